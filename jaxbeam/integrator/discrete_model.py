@@ -12,6 +12,7 @@ from jaxbeam.integrator.monitored_rows import largest_per_energy, monitored_rows
 from jaxbeam.integrator.propagators import PEAK_NODES, Propagators, propagators
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.model.sensing.corrected_rows import LoadInfluence, StaticCorrection
 from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.runtime.arrays import Array, xp
 
@@ -22,8 +23,8 @@ class DiscreteModel(eqx.Module):
     Outputs are deflections, or other quantities of sensors. `flexibility` bounds each of them by
     the energy: output^2 <= flexibility (q'^2 + q K q), for a deflection the static deflection (m/N)
     under a unit force there. With `with_node_states`, step matrices include
-    the states at the nodes. Peaks are those of the `magnitude` of an output, by default its
-    absolute value.
+    the states at the nodes. `load_influence` is that of statically corrected outputs. Peaks are
+    those of the `magnitude` of an output, by default its absolute value.
     """
 
     model: ModalModel
@@ -34,6 +35,7 @@ class DiscreteModel(eqx.Module):
     flexibility: Float[Array, " position"] | None
     modal_command_matrix: Float[Array, "mode actuator"] | None
     with_node_states: bool = eqx.field(static=True)
+    load_influence: LoadInfluence | None = None
     magnitude: Callable = eqx.field(static=True, default=abs)
 
     @property
@@ -48,11 +50,13 @@ def discrete_model(
     positions: Float[Array, " position"] | None,
     policy: AbstractInputPolicy | None = None,
     outputs: OutputRows | None = None,
+    correction: StaticCorrection | None = None,
 ) -> DiscreteModel:
     """Modal model on a time grid, with deflections monitored at `positions` (m), if any.
 
     An input policy adds the commands, and the states at the nodes if it is implicit. `outputs` are
-    monitored in place of the deflections: sums of the modes, accelerations with the forces.
+    monitored in place of the deflections: sums of the modes, accelerations with the forces, and
+    with their static `correction`, if it is given.
     """
     with_commands = policy is not None
     with_node_states = policy is not None and policy.implicit
@@ -66,16 +70,20 @@ def discrete_model(
     if outputs is None:
         shapes = model.shapes(positions, (0,))[0]
         outputs = OutputRows(shapes, xp.zeros((shapes.shape[0], 0)), (0,) * shapes.shape[0])
-    transition, force_response = monitored_rows(model, step_propagators, outputs, commands)
+    rows, influence = (
+        (None, None) if correction is None else (correction.rows, correction.influence)
+    )
+    transition, force_response = monitored_rows(model, step_propagators, outputs, commands, rows)
     return DiscreteModel(
         model,
         grid,
         step_propagators,
         transition,
         force_response,
-        largest_per_energy(model, outputs),
+        largest_per_energy(model, outputs, rows),
         commands,
         with_node_states,
+        influence,
     )
 
 
@@ -89,8 +97,10 @@ def signed_both_ways(discrete: DiscreteModel) -> DiscreteModel:
         both = xp.concatenate([split, -split], axis=2)
         return both.reshape(rows.shape[0], -1, *rows.shape[2:])
 
+    influence = discrete.load_influence
     return dataclasses.replace(
         discrete,
+        load_influence=influence and dataclasses.replace(influence, mirrored=True),
         monitored_transition=both_signs(discrete.monitored_transition),
         monitored_input=both_signs(discrete.monitored_input),
         flexibility=xp.tile(discrete.flexibility, 2),

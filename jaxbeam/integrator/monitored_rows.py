@@ -5,9 +5,10 @@ from jaxtyping import Float
 
 from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES, Propagators
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.model.sensing.corrected_rows import CorrectionRows
 from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.numerics.gauss import lagrange_coefficients
-from jaxbeam.runtime.arrays import Array, add_at, solve_triangular, xp
+from jaxbeam.runtime.arrays import Array, add_at, cholesky, solve_triangular, xp
 
 
 def monitored_rows(
@@ -15,6 +16,7 @@ def monitored_rows(
     propagators: Propagators,
     outputs: OutputRows,
     command_rates: Float[Array, "mode actuator"] | None,
+    corrected: CorrectionRows | None = None,
 ) -> tuple[
     Float[Array, "length sample block side"],
     Float[Array, "length sample force block input"],
@@ -24,6 +26,7 @@ def monitored_rows(
     Samples are the outputs at each peak node, one node after the other; inputs are the generalised
     forces, then the commands, whose `command_rates` are accelerations of the modes. Accelerations
     are q'' = (rows of A) z + forces, with the forces as polynomials through the Gauss nodes.
+    `corrected` are rows of the static correction, in addition.
     """
     blocks, count = model.state_matrix.shape[0], model.modes_per_block
     rows = outputs.rows.reshape(-1, blocks, count)
@@ -43,9 +46,19 @@ def monitored_rows(
     if len(grouped) > 1:
         as_given = np.argsort(np.concatenate(grouped))
         on_state, on_forces = on_state[:, :, as_given], on_forces[:, :, as_given]
-    forces_at_once = _feedthrough(outputs, rows, command_rates, response.shape[-1])
+    if corrected is not None:
+        for order, extra in ((1, corrected.rates), (2, corrected.accelerations)):
+            if extra is None:
+                continue
+            on_side, sides = extra.reshape(-1, blocks, count), np.s_[1 : 2 * count : 2]
+            if order == 2:
+                on_side, sides = xp.einsum("wbm,bmj->wbj", on_side, accelerations), np.s_[:]
+            on_state = on_state + xp.einsum("wbm,lpbmj->lpwbj", on_side, transition[..., sides, :])
+            added = xp.einsum("wbm,lpfbmk->lpwfbk", on_side, response[..., sides, :])
+            on_forces = on_forces + added
+    forces_at_once = _feedthrough(outputs, rows, command_rates, response.shape[-1], corrected)
     if forces_at_once is not None:
-        weights = _force_weights()[:, None, :, None, None]
+        weights = force_weights_at_peaks()[:, None, :, None, None]
         on_forces = on_forces + weights * forces_at_once[:, None]
     lengths = on_state.shape[0]
     return (
@@ -72,17 +85,20 @@ def _at_peak_nodes(propagators: Propagators):
     return xp.concatenate(transitions, axis=1), xp.concatenate(responses, axis=1)
 
 
-def _force_weights() -> np.ndarray:
+def force_weights_at_peaks() -> np.ndarray:
     """Weights (sample, force) from forces at the Gauss nodes to those at the peak nodes."""
     powers = np.array(PEAK_NODES)[:, None] ** np.arange(NODE_COUNT)
     return powers @ lagrange_coefficients(NODE_COUNT).T
 
 
-def _feedthrough(outputs: OutputRows, rows, command_rates, input_count: int):
+def _feedthrough(
+    outputs: OutputRows, rows, command_rates, input_count: int, corrected: CorrectionRows | None
+):
     """Outputs per input at the same instant (output, block, input); None if they are all zero."""
     count = rows.shape[-1]
     has_commands = command_rates is not None and outputs.on_commands.shape[1] > 0
-    if not (outputs.has_feedthrough.any() or has_commands):
+    has_masses = corrected is not None and corrected.accelerations is not None
+    if not (outputs.has_feedthrough.any() or has_commands or has_masses):
         return None
     direct = xp.zeros((*rows.shape[:2], input_count))
     for i in np.flatnonzero(outputs.has_feedthrough):
@@ -92,13 +108,25 @@ def _feedthrough(outputs: OutputRows, rows, command_rates, input_count: int):
     if has_commands:
         actuators = outputs.on_commands.shape[1]
         direct = add_at(direct, np.s_[:, 0, count : count + actuators], outputs.on_commands)
+    if corrected is None:
+        return direct
+    if corrected.accelerations is not None:
+        on_accelerations = corrected.accelerations.reshape(rows.shape)
+        direct = add_at(direct, np.s_[..., :count], on_accelerations)
+        if command_rates is not None:
+            direct = add_at(direct, np.s_[:, :, count:], on_accelerations @ command_rates)
+    if has_commands:
+        direct = add_at(direct, np.s_[:, 0, count : count + actuators], corrected.commands)
     return direct
 
 
-def largest_per_energy(model: ModalModel, outputs: OutputRows) -> Float[Array, " output"]:
+def largest_per_energy(
+    model: ModalModel, outputs: OutputRows, corrected: CorrectionRows | None = None
+) -> Float[Array, " output"]:
     """Bound of the square of each free output per q'^2 + q K q; infinite with rigid-body modes.
 
-    For a row s on q it is s K^-1 s; on q', s s; on q'' = -K q - D q', (sqrt(s K s) + |D s|)^2.
+    For a row s on q it is s K^-1 s; on q', s s; on q'' = -K q - D q', (sqrt(s K s) + |D s|)^2; of
+    an output with more than one row, the square of the sum of their roots.
     """
     orders = np.array(outputs.time_derivatives, int)
     bounds = xp.zeros(orders.shape)
@@ -108,12 +136,21 @@ def largest_per_energy(model: ModalModel, outputs: OutputRows) -> Float[Array, "
     if rates.size:
         bounds = add_at(bounds, rates, xp.sum(outputs.rows[rates] ** 2, axis=1))
     if accelerations.size:
-        rows, stiffness = outputs.rows[accelerations], model.stiffness()
-        damping = -model.A[model.rate_index, model.rate_index]
-        elastic = xp.sum(rows * (rows @ stiffness), axis=1)
-        damped = xp.sum((rows @ damping) ** 2, axis=1)
-        bounds = add_at(bounds, accelerations, (xp.sqrt(elastic) + xp.sqrt(damped)) ** 2)
-    return bounds
+        bound = _of_accelerations(model, outputs.rows[accelerations])
+        bounds = add_at(bounds, accelerations, bound)
+    if corrected is None or corrected.rates is None:
+        return bounds
+    roots = xp.sqrt(bounds) + xp.sqrt(xp.sum(corrected.rates**2, axis=1))
+    if corrected.accelerations is not None:
+        roots = roots + xp.sqrt(_of_accelerations(model, corrected.accelerations))
+    return roots**2
+
+
+def _of_accelerations(model: ModalModel, rows) -> Float[Array, " output"]:
+    damping = -model.A[model.rate_index, model.rate_index]
+    elastic = xp.sum(rows * (rows @ model.stiffness()), axis=1)
+    damped = xp.sum((rows @ damping) ** 2, axis=1)
+    return (xp.sqrt(elastic) + xp.sqrt(damped)) ** 2
 
 
 def _static_flexibility(
@@ -125,5 +162,6 @@ def _static_flexibility(
     """
     if model.modes_per_block == 1:
         return xp.sum(shapes**2 / -model.state_matrix[:, 1, 0], axis=1)
-    half_solved = solve_triangular(xp.linalg.cholesky(model.stiffness()), shapes.T, lower=True)
-    return xp.sum(half_solved**2, axis=0)
+    half_solved = solve_triangular(cholesky(model.stiffness()), shapes.T, lower=True)
+    flexibility = xp.sum(half_solved**2, axis=0)
+    return xp.where(xp.isfinite(flexibility), flexibility, xp.inf)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.integrator.discrete_model import DiscreteModel
-from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
+from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT, PEAK_NODES
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.contact import ModalCompliance, SurfaceRows, surface_rows
 from jaxbeam.model.load_set import LoadSet
@@ -88,7 +88,8 @@ class LoadPath(eqx.Module):
 
     `length_index` is the index of a step's length among those of the grid; start and length are in
     s. `loads` are the indices of the wheels in the rows. `surface` is the height of the profile (m)
-    under all wheels, and its first and second rate, where there is a profile.
+    under all wheels, and its first and second rate, where there is a profile. `influence` is the
+    static one of a force of each wheel at the peak nodes on corrected outputs.
     """
 
     length_index: Int[Array, " step"]
@@ -98,6 +99,7 @@ class LoadPath(eqx.Module):
     on_beam: Bool[Array, "step load"]
     rows: SurfaceRows
     surface: Float[Array, "step 3 wheel node"] | None
+    influence: Float[Array, "step load sample output"] | None = None
 
 
 def chunk_length(discrete: DiscreteModel, loads: LoadSet, max_loads: int) -> int:
@@ -151,7 +153,26 @@ def load_path(
     motion = position, speed, acceleration, on_beam_at_nodes
     rows = surface_rows(model, *motion, springs, not loads.massless)
     surface = None if surface is None else xp.stack(surface, axis=1)
-    return LoadPath(length_index, start, length, load_index, on_beam, rows, surface)
+    influence = None
+    if discrete.load_influence is not None:
+        influence = _static_influence(discrete, loads, start, length, load_index, on_beam)
+    return LoadPath(length_index, start, length, load_index, on_beam, rows, surface, influence)
+
+
+def _static_influence(discrete: DiscreteModel, loads: LoadSet, start, length, load_index, on_beam):
+    """Static influence of wheels on corrected outputs at the peak nodes of steps.
+
+    It is (step, load, sample, output). At the ends of a step the limits within it: a wheel may pass
+    a sensor there, where moments have a kink and shear forces jump.
+    """
+    nodes = xp.asarray([*PEAK_NODES, 0.5], length.dtype)
+    position = xp.moveaxis(loads.kinematics(start[:, None] + length[:, None] * nodes)[0], 0, 1)
+    position = xp.take_along_axis(position, load_index[:, :, None], axis=1)
+    active = on_beam[:, :, None]
+    position = xp.where(active, position, 0.0)
+    middle = xp.broadcast_to(position[..., -1:], position[..., :-1].shape)
+    influence = discrete.load_influence.of_forces_at(position[..., :-1], middle)
+    return xp.where(active[..., None], influence, 0.0)
 
 
 @jax.named_scope("load_path")

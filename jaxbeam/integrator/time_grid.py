@@ -73,9 +73,10 @@ class TimeGrid(eqx.Module):
         return take(self.cumulative_counts, panel) - take(self.counts, panel)
 
 
-def _load_events(case: Case, model: ModalModel):
+def _load_events(case: Case, model: ModalModel, places=None):
     """Entry and exit of each wheel (wheel, 2), and all load events (event,), in s."""
-    places, loads = model.modes.nodes[1:-1], load_set(case)
+    own, loads = model.modes.nodes[1:-1], load_set(case)
+    places = own if places is None else xp.concatenate([own, places])
     if loads.profile is not None:
         places = xp.concatenate([places, loads.profile.kinks()])
     windows = loads.entry_exit_times()
@@ -94,14 +95,19 @@ def _loads_on_beam(positions, panels: int):
 
 
 def grid_by_step_length(
-    case: Case, model: ModalModel, max_step: Float[Array, ""], extra_steps: int | Int[Array, ""] = 0
+    case: Case,
+    model: ModalModel,
+    max_step: Float[Array, ""],
+    extra_steps: int | Int[Array, ""] = 0,
+    places: Float[Array, " place"] | None = None,
 ) -> TimeGrid:
     """Panels between load events, with steps of at most `max_step` (s).
 
     `extra_steps` are added to each panel. An error estimate takes one: a smaller `max_step` may
-    leave the number of steps of a short panel unchanged.
+    leave the number of steps of a short panel unchanged. Steps also end where a wheel passes one of
+    the `places` (m).
     """
-    windows, events = _load_events(case, model)
+    windows, events = _load_events(case, model, places)
     end = case.run.duration
     times = xp.concatenate([xp.zeros(1), xp.clip(events, 0.0, end), end[None]])
     order = xp.argsort(times, stable=True)
@@ -121,14 +127,19 @@ def grid_by_step_length(
 
 
 def grid_by_schedule(
-    case: Case, model: ModalModel, schedule: EventSchedule, substeps: int | Int[Array, ""]
+    case: Case,
+    model: ModalModel,
+    schedule: EventSchedule,
+    substeps: int | Int[Array, ""],
+    places: Float[Array, " place"] | None = None,
 ) -> TimeGrid:
     """Panels between the events of a schedule and the load events, of `substeps` steps each.
 
-    Nearly all panels share a few step lengths, hence their propagators.
+    Nearly all panels share a few step lengths, hence their propagators. Steps also end where a
+    wheel passes one of the `places` (m).
     """
     times = schedule.times
-    windows, events = _load_events(case, model)
+    windows, events = _load_events(case, model, places)
     if schedule.control_sample is not None:
         # A step of zero length after the end: the controller acts at the last event too.
         events = xp.append(events, times[-1])

@@ -18,6 +18,7 @@ from jaxbeam.sweeps.batches import Batches
 from jaxbeam.sweeps.block_store import BlockStore, MemoryStore
 from jaxbeam.sweeps.blocks import Runner
 from jaxbeam.sweeps.specification import SweepSpecification
+from jaxbeam.sweeps.truncation import estimated_errors, is_corrected
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -62,6 +63,10 @@ def compute_sweep(
             progress_bar.update(runner.run_count(block))
     dataset = _to_dataset(specification, runner.batches, block_store.collect())
     dataset.attrs |= {"error_estimate": error, sweep_store.FINGERPRINT_ATTRIBUTE: fingerprint}
+    for quantity, share in estimated_errors(
+        specification.case, _worst_runs(specification, dataset)
+    ).items():
+        dataset[f"peak_{quantity}"].attrs["truncation_error"] = share
     block_store.finish(dataset)
     return dataset
 
@@ -129,14 +134,27 @@ def _to_dataset(
     return xarray.Dataset(variables, coordinates, attributes)
 
 
+def _worst_runs(specification: SweepSpecification, dataset) -> dict[str, dict[str, float]]:
+    """Numbers of the run with the largest peak of each quantity; none where all runs failed."""
+    runs, worst = specification.runs(), {}
+    for quantity in {sensor.quantity for sensor in specification.case.sensors}:
+        peaks = dataset[f"peak_{quantity}"].values.reshape(len(runs), -1)
+        if np.isfinite(peaks).any():
+            row = runs[np.nanargmax(peaks) // peaks.shape[1]]
+            worst[quantity] = dict(zip(specification.axes, map(float, row), strict=True))
+    return worst
+
+
 def _peak_variables(case: Case, dims: tuple[str, ...], peaks) -> dict[str, tuple]:
     """Peaks (..., sensor) as a variable for each quantity, NaN at sensors of others."""
     quantities = np.array([sensor.quantity for sensor in case.sensors])
-    variables = {}
+    variables, corrected = {}, is_corrected(case)
     for sensor in case.sensors:
         entry, own = QUANTITIES[sensor.quantity], quantities == sensor.quantity
         words = f"largest absolute {sensor.quantity}"
-        words += f", sum of {case.beam.modes} modes" if entry.bends else ""
+        if entry.bends:
+            modes = f"sum of {case.beam.modes} modes"
+            words += ", statically corrected" if corrected else f", {modes}"
         values = np.where(own, peaks, np.nan).astype(peaks.dtype)
         attributes = {"units": entry.unit, "long_name": words}
         variables[f"peak_{sensor.quantity}"] = ((*dims, "sensor"), values, attributes)

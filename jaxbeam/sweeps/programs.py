@@ -27,6 +27,7 @@ from jaxbeam.integrator.integrate import (
 from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
+from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
 from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,
@@ -76,16 +77,18 @@ class Program(NamedTuple):
     def grid(self, model, shared_values, step_size):
         """Time grid of a batch for a longest step (s) and a number of extra steps per event."""
         varied, (max_step, extra_steps) = self.case_with(shared_values), step_size
+        places = corrected_places(varied, model)
         if self.schedule is None:
-            return grid_by_step_length(varied, model, max_step, extra_steps)
+            return grid_by_step_length(varied, model, max_step, extra_steps, places)
         substeps = jnp.ceil(jnp.max(self.schedule.lengths) / max_step).astype(int) + extra_steps
-        return grid_by_schedule(varied, model, self.schedule, self.substeps or substeps)
+        return grid_by_schedule(varied, model, self.schedule, self.substeps or substeps, places)
 
     def discretise(self, model, shared_values, step_size, policy=None):
         """Discrete model of a batch, with peaks of what the sensors measure."""
         varied, grid = self.case_with(shared_values), self.grid(model, shared_values, step_size)
         outputs = sensor_rows(model, varied, varied.sensors)
-        return discrete_model(model, grid, None, policy, outputs)
+        correction = static_correction(model, varied, varied.sensors, outputs)
+        return discrete_model(model, grid, None, policy, outputs, correction)
 
 
 @compiled(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)

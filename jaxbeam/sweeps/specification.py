@@ -25,6 +25,7 @@ from jaxbeam.integrator import native_peaks
 from jaxbeam.sweeps import MAX_RUNS
 from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, Batches, addresses_within_batches, make_batches
 from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner
+from jaxbeam.sweeps.truncation import is_corrected
 
 # Positions and list entries, whose values are valid only in combination.
 JOINTLY_CHECKED = re.compile(
@@ -155,10 +156,11 @@ def sweep_specification(
     if not case.sensors:
         raise ValueError("the case has no sensors, and peaks are taken there; add one to `sensors`")
     for i, sensor in enumerate(case.sensors):
-        if QUANTITIES[sensor.quantity].x_derivative > 2:
+        if QUANTITIES[sensor.quantity].x_derivative > 2 and not is_corrected(case):
             raise ValueError(
-                f"sensors.{i} measures {sensor.quantity}, whose sum of modes converges too slowly"
-                " for the peaks of a sweep: leave it out, and simulate single runs"
+                f"sensors.{i} measures {sensor.quantity}, whose sum of modes converges too slowly,"
+                " and which is not statically corrected, as the beam can move as a rigid body:"
+                " leave it out, or hold the beam"
             )
     over = {current_address(address): given for address, given in over.items()}
     twice = overlap(over, list_sizes(case))

@@ -1,42 +1,154 @@
-"""Warning of what few modes miss of curvatures, strains and moments, whose peaks sweeps follow."""
+"""What the modes that a sweep leaves out change of its peaks: warning, and estimated errors."""
 
+import dataclasses
 import warnings
 
-from jaxbeam.case.case import Case, concrete_case
-from jaxbeam.case.quantities import QUANTITIES
-from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.static_correction import is_supported, residual_flexibility
-from jaxbeam.model.statics import influence_line
+import numpy as np
+from jaxtyping import Float
 
-NEGLIGIBLE_SHARE = 1e-3
+from jaxbeam.case.case import Case, concrete_case, replace
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import Sensor
+from jaxbeam.model.layout import is_uniform
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.sensing.output_rows import quantity_history
+from jaxbeam.model.static_correction import (
+    Motion,
+    corrected_history,
+    is_supported,
+    residual_flexibility,
+)
+from jaxbeam.model.statics import influence_line
+from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.simulation.record import Record
+from jaxbeam.simulation.simulate import ContactLossWarning, simulate
+
+LEFT_OUT = 2  # highest modes whose dynamic part estimates that of all modes beyond
+SAMPLES = 400  # of the run from which errors of corrected quantities are estimated
+ESTIMATE_TOLERANCE = 1e-3  # of that run
 
 
 class TruncationWarning(UserWarning):
     """Warning of a quantity that the modes of a case miss in part."""
 
 
-def warn_of_truncation(case: Case) -> None:
-    """Warn of sensors at which the modes miss part of the static value under a load there.
+def is_corrected(case: Case) -> bool:
+    """Whether peaks of curvatures, strains and section forces are statically corrected."""
+    case = concrete_case(case)
+    return is_supported(case, mesh_layout(case))
 
-    The share is that of the residual of the modes (see `residual_flexibility`) in the influence
-    line, with load and section at the sensor.
+
+def warn_of_truncation(case: Case) -> None:
+    """Warn of sensors of curvature, strain or moment whose peaks cannot be corrected."""
+    uncorrected = [i for i, sensor in enumerate(case.sensors) if sensor.bends]
+    if not uncorrected or is_corrected(case):
+        return
+    names = ", ".join(f"sensors.{i} ({case.sensors[i].quantity})" for i in uncorrected)
+    warnings.warn(
+        f"peaks of {names} are sums of {case.beam.modes} modes and not statically corrected, as the"
+        " beam can move as a rigid body: keep more modes (beam.modes), and compare",
+        TruncationWarning,
+        stacklevel=3,
+    )
+
+
+def static_shares(case: Case) -> dict[str, float]:
+    """Largest share that the modes miss of static deflections and rotations, by quantity.
+
+    At each sensor under a load there; a rotation, which may be zero there, under one at a quarter
+    of the span.
     """
     case = concrete_case(case)
-    layout = mesh_layout(case)
+    layout, shares = mesh_layout(case), {}
     if not is_supported(case, layout):
-        return
-    for i, sensor in enumerate(case.sensors):
-        derivative, x = QUANTITIES[sensor.quantity].x_derivative, sensor.position
-        if not sensor.bends:
+        return shares
+    for sensor in case.sensors:
+        entry, x = QUANTITIES[sensor.quantity], sensor.position
+        if entry.bends or entry.time_derivative:
             continue
-        exact = float(influence_line(case, x, x, derivative, layout))
-        missing = float(residual_flexibility(case, x, x, derivative, layout))
+        at = x if entry.x_derivative == 0 else case.beam.length / 4
+        exact = float(influence_line(case, x, at, entry.x_derivative, layout))
+        missing = float(residual_flexibility(case, x, at, entry.x_derivative, layout))
         share = abs(missing / exact) if exact else 0.0
-        if share > NEGLIGIBLE_SHARE:
-            warnings.warn(
-                f"peaks of sensors.{i} ({sensor.quantity}) are sums of {case.beam.modes} modes,"
-                f" which miss {share:.1%} of the static value under a load there: keep more modes"
-                " (beam.modes), or simulate single runs, whose readings are corrected",
-                TruncationWarning,
-                stacklevel=3,
-            )
+        shares[sensor.quantity] = max(share, shares.get(sensor.quantity, 0.0))
+    return shares
+
+
+def estimated_errors(case: Case, worst: dict[str, dict[str, float]]) -> dict[str, float]:
+    """Truncation errors of peaks relative to the largest, by quantity, where they are known.
+
+    `worst` has the numbers of the run with the largest peak of each quantity. Of deflections and
+    rotations the error is the static one; others are estimated from that run (see
+    `truncation_errors`), without a controller.
+    """
+    errors = static_shares(case)
+    quantities = [sensor.quantity for sensor in case.sensors]
+    if case.controller is not None:
+        return errors
+    for quantity, numbers in worst.items():
+        if quantity in errors:
+            continue
+        of_run = concrete_case(replace(case, numbers))
+        times = np.linspace(0.0, float(of_run.run.duration), SAMPLES)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ContactLossWarning)
+            record = simulate(of_run, times, tolerance=ESTIMATE_TOLERANCE)
+        own = np.array(quantities) == quantity
+        found = np.asarray(truncation_errors(record))[own]
+        if np.isfinite(found).any():
+            errors[quantity] = float(np.nanmax(found))
+    return errors
+
+
+def truncation_errors(record: Record) -> Float[Array, " sensor"]:
+    """Estimated truncation error of the quantity of each sensor, relative to its largest value.
+
+    From the samples of a record. Of a deflection or rotation, the largest part that the static
+    correction would add. Of others, the largest change with the dynamic part of the two highest
+    modes left out, which is more than that of all higher modes where their contributions fall;
+    accelerations under point forces do not converge, and their modes are a convention. NaN for
+    those of a case with one mode, and for slopes of a beam that is not uniform.
+    """
+    errors = []
+    for sensor in record.case.sensors:
+        full = _history(record, sensor)
+        quantity = QUANTITIES[sensor.quantity]
+        if quantity.of_axis and not is_uniform(record.case):
+            other = full * xp.nan
+        elif quantity.time_derivative == 0 and not quantity.bends:
+            parts = record.case, record.modes, record.motion, sensor.position
+            other = corrected_history(*parts, quantity.x_derivative)
+        else:
+            fewer = _with_fewer_modes(record)
+            other = full * xp.nan if fewer is None else _history(fewer, sensor)
+        largest = xp.max(xp.abs(full))
+        change = xp.max(xp.abs(full - other))
+        errors.append(xp.where(largest > 0, change / xp.where(largest > 0, largest, 1.0), 0.0))
+    return xp.array(errors).reshape(-1)
+
+
+def _history(record: Record, sensor: Sensor):
+    channel = sensor.position, sensor.quantity, sensor.fibre_distance, sensor.section_modulus
+    return quantity_history(record.case, record.modes, record.motion, *channel)
+
+
+def _with_fewer_modes(record: Record) -> Record | None:
+    """The record without its highest modes; None with one mode."""
+    case, count = record.case, record.case.beam.modes
+    kept = count - min(LEFT_OUT, count - 1)
+    if kept == count:
+        return None
+    beam = dataclasses.replace(case.beam, modes=kept, damping_ratio=_of_lowest(case.beam, kept))
+    amplitudes = {name: getattr(record, name)[:, :kept] for name in Motion._fields[:3]}
+    return dataclasses.replace(
+        record,
+        case=dataclasses.replace(case, beam=beam),
+        modes=record.modes.lowest(kept),
+        **amplitudes,
+    )
+
+
+def _of_lowest(beam, count: int):
+    """Damping ratios of the lowest modes: one for all, or a list."""
+    ratio = beam.damping_ratio
+    return ratio[:count] if np.ndim(ratio) else ratio
