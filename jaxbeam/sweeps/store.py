@@ -25,6 +25,7 @@ from jaxbeam.sweeps.zarr_files import (
     FINGERPRINT_ATTRIBUTE,
     array_options,
     blocks_mark,
+    check_codecs,
     checksummed,
     explaining_damage,
     explaining_write_errors,
@@ -48,7 +49,8 @@ class ZarrStore(BlockStore):
 
         self._path = path
         with explaining_damage(path):
-            group: Any = zarr.open_group(path, mode="r+", zarr_format=3)
+            check_codecs(path)
+            group: Any = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
             mark = blocks_mark(str(group.attrs[FINGERPRINT_ATTRIBUTE]))
             self._blocks: Any = group[BLOCKS_GROUP][mark]
             self._folder = path / BLOCKS_GROUP / mark
@@ -145,7 +147,8 @@ def read_dataset(path: Path) -> xarray.Dataset:
 
     shutil.rmtree(path / BLOCKS_GROUP, ignore_errors=True)  # chunks may remain after a kill
     with explaining_damage(path):
-        group = zarr.open_group(path, mode="r", zarr_format=3)
+        check_codecs(path)
+        group = zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
         arrays: dict[str, Any] = {
             part.name: group[part.name] for part in path.iterdir() if part.is_dir()
         }
@@ -165,9 +168,8 @@ def status(path: Path) -> tuple[str, str] | None:
     if not path.exists():
         return None
     try:
-        fingerprint = str(
-            zarr.open_group(path, mode="r", zarr_format=3).attrs[FINGERPRINT_ATTRIBUTE]
-        )
+        group = zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
+        fingerprint = str(group.attrs[FINGERPRINT_ATTRIBUTE])
     except (KeyError, OSError, ValueError):
         raise FileExistsError(
             f"{path} exists and is not a sweep of jaxbeam; choose another name"

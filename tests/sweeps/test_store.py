@@ -1,6 +1,8 @@
 """Stores that are damaged, full or not writable: one sentence, and finished blocks are kept."""
 
 import ast
+import json
+import pickle
 import resource
 import shutil
 from pathlib import Path
@@ -193,6 +195,43 @@ def test_nothing_is_unpickled(copy, tmp_path):
     (copy / "peak_time" / "zarr.json").write_text(text.replace('"zstd"', '"numcodecs.pickle"'))
     with pytest.raises(ValueError, match="is damaged"):
         sweep(copy, resume=True)
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize("place", ["root", "array", "named"])
+def test_stores_with_codecs_that_run_code_are_refused(copy, tmp_path, place):
+    """Zarr of format 2 has filters of numcodecs, of which `pickle` runs code of the store."""
+    trace, array = tmp_path / "trace", copy / "peak_time"
+    if place == "named":  # a codec that zarr finds by its name in any installed package
+        text = (array / "zarr.json").read_text()
+        (array / "zarr.json").write_text(text.replace('"zstd"', '"numcodecs.shuffle"'))
+        with pytest.raises(ValueError, match=r"uses 'numcodecs\.shuffle', which jaxbeam does not"):
+            sweep(copy, resume=True)
+        return
+    shutil.rmtree(array)
+    array.mkdir()
+    metadata = {
+        "zarr_format": 2,
+        "shape": [1],
+        "chunks": [1],
+        "dtype": "|O",
+        "order": "C",
+        "compressor": None,
+        "fill_value": None,
+        "filters": [{"id": "pickle", "protocol": 5}],
+    }
+    (array / ".zarray").write_text(json.dumps(metadata))
+    (array / "0").write_bytes(pickle.dumps(np.array([TracedObject(trace)], dtype=object)))
+    if place == "root":
+        attributes = json.loads((copy / "zarr.json").read_text())["attributes"]
+        (copy / "zarr.json").unlink()
+        (copy / ".zgroup").write_text('{"zarr_format": 2}')
+        (copy / ".zattrs").write_text(json.dumps(attributes))
+        with pytest.raises(FileExistsError, match="is not a sweep of jaxbeam"):
+            sweep(copy, resume=True)
+    else:
+        with pytest.raises(ValueError, match=r"is damaged \(jaxbeam writes no \.zarray"):
+            sweep(copy, resume=True)
     assert not trace.exists()
 
 
