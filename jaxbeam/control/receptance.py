@@ -214,9 +214,12 @@ def closed_loop_poles(
         # Rates by the highest frequency, so that all states are of one size.
         size = np.ones(model.state_count)
         size[model.rate_index] = np.sqrt(np.abs(model.A).max())
-        scaled = [matrix * size / size[:, None] for matrix in (model.A, loop)]
+        A, loop = (matrix * size / size[:, None] for matrix in (model.A, loop))
         poles = np.array(
-            [_refined(*scaled, delay, *start) for start in _starts(*scaled, delay, 3 * count)]
+            [
+                _refined(A, loop, delay, start[0], start[1])
+                for start in _starts(A, loop, delay, 3 * count)
+            ]
         )
     poles = poles[np.isfinite(poles) & (poles.imag >= 0)]
     poles = poles[np.argsort(-poles.real)]
