@@ -1,5 +1,6 @@
 """Meaning of arguments, checked before any work; imports nothing heavy at the top."""
 
+import importlib.util
 import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -209,10 +210,21 @@ def check_exists(kind: str, *paths: Path) -> None:
 
 
 TABLE_SUFFIXES = (".csv", ".xlsx", ".mat", ".parquet")
+TABLE_PACKAGES = {".xlsx": "openpyxl", ".parquet": "pyarrow"}
 
 
 def check_suffix(path: Path | None, suffix: str, content: str, others: Sequence[str] = ()) -> None:
-    """Raises ValueError if a file has not the suffix of its content, nor one of the others."""
+    """Whether a file can be written by its suffix, before any work.
+
+    Raises ValueError if it has not the suffix of its content, nor one of the others, or if the
+    package that writes it is not installed.
+    """
+    package = TABLE_PACKAGES.get(path.suffix, "") if path and path.suffix in others else ""
+    if package and not importlib.util.find_spec(package):
+        raise ValueError(
+            f"{path.suffix} files need {package}, which is not installed: pip install {package},"
+            " or 'jaxbeam[tables]'"
+        )
     if path and path.suffix not in (suffix, *others):
         more = f", or {', '.join(others)}" if others else ""
         raise ValueError(

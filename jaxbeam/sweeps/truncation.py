@@ -92,7 +92,10 @@ def estimated_errors(case: Case, worst: dict[str, dict[str, float]]) -> dict[str
         times = np.linspace(0.0, float(of_run.run.duration), SAMPLES)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ContactLossWarning)
-            record = simulate(of_run, times, tolerance=ESTIMATE_TOLERANCE)
+            try:
+                record = simulate(of_run, times, tolerance=ESTIMATE_TOLERANCE)
+            except RuntimeError:  # no step was found: the peaks are kept, their error is not known
+                continue
         own = np.array(quantities) == quantity
         found = np.asarray(truncation_errors(record))[own]
         if np.isfinite(found).any():

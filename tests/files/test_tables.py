@@ -1,11 +1,14 @@
 """Tables in files of other programs: read again by those programs, to the last bit."""
 
 import csv
+import importlib.util
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import jaxbeam as jb
+from jaxbeam.cli.arguments import TABLE_SUFFIXES, check_suffix
 from jaxbeam.files.tables import write_table
 
 CASE = jb.Case(
@@ -83,3 +86,10 @@ def test_files_are_not_replaced_nor_left_half_written(record, tmp_path):
     with pytest.raises(ValueError):
         write_table(tmp_path / "bad.csv", {"a": np.zeros(2), "b": np.zeros(3)})
     assert [found.name for found in tmp_path.iterdir()] == ["run.csv"]
+
+
+def test_a_missing_package_is_told_before_the_run(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"\.xlsx files need openpyxl, which is not installed"):
+        check_suffix(Path("run.xlsx"), ".nc", "a record", TABLE_SUFFIXES)
+    check_suffix(Path("run.csv"), ".nc", "a record", TABLE_SUFFIXES)

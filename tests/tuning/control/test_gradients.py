@@ -28,6 +28,10 @@ LOOPS = {
             "actuators.0.end": 0.3425,
         },
     ),
+    "output feedback": (
+        jb.OutputFeedback([[-3000.0]], period=0.01),
+        {"controller.gains.0.0": -3000.0},
+    ),
     "regulator": (
         jb.LQR(
             estimator=jb.Kalman(process_noise=0.02, measurement_noise=1e-5),
