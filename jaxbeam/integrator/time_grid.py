@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.events import EventSchedule
-from jaxbeam.model.load_set import LoadSet, load_set
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import Array, put, searchsorted, stop_gradient, take, xp
 
@@ -73,16 +73,10 @@ class TimeGrid(eqx.Module):
         return take(self.cumulative_counts, panel) - take(self.counts, panel)
 
 
-def load_events(
-    loads: LoadSet, model: ModalModel, places: Float[Array, " place"] | None = None
-) -> tuple[Float[Array, "wheel 2"], Float[Array, " event"]]:
-    """Entry and exit of each wheel, and all load events, in s; passages of some places (m) too."""
+def _load_events(case: Case, model: ModalModel, places=None):
+    """Entry and exit of each wheel (wheel, 2), and all load events (event,), in s."""
     own = model.modes.nodes[1:-1]
-    places = own if places is None else xp.concatenate([own, places])
-    if loads.profile is not None:
-        places = xp.concatenate([places, loads.profile.kinks()])
-    windows = loads.entry_exit_times()
-    return windows, xp.concatenate([windows.reshape(-1), loads.passage_times(places)])
+    return load_set(case).events(own if places is None else xp.concatenate([own, places]))
 
 
 def _loads_on_beam(positions, panels: int):
@@ -109,7 +103,7 @@ def grid_by_step_length(
     leave the number of steps of a short panel unchanged. Steps also end where a wheel passes one of
     the `places` (m).
     """
-    windows, events = load_events(load_set(case), model, places)
+    windows, events = _load_events(case, model, places)
     end = case.run.duration
     times = xp.concatenate([xp.zeros(1), xp.clip(events, 0.0, end), end[None]])
     order = xp.argsort(times, stable=True)
@@ -141,7 +135,7 @@ def grid_by_schedule(
     wheel passes one of the `places` (m).
     """
     times = schedule.times
-    windows, events = load_events(load_set(case), model, places)
+    windows, events = _load_events(case, model, places)
     if schedule.control_sample is not None:
         # A step of zero length after the end: the controller acts at the last event too.
         events = xp.append(events, times[-1])

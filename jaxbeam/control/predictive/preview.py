@@ -13,7 +13,6 @@ from jaxtyping import Float, Int
 
 from jaxbeam.control.optimal.crossing_plant import crossing_plant
 from jaxbeam.control.predictive.prediction import SampledPlant
-from jaxbeam.integrator.time_grid import load_events
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.coupled_stages import (
     ConstantPlant,
@@ -128,7 +127,7 @@ def preview(plant: Plant, period: Float[Array, ""], delay: Float[Array, ""] | No
         response = _response(constant_plant, length)
         return cell_maps(constant_plant, response, coupling, explicit)[0]
 
-    events = xp.sort(load_events(plant.loads, plant.modal_model)[1])
+    events = xp.sort(plant.loads.events(plant.modal_model.modes.nodes[1:-1])[1])
     far = xp.maximum(plant.case.run.duration, 0.0) + 1.0  # beyond any prediction that matters
     events = xp.clip(events, -period, far + 1000 * period)
     cells, number = edges.shape[0] - 1, xp.floor(events / period)
