@@ -19,6 +19,7 @@ from jaxbeam.cli.commands.models import compare_models, design_experiment
 from jaxbeam.cli.commands.new import new
 from jaxbeam.cli.commands.simulate import simulate
 from jaxbeam.cli.commands.stability import stability
+from jaxbeam.cli.commands.state_space import state_space
 from jaxbeam.cli.commands.sweep import native, sweep
 from jaxbeam.cli.commands.thesis import demo, reproduce
 from jaxbeam.cli.commands.tune import tune
@@ -27,7 +28,7 @@ from jaxbeam.cli.options import print_message
 
 COMMANDS = {
     "Simulation": (new, check, describe, modes, frf, simulate, sweep),
-    "Control": (compare, stability, tune, export),
+    "Control": (compare, stability, state_space, tune, export),
     "Identification": (identify, identify_responses, weigh, compare_models, design_experiment),
     "Other": (demo, reproduce, native),
 }
