@@ -200,9 +200,11 @@ class AbstractController(eqx.Module, metaclass=AcceptsFormerArguments):
     def law(self, plant: Any) -> Any:
         """Law designed for the nominal plant, or for the plant of the case if there is none."""
         plant = plant if self.nominal_plant is None else self.nominal_plant
-        active = commanded(plant.case.actuators)
+        active = None if plant is None else commanded(plant.case.actuators)
+        if active is None or not self.leaves_passive_out:
+            return self.design_law(plant)
         count = len(plant.case.actuators)
-        if not self.leaves_passive_out or len(active) == count:
+        if len(active) == count:
             return self.design_law(plant)
         return LawOfCommanded(self.design_law(plant.of_actuators(active)), active, count)
 
