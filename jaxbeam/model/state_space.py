@@ -81,11 +81,6 @@ class Plant(Module):
         one = xp.ones(int(has_known_disturbance(self.loads)))
         return xp.concatenate([vehicles, self.weights, one])
 
-    def on_static_loads(self) -> "Plant":
-        """The plant without springs of vehicles: wheels have their static loads and masses."""
-        wheels = dataclasses.replace(self.loads.wheels, stiffness=None, damping=None, vehicles=())
-        return dataclasses.replace(self, loads=dataclasses.replace(self.loads, wheels=wheels))
-
     def of_actuators(self, indices: Sequence[int]) -> "Plant":
         """The plant with the commands of some actuators only; the others act as they are."""
         actuators = tuple(self.case.actuators[i] for i in indices)
