@@ -30,7 +30,7 @@ if importlib.metadata.version("jaxlib").startswith(("0.10.", "0.11.0")):
     os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
 # Compiled programs are shared by all test processes, later files, and commands that tests start:
 # they use one folder, set before the test processes start. It is also their cache folder, so that
-# a library which a user compiled by `jaxbeam native` changes no test.
+# what a user compiled changes no test.
 if "PYTEST_XDIST_WORKER" not in os.environ:
     _cache = tempfile.TemporaryDirectory(prefix="compiled", ignore_cleanup_errors=True)
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _cache.name)

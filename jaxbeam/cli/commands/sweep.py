@@ -143,14 +143,14 @@ def _lines(case: "jb.Case", peaks, failed, values) -> list[str]:
 
 
 def native(*, remove: bool = False, options: PrintOptions = PrintOptions()) -> None:
-    """Compile the C code for this machine, once; sweeps of peaks use it from then on.
+    """Compile the C code of sweeps now, or say why that fails.
 
-    Needs a C compiler.
+    The first sweep of a thousand runs or more does so by itself where there is a C compiler.
 
     Parameters
     ----------
     remove
-        Remove the compiled code; sweeps use XLA again.
+        Remove the compiled code; sweeps use XLA until this command compiles it again.
     """
     from jaxbeam.integrator import native_peaks
 
