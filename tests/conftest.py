@@ -41,6 +41,8 @@ os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 import hypothesis
 import pytest
 
+from tests.fuzzing import FACTOR
+
 # Tracing makes millions of small objects that live long: with Python's own thresholds, garbage
 # collection takes up to a tenth of the time and frees next to nothing.
 gc.set_threshold(100_000, 20, 100)
@@ -49,7 +51,7 @@ gc.set_threshold(100_000, 20, 100)
 # the first example includes compiling. No database: it would only hold the same examples.
 hypothesis.settings.register_profile(
     "jaxbeam",
-    derandomize=True,
+    derandomize=FACTOR == 1,
     deadline=None,
     database=None,
     print_blob=False,

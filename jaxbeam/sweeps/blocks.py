@@ -12,15 +12,11 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, value_at
 from jaxbeam.integrator.events import sample_schedule
+from jaxbeam.integrator.static_shapes import StaticShapes, max_concurrent_loads
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import (
-    StaticShapes,
-    max_concurrent_loads,
-    sample_times,
-    steps_per_interval,
-)
+from jaxbeam.simulation.integration_plan import sample_times, steps_per_interval
 from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.batches import Batches
 from jaxbeam.sweeps.common_layout import common_layout

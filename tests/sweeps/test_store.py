@@ -155,7 +155,7 @@ def test_full_disk_keeps_finished_blocks(unfinished, complete, tmp_path):
 
 
 def test_folder_that_is_not_writable_is_named_before_any_run(tmp_path, monkeypatch):
-    monkeypatch.setattr(SweepSpecification, "runner", lambda _: pytest.fail("it runs"))
+    monkeypatch.setattr(SweepSpecification, "uses_c", lambda _: pytest.fail("it runs"))
     with pytest.raises(OSError, match=r"cannot write runs\.zarr to the folder .*none: no such"):
         sweep(tmp_path / "none" / "runs.zarr")
     monkeypatch.setattr("tempfile.TemporaryFile", forbidden)
