@@ -11,6 +11,7 @@ from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.fuzzing import examples
 from tests.oracles import modal_equations
 from tests.oracles.loads import Load
@@ -75,7 +76,7 @@ def case_of(span, loads, duration) -> jb.Case:
 def test_deflections_agree_with_scipy_within_the_stated_error(crossing):
     span, loads, duration = crossing
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", jb.simulation.simulate.ContactLossWarning)
+        warnings.simplefilter("ignore", ContactLossWarning)
         record = jb.simulate(case_of(span, loads, duration))
     positions = np.array([0.37, 0.5]) * LENGTH
     expected = modal_equations.respond(span, loads, positions, np.asarray(record.times)).deflection
