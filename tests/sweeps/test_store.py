@@ -241,8 +241,9 @@ UNPICKLE = {"pickle", "cloudpickle", "marshal", "shelve", "dill", "joblib"}
 PICKLING = {"jaxbeam.runtime.compile_cache", "jaxbeam.runtime.program_key"}
 
 
-# Loads the C library that it has compiled, once its HMAC is verified.
-LOADING = {"jaxbeam.runtime.native_library"}
+# The first loads the C library that it has compiled, once its HMAC is verified; the second one that
+# it has compiled just before.
+LOADING = {"jaxbeam.runtime.native_library", "experiments.benchmarks.kernel"}
 
 
 def test_no_module_runs_code_from_files():
