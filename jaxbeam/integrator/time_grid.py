@@ -75,12 +75,8 @@ class TimeGrid(eqx.Module):
 
 def _load_events(case: Case, model: ModalModel, places=None):
     """Entry and exit of each wheel (wheel, 2), and all load events (event,), in s."""
-    own, loads = model.modes.nodes[1:-1], load_set(case)
-    places = own if places is None else xp.concatenate([own, places])
-    if loads.profile is not None:
-        places = xp.concatenate([places, loads.profile.kinks()])
-    windows = loads.entry_exit_times()
-    return windows, xp.concatenate([windows.reshape(-1), loads.passage_times(places)])
+    own = model.modes.nodes[1:-1]
+    return load_set(case).events(own if places is None else xp.concatenate([own, places]))
 
 
 def _loads_on_beam(positions, panels: int):
