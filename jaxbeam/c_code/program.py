@@ -127,9 +127,7 @@ def _source(case: Case) -> CSource:
         start = initial_filter_state(case.sensors[i], sections, 0.0)
         states = code.state(f"filter_{i}", start, f"states of the filter of sensor {i}")
         filter, reading = code.constant(f"filter_{i}", sections), f"{code.readings}[{i}]"
-        code.add(
-            f"{reading} = filter_sample({filter}, {count}, {states}, {reading});", 9 * count
-        )
+        code.add(f"{reading} = filter_sample({filter}, {count}, {states}, {reading});", 9 * count)
     return code
 
 

@@ -1,10 +1,9 @@
-"""Closed loop of a designed law, recorded: what a program in C receives, and what it must answer."""
+"""Closed loop of a designed law, recorded: inputs of a program in C, and expected commands."""
 
 import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -13,15 +12,27 @@ from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, Cont
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.filters import filter_step
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.integrator.integrate import integrate_history
+from jaxbeam.integrator.integrate import (
+    integrate_history,
+    longest_force_step,
+    max_stable_step,
+)
 from jaxbeam.integrator.propagators import NODE_COUNT
+from jaxbeam.model.load_set import load_set
+from jaxbeam.model.modal_model import modal_model
+from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensing.sensor_signals import Sections, initial_filter_state, sensor_sections
-from jaxbeam.runtime.arrays import Array, vmap, xp
+from jaxbeam.runtime.arrays import Array, any_jax, known, vmap, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
-from jaxbeam.simulation.integration_plan import IntegrationPlan, integration_plan
+from jaxbeam.simulation.closed_loop import loop_schedule
+from jaxbeam.simulation.integration_plan import (
+    IntegrationPlan,
+    static_shapes,
+    steps_per_interval,
+)
 from jaxbeam.simulation.simulate import integration_setup
 
-LOOP_TOLERANCE = 1e-3  # relative to the largest deflection: any motion of the beam will do
+MIN_COMPILED = 300  # samples from which compilation pays
 SAME_TIME_SHARE = 1e-9  # of a period
 
 
@@ -60,8 +71,10 @@ class FilteredLaw(AbstractSampledLaw):
             after.append(filter_state)
         filtered = xp.stack(readings) if readings else measurement.readings
         measurement = Measurement(filtered, measurement.state, measurement.command)
-        command, law_state, solved = self.law.step(law_state, measurement, t)
-        return ControlStep(command, (law_state, after), solved)
+        step = self.law.step(law_state, measurement, t)
+        if not any_jax(measurement):  # also of laws that use JAX for known numbers
+            step = known(step)
+        return ControlStep(step.command, (step.state, after), step.solved)
 
 
 class DesignedController(AbstractController):
@@ -106,29 +119,46 @@ def recorded_loop(case: Case, law: AbstractSampledLaw, max_samples: int) -> Reco
         sensor if part is None else eqx.tree_at(lambda s: s.filter, sensor, None)
         for sensor, part in zip(case.sensors, sections, strict=True)
     )
-    recorded = DesignedController(
-        period=controller.period,
-        delay=controller.delay,
-        resolution=controller.resolution,
-        law_to_run=FilteredLaw(law, sections, case.sensors),
-        is_compiled=controller.runs_compiled,
-    )
-    case = eqx.tree_at(
-        lambda c: (c.sensors, c.controller), case, (sensors, recorded), is_leaf=lambda x: x is None
-    )
     period, duration = (float(concrete(x)) for x in (controller.period, case.run.duration))
     # The command of a sample is read where it acts, up to a whole delay later.
     delay = 0.0 if controller.delay is None else float(concrete(controller.delay))
     later = math.ceil(delay / period - SAME_TIME_SHARE)
     count = min(math.floor(duration / period * (1 + 1e-12)) + 1, max_samples + later)
     times = np.arange(max(count, later + 2)) * period
-    plan = integration_plan(case, times, LOOP_TOLERANCE)
-    run = _run_compiled if controller.runs_compiled else _run
+    is_compiled = controller.runs_compiled and len(times) >= MIN_COMPILED
+    recorded = DesignedController(
+        period=controller.period,
+        delay=controller.delay,
+        resolution=controller.resolution,
+        law_to_run=FilteredLaw(law, sections, case.sensors),
+        is_compiled=is_compiled,
+    )
+    case = eqx.tree_at(
+        lambda c: (c.sensors, c.controller), case, (sensors, recorded), is_leaf=lambda x: x is None
+    )
+    plan = _plan(case, times)
+    run = _run_compiled if is_compiled else _run
     readings, states, commands = (np.asarray(part) for part in run(case, plan, times))
     if not all(np.isfinite(part).all() for part in (readings, states, commands)):
         raise ValueError("the closed loop diverges, so that there are no commands to check it by")
     end = len(times) - later
     return RecordedLoop(times[:end], readings[:end], states[:end], commands[later:])
+
+
+def _plan(case: Case, times: Float[np.ndarray, " sample"]) -> IntegrationPlan:
+    """Plan with the longest stable steps, without a trial run: any motion of the beam will do."""
+    shapes, schedule = static_shapes(case), loop_schedule(case, times)
+    longest = _longest_step(case, shapes.layout)
+    substeps = steps_per_interval(float(schedule.lengths.max()), float(longest))
+    return IntegrationPlan(shapes, substeps, 0, False, 0.0, schedule)
+
+
+@compiled_if_traced
+def _longest_step(case: Case, layout: Layout) -> Array:
+    """Longest stable time step (s) of the beam under its loads."""
+    loads = load_set(case)
+    stable = max_stable_step(modal_model(case, layout), loads)
+    return xp.minimum(stable, longest_force_step(case, loads))
 
 
 def _run_loop(case: Case, plan: IntegrationPlan, times) -> tuple[Array, Array, Array]:

@@ -4,8 +4,9 @@ The statements use the C functions of the folder `helpers`, each of which is in 
 A cost is a number of additions, multiplications, divisions, comparisons and functions of math.h.
 """
 
+import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -56,9 +57,10 @@ class CSource:
         return f"(measurements + {self.sensors})"
 
     def constant(self, name: str, values) -> str:
-        """Constant array of numbers; its name in C."""
+        """Constant array of numbers; its name in C, which is unique."""
         array = np.asarray(values)
         kind = int if array.dtype.kind in "iub" else float
+        name = _unique(name, self.constants)
         self.constants[name] = np.ravel(array).astype(kind)
         return name
 
@@ -73,9 +75,9 @@ class CSource:
         if new.sum() == 1:
             return self.constant(name, rows[0])
         self._number_samples(len(rows))
-        self.constant(name, rows[new])
-        self.constant(f"{name}_index", np.cumsum(new) - 1)
-        return f"({name} + {rows.shape[1]} * {name}_index[sample])"
+        name = self.constant(name, rows[new])
+        index = self.constant(f"{name}_index", np.cumsum(new) - 1)
+        return f"({name} + {rows.shape[1]} * {index}[sample])"
 
     def _number_samples(self, count: int) -> None:
         """Statements that number the samples, once."""
@@ -90,11 +92,13 @@ class CSource:
     def state(self, name: str, start, comment: str) -> str:
         """Array in the state that keeps its values between samples; its C expression."""
         values = np.ravel(np.asarray(start, float))
+        name = _unique(name, self.members)
         self.members[name] = Member(values.size, values, comment)
         return f"s->{name}"
 
     def work(self, name: str, size: int, comment: str = "work space") -> str:
         """Array in the state for intermediate results; its C expression."""
+        name = _unique(name, self.members)
         self.members[name] = Member(size, None, comment)
         return f"s->{name}"
 
@@ -147,6 +151,12 @@ class CSource:
     def helper_texts(self) -> list[str]:
         """Texts of the helpers that the statements use, in an order that C accepts."""
         return [text for _, text in _closure("\n".join([*self.lines, *self.first_gate_lines]))]
+
+
+def _unique(name: str, taken: Container[str]) -> str:
+    """A name, with a number if it is taken already."""
+    names = itertools.chain([name], (f"{name}_{i}" for i in itertools.count(2)))
+    return next(each for each in names if each not in taken)
 
 
 class _Helper(NamedTuple):

@@ -105,7 +105,7 @@ def samples_text(
         _wrapped(f"static const double {key}[] = {{{array_text(values) or '0'}}};")
         for key, values in arrays.items()
     ]
-    return f"""/* Samples of a simulated run of the controller: inputs and expected commands of {name}. */
+    return f"""/* Samples of a simulated run of {name}: inputs and expected commands. */
 enum {{ SAMPLES = {len(loop.times)}, GATE_EVENTS = {len(gate_events)} }};
 {_lines(texts)}
 """
@@ -137,7 +137,8 @@ enum {{ INPUTS = {big}_SENSORS + {big}_GIVEN_STATES }};
 
 int main(void)
 {{
-    const double tolerance = sizeof({name}_real) < sizeof(double) ? {FLOAT_TOLERANCE!r} : {TOLERANCE!r};
+    const int is_single = sizeof({name}_real) < sizeof(double);
+    const double tolerance = is_single ? {FLOAT_TOLERANCE!r} : {TOLERANCE!r};
     static {name}_state state;
     {name}_real measurements[INPUTS + 1] = {{0}}, commands[{big}_COMMANDS];
     double largest = 0, error = 0;
@@ -175,7 +176,9 @@ def _measurements(code: CSource) -> str:
     """What the measurements are, as a sentence."""
     text = f"Measurements are the readings of the {code.sensors} sensors in SI units"
     if code.given_states:
-        text += f",\n   then the {code.given_states} states of the model that the law is designed for"
+        text += (
+            f",\n   then the {code.given_states} states of the model that the law is designed for"
+        )
     return text + "."
 
 

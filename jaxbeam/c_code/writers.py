@@ -49,24 +49,33 @@ def no_c_code(part: Any) -> NoCCodeError:
 def write_law(law: Any, code: CSource) -> None:
     """Write a step of a sampled law: readings, acting command and time to the wanted command.
 
-    Raises NoCCodeError for a class that has no writer, as the other functions here.
+    Raises NoCCodeError for a class that has no writer.
     """
     raise no_c_code(law)
 
 
 @singledispatch
 def write_filter(filter: Any, code: CSource) -> EstimateCode:
-    """Write an update of a filter; the C expressions of its estimate."""
+    """Write an update of a filter; the C expressions of its estimate.
+
+    Raises NoCCodeError for a class that has no writer.
+    """
     raise no_c_code(filter)
 
 
 @singledispatch
 def write_state_law(law: Any, code: CSource, estimate: EstimateCode) -> None:
-    """Write a step of a law that is fed by an estimate, to the wanted command."""
+    """Write a step of a law that is fed by an estimate, to the wanted command.
+
+    Raises NoCCodeError for a class that has no writer.
+    """
     raise no_c_code(law)
 
 
 @singledispatch
 def write_load_source(source: Any, code: CSource) -> LoadCode:
-    """Write an update of a source of the load; the C expressions of its estimate."""
+    """Write an update of a source of the load; the C expressions of its estimate.
+
+    Raises NoCCodeError for a class that has no writer.
+    """
     raise no_c_code(source)

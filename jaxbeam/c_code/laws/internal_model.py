@@ -30,9 +30,7 @@ def _(law: InternalModelLaw, code: CSource) -> None:
         count = len(law.notch_sections)
         sections = code.constant("notches", law.notch_sections)
         states = code.state("notch", np.zeros(2 * count * actuators), "states of the notches")
-        notch = (
-            f"\n    y = filter_sample({sections}, {count}, {states} + {2 * count} * i, y);"
-        )
+        notch = f"\n    y = filter_sample({sections}, {count}, {states} + {2 * count} * i, y);"
         code.operations += 9 * count * actuators
     code.add(
         f"""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxbeam.c_code.source import CSource, interpolation_operations
+from jaxbeam.c_code.source import CSource
 from jaxbeam.c_code.writers import LoadCode, write_load_source
 from jaxbeam.control.load_identifiers import (
     INFLUENCE_ROUNDING,
@@ -17,12 +17,9 @@ from jaxbeam.control.load_identifiers import (
 
 @write_load_source.register
 def _(source: GivenLoad, code: CSource) -> LoadCode:
-    numbers = {"mass": "kg", "speed": "m/s", "entry_time": "s"}
-    names = [
-        code.state(f"load_{name}", float(getattr(source, name)), f"of the load ({unit}); settable")
-        for name, unit in numbers.items()
-    ]
-    return LoadCode(*names, "1", "1")
+    numbers = np.nan_to_num([source.mass, source.speed, source.entry_time])  # NaN: not used
+    load = code.state("load", numbers, "mass (kg), speed (m/s), entry (s) of the load; settable")
+    return LoadCode(f"{load}[0]", f"{load}[1]", f"{load}[2]", "1", "1")
 
 
 def _deflections(source: AbstractLoadIdentifier, code: CSource) -> str:

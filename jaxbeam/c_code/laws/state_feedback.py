@@ -46,18 +46,18 @@ def _write_command(code, schedule: GainSchedule, x: str, columns: int, design: s
     """Command of one design of a table, minus its gain times x times `weight`, is added."""
     intervals, powers = schedule.table.coefficients.shape[-4:-2]
     size = intervals * powers * code.actuators * columns
-    code.constant("breakpoints", schedule.table.breakpoints)
-    code.constant("polynomials", schedule.table.coefficients)
-    code.constant("final_gain", schedule.final_gain)
+    breakpoints = code.constant("breakpoints", schedule.table.breakpoints)
+    polynomials = code.constant("polynomials", schedule.table.coefficients)
+    final_gain = code.constant("final_gain", schedule.final_gain)
     code.add(
         f"""
 if (t >= start && t < end)
-    add_scheduled_command({code.output}, weight, breakpoints + {design} * {intervals + 1},
-                          polynomials + {design} * {size}, {intervals}, {powers},
+    add_scheduled_command({code.output}, weight, {breakpoints} + {design} * {intervals + 1},
+                          {polynomials} + {design} * {size}, {intervals}, {powers},
                           (t - start) / (end - start), {x}, {code.actuators}, {columns});
 else if (t >= end)
     multiply_add({code.output}, -weight * decay,
-                 final_gain + {design} * {code.actuators * columns}, {x}, {code.actuators},
+                 {final_gain} + {design} * {code.actuators * columns}, {x}, {code.actuators},
                  {columns});"""
     )
 
@@ -111,7 +111,9 @@ def _(law: ScheduledGainLaw, code: CSource, estimate: EstimateCode) -> None:
     mass_ends = f"(real){float(law.masses[0])!r}, (real){float(law.masses[-1])!r}"
     weight_line = ""
     if weights:
-        weight_line = f"\n{x}[{columns - 1}] = clamp(mass, {mass_ends}) * (real){float(law.gravity)!r};"
+        weight_line = (
+            f"\n{x}[{columns - 1}] = clamp(mass, {mass_ends}) * (real){float(law.gravity)!r};"
+        )
     code.add(
         f"""
 /* u = -K(mass, speed, share) x, interpolated between the designs of a grid */
