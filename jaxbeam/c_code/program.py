@@ -21,6 +21,7 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.kinds import import_modules, kind_of
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
+from jaxbeam.control.optimal.crossing_lqr import AbstractCrossingRegulator
 from jaxbeam.control.state_controller import AbstractStateController
 from jaxbeam.control.state_law import SampledStateLaw, TrueState
 from jaxbeam.model.modes import mesh_layout
@@ -66,7 +67,8 @@ def export_c(case: Case, name: str) -> CProgram:
     if controller.period is None:
         raise ValueError("controller.period is missing: a real controller samples; give its period")
     import_modules("jaxbeam.c_code.laws")
-    design = _designed_compiled if controller.runs_compiled else _designed
+    integrates = isinstance(controller, AbstractCrossingRegulator)
+    design = _designed_compiled if integrates else _designed
     law = known(design(case, mesh_layout(case)))
     code = _source(case)
     try:

@@ -40,6 +40,7 @@ TWO_LOADS = [
     jb.MovingMass(mass=0.4, speed=2.4, entry_time=0.02),
     jb.MovingMass(mass=0.2, speed=3.0, entry_time=0.1),
 ]
+ESTIMATED = jb.Kalman(0.02, 1e-5, loads="estimated", weight_deviation=1.0)
 SHORT = {"loads": [jb.MovingMass(mass=0.4, speed=15.0)], "run": Run(duration=0.06)}
 CASES = {
     "feedback": rig(Feedback([2e3, 1e3], higher_gains=[[1e8, 2e8]], period=PERIOD)),
@@ -122,6 +123,17 @@ CASES = {
         jb.MPC(3, 2, 1e-10, solver="hildreth", period=PERIOD, loads="known"), **SHORT
     ),
     "mpc-varying": rig(jb.MPC(3, 2, 1e-10, period=PERIOD, prediction="time-varying"), **SHORT),
+    "kalman-known": rig(
+        jb.LQR(**WEAK, estimator=jb.Kalman(0.02, 1e-5, loads="known"), delay=2e-3), **SHORT
+    ),
+    "kalman-estimated": rig(
+        jb.MPC(3, 1, 1e-10, loads="known", estimator=ESTIMATED, period=PERIOD),
+        **SHORT | {"actuators": [jb.PointForce(0.2, limits=(-0.5, 0.5))]},
+    ),
+    "mpc-vehicle": rig(
+        jb.MPC(3, 1, 1e-10, loads="known", estimator=KALMAN, period=PERIOD),
+        **SHORT | {"loads": [jb.Oscillator(0.3, 900.0, 2.0, speed=15.0)]},
+    ),
     "mpc-unconstrained": rig(jb.MPC(6, 2, 1e-10, solver="unconstrained", period=PERIOD)),
 }
 # Their designs compile for seconds.

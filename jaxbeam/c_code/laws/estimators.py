@@ -1,6 +1,6 @@
 """C code of filters with a constant gain, and of the inversion of mode shapes."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,22 +20,9 @@ def _(filter: TrueState, code: CSource) -> EstimateCode:
 
 @write_filter.register
 def _(filter: ConstantGainFilter, code: CSource) -> EstimateCode:
-    sensors, states = np.shape(filter.C)
-    x = code.state("estimate", np.zeros(states), "estimated states, then those of the sensors")
-    code.add("/* Estimate: prediction over a period, then correction by the readings */")
-    _predict(code, _matrices(filter.transition), "filter", x, x)
-    innovation = code.work("innovation", sensors, "readings less predicted ones")
-    offset = code.constant("reading_offset", filter.offset)
-    C = code.constant("filter_C", filter.C)
-    code.add(
-        f"for (i = 0; i < {sensors}; i++) {innovation}[i] = {code.readings}[i] - {offset}[i];",
-        sensors,
-    )
-    code.multiply_add(innovation, C, x, sensors, states, -1)
-    if np.any(filter.D):
-        D = code.constant("filter_D", filter.D)
-        code.multiply_add(innovation, D, code.command, sensors, code.actuators, -1)
-    code.multiply_add(x, code.constant("filter_gain", filter.gain), innovation, states, sensors)
+    x = code.state("estimate", np.zeros(np.shape(filter.C)[1]), "estimated states")
+    model = FilterModel(*transition_matrices(filter.transition), filter.C, filter.D, filter.gain)
+    write_filter_step(code, FilterModel(*(np.asarray(part)[None] for part in model)), filter.offset, x)
     return EstimateCode(x, filter.plant_states)
 
 
@@ -76,34 +63,69 @@ def _write_actuator_states(code: CSource, filter: InversionFilter, x: str, modes
     """States of the actuators over a period, driven by the held beam and the commands."""
     transition: Any = filter.actuator_transition
     beam = 2 * modes
-    A, previous, present = _matrices(transition)
+    A, previous, present = (np.asarray(part) for part in transition_matrices(transition))
     # The beam is held over the whole period: its columns of both inputs add.
     by_state = np.concatenate([previous[:, :beam] + present[:, :beam], A], axis=1)
     matrices = by_state, previous[:, beam:], present[:, beam:]
-    _predict(code, matrices, "actuator", x, f"{x} + {beam}")
+    matrices = tuple(matrix[None] for matrix in matrices)
+    write_prediction(code, matrices, "actuator", x, f"{x} + {beam}")
 
 
-def _matrices(transition: Transition) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Matrices of the states, of the command until the previous sample, and until this one."""
-    parts = transition.matrix, transition.previous_input_matrix, transition.input_matrix
-    return tuple(np.asarray(part) for part in parts)  # type: ignore[return-value]
+class FilterModel(NamedTuple):
+    """Matrices of a filter: those of x, of u until the previous sample and u since; C, D, gain."""
+
+    A: Any
+    previous: Any
+    present: Any
+    C: Any
+    D: Any
+    gain: Any
 
 
-def _predict(code: CSource, matrices, name: str, x: str, place: str) -> None:
+def transition_matrices(transition: Transition) -> tuple[Any, Any, Any]:
+    """Matrices of the states, of the command until the previous sample, and of that since."""
+    return transition.matrix, transition.previous_input_matrix, transition.input_matrix
+
+
+def write_filter_step(code: CSource, model: FilterModel, offset, x: str) -> None:
+    """Prediction of the states x over a period, and correction by the readings.
+
+    The matrices of the model have a first axis of samples.
+    """
+    sensors, states = np.shape(model.C)[1:]
+    code.add("/* Estimate: prediction over a period, then correction by the readings */")
+    write_prediction(code, model[:3], "filter", x, x)
+    innovation = code.work("innovation", sensors, "readings less predicted ones")
+    offset = code.constant("reading_offset", offset)
+    code.add(
+        f"for (i = 0; i < {sensors}; i++) {innovation}[i] = {code.readings}[i] - {offset}[i];",
+        sensors,
+    )
+    C = code.per_sample("filter_C", model.C)
+    code.multiply_add(innovation, C, x, sensors, states, -1)
+    if np.any(model.D):
+        D = code.per_sample("filter_D", model.D)
+        code.multiply_add(innovation, D, code.command, sensors, code.actuators, -1)
+    gain = code.per_sample("filter_gain", model.gain)
+    code.multiply_add(x, gain, innovation, states, sensors)
+
+
+def write_prediction(code: CSource, matrices, name: str, x: str, place: str) -> None:
     """Prediction over a period from the states x, put in a place among them.
 
-    The command that acted until the previous sample is kept for a transition that has it.
+    The command that acted until the previous sample is kept for a model that needs it. The matrices
+    have a first axis of samples.
     """
     A, previous, present = matrices
-    rows, columns = A.shape
+    _, rows, columns = np.shape(A)
     predicted = code.work(f"{name}_prediction", rows, "predicted states")
-    code.multiply(predicted, code.constant(f"{name}_A", A), x, rows, columns)
+    code.multiply(predicted, code.per_sample(f"{name}_A", A), x, rows, columns)
     if np.any(previous):
         last = code.state(f"{name}_last", np.zeros(code.actuators), "commands before")
-        matrix = code.constant(f"{name}_B_last", previous)
+        matrix = code.per_sample(f"{name}_B_last", previous)
         code.multiply_add(predicted, matrix, last, rows, code.actuators)
         code.add(f"copy({last}, {code.command}, {code.actuators});")
     if np.any(present):
-        matrix = code.constant(f"{name}_B", present)
+        matrix = code.per_sample(f"{name}_B", present)
         code.multiply_add(predicted, matrix, code.command, rows, code.actuators)
     code.add(f"copy({place}, {predicted}, {rows});")

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jaxbeam.c_code.source import CSource
 from jaxbeam.c_code.tables import at_samples
-from jaxbeam.c_code.writers import EstimateCode, no_c_code, write_state_law
+from jaxbeam.c_code.writers import EstimateCode, write_state_law
 from jaxbeam.case.estimator import Estimate
 from jaxbeam.control.predictive.mpc_law import MPCLaw
 from jaxbeam.control.predictive.qp import MAX_STEPS, MAX_SWEEPS
@@ -37,12 +37,11 @@ class _Program(NamedTuple):
 
 @write_state_law.register
 def _(law: MPCLaw, code: CSource, estimate: EstimateCode) -> None:
-    if estimate.weights is not None and law.known_weights:
-        raise no_c_code(law)
-    program = _program(law, code)
+    wheels = estimate.wheels if law.known_weights else 0
+    program = _program(law, code, wheels)
     states, actuators = np.shape(law.C)[1], code.actuators
     limits, variables = program.rows.shape[1:]
-    columns = 2 * states + actuators + 1
+    columns = 2 * states + actuators + 1 + wheels
     last = code.state("last_state", np.zeros(states), "state at the last sample")
     initial = code.work("initial", columns, "initial conditions of the prediction")
     predicted = code.work("predicted_state", states, "state that the last sample predicts")
@@ -51,11 +50,13 @@ def _(law: MPCLaw, code: CSource, estimate: EstimateCode) -> None:
     code.add("/* Initial conditions: state, its unexplained change, last command, 1 */")
     _copy_state(law, code, estimate, initial)
     code.add(
-        f"copy({command}, {code.command}, {actuators});\n{initial}[{columns - 1}] = 1;\n"
+        f"copy({command}, {code.command}, {actuators});\n{initial}[{columns - wheels - 1}] = 1;\n"
         f"copy({unexplained}, {last}, {states});"
     )
+    if wheels:
+        code.add(f"copy({initial} + {columns - wheels}, {estimate.weights}, {wheels});")
     past = code.per_sample("past", program.past)
-    code.multiply(predicted, past, unexplained, states, states + actuators + 1)
+    code.multiply(predicted, past, unexplained, states, columns - states)
     code.add(
         f"for (i = 0; i < {states}; i++)"
         f" {initial}[{states} + i] = {initial}[i] - {predicted}[i];\n"
@@ -142,27 +143,40 @@ def _sweep_operations(R: int, V: int) -> int:
     return 10 * R * V + 14 * R + 8 * V + 12
 
 
-def _program(law: MPCLaw, code: CSource) -> _Program:
-    """Numbers of the law at all samples; at one if they do not change."""
+def _program(law: MPCLaw, code: CSource, wheels: int) -> _Program:
+    """Numbers of the law at all samples; at one if they do not change.
+
+    The last of the initial conditions are estimated weights of a number of `wheels`.
+    """
     states, actuators = np.shape(law.C)[1], code.actuators
     columns = 2 * states + actuators + 1
     unit, commands = np.eye(columns), np.zeros((columns, actuators))
     commands[2 * states : 2 * states + actuators] = np.eye(actuators)
 
     def numbers(t):
-        estimate = Estimate(xp.zeros(states))
-        past, prediction, weights = law._predict(t, estimate)
+        def prediction_for(weights):
+            return law._predict(t, Estimate(xp.zeros(states), weights if wheels else None))
+
+        past, prediction, weights = prediction_for(xp.zeros(wheels))
         known = past.E @ weights if weights.shape[0] else xp.zeros(states)
-        past = xp.concatenate([past.A, past.B, known[:, None]], axis=1)
+        past = xp.concatenate([past.A, past.B, known[:, None], past.E[:, :wheels]], axis=1)
         start = law.quadratic_program(prediction, xp.zeros(columns), xp.zeros(actuators))
         programs = vmap(lambda *at: law.quadratic_program(prediction, *at)[1::2])(unit, commands)
-        return past, start.H, programs[0].T, start.M, (programs[1] - start.gamma).T, start.gamma
+        f, limits = programs[0], programs[1] - start.gamma
+        constant = limits[-1] + start.gamma
+        # A weight changes the response to the condition 1.
+        for weight in np.eye(wheels):
+            _, loaded, _ = prediction_for(weight)
+            program = law.quadratic_program(loaded, unit[-1], commands[-1])
+            f = xp.concatenate([f, (program.f - f[columns - 1])[None]])
+            limits = xp.concatenate([limits, (program.gamma - constant)[None]])
+        return past, start.H, f.T, start.M, limits.T, start.gamma
 
     past, H, f, M, limit_columns, gamma = at_samples(
         numbers, code, varies=law.loaded_plant is not None
     )
     inverse_factor = np.linalg.inv(np.linalg.cholesky(H))
-    limit_columns[..., -1] += gamma
+    limit_columns[..., columns - 1] += gamma
     transposed = np.swapaxes(inverse_factor, -1, -2)
     rows = M @ transposed
     norms = np.sqrt(np.sum(rows**2, axis=-1, keepdims=True))
