@@ -87,7 +87,7 @@ class CSource:
                 f"Tables over time end after {count} samples; then their last entries hold."
             )
             self.lines[:0] = [line]
-            self.operations += 3
+            self.operations += 4
 
     def state(self, name: str, start, comment: str) -> str:
         """Array in the state that keeps its values between samples; its C expression."""

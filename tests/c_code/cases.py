@@ -102,7 +102,7 @@ CASES = {
             period=PERIOD,
         )
     ),
-    "state": rig(jb.StateFeedback(np.full((2, 5), 0.3), period=PERIOD)),
+    "state": rig(jb.StateFeedback(np.full((2, 5), 2.0), period=PERIOD)),
     "lqr-observer": rig(jb.LQR(**WEIGHTS, estimator=jb.Observer(speed=3.0))),
     "dlqr-kalman": rig(DiscreteLQR(**WEIGHTS, delay=2e-3, estimator=KALMAN), sensors=FILTERED),
     "lqr-inversion": rig(jb.LQR(**WEIGHTS, estimator=jb.Inversion(1e-2), delay=2 * PERIOD)),

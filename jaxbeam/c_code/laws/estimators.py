@@ -22,7 +22,9 @@ def _(filter: TrueState, code: CSource) -> EstimateCode:
 def _(filter: ConstantGainFilter, code: CSource) -> EstimateCode:
     x = code.state("estimate", np.zeros(np.shape(filter.C)[1]), "estimated states")
     model = FilterModel(*transition_matrices(filter.transition), filter.C, filter.D, filter.gain)
-    write_filter_step(code, FilterModel(*(np.asarray(part)[None] for part in model)), filter.offset, x)
+    write_filter_step(
+        code, FilterModel(*(np.asarray(part)[None] for part in model)), filter.offset, x
+    )
     return EstimateCode(x, filter.plant_states)
 
 
