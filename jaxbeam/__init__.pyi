@@ -38,6 +38,7 @@ from .case.loads.planar.parts import (
     VehicleHinge as VehicleHinge,
     VehicleSpring as VehicleSpring,
 )
+from .case.loads.planar.sensors import VehicleSensor as VehicleSensor
 from .case.loads.quarter_car import QuarterCar as QuarterCar
 from .case.loads.varying_force import VaryingForce as VaryingForce
 from .case.loads.vehicle import VehicleLoad as VehicleLoad

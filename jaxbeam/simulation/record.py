@@ -18,6 +18,7 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.sensing.output_rows import quantity_history
+from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readings
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation import section_forces
@@ -211,6 +212,15 @@ class Record(eqx.Module):
         if self.controller_readings is not None:
             return self.controller_readings
         return sensor_readings(self.case, self.modes, self.motion, self.times, noisy=True)
+
+    @property
+    def vehicle_readings(self) -> Float[Array, "time vehicle_sensor"]:
+        """Readings of the sensors on vehicles in SI units, with filters and noise.
+
+        Raises ValueError if the times do not suit a filter.
+        """
+        motion = self.body_displacement, self.body_velocity, self.body_acceleration
+        return vehicle_readings(self.case, VehicleMotion(*motion), self.times, noisy=True)
 
     @property
     def saturated(self) -> Bool[Array, "time actuator"]:
