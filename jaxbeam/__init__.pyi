@@ -98,12 +98,12 @@ from .model.frequency_response import (
     mobility as mobility,
     receptance as receptance,
 )
+from .model.influence import influence_line as influence_line
 from .model.modes import modes as modes
 from .model.settlement import settlement_response as settlement_response
 from .model.state_space import state_space as state_space
 from .model.static_correction import bending_moment as bending_moment, shear_force as shear_force
 from .model.statics import (
-    influence_line as influence_line,
     static_deflection as static_deflection,
     static_peak as static_peak,
 )

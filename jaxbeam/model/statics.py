@@ -27,9 +27,8 @@ PEAK_POSITIONS = tuple(float(share) for share in np.linspace(0, 1, 10))
 def _influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
     greens = flexibility(case, layout, x.reshape(-1), derivative)
     length = case.beam.length
-    line = (
-        -greens(load_positions / length) * length ** (3 - derivative) / case.beam.bending_stiffness
-    )
+    order = abs(derivative)  # that of the slope is 1, too
+    line = -greens(load_positions / length) * length ** (3 - order) / case.beam.bending_stiffness
     return line.reshape((*load_positions.shape, *x.shape))
 
 
