@@ -3,6 +3,8 @@ from .analysis.amplification import (
     amplification as amplification,
     envelope as envelope,
 )
+from .analysis.assessment.assess import assess as assess
+from .analysis.assessment.assessment import Assessment as Assessment, CodeCheck as CodeCheck
 from .analysis.bound.bound import bound as bound
 from .analysis.plausibility import check as check
 from .analysis.plausible_numbers import Plausibility as Plausibility
