@@ -357,16 +357,15 @@ def _section_checks(
     for i, section in enumerate(sections):
         line = tabulated_line(case, section)
         limit = classification * static_factor * largest_under_lm71(line)
-        best = None
+        found = []
         for one in responses:
             train = library()[one.train]
             static = largest_under_train(line, train.offsets, train.forces)
             peaks = one.peaks[:, first + i]
             at = int(np.argmax(peaks))
             total = float(peaks[at]) + irregular * static
-            if best is None or total > best[0]:
-                best = total, one.train, one.speeds[at], float(peaks[at]) / static - 1
-        total, train, speed, increment = best
+            found.append((total, one.train, one.speeds[at], float(peaks[at]) / static - 1))
+        total, train, speed, increment = max(found)
         remark = f"{train} at {3.6 * speed:.4g} km/h, phi'_dyn = {increment:.4g}"
         governs = total > limit
         remark += "; HSLM governs the design" if governs else "; LM71 governs the design"

@@ -20,8 +20,8 @@ def code_numbers() -> dict[str, Any]:
 class FrequencyLimits(NamedTuple):
     """Limits (Hz) of the first natural frequency n0, figure 6.10."""
 
-    lower: Float[Array, ""]
-    upper: Float[Array, ""]
+    lower: Float[Array, "..."]
+    upper: Float[Array, "..."]
 
 
 def frequency_limits(length) -> FrequencyLimits:
@@ -39,7 +39,7 @@ def frequency_limits(length) -> FrequencyLimits:
     )
 
 
-def running_factor(speed, length, frequency) -> Float[Array, ""]:
+def running_factor(speed, length, frequency) -> Float[Array, "..."]:
     """Dynamic increment phi' of a train on perfect track, annex C.
 
     phi' = K / (1 - K + K^4) with K = v / (2 L n0) up to 0.76, then 1.325; v in m/s, the determinant
@@ -52,7 +52,7 @@ def running_factor(speed, length, frequency) -> Float[Array, ""]:
     return xp.where(beyond, numbers["limit"], within / (1 - within + within**4))
 
 
-def irregularity_factor(speed, length, frequency) -> Float[Array, ""]:
+def irregularity_factor(speed, length, frequency) -> Float[Array, "..."]:
     """Dynamic increment phi'' from irregularities of the track, annex C; not below zero.
 
     phi'' = alpha / 100 (56 exp(-(L/10)^2) + 50 (n0 L / 80 - 1) exp(-(L/20)^2)), alpha = v / 22 up
@@ -68,7 +68,7 @@ def irregularity_factor(speed, length, frequency) -> Float[Array, ""]:
     return xp.maximum(alpha / 100 * percent, 0.0)
 
 
-def static_dynamic_factor(length, maintenance: str) -> Float[Array, ""]:
+def static_dynamic_factor(length, maintenance: str) -> Float[Array, "..."]:
     """Dynamic factor Phi_2 ("careful" maintenance) or Phi_3 ("standard") of LM71, 6.4.5.2.
 
     The determinant length is in m.

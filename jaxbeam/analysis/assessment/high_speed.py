@@ -11,6 +11,7 @@ from jaxbeam.case.case import Case, Run
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.axles import Axles
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.model.modes import modes
 from jaxbeam.sweeps.sweep import sweep
 from jaxbeam.vehicles.trains import trains as library
 
@@ -49,14 +50,23 @@ def train_response(
     loaded = dataclasses.replace(
         case, sensors=sensors, loads=(load,), run=Run(1.0, sample_rate=20.0)
     )
+    way = float(concrete(case.beam.length)) + float(offsets[-1])
+    free = FREE_PERIODS / float(concrete(modes(case).frequencies)[0])
+
+    def peaks_at(speeds) -> Float[np.ndarray, "speed sensor"]:
+        over = {"loads.0.speed": speeds, "run.duration": way / speeds + free}
+        found = sweep(loaded, over, paired=True, progress=False, tolerance=TOLERANCE)
+        columns = [found[f"peak_{s.quantity}"].to_numpy()[:, i] for i, s in enumerate(sensors)]
+        return np.stack(columns, axis=-1)
+
     speeds = _first_speeds(loaded, lowest, highest)
-    count, peaks, change = speeds.size, _peaks(loaded, speeds), np.inf
+    count, peaks, change = speeds.size, peaks_at(speeds), np.inf
     quantities = np.array([sensor.quantity for sensor in sensors])
     for _ in range(MAX_ROUNDS):
         before = _largest(peaks, quantities)
         added = _between(speeds, peaks, quantities, count)
         speeds = np.concatenate([speeds, added])
-        peaks = np.concatenate([peaks, _peaks(loaded, added)])
+        peaks = np.concatenate([peaks, peaks_at(added)])
         order = np.argsort(speeds)
         speeds, peaks = speeds[order], peaks[order]
         change = max(_largest(peaks, quantities) / before) - 1
@@ -73,17 +83,6 @@ def _first_speeds(case: Case, lowest: float, highest: float) -> Float[np.ndarray
         found = resonance_speeds(case, spacing, lowest, highest)
         speeds = np.union1d(speeds, [critical.speed for critical in found])
     return speeds
-
-
-def _peaks(case: Case, speeds) -> Float[np.ndarray, "speed sensor"]:
-    from jaxbeam.model.modes import modes
-
-    way = float(concrete(case.beam.length)) + float(concrete(case.loads[0].offsets)[-1])
-    free = FREE_PERIODS / float(concrete(modes(case).frequencies)[0])
-    over = {"loads.0.speed": speeds, "run.duration": way / speeds + free}
-    found = sweep(case, over, paired=True, progress=False, tolerance=TOLERANCE)
-    columns = [found[f"peak_{s.quantity}"].to_numpy()[:, i] for i, s in enumerate(case.sensors)]
-    return np.stack(columns, axis=-1)
 
 
 def _largest(peaks, quantities) -> Float[np.ndarray, " quantity"]:
