@@ -17,6 +17,7 @@ from .analysis.ride import (
     weighted_rms as weighted_rms,
     wheel_unloading as wheel_unloading,
 )
+from .analysis.sections.characteristic_points import characteristic_points as characteristic_points
 from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
 from .case.actuators.patch import Patch as Patch
 from .case.actuators.point import PointForce as PointForce

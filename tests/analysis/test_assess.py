@@ -16,13 +16,13 @@ from jaxbeam.analysis.assessment.formulas import (
     static_dynamic_factor,
 )
 from jaxbeam.analysis.assessment.high_speed import train_response
-from jaxbeam.analysis.assessment.sections import characteristic_points
 from jaxbeam.analysis.assessment.static_loads import (
     Section,
     largest_under_lm71,
     largest_under_train,
     tabulated_line,
 )
+from jaxbeam.analysis.sections.characteristic_points import characteristic_points
 from jaxbeam.vehicles.trains import trains
 from tests.modules import ROOT
 

@@ -177,6 +177,17 @@ def test_assess_cites_clauses(run, refused, folder):
     assert "track cannot be 'gravel'" in refused(f"{line} --track gravel")
 
 
+def test_influence_lines_as_a_table(run, refused, folder):
+    printed = run("influence case.toml -o lines.csv --plot")
+    assert "moment at midspan 1" in printed and (folder / "lines.png").exists()
+    heads, *rows = (folder / "lines.csv").read_text().splitlines()
+    assert heads.split(",")[1] == "moment at midspan 1 (m)"
+    assert max(float(row.split(",")[1]) for row in rows) == pytest.approx(0.6 / 4)
+    found = run("influence case.toml --quantity shear --at 150mm --json")
+    assert max(found["shear at quarter 1 (1)"]) == pytest.approx(0.75, abs=0.02)
+    assert "did you mean 'reaction'" in refused("influence case.toml --quantity reactions")
+
+
 def test_an_accelerometer_is_not_reported_as_deflection(run):
     line = "case.toml --set sensors.1.quantity=acceleration --set sensors.1.name=deck"
     found = run(f"simulate {line} --json")

@@ -24,13 +24,13 @@ from jaxbeam.analysis.assessment.formulas import (
     static_dynamic_factor,
 )
 from jaxbeam.analysis.assessment.high_speed import TrainResponse, train_response
-from jaxbeam.analysis.assessment.sections import characteristic_points, spans
 from jaxbeam.analysis.assessment.static_loads import (
     Section,
     largest_under_lm71,
     largest_under_train,
     tabulated_line,
 )
+from jaxbeam.analysis.sections.characteristic_points import characteristic_points, spans
 from jaxbeam.case.beam_parts.damping import MATERIALS
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.declared_checks import suggestion
