@@ -77,7 +77,7 @@ class Program(NamedTuple):
     def grid(self, model, shared_values, step_size):
         """Time grid of a batch for a longest step (s) and a number of extra steps per event."""
         varied, (max_step, extra_steps) = self.case_with(shared_values), step_size
-        places = corrected_places(varied, model)
+        places = corrected_places(varied, model, varied.sensors)
         if self.schedule is None:
             return grid_by_step_length(varied, model, max_step, extra_steps, places)
         substeps = jnp.ceil(jnp.max(self.schedule.lengths) / max_step).astype(int) + extra_steps
