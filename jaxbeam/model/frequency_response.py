@@ -43,6 +43,14 @@ class FrequencyResponse(eqx.Module):
     pairs: tuple[ChannelPair, ...] = eqx.field(static=True)
     title: str = eqx.field(static=True, default="")
 
+    def __repr__(self) -> str:
+        pairs = "".join(f"\n  {p}" + f", in {p.unit}" * (p.unit != "1") for p in self.pairs)
+        if not is_concrete(self.frequencies):
+            return f"FrequencyResponse{pairs}"
+        first, last = concrete(self.frequencies)[[0, -1]]
+        count = self.frequencies.size
+        return f"FrequencyResponse at {count} frequencies, {first:.4g} to {last:.4g} Hz{pairs}"
+
     @property
     def magnitude(self) -> Float[Array, "frequency pair"]:
         """Amplitude of the output per amplitude of the input, in the unit of the pair."""

@@ -20,6 +20,7 @@ from numpy.polynomial import legendre
 
 from jaxbeam.case.beam_parts.damping import MATERIALS
 from jaxbeam.case.case import Case
+from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.model.layout import Layout, find_layout, is_uniform, longest_span, node_positions
 from jaxbeam.model.theory.buckling import check_buckling
 from jaxbeam.model.theory.elements import assemble_sections, bending_basis
@@ -29,6 +30,7 @@ from jaxbeam.numerics.eigen import REPEATED_EIGENVALUE_TOLERANCE, eigen
 from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, add_at, set_at, stop_gradient, xp
 
+MAX_LISTED = 12  # modes in the text of all
 ROUNDING_SHARE = 4e-15  # of the largest coefficient of a shape: smaller ones are rounding errors
 
 
@@ -65,6 +67,15 @@ class Modes(eqx.Module):
     layout: Layout = eqx.field(static=True)
     sections: Sections | None = None
     rotation_series: Float[Array, "segment degree mode"] | None = None
+
+    def __repr__(self) -> str:
+        if not is_concrete(self.stiffness) or self.stiffness.ndim != 1:
+            return f"Modes({self.stiffness.shape[-1]} modes)"
+        numbers = zip(concrete(self.frequencies), concrete(self.damping_ratios), strict=True)
+        rows = [f"  {i}: {f:.5g} Hz, damping ratio {z:.3g}" for i, (f, z) in enumerate(numbers, 1)]
+        if len(rows) > MAX_LISTED:
+            rows[MAX_LISTED - 1 : -1] = ["  ..."]
+        return "\n".join([f"Modes: {self.stiffness.size} of the beam", *rows])
 
     def lowest(self, count: int) -> "Modes":
         """The lowest modes, as many as `count`."""

@@ -1,12 +1,12 @@
 """Shared style of all figures: colours, fonts, unit prefixes, labels that do not overlap."""
 
-from typing import NamedTuple
-
 import numpy as np
 from cycler import cycler
 from jaxtyping import Float
 from matplotlib import rc_context
 from matplotlib.colors import to_rgb
+
+from jaxbeam.case.display.prefixes import UnitScale as UnitScale, unit_scale as unit_scale
 
 INK, GREY, FAINT, SHADE = "#22282e", "#6b747c", "#dfe3e6", "#eef2f5"
 # Okabe and Ito's colours, distinct with any kind of colour vision.
@@ -46,31 +46,6 @@ STYLE = {
 
 use_style = rc_context(STYLE)
 """Decorator of functions that draw: the style holds inside them only."""
-
-
-class UnitScale(NamedTuple):
-    """Values divided by `factor` are in `unit`."""
-
-    factor: float
-    unit: str
-
-
-_PREFIXES = ((1e6, 1e6, "M"), (1e3, 1e3, "k"), (0.1, 1.0, ""), (1e-4, 1e-3, "m"), (1e-7, 1e-6, "µ"))
-
-
-def unit_scale(values, unit: str) -> UnitScale:
-    """Prefixed unit for the largest of some values in an SI unit: mm for 0.0014 m.
-
-    Values without unit ("1"), or in 1/m, get a power of ten instead.
-    """
-    sizes = np.abs(np.asarray(values, float))
-    largest = np.max(sizes[np.isfinite(sizes)], initial=0.0)
-    fitting = ((factor, prefix) for least, factor, prefix in _PREFIXES if largest >= least)
-    factor, prefix = next(fitting, (1e-9, "n")) if largest else (1.0, "")
-    if unit == "" or unit.startswith("1"):
-        power = "" if factor == 1 else f"$10^{{{np.log10(factor):.0f}}}$"
-        return UnitScale(factor, f"{power or '1'}{unit[1:]}" if unit[1:] else power)
-    return UnitScale(factor, prefix + unit.replace("^2", "²"))
 
 
 def axis_label(words: str, unit: str) -> str:

@@ -1,6 +1,5 @@
 """Record of one simulated run: histories, section forces, peaks, error; as xarray and netCDF."""
 
-import json
 import os
 from typing import TYPE_CHECKING
 
@@ -10,8 +9,7 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.case.aliases import renamed_property
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete
-from jaxbeam.files.case_file import case_to_dict
+from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.files.netcdf import write_netcdf
 from jaxbeam.files.tables import write_table
 from jaxbeam.model.load_set import load_set
@@ -22,15 +20,11 @@ from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation import section_forces
 from jaxbeam.simulation.extremes import Extremes, sensor_extremes
-from jaxbeam.simulation.labels import contact_sentence, wheel_labels
+from jaxbeam.simulation.labels import contact_sentence
 from jaxbeam.simulation.record_envelope import RecordEnvelope, record_envelope
-from jaxbeam.simulation.record_table import record_columns
-from jaxbeam.simulation.result_variables import (
-    MODE_FIELDS,
-    MODE_VARIABLES,
-    VARIABLES,
-    sensor_coordinates,
-)
+from jaxbeam.simulation.views.dataset import dataset_parts
+from jaxbeam.simulation.views.table import record_columns
+from jaxbeam.simulation.views.text import record_text
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -256,41 +250,19 @@ class Record(eqx.Module):
         parts.append(f"estimated error {float(concrete(self.error_estimate)):.1e} of the peak")
         return "; ".join(parts)
 
+    def __repr__(self) -> str:
+        if not is_concrete(self.coordinates) or self.times.ndim != 1:
+            return f"Record of {self.case.title!r}, traced or of several runs"
+        return record_text(self.case, self.times, self.verdict, self.extremes)
+
     def _dataset_parts(self) -> tuple[dict, dict, dict]:
         """Variables, coordinates and attributes of the labelled dataset."""
         extremes = self.extremes._asdict()
-        variables = {
-            name: (
-                dims,
-                np.asarray(extremes[name] if name in extremes else getattr(self, name)),
-                {"units": unit, "long_name": words},
-            )
-            for name, (dims, unit, words) in VARIABLES.items()
-        }
-        # Modes of repeated frequencies are not unique, so they are stored.
-        variables |= {
-            f"mode_{name}": (
-                dims,
-                np.asarray(getattr(self.modes, MODE_FIELDS.get(name, name))),
-                {"units": unit, "long_name": words},
-            )
-            for name, (dims, unit, words) in MODE_VARIABLES.items()
-        }
-        coordinates = {
-            "time": ("time", np.asarray(self.times), {"units": "s"}),
-            **sensor_coordinates(self.case),
-            "load": ("load", wheel_labels(self.case)),
-            "body": ("body", np.array(self.bodies, dtype=str)),
-            "frequency": ("mode", np.asarray(self.modes.frequencies), {"units": "Hz"}),
-        }
-        attributes = {
-            "title": self.case.title,
-            "case": json.dumps(case_to_dict(self.case)),
-            "error_estimate": float(self.error_estimate),
-            "steps": self.steps,
-            "verdict": self.verdict,
-        }
-        return variables, coordinates, attributes
+
+        def value(name: str):
+            return extremes[name] if name in extremes else getattr(self, name)
+
+        return dataset_parts(self.case, self.modes, self.times, self.bodies, value)
 
     def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units; `record_from_xarray` restores the record exactly."""
