@@ -27,6 +27,7 @@ from jaxbeam.runtime.compiling import compiled_if_traced
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
+    from matplotlib.figure import FigureBase
 
 StationaryMasses = Sequence[tuple[Any, Any]]  # position (m) and mass (kg) of each
 
@@ -68,6 +69,12 @@ class FrequencyResponse(eqx.Module):
                 return self.values[:, i]
         available = ", ".join(map(str, self.pairs))
         raise ValueError(f"there is no response of {output} to {input}; there are {available}")
+
+    def plot(self, **options: Any) -> "FigureBase":
+        """Magnitude and phase; see `jaxbeam.plot.plot_frequency_response` and its options."""
+        from jaxbeam.plot import plot_frequency_response
+
+        return plot_frequency_response(self, **options)
 
     def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units, of real variables that every file format can hold."""

@@ -11,7 +11,6 @@ from PIL import Image
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.load_set import load_set
-from jaxbeam.plot.record import shade_crossings
 from jaxbeam.plot.schematic import (
     ACTUATOR_MARKER,
     actuator_positions,
@@ -30,6 +29,7 @@ from jaxbeam.plot.style import (
     unit_scale,
     use_style,
 )
+from jaxbeam.plot.traffic.crossings import shade_crossings
 from jaxbeam.plot.traffic.moving import Traffic
 from jaxbeam.simulation.record import Record
 
@@ -43,6 +43,7 @@ def animate(
     *,
     frames: int = 120,
     rate: int | float = 24,
+    title: str | None = None,
     overwrite: bool = False,
 ) -> None:
     """Write a GIF of the beam, its deflection enlarged, and the loads that cross it.
@@ -51,9 +52,9 @@ def animate(
     unless the profile is rough; it is the line on the beam and beside it. Actuators hang below the
     beam, patches are drawn on it, sensors are dots; the thin line is the envelope of the downward
     deflection. Below is what the sensors measure so far, and the commands if there is a controller.
-    The whole run takes `frames` frames, `rate` of them a second; a clock shows its time (s). Raises
-    FileExistsError if the file exists and `overwrite` is not set, ValueError for a run that
-    diverges.
+    The whole run takes `frames` frames, `rate` of them a second; a clock shows its time (s). The
+    title is that of the case if left out. Raises FileExistsError if the file exists and `overwrite`
+    is not set, ValueError for a run that diverges.
     """
     if not overwrite and os.path.exists(path):
         raise FileExistsError(f"{path} exists; choose another name, or overwrite it")
@@ -82,7 +83,7 @@ def animate(
         axes.tick_params(labelbottom=False)
     if below:
         below[-1].set_xlabel("time (s)")
-    set_title(figure, record.case.title)
+    set_title(figure, title, record.case.title)
 
     images = []
     for frame in np.linspace(0, record.times.shape[0] - 1, frames).round().astype(int):

@@ -4,7 +4,9 @@ import numpy as np
 from cycler import cycler
 from jaxtyping import Float
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure, FigureBase
 
 from jaxbeam.case.display.prefixes import UnitScale as UnitScale, unit_scale as unit_scale
 
@@ -12,6 +14,7 @@ INK, GREY, FAINT, SHADE = "#22282e", "#6b747c", "#dfe3e6", "#eef2f5"
 # Okabe and Ito's colours, distinct with any kind of colour vision.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 ALARM = COLOURS[1]
+LABEL_HEIGHT = 0.17  # inches, of a line of text
 LOAD_COLOURS = (INK, "#A6611A", "#7B3294", "#7A868F")  # distinct from COLOURS too
 
 STYLE = {
@@ -48,6 +51,9 @@ use_style = rc_context(STYLE)
 """Decorator of functions that draw: the style holds inside them only."""
 
 
+Size = tuple[int | float, int | float]  # width and height in inches
+
+
 def axis_label(words: str, unit: str) -> str:
     """Label of an axis: words, and the unit in brackets if there is one."""
     return f"{words} ({unit})" if unit else words
@@ -78,10 +84,52 @@ def command_drawstyle(controller) -> str:
     return "default" if controller.period is None else "steps-post"
 
 
-def set_title(figure, title: str) -> None:
-    """Set the title of a figure, flush left; nothing for an empty one."""
-    if title:
+def drawing_area(ax: Axes | None, size: Size) -> FigureBase:
+    """A figure of some size (inches), or a part of the figure of `ax` that takes its place.
+
+    Raises ValueError if the axes have no place in a grid.
+    """
+    if ax is None:
+        return Figure(figsize=size)
+    place, figure = ax.get_subplotspec(), ax.get_figure()
+    if place is None or figure is None:
+        raise ValueError(
+            "ax has no place in a grid, which the panels could divide: make it with subplots"
+        )
+    ax.remove()
+    return figure.add_subfigure(place)
+
+
+def single_axes(ax: Axes | None, size: Size) -> tuple[FigureBase, Axes]:
+    """Figure and axes of a figure of one panel: those given, or new ones of some size (inches).
+
+    Raises ValueError for axes without a figure.
+    """
+    if ax is None:
+        figure = Figure(figsize=size)
+        return figure, figure.subplots()
+    figure = ax.get_figure()
+    if figure is None:
+        raise ValueError("ax belongs to no figure: make it with subplots")
+    return figure, ax
+
+
+def set_title(figure: FigureBase, title: str | None, default: str, ax: Axes | None = None) -> None:
+    """Set the title of a figure, flush left, or of the axes given; none if it is empty."""
+    title = default if title is None else title
+    if not title:
+        return
+    if ax is not None and ax.get_figure() is not None:
+        ax.set_title(title, loc="left", fontweight="bold")
+    else:
         figure.suptitle(title, x=0.01, ha="left")
+
+
+def text_share(axes: Axes, characters: int, size: float = 9.0) -> float:
+    """Width of a text of a font size (points) over that of the axes, about."""
+    figure = axes.get_figure(root=True)
+    width = 72 * axes.get_window_extent().width / (figure.dpi if figure else 72)
+    return 0.55 * size * characters / width
 
 
 def annotate(axes, text: str, point, offset, **options) -> None:
@@ -89,14 +137,21 @@ def annotate(axes, text: str, point, offset, **options) -> None:
     axes.annotate(text, point, xytext=offset, textcoords="offset points", **options)
 
 
-def separate_labels(positions, gap: float) -> Float[np.ndarray, " label"]:
-    """Positions at least `gap` apart, order kept, nearest to the wanted ones in least squares."""
+def separate_labels(
+    positions, gap: float, limits: tuple[float, float] = (-np.inf, np.inf)
+) -> Float[np.ndarray, " label"]:
+    """Positions at least `gap` apart, order kept, nearest to the wanted ones in least squares.
+
+    They are moved to within the limits if they fit there.
+    """
     positions = np.asarray(positions, float)
     order = np.argsort(positions, kind="stable")
     steps = gap * np.arange(positions.size)
     separated = np.empty_like(positions)
     # With the gaps subtracted, positions must not decrease: isotonic regression.
-    separated[order] = _isotonic_regression(positions[order] - steps) + steps
+    fitted = _isotonic_regression(positions[order] - steps)
+    low, high = limits[0] + gap / 2, limits[1] - gap / 2 - gap * (positions.size - 1)
+    separated[order] = np.maximum(np.minimum(fitted, high), low) + steps
     return separated
 
 
@@ -114,11 +169,21 @@ def _isotonic_regression(values):
 
 
 def margin_labels(axes, heights, labels, colours) -> None:
-    """Write labels in the right margin, each beside its height (data units) if there is room."""
+    """Write labels in the right margin, each beside its height (data units) if there is room.
+
+    Of more labels than fit those farthest from zero are written, with the number of the others.
+    """
     low, high = axes.get_ylim()
-    inches = axes.get_figure().get_figheight() * axes.get_position().height
-    label_heights = separate_labels(heights, 0.17 * (high - low) / inches)
-    for height, label, tint in zip(label_heights, labels, colours, strict=True):
+    inches = axes.get_window_extent().height / axes.get_figure(root=True).dpi
+    room = max(2, int(inches / LABEL_HEIGHT))
+    entries = list(zip(heights, labels, colours, strict=True))
+    if len(entries) > room:
+        entries.sort(key=lambda entry: -abs(entry[0]))
+        others = f"and {len(entries) - room + 1} more"
+        entries = [*entries[: room - 1], (low, others, GREY)]
+    gap = LABEL_HEIGHT * (high - low) / inches
+    label_heights = separate_labels([entry[0] for entry in entries], gap, (low, high))
+    for height, (_, label, tint) in zip(label_heights, entries, strict=True):
         annotate(
             axes,
             label,
@@ -131,8 +196,10 @@ def margin_labels(axes, heights, labels, colours) -> None:
         )
 
 
-def draw_limits(axes, limits, colours) -> None:
+def draw_limits(axes, limits, colours, unit: str = "") -> None:
     """Draw limits of commands as dotted lines, with their values in the right margin."""
     for limit, tint in zip(limits, colours, strict=True):
         axes.axhline(limit, color=tint, linewidth=0.9, linestyle=":")
-    margin_labels(axes, limits, [f"limit {format_number(limit)}" for limit in limits], colours)
+    margin_labels(
+        axes, limits, [f"limit {format_number(limit)} {unit}".rstrip() for limit in limits], colours
+    )

@@ -1,7 +1,7 @@
 """Record of one simulated run: histories, section forces, peaks, error; as xarray and netCDF."""
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
@@ -28,6 +28,7 @@ from jaxbeam.simulation.views.text import record_text
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
+    from matplotlib.figure import FigureBase
 
 
 class Record(eqx.Module):
@@ -269,6 +270,21 @@ class Record(eqx.Module):
         import xarray
 
         return xarray.Dataset(*self._dataset_parts())
+
+    def plot(self, quantity: str | None = None, **options: Any) -> "FigureBase":
+        """Figure of the record, or of one quantity of its sensors; see `jaxbeam.plot.plot_record`.
+
+        `options` are its `ax`, `title` and `labels`; it raises as that function does.
+        """
+        from jaxbeam.plot import plot_record
+
+        return plot_record(self, quantity, **options)
+
+    def plot_envelope(self, quantity: str = "moment", **options: Any) -> "FigureBase":
+        """Figure of the envelope of a quantity; see `jaxbeam.plot.plot_envelope`."""
+        from jaxbeam.plot import plot_envelope
+
+        return plot_envelope(self, quantity, **options)
 
     @property
     def columns(self) -> dict[str, Float[np.ndarray, " time"]]:

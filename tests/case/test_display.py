@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
+from jaxbeam.case.display.addresses import address_words
 from jaxbeam.case.display.prefixes import unit_scale, with_prefix
 
 BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.02)
@@ -69,3 +70,31 @@ def test_prefixes_of_single_numbers(value, unit, expected):
 def test_units_without_prefix_stay():
     assert unit_scale([2e-7], "m^4") == (1.0, "m^4")
     assert unit_scale([2e6], "kg/m") == (1.0, "kg/m")
+
+
+CASE = jb.Case(
+    BEAM,
+    supports=[jb.Support(0.2)],
+    sensors=[jb.Sensor(0.3, name="midspan"), jb.Sensor(0.4)],
+    loads=[jb.MovingMass(mass=1.0, speed=2.0), jb.Axles(train="HSLM-A1", speed=2.0)],
+    controller=jb.Feedback(gains=[1.0, 2.0], period=0.01),
+)
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("loads.0.speed", "speed of load 0"),
+        ("loads.*.speed", "speed of all loads"),
+        ("loads.1.speed", "speed of train 1"),
+        ("loads.1.train", "train of train 1"),
+        ("supports.0.rotational_stiffness", "rotational stiffness of the support"),
+        ("sensors.0.position", "position of sensor midspan"),
+        ("sensors.1.position", "position of sensor 1"),
+        ("beam.youngs_modulus", "Young's modulus of the beam"),
+        ("controller.gains.1", "gains 1 of the controller"),
+        ("run.duration", "duration"),
+    ],
+)
+def test_addresses_in_words(address, words):
+    assert address_words(CASE, address) == words
