@@ -103,7 +103,7 @@ def draw_schematic(axes, case: Case) -> None:
     texts = {
         f"{x:.4g} m": (i, x) for i, x in enumerate(sensor_positions)
     }  # of sensors at one place
-    gap = 1.04 * length * text_share(axes, max(map(len, texts), default=0) + 1)
+    gap = 1.04 * length * text_share(axes, max(map(len, texts), default=0) + 2)
     # Of more sensors than there is room for labels every second or third has one.
     labelled = list(texts.items())[:: 1 + int(gap * len(texts) / length)]
     places = separate_labels([x for _, (_, x) in labelled], gap, (0.0, length))
