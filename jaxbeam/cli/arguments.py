@@ -2,6 +2,7 @@
 
 import importlib.util
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -200,6 +201,26 @@ def _parse_numbers(option: str, text: str, entries: Sequence[str]) -> list[float
 def figure_path(output: Path | None, source: Path) -> Path:
     """File of a picture: beside the output, or named after the source in this folder."""
     return (output or Path(source.name)).with_suffix(".png")
+
+
+INCHES = {"mm": 1 / 25.4, "cm": 1 / 2.54, "in": 1.0}
+MIN_INCHES, MAX_INCHES = 1.0, 100.0
+
+
+def parse_size(text: str) -> tuple[float, float]:
+    """Width and height in inches of WIDTHxHEIGHT with a unit, as 160x100mm.
+
+    Raises ValueError for other texts, and for sizes below one inch or above 100.
+    """
+    found = re.fullmatch(r"(\d+\.?\d*)\s*x\s*(\d+\.?\d*)\s*(mm|cm|in)", text.strip())
+    if found is None:
+        raise ValueError(
+            f"--size takes WIDTHxHEIGHT in mm, cm or in, such as 160x100mm, not {text!r}"
+        )
+    width, height = (float(found.group(i)) * INCHES[found.group(3)] for i in (1, 2))
+    if not MIN_INCHES <= min(width, height) <= max(width, height) <= MAX_INCHES:
+        raise ValueError(f"--size {text}: a side is 25 mm at least and 2540 mm at most")
+    return width, height
 
 
 def check_exists(kind: str, *paths: Path) -> None:

@@ -100,6 +100,12 @@ def drawing_area(ax: Axes | None, size: Size) -> FigureBase:
     return figure.add_subfigure(place)
 
 
+@use_style
+def page(size: Size) -> Axes:
+    """Axes that fill a figure of some size (inches), for `ax` of a function that draws."""
+    return Figure(figsize=size).subplots()
+
+
 def single_axes(ax: Axes | None, size: Size) -> tuple[FigureBase, Axes]:
     """Figure and axes of a figure of one panel: those given, or new ones of some size (inches).
 

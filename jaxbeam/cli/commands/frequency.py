@@ -9,12 +9,11 @@ import jaxbeam as jb
 from jaxbeam.cli.arguments import (
     TABLE_SUFFIXES,
     check_suffix,
-    figure_path,
     frequency_grid,
     input_output_pair,
     stationary_mass,
 )
-from jaxbeam.cli.options import CaseOptions, Output, table
+from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, table
 
 
 def modes(
@@ -23,6 +22,7 @@ def modes(
     *,
     output: Output = None,
     plot: bool = False,
+    pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Compute natural frequencies and damping ratios.
@@ -37,14 +37,15 @@ def modes(
         Draw the mode shapes to CASE_modes.png in this folder.
     """
     check_suffix(output, TABLE_SUFFIXES[0], "a table of modes", TABLE_SUFFIXES[1:])
-    picture = figure_path(None, case.with_stem(f"{case.stem}_modes")) if plot else None
+    picture = pictures.path(plot, None, case.with_stem(f"{case.stem}_modes"))
     options.check_outputs(output, picture)
     parsed_case = options.read(case)
     found = jb.modes(parsed_case)
     if picture:
         from jaxbeam.plot import plot_modes
 
-        plot_modes(parsed_case, found).savefig(picture)
+        figure = plot_modes(parsed_case, found, ax=pictures.page(), title=pictures.title)
+        pictures.save(figure, picture)
     if output:
         import numpy as np
 
@@ -83,6 +84,7 @@ def frf(
     points: int = 2000,
     output: Output = None,
     plot: bool = False,
+    pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Compute frequency responses without the loads; print resonances and antiresonances.
@@ -110,7 +112,7 @@ def frf(
         Draw magnitude and phase to a PNG beside the output, or to CASE_frf.png in this folder.
     """
     check_suffix(output, ".nc", "a frequency response")
-    picture = figure_path(output, case.with_stem(f"{case.stem}_frf")) if plot else None
+    picture = pictures.path(plot, output, case.with_stem(f"{case.stem}_frf"))
     options.check_outputs(output, picture)
     frequencies = frequency_grid(from_, to, points)
     pairs = [input_output_pair(text) for text in pair] or None
@@ -125,7 +127,8 @@ def frf(
     if picture:
         from jaxbeam.plot import plot_frequency_response
 
-        plot_frequency_response(response).savefig(picture)
+        figure = plot_frequency_response(response, ax=pictures.page(), title=pictures.title)
+        pictures.save(figure, picture)
     columns = zip(response.pairs, response.magnitude.T, response.phase.T, strict=True)
     lines = []
     for i, channel_pair in enumerate(response.pairs):

@@ -9,7 +9,6 @@ from cyclopts import Parameter
 import jaxbeam as jb
 from jaxbeam.cli.arguments import (
     check_suffix,
-    figure_path,
     parse_sweep_values,
     refuse_option,
 )
@@ -17,6 +16,7 @@ from jaxbeam.cli.options import (
     CaseOptions,
     Output,
     Over,
+    PictureOptions,
     PrintOptions,
     print_plausibility,
     table,
@@ -34,6 +34,7 @@ def sweep(
     scheduler: str | None = None,
     precision: str = "double",
     plot: bool = False,
+    pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Simulate a case for many values of some of its parameters.
@@ -65,9 +66,9 @@ def sweep(
         bool(scheduler) and not output, "--scheduler needs a store for the results: -o OUT.zarr"
     )
     check_suffix(output, ".zarr", "a sweep")
-    picture = figure_path(output, case.with_stem(f"{case.stem}_sweep")) if plot else None
+    picture = pictures.path(plot, output, case.with_stem(f"{case.stem}_sweep"))
     refuse_option(
-        plot and not 0 < sum(len(given) > 1 for given in values.values()) < 3,
+        bool(picture) and not 0 < sum(len(given) > 1 for given in values.values()) < 3,
         "--plot draws peaks over one or two parameters with several values; leave it out",
     )
     if not resume:
@@ -92,7 +93,8 @@ def sweep(
     if picture:
         from jaxbeam.plot import plot_sweep
 
-        plot_sweep(results).savefig(picture)
+        figure = plot_sweep(results, ax=pictures.page(), title=pictures.title)
+        pictures.save(figure, picture)
     values = {address: results[address].to_numpy().tolist() for address in values}  # in SI units
     peaks = {str(name): results[name] for name in results if str(name).startswith("peak_")}
     del peaks["peak_time"]
