@@ -27,7 +27,7 @@ from jaxbeam.runtime.compiling import compiled_if_traced
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
-    from matplotlib.figure import FigureBase
+    from matplotlib.figure import Figure, SubFigure
 
 StationaryMasses = Sequence[tuple[Any, Any]]  # position (m) and mass (kg) of each
 
@@ -70,7 +70,7 @@ class FrequencyResponse(eqx.Module):
         available = ", ".join(map(str, self.pairs))
         raise ValueError(f"there is no response of {output} to {input}; there are {available}")
 
-    def plot(self, **options: Any) -> "FigureBase":
+    def plot(self, **options: Any) -> "Figure | SubFigure":
         """Magnitude and phase; see `jaxbeam.plot.plot_frequency_response` and its options."""
         from jaxbeam.plot import plot_frequency_response
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import FigureBase
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.analysis.compare import Comparison
 from jaxbeam.case.fields import concrete
@@ -15,6 +15,7 @@ from jaxbeam.plot.style import (
     draw_limits,
     drawing_area,
     format_number,
+    label_height,
     margin_labels,
     set_title,
     unit_scale,
@@ -29,7 +30,7 @@ OPTIMAL_STYLE = {"color": INK, "linewidth": 1.0, "linestyle": (0, (5, 2))}
 @use_style
 def plot_comparison(
     comparison: Comparison, *, ax: Axes | None = None, title: str | None = None
-) -> FigureBase:
+) -> Figure | SubFigure:
     """Deflection at the sensor with the largest uncontrolled peak, and commands, of controllers.
 
     Dashed: the optimal commands of the bound and their response; thin line: the least achievable
@@ -83,7 +84,7 @@ def _draw_deflection(axes, comparison: Comparison):
         if low <= bound <= high:
             axes.axhline(bound, color=INK, linewidth=0.7)
     position = float(concrete(comparison.case.sensors[sensor].position))
-    axes.set_ylabel(f"deflection at {position:.4g} m ({unit})")
+    label_height(axes, f"deflection at {position:.4g} m", unit)
     label_loads(axes, comparison.uncontrolled)
     margin_labels(axes, peaks, labels, [look["color"] for _, _, look in runs])
 
@@ -99,7 +100,7 @@ def _draw_commands(axes, comparison: Comparison, index: int):
         style, command = command_drawstyle(record.case.controller), command / factor
         axes.plot(np.asarray(record.times), command, drawstyle=style, **(look | {"linewidth": 1.1}))
     number = f" {index}" if len(comparison.case.actuators) > 1 else ""
-    axes.set_ylabel(f"command{number} ({unit})")
+    label_height(axes, f"command{number}", unit)
     limits = actuator.command_limits()
     if limits is not None:
         draw_limits(axes, (concrete(limits) / factor).tolist(), [GREY, GREY], unit)

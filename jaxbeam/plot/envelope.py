@@ -2,7 +2,7 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, FigureBase
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.plot.schematic import draw_schematic
@@ -29,7 +29,7 @@ def plot_envelope(
     ax: Axes | None = None,
     title: str | None = None,
     **parameters,
-) -> FigureBase:
+) -> Figure | SubFigure:
     """Schematic of the case, and the envelope of a quantity over the length of the beam.
 
     Dots mark the smallest and the largest value, with the time of each. `positions` (m) and

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.figure import FigureBase
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.plot.style import (
     GREY,
@@ -34,7 +34,9 @@ class FitPanel:
 
 
 @use_style
-def plot_fit(panels: Sequence[FitPanel], title: str = "", *, ax: Axes | None = None) -> FigureBase:
+def plot_fit(
+    panels: Sequence[FitPanel], title: str = "", *, ax: Axes | None = None
+) -> Figure | SubFigure:
     """Measured (dots) and fitted signals (lines) and residuals, a column a log.
 
     Residuals of a log share one scale, and are labelled with their standard deviations. The

@@ -2,7 +2,7 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import FigureBase
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import LogFormatter, MultipleLocator, NullFormatter
 
 from jaxbeam.model.frequency_response import FrequencyResponse
@@ -12,7 +12,7 @@ from jaxbeam.plot.style import FAINT, colour, drawing_area, set_title, use_style
 @use_style
 def plot_frequency_response(
     response: FrequencyResponse, *, ax: Axes | None = None, title: str | None = None
-) -> FigureBase:
+) -> Figure | SubFigure:
     """Magnitude and phase over frequency, a column a unit, a curve an input-output pair.
 
     A frequency of zero, which a logarithmic axis lacks, is left out. The figure takes the place of

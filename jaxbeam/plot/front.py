@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.figure import FigureBase
+from matplotlib.figure import Figure, SubFigure
 from numpy import ndarray
 
 from jaxbeam.plot.style import colour, set_title, single_axes, use_style
@@ -17,7 +17,7 @@ def plot_pareto_front(
     title: str = "",
     *,
     ax: Axes | None = None,
-) -> FigureBase:
+) -> Figure | SubFigure:
     """Objective over the limited metric, a line for training and for held-out runs.
 
     It is drawn on `ax` if it is given. Raises ValueError without lines.

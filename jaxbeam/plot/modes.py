@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import FigureBase
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
@@ -32,7 +32,7 @@ def plot_modes(
     *,
     ax: Axes | None = None,
     title: str | None = None,
-) -> FigureBase:
+) -> Figure | SubFigure:
     """Mode shapes of a case, one above the other, with frequencies (Hz) and damping ratios.
 
     Shapes are scaled to the same height. `modes` are computed from the case, and the title is

@@ -2,7 +2,7 @@
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import FigureBase
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.analysis.stability import FrozenPoles, Growth
 from jaxbeam.plot.style import ALARM, GREY, INK, colour, drawing_area, set_title, use_style
@@ -18,7 +18,7 @@ def plot_poles(
     title: str = "",
     *,
     ax: Axes | None = None,
-) -> FigureBase:
+) -> Figure | SubFigure:
     """Poles with frozen loads in the complex plane, and their largest real part over time.
 
     Dots mark the start of the crossing, shading instability of the frozen loop. With `growth`, the

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import FigureBase
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
@@ -14,12 +14,12 @@ from jaxbeam.plot.schematic import draw_schematic, shows_traffic
 from jaxbeam.plot.style import (
     GREY,
     UnitScale,
-    axis_label,
     colour,
     command_drawstyle,
     draw_limits,
     drawing_area,
     format_number,
+    label_height,
     load_colour,
     margin_labels,
     set_title,
@@ -40,7 +40,7 @@ def plot_record(
     ax: Axes | None = None,
     title: str | None = None,
     labels: Sequence[str] | None = None,
-) -> FigureBase:
+) -> Figure | SubFigure:
     """Schematic, quantities of the sensors, contact forces, bodies of vehicles, and commands.
 
     Each quantity has axes of its own. Dots mark peaks, shading the times with loads on the beam;
@@ -96,7 +96,7 @@ def _names(case: Case, labels: Sequence[str] | None) -> list[str]:
     return list(labels)
 
 
-def _plot_quantity(record, quantity, names, ax, title) -> FigureBase:
+def _plot_quantity(record, quantity, names, ax, title) -> Figure | SubFigure:
     measured = list(dict.fromkeys(sensor.quantity for sensor in record.case.sensors))
     if quantity not in measured:
         raise ValueError(
@@ -143,7 +143,7 @@ def _draw_quantity(axes, record, quantity: str, names: list[str], with_loads: bo
         peaks.append(peak / factor)
         axes.plot([when], peaks[-1:], "o", color=colour(i), markeredgecolor="white", zorder=3)
         texts.append(f"{names[i] or 'peak'} {format_number(peaks[-1])} {unit}")
-    axes.set_ylabel(axis_label(quantity, unit))
+    label_height(axes, quantity, unit)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.07 * (high - low))  # room for the names
     if 0 in own or with_loads:  # the first of the quantities
@@ -176,5 +176,5 @@ def _draw_commands(axes, record):
             if np.any(np.isclose(command[:, i], limit)):
                 reached.append(limit / scale.factor)
                 tints.append(load_colour(i))
-    axes.set_ylabel(axis_label("command", words))
+    label_height(axes, "command", words)
     draw_limits(axes, reached, tints, scale.unit)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import xarray
 from matplotlib.axes import Axes
-from matplotlib.figure import FigureBase
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
@@ -75,7 +75,7 @@ def plot_speed_sweep(
     *,
     ax: Axes | None = None,
     title: str | None = None,
-) -> FigureBase:
+) -> Figure | SubFigure:
     """Peaks (speed, word, sensor) over speed, in the units of the sensors, a curve for each word.
 
     A panel for each sensor, under its name, and speeds in km/h from 72 km/h on. Behind the curves

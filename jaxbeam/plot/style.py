@@ -6,7 +6,7 @@ from jaxtyping import Float
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure, FigureBase
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.case.display.prefixes import UnitScale as UnitScale, unit_scale as unit_scale
 
@@ -84,7 +84,18 @@ def command_drawstyle(controller) -> str:
     return "default" if controller.period is None else "steps-post"
 
 
-def drawing_area(ax: Axes | None, size: Size) -> FigureBase:
+def label_height(axes: Axes, words: str, unit: str) -> None:
+    """Label the vertical axis: words and unit, in two lines and smaller letters on low axes."""
+    figure = axes.get_figure(root=True)
+    points = 72 * axes.get_window_extent().height / (figure.dpi if figure else 72)
+    text, size = axis_label(words, unit), 9.0
+    if 0.55 * size * len(text) > points and unit:
+        text = f"{words}\n({unit})"
+    longest = max(map(len, text.split("\n")))
+    axes.set_ylabel(text, fontsize=min(size, max(6.0, points / (0.55 * longest))))
+
+
+def drawing_area(ax: Axes | None, size: Size) -> Figure | SubFigure:
     """A figure of some size (inches), or a part of the figure of `ax` that takes its place.
 
     Raises ValueError if the axes have no place in a grid.
@@ -106,7 +117,7 @@ def page(size: Size) -> Axes:
     return Figure(figsize=size).subplots()
 
 
-def single_axes(ax: Axes | None, size: Size) -> tuple[FigureBase, Axes]:
+def single_axes(ax: Axes | None, size: Size) -> tuple[Figure | SubFigure, Axes]:
     """Figure and axes of a figure of one panel: those given, or new ones of some size (inches).
 
     Raises ValueError for axes without a figure.
@@ -120,7 +131,9 @@ def single_axes(ax: Axes | None, size: Size) -> tuple[FigureBase, Axes]:
     return figure, ax
 
 
-def set_title(figure: FigureBase, title: str | None, default: str, ax: Axes | None = None) -> None:
+def set_title(
+    figure: Figure | SubFigure, title: str | None, default: str = "", ax: Axes | None = None
+) -> None:
     """Set the title of a figure, flush left, or of the axes given; none if it is empty."""
     title = default if title is None else title
     if not title:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray
 from matplotlib.axes import Axes
-from matplotlib.figure import FigureBase
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
@@ -52,7 +52,7 @@ def plot_sweep(
     ax: Axes | None = None,
     title: str | None = None,
     labels: Sequence[str] | None = None,
-) -> FigureBase:
+) -> Figure | SubFigure:
     """Peaks at the sensors over the swept addresses: curves for one, a map per sensor for two.
 
     Trains over speed are drawn as in `plot_speed_sweep`, other words as bars. Each quantity has a

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.figure import FigureBase
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.plot.style import GREY, INK, SHADE, colour, drawing_area, set_title, use_style
 
@@ -30,7 +30,7 @@ def plot_tuning(
     title: str = "",
     *,
     ax: Axes | None = None,
-) -> FigureBase:
+) -> Figure | SubFigure:
     """Peaks of every run relative to no control, and the objective over the steps of the search.
 
     Shading: below the least achievable peak, the bound on any controller. The figure takes the

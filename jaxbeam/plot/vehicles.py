@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import FigureBase
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.case.beam import Beam
 from jaxbeam.case.case import Case
@@ -35,7 +35,7 @@ def plot_vehicles(
     *,
     ax: Axes | None = None,
     title: str = "",
-) -> FigureBase:
+) -> Figure | SubFigure:
     """Vehicles of loads, one below the other, with static loads under gravity of 9.81 m/s^2.
 
     The front is on the right; positions are those in front of the last wheel, in m. `titles` are

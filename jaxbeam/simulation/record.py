@@ -28,7 +28,7 @@ from jaxbeam.simulation.views.text import record_text
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
-    from matplotlib.figure import FigureBase
+    from matplotlib.figure import Figure, SubFigure
 
 
 class Record(eqx.Module):
@@ -271,7 +271,7 @@ class Record(eqx.Module):
 
         return xarray.Dataset(*self._dataset_parts())
 
-    def plot(self, quantity: str | None = None, **options: Any) -> "FigureBase":
+    def plot(self, quantity: str | None = None, **options: Any) -> "Figure | SubFigure":
         """Figure of the record, or of one quantity of its sensors; see `jaxbeam.plot.plot_record`.
 
         `options` are its `ax`, `title` and `labels`; it raises as that function does.
@@ -280,7 +280,7 @@ class Record(eqx.Module):
 
         return plot_record(self, quantity, **options)
 
-    def plot_envelope(self, quantity: str = "moment", **options: Any) -> "FigureBase":
+    def plot_envelope(self, quantity: str = "moment", **options: Any) -> "Figure | SubFigure":
         """Figure of the envelope of a quantity; see `jaxbeam.plot.plot_envelope`."""
         from jaxbeam.plot import plot_envelope
 
