@@ -1,6 +1,5 @@
 """Meaning of arguments, checked before any work; imports nothing heavy at the top."""
 
-import importlib.util
 import math
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -8,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxbeam.case.reading.units import is_quantity, number_and_unit
+from jaxbeam.files.endings import check_ending
 
 
 def parse_assignment(option: str, text: str) -> tuple[str, str]:
@@ -230,27 +230,14 @@ def check_exists(kind: str, *paths: Path) -> None:
             raise FileNotFoundError(f"{path}: there is no such {kind}")
 
 
-TABLE_SUFFIXES = (".csv", ".xlsx", ".mat", ".parquet")
-TABLE_PACKAGES = {".xlsx": "openpyxl", ".parquet": "pyarrow"}
-
-
 def check_suffix(path: Path | None, suffix: str, content: str, others: Sequence[str] = ()) -> None:
     """Whether a file can be written by its suffix, before any work.
 
-    Raises ValueError if it has not the suffix of its content, nor one of the others, or if the
-    package that writes it is not installed.
+    Raises ValueError if it has not the suffix of its content, nor one of the others, ImportError if
+    the package that writes it is not installed.
     """
-    package = TABLE_PACKAGES.get(path.suffix, "") if path and path.suffix in others else ""
-    if package and not importlib.util.find_spec(package):
-        raise ValueError(
-            f"{path.suffix} files need {package}, which is not installed: pip install {package},"
-            " or 'jaxbeam[tables]'"
-        )
-    if path and path.suffix not in (suffix, *others):
-        more = f", or {', '.join(others)}" if others else ""
-        raise ValueError(
-            f"{content} is written to a {suffix} file; call it {path.with_suffix(suffix)}{more}"
-        )
+    if path:
+        check_ending(path, content, (suffix, *others))
 
 
 def refuse_option(is_given: bool, reason: str) -> None:

@@ -17,6 +17,7 @@ from jaxtyping import Complex, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
+from jaxbeam.case.display.views import TableViews
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.channels import ChannelPair, check_pairs, common_pairs, input_column, output_row
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 StationaryMasses = Sequence[tuple[Any, Any]]  # position (m) and mass (kg) of each
 
 
-class FrequencyResponse(eqx.Module):
+class FrequencyResponse(TableViews, eqx.Module):
     """Frequency responses at `frequencies` (Hz), one column for each pair of input and output.
 
     `values` are complex amplitudes of the output per input, in the `unit` of the pair; their phase
@@ -75,6 +76,17 @@ class FrequencyResponse(eqx.Module):
         from jaxbeam.plot import plot_frequency_response
 
         return plot_frequency_response(self, **options)
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Frequency (Hz), and magnitude and phase (degrees) of each pair, by head."""
+        columns = {"frequency (Hz)": np.asarray(self.frequencies)}
+        magnitude, phase = np.asarray(self.magnitude), np.asarray(self.phase)
+        for i, pair in enumerate(self.pairs):
+            unit = "" if pair.unit == "1" else f" ({pair.unit})"
+            columns[f"{pair} magnitude{unit}"] = magnitude[:, i]
+            columns[f"{pair} phase (degree)"] = phase[:, i]
+        return columns
 
     def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units, of real variables that every file format can hold."""

@@ -9,9 +9,11 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.case.aliases import renamed_property
 from jaxbeam.case.case import Case
+from jaxbeam.case.display.views import TableViews
 from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.files.endings import check_ending
 from jaxbeam.files.netcdf import write_netcdf
-from jaxbeam.files.tables import write_table
+from jaxbeam.files.tables import write_result
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.measurement import sensor_readings
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-class Record(eqx.Module):
+class Record(TableViews, eqx.Module):
     """Record of one simulated run.
 
     Deflection is positive upwards. Samples at an entry or exit of a load are those just after.
@@ -288,20 +290,21 @@ class Record(eqx.Module):
 
     @property
     def columns(self) -> dict[str, Float[np.ndarray, " time"]]:
-        """Histories by head, as "midspan deflection (m)": `pandas.DataFrame(columns)` works."""
+        """Histories by head, as "midspan deflection (m)"; `to_dataframe` has them too."""
         histories = self.sensor_values, self.contact_force, self.command
         return record_columns(self.case, self.times, *histories)
 
     def save(self, path: str | os.PathLike, overwrite: bool = False) -> None:
-        """Write the record to .nc (all of it), or its `columns` to .csv, .xlsx, .mat or .parquet.
+        """Write all of the record to .nc or .zarr, or its `columns` to .csv, .xlsx, .mat, .parquet.
 
         Raises FileExistsError if the file exists, without `overwrite`; ValueError for another
-        ending; ImportError, with what to install, if a package is missing (see `write_table`).
+        ending; ImportError, with what to install, if a package is missing (see `jaxbeam.save`).
         """
-        if os.fspath(path).endswith(".nc"):
+        check_ending(path, "a record")
+        if os.fspath(path).endswith(".nc"):  # without xarray, which takes long to import
             self.to_netcdf(path, overwrite)
         else:
-            write_table(path, self.columns, overwrite)
+            write_result(path, lambda: self.columns, self.to_xarray, overwrite)
 
     def to_netcdf(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write the labelled dataset to a netCDF file.

@@ -53,6 +53,11 @@ REFUSED = [
     ),
     ("sweep case.toml --over loads.0.train=HSLM-A1,2", "'HSLM-A1' is not a number"),
     ("sweep case.toml --over loads.0.speed=1,2 --resume", "--resume needs the store to continue"),
+    (
+        "sweep case.toml --over loads.0.speed=1,2 --resume -o out.csv",
+        "--resume needs a store of blocks: -o OUT.zarr",
+    ),
+    ("sweep case.toml --over loads.0.speed=1,2 -o out.txt", "a sweep is written to a .zarr file"),
     ("frf case.toml --from 0", "--from and --to must increase from above 0 Hz; they are 0, 1000"),
     ("frf case.toml --from 10 --to 1", "--from and --to must increase from above 0 Hz"),
     ("frf case.toml --points 1", "--points must be 2 or more; it is 1"),

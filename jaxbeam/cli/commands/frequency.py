@@ -7,13 +7,13 @@ from cyclopts import Parameter
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import (
-    TABLE_SUFFIXES,
     check_suffix,
     frequency_grid,
     input_output_pair,
     stationary_mass,
 )
 from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, table
+from jaxbeam.files.endings import RESULTS, TABLES
 
 
 def modes(
@@ -32,11 +32,12 @@ def modes(
     case
         Case file, TOML.
     output
-        Write the table to this file: OUT.csv, .xlsx, .mat or .parquet.
+        Write the table to this file, OUT.csv, .xlsx, .mat or .parquet, or OUT.nc or .zarr with the
+        mode shapes.
     plot
         Draw the mode shapes to CASE_modes.png in this folder.
     """
-    check_suffix(output, TABLE_SUFFIXES[0], "a table of modes", TABLE_SUFFIXES[1:])
+    check_suffix(output, TABLES[0], "a table of modes", RESULTS)
     picture = pictures.path(plot, None, case.with_stem(f"{case.stem}_modes"))
     options.check_outputs(output, picture)
     parsed_case = options.read(case)
@@ -47,17 +48,7 @@ def modes(
         figure = plot_modes(parsed_case, found, ax=pictures.page(), title=pictures.title)
         pictures.save(figure, picture)
     if output:
-        import numpy as np
-
-        from jaxbeam.files.tables import write_table
-
-        heads = ("mode", "frequency (Hz)", "damping ratio")
-        numbers = (
-            np.arange(1.0, 1 + len(found.frequencies)),
-            found.frequencies,
-            found.damping_ratios,
-        )
-        write_table(output, dict(zip(heads, numbers, strict=True)), options.overwrite)
+        jb.save(found, output, options.overwrite)
     rows = zip(found.frequencies, found.damping_ratios, strict=True)
     options.report(
         {"frequencies_hz": found.frequencies, "damping_ratios": found.damping_ratios},
@@ -107,11 +98,11 @@ def frf(
     points
         Number of frequencies, logarithmically spaced; 2000 if left out.
     output
-        Write the responses to this netCDF file, OUT.nc.
+        Write the responses to this file: OUT.nc, .zarr, .csv, .xlsx, .mat or .parquet.
     plot
         Draw magnitude and phase to a PNG beside the output, or to CASE_frf.png in this folder.
     """
-    check_suffix(output, ".nc", "a frequency response")
+    check_suffix(output, ".nc", "a frequency response", RESULTS)
     picture = pictures.path(plot, output, case.with_stem(f"{case.stem}_frf"))
     options.check_outputs(output, picture)
     frequencies = frequency_grid(from_, to, points)
@@ -123,7 +114,7 @@ def frf(
 
     response = frequency_response(parsed_case, frequencies, pairs, masses)
     if output:
-        response.to_netcdf(output, options.overwrite)
+        jb.save(response, output, options.overwrite)
     if picture:
         from jaxbeam.plot import plot_frequency_response
 

@@ -5,8 +5,9 @@ import warnings
 from pathlib import Path
 
 import jaxbeam as jb
-from jaxbeam.cli.arguments import TABLE_SUFFIXES, check_suffix
+from jaxbeam.cli.arguments import check_suffix
 from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, print_plausibility, table
+from jaxbeam.files.endings import RESULTS
 
 MAX_WHEELS = 8  # of a load, or bodies, with a row each
 
@@ -28,14 +29,14 @@ def simulate(
     case
         Case file, TOML.
     output
-        Write the record to this netCDF file, OUT.nc, or what sensors measure, contact forces and
-        commands to a table: OUT.csv, .xlsx, .mat or .parquet.
+        Write all of the record to this file, OUT.nc or OUT.zarr, or what sensors measure, contact
+        forces and commands to a table: OUT.csv, .xlsx, .mat or .parquet.
     plot
         Draw the record to a PNG beside the output, or named after the case.
     animate
         Write an animation of the run to this file, OUT.gif, or OUT.mp4 if ffmpeg is installed.
     """
-    check_suffix(output, ".nc", "a record", TABLE_SUFFIXES)
+    check_suffix(output, ".nc", "a record", RESULTS)
     if animate:
         from jaxbeam.plot.traffic.film import check_film
 

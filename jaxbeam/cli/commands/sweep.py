@@ -44,7 +44,8 @@ def sweep(
     case
         Case file, TOML.
     output
-        Write the results to this zarr store, OUT.zarr, block by block.
+        Write the results to this zarr store, OUT.zarr, block by block; or at the end, a row for
+        each run, to OUT.csv, .xlsx, .mat or .parquet, or all to OUT.nc.
     paired
         Pair the values of all parameters one by one instead of computing all combinations.
     resume
@@ -65,7 +66,13 @@ def sweep(
     refuse_option(
         bool(scheduler) and not output, "--scheduler needs a store for the results: -o OUT.zarr"
     )
-    check_suffix(output, ".zarr", "a sweep")
+    check_suffix(output, ".zarr", "a sweep", RESULTS)
+    store = output if output and output.suffix == ".zarr" else None
+    for option, is_given in (("--resume", resume), ("--scheduler", bool(scheduler))):
+        refuse_option(
+            is_given and store is None,
+            f"{option} needs a store, written block by block: -o OUT.zarr",
+        )
     picture = pictures.path(plot, output, case.with_stem(f"{case.stem}_sweep"))
     refuse_option(
         bool(picture) and not 0 < sum(len(given) > 1 for given in values.values()) < 3,
@@ -82,7 +89,7 @@ def sweep(
         results = jb.sweep(
             parsed_case,
             values,
-            store=output,
+            store=store,
             resume=resume,
             overwrite=options.overwrite,
             paired=paired,
@@ -90,6 +97,8 @@ def sweep(
             precision=precision,
             client=client,
         )
+    if output and not store:
+        jb.save(results, output, options.overwrite)
     if picture:
         from jaxbeam.plot import plot_sweep
 
