@@ -30,7 +30,8 @@ from tuning.logs.alignment import align_logs
 from tuning.logs.log import Log
 from tuning.logs.quality import find_faults, mask
 from tuning.logs.reading import read_log, read_logs
-from tuning.modal.identify_modes import ModalFit, identify_modes
+from tuning.modal.fit import ModalFit
+from tuning.modal.identify_modes import identify_modes
 from tuning.parameters.prior import Prior
 from tuning.weighing.weigh import weigh
 
