@@ -11,14 +11,14 @@ from tuning.logs.quality import GAP_STEPS
 MIN_RECORD_SAMPLES = 64
 
 
-class Record(NamedTuple):
+class EvenRecord(NamedTuple):
     """Samples at even steps: the time of the first (s), and the values (time, channel)."""
 
     start: float
     values: Float[np.ndarray, "time channel"]
 
 
-def even_records(log: Log) -> tuple[float, tuple[Record, ...], tuple[str, ...]]:
+def even_records(log: Log) -> tuple[float, tuple[EvenRecord, ...], tuple[str, ...]]:
     """Sampling rate (Hz), the records of a log between its gaps, and notes on what was done.
 
     All records have one rate, that of the usual step. Times off an even grid by more than rounding
@@ -48,7 +48,7 @@ def even_records(log: Log) -> tuple[float, tuple[Record, ...], tuple[str, ...]]:
             grid = grid[grid <= times[-1]]
             values = CubicSpline(times, values, axis=0)(grid)
             resampled = max(resampled, float(deviation))
-        records.append(Record(float(times[0]), values))
+        records.append(EvenRecord(float(times[0]), values))
     if not records:
         raise ValueError(
             f"{log.source}: after {len(cuts)} gaps no record has {MIN_RECORD_SAMPLES} samples"

@@ -172,7 +172,7 @@ def _past_weight(mean, rows):
 
 
 class _Realisation(NamedTuple):
-    """Model of one order: eigenvalues, right and left eigenvectors, pseudo-inverse, state matrix."""
+    """Model of one order: eigenvalues, right and left eigenvectors, pseudo-inverse and matrix."""
 
     eigenvalues: Complex[np.ndarray, " state"]
     vectors: Complex[np.ndarray, "state state"]
