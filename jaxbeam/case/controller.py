@@ -12,6 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, number
 from jaxbeam.case.former_arguments import AcceptsFormerArguments
 from jaxbeam.runtime.arrays import Array, set_at, xp
@@ -149,7 +150,7 @@ def commanded(actuators: Sequence[Any]) -> tuple[int, ...]:
     return tuple(i for i, actuator in enumerate(actuators) if actuator.command_unit != "1")
 
 
-class AbstractController(eqx.Module, metaclass=AcceptsFormerArguments):
+class AbstractController(ReprWithUnits, eqx.Module, metaclass=AcceptsFormerArguments):
     """Settings of a controller.
 
     With a sampling `period` (s) its law acts at 0, period, 2 period, ...; a command begins `delay`

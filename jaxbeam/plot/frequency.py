@@ -1,28 +1,32 @@
 """Bode plots of frequency responses; Bode and Nyquist plots of loop gains."""
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import LogFormatter, MultipleLocator, NullFormatter
 
 from jaxbeam.analysis.linearised_loop import LinearisedLoop
 from jaxbeam.analysis.margins import loop_gain
 from jaxbeam.model.frequency_response import FrequencyResponse
-from jaxbeam.plot.style import ALARM, FAINT, GREY, colour, set_title, use_style
+from jaxbeam.plot.style import ALARM, FAINT, GREY, colour, drawing_area, set_title, use_style
 
 NYQUIST_RADIUS = 3.0  # of the part of the plane that is drawn, around the origin
 
 
 @use_style
-def plot_frequency_response(response: FrequencyResponse) -> Figure:
+def plot_frequency_response(
+    response: FrequencyResponse, *, ax: Axes | None = None, title: str | None = None
+) -> Figure | SubFigure:
     """Magnitude and phase over frequency, a column a unit, a curve an input-output pair.
 
-    A frequency of zero, which a logarithmic axis lacks, is left out.
+    A frequency of zero, which a logarithmic axis lacks, is left out. The figure takes the place of
+    `ax`; its title is that of the response if left out.
     """
     positive = np.asarray(response.frequencies) > 0
     frequencies = np.asarray(response.frequencies)[positive]
     magnitude, phase = (np.asarray(x)[positive] for x in (response.magnitude, response.phase))
     units = list(dict.fromkeys(pair.unit for pair in response.pairs))
-    figure = Figure(figsize=(max(7.0, 1.0 + 4.2 * len(units)), 5.6))
+    figure = drawing_area(ax, (max(7.0, 1.0 + 4.2 * len(units)), 5.6))
     grid = figure.subplots(2, len(units), squeeze=False, sharex=True, height_ratios=[3, 2])
     for (top, bottom), unit in zip(grid.T, units, strict=True):
         chosen = [i for i, pair in enumerate(response.pairs) if pair.unit == unit]
@@ -45,18 +49,25 @@ def plot_frequency_response(response: FrequencyResponse) -> Figure:
         bottom.xaxis.set_major_formatter("{x:g}")
         bottom.set(xlabel="frequency (Hz)", ylabel="phase (°)")
         bottom.set_xlim(frequencies[0], frequencies[-1])
-    set_title(figure, response.title)
+    set_title(figure, title, response.title)
     return figure
 
 
 @use_style
-def plot_loop_gain(loops: dict[str, LinearisedLoop], actuator: int = 0, title: str = "") -> Figure:
+def plot_loop_gain(
+    loops: dict[str, LinearisedLoop],
+    actuator: int = 0,
+    title: str = "",
+    *,
+    ax: Axes | None = None,
+) -> Figure | SubFigure:
     """Bode and Nyquist plots of loops broken at one command, by their names.
 
     Drawn is the transfer function -L from the command to the negative command that the law returns,
     so that the critical point is -1, as in textbooks, and the loop is that of negative feedback.
+    The figure takes the place of `ax`.
     """
-    figure = Figure(figsize=(9.0, 4.6))
+    figure = drawing_area(ax, (9.0, 4.6))
     axes = figure.subplot_mosaic([["magnitude", "plane"], ["phase", "plane"]])
     magnitude, phase, plane = axes["magnitude"], axes["phase"], axes["plane"]
     for i, (name, loop) in enumerate(loops.items()):

@@ -89,7 +89,7 @@ def design_experiment(
     low, high = np.array(list(over.values()), float).T
     nominal = jnp.array([float(concrete(value_at(case, address))) for address in free])
     before = np.array([float(concrete(value_at(case, address))) for address in over])
-    noise_levels = jnp.array([noise if s.noise is None else s.noise for s in case.sensors])
+    noise_levels = jnp.array([noise if s.noise is None else s.noise for s in case.all_sensors])
 
     def cramer_rao(choice, plan):
         """Cramer-Rao bound: logarithms of standard errors, and half that of the volume."""

@@ -4,8 +4,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxbeam.cli.arguments import figure_path, stationary_mass
-from jaxbeam.cli.options import CaseOptions, table
+from jaxbeam.cli.arguments import stationary_mass
+from jaxbeam.cli.options import CaseOptions, PictureOptions, table
 
 if TYPE_CHECKING:
     from jaxbeam.analysis.linearised_loop import LinearisedLoop
@@ -20,6 +20,7 @@ def stability(
     headway: float | None = None,
     mass_at: tuple[str, ...] = (),
     plot: bool = False,
+    pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Tell whether the loop is stable along the crossing; compute margins, poles and growth.
@@ -42,11 +43,9 @@ def stability(
         plots of the loop, broken at the first command, to CASE_loop.png.
     """
     places = [stationary_mass(text) for text in mass_at]
-    pictures = [
-        figure_path(None, case.with_stem(f"{case.stem}_{name}")) if plot else None
-        for name in ("poles", "loop")
-    ]
-    options.check_outputs(*pictures)
+    picture = pictures.path(plot, None, case.with_stem(f"{case.stem}_poles"))
+    loop_picture = picture and picture.with_stem(picture.stem.removesuffix("_poles") + "_loop")
+    options.check_outputs(picture, loop_picture)
     parsed_case = options.read(case)
 
     from jaxbeam.analysis.crossing_margin import stability_margin
@@ -76,13 +75,14 @@ def stability(
     load_limits = {
         name: load_stability_limits(parsed_case, measure) for name, measure in measures.items()
     }
-    if plot:
+    if picture:
         from jaxbeam.plot import plot_loop_gain, plot_poles
 
-        title = parsed_case.title
-        figures = plot_poles(poles, crossing_growth, title), plot_loop_gain(loops, title=title)
-        for figure, picture in zip(figures, pictures, strict=True):
-            figure.savefig(picture)
+        title = parsed_case.title if pictures.title is None else pictures.title
+        figure = plot_poles(poles, crossing_growth, title, ax=pictures.page())
+        pictures.save(figure, picture)
+        figure = plot_loop_gain(loops, title=title, ax=pictures.page())
+        pictures.save(figure, loop_picture)
     worst = int(poles.largest_real_part.argmax())
     content = {
         "verdict": along_crossing.verdict,
@@ -153,7 +153,7 @@ def stability(
             if value is not None:
                 found = _limit_text(quantity, value, unit)
                 lines.append(f"with {name} the loop is unstable {found}")
-    options.report(content, lines, *pictures)
+    options.report(content, lines, picture, loop_picture)
 
 
 def _margins_of(loop: "LinearisedLoop") -> list["Margins"]:
