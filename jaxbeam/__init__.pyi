@@ -41,6 +41,7 @@ from .case.loads.planar.parts import (
     VehicleHinge as VehicleHinge,
     VehicleSpring as VehicleSpring,
 )
+from .case.loads.planar.sensors import VehicleSensor as VehicleSensor
 from .case.loads.quarter_car import QuarterCar as QuarterCar
 from .case.loads.varying_force import VaryingForce as VaryingForce
 from .case.loads.vehicle import VehicleLoad as VehicleLoad
@@ -95,6 +96,8 @@ from .estimation.kalman import Kalman as Kalman
 from .estimation.observer import Observer as Observer
 from .files.case_file import load_case as load_case, save_case as save_case
 from .files.profile_file import profile_from_file as profile_from_file
+from .files.sweep_table import sweep_columns as sweep_columns
+from .files.tables import save as save
 from .model.frequency_response import (
     accelerance as accelerance,
     frequency_response as frequency_response,

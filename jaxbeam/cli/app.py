@@ -19,6 +19,7 @@ from jaxbeam.cli.commands.frequency import frf, modes
 from jaxbeam.cli.commands.identify import identify
 from jaxbeam.cli.commands.models import compare_models, design_experiment
 from jaxbeam.cli.commands.new import new
+from jaxbeam.cli.commands.schema import schema
 from jaxbeam.cli.commands.simulate import simulate
 from jaxbeam.cli.commands.stability import stability
 from jaxbeam.cli.commands.sweep import native, sweep
@@ -32,7 +33,7 @@ COMMANDS = {
     "Engineering": (assess, influence),
     "Control": (compare, stability, tune, export),
     "Identification": (identify, identify_responses, weigh, compare_models, design_experiment),
-    "Other": (demo, reproduce, native),
+    "Other": (demo, reproduce, schema, native),
 }
 
 # Old words work for one release, with a warning that names the new one.

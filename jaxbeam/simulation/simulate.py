@@ -24,6 +24,7 @@ from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
 from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readings
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
@@ -123,15 +124,19 @@ _simulate_compiled = compiled(_simulate_record)
 def simulate_readings(
     case: Case, times: Float[Array, " time"], plan: IntegrationPlan
 ) -> Float[Array, "time sensor"]:
-    """Readings of the sensors at ascending times (s), as `Record.measured` but without noise.
+    """Readings of all sensors at ascending times (s), as `Record.measured` but without noise.
 
-    The controller has no noise either, as that of a log is unknown. For fits: less to compile and
-    differentiate than `simulate`, without its checks and warnings.
+    Those on vehicles follow those on the beam. The controller has no noise either, as that of a log
+    is unknown. For fits: less to compile and differentiate than `simulate`, without its checks and
+    warnings.
     """
     _, outputs, modal, _ = _integrate(case, plan, times, None, noisy=False)
-    if outputs.readings is not None:
-        return outputs.readings
-    return sensor_readings(case, modal, outputs.motion, times)
+    readings = outputs.readings
+    if readings is None:
+        readings = sensor_readings(case, modal, outputs.motion, times)
+    if not case.vehicle_sensors:
+        return readings
+    return xp.concatenate([readings, vehicle_readings(case, outputs.vehicles, times)], axis=1)
 
 
 class Histories(NamedTuple):
@@ -241,17 +246,6 @@ def _commands_at_steps(case: Case, commands, steps):
     commands_at_start = xp.tensordot(histories, end_weights()[:, 0], axes=[1, 0])[steps]
     low, high, _ = command_ranges(case)
     return xp.clip(commands_at_start, low, high)
-
-
-class VehicleMotion(NamedTuple):
-    """Heights (m) or pitch angles (rad) of the bodies of vehicles, their rates and accelerations.
-
-    Of all vehicles, one after the other (see `Record.bodies`), measured from static equilibrium.
-    """
-
-    body_displacement: Float[Array, "time body"]
-    body_velocity: Float[Array, "time body"]
-    body_acceleration: Float[Array, "time body"]
 
 
 def _vehicle_motion(model: ModalModel, loads: LoadSet, states, accelerations) -> VehicleMotion:

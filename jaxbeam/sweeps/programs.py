@@ -25,6 +25,7 @@ from jaxbeam.integrator.integrate import (
     longest_force_step,
     max_stable_step,
 )
+from jaxbeam.integrator.static_shapes import StaticShapes
 from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
@@ -37,7 +38,6 @@ from jaxbeam.runtime.compiling import (
     compiled,
 )
 from jaxbeam.simulation.closed_loop import closed_loop
-from jaxbeam.simulation.integration_plan import StaticShapes
 
 
 class Program(NamedTuple):

@@ -204,3 +204,21 @@ def test_record_without_loads_and_sensors(tmp_path):
 def test_former_name_of_the_readings_warns(record):
     with pytest.warns(DeprecationWarning, match="Record.shown is called controller_readings now"):
         assert record.shown is record.controller_readings is None
+
+
+def test_text_has_the_extremes_of_each_sensor(record):
+    lines = repr(record).splitlines()
+    assert lines[0] == "Record of 'a run for its record': 101 samples to 0.4 s, 5 sensors, 2 loads"
+    assert lines[1].strip() == record.verdict
+    assert lines[2].split() == ["sensor", "position", "quantity", "smallest", "at", "largest", "at"]
+    found = record.extremes
+    assert f"{1e3 * found.smallest[0]:.4g} mm  {found.smallest_time[0]:.4g} s" in lines[3]
+    largest, time = f"{found.largest[1]:.4g}", f"{found.largest_time[1]:.4g}"
+    assert lines[4].split()[-4:] == [largest, "m/s²", time, "s"]
+    several = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), record)
+    assert repr(several) == "Record of 'a run for its record', traced or of several runs"
+
+
+def test_text_of_modes(record):
+    first = f"  1: {record.modes.frequencies[0]:.5g} Hz, damping ratio 0.02"
+    assert repr(record.modes).splitlines()[:2] == ["Modes: 3 of the beam", first]

@@ -152,7 +152,7 @@ def _bridge(case: Case) -> Case:
             "an active control cannot be certified: leave the controller out of the case"
         )
     bridge = dataclasses.replace(
-        case, loads=(), sensors=(), controller=None, profile=None, run=Run(1.0)
+        case, loads=(), sensors=(), vehicle_sensors=(), controller=None, profile=None, run=Run(1.0)
     )
     check_case(bridge)
     return bridge
