@@ -64,7 +64,15 @@ def simulate(
         look = {"title": pictures.title, "size": pictures.inches()}
         write_animation(record, animate, overwrite=options.overwrite, **look)
     content = _to_dict(record) | {"plausibility": plausibility}
-    options.report(content, _lines(record), output, picture, animate)
+    lines = _lines(record)
+    controller = parsed_case.controller
+    if controller is not None and not controller.open_loop:
+        from jaxbeam.analysis.crossing_margin import stability_margin
+
+        margin = stability_margin(parsed_case)
+        content["stability"] = margin.verdict
+        lines.append(f"the loop is {margin}")
+    options.report(content, lines, output, picture, animate)
 
 
 def _to_dict(record: "jb.Record") -> dict:
