@@ -74,7 +74,8 @@ def export_c(case: Case, name: str) -> CProgram:
     try:
         write_law(law, code)
     except NoCCodeError as error:
-        raise ValueError(f"controller.kind = {kind_of(type(controller))!r}: {error}") from None
+        kind = kind_of(type(controller)) or type(controller).__name__
+        raise ValueError(f"controller.kind {kind!r} cannot be exported as C: {error}") from None
     _write_limits(case, code)
     loop = recorded_loop(case, law, MAX_SAMPLES)
     given = _given_states(law, loop, code)

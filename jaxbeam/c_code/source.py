@@ -150,7 +150,7 @@ class CSource:
 
     def helper_texts(self) -> list[str]:
         """Texts of the helpers that the statements use, in an order that C accepts."""
-        return [text for _, text in _closure("\n".join([*self.lines, *self.first_gate_lines]))]
+        return helpers_of("\n".join([*self.lines, *self.first_gate_lines]))
 
 
 def _unique(name: str, taken: Container[str]) -> str:
@@ -168,6 +168,11 @@ class _Helper(NamedTuple):
 def _helpers() -> dict[str, _Helper]:
     files = sorted(HELPERS.glob("*.h"))
     return {f.stem: _Helper(f.stem, f.read_text(encoding="utf-8").strip()) for f in files}
+
+
+def helpers_of(text: str) -> list[str]:
+    """Texts of the helpers that a text in C calls, in an order that C accepts."""
+    return [helper.text for helper in _closure(text)]
 
 
 def _closure(text: str) -> Sequence[_Helper]:

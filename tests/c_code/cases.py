@@ -1,17 +1,22 @@
 """Small cases, one for each kind of controller and estimator, whose C code is tested."""
 
+import equinox as eqx
 import numpy as np
 
 import jaxbeam as jb
 from jaxbeam.case.case import Run
+from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.feedback import Feedback
 from jaxbeam.control.load_identification import LoadIdentification
 from jaxbeam.control.optimal.crossing_lqr import FiniteLQR
+from jaxbeam.control.optimal.gain_schedules import GainSchedule
 from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
-from jaxbeam.control.optimal.scheduled_lqr import ScheduledLQR
+from jaxbeam.control.optimal.scheduled_lqr import ScheduledGainLaw, ScheduledLQR
 from jaxbeam.control.output_feedback import OutputFeedback
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.scheduled_feedback import ScheduledFeedback
+from jaxbeam.control.state_law import SampledStateLaw, TrueState
+from jaxbeam.numerics.gain_table import GainTable
 
 PERIOD = 5e-3
 
@@ -29,6 +34,11 @@ def rig(controller, **changes):
 
 
 FILTERED = [jb.Sensor(0.2, filter=jb.Filter(40.0, 3), offset=1e-4), jb.Sensor(0.4, resolution=1e-5)]
+LATE = [
+    jb.Sensor(0.2, filter=jb.Filter(40.0), delay=7e-3, noise=1e-6),
+    jb.Sensor(0.4, filter=jb.Filter(20.0), sampling_period=2 * PERIOD),
+    jb.Sensor(0.3, "velocity", filter=jb.Filter(30.0, realisation="analogue")),
+]
 WEIGHTS = {
     "state_weight": [1e4, 1e2, 1.0, 0.1, 0.0],
     "command_weight": [1e-4, 1e-3],
@@ -46,7 +56,8 @@ CASES = {
     "feedback": rig(Feedback([2e3, 1e3], higher_gains=[[1e8, 2e8]], period=PERIOD)),
     "feedback-cubic": rig(Feedback([5e8, 1e8], power=3, period=PERIOD), sensors=FILTERED),
     "output-feedback": rig(
-        OutputFeedback([[2e3, 0.0, 5.0], [0.0, -1e3, 1.0]], period=PERIOD, delay=PERIOD)
+        OutputFeedback([[2e3, 0.0, 5.0], [0.0, -1e3, 1.0]], period=PERIOD, delay=PERIOD),
+        sensors=LATE,
     ),
     "pd": rig(jb.PD([2e3, 1e3], rate_gains=[10.0, 5.0], lag=1e-2, period=PERIOD)),
     "lead": rig(jb.Lead([2e3, 1e3], zero=5.0, pole=[20.0, 30.0], period=PERIOD)),
@@ -136,6 +147,41 @@ CASES = {
     ),
     "mpc-unconstrained": rig(jb.MPC(6, 2, 1e-10, solver="unconstrained", period=PERIOD)),
 }
+
+
+class GivenTables(AbstractController):
+    """Random tables of gains over the crossing, for the true state of the beam."""
+
+    family: bool = eqx.field(static=True, default=False)
+    nearest: bool = eqx.field(static=True, default=False)
+    identification: LoadIdentification | None = None
+
+    def design_law(self, plant):
+        grid = (2, 3) if self.family else ()
+        inner = np.sort(RANDOM.uniform(size=(*grid, 4)), axis=-1)
+        ends = np.zeros((*grid, 1)), np.ones((*grid, 1))
+        breakpoints = np.concatenate([ends[0], inner, ends[1]], axis=-1)
+        columns = 5 + self.family
+        table = GainTable(breakpoints, 20.0 * RANDOM.normal(size=(*grid, 5, 3, 2, columns)))
+        final = 20.0 * RANDOM.normal(size=(*grid, 2, columns))
+        numbers = np.zeros((*grid, int(self.family))), np.full(grid, 0.02), np.full(grid, 0.2)
+        law = GainSchedule(table, final, *numbers, np.full(grid, 0.03), self.family)
+        if self.family:
+            source = self.identification.identifier(plant, plant)
+            grids = np.array([0.3, 0.5]), np.array([1.0, 2.0, 3.0])
+            numbers = plant.case.beam.length, plant.case.run.gravity, np.array(2.4)
+            law = ScheduledGainLaw(law, *grids, *numbers, source, self.nearest)
+        return SampledStateLaw(law, TrueState(np.eye(5)))
+
+
+RANDOM = np.random.default_rng(0)
+GATES = LoadIdentification(gates=[-0.05, 0.05])
+CASES["table"] = rig(GivenTables(period=PERIOD))
+CASES["family"] = rig(GivenTables(family=True, identification=GATES, period=3 * PERIOD))
+CASES["nearest"] = rig(
+    GivenTables(family=True, nearest=True, identification=GATES, period=3 * PERIOD)
+)
+
 # Their designs compile for seconds.
 DESIGNED_TABLES = {
     "lqr-finite": rig(FiniteLQR(**WEAK, points=60, after="fade", fade_time=0.02, estimator=KALMAN)),
