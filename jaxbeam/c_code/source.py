@@ -47,6 +47,7 @@ class CSource:
         self.constants: dict[str, np.ndarray] = {}
         self.members: dict[str, Member] = {}
         self.counters: dict[str, str] = {}
+        self.variables: list[str] = []
         self.lines: list[str] = []
         self.notes: list[str] = []
         self.operations = 0

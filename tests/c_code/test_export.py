@@ -59,7 +59,7 @@ def test_check_finds_a_wrong_constant(program, tmp_path):
     subprocess.run(build, cwd=tmp_path, check=True)
     ended = subprocess.run([tmp_path / "check"], capture_output=True, text=True)
     assert ended.returncode == 1
-    assert 0.01 < float(ended.stdout.split("largest error ")[1].split()[0]) < 0.04
+    assert 1e-3 < float(ended.stdout.split("largest error ")[1].split()[0]) < 4e-3
 
 
 def test_files_are_not_overwritten(program, tmp_path):

@@ -75,8 +75,7 @@ def _(law: MPCLaw, code: CSource, estimate: EstimateCode) -> None:
     code.multiply(move_work, move, minimiser, actuators, variables)
     code.add(
         f"for (i = 0; i < {actuators}; i++)\n"
-        f"    {code.output}[i] = {code.command}[i] + ({solved} ? {move_work}[i] : 0);"
-        + ("\n}" if limits else ""),
+        f"    {code.output}[i] = {code.command}[i] + ({solved} ? {move_work}[i] : 0);",
         actuators,
     )
 
@@ -93,7 +92,8 @@ def _copy_state(law: MPCLaw, code: CSource, estimate: EstimateCode, initial: str
 
 
 def _write_quadratic_program(law, code: CSource, program: _Program, minimiser, initial) -> None:
-    """The solution replaces the unconstrained minimiser; opens a block with `solved`."""
+    """The solution replaces the unconstrained minimiser; `solved` is whether there is one."""
+    code.variables += ["real scale", "int solved"]
     limits, variables = program.rows.shape[1:]
     h = code.work("limits", limits, "right-hand sides h")
     z = code.work("solution", variables, "solution of the least-distance form")
@@ -115,10 +115,8 @@ def _write_quadratic_program(law, code: CSource, program: _Program, minimiser, i
     method = "hildreth" if law.solver == "hildreth" else "interior_point"
     code.add(
         f"""
-{{
-const real scale = least_distance({h}, {G}, {minimiser}, {limits}, {variables});
-const int solved = scale <= 0
-    || {method}({z}, {G}, {h}, {limits}, {variables}, {steps}, {work});
+scale = least_distance({h}, {G}, {minimiser}, {limits}, {variables});
+solved = scale <= 0 || {method}({z}, {G}, {h}, {limits}, {variables}, {steps}, {work});
 if (!solved) {failures}++;
 if (scale > 0)
     for (i = 0; i < {variables}; i++) {minimiser}[i] += scale * {z}[i];""",
