@@ -87,7 +87,7 @@ def _copy_state(law: MPCLaw, code: CSource, estimate: EstimateCode, initial: str
     if law.vehicle_states:
         code.add(f"copy({initial} + {place}, {estimate.vehicles}, {law.vehicle_states});")
         place += law.vehicle_states
-    if law.delay is not None:
+    if law.delayed:
         code.add(f"copy({initial} + {place}, {code.command}, {code.actuators});")
 
 
@@ -171,7 +171,7 @@ def _program(law: MPCLaw, code: CSource, wheels: int) -> _Program:
         return past, start.H, f.T, start.M, limits.T, start.gamma
 
     past, H, f, M, limit_columns, gamma = at_samples(
-        numbers, code, varies=law.loaded_plant is not None
+        numbers, code, varies=law.preview is not None
     )
     inverse_factor = np.linalg.inv(np.linalg.cholesky(H))
     limit_columns[..., columns - 1] += gamma
