@@ -170,11 +170,10 @@ def _program(law: MPCLaw, code: CSource, wheels: int) -> _Program:
             limits = xp.concatenate([limits, (program.gamma - constant)[None]])
         return past, start.H, f.T, start.M, limits.T, start.gamma
 
-    past, H, f, M, limit_columns, gamma = at_samples(
-        numbers, code, varies=law.preview is not None
-    )
+    past, H, f, M, limit_columns, gamma = at_samples(numbers, code, varies=law.preview is not None)
     inverse_factor = np.linalg.inv(np.linalg.cholesky(H))
-    limit_columns[..., columns - 1] += gamma
+    to_one = np.eye(limit_columns.shape[-1])[columns - 1]
+    limit_columns = limit_columns + gamma[..., None] * to_one
     transposed = np.swapaxes(inverse_factor, -1, -2)
     rows = M @ transposed
     norms = np.sqrt(np.sum(rows**2, axis=-1, keepdims=True))
