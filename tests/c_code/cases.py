@@ -3,6 +3,7 @@
 import dataclasses
 
 import equinox as eqx
+import jax
 import numpy as np
 
 import jaxbeam as jb
@@ -16,12 +17,11 @@ from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
 from jaxbeam.control.optimal.scheduled_lqr import ScheduledGainLaw, ScheduledLQR
 from jaxbeam.control.output_feedback import OutputFeedback
 from jaxbeam.control.predictive.prediction import SampledPlant
+from jaxbeam.control.predictive.preview import Preview
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.scheduled_feedback import ScheduledFeedback
 from jaxbeam.control.state_law import SampledStateLaw, TrueState
-from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.gain_table import GainTable
-from jaxbeam.runtime.module import Module
 
 PERIOD = 5e-3
 
@@ -150,35 +150,37 @@ class GivenTables(AbstractController):
     identification: LoadIdentification | None = None
 
     def design_law(self, plant):
-        grid = (2, 3) if self.family else ()
-        inner = np.sort(RANDOM.uniform(size=(*grid, 4)), axis=-1)
-        ends = np.zeros((*grid, 1)), np.ones((*grid, 1))
-        breakpoints = np.concatenate([ends[0], inner, ends[1]], axis=-1)
-        columns = 5 + self.family
-        table = GainTable(breakpoints, 20.0 * RANDOM.normal(size=(*grid, 5, 3, 2, columns)))
-        final = 20.0 * RANDOM.normal(size=(*grid, 2, columns))
-        numbers = np.zeros((*grid, int(self.family))), np.full(grid, 0.02), np.full(grid, 0.2)
-        law = GainSchedule(table, final, *numbers, np.full(grid, 0.03), self.family)
-        if self.family:
-            source = self.identification.identifier(plant, plant)
-            grids = np.array([0.3, 0.5]), np.array([1.0, 2.0, 3.0])
-            numbers = plant.case.beam.length, plant.case.run.gravity, np.array(2.4)
-            law = ScheduledGainLaw(law, *grids, *numbers, source, self.nearest)
+        if not self.family:
+            return SampledStateLaw(self.random_schedule(), TrueState(np.eye(5)))
+        schedules = [self.random_schedule() for _ in range(6)]
+        grid = jax.tree.map(lambda *x: np.reshape(np.stack(x), (2, 3, *x[0].shape)), *schedules)
+        grids = np.array([0.3, 0.5]), np.array([1.0, 2.0, 3.0])
+        numbers = plant.case.beam.length, plant.case.run.gravity, np.array(2.4)
+        source = self.identification.identifier(plant, plant)
+        law = ScheduledGainLaw(grid, *grids, *numbers, source, self.nearest)
         return SampledStateLaw(law, TrueState(np.eye(5)))
 
+    def random_schedule(self) -> GainSchedule:
+        """Table of five cubics from 0.02 to 0.2 s, then a gain that fades."""
+        columns, inner = 5 + self.family, np.sort(RANDOM.uniform(size=4))
+        coefficients = 20.0 * RANDOM.normal(size=(5, 4, 2, columns))
+        table = GainTable(np.concatenate([[0.0], inner, [1.0]]), coefficients)
+        final, weights = 20.0 * RANDOM.normal(size=(2, columns)), np.zeros(int(self.family))
+        times = np.array(0.02), np.array(0.2), np.array(0.03)
+        return GainSchedule(table, final, weights, *times, self.family)
 
-class VaryingPlants(Module):
+
+class VaryingPlants(Preview):
     """Stands for the preview of a crossing, which takes a compilation: plants that vary in time."""
 
-    plant: Plant
-    sampled: SampledPlant
+    sampled: SampledPlant | None = None
 
     def sampled_plants(self, t, first, count):
         periods = np.floor(t / PERIOD + 0.5) + first + np.arange(count)
         share = np.where(periods < 9, 0.2 * np.sin(0.5 * periods), 0.1)[:, None, None]
-        wheels = self.plant.augmented_start.shape[0]
-        E = 1e-4 * np.ones((count, self.sampled.A.shape[0], wheels)) * (1 + share)
-        return SampledPlant(self.sampled.A * (1 + 0.1 * share), self.sampled.B * (1 - share), E)
+        A, B, _ = self.sampled
+        E = 1e-4 * np.ones((count, A.shape[0], self.plant.augmented_start.shape[0]))
+        return SampledPlant(A * (1 + 0.1 * share), B * (1 - share), E * (1 + share))
 
 
 class VaryingMPC(AbstractController):
@@ -189,7 +191,8 @@ class VaryingMPC(AbstractController):
     def design_law(self, plant):
         settings = dataclasses.replace(self.settings, period=self.period, delay=self.delay)
         law = settings.law(plant)
-        plants = VaryingPlants(plant, law.law.sampled_plant)
+        none = np.zeros(1), (), np.zeros(0, int), np.zeros((0, 1, 1))
+        plants = VaryingPlants(plant, self.period, self.delay, *none, law.law.sampled_plant)
         law = eqx.tree_at(lambda s: s.law.preview, law, plants, is_leaf=lambda x: x is None)
         return dataclasses.replace(law, law=dataclasses.replace(law.law, known_weights=True))
 
