@@ -178,6 +178,7 @@ class VaryingPlants(Preview):
     def sampled_plants(self, t, first, count):
         periods = np.floor(t / PERIOD + 0.5) + first + np.arange(count)
         share = np.where(periods < 9, 0.2 * np.sin(0.5 * periods), 0.1)[:, None, None]
+        assert self.sampled is not None
         A, B, _ = self.sampled
         E = 1e-4 * np.ones((count, A.shape[0], self.plant.augmented_start.shape[0]))
         return SampledPlant(A * (1 + 0.1 * share), B * (1 - share), E * (1 + share))
