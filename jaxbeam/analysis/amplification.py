@@ -3,17 +3,23 @@
 import dataclasses
 from typing import NamedTuple
 
+import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.integrator.discrete_model import signed_both_ways
 from jaxbeam.integrator.integrate import integrate_peaks
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.statics import static_peak
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
+from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import integration_setup
+
+MAX_WHEELS = 120  # of a record with amplification, as its static peaks take about 6 ms a wheel
+NEGLIGIBLE = 1e-6  # share of the largest static peak below which one is that of a support
 
 
 class Envelope(NamedTuple):
@@ -78,3 +84,27 @@ def amplification(case: Case, x, tolerance: float = TOLERANCE) -> Float[Array, "
     """
     lowest, highest = envelope(case, x, tolerance)
     return xp.maximum(-lowest, highest) / static_peak(case, xp.asarray(x, float))
+
+
+def record_amplification(record: Record) -> list[float | None]:
+    """Dynamic amplification at each sensor of a record: peak over static peak of deflection.
+
+    None at sensors of other quantities or where the static deflection vanishes, with a controller,
+    for more wheels than MAX_WHEELS, and for beams whose static deflections are not known (see
+    `static_peak`).
+    """
+    case = record.case
+    nothing: list[float | None] = [None] * len(case.sensors)
+    wheels = load_set(case).wheel_count
+    if case.controller is not None or not 0 < wheels <= MAX_WHEELS or not case.sensors:
+        return nothing
+    try:
+        static = np.asarray(static_peak(case, case.sensor_positions))
+    except ValueError:
+        return nothing
+    known = static > NEGLIGIBLE * np.max(static)
+    columns = zip(case.sensors, record.peak_deflection, static, known, strict=True)
+    return [
+        float(peak / size) if is_known and sensor.quantity == "deflection" else None
+        for sensor, peak, size, is_known in columns
+    ]

@@ -179,13 +179,13 @@ def _contact_lines(results: "xarray.Dataset", addresses: Sequence[str]) -> list[
     if forces is None or not forces.size or not bool(forces.notnull().any()):
         return []
     least = forces.fillna(math.inf).min("load")
-    run = least.isel(least.argmin(...))
-    names = [_head(results[address]) for address in addresses]
-    at = zip(names, _swept_values(run, addresses), strict=True)
-    lost = int((least < 0).sum())
+    run, lost = least.isel(least.argmin(...)), int((least < 0).sum())
+    where = []
+    for address, value in zip(addresses, _swept_values(run, addresses), strict=True):
+        words, _, unit = _head(results[address]).partition(" (")
+        where.append(f"{words} {value} {unit.rstrip(')')}".rstrip())
     words = f"contact is lost in {lost} runs" if lost else "no run loses contact"
-    where = ", ".join(f"{name} {value}" for name, value in at)
-    return [f"smallest contact force {float(run):.6g} N at {where}; {words}"]
+    return [f"smallest contact force {float(run):.6g} N, at {', '.join(where)}; {words}"]
 
 
 def native(*, remove: bool = False, options: PrintOptions = PrintOptions()) -> None:
