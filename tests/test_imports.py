@@ -22,7 +22,7 @@ jaxbeam.integrator  jaxbeam.estimation
 jaxbeam.control
 jaxbeam.files
 jaxbeam.rigs  jaxbeam.simulation
-jaxbeam.sweeps
+jaxbeam.sweeps  jaxbeam.c_code
 jaxbeam.analysis
 jaxbeam.plot
 jaxbeam

@@ -28,6 +28,7 @@ from jaxbeam.case.fields import (
 )
 from jaxbeam.case.joint_addresses import ALL, each_address
 from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
+from jaxbeam.case.loads.planar.sensors import VehicleSensor
 from jaxbeam.case.profiles.base import AbstractProfile
 from jaxbeam.case.quantities import OF_QUANTITY
 from jaxbeam.case.reading.units import in_si
@@ -51,6 +52,8 @@ class Run(ReprWithUnits, eqx.Module):
 class Case(eqx.Module):
     """Beam, supports, actuators, sensors, loads, profile, controller and run settings.
 
+    Sensors are on the beam; `vehicle_sensors` are on bodies and axles of the loads.
+
     An immutable tree: `replace(case, {"loads.0.mass": 0.3})` or `equinox.tree_at` return a changed
     copy. Every number has an address, its dotted path. Its fields are the keys of a case file.
     """
@@ -60,6 +63,7 @@ class Case(eqx.Module):
     actuators: tuple[AbstractActuator, ...] = ()
     sensors: tuple[Sensor, ...] = ()
     loads: tuple[AbstractLoad, ...] = ()
+    vehicle_sensors: tuple[VehicleSensor, ...] = ()
     profile: AbstractProfile | None = None
     controller: AbstractController | None = None
     run: Run | None = None
@@ -76,12 +80,14 @@ class Case(eqx.Module):
         run: Run | None = None,
         title: str = "",
         profile=None,
+        vehicle_sensors=(),
     ):
         self.beam = beam
         self.supports = tuple(supports)
         self.actuators = tuple(actuators)
         self.sensors = tuple(sensors)
         self.loads = tuple(loads)
+        self.vehicle_sensors = tuple(vehicle_sensors)
         self.profile = profile
         self.controller = controller
         self.run = Run(duration=1.0) if run is None else run
@@ -94,6 +100,11 @@ class Case(eqx.Module):
     def sensor_positions(self) -> Float[Array, " sensor"]:
         """Positions of the sensors, distances from the left end (m)."""
         return xp.array([sensor.position for sensor in self.sensors]).reshape(-1)
+
+    @property
+    def all_sensors(self) -> tuple[Sensor | VehicleSensor, ...]:
+        """Sensors on the beam, then those on vehicles: the channels of a log."""
+        return (*self.sensors, *self.vehicle_sensors)
 
 
 class PartClass(typing.NamedTuple):
@@ -224,7 +235,7 @@ def unit_at(case: Case, address: str) -> str:
             part = part[int(name)]
         elif dataclasses.is_dataclass(part):
             unit = type(part).__dataclass_fields__[name].metadata.get("unit", "")
-            if isinstance(part, Sensor) and unit == OF_QUANTITY:
+            if isinstance(part, Sensor | VehicleSensor) and unit == OF_QUANTITY:
                 unit = part.unit
             part = getattr(part, name)
         elif ", " in unit:  # an entry of a list of several units

@@ -18,10 +18,11 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.sensing.output_rows import quantity_history
+from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readings
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation import section_forces
-from jaxbeam.simulation.extremes import Extremes, sensor_extremes
+from jaxbeam.simulation.extremes import Extremes
 from jaxbeam.simulation.labels import contact_sentence
 from jaxbeam.simulation.record_envelope import RecordEnvelope, record_envelope
 from jaxbeam.simulation.views.dataset import dataset_parts
@@ -39,7 +40,8 @@ class Record(TableViews, eqx.Module):
     Deflection is positive upwards. Samples at an entry or exit of a load are those just after.
     Loads are counted by their wheels. `load_position` (m) is NaN while a wheel is off the beam,
     `contact_force` (N, positive under compression) zero, unless it is the wheel of a vehicle, which
-    presses on the ground. The `bodies` of vehicles have displacements in m (or rad) from static
+    presses on the ground. `smallest` and `largest` values of the quantities of the sensors are in
+    their units. The `bodies` of vehicles have displacements in m (or rad) from static
     equilibrium, positive upwards. Peaks are those in continuous time. `contact_lost_time` (s) and
     `contact_lost_position` (m) are those of the first negative contact force, which the bilateral
     model allows; NaN without one. `command` is that of the actuators, within their limits; at a
@@ -61,6 +63,10 @@ class Record(TableViews, eqx.Module):
     failures: Float[Array, " time"]
     peak_deflection: Float[Array, " sensor"]
     peak_time: Float[Array, " sensor"]
+    smallest: Float[Array, " sensor"]
+    smallest_time: Float[Array, " sensor"]
+    largest: Float[Array, " sensor"]
+    largest_time: Float[Array, " sensor"]
     lowest_contact_force: Float[Array, " load"]
     contact_lost_time: Float[Array, " load"]
     contact_lost_position: Float[Array, " load"]
@@ -159,10 +165,9 @@ class Record(TableViews, eqx.Module):
     def extremes(self) -> Extremes:
         """Smallest and largest value of the quantity of each sensor, with their times (s).
 
-        From the samples; peaks of deflections between samples too.
+        Those in continuous time, between samples too; zero, at rest, is among the values.
         """
-        peaks = self.peak_deflection, self.peak_time
-        return sensor_extremes(self.case.sensors, self.times, self.sensor_values, *peaks)
+        return Extremes(self.smallest, self.smallest_time, self.largest, self.largest_time)
 
     def _at_sensors(self, quantity: str) -> Float[Array, "time sensor"]:
         return self.at(self.case.sensor_positions, quantity)
@@ -208,6 +213,15 @@ class Record(TableViews, eqx.Module):
         if self.controller_readings is not None:
             return self.controller_readings
         return sensor_readings(self.case, self.modes, self.motion, self.times, noisy=True)
+
+    @property
+    def vehicle_readings(self) -> Float[Array, "time vehicle_sensor"]:
+        """Readings of the sensors on vehicles in SI units, with filters and noise.
+
+        Raises ValueError if the times do not suit a filter.
+        """
+        motion = self.body_displacement, self.body_velocity, self.body_acceleration
+        return vehicle_readings(self.case, VehicleMotion(*motion), self.times, noisy=True)
 
     @property
     def saturated(self) -> Bool[Array, "time actuator"]:
@@ -260,12 +274,9 @@ class Record(TableViews, eqx.Module):
 
     def _dataset_parts(self) -> tuple[dict, dict, dict]:
         """Variables, coordinates and attributes of the labelled dataset."""
-        extremes = self.extremes._asdict()
-
-        def value(name: str):
-            return extremes[name] if name in extremes else getattr(self, name)
-
-        return dataset_parts(self.case, self.modes, self.times, self.bodies, value)
+        return dataset_parts(
+            self.case, self.modes, self.times, self.bodies, lambda name: getattr(self, name)
+        )
 
     def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units; `record_from_xarray` restores the record exactly."""

@@ -99,3 +99,22 @@ def test_record_has_amplification_where_the_static_deflection_is_known():
     free = dataclasses.replace(case, beam=dataclasses.replace(case.beam, ends="free-free"))
     free = dataclasses.replace(free, sensors=sensors[:1])
     assert record_amplification(jb.simulate(free)) == [None]
+
+
+def test_envelope_of_moments_against_the_record_and_amplification_of_a_slow_force():
+    case = crossing(0.5, modes=3)
+    positions, x = np.array([0.15, 0.3]), 0.3
+    slow = envelope(case, positions, quantity="moment")
+    static = FORCE * positions * (LENGTH - positions) / LENGTH
+    assert_allclose(slow.highest, static, rtol=0.02)
+    found = amplification(case, positions, quantity="moment")
+    assert_allclose(found, np.asarray(slow.highest) / static, rtol=1e-9)
+    stress = amplification(case, positions, quantity="stress", section_modulus=-2.0)
+    assert_allclose(stress, found, rtol=1e-9)
+    fast = crossing(4.0, modes=3)
+    record = jb.simulate(fast, np.linspace(0.0, float(fast.run.duration), 4001))
+    moments = np.asarray(record.bending_moment(x))
+    low, high = envelope(fast, [x], quantity="moment")
+    assert_allclose([low[0], high[0]], [moments.min(), moments.max()], rtol=1e-3)
+    with pytest.raises(ValueError, match="no amplification of 'shear'"):
+        amplification(fast, [x], quantity="shear")

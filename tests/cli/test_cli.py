@@ -224,6 +224,26 @@ def test_modes_as_a_table(run, folder):
     np.testing.assert_allclose(table[:, 2], 0.03, rtol=1e-9)
 
 
+def test_assess_cites_clauses(run, refused, folder):
+    line = "assess case.toml --line-speed 30 --code en1991-2"
+    assert "EN 1991-2, annex C" in run(f"{line} -o report.md")
+    assert (folder / "report.md").read_text().startswith("# one span, one ball")
+    found = run(f"{line} --json")
+    assert found["checks"][1]["outcome"] == "required"  # 15 Hz at 0.6 m: below 80 / 0.6
+    assert "track cannot be 'gravel'" in refused(f"{line} --track gravel")
+
+
+def test_influence_lines_as_a_table(run, refused, folder):
+    printed = run("influence case.toml -o lines.csv --plot")
+    assert "moment at midspan 1" in printed and (folder / "lines.png").exists()
+    heads, *rows = (folder / "lines.csv").read_text().splitlines()
+    assert heads.split(",")[1] == "moment at midspan 1 (m)"
+    assert max(float(row.split(",")[1]) for row in rows) == pytest.approx(0.6 / 4)
+    found = run("influence case.toml --quantity shear --at 150mm --json")
+    assert max(found["shear at quarter 1 (1)"]) == pytest.approx(0.75, abs=0.02)
+    assert "did you mean 'reaction'" in refused("influence case.toml --quantity reactions")
+
+
 def test_an_accelerometer_is_not_reported_as_deflection(run):
     line = "case.toml --set sensors.1.quantity=acceleration --set sensors.1.name=deck"
     found = run(f"simulate {line} --json")

@@ -77,7 +77,7 @@ def sweep(
     for option, is_given in (("--resume", resume), ("--scheduler", bool(scheduler))):
         refuse_option(
             is_given and store is None,
-            f"{option} needs a store, written block by block: -o OUT.zarr",
+            f"{option} needs a store of blocks: -o OUT.zarr",
         )
     picture = pictures.path(plot, output, case.with_stem(f"{case.stem}_sweep"))
     refuse_option(
@@ -189,14 +189,14 @@ def _contact_lines(results: "xarray.Dataset", addresses: Sequence[str]) -> list[
 
 
 def native(*, remove: bool = False, options: PrintOptions = PrintOptions()) -> None:
-    """Compile the C code for this machine, once; sweeps of peaks use it from then on.
+    """Compile the C code of sweeps now, or say why that fails.
 
-    Needs a C compiler.
+    The first sweep of a thousand runs or more does so by itself where there is a C compiler.
 
     Parameters
     ----------
     remove
-        Remove the compiled code; sweeps use XLA again.
+        Remove the compiled code; sweeps use XLA until this command compiles it again.
     """
     from jaxbeam.integrator import native_peaks
 
