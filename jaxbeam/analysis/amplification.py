@@ -3,7 +3,6 @@
 import dataclasses
 from typing import NamedTuple
 
-import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
@@ -11,28 +10,18 @@ from jaxbeam.case.declared_checks import check_on_beam, suggestion
 from jaxbeam.case.quantities import QUANTITIES, quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.integrate import integrate_peaks
-<<<<<<< HEAD
-from jaxbeam.model.load_set import load_set
-=======
 from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.sensing.output_rows import beside, quantity_factor
->>>>>>> main
 from jaxbeam.model.statics import static_peak
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
-from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import integration_setup
 
-<<<<<<< HEAD
-MAX_WHEELS = 120  # of a record with amplification, as its static peaks take about 6 ms a wheel
-NEGLIGIBLE = 1e-6  # share of the largest static peak below which one is that of a support
-=======
 # Quantities whose static value is continuous in the position of a load.
 AMPLIFIED = tuple(
     name for name, entry in QUANTITIES.items() if not entry.time_derivative and entry.field < 3
 )
->>>>>>> main
 
 
 class Envelope(NamedTuple):
@@ -124,43 +113,26 @@ def amplification(
     >>> print(f"{jb.amplification(case, x=[0.3], quantity='moment')[0]:.2f}")
     1.05
     """
-<<<<<<< HEAD
-    lowest, highest = envelope(case, x, tolerance)
-    return xp.maximum(-lowest, highest) / static_peak(case, xp.asarray(x, float))
-
-
-def record_amplification(record: Record) -> list[float | None]:
-    """Dynamic amplification at each sensor of a record: peak over static peak of deflection.
-
-    None at sensors of other quantities or where the static deflection vanishes, with a controller,
-    for more wheels than MAX_WHEELS, and for beams whose static deflections are not known (see
-    `static_peak`).
-    """
-    case = record.case
-    nothing: list[float | None] = [None] * len(case.sensors)
-    wheels = load_set(case).wheel_count
-    if case.controller is not None or not 0 < wheels <= MAX_WHEELS or not case.sensors:
-        return nothing
-    try:
-        static = np.asarray(static_peak(case, case.sensor_positions))
-    except ValueError:
-        return nothing
-    known = static > NEGLIGIBLE * np.max(static)
-    columns = zip(case.sensors, record.peak_deflection, static, known, strict=True)
-    return [
-        float(peak / size) if is_known and sensor.quantity == "deflection" else None
-        for sensor, peak, size, is_known in columns
-    ]
-=======
     parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
     if quantity not in AMPLIFIED:
         raise ValueError(f"no amplification of {quantity!r}; {suggestion(quantity, AMPLIFIED)}")
-    entry = quantity_of(quantity, **parameters)
+    quantity_of(quantity, **parameters)
     lowest, highest = envelope(case, x, tolerance, quantity=quantity, **parameters)
+    return xp.maximum(-lowest, highest) / static_amplified(case, x, quantity, **parameters)
+
+
+def static_amplified(
+    case: Case, x, quantity: str = "deflection", fibre_distance=None, section_modulus=None
+) -> Float[Array, " position"]:
+    """Largest absolute static value of a quantity at positions x (m), in its unit.
+
+    The denominator of `amplification`, which says what it is and which quantities have one.
+    Raises ValueError as it does.
+    """
+    parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
+    entry = quantity_of(quantity, **parameters)
     x = xp.asarray(x, float)
     order = 1 if entry.of_axis and is_uniform(case) else entry.field
     at = beside(case, x) if entry.bends else x
     static = static_peak(case, at, derivative=order)
-    static = xp.abs(quantity_factor(case, at, entry, fibre_distance, section_modulus)) * static
-    return xp.maximum(-lowest, highest) / static
->>>>>>> main
+    return xp.abs(quantity_factor(case, at, entry, fibre_distance, section_modulus)) * static

@@ -7,7 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.amplification import amplification, envelope, record_amplification
+from jaxbeam.analysis.amplification import amplification, envelope
+from jaxbeam.analysis.record_amplification import record_amplification
 
 LENGTH, RIGIDITY, DENSITY, FORCE = 0.6, 11.68, 0.535, 5.0
 POSITIONS = np.array([0.15, 0.3, 0.4])
@@ -91,10 +92,11 @@ def test_amplification_of_slow_and_fast_forces():
 
 def test_record_has_amplification_where_the_static_deflection_is_known():
     """At sensors of deflection, but not over a support, nor with rigid-body modes or control."""
-    sensors = [jb.Sensor(0.3), jb.Sensor(0.6), jb.Sensor(0.2, "moment")]
+    sensors = [jb.Sensor(0.3), jb.Sensor(0.6), jb.Sensor(0.2, "velocity"), jb.Sensor(0.3, "moment")]
     case = dataclasses.replace(crossing(2.0), sensors=sensors)
-    at_sensor, *others = record_amplification(jb.simulate(case))
+    at_sensor, *others, moment = record_amplification(jb.simulate(case))
     assert_allclose(at_sensor, amplification(case, [0.3])[0], rtol=1e-6)
+    assert_allclose(moment, amplification(case, [0.3], quantity="moment")[0], rtol=1e-4)
     assert others == [None, None]
     free = dataclasses.replace(case, beam=dataclasses.replace(case.beam, ends="free-free"))
     free = dataclasses.replace(free, sensors=sensors[:1])
