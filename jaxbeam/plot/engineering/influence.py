@@ -3,19 +3,33 @@
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.analysis.sections.influence_table import InfluenceTable
 from jaxbeam.case.case import Case
 from jaxbeam.plot.schematic import draw_schematic
-from jaxbeam.plot.style import COLOURS, GREY, axis_label, set_title, unit_scale, use_style
+from jaxbeam.plot.style import (
+    COLOURS,
+    GREY,
+    axis_label,
+    drawing_area,
+    set_title,
+    unit_scale,
+    use_style,
+)
 
 
 @use_style
-def plot_influence(case: Case, lines: InfluenceTable) -> Figure:
-    """Schematic of the case, and its influence lines with axes for each quantity."""
+def plot_influence(
+    case: Case, lines: InfluenceTable, *, ax: Axes | None = None, title: str | None = None
+) -> Figure | SubFigure:
+    """Schematic of the case, and its influence lines with axes for each quantity.
+
+    The figure takes the place of `ax`; its title is that of the case if left out.
+    """
     quantities: Sequence[str] = list(dict.fromkeys(lines.quantities))
-    figure = Figure(figsize=(8, 1.0 + 2.4 * len(quantities)))
+    figure = drawing_area(ax, (8, 1.0 + 2.4 * len(quantities)))
     ratios = [0.7, *(2.4 for _ in quantities)]
     top, *axes = np.atleast_1d(figure.subplots(len(ratios), 1, height_ratios=ratios))
     draw_schematic(top, case)
@@ -30,5 +44,5 @@ def plot_influence(case: Case, lines: InfluenceTable) -> Figure:
         one.set(xlim=top.get_xlim(), ylabel=axis_label(quantity, unit))
         one.legend(loc="best", fontsize=8)
     axes[-1].set_xlabel("position of a load of 1 N (m)")
-    set_title(figure, case.title)
+    set_title(figure, title, case.title)
     return figure
