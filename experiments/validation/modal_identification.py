@@ -26,7 +26,7 @@ MIN_ENERGY = 0.05  # energy share of the modes that must be found
 DURATION = 300.0  # s
 
 
-class Comparison(NamedTuple):
+class PlantedComparison(NamedTuple):
     """Identified modes against planted ones.
 
     `covered` tells, for each identified mode that is one of the structure, whether its intervals of
@@ -54,7 +54,7 @@ def log_of(planted: Planted) -> Log:
     )
 
 
-def compare(fit: ModalFit, planted: Planted) -> Comparison:
+def compare(fit: ModalFit, planted: Planted) -> PlantedComparison:
     """Pairs of identified and planted modes, each used once, the nearest poles first."""
     structure = planted.structure
     poles = 2 * np.pi * fit.frequencies * (-fit.damping_ratios + 1j)
@@ -74,7 +74,7 @@ def compare(fit: ModalFit, planted: Planted) -> Comparison:
         errors.append([fit.frequencies[mine] / f - 1, fit.damping_ratios[mine] / z - 1])
     strong = np.flatnonzero(planted.energies > MIN_ENERGY)
     seen = [int(k) in pairs.values() for k in strong]
-    return Comparison(
+    return PlantedComparison(
         np.array(covered, float).reshape(-1, 2),
         np.array(errors, float).reshape(-1, 2),
         tuple(f for i, f in enumerate(fit.frequencies.tolist()) if i not in pairs),
@@ -83,8 +83,8 @@ def compare(fit: ModalFit, planted: Planted) -> Comparison:
     )
 
 
-def assess(kind: str, seeds: Iterable[int], duration: float = DURATION) -> list[Comparison]:
-    """Comparison for each seed, printed as it comes."""
+def assess(kind: str, seeds: Iterable[int], duration: float = DURATION) -> list[PlantedComparison]:
+    """PlantedComparison for each seed, printed as it comes."""
     found = []
     for seed in seeds:
         planted = sampled(random_structure(seed), kind, seed, duration)
@@ -100,7 +100,7 @@ def assess(kind: str, seeds: Iterable[int], duration: float = DURATION) -> list[
     return found
 
 
-def summary(found: list[Comparison]) -> str:
+def summary(found: list[PlantedComparison]) -> str:
     """Shares over all seeds, and quantiles of the errors."""
     covered = np.concatenate([one.covered for one in found])
     errors = np.abs(np.concatenate([one.errors for one in found]))

@@ -16,6 +16,7 @@ from jaxbeam.cli.commands.export import export
 from jaxbeam.cli.commands.frequency import frf, modes
 from jaxbeam.cli.commands.identify import identify
 from jaxbeam.cli.commands.models import compare_models, design_experiment
+from jaxbeam.cli.commands.modes_from_log import modes_from_log
 from jaxbeam.cli.commands.new import new
 from jaxbeam.cli.commands.simulate import simulate
 from jaxbeam.cli.commands.stability import stability
@@ -28,7 +29,14 @@ from jaxbeam.cli.options import print_message
 COMMANDS = {
     "Simulation": (new, check, describe, modes, frf, simulate, sweep),
     "Control": (compare, stability, tune, export),
-    "Identification": (identify, identify_responses, weigh, compare_models, design_experiment),
+    "Identification": (
+        identify,
+        modes_from_log,
+        identify_responses,
+        weigh,
+        compare_models,
+        design_experiment,
+    ),
     "Other": (demo, reproduce, native),
 }
 

@@ -82,6 +82,8 @@ def _modes_of_band(prepared: Prepared, whole, data_driven, order):
     records = tuple(record / scale for record in prepared.records)
     channels, longest = records[0].shape[1], max(map(len, records))
     rows = block_rows(prepared.rate, prepared.band[0], channels, longest)
+    if order is not None:
+        rows = max(rows, order // channels + 1)
     subspace = decompose(records, prepared.rate, rows, data_driven)
     highest = order or min(MAX_ORDER, 2 * rows * channels // 3)
     parts = [poles_of_order(subspace, n) for n in range(2, highest + 1, 2)]
