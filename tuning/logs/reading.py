@@ -10,6 +10,7 @@ A TOML file of the same stem beside a log describes it (all entries are optional
     t = "ms"
     d1 = { unit = "mm", sensor = 0, position = 0.3 }  # index of the sensor in the case
     a1 = { unit = "V", sensitivity = "100 mV/g" }     # output of a transducer
+    a2 = { unit = "g", vehicle_sensor = 0 }           # index of the vehicle sensor in the case
     u = { unit = "V", actuator = 0 }                  # command to an actuator of the case
     [[loads]]                                         # as in a case file
     kind = "mass"
@@ -180,6 +181,7 @@ def _make_log(
         sensors=tuple(description.sensor(name) for name in channels),
         positions=tuple(description.position(name) for name in channels),
         actuators=tuple(description.actuator(name) for name in channels),
+        vehicle_sensors=tuple(description.vehicle_sensor(name) for name in channels),
         loads=description.loads_of(run),
         valid=valid[:, 1:],
         notes=tuple(notes),

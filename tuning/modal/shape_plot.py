@@ -9,8 +9,8 @@ def draw_shapes(axes, fit, length: float | None = None) -> None:
     """Draw the shapes of a `ModalFit` over the positions of its sensors (m), and the MAC matrix.
 
     Without positions they are drawn over the channels. Bars are 95 % intervals of real parts;
-    hollow markers are imaginary parts, which vanish for a shape without complexity. `length` (m) is that
-    of the beam.
+    hollow markers are imaginary parts, which vanish for a shape without complexity. `length` is
+    that of the beam (m).
     """
     axes.set_axis_off()
     left, right = axes.inset_axes([0.0, 0.1, 0.66, 0.9]), axes.inset_axes([0.76, 0.1, 0.24, 0.9])
