@@ -16,6 +16,7 @@ from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.aliases import current_address
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.display.parts import ReprWithUnits, case_text
 from jaxbeam.case.fields import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -35,7 +36,7 @@ from jaxbeam.case.sensors import Sensor
 from jaxbeam.runtime.arrays import Array, set_at, xp
 
 
-class Run(eqx.Module):
+class Run(ReprWithUnits, eqx.Module):
     """Duration of a run, sampling rate of its record, gravity, and seed of the sensor noise."""
 
     duration: Float[Array, ""] = number("s", "simulated time, from 0", POSITIVE)
@@ -91,6 +92,9 @@ class Case(eqx.Module):
         self.controller = controller
         self.run = Run(duration=1.0) if run is None else run
         self.title = title
+
+    def __repr__(self) -> str:
+        return case_text(self)
 
     @property
     def sensor_positions(self) -> Float[Array, " sensor"]:

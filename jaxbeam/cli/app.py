@@ -12,11 +12,14 @@ from cyclopts import App, CycloptsError, Group, Parameter
 from jaxbeam.cli.commands.check import check
 from jaxbeam.cli.commands.compare import compare
 from jaxbeam.cli.commands.describe import describe
+from jaxbeam.cli.commands.engineering.assess import assess
+from jaxbeam.cli.commands.engineering.influence import influence
 from jaxbeam.cli.commands.export import export
 from jaxbeam.cli.commands.frequency import frf, modes
 from jaxbeam.cli.commands.identify import identify
 from jaxbeam.cli.commands.models import compare_models, design_experiment
 from jaxbeam.cli.commands.new import new
+from jaxbeam.cli.commands.schema import schema
 from jaxbeam.cli.commands.simulate import simulate
 from jaxbeam.cli.commands.stability import stability
 from jaxbeam.cli.commands.sweep import native, sweep
@@ -27,9 +30,10 @@ from jaxbeam.cli.options import print_message
 
 COMMANDS = {
     "Simulation": (new, check, describe, modes, frf, simulate, sweep),
+    "Engineering": (assess, influence),
     "Control": (compare, stability, tune, export),
     "Identification": (identify, identify_responses, weigh, compare_models, design_experiment),
-    "Other": (demo, reproduce, native),
+    "Other": (demo, reproduce, schema, native),
 }
 
 # Old words work for one release, with a warning that names the new one.

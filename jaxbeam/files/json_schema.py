@@ -1,0 +1,110 @@
+"""JSON Schema of case files, with which editors complete and check TOML."""
+
+import dataclasses
+from typing import Any
+
+from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, axis_names
+from jaxbeam.case.profiles.table import TableProfile
+from jaxbeam.case.quantities import OF_QUANTITY
+from jaxbeam.files.declared_keys import Key, table_classes, table_keys, tables
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON Schema (2020-12) of a case file, from the declarations of its fields.
+
+    Numbers may be texts with units, as "25 m". What relates several keys, as that loads need a
+    speed or a table of times, is left to `load_case`.
+
+    >>> schema = json_schema()
+    >>> schema["properties"]["beam"]["properties"]["length"]["description"]
+    'total length (m)'
+    """
+    definitions: dict[str, Any] = {}
+    properties: dict[str, Any] = {"title": {"type": "string", "description": "title of the case"}}
+    for name, (part_class, listed) in tables().items():
+        table = _table(part_class, definitions)
+        properties[name] = {"type": "array", "items": table} if listed else table
+    return {
+        "$schema": DIALECT,
+        "title": "Case file of jaxbeam",
+        "type": "object",
+        "additionalProperties": False,
+        "required": ["beam"],
+        "properties": properties,
+        "$defs": definitions,
+    }
+
+
+def _table(part_class: type, definitions: dict[str, Any]) -> dict[str, Any]:
+    """Schema of a table: one of those of its kinds, which are definitions."""
+    classes = table_classes(part_class)
+    if "" in classes:
+        return _of_class(classes[""], "", definitions)
+    choices = []
+    for kind, each in classes.items():
+        name = f"{part_class.__name__.removeprefix('Abstract').lower()}-{kind}"
+        if name not in definitions:
+            definitions[name] = {}  # of a table within itself
+            definitions[name] = _of_class(each, kind, definitions)
+        condition = {"properties": {"kind": {"const": kind}}, "required": ["kind"]}
+        choices.append({"if": condition, "then": {"$ref": f"#/$defs/{name}"}})
+    return {
+        "type": "object",
+        "required": ["kind"],
+        "properties": {"kind": {"enum": list(classes)}},
+        "allOf": choices,
+    }
+
+
+def _of_class(part_class: type, kind: str, definitions: dict[str, Any]) -> dict[str, Any]:
+    keys = table_keys(part_class)
+    properties: dict[str, Any] = {"kind": {"const": kind}} if kind else {}
+    properties |= {key.name: _value(key, definitions) for key in keys}
+    required = [key.name for key in keys if key.default is dataclasses.MISSING]
+    if part_class is TableProfile:  # the points may be in a file of their own
+        properties["file"] = {"type": "string", "description": "file of positions and heights"}
+        required = []
+    return {
+        "type": "object",
+        "description": (part_class.__doc__ or "").strip().split("\n\n")[0],
+        "additionalProperties": False,
+        "properties": properties,
+        "required": ["kind"] * bool(kind) + required,
+    }
+
+
+def _value(key: Key, definitions: dict[str, Any]) -> dict[str, Any]:
+    """Schema of the value of a key."""
+    if key.part_class is not None:
+        table = _table(key.part_class, definitions)
+        return {"type": "array", "items": table} if key.listed else table
+    unit = "" if key.unit in ("", "1") else f" ({key.unit})"
+    value: dict[str, Any] = {"description": key.meaning + unit.replace(OF_QUANTITY, "its unit")}
+    if key.is_number:
+        value |= _number(key)
+    elif key.is_count:
+        value |= {"type": "integer", "minimum": key.field.metadata["minimum"]}
+    else:
+        value |= {"enum": [*key.words]} if key.words else {"type": "string"}
+    if not (key.default is dataclasses.MISSING or key.default in (None, "")):
+        value["default"] = key.default
+    return value
+
+
+def _number(key: Key) -> dict[str, Any]:
+    """Schema of one number, of a list or of a list of lists, by the axes of the declaration."""
+    one: dict[str, Any] = {"type": ["number", "string"]}
+    if key.constraint == POSITIVE:
+        one["exclusiveMinimum"] = 0
+    elif key.constraint == NOT_NEGATIVE:
+        one["minimum"] = 0
+    axes = axis_names(key.field).split()
+    if axes and axes[0].startswith("*"):
+        return {"anyOf": [one, {"type": "array", "items": one}]}
+    for axis in reversed(axes):
+        one = {"type": "array", "items": one}
+        if axis.isdigit():
+            one |= {"minItems": int(axis), "maxItems": int(axis)}
+    return one
