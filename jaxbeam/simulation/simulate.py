@@ -75,7 +75,7 @@ def simulate(
         case, dataclasses.replace(plan, error=0.0), times, xp.asarray(plan.error)
     )
     if is_concrete(record.contact_lost_time):
-        lost = np.isfinite(concrete(record.contact_lost_time))
+        lost = np.isfinite(concrete(record.contact_lost_time)) & ~load_set(case).prescribed
         if lost.any() and np.isnan(concrete(record.diverged_time)):
             warnings.warn(record.verdict, ContactLossWarning, stacklevel=2)
     return record
