@@ -3,6 +3,8 @@ from .analysis.amplification import (
     amplification as amplification,
     envelope as envelope,
 )
+from .analysis.assessment.assess import assess as assess
+from .analysis.assessment.assessment import Assessment as Assessment, CodeCheck as CodeCheck
 from .analysis.bound.bound import bound as bound
 from .analysis.plausibility import check as check
 from .analysis.plausible_numbers import Plausibility as Plausibility
@@ -15,6 +17,7 @@ from .analysis.ride import (
     weighted_rms as weighted_rms,
     wheel_unloading as wheel_unloading,
 )
+from .analysis.sections.characteristic_points import characteristic_points as characteristic_points
 from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
 from .case.actuators.patch import Patch as Patch
 from .case.actuators.point import PointForce as PointForce
@@ -38,6 +41,7 @@ from .case.loads.planar.parts import (
     VehicleHinge as VehicleHinge,
     VehicleSpring as VehicleSpring,
 )
+from .case.loads.planar.sensors import VehicleSensor as VehicleSensor
 from .case.loads.quarter_car import QuarterCar as QuarterCar
 from .case.loads.varying_force import VaryingForce as VaryingForce
 from .case.loads.vehicle import VehicleLoad as VehicleLoad
@@ -92,18 +96,20 @@ from .estimation.kalman import Kalman as Kalman
 from .estimation.observer import Observer as Observer
 from .files.case_file import load_case as load_case, save_case as save_case
 from .files.profile_file import profile_from_file as profile_from_file
+from .files.sweep_table import sweep_columns as sweep_columns
+from .files.tables import save as save
 from .model.frequency_response import (
     accelerance as accelerance,
     frequency_response as frequency_response,
     mobility as mobility,
     receptance as receptance,
 )
+from .model.influence import influence_line as influence_line
 from .model.modes import modes as modes
 from .model.settlement import settlement_response as settlement_response
 from .model.state_space import state_space as state_space
 from .model.static_correction import bending_moment as bending_moment, shear_force as shear_force
 from .model.statics import (
-    influence_line as influence_line,
     static_deflection as static_deflection,
     static_peak as static_peak,
 )

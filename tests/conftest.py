@@ -30,7 +30,7 @@ if importlib.metadata.version("jaxlib").startswith(("0.10.", "0.11.0")):
     os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
 # Compiled programs are shared by all test processes, later files, and commands that tests start:
 # they use one folder, set before the test processes start. It is also their cache folder, so that
-# a library which a user compiled by `jaxbeam native` changes no test.
+# what a user compiled changes no test.
 if "PYTEST_XDIST_WORKER" not in os.environ:
     _cache = tempfile.TemporaryDirectory(prefix="compiled", ignore_cleanup_errors=True)
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _cache.name)
@@ -41,6 +41,8 @@ os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 import hypothesis
 import pytest
 
+from tests.fuzzing import FACTOR
+
 # Tracing makes millions of small objects that live long: with Python's own thresholds, garbage
 # collection takes up to a tenth of the time and frees next to nothing.
 gc.set_threshold(100_000, 20, 100)
@@ -49,7 +51,7 @@ gc.set_threshold(100_000, 20, 100)
 # the first example includes compiling. No database: it would only hold the same examples.
 hypothesis.settings.register_profile(
     "jaxbeam",
-    derandomize=True,
+    derandomize=FACTOR == 1,
     deadline=None,
     database=None,
     print_blob=False,

@@ -11,7 +11,8 @@ import pytest
 from tests.modules import PACKAGES, module_files, parse
 
 # A package imports only those in lines above its own. A name stands for all modules within it that
-# no longer name here covers.
+# no longer name here covers. One import may point down: methods of results that are called `plot`
+# or `plot_...` forward to `jaxbeam.plot`.
 ORDER = """
 jaxbeam.runtime  jaxbeam.vehicles
 jaxbeam.case
@@ -21,7 +22,7 @@ jaxbeam.integrator  jaxbeam.estimation
 jaxbeam.control
 jaxbeam.files
 jaxbeam.rigs  jaxbeam.simulation
-jaxbeam.sweeps
+jaxbeam.sweeps  jaxbeam.c_code
 jaxbeam.analysis
 jaxbeam.plot
 jaxbeam
@@ -60,9 +61,23 @@ def package(module: str) -> str:
     return entry
 
 
+def plot_methods(tree: ast.AST) -> Iterator[ast.FunctionDef]:
+    """Methods of classes called `plot` or `plot_...`."""
+    for owner in ast.walk(tree):
+        for node in owner.body if isinstance(owner, ast.ClassDef) else ():
+            if isinstance(node, ast.FunctionDef) and node.name.split("_")[0] == "plot":
+                yield node
+
+
 def imported(tree: ast.AST, files: Mapping[str, object]) -> Iterator[tuple[str, int]]:
-    """Modules of PACKAGES that a syntax tree imports, anywhere in it, and the line numbers."""
+    """Modules of PACKAGES that a syntax tree imports, anywhere in it, and the line numbers.
+
+    Without those of methods that forward to `jaxbeam.plot`.
+    """
+    forwarding = {id(node) for method in plot_methods(tree) for node in ast.walk(method)}
     for node in ast.walk(tree):
+        if id(node) in forwarding and getattr(node, "module", "") == "jaxbeam.plot":
+            continue
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -121,6 +136,18 @@ def test_violations_and_circles_are_found():
     code = "if TYPE_CHECKING:\n    from jaxbeam.model.modes import Modes\n"
     assert {name for name, _ in imported(ast.parse(code), FILES)} == {"jaxbeam.model.modes"}
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}})
+
+
+def test_only_methods_called_plot_may_forward_to_figures():
+    code = "class Result:\n    def {}(self):\n        from {} import plot_record\n"
+    for name, package_name, found in (
+        ("plot", "jaxbeam.plot", set()),
+        ("plot_envelope", "jaxbeam.plot", set()),
+        ("draw", "jaxbeam.plot", {"jaxbeam.plot.__init__"}),
+        ("plot", "jaxbeam.sweeps", {"jaxbeam.sweeps.__init__"}),
+    ):
+        tree = ast.parse(code.format(name, package_name))
+        assert {module for module, _ in imported(tree, FILES)} == found
 
 
 @pytest.mark.parametrize("folder", sorted({path.parent for path in FILES.values()}))

@@ -20,6 +20,8 @@ from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import max_stable_step
 from jaxbeam.integrator.propagators import propagators
+from jaxbeam.integrator.static_shapes import static_shapes
+from jaxbeam.integrator.step_size import run_peaks
 from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.contact import contact_at
 from jaxbeam.model.flexibility import flexibility
@@ -29,12 +31,7 @@ from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.statics import static_deflection_per_command
 from jaxbeam.runtime.arrays import any_jax
-from jaxbeam.simulation.integration_plan import (
-    integration_plan,
-    run_peaks,
-    sample_times,
-    static_shapes,
-)
+from jaxbeam.simulation.integration_plan import integration_plan, sample_times
 
 TOLERANCE = 1e-11  # relative to the largest entry of each array
 # Where a curve is flat, its values differ by the square of a difference in time.

@@ -13,6 +13,7 @@ from jaxbeam.case.case import Run
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.estimator import AbstractEstimator
 from jaxbeam.case.loads.base import AbstractLoad
+from jaxbeam.case.loads.planar.sensors import VehicleSensor
 from jaxbeam.case.profiles.base import AbstractProfile
 from jaxbeam.case.sensors import Sensor
 from tests.modules import ROOT
@@ -22,6 +23,7 @@ PARTS = {
     "supports": Support,
     "actuators": AbstractActuator,
     "sensors": Sensor,
+    "vehicle_sensors": VehicleSensor,
     "loads": AbstractLoad,
     "profile": AbstractProfile,
     "controller": AbstractController,

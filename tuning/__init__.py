@@ -26,10 +26,12 @@ from tuning.fit.report import write_report
 from tuning.fit.storage import load_fit, save_fit
 from tuning.fit.uncertainty.posterior import sample
 from tuning.fit.uncertainty.profile import profile
+from tuning.logs.alignment import align_logs
 from tuning.logs.log import Log
 from tuning.logs.quality import find_faults, mask
 from tuning.logs.reading import read_log, read_logs
-from tuning.modal.identify_modes import ModalFit, identify_modes
+from tuning.modal.fit import ModalFit
+from tuning.modal.identify_modes import identify_modes
 from tuning.parameters.prior import Prior
 from tuning.weighing.weigh import weigh
 
@@ -43,6 +45,7 @@ __all__ = [
     "Responses",
     "StabilityConstraint",
     "TuningResult",
+    "align_logs",
     "compare_fits",
     "cross_validate",
     "design_experiment",

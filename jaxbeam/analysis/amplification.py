@@ -1,4 +1,4 @@
-"""Deflection envelopes along the beam, and dynamic amplification over static loading."""
+"""Envelopes along the beam, and dynamic amplification over static loading, of any quantity."""
 
 import dataclasses
 from typing import NamedTuple
@@ -6,30 +6,52 @@ from typing import NamedTuple
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.declared_checks import check_on_beam
-from jaxbeam.integrator.discrete_model import signed_both_ways
+from jaxbeam.case.declared_checks import check_on_beam, suggestion
+from jaxbeam.case.quantities import QUANTITIES, quantity_of
+from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.integrate import integrate_peaks
+from jaxbeam.model.layout import is_uniform
+from jaxbeam.model.sensing.output_rows import beside, quantity_factor
 from jaxbeam.model.statics import static_peak
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
 from jaxbeam.simulation.simulate import integration_setup
 
+# Quantities whose static value is continuous in the position of a load.
+AMPLIFIED = tuple(
+    name for name, entry in QUANTITIES.items() if not entry.time_derivative and entry.field < 3
+)
+
 
 class Envelope(NamedTuple):
-    """Lowest and highest deflection (m) at given positions: at most zero, and at least zero."""
+    """Lowest and highest value of a quantity at given positions: at most zero, and at least zero.
+
+    In m for deflections.
+    """
 
     lowest: Float[Array, " position"]
     highest: Float[Array, " position"]
 
 
-def envelope(case: Case, x, tolerance: float = TOLERANCE) -> Envelope:
-    """Lowest and highest deflection (m) at positions x (m) during a run, between samples too.
+def envelope(
+    case: Case,
+    x,
+    tolerance: float = TOLERANCE,
+    *,
+    quantity: str = "deflection",
+    fibre_distance=None,
+    section_modulus=None,
+) -> Envelope:
+    """Lowest and highest value of a quantity at positions x (m) during a run, between samples too.
 
-    Free vibration and control are included; histories are not stored. The beam starts at rest, so
-    zero is always among the deflections. `tolerance` is relative to the largest deflection. Raises
-    ValueError for an invalid case or positions off the beam, RuntimeError if no time step meets
-    the tolerance.
+    By default the deflection in m; other quantities are those of sensors, in their units, moments
+    and the like statically corrected. Free vibration and control are included; histories are not
+    stored. The beam starts at rest, so zero is always among the values. `tolerance` is relative to
+    the largest deflection. Strain needs `fibre_distance` (m), stress `section_modulus` (m^3).
+
+    Raises ValueError for an invalid case, positions off the beam, an unknown quantity or one whose
+    parameter is missing, RuntimeError if no time step meets the tolerance.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -40,17 +62,20 @@ def envelope(case: Case, x, tolerance: float = TOLERANCE) -> Envelope:
     >>> print(f"{1e3 * low[0]:.2f} mm")
     -2.00 mm
     """
+    quantity_of(quantity, fibre_distance, section_modulus)
     x = xp.asarray(x, float)
     plan = integration_plan(case, tolerance=tolerance)
     check_on_beam("x", x, case.beam.length)
+    parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
+    sensors = tuple(Sensor(one, quantity, **parameters) for one in x)
     calculate = _open_loop_envelope if case.controller is None else _closed_loop_envelope
-    return calculate(case, dataclasses.replace(plan, error=0.0), sample_times(case), x)
+    return calculate(case, dataclasses.replace(plan, error=0.0), sample_times(case), sensors)
 
 
-def _envelope(case, plan, times, x):
-    discrete, loads, policy, *_ = integration_setup(case, plan, times, x)
+def _envelope(case, plan, times, sensors):
+    discrete, loads, policy, *_ = integration_setup(case, plan, times, sensors)
     running_peaks, _ = integrate_peaks(
-        signed_both_ways(discrete), loads, max_loads=plan.shapes.max_loads, policy=policy
+        discrete, loads, max_loads=plan.shapes.max_loads, policy=policy
     )
     highest, lowest = xp.split(running_peaks.refined_peak()[0][:, 0], 2)
     return Envelope(-lowest, highest)
@@ -60,13 +85,23 @@ _open_loop_envelope = compiled_if_traced(_envelope)
 _closed_loop_envelope = compiled(_envelope)
 
 
-def amplification(case: Case, x, tolerance: float = TOLERANCE) -> Float[Array, " position"]:
-    """Dynamic amplification at positions x (m): largest dynamic over largest static deflection.
+def amplification(
+    case: Case,
+    x,
+    tolerance: float = TOLERANCE,
+    *,
+    quantity: str = "deflection",
+    fibre_distance=None,
+    section_modulus=None,
+) -> Float[Array, " position"]:
+    """Dynamic amplification at positions x (m): largest dynamic over largest static value.
 
-    The static deflection is that of the same loads without inertia of beam and loads, exact (see
-    `static_peak`). The dynamic one has the modes of the case only, so with few modes the ratio of
-    a slow crossing is slightly below one. Raises as `envelope`, and ValueError for a beam that can
-    move as a rigid body.
+    By default of the deflection; `quantity` may be rotation, slope, curvature, strain, moment or
+    stress, as in `envelope`. The static value is that of the same loads without inertia of beam and
+    loads, exact (see `static_peak`). The dynamic deflection has the modes of the case only, so with
+    few modes the ratio of a slow crossing is slightly below one; moments and the like are
+    statically corrected. Raises as `envelope`, and ValueError for a beam that can move as a rigid
+    body, or a quantity without a continuous static value.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -75,6 +110,17 @@ def amplification(case: Case, x, tolerance: float = TOLERANCE) -> Float[Array, "
     ... )
     >>> print(f"{jb.amplification(case, x=[0.3])[0]:.2f}")
     1.06
+    >>> print(f"{jb.amplification(case, x=[0.3], quantity='moment')[0]:.2f}")
+    1.05
     """
-    lowest, highest = envelope(case, x, tolerance)
-    return xp.maximum(-lowest, highest) / static_peak(case, xp.asarray(x, float))
+    parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
+    if quantity not in AMPLIFIED:
+        raise ValueError(f"no amplification of {quantity!r}; {suggestion(quantity, AMPLIFIED)}")
+    entry = quantity_of(quantity, **parameters)
+    lowest, highest = envelope(case, x, tolerance, quantity=quantity, **parameters)
+    x = xp.asarray(x, float)
+    order = 1 if entry.of_axis and is_uniform(case) else entry.field
+    at = beside(case, x) if entry.bends else x
+    static = static_peak(case, at, derivative=order)
+    static = xp.abs(quantity_factor(case, at, entry, fibre_distance, section_modulus)) * static
+    return xp.maximum(-lowest, highest) / static

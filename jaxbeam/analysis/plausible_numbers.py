@@ -6,9 +6,9 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.trajectory import NEVER
+from jaxbeam.model.influence import held_positions
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modes import Modes
 
@@ -83,16 +83,8 @@ def plausible_numbers(case: Case, found: Modes) -> Plausibility:
     )
 
 
-def _held_positions(case: Case) -> list[float]:
-    """Positions (m) at which an end or a support holds the deflection."""
-    length = float(case.beam.length)
-    ends = (0.0, case.beam.left_end), (length, case.beam.right_end)
-    held = [x for x, end in ends if END_CONDITIONS[end][0]]
-    return sorted([*held, *(float(support.position) for support in case.supports)])
-
-
 def _longest_span(case: Case) -> float:
-    marks = sorted({0.0, *_held_positions(case), float(case.beam.length)})
+    marks = sorted({0.0, *held_positions(case).tolist(), float(case.beam.length)})
     return max(right - left for left, right in itertools.pairwise(marks))
 
 

@@ -15,6 +15,7 @@ from jaxbeam.case.beam_parts.properties import (
 )
 from jaxbeam.case.beam_parts.segment import Segment
 from jaxbeam.case.declared_checks import check_on_beam, suggestion, validate_direct_or_derived
+from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import (
     NOT_NEGATIVE,
     ON_BEAM,
@@ -40,7 +41,7 @@ END_CONDITIONS = {
 }
 
 
-class Support(eqx.Module):
+class Support(ReprWithUnits, eqx.Module):
     """Support at a position along a beam, rigid or elastic.
 
     Without a `stiffness` it holds the deflection rigidly; with one it is a vertical spring.
@@ -60,7 +61,7 @@ class Support(eqx.Module):
     )
 
 
-class Beam(eqx.Module):
+class Beam(ReprWithUnits, eqx.Module):
     """Straight beam, by default an Euler-Bernoulli beam of uniform section.
 
     Give either `flexural_rigidity` and `mass_per_length`, or the rectangular section and material

@@ -16,6 +16,7 @@ from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.aliases import current_address
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.display.parts import ReprWithUnits, case_text
 from jaxbeam.case.fields import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -27,6 +28,7 @@ from jaxbeam.case.fields import (
 )
 from jaxbeam.case.joint_addresses import ALL, each_address
 from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
+from jaxbeam.case.loads.planar.sensors import VehicleSensor
 from jaxbeam.case.profiles.base import AbstractProfile
 from jaxbeam.case.quantities import OF_QUANTITY
 from jaxbeam.case.reading.units import in_si
@@ -34,7 +36,7 @@ from jaxbeam.case.sensors import Sensor
 from jaxbeam.runtime.arrays import Array, set_at, xp
 
 
-class Run(eqx.Module):
+class Run(ReprWithUnits, eqx.Module):
     """Duration of a run, sampling rate of its record, gravity, and seed of the sensor noise."""
 
     duration: Float[Array, ""] = number("s", "simulated time, from 0", POSITIVE)
@@ -50,6 +52,8 @@ class Run(eqx.Module):
 class Case(eqx.Module):
     """Beam, supports, actuators, sensors, loads, profile, controller and run settings.
 
+    Sensors are on the beam; `vehicle_sensors` are on bodies and axles of the loads.
+
     An immutable tree: `replace(case, {"loads.0.mass": 0.3})` or `equinox.tree_at` return a changed
     copy. Every number has an address, its dotted path. Its fields are the keys of a case file.
     """
@@ -59,6 +63,7 @@ class Case(eqx.Module):
     actuators: tuple[AbstractActuator, ...] = ()
     sensors: tuple[Sensor, ...] = ()
     loads: tuple[AbstractLoad, ...] = ()
+    vehicle_sensors: tuple[VehicleSensor, ...] = ()
     profile: AbstractProfile | None = None
     controller: AbstractController | None = None
     run: Run | None = None
@@ -75,21 +80,31 @@ class Case(eqx.Module):
         run: Run | None = None,
         title: str = "",
         profile=None,
+        vehicle_sensors=(),
     ):
         self.beam = beam
         self.supports = tuple(supports)
         self.actuators = tuple(actuators)
         self.sensors = tuple(sensors)
         self.loads = tuple(loads)
+        self.vehicle_sensors = tuple(vehicle_sensors)
         self.profile = profile
         self.controller = controller
         self.run = Run(duration=1.0) if run is None else run
         self.title = title
 
+    def __repr__(self) -> str:
+        return case_text(self)
+
     @property
     def sensor_positions(self) -> Float[Array, " sensor"]:
         """Positions of the sensors, distances from the left end (m)."""
         return xp.array([sensor.position for sensor in self.sensors]).reshape(-1)
+
+    @property
+    def all_sensors(self) -> tuple[Sensor | VehicleSensor, ...]:
+        """Sensors on the beam, then those on vehicles: the channels of a log."""
+        return (*self.sensors, *self.vehicle_sensors)
 
 
 class PartClass(typing.NamedTuple):
@@ -220,7 +235,7 @@ def unit_at(case: Case, address: str) -> str:
             part = part[int(name)]
         elif dataclasses.is_dataclass(part):
             unit = type(part).__dataclass_fields__[name].metadata.get("unit", "")
-            if isinstance(part, Sensor) and unit == OF_QUANTITY:
+            if isinstance(part, Sensor | VehicleSensor) and unit == OF_QUANTITY:
                 unit = part.unit
             part = getattr(part, name)
         elif ", " in unit:  # an entry of a list of several units

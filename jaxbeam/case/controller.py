@@ -10,6 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 from jaxtyping import Bool, Float
 
+from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, number
 from jaxbeam.case.former_arguments import AcceptsFormerArguments
 from jaxbeam.runtime.arrays import Array, xp
@@ -105,7 +106,7 @@ class AbstractStaticLaw(AbstractSampledLaw, AbstractContinuousLaw):
         return ControlStep(self.command(state, measurement, t), state)
 
 
-class AbstractController(eqx.Module, metaclass=AcceptsFormerArguments):
+class AbstractController(ReprWithUnits, eqx.Module, metaclass=AcceptsFormerArguments):
     """Settings of a controller.
 
     With a sampling `period` (s) its law acts at 0, period, 2 period, ...; a command begins `delay`

@@ -12,11 +12,12 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float
 
+from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import POSITIVE, choice, concrete, count, is_concrete, number
 from jaxbeam.runtime.arrays import Array, scan, xp
 
 
-class Filter(eqx.Module):
+class Filter(ReprWithUnits, eqx.Module):
     """Low-pass filter with gain 1 at low frequency and 1 / sqrt(2) at the cutoff.
 
     An analogue filter acts on the signal before it is sampled, a digital one on the samples.

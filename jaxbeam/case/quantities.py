@@ -55,6 +55,19 @@ QUANTITIES = {
     "stress": Quantity("Pa", x_derivative=2, section_force=True, over_modulus=True),
 }
 
+# Quantities of the bodies of vehicles, and those of the beam in the same units.
+BODY_QUANTITIES = {
+    "acceleration": "acceleration",
+    "velocity": "velocity",
+    "displacement": "deflection",
+}
+
+
+def unit_of(name: str) -> str | None:
+    """SI unit of a quantity of the beam or of a body, None for any other name."""
+    quantity = QUANTITIES.get(BODY_QUANTITIES.get(name, name))
+    return None if quantity is None else quantity.unit
+
 
 def quantity_of(
     name: str, fibre_distance: object = None, section_modulus: object = None

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 
 from jaxtyping import Float
 
+from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import (
     INCREASING,
     NOT_NEGATIVE,
@@ -22,7 +23,7 @@ from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.module import Module
 
 
-class Sensor(Module):
+class Sensor(ReprWithUnits, Module):
     """Point sensor of a quantity at a position on the beam; deflections are positive upwards.
 
     `strain` is the bending strain -z d2w/dx2 of the fibre at z = `fibre_distance` above the neutral

@@ -25,6 +25,7 @@ from jaxbeam.case.declared_checks import (
 from jaxbeam.case.fields import ON_BEAM, concrete, is_concrete
 from jaxbeam.case.filters import nyquist_error
 from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
+from jaxbeam.case.loads.planar.sensors import VehicleSensor
 from jaxbeam.case.loads.vehicle_checks import known_numbers
 from jaxbeam.case.loads.vehicle_model import VehicleModel
 from jaxbeam.case.profiles.base import AbstractProfile
@@ -61,6 +62,8 @@ def check_case(case: Case) -> None:
     _check_kinks(case)
     _check_profile(case)
     _check_labels(case.sensors)
+    for i, sensor in enumerate(case.vehicle_sensors):
+        _check_vehicle_sensor(f"vehicle_sensors.{i}", sensor, case)
     for i, sensor in enumerate(case.sensors):
         _check_sampling(f"sensors.{i}", sensor, case)
     if case.controller is not None:
@@ -180,6 +183,35 @@ def _check_labels(sensors: tuple[Sensor, ...]) -> None:
                 f"sensors.{labels.index(label)} and sensors.{i} are both called {label!r} in"
                 f" results; give sensors.{i} another name"
             )
+
+
+def _check_vehicle_sensor(address: str, sensor: VehicleSensor, case: Case) -> None:
+    """Validate that the body of a sensor is one of the loads."""
+    if sensor.load >= len(case.loads):
+        raise ValueError(
+            f"{address}.load is {sensor.load}, but the case has {len(case.loads)} loads, counted"
+            " from 0"
+        )
+    load = case.loads[sensor.load]
+    names = load.vehicle(case.run.gravity).names
+    if sensor.body not in names or sensor.body.endswith(" pitch"):
+        heights = [name for name in names if not name.endswith(" pitch")]
+        has = f"they are {', '.join(heights)}" if heights else "it has none, without suspension"
+        raise ValueError(
+            f"{address}.body is {sensor.body!r}, which is no body of loads.{sensor.load}; {has}"
+        )
+    if sensor.vehicle >= load.spacings().shape[0]:
+        raise ValueError(
+            f"{address}.vehicle is {sensor.vehicle}, but loads.{sensor.load} has"
+            f" {load.spacings().shape[0]} in a row, counted from 0"
+        )
+    position = sensor.position
+    pitches = f"{sensor.body} pitch" in names
+    if not pitches and is_concrete(position) and concrete(position) != 0:
+        raise ValueError(
+            f"{address}.position would have no effect: the {sensor.body} of loads.{sensor.load}"
+            " does not pitch; leave it out"
+        )
 
 
 def _check_sampling(address: str, sensor: Sensor, case: Case) -> None:

@@ -12,6 +12,8 @@ from cyclopts import App, CycloptsError, Group, Parameter
 from jaxbeam.cli.commands.check import check
 from jaxbeam.cli.commands.compare import compare
 from jaxbeam.cli.commands.describe import describe
+from jaxbeam.cli.commands.engineering.assess import assess
+from jaxbeam.cli.commands.engineering.influence import influence
 from jaxbeam.cli.commands.export import export
 from jaxbeam.cli.commands.frequency import frf, modes
 from jaxbeam.cli.commands.identify import identify
@@ -28,6 +30,7 @@ from jaxbeam.cli.options import print_message
 
 COMMANDS = {
     "Simulation": (new, check, describe, modes, frf, simulate, sweep),
+    "Engineering": (assess, influence),
     "Control": (compare, stability, tune, export),
     "Identification": (identify, identify_responses, weigh, compare_models, design_experiment),
     "Other": (demo, reproduce, schema, native),

@@ -1,12 +1,13 @@
 """Meaning of arguments, checked before any work; imports nothing heavy at the top."""
 
-import importlib.util
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from jaxbeam.case.reading.units import is_quantity, number_and_unit
+from jaxbeam.files.endings import check_ending
 
 
 def parse_assignment(option: str, text: str) -> tuple[str, str]:
@@ -202,6 +203,26 @@ def figure_path(output: Path | None, source: Path) -> Path:
     return (output or Path(source.name)).with_suffix(".png")
 
 
+INCHES = {"mm": 1 / 25.4, "cm": 1 / 2.54, "in": 1.0}
+MIN_INCHES, MAX_INCHES = 1.0, 100.0
+
+
+def parse_size(text: str) -> tuple[float, float]:
+    """Width and height in inches of WIDTHxHEIGHT with a unit, as 160x100mm.
+
+    Raises ValueError for other texts, and for sizes below one inch or above 100.
+    """
+    found = re.fullmatch(r"(\d+\.?\d*)\s*x\s*(\d+\.?\d*)\s*(mm|cm|in)", text.strip())
+    if found is None:
+        raise ValueError(
+            f"--size takes WIDTHxHEIGHT in mm, cm or in, such as 160x100mm, not {text!r}"
+        )
+    width, height = (float(found.group(i)) * INCHES[found.group(3)] for i in (1, 2))
+    if not MIN_INCHES <= min(width, height) <= max(width, height) <= MAX_INCHES:
+        raise ValueError(f"--size {text}: a side is 25 mm at least and 2540 mm at most")
+    return width, height
+
+
 def check_exists(kind: str, *paths: Path) -> None:
     """Raises FileNotFoundError if one of the files, of a kind such as "log file", is missing."""
     for path in paths:
@@ -209,27 +230,14 @@ def check_exists(kind: str, *paths: Path) -> None:
             raise FileNotFoundError(f"{path}: there is no such {kind}")
 
 
-TABLE_SUFFIXES = (".csv", ".xlsx", ".mat", ".parquet")
-TABLE_PACKAGES = {".xlsx": "openpyxl", ".parquet": "pyarrow"}
-
-
 def check_suffix(path: Path | None, suffix: str, content: str, others: Sequence[str] = ()) -> None:
     """Whether a file can be written by its suffix, before any work.
 
-    Raises ValueError if it has not the suffix of its content, nor one of the others, or if the
-    package that writes it is not installed.
+    Raises ValueError if it has not the suffix of its content, nor one of the others, ImportError if
+    the package that writes it is not installed.
     """
-    package = TABLE_PACKAGES.get(path.suffix, "") if path and path.suffix in others else ""
-    if package and not importlib.util.find_spec(package):
-        raise ValueError(
-            f"{path.suffix} files need {package}, which is not installed: pip install {package},"
-            " or 'jaxbeam[tables]'"
-        )
-    if path and path.suffix not in (suffix, *others):
-        more = f", or {', '.join(others)}" if others else ""
-        raise ValueError(
-            f"{content} is written to a {suffix} file; call it {path.with_suffix(suffix)}{more}"
-        )
+    if path:
+        check_ending(path, content, (suffix, *others))
 
 
 def refuse_option(is_given: bool, reason: str) -> None:

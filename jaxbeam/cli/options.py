@@ -18,8 +18,16 @@ from cyclopts import Parameter
 
 import jaxbeam as jb
 from jaxbeam.case.reading.toml_file import read_toml
-from jaxbeam.cli.arguments import parse_assignment, parse_value
+from jaxbeam.cli.arguments import (
+    check_suffix,
+    figure_path,
+    parse_assignment,
+    parse_size,
+    parse_value,
+)
 from jaxbeam.files.report import text_table
+
+PICTURES = (".png", ".svg", ".pdf")
 
 Output = Annotated[Path | None, Parameter(("-o", "--output"))]
 Free = Annotated[
@@ -115,6 +123,79 @@ class CaseOptions(OutputOptions):
         from jaxbeam.files.case_file import with_settings
 
         return with_settings(jb.load_case(path), changes)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class DrawingOptions:
+    """Options of a command that draws."""
+
+    size: Annotated[
+        str, Parameter(help="WIDTHxHEIGHT of pictures, such as 160x100mm, 16x10cm or 6x4in.")
+    ] = ""
+    dpi: Annotated[float, Parameter(help="Dots per inch of pictures; 150 if left out.")] = 150.0
+    title: Annotated[str | None, Parameter(help="Title of pictures; '' for none.")] = None
+
+    def check(self, *paths: Path | None) -> None:
+        """Check the options and files of pictures, before any work.
+
+        Raises ValueError for a size without a unit, too many or no dots per inch, and for a file of
+        another ending than .png, .svg and .pdf.
+        """
+        self.inches()
+        if not 10 <= self.dpi <= 2400:
+            raise ValueError(f"--dpi must be from 10 to 2400; it is {self.dpi:g}")
+        for path in filter(None, paths):
+            check_suffix(path, PICTURES[0], "a picture", PICTURES[1:])
+
+    def inches(self) -> tuple[float, float] | None:
+        """Width and height in inches, None if left out. Raises ValueError as `check` does."""
+        return parse_size(self.size) if self.size else None
+
+    def page(self) -> Any:
+        """Axes that fill a figure of the size, in whose place one is drawn; None if left out."""
+        size = self.inches()
+        if size is None:
+            return None
+        from jaxbeam.plot.style import page
+
+        return page(size)
+
+    def titled(self, figure: Any) -> Any:
+        """The figure with the title of `--title`, if there is one."""
+        if self.title is not None:
+            from jaxbeam.plot.style import set_title
+
+            figure.suptitle("")
+            set_title(figure, self.title, "")
+        return figure
+
+    def save(self, figure: Any, path: Path) -> None:
+        """Write a figure, also one that was drawn in the place of `page`, to a file."""
+        whole = figure.get_figure(root=True)
+        size = self.inches()
+        if size is not None:
+            whole.set_size_inches(size)
+        whole.savefig(path, dpi=self.dpi)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class PictureOptions(DrawingOptions):
+    """Options of a command that draws on request."""
+
+    picture: Annotated[
+        Path | None, Parameter(help="Draw to this file instead, OUT.png, OUT.svg or OUT.pdf.")
+    ] = None
+
+    def path(self, plot: bool, output: Path | None, source: Path) -> Path | None:
+        """File of the picture: that of `--picture`, or with `--plot` beside output or source.
+
+        Raises ValueError as `check` does.
+        """
+        path = self.picture or (figure_path(output, source) if plot else None)
+        self.check(path)
+        return path
 
 
 def print_plausibility(

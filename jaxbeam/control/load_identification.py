@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
+from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import POSITIVE, concrete, is_concrete, number
 from jaxbeam.control.load_identifiers import (
     AbstractLoadIdentifier,
@@ -27,7 +28,7 @@ from jaxbeam.runtime.compiling import compiled_if_traced
 INFLUENCE_POSITIONS = 201  # load positions along the beam at which influence lines are tabulated
 
 
-class LoadIdentification(eqx.Module):
+class LoadIdentification(ReprWithUnits, eqx.Module):
     """Settings for identifying speed and mass of a load while it crosses.
 
     The speed follows from two `gates`, which may lie before the beam (at a negative position if the

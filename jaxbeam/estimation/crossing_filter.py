@@ -8,6 +8,7 @@ from jaxtyping import Float
 from jaxbeam.case.estimator import AbstractSampledFilter, Estimate
 from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.gains import filter_gain
+from jaxbeam.estimation.sampled_plant import Transition
 from jaxbeam.estimation.sensor_chain import FilteredPlant, SensorChain
 from jaxbeam.estimation.simulated_vehicles import with_loads
 from jaxbeam.numerics.matrices import symmetric_part
@@ -56,31 +57,43 @@ class CrossingFilter(AbstractSampledFilter):
         commands = len(self.filtered.plant.case.actuators)
         return FilterState(self.initial, self.initial_covariance, xp.zeros(commands))
 
-    def predict(self, state: FilterState, command, t: Float[Array, ""]) -> OneStepPrediction:
-        """Prediction for the sample at t (s) under the command since the last sample."""
+    def model_at(
+        self, t: Float[Array, ""] | float
+    ) -> tuple[Transition, Float[Array, "sensor state"], Float[Array, "sensor actuator"]]:
+        """Transition to the sample at t (s) from the one before, and C and D of its readings."""
 
         def system_at(time):
             return self.filtered.with_filtered_outputs(self.filtered.plant.augmented(time))
 
         transition = self.sensor_chain.transition(system_at, self.noise_intensity, self.scale, t)
+        system = system_at(t)
+        return transition, *self.sensor_chain.output_matrices(system.C, system.D)
+
+    def predict(self, state: FilterState, command, t: Float[Array, ""]) -> OneStepPrediction:
+        """Prediction for the sample at t (s) under the command since the last sample."""
+        transition, C, D = self.model_at(t)
         x = transition.predict(state.x, state.command, command)
         covariance = transition.predict_covariance(state.covariance)
-        system = system_at(t)
-        C, D = self.sensor_chain.output_matrices(system.C, system.D)
         readings = C @ x + D @ command + sensor_offsets(self.filtered.plant)
         innovation_covariance = C @ covariance @ C.T + self.sensor_chain.noise_covariance
         return OneStepPrediction(x, covariance, readings, innovation_covariance, C)
 
     def update(self, state, measurement, t):
         prediction = self.predict(state, measurement.command, t)
-        noise = self.sensor_chain.noise_covariance
-        gain = filter_gain(prediction.covariance, prediction.C, noise)
+        gain, covariance = self.correction(prediction.covariance, prediction.C)
         x = prediction.x + gain @ (measurement.readings - prediction.readings)
+        return self._estimate(x, t), FilterState(x, covariance, measurement.command)
+
+    def correction(
+        self, covariance: Square, C: Float[Array, "sensor state"]
+    ) -> tuple[Float[Array, "state sensor"], Square]:
+        """Gain for a prediction of this covariance, and the covariance after its correction."""
+        noise = self.sensor_chain.noise_covariance
+        gain = filter_gain(covariance, C, noise)
         # Joseph's form: symmetric and positive semidefinite in spite of rounding.
-        error_matrix = xp.eye(x.shape[0]) - gain @ prediction.C
-        covariance = error_matrix @ prediction.covariance @ error_matrix.T + gain @ noise @ gain.T
-        state = FilterState(x, symmetric_part(covariance), measurement.command)
-        return self._estimate(x, t), state
+        error_matrix = xp.eye(covariance.shape[0]) - gain @ C
+        corrected = error_matrix @ covariance @ error_matrix.T + gain @ noise @ gain.T
+        return gain, symmetric_part(corrected)
 
     def _estimate(self, x, t) -> Estimate:
         plant = self.filtered.plant

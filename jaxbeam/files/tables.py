@@ -1,51 +1,125 @@
-"""Tables of numbers as files for other programs: CSV, Excel, MATLAB and Parquet, by their ending.
+"""Results as files for other programs, by their ending: tables of columns, and whole datasets.
 
 A file is written beside its place and then moved there, so that none is ever half written.
 """
 
-import importlib
 import os
+import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
-Columns = Mapping[str, Float[np.ndarray, " row"]]
+from jaxbeam.files.endings import DATASETS, RESULTS, TABLES, check_ending
+
+if TYPE_CHECKING:
+    import xarray  # imported where it is used, as it takes as long as all of JAX
+
+Columns = Mapping[str, np.ndarray]  # equally long, of numbers or texts, by their heads
 MAX_EXCEL_ROWS = 1_048_575  # below the heads
 
 
-def write_table(path: str | os.PathLike, columns: Columns, overwrite: bool = False) -> None:
-    """Write equally long columns of numbers by their heads, as "midspan deflection (m)".
+def save(result: Any, path: str | os.PathLike, overwrite: bool = False) -> None:
+    """Write a result to a file: a record, modes, frequency responses, an envelope, a sweep.
 
-    The ending decides: .csv (UTF-8, all digits), .xlsx (needs openpyxl), .mat (the matrix `values`
-    with the heads `columns`), .parquet (needs pyarrow). Raises FileExistsError if the file exists,
-    without `overwrite`; ValueError for another ending or too many rows for Excel; ImportError, with
-    what to install, if a package is missing.
+    The ending decides: .nc and .zarr hold its dataset, with units and coordinates; .csv (UTF-8, all
+    digits), .xlsx, .mat and .parquet its `columns`, with units in their heads (`write_table`). Of a
+    sweep, a row for each run (`files.sweep_table.sweep_columns`). Raises FileExistsError if the
+    file exists, without `overwrite`; ValueError for another ending; ImportError, with what to
+    install, if a package is missing.
+
+    >>> import tempfile, pathlib, jaxbeam as jb
+    >>> case = jb.Case(jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535))
+    >>> path = pathlib.Path(tempfile.mkdtemp(), "modes.csv")
+    >>> jb.save(jb.modes(case), path)
+    >>> print(path.read_text().splitlines()[0])
+    mode,frequency (Hz),damping ratio
     """
     path = Path(path)
-    if path.suffix not in WRITERS:
-        raise ValueError(f"{path}: a table is written to a file of {', '.join(WRITERS)}")
+    check_ending(path, "a result", RESULTS)
+    if hasattr(result, "data_vars"):  # the dataset of a sweep
+        from jaxbeam.files.sweep_table import sweep_columns
+
+        columns = sweep_columns(result) if path.suffix in TABLES else {}
+        write_result(path, lambda: columns, lambda: result, overwrite)
+    else:
+        write_result(path, lambda: result.columns, result.to_xarray, overwrite)
+
+
+def write_result(
+    path: str | os.PathLike,
+    columns: Callable[[], Columns],
+    dataset: "Callable[[], xarray.Dataset]",
+    overwrite: bool = False,
+) -> None:
+    """Write columns or a dataset, whichever the ending asks for; see `save` for what is raised."""
+    if Path(path).suffix in DATASETS:
+        write_dataset(path, dataset(), overwrite)
+    else:
+        write_table(path, columns(), overwrite)
+
+
+def write_dataset(
+    path: str | os.PathLike, dataset: "xarray.Dataset", overwrite: bool = False
+) -> None:
+    """Write a labelled dataset to .nc or .zarr; see `save` for what is raised."""
+    check_ending(path, "a dataset", DATASETS)
+    _replace(Path(path), overwrite, lambda beside: _write_dataset(beside, dataset))
+
+
+def write_table(path: str | os.PathLike, columns: Columns, overwrite: bool = False) -> None:
+    """Write equally long columns by their heads, as "midspan deflection (m)".
+
+    The ending decides: .csv (UTF-8, all digits), .xlsx (needs openpyxl), .mat (the matrix `values`
+    with the heads `columns`; columns of texts as cells in `texts` with heads `text_columns`),
+    .parquet (needs pyarrow). Raises as `save` does, and ValueError for columns of different lengths
+    or too many rows for Excel.
+    """
+    check_ending(path, "a table", TABLES)
+    plain = {head: _plain(column) for head, column in columns.items()}
+    lengths = {column.size for column in plain.values()}
+    if len(lengths) > 1:
+        raise ValueError(f"the columns of a table must be equally long, not {sorted(lengths)}")
+    _replace(Path(path), overwrite, lambda beside: WRITERS[beside.suffix](beside, plain))
+
+
+def _plain(column) -> np.ndarray:
+    """A column as floats, or as objects if it holds texts."""
+    column = np.asarray(column)
+    return column.astype(object) if column.dtype.kind in "UO" else column.astype(float)
+
+
+def _replace(path: Path, overwrite: bool, write: Callable[[Path], None]) -> None:
+    """Write a file or folder beside its place, and move it there."""
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
     beside = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
-        WRITERS[path.suffix](beside, {head: np.asarray(c, float) for head, c in columns.items()})
+        write(beside)
+        if path.is_dir():
+            shutil.rmtree(path)
         os.replace(beside, path)
     finally:
+        if beside.is_dir():
+            shutil.rmtree(beside)
         beside.unlink(missing_ok=True)
 
 
-def _needed(package: str, ending: str) -> Any:
-    try:
-        return importlib.import_module(package)
-    except ImportError:
-        name = package.partition(".")[0]
-        raise ImportError(
-            f"{ending} files need {name}, which is not installed: pip install {name}, or"
-            " 'jaxbeam[tables]'"
-        ) from None
+def _write_dataset(path: Path, dataset: "xarray.Dataset") -> None:
+    # Empty dimensions would become unlimited ones in a file.
+    empty = [name for name in dataset.variables if dataset[name].size == 0]
+    dataset = dataset.drop_vars(empty)
+    if path.suffix == ".nc":
+        dataset.to_netcdf(path, engine="scipy")
+        return
+    # Zarr specifies strings of variable length, not of fixed length.
+    texts = {
+        name: (values.dims, values.values.astype(object), values.attrs)
+        for name, values in dataset.variables.items()
+        if values.dtype.kind == "U"
+    }
+    dataset.assign(texts).to_zarr(path, mode="w", consolidated=False, zarr_format=3)
 
 
 def _write_csv(path: Path, columns: Columns) -> None:
@@ -54,33 +128,48 @@ def _write_csv(path: Path, columns: Columns) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
-        writer.writerows(np.stack(list(columns.values()), axis=-1).tolist())
+        writer.writerows(_rows(columns))
+
+
+def _rows(columns: Columns) -> Any:
+    return zip(*(column.tolist() for column in columns.values()), strict=True)
 
 
 def _write_excel(path: Path, columns: Columns) -> None:
-    rows = np.stack(list(columns.values()), axis=-1)
-    if len(rows) > MAX_EXCEL_ROWS:
+    import openpyxl
+
+    count = max((column.size for column in columns.values()), default=0)
+    if count > MAX_EXCEL_ROWS:
         raise ValueError(
-            f"{len(rows)} rows are more than the {MAX_EXCEL_ROWS} of Excel: write .csv or .parquet"
+            f"{count} rows are more than the {MAX_EXCEL_ROWS} of Excel: write .csv or .parquet"
         )
-    book = _needed("openpyxl", ".xlsx").Workbook(write_only=True)
+    book = openpyxl.Workbook(write_only=True)
     sheet = book.create_sheet("jaxbeam")
     sheet.append(list(columns))
-    for row in rows.tolist():
-        sheet.append([value if np.isfinite(value) else None for value in row])
+    for row in _rows(columns):
+        sheet.append([v if isinstance(v, str) or np.isfinite(v) else None for v in row])
     book.save(path)
 
 
 def _write_matlab(path: Path, columns: Columns) -> None:
     import scipy.io
 
-    heads = np.array(list(columns), dtype=object)
-    scipy.io.savemat(path, {"columns": heads, "values": np.stack(list(columns.values()), axis=-1)})
+    texts = {head: column for head, column in columns.items() if column.dtype == object}
+    numbers = {head: column for head, column in columns.items() if head not in texts}
+    content = {
+        "columns": np.array(list(numbers), dtype=object),
+        "values": np.stack(list(numbers.values()), axis=-1),
+    }
+    if texts:
+        content["text_columns"] = np.array(list(texts), dtype=object)
+        content["texts"] = np.stack(list(texts.values()), axis=-1)
+    scipy.io.savemat(path, content)
 
 
 def _write_parquet(path: Path, columns: Columns) -> None:
-    arrow = _needed("pyarrow", ".parquet")
-    _needed("pyarrow.parquet", ".parquet").write_table(arrow.table(dict(columns)), path)
+    import pyarrow.parquet
+
+    pyarrow.parquet.write_table(pyarrow.table(dict(columns)), path)
 
 
 WRITERS: dict[str, Callable[[Path, Columns], None]] = {

@@ -83,6 +83,8 @@ def update_peaks(
         estimate = optimization_barrier(
             estimate_peak(xp.moveaxis(samples, 1, 0), PEAK_NODES, best.magnitude)
         )
+        # Steps of no length, as of loads that leave after the end, are no part of the run.
+        estimate = xp.where(length[:, None, None] > 0, estimate, 0.0)
         best_estimate, peak_step = max_with_ties(estimate)
         peak_step = xp.max(xp.where(peak_step, np.arange(steps)[:, None, None], 0), axis=0)
         better = best_estimate > best.estimate

@@ -75,12 +75,8 @@ class TimeGrid(eqx.Module):
 
 def _load_events(case: Case, model: ModalModel, places=None):
     """Entry and exit of each wheel (wheel, 2), and all load events (event,), in s."""
-    own, loads = model.modes.nodes[1:-1], load_set(case)
-    places = own if places is None else xp.concatenate([own, places])
-    if loads.profile is not None:
-        places = xp.concatenate([places, loads.profile.kinks()])
-    windows = loads.entry_exit_times()
-    return windows, xp.concatenate([windows.reshape(-1), loads.passage_times(places)])
+    own = model.modes.nodes[1:-1]
+    return load_set(case).events(own if places is None else xp.concatenate([own, places]))
 
 
 def _loads_on_beam(positions, panels: int):
@@ -100,8 +96,11 @@ def grid_by_step_length(
     max_step: Float[Array, ""],
     extra_steps: int | Int[Array, ""] = 0,
     places: Float[Array, " place"] | None = None,
+    refinement: int = 1,
 ) -> TimeGrid:
     """Panels between load events, with steps of at most `max_step` (s).
+
+    With a `refinement` each of these steps is divided into so many.
 
     `extra_steps` are added to each panel. An error estimate takes one: a smaller `max_step` may
     leave the number of steps of a short panel unchanged. Steps also end where a wheel passes one of
@@ -116,6 +115,7 @@ def grid_by_step_length(
     counts = xp.ceil(stop_gradient(panel_lengths / max_step)).astype(int) + extra_steps * (
         panel_lengths > 0
     )
+    counts = counts * refinement
     lengths = panel_lengths / xp.maximum(counts, 1)
     length_index = xp.arange(panel_lengths.shape[0])
     lengths = xp.append(lengths, 0.0)

@@ -17,6 +17,7 @@ from jaxtyping import Complex, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
+from jaxbeam.case.display.views import TableViews
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.channels import ChannelPair, check_pairs, common_pairs, input_column, output_row
@@ -27,11 +28,12 @@ from jaxbeam.runtime.compiling import compiled_if_traced
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
+    from matplotlib.figure import Figure, SubFigure
 
 StationaryMasses = Sequence[tuple[Any, Any]]  # position (m) and mass (kg) of each
 
 
-class FrequencyResponse(eqx.Module):
+class FrequencyResponse(TableViews, eqx.Module):
     """Frequency responses at `frequencies` (Hz), one column for each pair of input and output.
 
     `values` are complex amplitudes of the output per input, in the `unit` of the pair; their phase
@@ -42,6 +44,14 @@ class FrequencyResponse(eqx.Module):
     values: Complex[Array, "frequency pair"]
     pairs: tuple[ChannelPair, ...] = eqx.field(static=True)
     title: str = eqx.field(static=True, default="")
+
+    def __repr__(self) -> str:
+        pairs = "".join(f"\n  {p}" + f", in {p.unit}" * (p.unit != "1") for p in self.pairs)
+        if not is_concrete(self.frequencies):
+            return f"FrequencyResponse{pairs}"
+        first, last = concrete(self.frequencies)[[0, -1]]
+        count = self.frequencies.size
+        return f"FrequencyResponse at {count} frequencies, {first:.4g} to {last:.4g} Hz{pairs}"
 
     @property
     def magnitude(self) -> Float[Array, "frequency pair"]:
@@ -60,6 +70,23 @@ class FrequencyResponse(eqx.Module):
                 return self.values[:, i]
         available = ", ".join(map(str, self.pairs))
         raise ValueError(f"there is no response of {output} to {input}; there are {available}")
+
+    def plot(self, **options: Any) -> "Figure | SubFigure":
+        """Magnitude and phase; see `jaxbeam.plot.plot_frequency_response` and its options."""
+        from jaxbeam.plot import plot_frequency_response
+
+        return plot_frequency_response(self, **options)
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Frequency (Hz), and magnitude and phase (degrees) of each pair, by head."""
+        columns = {"frequency (Hz)": np.asarray(self.frequencies)}
+        magnitude, phase = np.asarray(self.magnitude), np.asarray(self.phase)
+        for i, pair in enumerate(self.pairs):
+            unit = "" if pair.unit == "1" else f" ({pair.unit})"
+            columns[f"{pair} magnitude{unit}"] = magnitude[:, i]
+            columns[f"{pair} phase (degree)"] = phase[:, i]
+        return columns
 
     def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units, of real variables that every file format can hold."""

@@ -204,6 +204,18 @@ class LoadSet(Module):
         windows = [xp.stack(path.entry_exit_times(behind), -1) for path, behind in self._paths()]
         return xp.concatenate(windows) if windows else xp.zeros((0, 2))
 
+    def events(
+        self, places: Float[Array, " place"]
+    ) -> tuple[Float[Array, "wheel 2"], Float[Array, " event"]]:
+        """Entry and exit of each wheel, and all times at which its motion is not smooth, in s.
+
+        These include the passage of some places (m), and of kinks of the profile.
+        """
+        if self.profile is not None:
+            places = xp.concatenate([places, self.profile.kinks()])
+        windows = self.entry_exit_times()
+        return windows, xp.concatenate([windows.reshape(-1), self.passage_times(places)])
+
     def passage_times(self, positions: Float[Array, " position"]) -> Float[Array, " time"]:
         """Times (s) at which wheels pass positions (m), and of jumps in speed or acceleration.
 

@@ -11,6 +11,7 @@ Beams that are not uniform have their elements in `model.theory`.
 """
 
 import functools
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -20,6 +21,8 @@ from numpy.polynomial import legendre
 
 from jaxbeam.case.beam_parts.damping import MATERIALS
 from jaxbeam.case.case import Case
+from jaxbeam.case.display.views import TableViews
+from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.model.layout import Layout, find_layout, is_uniform, longest_span, node_positions
 from jaxbeam.model.theory.buckling import check_buckling
 from jaxbeam.model.theory.elements import assemble_sections, bending_basis
@@ -29,6 +32,10 @@ from jaxbeam.numerics.eigen import REPEATED_EIGENVALUE_TOLERANCE, eigen
 from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, add_at, set_at, stop_gradient, xp
 
+if TYPE_CHECKING:
+    import xarray  # imported where it is used, as it takes as long as all of JAX
+
+MAX_LISTED = 12  # modes in the text of all
 ROUNDING_SHARE = 4e-15  # of the largest coefficient of a shape: smaller ones are rounding errors
 
 
@@ -43,7 +50,7 @@ def _reference_element(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return legendre_to_chebyshev(degree + 1) @ basis, mass, bending
 
 
-class Modes(eqx.Module):
+class Modes(TableViews, eqx.Module):
     """Modes of the supported beam: q_j'' + damping_j q_j' + stiffness_j q_j = psi_j(x) . force.
 
     `coupling` is the off-diagonal stiffness between repeated modes, zero in value but not in
@@ -65,6 +72,40 @@ class Modes(eqx.Module):
     layout: Layout = eqx.field(static=True)
     sections: Sections | None = None
     rotation_series: Float[Array, "segment degree mode"] | None = None
+
+    def __repr__(self) -> str:
+        if not is_concrete(self.stiffness) or self.stiffness.ndim != 1:
+            return f"Modes({self.stiffness.shape[-1]} modes)"
+        numbers = zip(concrete(self.frequencies), concrete(self.damping_ratios), strict=True)
+        rows = [f"  {i}: {f:.5g} Hz, damping ratio {z:.3g}" for i, (f, z) in enumerate(numbers, 1)]
+        if len(rows) > MAX_LISTED:
+            rows[MAX_LISTED - 1 : -1] = ["  ..."]
+        return "\n".join([f"Modes: {self.stiffness.size} of the beam", *rows])
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Number, frequency (Hz) and damping ratio of each mode, by head."""
+        frequencies = np.asarray(self.frequencies)
+        return {
+            "mode": np.arange(1, 1 + frequencies.size),
+            "frequency (Hz)": frequencies,
+            "damping ratio": np.asarray(self.damping_ratios),
+        }
+
+    def to_xarray(self, positions: int = 101) -> "xarray.Dataset":
+        """Frequencies, damping ratios, and shapes at equally spaced positions, with units."""
+        import xarray
+
+        heads = self.columns
+        x = np.linspace(float(self.nodes[0]), float(self.nodes[-1]), positions)
+        return xarray.Dataset(
+            {
+                "frequency": ("mode", heads["frequency (Hz)"], {"units": "Hz"}),
+                "damping_ratio": ("mode", heads["damping ratio"], {"units": "1"}),
+                "shape": (("position", "mode"), np.asarray(self.shapes(x)), {"units": "kg^-0.5"}),
+            },
+            {"mode": heads["mode"], "position": ("position", x, {"units": "m"})},
+        )
 
     def lowest(self, count: int) -> "Modes":
         """The lowest modes, as many as `count`."""

@@ -27,9 +27,8 @@ PEAK_POSITIONS = tuple(float(share) for share in np.linspace(0, 1, 10))
 def _influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
     greens = flexibility(case, layout, x.reshape(-1), derivative)
     length = case.beam.length
-    line = (
-        -greens(load_positions / length) * length ** (3 - derivative) / case.beam.bending_stiffness
-    )
+    order = abs(derivative)  # that of the slope is 1, too
+    line = -greens(load_positions / length) * length ** (3 - order) / case.beam.bending_stiffness
     return line.reshape((*load_positions.shape, *x.shape))
 
 
@@ -131,7 +130,9 @@ def _deflection_per_port_force(case: Case, layout: Layout, x, derivative: int):
     return (gains * length ** (3 - derivative) / case.beam.bending_stiffness).reshape(-1, *x.shape)
 
 
-def static_peak(case: Case, x, layout: Layout | None = None) -> Float[Array, "*position"]:
+def static_peak(
+    case: Case, x, layout: Layout | None = None, derivative: int = 0
+) -> Float[Array, "*position"]:
     """Largest absolute static deflection (m) at x (m) over the whole crossing of the case's loads.
 
     At every instant the loads press with their weights at their positions, without inertia of loads
@@ -139,21 +140,21 @@ def static_peak(case: Case, x, layout: Layout | None = None) -> Float[Array, "*p
     the limit of a slow crossing. The crossing is that from the first entry to the last exit (or
     stop), whatever the duration of the run.
 
-    The maximum is exact: between the events of a crossing the deflection is a polynomial in time.
-    Differentiable in every number where the maximum is unique. Raises ValueError as
-    `influence_line` does.
+    `derivative` (up to 2) gives that x-derivative instead. The maximum is exact: between the events
+    of a crossing the deflection is a polynomial in time. Differentiable in every number where the
+    maximum is unique. Raises ValueError as `influence_line` does.
     """
     x = xp.asarray(x, float)
     layout = _validated_layout(case, layout, x=x)
     if not case.loads:
         return xp.zeros(x.shape)
-    return _static_peak(case, layout, x)
+    return _static_peak(case, layout, x, derivative)
 
 
 @compiled_if_traced
-def _static_peak(case: Case, layout: Layout, x):
-    length = case.beam.length
-    greens = flexibility(case, layout, x.reshape(-1), 0)
+def _static_peak(case: Case, layout: Layout, x, derivative: int):
+    length, order = case.beam.length, abs(derivative)
+    greens = flexibility(case, layout, x.reshape(-1), derivative)
     loads = load_set(case)
     windows = loads.entry_exit_times()
     nodes = greens.breakpoints
@@ -170,7 +171,7 @@ def _static_peak(case: Case, layout: Layout, x):
         active = (windows[wheel, 0] < middle) & (middle < windows[wheel, 1])
         total = total + loads.weight[wheel] * active[:, None] * greens(positions[wheel])
     highest = xp.max(refine_peak(total, PEAK_POSITIONS)[0], axis=0)
-    return (highest * length**3 / case.beam.bending_stiffness).reshape(x.shape)
+    return (highest * length ** (3 - order) / case.beam.bending_stiffness).reshape(x.shape)
 
 
 def _validated_layout(case: Case, layout: Layout | None, **positions) -> Layout:

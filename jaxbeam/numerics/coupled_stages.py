@@ -119,14 +119,14 @@ def stage_responses(
     )
 
 
-def coupled_stages(
-    plant: ConstantPlant,
-    response: StageResponse,
-    coupling: Coupling,
-    R: InputWeight,
-    length: Float[Array, ""],
-) -> Stage:
-    """Stages of intervals of one length (s), from the coupling (interval, node) at their nodes."""
+def node_forces(
+    plant: ConstantPlant, response: StageResponse, coupling: Coupling, explicit: bool = False
+) -> tuple[Float[Array, "interval node_force column"], Float[Array, "node direction force _"]]:
+    """Forces f at the nodes per unit of (x0, commands at the nodes), and F, intervals last.
+
+    For intervals of one length from the coupling (interval, node) at their nodes. Where no force
+    depends on another one, nor on the states that forces change, the law is `explicit`.
+    """
     states, inputs = plant.B.shape
     free_columns = states + NODE_COUNT * inputs  # the states at the start and the commands
     interval_count, forces = coupling.force_state_rows.shape[0], coupling.force_state_rows.shape[2]
@@ -143,6 +143,8 @@ def coupled_stages(
         .add(direct_part.reshape(NODE_COUNT, -1, forces, interval_count))
     )
     right = right.swapaxes(1, 2).reshape(size, free_columns, interval_count)
+    if explicit:
+        return jnp.moveaxis(right, -1, 0), distribution
     force_on_force = contact_rows[:, free_columns:].reshape(
         NODE_COUNT, NODE_COUNT, -1, forces, interval_count
     )
@@ -153,7 +155,22 @@ def coupled_stages(
     force_system = (
         np.eye(NODE_COUNT)[:, None, :, None, None] * force_feedthrough[:, :, None] - force_on_force
     )
-    force = jax.vmap(solve_unpivoted, -1)(force_system.reshape(size, size, interval_count), right)
+    system = force_system.reshape(size, size, interval_count)
+    return jax.vmap(solve_unpivoted, -1)(system, right), distribution
+
+
+def coupled_stages(
+    plant: ConstantPlant,
+    response: StageResponse,
+    coupling: Coupling,
+    R: InputWeight,
+    length: Float[Array, ""],
+) -> Stage:
+    """Stages of intervals of one length (s), from the coupling (interval, node) at their nodes."""
+    states, inputs = plant.B.shape
+    free_columns = states + NODE_COUNT * inputs
+    force, distribution = node_forces(plant, response, coupling)
+    interval_count, size, _ = force.shape
     # Response of the end to the forces; their cost with x0 and u, and by themselves.
     force_response = jnp.concatenate([response.state_at_end, response.cost])[:, free_columns:]
     force_response = force_response.reshape(-1, NODE_COUNT, distribution.shape[1])

@@ -18,7 +18,7 @@ from jaxbeam.numerics.batched_linalg import batch_size_of, matmul, solve_batch, 
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.gauss import gauss_nodes, gauss_weights, integration_matrix
 from jaxbeam.numerics.matrices import InputWeight, Square, symmetric_part
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 NODE_COUNT = 6  # Gauss nodes of an interval; order 12
 GAUSS_NODES = gauss_nodes(NODE_COUNT)
@@ -106,7 +106,7 @@ def _collocated_stage(A, B, length, Q, R) -> Stage:
     state_coupling = integration_weights[:, None, :, None] * A[:, :, None, :]
     input_coupling = np.eye(NODE_COUNT)[:, None, :, None] * B[:, :, None, :]
     right = jnp.concatenate([A, input_coupling.reshape(NODE_COUNT, size, values)], axis=2)
-    rates = jnp.linalg.solve(
+    rates = xp.linalg.solve(
         jnp.eye(rows) - state_coupling.reshape(rows, rows), right.reshape(rows, size + values)
     ).reshape(NODE_COUNT, size, size + values)
     start = np.eye(size, size + values)

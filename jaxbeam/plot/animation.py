@@ -11,7 +11,6 @@ from PIL import Image
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.load_set import load_set
-from jaxbeam.plot.record import shade_crossings
 from jaxbeam.plot.schematic import (
     ACTUATOR_MARKER,
     actuator_positions,
@@ -30,10 +29,10 @@ from jaxbeam.plot.style import (
     unit_scale,
     use_style,
 )
+from jaxbeam.plot.traffic.crossings import shade_crossings
+from jaxbeam.plot.traffic.film import check_film, write_film
 from jaxbeam.plot.traffic.moving import Traffic
 from jaxbeam.simulation.record import Record
-
-PALETTE_SIZE = 96  # colours of the GIF; few keep the file small
 
 
 @use_style
@@ -43,18 +42,23 @@ def animate(
     *,
     frames: int = 120,
     rate: int | float = 24,
+    title: str | None = None,
+    size: tuple[float, float] | None = None,
+    dpi: float | int = 90,
     overwrite: bool = False,
 ) -> None:
-    """Write a GIF of the beam, its deflection enlarged, and the loads that cross it.
+    """Write a GIF or MP4 of the beam, its deflection enlarged, and the loads that cross it.
 
     Vehicles are boxes on springs, as far above the surface as their bodies move, on the same scale
     unless the profile is rough; it is the line on the beam and beside it. Actuators hang below the
     beam, patches are drawn on it, sensors are dots; the thin line is the envelope of the downward
     deflection. Below is what the sensors measure so far, and the commands if there is a controller.
-    The whole run takes `frames` frames, `rate` of them a second; a clock shows its time (s). Raises
-    FileExistsError if the file exists and `overwrite` is not set, ValueError for a run that
-    diverges.
+    The whole run takes `frames` frames, `rate` of them a second; a clock shows its time (s). The
+    title is that of the case if left out, `size` is in inches. Raises FileExistsError if the file
+    exists and `overwrite` is not set, ValueError for a run that diverges, for another ending than
+    .gif and .mp4, and for .mp4 without the program ffmpeg, which writes it.
     """
+    check_film(path)
     if not overwrite and os.path.exists(path):
         raise FileExistsError(f"{path} exists; choose another name, or overwrite it")
     if np.isfinite(float(concrete(record.diverged_time))):
@@ -63,7 +67,7 @@ def animate(
     quantities = list(dict.fromkeys(sensor.quantity for sensor in record.case.sensors))
     stage = 3.0 if load_set(record.case).on_ground.any() else 2.2
     heights = [stage] + [1.3] * (len(quantities) + controlled)
-    figure = Figure(figsize=(6.4, 0.8 + sum(heights)), dpi=90)
+    figure = Figure(figsize=size or (6.4, 0.8 + sum(heights)), dpi=dpi)
     canvas = FigureCanvasAgg(figure)
     top, *below = figure.subplots(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
     updates = [_beam_axes(top, record)]
@@ -82,7 +86,7 @@ def animate(
         axes.tick_params(labelbottom=False)
     if below:
         below[-1].set_xlabel("time (s)")
-    set_title(figure, record.case.title)
+    set_title(figure, title, record.case.title)
 
     images = []
     for frame in np.linspace(0, record.times.shape[0] - 1, frames).round().astype(int):
@@ -92,17 +96,7 @@ def animate(
         if not images:
             figure.set_layout_engine("none")  # keep the layout of the first frame
         images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
-    # One palette for all frames, of the last and fullest: GIF stores only what changes.
-    palette = images[-1].quantize(PALETTE_SIZE)
-    first, *others = (one.quantize(palette=palette, dither=Image.Dither.NONE) for one in images)
-    first.save(
-        path,
-        format="GIF",
-        save_all=True,
-        append_images=others,
-        duration=round(1000 / rate),
-        loop=0,
-    )
+    write_film(path, images, rate)
 
 
 def _beam_axes(axes, record):

@@ -1,44 +1,51 @@
 """Controllers on one case: deflections and commands, beside the least achievable peak."""
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.analysis.compare import Comparison
 from jaxbeam.case.fields import concrete
-from jaxbeam.plot.record import label_loads, shade_crossings, signed_peak
+from jaxbeam.plot.record import signed_peak
 from jaxbeam.plot.style import (
     GREY,
     INK,
     colour,
     command_drawstyle,
     draw_limits,
+    drawing_area,
     format_number,
+    label_height,
     margin_labels,
     set_title,
     unit_scale,
     use_style,
 )
+from jaxbeam.plot.traffic.crossings import label_loads, shade_crossings
 
 UNCONTROLLED_STYLE = {"color": GREY, "linewidth": 1.1, "linestyle": (0, (1, 1))}
 OPTIMAL_STYLE = {"color": INK, "linewidth": 1.0, "linestyle": (0, (5, 2))}
 
 
 @use_style
-def plot_comparison(comparison: Comparison) -> Figure:
+def plot_comparison(
+    comparison: Comparison, *, ax: Axes | None = None, title: str | None = None
+) -> Figure | SubFigure:
     """Deflection at the sensor with the largest uncontrolled peak, and commands, of controllers.
 
     Dashed: the optimal commands of the bound and their response; thin line: the least achievable
-    peak. Labels give peaks and, in brackets, shares of the attainable reduction.
+    peak. Labels give peaks and, in brackets, shares of the attainable reduction. The figure takes
+    the place of `ax`; its title is that of the case if left out.
     """
     actuators = len(comparison.case.actuators)
     heights = [4.2] + [1.9] * actuators
-    figure = Figure(figsize=(9, 0.9 + sum(heights)))
+    figure = drawing_area(ax, (9, 0.9 + sum(heights)))
     top, *below = figure.subplots(len(heights), 1, height_ratios=heights, sharex=True)
     _draw_deflection(top, comparison)
     for i, axes in enumerate(below):
         _draw_commands(axes, comparison, i)
     below[-1].set_xlabel("time (s)")
-    set_title(figure, comparison.case.title)
+    set_title(figure, title, comparison.case.title)
     return figure
 
 
@@ -77,7 +84,7 @@ def _draw_deflection(axes, comparison: Comparison):
         if low <= bound <= high:
             axes.axhline(bound, color=INK, linewidth=0.7)
     position = float(concrete(comparison.case.sensors[sensor].position))
-    axes.set_ylabel(f"deflection at {position:.4g} m ({unit})")
+    label_height(axes, f"deflection at {position:.4g} m", unit)
     label_loads(axes, comparison.uncontrolled)
     margin_labels(axes, peaks, labels, [look["color"] for _, _, look in runs])
 
@@ -86,12 +93,14 @@ def _draw_commands(axes, comparison: Comparison, index: int):
     actuator = comparison.case.actuators[index]
     shade_crossings(axes, comparison.uncontrolled)
     axes.axhline(0, color=GREY, linewidth=0.8)
-    for _, record, look in _styled_runs(comparison)[1:]:
-        style = command_drawstyle(record.case.controller)
-        command = np.asarray(record.command)[:, index]
+    runs = _styled_runs(comparison)[1:]
+    commands = [np.asarray(record.command)[:, index] for _, record, _ in runs]
+    factor, unit = unit_scale(np.concatenate(commands), actuator.command_unit)
+    for command, (_, record, look) in zip(commands, runs, strict=True):
+        style, command = command_drawstyle(record.case.controller), command / factor
         axes.plot(np.asarray(record.times), command, drawstyle=style, **(look | {"linewidth": 1.1}))
     number = f" {index}" if len(comparison.case.actuators) > 1 else ""
-    axes.set_ylabel(f"command{number} ({actuator.command_unit})")
+    label_height(axes, f"command{number}", unit)
     limits = actuator.command_limits()
     if limits is not None:
-        draw_limits(axes, concrete(limits).tolist(), [GREY, GREY])
+        draw_limits(axes, (concrete(limits) / factor).tolist(), [GREY, GREY], unit)

@@ -5,13 +5,15 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.plot.style import (
     GREY,
     INK,
     annotate,
     colour,
+    drawing_area,
     format_number,
     set_title,
     unit_scale,
@@ -32,16 +34,18 @@ class FitPanel:
 
 
 @use_style
-def plot_fit(panels: Sequence[FitPanel], title: str = "") -> Figure:
+def plot_fit(
+    panels: Sequence[FitPanel], title: str = "", *, ax: Axes | None = None
+) -> Figure | SubFigure:
     """Measured (dots) and fitted signals (lines) and residuals, a column a log.
 
-    Residuals of a log share one scale, and are labelled with their standard deviations. Raises
-    ValueError without panels.
+    Residuals of a log share one scale, and are labelled with their standard deviations. The
+    figure takes the place of `ax`. Raises ValueError without panels.
     """
     if not panels:
         raise ValueError("there is nothing to draw: give at least one log")
     channels = max(panel.measured.shape[1] for panel in panels)
-    figure = Figure(figsize=(max(7.0, 1.2 + 3.6 * len(panels)), 3.6 + 0.8 * channels))
+    figure = drawing_area(ax, (max(7.0, 1.2 + 3.6 * len(panels)), 3.6 + 0.8 * channels))
     grid = figure.subplots(
         1 + channels,
         len(panels),
@@ -53,7 +57,7 @@ def plot_fit(panels: Sequence[FitPanel], title: str = "") -> Figure:
         _draw(column, panel)
     handles, labels = grid[0, 0].get_legend_handles_labels()
     grid[0, 0].legend(handles[:2], labels[:2], loc="best", handlelength=1.2, markerscale=3)
-    set_title(figure, title)
+    set_title(figure, title, "")
     return figure
 
 

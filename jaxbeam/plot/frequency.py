@@ -1,24 +1,28 @@
 """Bode plots of frequency responses."""
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import LogFormatter, MultipleLocator, NullFormatter
 
 from jaxbeam.model.frequency_response import FrequencyResponse
-from jaxbeam.plot.style import FAINT, colour, set_title, use_style
+from jaxbeam.plot.style import FAINT, colour, drawing_area, set_title, use_style
 
 
 @use_style
-def plot_frequency_response(response: FrequencyResponse) -> Figure:
+def plot_frequency_response(
+    response: FrequencyResponse, *, ax: Axes | None = None, title: str | None = None
+) -> Figure | SubFigure:
     """Magnitude and phase over frequency, a column a unit, a curve an input-output pair.
 
-    A frequency of zero, which a logarithmic axis lacks, is left out.
+    A frequency of zero, which a logarithmic axis lacks, is left out. The figure takes the place of
+    `ax`; its title is that of the response if left out.
     """
     positive = np.asarray(response.frequencies) > 0
     frequencies = np.asarray(response.frequencies)[positive]
     magnitude, phase = (np.asarray(x)[positive] for x in (response.magnitude, response.phase))
     units = list(dict.fromkeys(pair.unit for pair in response.pairs))
-    figure = Figure(figsize=(max(7.0, 1.0 + 4.2 * len(units)), 5.6))
+    figure = drawing_area(ax, (max(7.0, 1.0 + 4.2 * len(units)), 5.6))
     grid = figure.subplots(2, len(units), squeeze=False, sharex=True, height_ratios=[3, 2])
     for (top, bottom), unit in zip(grid.T, units, strict=True):
         chosen = [i for i, pair in enumerate(response.pairs) if pair.unit == unit]
@@ -41,5 +45,5 @@ def plot_frequency_response(response: FrequencyResponse) -> Figure:
         bottom.xaxis.set_major_formatter("{x:g}")
         bottom.set(xlabel="frequency (Hz)", ylabel="phase (°)")
         bottom.set_xlim(frequencies[0], frequencies[-1])
-    set_title(figure, response.title)
+    set_title(figure, title, response.title)
     return figure

@@ -2,7 +2,8 @@
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
@@ -16,16 +17,26 @@ from jaxbeam.plot.style import (
     colour,
     format_number,
     set_title,
+    single_axes,
     unit_scale,
     use_style,
 )
 
+FEW_MODES = 10
+
 
 @use_style
-def plot_modes(case: Case, modes: Modes | None = None) -> Figure:
+def plot_modes(
+    case: Case,
+    modes: Modes | None = None,
+    *,
+    ax: Axes | None = None,
+    title: str | None = None,
+) -> Figure | SubFigure:
     """Mode shapes of a case, one above the other, with frequencies (Hz) and damping ratios.
 
-    Shapes are scaled to the same height. `modes` are computed from the case if left out.
+    Shapes are scaled to the same height. `modes` are computed from the case, and the title is
+    its own, if left out. They are drawn on `ax` if it is given.
     """
     modes = find_modes(case) if modes is None else modes
     length = float(concrete(case.beam.length))
@@ -33,8 +44,8 @@ def plot_modes(case: Case, modes: Modes | None = None) -> Figure:
     shapes = np.asarray(modes.shapes(jnp.asarray(x)))
     shapes = 0.36 * shapes / np.max(np.abs(shapes), axis=0)
     count = shapes.shape[1]
-    figure = Figure(figsize=(7, 1.1 + 0.8 * count))
-    axes = figure.subplots()
+    height = 0.8 if count <= FEW_MODES else 0.45  # inches, of a mode
+    figure, axes = single_axes(ax, (7, 1.1 + height * count))
     for i, (frequency, ratio) in enumerate(
         zip(modes.frequencies, modes.damping_ratios, strict=True)
     ):
@@ -58,7 +69,7 @@ def plot_modes(case: Case, modes: Modes | None = None) -> Figure:
     axes.spines["left"].set_visible(False)
     axes.grid(False, axis="y")
     axes.grid(True, axis="x", color=FAINT)
-    set_title(figure, case.title)
+    set_title(figure, title, case.title, ax)
     return figure
 
 

@@ -1,10 +1,11 @@
 """Poles of the closed loop along a crossing."""
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.analysis.stability import FrozenPoles, Growth
-from jaxbeam.plot.style import ALARM, GREY, INK, colour, set_title, use_style
+from jaxbeam.plot.style import ALARM, GREY, INK, colour, drawing_area, set_title, use_style
 
 # Branches with decay rates above this, relative to the largest frequency, are left out.
 MAX_DECAY_RATIO = 3.0
@@ -12,15 +13,19 @@ MAX_DECAY_RATIO = 3.0
 
 @use_style
 def plot_poles(
-    poles_along_crossing: FrozenPoles, growth: Growth | None = None, title: str = ""
-) -> Figure:
+    poles_along_crossing: FrozenPoles,
+    growth: Growth | None = None,
+    title: str = "",
+    *,
+    ax: Axes | None = None,
+) -> Figure | SubFigure:
     """Poles with frozen loads in the complex plane, and their largest real part over time.
 
     Dots mark the start of the crossing, shading instability of the frozen loop. With `growth`, the
-    growth of deviations since the start is drawn below.
+    growth of deviations since the start is drawn below. The figure takes the place of `ax`.
     """
     rows = 2 if growth is None else 3
-    figure = Figure(figsize=(8.0, 4.6))
+    figure = drawing_area(ax, (8.0, 4.6))
     plane, *right = figure.subplot_mosaic([["plane", str(i)] for i in range(rows - 1)]).values()
     poles = poles_along_crossing.poles
     largest_frequency = np.abs(poles.imag).max() or np.abs(poles.real).max()
@@ -63,5 +68,5 @@ def plot_poles(
             title="growth of deviations since the start", xlim=real_part_axes.get_xlim()
         )
     right[-1].set_xlabel("time (s)")
-    set_title(figure, title)
+    set_title(figure, title, "")
     return figure

@@ -8,7 +8,7 @@ from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.model.load_set import load_set
-from jaxbeam.plot.style import COLOURS, GREY, INK, annotate, colour, separate_labels
+from jaxbeam.plot.style import COLOURS, GREY, INK, annotate, colour, separate_labels, text_share
 from jaxbeam.plot.traffic.drawing import vehicle_art
 
 # Markers in points, below the point of the beam they support.
@@ -98,12 +98,18 @@ def draw_schematic(axes, case: Case) -> None:
         _draw_traffic(axes, case)
     sensor_positions = np.array([float(concrete(sensor.position)) for sensor in case.sensors])
     side = {"va": "top"} if crossed else {}  # of the beam, where no vehicle is
-    for i, (x, label_position) in enumerate(
-        zip(sensor_positions, separate_labels(sensor_positions, 0.08 * length), strict=True)
-    ):
+    for i, x in enumerate(sensor_positions):
         axes.plot([x], [0], "o", color=colour(i), markersize=8, markeredgecolor="white", zorder=4)
-        offset, tint = (0, -9 if crossed else 9), colour(i)
-        annotate(axes, f"{x:.4g} m", (label_position, 0), offset, ha="center", color=tint, **side)
+    texts = {
+        f"{x:.4g} m": (i, x) for i, x in enumerate(sensor_positions)
+    }  # of sensors at one place
+    gap = 1.04 * length * text_share(axes, max(map(len, texts), default=0) + 2)
+    # Of more sensors than there is room for labels every second or third has one.
+    labelled = list(texts.items())[:: 1 + int(gap * len(texts) / length)]
+    places = separate_labels([x for _, (_, x) in labelled], gap, (0.0, length))
+    for (text, (i, _)), place in zip(labelled, places, strict=True):
+        offset = (0, -9 if crossed else 9)
+        annotate(axes, text, (place, 0), offset, ha="center", color=colour(i), **side)
 
 
 def surface_height(case: Case, x) -> np.ndarray:

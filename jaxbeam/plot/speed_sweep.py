@@ -1,10 +1,12 @@
 """Figure of a sweep over speed: peaks of trains, their envelope, and speeds of resonance."""
 
 import json
+from collections.abc import Sequence
 
 import numpy as np
 import xarray
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
@@ -15,8 +17,9 @@ from jaxbeam.analysis.critical_speeds import (
     resonance_speeds,
 )
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.display.addresses import address_words
 from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.model.load_set import load_set
 from jaxbeam.plot.style import (
@@ -24,8 +27,10 @@ from jaxbeam.plot.style import (
     FAINT,
     GREY,
     INK,
+    UnitScale,
     annotate,
     axis_label,
+    drawing_area,
     format_number,
     margin_labels,
     set_title,
@@ -63,13 +68,22 @@ def is_word_axis(peaks: xarray.DataArray, address: str) -> bool:
 
 
 @use_style
-def plot_speed_sweep(peaks: xarray.DataArray, case: Case) -> Figure:
+def plot_speed_sweep(
+    peaks: xarray.DataArray,
+    case: Case,
+    names: Sequence[str],
+    *,
+    ax: Axes | None = None,
+    title: str | None = None,
+) -> Figure | SubFigure:
     """Peaks (speed, word, sensor) over speed, in the units of the sensors, a curve for each word.
 
-    A panel for each sensor, with speeds in km/h from 72 km/h on. Behind the curves of several
-    words is their envelope; a black dot marks the largest peak of all. Triangles mark resonance
-    speeds d f_1 / i of a curve, dashed lines those of the curve with the largest peak; dotted lines
-    are cancellation speeds, where there is a closed form (see `analysis.critical_speeds`).
+    A panel for each sensor, under its name, and speeds in km/h from 72 km/h on. Behind the curves
+    of several words is their envelope; a black dot marks the largest peak of all. Triangles mark
+    resonance speeds d f_1 / i of a curve, dashed lines those of the curve with the largest peak;
+    dotted lines are cancellation speeds, where there is a closed form (see
+    `analysis.critical_speeds`). The figure takes the place of `ax`; its title is that of
+    the case if left out.
     """
     (address,) = (str(dim) for dim in peaks.dims if is_speed(str(dim)))
     others = [str(dim) for dim in peaks.dims if dim not in (address, "sensor")]
@@ -81,38 +95,39 @@ def plot_speed_sweep(peaks: xarray.DataArray, case: Case) -> Figure:
     values = values.reshape(peaks.sizes["sensor"], len(labels), -1)
     speeds = np.abs(peaks[address].values)
     count = len(values)
-    figure = Figure(figsize=(7.6, 0.6 + 3.9 * count))
+    numbers = sensor_numbers(peaks, case)
+    figure = drawing_area(ax, (7.6, 0.6 + 3.9 * count))
     panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
     for i, (axes, curves) in enumerate(zip(panels, values, strict=True)):
-        quantity = case.sensors[i].quantity
+        quantity = case.sensors[numbers[i]].quantity
         factor, unit = unit_scale(curves, QUANTITIES[quantity].unit)
         axes.set_ylabel(axis_label(f"peak {quantity}", unit))
         _draw_panel(axes, speeds, curves / factor, labels, cases, _load_index(address), unit)
         if count > 1:
-            axes.set_title(f"sensor {i}, at {float(concrete(case.sensors[i].position)):.4g} m")
-    panels[-1].set_xlabel(_speed_label(address, case, _scale(speeds)[1]))
-    set_title(figure, case.title)
+            axes.set_title(names[i])
+    panels[-1].set_xlabel(axis_label(address_words(case, address), speed_scale(speeds).unit))
+    set_title(figure, title, case.title)
     return figure
 
 
-def _scale(speeds) -> tuple[float, str]:
-    """Factor from m/s, and unit, in which speeds are drawn."""
-    return (3.6, "km/h") if np.max(speeds) >= FAST else (1.0, "m/s")
+def speed_scale(speeds) -> UnitScale:
+    """Unit in which speeds (m/s) are drawn: km/h from 72 km/h on."""
+    is_fast = np.max(np.abs(speeds)) >= FAST
+    return UnitScale(1 / 3.6, "km/h") if is_fast else UnitScale(1.0, "m/s")
+
+
+def sensor_numbers(peaks: xarray.DataArray, case: Case) -> list[int]:
+    """Numbers of the sensors of a dataset, by their labels."""
+    if "sensor" not in peaks.coords:
+        return list(range(peaks.sizes["sensor"]))
+    labels = sensor_labels(case.sensors)
+    return [labels.index(str(label)) for label in np.atleast_1d(peaks["sensor"].values)]
 
 
 def _load_index(address: str) -> int:
     """Index of the load that an address names; 0 for all."""
     index = address.split(".")[1]
     return int(index) if index.isdigit() else 0
-
-
-def _speed_label(address: str, case: Case, unit: str) -> str:
-    if "*" in address and len(case.loads) > 1:
-        return f"speed of all loads ({unit})"
-    is_row = load_set(case).wheel_count > len(case.loads)
-    name = "train" if case.loads[_load_index(address)].kind == "axles" and is_row else "load"
-    number = f" {_load_index(address)}" if len(case.loads) > 1 else ""
-    return f"speed of {name}{number} ({unit})"
 
 
 def _cases(peaks, case: Case, count: int) -> list[Case]:
@@ -133,7 +148,7 @@ def _colours(count: int) -> list:
 
 def _draw_panel(axes, speeds, curves, labels, cases, load, unit):
     """Curves (word, speed) of one sensor, their envelope and the marks on them."""
-    factor, speed_unit = _scale(speeds)
+    factor, speed_unit = 1 / speed_scale(speeds).factor, speed_scale(speeds).unit
     order = np.argsort(speeds)
     x, curves = factor * speeds[order], curves[:, order]
     finite = np.where(np.isfinite(curves), curves, -np.inf)

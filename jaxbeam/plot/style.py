@@ -1,17 +1,20 @@
 """Shared style of all figures: colours, fonts, unit prefixes, labels that do not overlap."""
 
-from typing import NamedTuple
-
 import numpy as np
 from cycler import cycler
 from jaxtyping import Float
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure, SubFigure
+
+from jaxbeam.case.display.prefixes import UnitScale as UnitScale, unit_scale as unit_scale
 
 INK, GREY, FAINT, SHADE = "#22282e", "#6b747c", "#dfe3e6", "#eef2f5"
 # Okabe and Ito's colours, distinct with any kind of colour vision.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 ALARM = COLOURS[1]
+LABEL_HEIGHT = 0.17  # inches, of a line of text
 LOAD_COLOURS = (INK, "#A6611A", "#7B3294", "#7A868F")  # distinct from COLOURS too
 
 STYLE = {
@@ -48,29 +51,7 @@ use_style = rc_context(STYLE)
 """Decorator of functions that draw: the style holds inside them only."""
 
 
-class UnitScale(NamedTuple):
-    """Values divided by `factor` are in `unit`."""
-
-    factor: float
-    unit: str
-
-
-_PREFIXES = ((1e6, 1e6, "M"), (1e3, 1e3, "k"), (0.1, 1.0, ""), (1e-4, 1e-3, "m"), (1e-7, 1e-6, "µ"))
-
-
-def unit_scale(values, unit: str) -> UnitScale:
-    """Prefixed unit for the largest of some values in an SI unit: mm for 0.0014 m.
-
-    Values without unit ("1"), or in 1/m, get a power of ten instead.
-    """
-    sizes = np.abs(np.asarray(values, float))
-    largest = np.max(sizes[np.isfinite(sizes)], initial=0.0)
-    fitting = ((factor, prefix) for least, factor, prefix in _PREFIXES if largest >= least)
-    factor, prefix = next(fitting, (1e-9, "n")) if largest else (1.0, "")
-    if unit == "" or unit.startswith("1"):
-        power = "" if factor == 1 else f"$10^{{{np.log10(factor):.0f}}}$"
-        return UnitScale(factor, f"{power or '1'}{unit[1:]}" if unit[1:] else power)
-    return UnitScale(factor, prefix + unit.replace("^2", "²"))
+Size = tuple[int | float, int | float]  # width and height in inches
 
 
 def axis_label(words: str, unit: str) -> str:
@@ -103,10 +84,71 @@ def command_drawstyle(controller) -> str:
     return "default" if controller.period is None else "steps-post"
 
 
-def set_title(figure, title: str) -> None:
-    """Set the title of a figure, flush left; nothing for an empty one."""
-    if title:
+def label_height(axes: Axes, words: str, unit: str) -> None:
+    """Label the vertical axis: words and unit, in two lines and smaller letters on low axes."""
+    figure = axes.get_figure(root=True)
+    points = 72 * axes.get_window_extent().height / (figure.dpi if figure else 72)
+    text, size = axis_label(words, unit), 9.0
+    if 0.55 * size * len(text) > points and unit:
+        text = f"{words}\n({unit})"
+    longest = max(map(len, text.split("\n")))
+    axes.set_ylabel(text, fontsize=min(size, max(6.0, points / (0.55 * longest))))
+
+
+def drawing_area(ax: Axes | None, size: Size) -> Figure | SubFigure:
+    """A figure of some size (inches), or a part of the figure of `ax` that takes its place.
+
+    Raises ValueError if the axes have no place in a grid.
+    """
+    if ax is None:
+        return Figure(figsize=size)
+    place, figure = ax.get_subplotspec(), ax.get_figure()
+    if place is None or figure is None:
+        raise ValueError(
+            "ax has no place in a grid, which the panels could divide: make it with subplots"
+        )
+    ax.remove()
+    return figure.add_subfigure(place)
+
+
+@use_style
+def page(size: Size) -> Axes:
+    """Axes that fill a figure of some size (inches), for `ax` of a function that draws."""
+    return Figure(figsize=size).subplots()
+
+
+def single_axes(ax: Axes | None, size: Size) -> tuple[Figure | SubFigure, Axes]:
+    """Figure and axes of a figure of one panel: those given, or new ones of some size (inches).
+
+    Raises ValueError for axes without a figure.
+    """
+    if ax is None:
+        figure = Figure(figsize=size)
+        return figure, figure.subplots()
+    figure = ax.get_figure()
+    if figure is None:
+        raise ValueError("ax belongs to no figure: make it with subplots")
+    return figure, ax
+
+
+def set_title(
+    figure: Figure | SubFigure, title: str | None, default: str = "", ax: Axes | None = None
+) -> None:
+    """Set the title of a figure, flush left, or of the axes given; none if it is empty."""
+    title = default if title is None else title
+    if not title:
+        return
+    if ax is not None and ax.get_figure() is not None:
+        ax.set_title(title, loc="left", fontweight="bold")
+    else:
         figure.suptitle(title, x=0.01, ha="left")
+
+
+def text_share(axes: Axes, characters: int, size: float = 9.0) -> float:
+    """Width of a text of a font size (points) over that of the axes, about."""
+    figure = axes.get_figure(root=True)
+    width = 72 * axes.get_window_extent().width / (figure.dpi if figure else 72)
+    return 0.55 * size * characters / width
 
 
 def annotate(axes, text: str, point, offset, **options) -> None:
@@ -114,14 +156,21 @@ def annotate(axes, text: str, point, offset, **options) -> None:
     axes.annotate(text, point, xytext=offset, textcoords="offset points", **options)
 
 
-def separate_labels(positions, gap: float) -> Float[np.ndarray, " label"]:
-    """Positions at least `gap` apart, order kept, nearest to the wanted ones in least squares."""
+def separate_labels(
+    positions, gap: float, limits: tuple[float, float] = (-np.inf, np.inf)
+) -> Float[np.ndarray, " label"]:
+    """Positions at least `gap` apart, order kept, nearest to the wanted ones in least squares.
+
+    They are moved to within the limits if they fit there.
+    """
     positions = np.asarray(positions, float)
     order = np.argsort(positions, kind="stable")
     steps = gap * np.arange(positions.size)
     separated = np.empty_like(positions)
     # With the gaps subtracted, positions must not decrease: isotonic regression.
-    separated[order] = _isotonic_regression(positions[order] - steps) + steps
+    fitted = _isotonic_regression(positions[order] - steps)
+    low, high = limits[0] + gap / 2, limits[1] - gap / 2 - gap * (positions.size - 1)
+    separated[order] = np.maximum(np.minimum(fitted, high), low) + steps
     return separated
 
 
@@ -139,11 +188,21 @@ def _isotonic_regression(values):
 
 
 def margin_labels(axes, heights, labels, colours) -> None:
-    """Write labels in the right margin, each beside its height (data units) if there is room."""
+    """Write labels in the right margin, each beside its height (data units) if there is room.
+
+    Of more labels than fit those farthest from zero are written, with the number of the others.
+    """
     low, high = axes.get_ylim()
-    inches = axes.get_figure().get_figheight() * axes.get_position().height
-    label_heights = separate_labels(heights, 0.17 * (high - low) / inches)
-    for height, label, tint in zip(label_heights, labels, colours, strict=True):
+    inches = axes.get_window_extent().height / axes.get_figure(root=True).dpi
+    room = max(2, int(inches / LABEL_HEIGHT))
+    entries = list(zip(heights, labels, colours, strict=True))
+    if len(entries) > room:
+        entries.sort(key=lambda entry: -abs(entry[0]))
+        others = f"and {len(entries) - room + 1} more"
+        entries = [*entries[: room - 1], (low, others, GREY)]
+    gap = LABEL_HEIGHT * (high - low) / inches
+    label_heights = separate_labels([entry[0] for entry in entries], gap, (low, high))
+    for height, (_, label, tint) in zip(label_heights, entries, strict=True):
         annotate(
             axes,
             label,
@@ -156,8 +215,10 @@ def margin_labels(axes, heights, labels, colours) -> None:
         )
 
 
-def draw_limits(axes, limits, colours) -> None:
+def draw_limits(axes, limits, colours, unit: str = "") -> None:
     """Draw limits of commands as dotted lines, with their values in the right margin."""
     for limit, tint in zip(limits, colours, strict=True):
         axes.axhline(limit, color=tint, linewidth=0.9, linestyle=":")
-    margin_labels(axes, limits, [f"limit {format_number(limit)}" for limit in limits], colours)
+    margin_labels(
+        axes, limits, [f"limit {format_number(limit)} {unit}".rstrip() for limit in limits], colours
+    )

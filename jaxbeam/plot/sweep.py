@@ -2,29 +2,41 @@
 
 import functools
 import json
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import xarray
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from jaxbeam.case.case import Case, unit_at
+from jaxbeam.case.display.addresses import address_words
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
-from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_from_dict
-from jaxbeam.plot.speed_sweep import is_speed_sweep, is_word_axis, plot_speed_sweep
+from jaxbeam.plot.speed_sweep import (
+    is_speed,
+    is_speed_sweep,
+    is_word_axis,
+    plot_speed_sweep,
+    sensor_numbers,
+    speed_scale,
+)
 from jaxbeam.plot.style import (
     ALARM,
     FAINT,
     INK,
+    UnitScale,
     axis_label,
     colour,
+    drawing_area,
     format_number,
     margin_labels,
     set_title,
+    single_axes,
     unit_scale,
     use_style,
 )
@@ -34,21 +46,31 @@ MAX_MARKED_RUNS = 40  # largest number of runs of a curve that are marked with d
 
 
 @use_style
-def plot_sweep(dataset: xarray.Dataset) -> Figure:
+def plot_sweep(
+    dataset: xarray.Dataset,
+    *,
+    ax: Axes | None = None,
+    title: str | None = None,
+    labels: Sequence[str] | None = None,
+) -> Figure | SubFigure:
     """Peaks at the sensors over the swept addresses: curves for one, a map per sensor for two.
 
     Trains over speed are drawn as in `plot_speed_sweep`, other words as bars. Each quantity has a
     scale of its own. A dot marks the largest peak; failed runs are left out; paired runs are drawn
     over their number. A sweep over more addresses is drawn in slices:
-    `plot_sweep(dataset.isel({"loads.0.mass": 0}))`. Raises ValueError for more than two addresses,
-    for a single run, and for a dataset without peaks and the attribute `case`.
+    `plot_sweep(dataset.isel({"loads.0.mass": 0}))`.
+
+    The figure takes the place of `ax`, curves of one quantity are drawn on it. The title is that of
+    the case, with what was selected, if left out; `labels` name the sensors of the dataset. Raises
+    ValueError for more than two addresses, for a single run, for a dataset without peaks and the
+    attribute `case`, and for another number of labels than sensors.
     """
-    names = [f"peak_{name}" for name in QUANTITIES if f"peak_{name}" in dataset]
-    if not names or "case" not in dataset.attrs:
+    variables = [f"peak_{name}" for name in QUANTITIES if f"peak_{name}" in dataset]
+    if not variables or "case" not in dataset.attrs:
         raise ValueError("not a sweep of jaxbeam: the dataset lacks its peaks or its case")
     case = case_from_dict(json.loads(dataset.attrs["case"]))
     # Each sensor has its peaks in the variable of its quantity, and NaN in the others.
-    peaks = functools.reduce(lambda one, other: one.fillna(other), (dataset[n] for n in names))
+    peaks = functools.reduce(lambda one, other: one.fillna(other), (dataset[n] for n in variables))
     peaks = peaks.squeeze([d for d in peaks.dims if d != "sensor" and peaks.sizes[d] == 1])
     swept = [str(dimension) for dimension in peaks.dims if dimension != "sensor"]
     with_values = [address for address in swept if address in peaks.coords]
@@ -62,8 +84,9 @@ def plot_sweep(dataset: xarray.Dataset) -> Figure:
             f"a sweep is drawn over one or two addresses, not {len(swept)} ({', '.join(swept)}); "
             f"select a value of the others, as in dataset.isel({{{swept[0]!r}: 0}})"
         )
+    names = _sensor_names(peaks, case, labels)
     if is_speed_sweep(peaks, case):
-        return plot_speed_sweep(peaks, case)
+        return plot_speed_sweep(peaks, case, names, ax=ax, title=title)
     words = [address for address in swept if is_word_axis(peaks, address)]
     if words and len(swept) > 1:
         raise ValueError(
@@ -71,39 +94,39 @@ def plot_sweep(dataset: xarray.Dataset) -> Figure:
             f" dataset.isel({{{words[0]!r}: 0}})"
         )
     peaks = peaks.transpose("sensor", *swept)
-    numbers = _sensor_numbers(peaks, case)
+    numbers = sensor_numbers(peaks, case)
     by_quantity = [
         [row for row, i in enumerate(numbers) if case.sensors[i].quantity == quantity]
         for quantity in dict.fromkeys(case.sensors[i].quantity for i in numbers)
     ]
-    groups = [_quantity_peaks(peaks, numbers, rows, case) for rows in by_quantity]
+    groups = [_quantity_peaks(peaks, numbers, rows, case, names) for rows in by_quantity]
     draw = _bars if words else _curves if len(swept) == 1 else _maps
-    figure = draw(groups, swept, case)
+    figure = draw(groups, swept, case, ax)
     fixed_values = [
         _fixed_value(case, str(address), value.item())
         for address, value in peaks.coords.items()
         if value.ndim == 0 and address not in ("sensor", "cases")
     ]
-    set_title(figure, "\n".join(filter(None, [case.title, ", ".join(fixed_values)])))
+    whole_title = "\n".join(filter(None, [case.title, ", ".join(fixed_values)]))
+    set_title(figure, title, whole_title, ax)
     return figure
 
 
 def _fixed_value(case: Case, address: str, value) -> str:
-    """Address and value of a dimension that was selected."""
+    """What a dimension is that was selected, and its value."""
+    words = address_words(case, address)
     if isinstance(value, str):
-        return f"{address} = {value}"
-    return f"{address} = {value:.4g} {_unit(case, address)}".rstrip()
+        return f"{words} {value}"
+    factor, unit = _axis_scale(case, address, value)
+    return f"{words} {value / factor:.4g} {unit}".rstrip()
 
 
-def _unit(case: Case, address: str) -> str:
-    """SI unit of the number at an address; empty if it has none."""
+def _axis_scale(case: Case, address: str, values) -> UnitScale:
+    """Unit of the axis of a swept number: with a prefix, or km/h of fast speeds."""
+    if is_speed(address):
+        return speed_scale(values)
     unit = unit_at(case, address)
-    return "" if unit == "1" else unit
-
-
-def _axis_label(case: Case, address: str) -> str:
-    unit = _unit(case, address)
-    return f"{address} ({unit})" if unit else address
+    return UnitScale(1.0, "") if unit in ("", "1") else unit_scale(values, unit)
 
 
 class QuantityPeaks(NamedTuple):
@@ -116,25 +139,22 @@ class QuantityPeaks(NamedTuple):
     numbers: list[int]
 
 
-def _sensor_numbers(peaks, case: Case) -> list[int]:
-    """Numbers of the sensors of a dataset, by their labels."""
-    if "sensor" not in peaks.coords:
-        return list(range(peaks.sizes["sensor"]))
-    labels = sensor_labels(case.sensors)
-    return [labels.index(str(label)) for label in peaks["sensor"].values]
-
-
-def _quantity_peaks(peaks, numbers, rows, case: Case) -> QuantityPeaks:
+def _quantity_peaks(peaks, numbers, rows, case: Case, names: list[str]) -> QuantityPeaks:
     """Peaks of the sensors of a quantity, which are some rows of all peaks."""
     own = [numbers[row] for row in rows]
     quantity = case.sensors[own[0]].quantity
     factor, unit = unit_scale(peaks[rows], QUANTITIES[quantity].unit)
     label = axis_label(f"peak {quantity}", unit)
-    return QuantityPeaks(label, unit, peaks[rows] / factor, _sensor_names(peaks, own, case), own)
+    return QuantityPeaks(label, unit, peaks[rows] / factor, [names[row] for row in rows], own)
 
 
-def _sensor_names(peaks, numbers, case: Case) -> list[str]:
-    """Names of sensors; without one, positions (m), or numbers if positions are swept."""
+def _sensor_names(peaks, case: Case, labels: Sequence[str] | None) -> list[str]:
+    """Names of the sensors of a dataset; without one, positions (m), or numbers if swept."""
+    numbers = sensor_numbers(peaks, case)
+    if labels is not None:
+        if len(labels) != len(numbers):
+            raise ValueError(f"labels names {len(labels)} sensors; the sweep has {len(numbers)}")
+        return list(labels)
     swept = any(str(address).startswith("sensors.") for address in peaks.coords)
     positions = [f"at {float(concrete(case.sensors[i].position)):.4g} m" for i in numbers]
     return [
@@ -143,13 +163,22 @@ def _sensor_names(peaks, numbers, case: Case) -> list[str]:
     ]
 
 
-def _curves(groups: list[QuantityPeaks], swept, case):
+def _curves(groups: list[QuantityPeaks], swept, case, ax):
     (address,) = swept
-    figure = Figure(figsize=(6.4, 1.2 + 2.8 * len(groups)))
-    rows = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
+    if len(groups) == 1:
+        figure, axes = single_axes(ax, (6.4, 4.0))
+        rows = [axes]
+    else:
+        figure = drawing_area(ax, (6.4, 1.2 + 2.8 * len(groups)))
+        rows = figure.subplots(len(groups), 1, sharex=True, squeeze=False)[:, 0]
+    words, scale = "run", UnitScale(1.0, "")
+    if address in groups[0].peaks.coords:
+        scale = _axis_scale(case, address, groups[0].peaks[address])
+        words = address_words(case, address)
     for axes, group in zip(rows, groups, strict=True):
         peaks = group.peaks
         x = peaks[address].values if address in peaks.coords else np.arange(peaks.sizes[address])
+        x = x / scale.factor
         line_style = "o-" if x.size <= MAX_MARKED_RUNS else "-"
         tints, last_values = [colour(i) for i in group.numbers], []
         for tint, values in zip(tints, peaks.values, strict=True):
@@ -162,16 +191,16 @@ def _curves(groups: list[QuantityPeaks], swept, case):
         axes.set_ylim(bottom=0)
         axes.margins(x=0.01)
         margin_labels(axes, last_values, group.names, tints)
-    rows[-1].set_xlabel(_axis_label(case, address))
+    rows[-1].set_xlabel(axis_label(words, scale.unit))
     return figure
 
 
-def _bars(groups: list[QuantityPeaks], swept, case):
+def _bars(groups: list[QuantityPeaks], swept, case, ax):
     """Peaks of words, a bar for each sensor beside each word."""
     (address,) = swept
     labels = [str(word) for word in groups[0].peaks[address].values]
     heights = [0.9 + 0.3 * len(labels) * len(group.names) for group in groups]
-    figure = Figure(figsize=(6.4, sum(heights)))
+    figure = drawing_area(ax, (6.4, sum(heights)))
     rows = figure.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, group in zip(rows, groups, strict=True):
         count = len(group.names)
@@ -181,33 +210,35 @@ def _bars(groups: list[QuantityPeaks], swept, case):
             axes.barh(places, values, 0.7 / count, color=colour(number), label=name)
         axes.set_yticks(np.arange(len(labels)), labels)
         axes.invert_yaxis()
-        axes.set(xlabel=group.label, ylabel=address)
+        axes.set(xlabel=group.label, ylabel=address_words(case, address))
         axes.legend()
     return figure
 
 
-def _maps(groups: list[QuantityPeaks], swept, case):
+def _maps(groups: list[QuantityPeaks], swept, case, ax):
     columns = min(max(len(group.names) for group in groups), 3)
     heights = [-(-len(group.names) // columns) for group in groups]
-    figure = Figure(figsize=(1.5 + 2.9 * columns, 0.7 + 2.8 * sum(heights)))
+    figure = drawing_area(ax, (1.5 + 2.9 * columns, 0.7 + 2.8 * sum(heights)))
     grid = figure.subplots(sum(heights), columns, sharex=True, sharey=True, squeeze=False)
+    scales = [_axis_scale(case, address, groups[0].peaks[address]) for address in swept]
     first = 0
     for group, height in zip(groups, heights, strict=True):
-        _draw_maps(figure, grid[first : first + height], group, swept)
+        _draw_maps(figure, grid[first : first + height], group, swept, scales)
         first += height
     for axes in grid[-1]:
-        axes.set_xlabel(_axis_label(case, swept[1]))
+        axes.set_xlabel(axis_label(address_words(case, swept[1]), scales[1].unit))
     for axes in grid[:, 0]:
-        axes.set_ylabel(_axis_label(case, swept[0]))
+        axes.set_ylabel(axis_label(address_words(case, swept[0]), scales[0].unit))
     return figure
 
 
-def _draw_maps(figure, grid, group: QuantityPeaks, swept):
+def _draw_maps(figure, grid, group: QuantityPeaks, swept, scales):
     """Maps of a quantity in the rows of a grid; equal colours are equal peaks."""
     peaks = group.peaks
     for axes in grid.flat[len(group.names) :]:
         axes.set_visible(False)
-    y, x = (peaks[address].values for address in swept)
+    scaled = zip(swept, scales, strict=True)
+    y, x = (peaks[address].values / scale.factor for address, scale in scaled)
     highest = np.max(peaks.values, initial=0.0, where=np.isfinite(peaks.values)) or 1.0
     contour_levels = MaxNLocator(8).tick_values(0, highest)
     fill_levels = np.linspace(0, contour_levels[-1], 8 * (contour_levels.size - 1) + 1)

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 
-from jaxbeam.plot.style import GREY, INK, SHADE, colour, set_title, use_style
+from jaxbeam.plot.style import GREY, INK, SHADE, colour, drawing_area, set_title, use_style
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,17 +25,21 @@ class TuningPanel:
 
 @use_style
 def plot_tuning(
-    panels: Sequence[TuningPanel], history: Float[np.ndarray, "step start"], title: str = ""
-) -> Figure:
+    panels: Sequence[TuningPanel],
+    history: Float[np.ndarray, "step start"],
+    title: str = "",
+    *,
+    ax: Axes | None = None,
+) -> Figure | SubFigure:
     """Peaks of every run relative to no control, and the objective over the steps of the search.
 
-    Shading: below the least achievable peak, the bound on any controller. Raises ValueError without
-    panels.
+    Shading: below the least achievable peak, the bound on any controller. The figure takes the
+    place of `ax`. Raises ValueError without panels.
     """
     if not panels:
         raise ValueError("there is nothing to draw: give at least one panel")
     max_runs = max(len(panel.labels) for panel in panels)
-    figure = Figure(figsize=(max(7.0, 4.2 * len(panels)), 3.4 + 0.26 * max_runs))
+    figure = drawing_area(ax, (max(7.0, 4.2 * len(panels)), 3.4 + 0.26 * max_runs))
     grid = figure.subplots(
         2, len(panels), squeeze=False, height_ratios=[1.2 + 0.22 * max_runs, 1.2]
     )
@@ -51,7 +56,7 @@ def plot_tuning(
     below.plot(history, color=GREY, linewidth=0.7)
     below.plot(np.fmin.accumulate(np.nanmin(history, axis=1)), color=INK, linewidth=1.4)
     below.set(xlabel="step", ylabel="objective", title="search: every start, and the best so far")
-    set_title(figure, title)
+    set_title(figure, title, "")
     return figure
 
 

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.case.beam import Beam
 from jaxbeam.case.case import Case
@@ -11,7 +12,16 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.base import AbstractLoad, wheel_distances
 from jaxbeam.model.load_set import load_set
 from jaxbeam.plot.schematic import LOAD_MARKER
-from jaxbeam.plot.style import COLOURS, GREY, INK, annotate, unit_scale, use_style
+from jaxbeam.plot.style import (
+    COLOURS,
+    GREY,
+    INK,
+    annotate,
+    drawing_area,
+    set_title,
+    unit_scale,
+    use_style,
+)
 from jaxbeam.plot.traffic.drawing import vehicle_art
 
 AXES_WIDTH = 540.0  # points
@@ -19,20 +29,28 @@ MAX_LABELS = 12  # wheels with their static loads
 
 
 @use_style
-def plot_vehicles(loads: Sequence[AbstractLoad], titles: Sequence[str] = ()) -> Figure:
+def plot_vehicles(
+    loads: Sequence[AbstractLoad],
+    titles: Sequence[str] = (),
+    *,
+    ax: Axes | None = None,
+    title: str = "",
+) -> Figure | SubFigure:
     """Vehicles of loads, one below the other, with static loads under gravity of 9.81 m/s^2.
 
-    The front is on the right; positions are those in front of the last wheel, in m. Raises
-    ValueError without loads.
+    The front is on the right; positions are those in front of the last wheel, in m. `titles` are
+    those of the loads, `title` that of the figure, which takes the place of `ax`. Raises ValueError
+    without loads.
     """
     if not loads:
         raise ValueError("there is nothing to draw: give at least one load")
-    figure = Figure(figsize=(8, 0.4 + 1.8 * len(loads)))
+    figure = drawing_area(ax, (8, 0.4 + 1.8 * len(loads)))
     rows = figure.subplots(len(loads), 1, squeeze=False)[:, 0]
     for i, (axes, load) in enumerate(zip(rows, loads, strict=True)):
         _draw(axes, load)
         axes.set_title(titles[i] if i < len(titles) else load.kind)
     rows[-1].set_xlabel("position (m)")
+    set_title(figure, title, "")
     return figure
 
 

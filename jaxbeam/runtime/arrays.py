@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-_MAX_PADE_NORM = 5.37  # of a matrix whose exponential is its Pade approximant (13, 13), in doubles
+from jaxbeam.runtime import lapack
+
 _KNOWN = (np.ndarray, np.generic, float, int, bool, str, type(None), type, slice)
 
 
@@ -66,7 +67,8 @@ class _Namespace:
         self._known, self._traced = known, traced
 
     def __getattr__(self, name):
-        known, traced = getattr(self._known, name), getattr(self._traced, name)
+        known = getattr(self._known, name)
+        traced: Any = lapack if name == "linalg" else getattr(self._traced, name)
         known = _einsum if name == "einsum" else known
         if name in ("linalg", "fft"):
             attribute: Any = _Namespace(known, traced)
@@ -254,7 +256,7 @@ def optimization_barrier(tree) -> Any:
 def solve(matrix, right) -> Any:
     """Solutions of linear systems (..., row, column); not finite where the matrix is singular."""
     if is_jax(matrix) or is_jax(right):
-        return jnp.linalg.solve(matrix, right)
+        return lapack.solve(matrix, right)
     try:
         return np.linalg.solve(matrix, right)
     except np.linalg.LinAlgError:  # of any matrix of a stack
@@ -267,7 +269,7 @@ def solve(matrix, right) -> Any:
 def solve_triangular(matrix, right, lower: bool, transposed: bool = False) -> Any:
     """Solution of a triangular system, or of that with the transposed matrix."""
     if is_jax(matrix) or is_jax(right):
-        return jax.scipy.linalg.solve_triangular(matrix, right, transposed, lower=lower)
+        return lapack.solve_triangular(matrix, right, lower, transposed)
     import scipy.linalg  # 0.1 s, which compiled programs need not wait for
 
     return scipy.linalg.solve_triangular(matrix, right, transposed, lower=lower, check_finite=False)
@@ -276,9 +278,7 @@ def solve_triangular(matrix, right, lower: bool, transposed: bool = False) -> An
 def solve_tridiagonal(lower, diagonal, upper, right) -> Any:
     """Solution of a tridiagonal system (n,), with n - 1 entries below and above the diagonal."""
     if is_jax((lower, diagonal, upper, right)):
-        lower, upper = jnp.append(0.0, lower), jnp.append(upper, 0.0)
-        columns = jnp.asarray(right)[:, None]
-        return jax.lax.linalg.tridiagonal_solve(lower, diagonal, upper, columns)[:, 0]
+        return lapack.solve_tridiagonal(lower, diagonal, upper, right)
     import scipy.linalg
 
     bands = np.stack([np.append(0.0, upper), diagonal, np.append(lower, 0.0)])
@@ -288,7 +288,7 @@ def solve_tridiagonal(lower, diagonal, upper, right) -> Any:
 def cholesky(matrix) -> Any:
     """Lower triangular factor of a matrix; nan where it is not positive definite."""
     if is_jax(matrix):
-        return jnp.linalg.cholesky(matrix)
+        return lapack.cholesky(matrix)
     try:
         return np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
@@ -296,23 +296,12 @@ def cholesky(matrix) -> Any:
 
 
 def expm(matrix) -> Any:
-    """Exponential of a matrix, by scaling and squaring.
+    """Exponential of a matrix."""
+    if is_jax(matrix):
+        return lapack.expm(matrix)
+    import scipy.linalg
 
-    The scaling is done here, since that of JAX (0.10 to 0.12) leaves a norm of up to twice the
-    bound of its Pade approximant: errors of 1e-8 where it should be 1e-15.
-    """
-    if not is_jax(matrix):
-        import scipy.linalg
-
-        return scipy.linalg.expm(matrix)
-    norm = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(matrix), axis=0)))
-    squarings = jnp.maximum(jnp.ceil(jnp.log2(norm / _MAX_PADE_NORM)), 0)
-
-    def square(root, step):
-        return jax.lax.cond(step < squarings, lambda r: r @ r, lambda r: r, root), None
-
-    root = jax.scipy.linalg.expm(matrix / 2**squarings, max_squarings=1)
-    return jax.lax.scan(square, root, jnp.arange(40))[0]
+    return scipy.linalg.expm(matrix)
 
 
 def block_diag(*blocks) -> Any:

@@ -1,4 +1,4 @@
-"""Optional C code: compiled on request, stored in the cache folder, called by XLA.
+"""Optional C code: compiled when first of use, stored in the cache folder, called by XLA.
 
 A library is named by a hash of its source, its compiler flags, the machine and the version of JAX.
 Its functions are targets of XLA's foreign function interface. Everything also runs without it.
@@ -71,12 +71,26 @@ class Library(NamedTuple):
         except (CacheError, OSError) as error:
             raise RuntimeError(f"the C code cannot be stored: {error}") from None
 
-    def remove(self) -> pathlib.Path:
-        """Delete the compiled library, if built; its path. Raises RuntimeError if that fails."""
+    def build_if_missing(self) -> bool:
+        """Whether the library is available after compiling it, if it never was, where possible.
+
+        One that was removed or is refused is not compiled; a failure leaves everything as it was.
+        """
         try:
-            path = self.library_path()
-            path.unlink(missing_ok=True)
-            return path
+            if os.path.lexists(self.library_path()) or find_compiler() is None:
+                return False
+            self.build()
+        except (CacheError, RuntimeError):
+            return False
+        return self.available()
+
+    def remove(self) -> pathlib.Path:
+        """Remove the compiled library until `build`; its path, of an empty file in its place.
+
+        Raises RuntimeError if that fails.
+        """
+        try:
+            return write_file(self.file_name, b"")
         except (CacheError, OSError) as error:
             raise RuntimeError(f"the C code cannot be removed: {error}") from None
 
@@ -127,7 +141,7 @@ def _compile(library: Library, target: pathlib.Path) -> None:
 def _is_usable(library: Library, path: pathlib.Path, changed: int, size: int) -> bool:
     """Whether a library file is authentic and loads; examined once unless the file changes."""
     try:
-        return read_file(path.name) is not None and bool(_load(library))
+        return bool(read_file(path.name)) and bool(_load(library))  # an empty one was removed
     except (CacheError, OSError) as error:
         warnings.warn(f"C code not used: {error}; `jaxbeam native` compiles it anew", stacklevel=2)
         return False

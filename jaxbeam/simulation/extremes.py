@@ -1,16 +1,21 @@
-"""Smallest and largest values of what each sensor measures."""
+"""Smallest and largest values of what each sensor measures, between samples too."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.runtime.arrays import Array, set_at, take, xp
+from jaxbeam.integrator.running_peaks import Peaks
+from jaxbeam.runtime.arrays import Array, xp
 
 
 class Extremes(NamedTuple):
-    """Smallest and largest value of the quantity of each sensor, in its unit, and times (s)."""
+    """Smallest and largest value of the quantity of each sensor, in its unit, and times (s).
+
+    The beam starts at rest, so that zero is among the values.
+    """
 
     smallest: Float[Array, " sensor"]
     smallest_time: Float[Array, " sensor"]
@@ -18,28 +23,29 @@ class Extremes(NamedTuple):
     largest_time: Float[Array, " sensor"]
 
 
-def sensor_extremes(
-    sensors: Sequence[Sensor],
-    times: Float[Array, " time"],
-    values: Float[Array, "time sensor"],
-    peak_deflection: Float[Array, " sensor"],
-    peak_time: Float[Array, " sensor"],
-) -> Extremes:
-    """Extremes of the samples of each sensor; NaN from NaN.
+def monitored_sensors(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
+    """Deflections at all sensors, then the other quantities of those that measure others."""
+    others = (sensor for sensor in sensors if sensor.quantity != "deflection")
+    return *(Sensor(sensor.position) for sensor in sensors), *others
 
-    Peaks of the absolute deflection (m) and their times (s), which lie between samples, replace the
-    extreme of a sensor of deflections on their side.
+
+def sensor_extremes(sensors: Sequence[Sensor], peaks: Peaks) -> tuple[Extremes, Peaks]:
+    """Extremes at the sensors, and peaks of the absolute deflection there.
+
+    `peaks` are those of `monitored_sensors` in one run: the largest of each, then the largest of
+    its negative.
     """
-    parts = [[xp.zeros(len(sensors))] * 2 for _ in range(2)]
+    up, down = xp.split(peaks.peak_deflection, 2)
+    up_time, down_time = xp.split(peaks.peak_time, 2)
+    own, other = [], len(sensors)  # index of the quantity of each sensor among the monitored
     for i, sensor in enumerate(sensors):
-        history = values[:, i]
-        for side, sign in enumerate((-1.0, 1.0)):
-            index = xp.argmax(sign * history)
-            value, time = take(history, index), take(times, index)
-            if sensor.quantity == "deflection":
-                at_peak = xp.interp(peak_time[i], times, history)
-                beyond = (sign * at_peak > 0) & (peak_deflection[i] >= sign * value)
-                value = xp.where(beyond, sign * peak_deflection[i], value)
-                time = xp.where(beyond, peak_time[i], time)
-            parts[side] = [set_at(parts[side][0], i, value), set_at(parts[side][1], i, time)]
-    return Extremes(*parts[0], *parts[1])
+        is_deflection = sensor.quantity == "deflection"
+        own.append(i if is_deflection else other)
+        other += not is_deflection
+    index = np.array(own, int)
+    extremes = Extremes(-down[index], down_time[index], up[index], up_time[index])
+    every = np.arange(len(sensors))
+    is_up = up[every] >= down[every]
+    deflection = xp.where(is_up, up[every], down[every])
+    time = xp.where(is_up, up_time[every], down_time[every])
+    return extremes, peaks._replace(peak_deflection=deflection, peak_time=time)

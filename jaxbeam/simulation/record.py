@@ -1,8 +1,7 @@
 """Record of one simulated run: histories, section forces, peaks, error; as xarray and netCDF."""
 
-import json
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
@@ -10,39 +9,39 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.case.aliases import renamed_property
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete
-from jaxbeam.files.case_file import case_to_dict
+from jaxbeam.case.display.views import TableViews
+from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.files.endings import check_ending
 from jaxbeam.files.netcdf import write_netcdf
-from jaxbeam.files.tables import write_table
+from jaxbeam.files.tables import write_result
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.sensing.output_rows import quantity_history
+from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readings
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation import section_forces
-from jaxbeam.simulation.extremes import Extremes, sensor_extremes
-from jaxbeam.simulation.labels import contact_sentence, wheel_labels
+from jaxbeam.simulation.extremes import Extremes
+from jaxbeam.simulation.labels import contact_sentence
 from jaxbeam.simulation.record_envelope import RecordEnvelope, record_envelope
-from jaxbeam.simulation.record_table import record_columns
-from jaxbeam.simulation.result_variables import (
-    MODE_FIELDS,
-    MODE_VARIABLES,
-    VARIABLES,
-    sensor_coordinates,
-)
+from jaxbeam.simulation.views.dataset import dataset_parts
+from jaxbeam.simulation.views.table import record_columns
+from jaxbeam.simulation.views.text import record_text
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
+    from matplotlib.figure import Figure, SubFigure
 
 
-class Record(eqx.Module):
+class Record(TableViews, eqx.Module):
     """Record of one simulated run.
 
     Deflection is positive upwards. Samples at an entry or exit of a load are those just after.
     Loads are counted by their wheels. `load_position` (m) is NaN while a wheel is off the beam,
     `contact_force` (N, positive under compression) zero, unless it is the wheel of a vehicle, which
-    presses on the ground. The `bodies` of vehicles have displacements in m (or rad) from static
+    presses on the ground. `smallest` and `largest` values of the quantities of the sensors are in
+    their units. The `bodies` of vehicles have displacements in m (or rad) from static
     equilibrium, positive upwards. Peaks are those in continuous time. `contact_lost_time` (s) and
     `contact_lost_position` (m) are those of the first negative contact force, which the bilateral
     model allows; NaN without one. `command` is that of the actuators, within their limits; at a
@@ -64,6 +63,10 @@ class Record(eqx.Module):
     failures: Float[Array, " time"]
     peak_deflection: Float[Array, " sensor"]
     peak_time: Float[Array, " sensor"]
+    smallest: Float[Array, " sensor"]
+    smallest_time: Float[Array, " sensor"]
+    largest: Float[Array, " sensor"]
+    largest_time: Float[Array, " sensor"]
     lowest_contact_force: Float[Array, " load"]
     contact_lost_time: Float[Array, " load"]
     contact_lost_position: Float[Array, " load"]
@@ -162,10 +165,9 @@ class Record(eqx.Module):
     def extremes(self) -> Extremes:
         """Smallest and largest value of the quantity of each sensor, with their times (s).
 
-        From the samples; peaks of deflections between samples too.
+        Those in continuous time, between samples too; zero, at rest, is among the values.
         """
-        peaks = self.peak_deflection, self.peak_time
-        return sensor_extremes(self.case.sensors, self.times, self.sensor_values, *peaks)
+        return Extremes(self.smallest, self.smallest_time, self.largest, self.largest_time)
 
     def _at_sensors(self, quantity: str) -> Float[Array, "time sensor"]:
         return self.at(self.case.sensor_positions, quantity)
@@ -213,6 +215,15 @@ class Record(eqx.Module):
         return sensor_readings(self.case, self.modes, self.motion, self.times, noisy=True)
 
     @property
+    def vehicle_readings(self) -> Float[Array, "time vehicle_sensor"]:
+        """Readings of the sensors on vehicles in SI units, with filters and noise.
+
+        Raises ValueError if the times do not suit a filter.
+        """
+        motion = self.body_displacement, self.body_velocity, self.body_acceleration
+        return vehicle_readings(self.case, VehicleMotion(*motion), self.times, noisy=True)
+
+    @property
     def saturated(self) -> Bool[Array, "time actuator"]:
         """Whether each command is at a limit of its actuator, to 1e-9 of its range."""
         columns = [xp.zeros(self.times.shape, bool) for _ in self.case.actuators]
@@ -256,41 +267,16 @@ class Record(eqx.Module):
         parts.append(f"estimated error {float(concrete(self.error_estimate)):.1e} of the peak")
         return "; ".join(parts)
 
+    def __repr__(self) -> str:
+        if not is_concrete(self.coordinates) or self.times.ndim != 1:
+            return f"Record of {self.case.title!r}, traced or of several runs"
+        return record_text(self.case, self.times, self.verdict, self.extremes)
+
     def _dataset_parts(self) -> tuple[dict, dict, dict]:
         """Variables, coordinates and attributes of the labelled dataset."""
-        extremes = self.extremes._asdict()
-        variables = {
-            name: (
-                dims,
-                np.asarray(extremes[name] if name in extremes else getattr(self, name)),
-                {"units": unit, "long_name": words},
-            )
-            for name, (dims, unit, words) in VARIABLES.items()
-        }
-        # Modes of repeated frequencies are not unique, so they are stored.
-        variables |= {
-            f"mode_{name}": (
-                dims,
-                np.asarray(getattr(self.modes, MODE_FIELDS.get(name, name))),
-                {"units": unit, "long_name": words},
-            )
-            for name, (dims, unit, words) in MODE_VARIABLES.items()
-        }
-        coordinates = {
-            "time": ("time", np.asarray(self.times), {"units": "s"}),
-            **sensor_coordinates(self.case),
-            "load": ("load", wheel_labels(self.case)),
-            "body": ("body", np.array(self.bodies, dtype=str)),
-            "frequency": ("mode", np.asarray(self.modes.frequencies), {"units": "Hz"}),
-        }
-        attributes = {
-            "title": self.case.title,
-            "case": json.dumps(case_to_dict(self.case)),
-            "error_estimate": float(self.error_estimate),
-            "steps": self.steps,
-            "verdict": self.verdict,
-        }
-        return variables, coordinates, attributes
+        return dataset_parts(
+            self.case, self.modes, self.times, self.bodies, lambda name: getattr(self, name)
+        )
 
     def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units; `record_from_xarray` restores the record exactly."""
@@ -298,22 +284,38 @@ class Record(eqx.Module):
 
         return xarray.Dataset(*self._dataset_parts())
 
+    def plot(self, quantity: str | None = None, **options: Any) -> "Figure | SubFigure":
+        """Figure of the record, or of one quantity of its sensors; see `jaxbeam.plot.plot_record`.
+
+        `options` are its `ax`, `title` and `labels`; it raises as that function does.
+        """
+        from jaxbeam.plot import plot_record
+
+        return plot_record(self, quantity, **options)
+
+    def plot_envelope(self, quantity: str = "moment", **options: Any) -> "Figure | SubFigure":
+        """Figure of the envelope of a quantity; see `jaxbeam.plot.plot_envelope`."""
+        from jaxbeam.plot import plot_envelope
+
+        return plot_envelope(self, quantity, **options)
+
     @property
     def columns(self) -> dict[str, Float[np.ndarray, " time"]]:
-        """Histories by head, as "midspan deflection (m)": `pandas.DataFrame(columns)` works."""
+        """Histories by head, as "midspan deflection (m)"; `to_dataframe` has them too."""
         histories = self.sensor_values, self.contact_force, self.command
         return record_columns(self.case, self.times, *histories)
 
     def save(self, path: str | os.PathLike, overwrite: bool = False) -> None:
-        """Write the record to .nc (all of it), or its `columns` to .csv, .xlsx, .mat or .parquet.
+        """Write all of the record to .nc or .zarr, or its `columns` to .csv, .xlsx, .mat, .parquet.
 
         Raises FileExistsError if the file exists, without `overwrite`; ValueError for another
-        ending; ImportError, with what to install, if a package is missing (see `write_table`).
+        ending; ImportError, with what to install, if a package is missing (see `jaxbeam.save`).
         """
-        if os.fspath(path).endswith(".nc"):
+        check_ending(path, "a record")
+        if os.fspath(path).endswith(".nc"):  # without xarray, which takes long to import
             self.to_netcdf(path, overwrite)
         else:
-            write_table(path, self.columns, overwrite)
+            write_result(path, lambda: self.columns, self.to_xarray, overwrite)
 
     def to_netcdf(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write the labelled dataset to a netCDF file.

@@ -1,22 +1,28 @@
 """Smallest and largest values of a quantity along the beam, with place of the loads and time."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
+from jaxbeam.case.display.views import TableViews
+from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.output_rows import quantity_history
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, take, xp
 from jaxbeam.simulation.section_forces import SIDES, shear_force
 
+if TYPE_CHECKING:
+    import xarray  # imported where it is used, as it takes as long as all of JAX
+
 MAX_ENTRIES = 4_000_000  # of the influence of all loads at all times on one part of the positions
 DEFAULT_POSITIONS = 101
 
 
-class RecordEnvelope(NamedTuple):
+class RecordEnvelope(TableViews, eqx.Module):
     """Smallest and largest values of a quantity at positions (m), from the samples of a record.
 
     Values are in the unit of the quantity; with each are its time (s) and the positions of the
@@ -30,6 +36,37 @@ class RecordEnvelope(NamedTuple):
     largest: Float[Array, " position"]
     largest_time: Float[Array, " position"]
     largest_load_position: Float[Array, "position load"]
+    quantity: str = eqx.field(static=True)
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Position (m), smallest and largest value with their times (s), by head."""
+        unit = QUANTITIES[self.quantity].unit
+        brackets = "" if unit == "1" else f" ({unit})"
+        return {
+            "position (m)": np.asarray(self.positions),
+            f"smallest {self.quantity}{brackets}": np.asarray(self.smallest),
+            "time of smallest (s)": np.asarray(self.smallest_time),
+            f"largest {self.quantity}{brackets}": np.asarray(self.largest),
+            "time of largest (s)": np.asarray(self.largest_time),
+        }
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """Labelled dataset with units."""
+        import xarray
+
+        unit, words = QUANTITIES[self.quantity].unit, self.quantity
+        variables = {}
+        for side in ("smallest", "largest"):
+            values = (getattr(self, f"{side}{part}") for part in ("", "_time", "_load_position"))
+            value, time, place = map(np.asarray, values)
+            variables |= {
+                side: ("position", value, {"units": unit, "long_name": f"{side} {words}"}),
+                f"{side}_time": ("position", time, {"units": "s"}),
+                f"{side}_load_position": (("position", "load"), place, {"units": "m"}),
+            }
+        x = ("position", np.asarray(self.positions), {"units": "m"})
+        return xarray.Dataset(variables, {"position": x}, {"quantity": self.quantity})
 
 
 def record_envelope(
@@ -62,7 +99,8 @@ def record_envelope(
         extremes.append(
             [*_extremes(-sides, times, motion, -1.0), *_extremes(sides, times, motion, 1.0)]
         )
-    return RecordEnvelope(positions, *map(xp.concatenate, zip(*extremes, strict=True)))
+    joined = map(xp.concatenate, zip(*extremes, strict=True))
+    return RecordEnvelope(positions, *joined, quantity)
 
 
 def _extremes(values, times, motion: Motion, sign: float):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,8 @@ from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.integrator.discrete_model import DiscreteModel, discrete_model
+from jaxbeam.case.sensors import Sensor
+from jaxbeam.integrator.discrete_model import DiscreteModel, discrete_model, signed_both_ways
 from jaxbeam.integrator.events import sample_schedule
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history
@@ -19,12 +21,16 @@ from jaxbeam.integrator.time_grid import grid_by_schedule
 from jaxbeam.model.contact import contact_at, split_states
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
+from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
 from jaxbeam.model.sensing.measurement import sensor_readings
+from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readings
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop
 from jaxbeam.simulation.command_limits import command_ranges
+from jaxbeam.simulation.extremes import monitored_sensors, sensor_extremes
 from jaxbeam.simulation.integration_plan import (
     TOLERANCE,
     IntegrationPlan,
@@ -88,8 +94,10 @@ def _check_times(times) -> None:
 
 
 def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
-    running_peaks, outputs, modal, steps = _integrate(case, plan, times, case.sensor_positions)
+    monitored = monitored_sensors(case.sensors)
+    running_peaks, outputs, modal, steps = _integrate(case, plan, times, monitored)
     peaks = Peaks(*(part[0] for part in running_peaks.peaks()))
+    extremes, peaks = sensor_extremes(case.sensors, peaks)
     loads, lost_times = load_set(case), peaks.contact_lost_time
     # Each wheel at its own time.
     lost_positions = xp.diagonal(loads.kinematics(lost_times)[0])
@@ -102,6 +110,7 @@ def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
         failures=xp.zeros(times.shape) if outputs.failures is None else outputs.failures,
         controller_readings=outputs.readings,
         **peaks._asdict(),
+        **extremes._asdict(),
         contact_lost_position=lost_positions,
         error_estimate=error,
         steps=steps,
@@ -115,15 +124,19 @@ _simulate_compiled = compiled(_simulate_record)
 def simulate_readings(
     case: Case, times: Float[Array, " time"], plan: IntegrationPlan
 ) -> Float[Array, "time sensor"]:
-    """Readings of the sensors at ascending times (s), as `Record.measured` but without noise.
+    """Readings of all sensors at ascending times (s), as `Record.measured` but without noise.
 
-    The controller has no noise either, as that of a log is unknown. For fits: less to compile and
-    differentiate than `simulate`, without its checks and warnings.
+    Those on vehicles follow those on the beam. The controller has no noise either, as that of a log
+    is unknown. For fits: less to compile and differentiate than `simulate`, without its checks and
+    warnings.
     """
     _, outputs, modal, _ = _integrate(case, plan, times, None, noisy=False)
-    if outputs.readings is not None:
-        return outputs.readings
-    return sensor_readings(case, modal, outputs.motion, times)
+    readings = outputs.readings
+    if readings is None:
+        readings = sensor_readings(case, modal, outputs.motion, times)
+    if not case.vehicle_sensors:
+        return readings
+    return xp.concatenate([readings, vehicle_readings(case, outputs.vehicles, times)], axis=1)
 
 
 class Histories(NamedTuple):
@@ -162,9 +175,16 @@ class IntegrationSetup(NamedTuple):
 
 
 def integration_setup(
-    case: Case, plan: IntegrationPlan, times, positions, noisy: bool = True
+    case: Case,
+    plan: IntegrationPlan,
+    times,
+    monitored: Sequence[Sensor] | None,
+    noisy: bool = True,
 ) -> IntegrationSetup:
-    """Setup of a planned integration with peaks at positions (m); without noise unless `noisy`."""
+    """Setup of a planned integration; without noise unless `noisy`.
+
+    Its peaks are those of what the `monitored` sensors measure, upwards, then downwards.
+    """
     loads, layout = load_set(case), plan.shapes.layout
     if case.controller is None:
         model, policy = modal_model(case, layout, plan.shapes.coupled), None
@@ -181,18 +201,25 @@ def integration_setup(
         schedule = plan.schedule
         policy = closed_loop(case, layout, loads, schedule, noisy)
         model = policy.model
-    grid = grid_by_schedule(case, model, schedule, plan.substeps)
-    discrete = discrete_model(model, grid, positions, policy)
+    places = None if monitored is None else corrected_places(case, model, monitored)
+    grid = grid_by_schedule(case, model, schedule, plan.substeps, places)
+    if monitored is None:
+        discrete = discrete_model(model, grid, None, policy)
+    else:
+        outputs = sensor_rows(model, case, monitored)
+        correction = static_correction(model, case, monitored, outputs)
+        discrete = discrete_model(model, grid, None, policy, outputs, correction)
+        discrete = signed_both_ways(discrete)
     sample_steps = plan.substeps * grid.event_panels[schedule.sample_events]
     return IntegrationSetup(
         discrete, loads, policy, sample_steps, grid.counts.shape[0] * plan.substeps
     )
 
 
-def _integrate(case: Case, plan: IntegrationPlan, times, positions, noisy=True):
+def _integrate(case: Case, plan: IntegrationPlan, times, monitored, noisy=True):
     """Running peaks, outputs at the sample times, modes, and the number of steps."""
     discrete, loads, policy, sample_steps, steps = integration_setup(
-        case, plan, times, positions, noisy
+        case, plan, times, monitored, noisy
     )
     model = discrete.model
     running_peaks, states, commands, observed, _ = integrate_history(
@@ -219,17 +246,6 @@ def _commands_at_steps(case: Case, commands, steps):
     commands_at_start = xp.tensordot(histories, end_weights()[:, 0], axes=[1, 0])[steps]
     low, high, _ = command_ranges(case)
     return xp.clip(commands_at_start, low, high)
-
-
-class VehicleMotion(NamedTuple):
-    """Heights (m) or pitch angles (rad) of the bodies of vehicles, their rates and accelerations.
-
-    Of all vehicles, one after the other (see `Record.bodies`), measured from static equilibrium.
-    """
-
-    body_displacement: Float[Array, "time body"]
-    body_velocity: Float[Array, "time body"]
-    body_acceleration: Float[Array, "time body"]
 
 
 def _vehicle_motion(model: ModalModel, loads: LoadSet, states, accelerations) -> VehicleMotion:

@@ -2,12 +2,14 @@
 
 import json
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxbeam.case.case import Case
 from jaxbeam.files.case_file import case_from_dict
+from jaxbeam.files.zarr_codecs import check_codecs
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes, mesh_layout
 from jaxbeam.runtime.arrays import xp
@@ -71,11 +73,15 @@ def _is_sampled(case: Case) -> bool:
 
 
 def read_record(path: str | os.PathLike) -> Record:
-    """Record from a netCDF file written by `Record.to_netcdf`.
+    """Record from a netCDF file or zarr store written by `Record.save`.
 
     Raises OSError if the file cannot be read, ValueError if it is not that of a record.
     """
     import xarray
 
+    if os.path.isdir(path):
+        check_codecs(Path(path))
+        dataset = xarray.open_zarr(path, consolidated=False, zarr_format=3)
+        return record_from_xarray(dataset.load())
     with xarray.open_dataset(path, engine="scipy") as dataset:
         return record_from_xarray(dataset.load())

@@ -11,17 +11,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, value_at
-from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.events import sample_schedule
+from jaxbeam.integrator.static_shapes import StaticShapes, max_concurrent_loads
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import (
-    StaticShapes,
-    max_concurrent_loads,
-    sample_times,
-    steps_per_interval,
-)
+from jaxbeam.simulation.integration_plan import sample_times, steps_per_interval
 from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.batches import Batches
 from jaxbeam.sweeps.common_layout import common_layout
@@ -46,11 +41,18 @@ class Runner:
     """Runner of all batches of a sweep in blocks of equal shape.
 
     With `single` precision the integration is in float32, models and propagators are made in
-    float64. Raises ValueError if positions along the beam change their order within the sweep.
+    float64; `native` steps are taken in C. Raises ValueError if positions along the beam change
+    their order within the sweep.
     """
 
     def __init__(
-        self, case: Case, batches: Batches, histories: bool, tolerance: float, single: bool = False
+        self,
+        case: Case,
+        batches: Batches,
+        histories: bool,
+        tolerance: float,
+        single: bool = False,
+        native: bool = False,
     ):
         self.case, self.batches, self.tolerance = case, batches, tolerance
         self.histories, self.single = histories, single
@@ -77,7 +79,6 @@ class Runner:
         max_loads = load_set(case).wheel_count
         if max_loads > 1:
             max_loads = max(max_concurrent_loads(times) for times in self._entry_exit_times()[0])
-        native = native_peaks.supports(case) and not single
         self.shapes = StaticShapes(layout, has_coupling(case), max_loads, native)
         # The C library makes its own step matrices.
         self.discretise_separately = case.controller is None and not native

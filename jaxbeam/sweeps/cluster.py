@@ -82,8 +82,7 @@ def compute_and_store(blocks: list[int], fingerprint: str, path: Path) -> list[i
     if own_fingerprint != fingerprint:
         raise ValueError(
             "a worker has another version of jaxbeam or JAX than the machine that started the"
-            " sweep, or only one of them has the C library of `jaxbeam native`; install the same"
-            " everywhere"
+            " sweep; install the same everywhere"
         )
     for block in blocks:
         if not block_store.is_done(block):
@@ -99,7 +98,9 @@ def _runner(fingerprint: str, block_store: store.ZarrStore) -> tuple[Runner, str
     """Runner of a sweep, made once per process, and its fingerprint in this process."""
     with _runners_lock:
         if fingerprint not in _runners:
-            specification = specification_from_dict(block_store.specification())
+            content = block_store.specification()
+            specification = specification_from_dict(content)
             _runners.clear()
-            _runners[fingerprint] = specification.runner(), specification.fingerprint()
+            runner = specification.resumed_runner(content)
+            _runners[fingerprint] = runner, specification.fingerprint()
         return _runners[fingerprint]

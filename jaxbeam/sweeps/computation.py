@@ -37,17 +37,22 @@ def compute_sweep(
     computed again, and count in the progress bar as done before. With a `client` of Dask its
     workers compute all blocks but the first.
     """
-    fingerprint, runner = specification.fingerprint(), specification.runner()
+    fingerprint = specification.fingerprint()
     if path is not None and state == "resume":
         block_store = sweep_store.ZarrStore(path)
+        runner = specification.resumed_runner(block_store.specification())
         steps, error = block_store.steps[:-1], float(block_store.steps[-1])
     else:
+        progress_bar.set_description("compiling")
+        native = specification.uses_c()
+        runner = specification.runner(native)
         steps, error = runner.choose_step_sizes()
+        progress_bar.set_description(None)
         if path is None:
             block_store = MemoryStore(runner.block_count)
         else:
             step_sizes_and_error = np.append(steps, error)
-            content = specification.to_dict()
+            content = specification.to_dict() | {"native": native}
             block_store = sweep_store.create_store(
                 path, fingerprint, content, runner.block_count, step_sizes_and_error
             )

@@ -24,6 +24,7 @@ from jaxbeam.integrator.integrate import (
     longest_force_step,
     max_stable_step,
 )
+from jaxbeam.integrator.static_shapes import StaticShapes
 from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
@@ -35,7 +36,6 @@ from jaxbeam.runtime.compiling import (
     compiled,
 )
 from jaxbeam.simulation.closed_loop import closed_loop
-from jaxbeam.simulation.integration_plan import StaticShapes
 
 
 class Program(NamedTuple):
@@ -77,7 +77,7 @@ class Program(NamedTuple):
     def grid(self, model, shared_values, step_size):
         """Time grid of a batch for a longest step (s) and a number of extra steps per event."""
         varied, (max_step, extra_steps) = self.case_with(shared_values), step_size
-        places = corrected_places(varied, model)
+        places = corrected_places(varied, model, varied.sensors)
         if self.schedule is None:
             return grid_by_step_length(varied, model, max_step, extra_steps, places)
         substeps = jnp.ceil(jnp.max(self.schedule.lengths) / max_step).astype(int) + extra_steps

@@ -86,12 +86,33 @@ class SweepSpecification:
         within = [] if one_run_each else addresses_within_batches(self.case, self.axes)
         return make_batches(list(self.axes), self.runs(), within)
 
-    def runner(self) -> Runner:
-        """Runner of the batches in blocks.
+    def runner(self, native: bool) -> Runner:
+        """Runner of the batches in blocks, whose steps are taken in C if `native`.
 
         Raises ValueError if positions along the beam change their order within the sweep.
         """
-        return Runner(self.case, self.batches(), self.histories, self.tolerance, self.single)
+        settings = self.histories, self.tolerance, self.single
+        return Runner(self.case, self.batches(), *settings, native)
+
+    def resumed_runner(self, content: dict[str, Any]) -> Runner:
+        """Runner of the sweep of a store with this content, in C if it was begun so.
+
+        So all blocks agree to the bit. Raises ValueError if the C code cannot be compiled here.
+        """
+        native = bool(content["native"])
+        if native and not native_peaks.available():
+            try:
+                native_peaks.LIBRARY.build()
+            except RuntimeError as error:
+                raise ValueError(
+                    f"the sweep was begun with steps in C, which continuing it needs: {error}"
+                ) from None
+        return self.runner(native)
+
+    def uses_c(self) -> bool:
+        """Whether a new sweep takes its steps in C (see `native_peaks.chosen_for`)."""
+        peaks_in_double = not (self.histories or self.single)
+        return peaks_in_double and native_peaks.chosen_for(self.case, self.count)
 
     @functools.cached_property
     def case_dict(self) -> dict[str, Any]:
@@ -108,10 +129,9 @@ class SweepSpecification:
 
     def fingerprint(self) -> str:
         """SHA-256 of all that determines the results: case, values, settings and versions."""
-        native_steps = native_peaks.supports(self.case) and not (self.histories or self.single)
         content = self.to_dict() | {
             "blocks": [MAX_BLOCK_RUNS, MAX_BATCH_SIZE, len(jax.local_devices())],
-            "versions": [_version(), jax.__version__, native_steps],
+            "versions": [_version(), jax.__version__],
         }
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 

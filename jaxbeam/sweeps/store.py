@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxbeam.files.zarr_codecs import check_codecs
 from jaxbeam.sweeps.block_store import BlockStore
 from jaxbeam.sweeps.zarr_files import (
     BLOCKS_GROUP,
@@ -25,7 +26,6 @@ from jaxbeam.sweeps.zarr_files import (
     FINGERPRINT_ATTRIBUTE,
     array_options,
     blocks_mark,
-    check_codecs,
     checksummed,
     explaining_damage,
     explaining_write_errors,

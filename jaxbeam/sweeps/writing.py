@@ -66,8 +66,7 @@ def _choose(path: Path, fingerprint: str, resume: bool, overwrite: bool) -> Writ
     if existing[1] != fingerprint:
         raise ValueError(
             f"{path} holds a sweep of another case, other values or settings, or by another"
-            " version (the C library of `jaxbeam native` is one): it cannot be resumed with"
-            " these; choose another name, or overwrite it"
+            " version: it cannot be resumed with these; choose another name, or overwrite it"
         )
     return Writing(path, "complete" if existing[0] == "complete" else "resume")
 

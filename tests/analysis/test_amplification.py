@@ -87,3 +87,22 @@ def test_amplification_of_slow_and_fast_forces():
     assert_allclose(fast, -envelope(crossing(15.0), middle).lowest / static, rtol=1e-12)
     assert 1.6 < fast[0] < 1.8  # near its largest, at 0.62 of the critical speed
     assert_allclose(amplification(crossing(0.05, modes=6), middle), 1.0, atol=3e-3)
+
+
+def test_envelope_of_moments_against_the_record_and_amplification_of_a_slow_force():
+    case = crossing(0.5, modes=3)
+    positions, x = np.array([0.15, 0.3]), 0.3
+    slow = envelope(case, positions, quantity="moment")
+    static = FORCE * positions * (LENGTH - positions) / LENGTH
+    assert_allclose(slow.highest, static, rtol=0.02)
+    found = amplification(case, positions, quantity="moment")
+    assert_allclose(found, np.asarray(slow.highest) / static, rtol=1e-9)
+    stress = amplification(case, positions, quantity="stress", section_modulus=-2.0)
+    assert_allclose(stress, found, rtol=1e-9)
+    fast = crossing(4.0, modes=3)
+    record = jb.simulate(fast, np.linspace(0.0, float(fast.run.duration), 4001))
+    moments = np.asarray(record.bending_moment(x))
+    low, high = envelope(fast, [x], quantity="moment")
+    assert_allclose([low[0], high[0]], [moments.min(), moments.max()], rtol=1e-3)
+    with pytest.raises(ValueError, match="no amplification of 'shear'"):
+        amplification(fast, [x], quantity="shear")

@@ -86,13 +86,14 @@ def test_parts_of_a_case_follow_from_its_fields():
         "actuators": "AbstractActuator",
         "sensors": "Sensor",
         "loads": "AbstractLoad",
+        "vehicle_sensors": "VehicleSensor",
         "profile": "AbstractProfile",
         "controller": "AbstractController",
         "run": "Run",
     }
     assert {*classes, "title"} == set(Case.__dataclass_fields__)
     assert [key for key, found in part_classes().items() if found.listed] == [
-        *("supports", "actuators", "sensors", "loads")
+        *("supports", "actuators", "sensors", "loads", "vehicle_sensors")
     ]
 
 

@@ -3,9 +3,11 @@
 import itertools
 import json
 import math
+import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from jaxbeam.cli import main
 from tests.cli.example import CASE
@@ -26,7 +28,15 @@ REFUSED = [
     ("simulate case.toml -o out.txt", "a record is written to a .nc file; call it out.nc"),
     ("simulate case.toml -o none/out.nc", "there is no folder none to write out.nc to"),
     ("simulate case.toml -o old.nc", "old.nc exists; choose another name or add --overwrite"),
-    ("simulate case.toml --animate out.mp4", "an animation is written to a .gif file"),
+    ("simulate case.toml --animate out.avi", "an animation is written to a file of .gif or .mp4"),
+    (
+        "simulate case.toml --picture out.jpg",
+        "a picture is written to a .png file; call it out.png",
+    ),
+    ("simulate case.toml --plot --size 160x100", "--size takes WIDTHxHEIGHT in mm, cm or in, such"),
+    ("modes case.toml --plot --size 1x100mm", "a side is 25 mm at least and 2540 mm at most"),
+    ("frf case.toml --plot --dpi 1", "--dpi must be from 10 to 2400; it is 1"),
+    ("identify one.csv two.csv --picture out.png", "--picture names one file, and each log has"),
     ("simulate case.toml --set loads.0.speed", "--set takes ADDRESS=VALUE, such as"),
     ("simulate case.toml --set loads.0.sped=1", "loads.0 has no key 'sped'; did you mean 'speed'?"),
     ("simulate case.toml --set loads.1.speed=1", "no number at address 'loads.1.speed'; did you"),
@@ -43,6 +53,11 @@ REFUSED = [
     ),
     ("sweep case.toml --over loads.0.train=HSLM-A1,2", "'HSLM-A1' is not a number"),
     ("sweep case.toml --over loads.0.speed=1,2 --resume", "--resume needs the store to continue"),
+    (
+        "sweep case.toml --over loads.0.speed=1,2 --resume -o out.csv",
+        "--resume needs a store of blocks: -o OUT.zarr",
+    ),
+    ("sweep case.toml --over loads.0.speed=1,2 -o out.txt", "a sweep is written to a .zarr file"),
     ("frf case.toml --from 0", "--from and --to must increase from above 0 Hz; they are 0, 1000"),
     ("frf case.toml --from 10 --to 1", "--from and --to must increase from above 0 Hz"),
     ("frf case.toml --points 1", "--points must be 2 or more; it is 1"),
@@ -109,6 +124,41 @@ def test_simulate_prints_and_writes_the_same(run, folder):
     assert (folder / "out.gif").read_bytes().startswith(b"GIF89a")
 
 
+def test_pictures_have_endings_sizes_and_titles(run, folder):
+    """Width and height in millimetres, dots per inch and title of every command that draws."""
+    lines = (
+        "simulate case.toml",
+        "sweep case.toml --over loads.0.speed=1,2",
+        "modes case.toml",
+        "frf case.toml --points 20",
+    )
+    for line in lines:
+        run(f"{line} --picture out.png --size 127x76.2mm --dpi 100 --title Anew --overwrite")
+        with Image.open(folder / "out.png") as picture:
+            assert picture.size == (500, 300)
+        run(f"{line} --picture out.svg --title Anew --overwrite")
+        text = (folder / "out.svg").read_text()
+        assert "<!-- Anew -->" in text and "one span, one ball" not in text
+    run("modes case.toml --picture out.pdf")
+    assert (folder / "out.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_film_needs_ffmpeg(run, refused, folder, monkeypatch):
+    """A stand-in for ffmpeg notes its arguments and the bytes of the frames."""
+    monkeypatch.setenv("PATH", str(folder))
+    message = refused("simulate case.toml --animate out.mp4")
+    assert message == (
+        "out.mp4: .mp4 files need the program ffmpeg, which is not installed; write a .gif"
+    )
+    script = f"#!{sys.executable}\nimport sys\n"
+    script += "open(sys.argv[-1], 'w').write(f'{sys.argv[1:]} {len(sys.stdin.buffer.read())}')\n"
+    (folder / "ffmpeg").write_text(script)
+    (folder / "ffmpeg").chmod(0o755)
+    run("simulate case.toml --animate out.mp4 --size 2x2in --set run.duration=0.1")
+    written = (folder / "out.mp4").read_text()
+    assert "'180x180'" in written and written.endswith(str(120 * 180 * 180 * 3))
+
+
 def test_what_looks_wrong_is_said_before_a_run(run, folder, capsys):
     found = run("check case.toml --json")
     assert found["first_frequency"] == pytest.approx(frequency(1))
@@ -166,6 +216,26 @@ def test_modes_as_a_table(run, folder):
     np.testing.assert_allclose(table[:, 0], [1, 2, 3])
     np.testing.assert_allclose(table[:, 1], [frequency(n) for n in (1, 2, 3)], rtol=1e-9)
     np.testing.assert_allclose(table[:, 2], 0.03, rtol=1e-9)
+
+
+def test_assess_cites_clauses(run, refused, folder):
+    line = "assess case.toml --line-speed 30 --code en1991-2"
+    assert "EN 1991-2, annex C" in run(f"{line} -o report.md")
+    assert (folder / "report.md").read_text().startswith("# one span, one ball")
+    found = run(f"{line} --json")
+    assert found["checks"][1]["outcome"] == "required"  # 15 Hz at 0.6 m: below 80 / 0.6
+    assert "track cannot be 'gravel'" in refused(f"{line} --track gravel")
+
+
+def test_influence_lines_as_a_table(run, refused, folder):
+    printed = run("influence case.toml -o lines.csv --plot")
+    assert "moment at midspan 1" in printed and (folder / "lines.png").exists()
+    heads, *rows = (folder / "lines.csv").read_text().splitlines()
+    assert heads.split(",")[1] == "moment at midspan 1 (m)"
+    assert max(float(row.split(",")[1]) for row in rows) == pytest.approx(0.6 / 4)
+    found = run("influence case.toml --quantity shear --at 150mm --json")
+    assert max(found["shear at quarter 1 (1)"]) == pytest.approx(0.75, abs=0.02)
+    assert "did you mean 'reaction'" in refused("influence case.toml --quantity reactions")
 
 
 def test_an_accelerometer_is_not_reported_as_deflection(run):

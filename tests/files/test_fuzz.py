@@ -13,6 +13,7 @@ from jaxbeam.files.case_file import case_from_dict, case_to_dict, load_case
 from tests import mutations
 from tests.cli.example import CASE as SMALL
 from tests.files.test_case_file import FULL
+from tests.fuzzing import examples
 from tests.tuning.logs import test_readers as readers
 from tuning import read_logs
 
@@ -53,7 +54,7 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("fuzz")
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(mutations.trees(CASE))
 @example({"beam": CASE["beam"] | {"length": 10**400}})
 def test_random_case_file_is_read_or_refused(folder, tree):
@@ -68,7 +69,7 @@ def test_random_case_file_is_read_or_refused(folder, tree):
         assert case_to_dict(case_from_dict(content)) == content
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(mutations.contents(tomli_w.dumps(CASE).encode()))
 @example(b"title = " + b"[" * 100_000)
 @example(b"modes = " + b"1" * 5000)
@@ -107,7 +108,7 @@ def test_damaged_log_is_read_or_refused(folder, name, capfd):
         readers.FORMATS[name](path)
     read_logs(path)
 
-    @settings(max_examples=100)
+    @settings(max_examples=examples(100))
     @given(mutations.contents(path.read_bytes()), st.sampled_from(["mask", "refuse"]))
     def check(content, missing):
         path.write_bytes(content)
@@ -153,7 +154,7 @@ INVALID_WORDS = """
 """
 
 
-@settings(max_examples=150)
+@settings(max_examples=examples(150))
 @given(
     st.sampled_from(LINES),
     st.lists(st.sampled_from(INVALID_WORDS.split()), min_size=1, max_size=3),

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import pathlib
 import platform
+import shutil
 import subprocess
 import sys
 
@@ -29,7 +30,7 @@ from jaxbeam.numerics.peak_search import interpolation_matrix, refine_peak
 from jaxbeam.runtime import native_library
 from jaxbeam.simulation.integration_plan import static_shapes
 from jaxbeam.sweeps.specification import sweep_specification
-from jaxbeam.sweeps.store import FINGERPRINT_ATTRIBUTE
+from jaxbeam.sweeps.store import ZarrStore
 
 pytestmark = pytest.mark.skipif(native_library.find_compiler() is None, reason="no C compiler here")
 
@@ -122,7 +123,6 @@ def test_results_equal_those_of_xla(case, over):
     assert_allclose(native.peak_time, plain.peak_time, atol=2e-7)
     # They differ by rounding, or the sweep did not use C.
     assert np.any(native.peak_deflection != plain.peak_deflection)
-    assert native.attrs[FINGERPRINT_ATTRIBUTE] != plain.attrs[FINGERPRINT_ATTRIBUTE]
 
 
 def test_a_beam_without_loads_stays_at_rest():
@@ -211,25 +211,69 @@ def test_masked_tasks_do_not_change_the_others():
     assert_allclose(native[:, -3:], alone.peak_deflection, rtol=1e-6)
 
 
-def test_results_of_both_integrators_never_share_a_store():
-    """They round differently, so their fingerprints differ, for sweeps that use C."""
+def specification_of(case, histories=False, precision="double"):
+    return sweep_specification(case, GRID, False, histories, 1e-7, precision)
 
-    def fingerprints(histories, precision, case=PLAIN):
-        for available in (True, False):
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(native_peaks, "available", lambda available=available: available)
-                specification = sweep_specification(case, GRID, False, histories, 1e-7, precision)
-                yield specification.fingerprint()
 
-    assert len(set(fingerprints(False, "double"))) == 2
-    assert len(set(fingerprints(True, "double"))) == len(set(fingerprints(False, "single"))) == 1
+def test_sweeps_of_deflections_in_double_precision_use_c():
+    assert specification_of(PLAIN).uses_c()
+    assert not specification_of(PLAIN, histories=True).uses_c()
+    assert not specification_of(PLAIN, precision="single").uses_c()
     controlled = dataclasses.replace(
         PLAIN,
         actuators=[jb.Patch(0.1, 0.2, moment_per_volt=1e-4)],
         controller=jb.PD(gains=[300.0], rate_gains=[3.0], lag=[0.002], period=0.004),
         sensors=SENSORS[:1],
     )
-    assert len(set(fingerprints(False, "double", controlled))) == 1
+    assert not specification_of(controlled).uses_c()
+    assert not specification_of(
+        dataclasses.replace(PLAIN, sensors=[jb.Sensor(0.2, "moment")])
+    ).uses_c()
+
+
+@pytest.mark.parametrize("begun_in_c", [True, False])
+def test_a_sweep_continues_as_it_was_begun(begun_in_c, tmp_path, monkeypatch):
+    """Both integrators round differently; a store has the results of one of them."""
+    over = {"loads.0.mass": np.linspace(0.1, 0.9, 60), "loads.0.speed": [2.0, 4.0]}
+    case, path = dataclasses.replace(PLAIN, run=jb.Run(0.4)), tmp_path / "runs.zarr"
+
+    def sweep(available, store, **options):
+        monkeypatch.setattr(native_peaks, "available", lambda: available)
+        return jb.sweep(case, over, progress=False, store=store, **options)
+
+    expected = sweep(begun_in_c, None)
+    with monkeypatch.context() as patch:
+        patch.setattr(ZarrStore, "finish", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            sweep(begun_in_c, path)
+    if begun_in_c:
+        with monkeypatch.context() as patch:
+            patch.setattr(native_library, "find_compiler", lambda: None)
+            with pytest.raises(ValueError, match="begun with steps in C, .*: there is no C comp"):
+                sweep(False, path, resume=True)
+    (blocks,) = (part for part in (path / "blocks").iterdir() if part.is_dir())
+    shutil.rmtree(blocks / "done" / "c")
+    found = sweep(not begun_in_c, path, resume=True)
+    assert np.array_equal(found.peak_deflection, expected.peak_deflection)
+
+
+def interrupted(*_):
+    raise KeyboardInterrupt
+
+
+def test_the_first_large_sweep_compiles_c(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    library = native_peaks.LIBRARY
+    assert not native_peaks.chosen_for(PLAIN, native_peaks.MIN_RUNS_TO_COMPILE - 1)
+    assert not library.library_path().exists()
+    with monkeypatch.context() as patch:
+        patch.setenv("CC", "false")
+        assert not native_peaks.chosen_for(PLAIN, native_peaks.MIN_RUNS_TO_COMPILE)
+    assert not library.library_path().exists()
+    assert native_peaks.chosen_for(PLAIN, native_peaks.MIN_RUNS_TO_COMPILE)
+    assert library.library_path().exists() and native_peaks.chosen_for(PLAIN, 1)
+    library.remove()
+    assert not native_peaks.chosen_for(PLAIN, native_peaks.MIN_RUNS_TO_COMPILE)
 
 
 def test_the_command_compiles_and_removes(monkeypatch, tmp_path, capsys):
@@ -242,7 +286,7 @@ def test_the_command_compiles_and_removes(monkeypatch, tmp_path, capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["native", "--remove"])
     assert "sweeps use XLA" in capsys.readouterr().out
-    assert not native_peaks.LIBRARY.library_path().exists()
+    assert not native_peaks.available()
 
 
 SEARCH = """

@@ -1,12 +1,15 @@
 """Data and labels of figures."""
 
 import dataclasses
+import itertools
 
 import jax.numpy as jnp
 import matplotlib.pyplot
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageSequence
 
@@ -272,3 +275,61 @@ def test_labels_do_not_overlap():
 def test_old_names_warn(old, new):
     with pytest.warns(DeprecationWarning, match=f"{old} is called jaxbeam.plot.{new} now"):
         assert getattr(jaxbeam.plot, old) is getattr(jaxbeam.plot, new)
+
+
+def test_labels_stay_within_limits():
+    found = separate_labels([1.0, 1.0, 1.0, 9.0], 1.0, (0.0, 10.0))
+    assert_allclose(found, [0.5, 1.5, 2.5, 9.0])
+    assert_allclose(separate_labels([9.0, 9.9], 1.0, (0.0, 10.0)), [8.5, 9.5])
+
+
+def shown_boxes(figure):
+    """Extents of the visible texts of a figure that are not numbers of ticks."""
+    figure.draw_without_rendering()
+    texts = figure.findobj(lambda artist: isinstance(artist, Text) and artist.get_visible())
+    ticks = {id(text) for axes in figure.axes for text in axes.get_xticklabels()}
+    ticks |= {id(text) for axes in figure.axes for text in axes.get_yticklabels()}
+    return [t.get_window_extent() for t in texts if t.get_text() and id(t) not in ticks]
+
+
+def test_many_loads_and_sensors_are_readable():
+    """Fifty loads and thirty sensors: no text lies on another."""
+    case = jb.Case(
+        jb.Beam(25.0, 3e10, 1.5e4, modes=2),
+        sensors=[jb.Sensor(x) for x in np.linspace(1.0, 24.0, 30)],
+        loads=[jb.MovingForce(force=2e5, speed=50.0, entry_time=0.05 * i) for i in range(50)],
+        run=jb.Run(3.0, sample_rate=20.0),
+    )
+    figure = plot_record(jb.simulate(case))
+    boxes = shown_boxes(figure)
+    assert len(boxes) > 15
+    pairs = itertools.combinations([box.padded(-1) for box in boxes], 2)
+    assert not any(one.overlaps(other) for one, other in pairs)
+    said = words(figure)
+    assert "loads 0 to " in said and "more" in said and "weight 200 kN" in said
+
+
+def test_figures_take_the_place_of_axes(record):
+    """Single panels are drawn on the axes, others divide their place; other axes stay."""
+    figure = Figure(layout="constrained")
+    left, right = figure.subplots(1, 2)
+    assert record.plot("deflection", ax=left, title="here", labels=["one", "two"]) is figure
+    assert left.get_title(loc="left") == "here" and len(lines_of(left, record.times.size)) == 2
+    assert "two" in words(figure)
+    part = record.plot(ax=right, title="there")
+    assert part in figure.subfigs and len(part.axes) == 3
+    assert "there" in words(figure)
+    with pytest.raises(ValueError, match="ax has no place in a grid"):
+        record.plot(ax=Figure().add_axes((0, 0, 1, 1)))
+    with pytest.raises(ValueError, match="no sensor measures 'strain'; they measure deflection"):
+        record.plot("strain")
+    with pytest.raises(ValueError, match="labels names 1 sensors; the case has 2"):
+        record.plot(labels=["one"])
+
+
+def test_envelope_and_modes_on_axes(record):
+    left, right = Figure().subplots(1, 2)
+    record.plot_envelope("moment", ax=left)
+    assert len(lines_of(left, 101)) == 2
+    plot_modes(CASE, ax=right, title="shapes")
+    assert right.get_title(loc="left") == "shapes" and len(lines_of(right, 401)) == 2

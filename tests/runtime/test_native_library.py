@@ -8,7 +8,7 @@ import pytest
 
 from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime import native_library
-from jaxbeam.runtime.cache_folder import read_file, write_file
+from jaxbeam.runtime.cache_folder import read_file
 from jaxbeam.runtime.native_library import Library
 
 pytestmark = pytest.mark.skipif(native_library.find_compiler() is None, reason="no C compiler here")
@@ -49,10 +49,6 @@ def with_plain_digest(path, library):
     path.write_bytes(hashlib.sha256(library).digest() + library)
 
 
-def empty_but_authentic(path, library):
-    write_file(path.name, b"")
-
-
 def truncated(path, library):
     path.write_bytes(path.read_bytes()[:1000])
 
@@ -79,7 +75,6 @@ def with_a_known_key(path, library):
     [
         (without_hmac, "was not written with the key of this user"),
         (with_plain_digest, "was not written with the key of this user"),
-        (empty_but_authentic, "file too short"),
         (truncated, "is damaged"),
         (linked, "is a link"),
         (writable_by_others, "other users may write to"),

@@ -59,7 +59,7 @@ def swept(case, runs, native: bool, **options) -> np.ndarray:
     over = {address: [run[address] for run in runs] for address in runs[0]}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(native_peaks, "available", lambda: native)
-        assert native_peaks.supports(case) == (native and case.controller is None)
+        assert native_peaks.chosen_for(case, 1) == (native and case.controller is None)
         found = jb.sweep(case, over, paired=True, progress=False, **options)
     return found.peak_deflection.values
 

@@ -155,7 +155,7 @@ def test_full_disk_keeps_finished_blocks(unfinished, complete, tmp_path):
 
 
 def test_folder_that_is_not_writable_is_named_before_any_run(tmp_path, monkeypatch):
-    monkeypatch.setattr(SweepSpecification, "runner", lambda _: pytest.fail("it runs"))
+    monkeypatch.setattr(SweepSpecification, "uses_c", lambda _: pytest.fail("it runs"))
     with pytest.raises(OSError, match=r"cannot write runs\.zarr to the folder .*none: no such"):
         sweep(tmp_path / "none" / "runs.zarr")
     monkeypatch.setattr("tempfile.TemporaryFile", forbidden)
@@ -241,11 +241,18 @@ UNPICKLE = {"pickle", "cloudpickle", "marshal", "shelve", "dill", "joblib"}
 PICKLING = {"jaxbeam.runtime.compile_cache", "jaxbeam.runtime.program_key"}
 
 
+# The first loads the C library that it has compiled, once its HMAC is verified; the second one that
+# it has compiled just before.
+LOADING = {"jaxbeam.runtime.native_library", "experiments.benchmarks.kernel"}
+
+
 def test_no_module_runs_code_from_files():
     for name, path in module_files().items():
         for node in ast.walk(parse(path)):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
                 assert node.func.id not in RUN, f"{name} calls {node.func.id}"
+            if isinstance(node, ast.Attribute) and node.attr in ("CDLL", "LoadLibrary", "PyDLL"):
+                assert name in LOADING, f"{name} loads a library"
             if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
                 assert getattr(node.value, "value", True) is False, f"{name} allows pickles"
             if isinstance(node, ast.Import | ast.ImportFrom):

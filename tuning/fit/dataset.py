@@ -18,7 +18,7 @@ from tuning.logs.pairing import case_of_log, check_loads, check_times, pad_cases
 from tuning.parameters.free import LOG_ADDRESS, with_values
 
 SIMULATION_TOLERANCE = 1e-5  # of the largest deflection, below the resolution of logs
-OFFSET_ADDRESS = re.compile(r"sensors\.(\d+)\.offset")
+OFFSET_ADDRESS = re.compile(r"(vehicle_)?sensors\.(\d+)\.offset")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,17 +64,21 @@ class Dataset:
         ]
         columns = [own_addresses.index(address) for address in simulated_addresses]
         own = jnp.array([[value_at(case, a) for a in own_addresses] for case in self.cases])
-        zero_offsets = {a: 0.0 for a in offset_addresses(self.cases[0])}
+        zero_offsets = offset_addresses(self.cases[0])
         channels = {
-            int(OFFSET_ADDRESS.fullmatch(a)[1]): own_addresses.index(a)
+            zero_offsets.index(a): own_addresses.index(a)
             for a in own_addresses
             if a not in simulated_addresses
         }
-        constant = jnp.array([[s.offset for s in case.sensors] for case in self.cases])
+        constant = jnp.array([[s.offset for s in case.all_sensors] for case in self.cases])
 
         def simulated(run, values):
             case, times, schedule = run
-            case = replace(case, dict(zip(simulated_addresses, values, strict=True)) | zero_offsets)
+            case = replace(
+                case,
+                dict(zip(simulated_addresses, values, strict=True))
+                | dict.fromkeys(zero_offsets, 0.0),
+            )
             return simulate_readings(case, times, dataclasses.replace(self.plan, schedule=schedule))
 
         def gather(values):
@@ -143,8 +147,9 @@ class Dataset:
 
 
 def offset_addresses(case: Case) -> list[str]:
-    """Addresses of the offsets of all sensors."""
-    return [f"sensors.{i}.offset" for i in range(len(case.sensors))]
+    """Addresses of the offsets of all sensors, in the order of the channels."""
+    on_beam = [f"sensors.{i}.offset" for i in range(len(case.sensors))]
+    return on_beam + [f"vehicle_sensors.{i}.offset" for i in range(len(case.vehicle_sensors))]
 
 
 def make_dataset(case: Case, logs: list[Log]) -> Dataset:
@@ -155,7 +160,8 @@ def make_dataset(case: Case, logs: list[Log]) -> Dataset:
     """
     if not logs:
         raise ValueError("give at least one log")
-    check_case(case)
+    # Loads, and with them sensors on vehicles, may be known from the logs only.
+    check_case(case if case.loads else dataclasses.replace(case, vehicle_sensors=()))
     for log in logs:
         check_times(log)
     count = max(log.times.size for log in logs)
@@ -164,6 +170,7 @@ def make_dataset(case: Case, logs: list[Log]) -> Dataset:
     ordered = [sensor_readings(case, log) for log in logs]
     for log, own in zip(logs, cases, strict=True):
         check_loads(log, own)
+        check_case(own)
     cases = pad_cases(cases, times)
     shapes = {jax.tree.structure(own) for own in cases}
     if len(shapes) > 1:

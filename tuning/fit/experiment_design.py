@@ -16,6 +16,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, replace, unit_at, value_at
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
+from jaxbeam.runtime.arrays import xp
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import IntegrationPlan, integration_plan, sample_times
 from jaxbeam.simulation.simulate import simulate_readings
@@ -88,7 +89,7 @@ def design_experiment(
     low, high = np.array(list(over.values()), float).T
     nominal = jnp.array([float(concrete(value_at(case, address))) for address in free])
     before = np.array([float(concrete(value_at(case, address))) for address in over])
-    noise_levels = jnp.array([noise if s.noise is None else s.noise for s in case.sensors])
+    noise_levels = jnp.array([noise if s.noise is None else s.noise for s in case.all_sensors])
 
     def cramer_rao(choice, plan):
         """Cramer-Rao bound: logarithms of standard errors, and half that of the volume."""
@@ -103,9 +104,9 @@ def design_experiment(
         jacobian = jax.jacfwd(predict)(nominal) / noise_levels[:, None]
         rows = jacobian.reshape(-1, len(free)) * jnp.where(nominal == 0, 1.0, jnp.abs(nominal))
         information = rows.T @ rows
-        inverse = jnp.linalg.inv(information + 1e-12 * jnp.trace(information) * jnp.eye(len(free)))
+        inverse = xp.linalg.inv(information + 1e-12 * jnp.trace(information) * jnp.eye(len(free)))
         errors = jnp.log(jnp.diag(inverse)) / 2
-        return errors, -jnp.linalg.slogdet(information)[1] / 2
+        return errors, -xp.linalg.slogdet(information)[1] / 2
 
     @compiled
     def bound_with_gradient(choice, plan):

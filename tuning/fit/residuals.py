@@ -86,10 +86,12 @@ def channel_residuals(
     return found
 
 
-def residual_remarks(channels: Sequence[ChannelResiduals], sources: Sequence[str]) -> list[str]:
+def residual_remarks(
+    channels: Sequence[ChannelResiduals], sources: Sequence[str], names: Sequence[str]
+) -> list[str]:
     """Sentences on autocorrelated residuals and on time shifts; none if all is well.
 
-    `sources` are the names of the logs.
+    `sources` are the names of the logs, `names` those of the channels.
     """
     remarks = []
     for i, source in enumerate(sources):
@@ -97,7 +99,7 @@ def residual_remarks(channels: Sequence[ChannelResiduals], sources: Sequence[str
         coloured = [channel for channel in own if channel.p_value < WHITENESS_SIGNIFICANCE]
         if coloured:
             factors = ", ".join(
-                f"{c.autocorrelation_factor:.2g} at sensor {c.sensor}" for c in coloured
+                f"{c.autocorrelation_factor:.2g} at {names[c.sensor]}" for c in coloured
             )
             remarks.append(
                 f"{source}: residuals are no white noise, so the model misses something and its "
@@ -108,7 +110,7 @@ def residual_remarks(channels: Sequence[ChannelResiduals], sources: Sequence[str
             if abs(c.time_shift) > MIN_TIME_SHIFT_SD * c.time_shift_sd:
                 what = "late" if c.time_shift > 0 else "early"
                 remarks.append(
-                    f"{source}: sensor {c.sensor} seems {1e3 * abs(c.time_shift):.3g} ms {what} "
+                    f"{source}: {names[c.sensor]} seems {1e3 * abs(c.time_shift):.3g} ms {what} "
                     f"(+- {2e3 * c.time_shift_sd:.2g} ms): free its delay, or check its clock"
                 )
     return remarks

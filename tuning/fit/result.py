@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.quantities import unit_of
 from tuning.aliases import has_old_attributes
 from tuning.fit import summary
 from tuning.fit.dataset import Dataset
@@ -114,14 +114,14 @@ class Fit:
     @property
     def remarks(self) -> list[str]:
         """Sentences on bounds, unidentifiable directions, correlations, priors, noise and logs."""
-        logs = self.dataset.logs
+        logs, channel_names = self.dataset.logs, summary.channel_names(self.case)
         return [
             *summary.bound_remarks(self.parameters, self.values),
             *summary.unidentifiable_remarks(self.parameters, self.unidentifiable),
             *summary.correlation_remarks(self.addresses, self.correlation),
             *summary.prior_remarks(self.parameters, self.errors),
-            *summary.noise_remarks(self.case.sensors, logs, self.noise),
-            *residual_remarks(self.channel_residuals, [log.source for log in logs]),
+            *summary.noise_remarks(self.case, logs, self.noise),
+            *residual_remarks(self.channel_residuals, [log.source for log in logs], channel_names),
             *summary.log_remarks(logs),
         ]
 
@@ -156,7 +156,8 @@ class Fit:
         """Figure of measured, fitted and residual, one column for each log and quantity."""
         from jaxbeam.plot import FitPanel, plot_fit
 
-        quantities = [sensor.quantity for sensor in self.case.sensors]
+        quantities = [sensor.quantity for sensor in self.case.all_sensors]
+        channel_names = summary.channel_names(self.case)
         panels = []
         for i, log in enumerate(self.dataset.logs):
             count = log.times.size
@@ -171,8 +172,8 @@ class Fit:
                         times=log.times,
                         measured=self.dataset.measured[i, :count, channels].T,
                         fitted=self.fitted[i, :count, channels].T,
-                        names=[f"sensor {n}" for n in channels],
-                        unit=QUANTITIES[quantity].unit,
+                        names=[channel_names[n] for n in channels],
+                        unit=str(unit_of(quantity)),
                     )
                 )
         return plot_fit(panels, title=self.case.title)

@@ -31,7 +31,16 @@ _OLD_NAMES = {
 }
 _FIT_ARRAYS = ("values", "errors", "correlation", "noise", "fitted", "autocorrelation_factor")
 _LOG_ARRAYS = ("times", "values", "valid")
-_LOG_FIELDS = ("names", "quantities", "units", "sensors", "positions", "actuators", "notes")
+_LOG_FIELDS = (
+    "names",
+    "quantities",
+    "units",
+    "sensors",
+    "positions",
+    "actuators",
+    "notes",
+    "vehicle_sensors",
+)
 
 
 def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None:
@@ -142,6 +151,6 @@ def _read_log(index: int, header: dict, beam: dict, arrays) -> Log:
     loads = header["loads"]
     if loads is not None:
         loads = case_from_dict({"beam": beam, "loads": loads}).loads
-    words = {name: tuple(header[name]) for name in _LOG_FIELDS}
+    words = {name: tuple(header[name]) for name in _LOG_FIELDS if name in header}
     own = {name: arrays[f"log{index}.{name}"] for name in _LOG_ARRAYS}
     return Log(**own, **words, source=header["source"], loads=loads)

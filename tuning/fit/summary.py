@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.case import Case
 from jaxbeam.files.report import Row, text_table
 from tuning.fit.multi_start import LocalMinimum
 from tuning.logs.log import Log
@@ -106,14 +106,20 @@ def prior_remarks(parameters: Parameters, errors: Values) -> Iterator[str]:
             yield f"{parameter.address} is determined by its prior more than by the logs"
 
 
+def channel_names(case: Case) -> list[str]:
+    """Names of all sensors of a case: "sensor 0", then "vehicle sensor 0" for those on vehicles."""
+    on_vehicles = [f"vehicle sensor {i}" for i in range(len(case.vehicle_sensors))]
+    return [f"sensor {i}" for i in range(len(case.sensors))] + on_vehicles
+
+
 def noise_remarks(
-    sensors: Sequence[Sensor], logs: Sequence[Log], noise: Float[np.ndarray, "log channel"]
+    case: Case, logs: Sequence[Log], noise: Float[np.ndarray, "log channel"]
 ) -> Iterator[str]:
     """A sentence for each log: standard deviations of its residuals, with their units."""
-    units = [sensor.unit for sensor in sensors]
+    named = list(zip((s.unit for s in case.all_sensors), channel_names(case), strict=True))
     for log, levels in zip(logs, noise, strict=True):
-        pairs = enumerate(zip(levels, units, strict=True))
-        words = [f"{n:.3g} {unit} (sensor {i})" for i, (n, unit) in pairs if np.isfinite(n)]
+        pairs = zip(levels, named, strict=True)
+        words = [f"{n:.3g} {unit} ({name})" for n, (unit, name) in pairs if np.isfinite(n)]
         yield f"standard deviation of the residual of {log.source}: {', '.join(words)}"
 
 

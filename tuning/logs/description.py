@@ -23,6 +23,7 @@ _COLUMN_KEYS = {
     "unit": WORD,
     "sensitivity": WORD._replace(description='like "100 mV/g"'),
     "sensor": COUNT,
+    "vehicle_sensor": COUNT,
     "position": NUMBER._replace(description="a number in m"),
     "actuator": COUNT,
 }
@@ -55,6 +56,10 @@ class LogDescription:
     def sensor(self, name: str) -> int | None:
         """Index, in the case, of the sensor of a column."""
         return self.columns.get(name, {}).get("sensor")
+
+    def vehicle_sensor(self, name: str) -> int | None:
+        """Index, among the vehicle sensors of the case, of the sensor of a column."""
+        return self.columns.get(name, {}).get("vehicle_sensor")
 
     def actuator(self, name: str) -> int | None:
         """Index, in the case, of the actuator whose command a column is."""

@@ -19,9 +19,10 @@ class Log:
     read-only. `quantities` are those of sensors (`jaxbeam.case.quantities`), "force" (N) or
     "voltage" (V); `units` are those of the file, for labels. `sensors` and `positions` (m) are the
     index and position of the sensor of the case that a channel is, None if unknown; `actuators` the
-    index of the actuator whose command it is, None for readings; `loads` are those that crossed,
-    None if unknown. Samples that are not `valid` (time, channel) are left out of fits, by default
-    none. `notes` are sentences on how the log was read.
+    index of the actuator whose command it is, None for readings; `vehicle_sensors` the index of the
+    sensor on a vehicle; `loads` are those that crossed, None if unknown. Samples that are not
+    `valid` (time, channel) are left out of fits, by default none. `notes` are sentences on how the
+    log was read.
 
     Raises ValueError if lengths disagree, a value is not finite or times do not increase.
     """
@@ -38,15 +39,17 @@ class Log:
     loads: tuple[AbstractLoad, ...] | None = None
     valid: Bool[np.ndarray, "time channel"] | None = None
     notes: tuple[str, ...] = ()
+    vehicle_sensors: tuple[int | None, ...] = ()
 
     def __post_init__(self):
         channels = self.values.shape[1]
         if self.valid is None:
             object.__setattr__(self, "valid", np.ones(self.values.shape, bool))
-        for name in ("sensors", "positions", "actuators"):
+        for name in ("sensors", "positions", "actuators", "vehicle_sensors"):
             if not getattr(self, name):
                 object.__setattr__(self, name, (None,) * channels)
-        for name in ("names", "quantities", "units", "sensors", "positions", "actuators"):
+        per_channel = ("names", "quantities", "units", "sensors", "positions", "actuators")
+        for name in (*per_channel, "vehicle_sensors"):
             if len(getattr(self, name)) != channels:
                 raise ValueError(
                     f"{self.source}: {len(getattr(self, name))} {name} for {channels} channels"

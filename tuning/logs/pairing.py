@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from jaxbeam.case.case import Case, crossing_times, replace
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.base import AbstractLoad
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.quantities import unit_of
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.control.prescribed import Prescribed
 from tuning.logs.log import Log
@@ -98,36 +98,53 @@ def _check_command(case: Case, log: Log, channel: int, actuator: int) -> None:
 def sensor_readings(
     case: Case, log: Log
 ) -> tuple[Float[np.ndarray, "time sensor"], Bool[np.ndarray, "time sensor"]]:
-    """Readings of a log in the order of the case's sensors (time, sensor), and which are valid.
+    """Readings of a log in the order of `Case.all_sensors` (time, sensor), and which are valid.
 
     A log that does not name its sensors has all of them, in their order. Raises ValueError, naming
     the log, if its channels do not match the sensors.
     """
-    sensors = case.sensors
+    sensors, on_beam = case.all_sensors, len(case.sensors)
     if not sensors:
         raise ValueError("the case has no sensors to compare the logs with")
     named = [(number, i) for i, number in enumerate(log.sensors) if number is not None]
+    _check_known(log, [number for number, _ in named], "sensors", on_beam)
+    pairs = [(number, i) for i, number in enumerate(log.vehicle_sensors) if number is not None]
+    on_vehicles = len(case.vehicle_sensors)
+    _check_known(log, [number for number, _ in pairs], "vehicle_sensors", on_vehicles)
+    named += [(on_beam + number, i) for number, i in pairs]
     read = [i for i, actuator in enumerate(log.actuators) if actuator is None]
     order = dict(named) if named else dict(enumerate(read))
     if len(named) > len(order):
         raise ValueError(f"{log.source}: two of its channels are of the same sensor of the case")
-    if not set(order) <= set(range(len(sensors))) or (not named and len(order) < len(sensors)):
-        listed = f"{len(sensors)} sensors" if len(sensors) > 1 else "one sensor"
-        raise ValueError(
-            f"{log.source}: its channels {', '.join(log.names)} do not match the case's {listed}; "
-            "say in the TOML file beside it which `sensor` each column is, counted from 0"
-        )
+    if not named and len(order) != len(sensors):
+        raise _mismatch(log, len(sensors))
     values = np.zeros((log.times.size, len(sensors)))
     valid = np.zeros(values.shape, bool)
     for number, channel in order.items():
-        quantity = QUANTITIES.get(log.quantities[channel])
-        if quantity is None or quantity.unit != sensors[number].unit:
+        sensor, unit = sensors[number], unit_of(log.quantities[channel])
+        if unit != sensor.unit:
+            listed = "sensors" if number < on_beam else "vehicle_sensors"
+            own = number if number < on_beam else number - on_beam
             raise ValueError(
                 f"{log.source}: {log.names[channel]} holds {log.quantities[channel]} in "
-                f"{log.units[channel]}, but sensors.{number} measures {sensors[number].quantity}"
+                f"{log.units[channel]}, but {listed}.{own} measures {sensor.quantity}"
             )
         values[:, number], valid[:, number] = log.values[:, channel], log.valid[:, channel]
     return values, valid
+
+
+def _check_known(log: Log, numbers: list[int], name: str, count: int) -> None:
+    if any(not 0 <= number < count for number in numbers):
+        raise _mismatch(log, count, name.replace("_", " "))
+
+
+def _mismatch(log: Log, count: int, name: str = "sensors") -> ValueError:
+    listed = f"{count} {name}" if count != 1 else f"one {name.removesuffix('s')}"
+    key = name.replace(" ", "_").removesuffix("s")
+    return ValueError(
+        f"{log.source}: its channels {', '.join(log.names)} do not match the case's {listed}; "
+        f"say in the TOML file beside it which `{key}` each column is, counted from 0"
+    )
 
 
 def check_times(log: Log) -> None:

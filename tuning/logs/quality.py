@@ -1,4 +1,4 @@
-"""Faults of logged samples: gaps, clock drift, spikes, clipping, stuck values.
+"""Faults of logged samples: gaps, clock drift, offsets, spikes, clipping, stuck values.
 
 Faulty samples are reported, and left out of fits only on request:
 
@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import median_filter
 
 from tuning.logs.log import Log
+from tuning.logs.units import STANDARD_GRAVITY
 
 GAP_STEPS = 1.5  # usual steps between two samples, beyond which samples are missing
 SPIKE_SD = 12.0  # robust standard deviations between a spike and its neighbours
@@ -23,6 +24,8 @@ SPIKE_WINDOW_SAMPLES = 31  # samples around a spike, for that standard deviation
 MIN_SPIKE_RANGE_SHARE = 0.02  # height of a spike over the range of its channel
 MIN_CLIPPED_SAMPLES = 4  # equal samples at an extreme value that are clipped
 MIN_STUCK_SAMPLES = 12  # equal samples in a channel that otherwise never repeats a value
+GRAVITY_TOLERANCE = 0.1  # of standard gravity, for the mean of an accelerometer that feels it
+MAX_OFFSET_GRAVITIES = 1.2  # mean acceleration beyond which a sensor has no right zero or scale
 MAX_CLOCK_DRIFT_STEPS = 0.5  # steps between times and an even grid, at mid-log
 
 
@@ -40,8 +43,8 @@ class Fault:
 
 
 def find_faults(log: Log) -> list[Fault]:
-    """Gaps, clock drift, spikes, clipped and stuck samples of a log."""
-    found = [*_gaps(log), *_clock_drift(log)]
+    """Gaps, clock drift, gravity and offsets, spikes, clipped and stuck samples of a log."""
+    found = [*_gaps(log), *_clock_drift(log), *_offsets(log)]
     for i, name in enumerate(log.names):
         for kind, rule in _SAMPLE_FAULTS.items():
             samples = rule.find(log.values[:, i]) & log.valid[:, i]
@@ -108,6 +111,23 @@ def _clock_drift(log: Log):
             f"{log.source}: the clock drifts: midway the times are {abs(curvature) / step:.2g} "
             "steps off an even grid",
         )
+
+
+def _offsets(log: Log):
+    """Accelerometers whose mean is gravity, or more than gravity can be."""
+    for i, name in enumerate(log.names):
+        if log.quantities[i] != "acceleration" or not log.valid[:, i].any():
+            continue
+        mean = float(np.median(log.values[log.valid[:, i], i])) / STANDARD_GRAVITY
+        everywhere = np.ones(log.times.size, bool)
+        if abs(abs(mean) - 1) < GRAVITY_TOLERANCE:
+            message = f"{log.source}: {name} includes gravity (its median is {mean:.3f} g)"
+            yield Fault("gravity", name, everywhere, message)
+        elif abs(mean) > MAX_OFFSET_GRAVITIES:
+            message = (
+                f"{log.source}: {name} has an offset of {mean:.3g} g: the sensor is not calibrated"
+            )
+            yield Fault("offset", name, everywhere, message)
 
 
 def _spikes(values: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:

@@ -10,6 +10,7 @@ A TOML file of the same stem beside a log describes it (all entries are optional
     t = "ms"
     d1 = { unit = "mm", sensor = 0, position = 0.3 }  # index of the sensor in the case
     a1 = { unit = "V", sensitivity = "100 mV/g" }     # output of a transducer
+    a2 = { unit = "g", vehicle_sensor = 0 }           # index of the vehicle sensor in the case
     u = { unit = "V", actuator = 0 }                  # command to an actuator of the case
     [[loads]]                                         # as in a case file
     kind = "mass"
@@ -31,6 +32,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tuning.logs.columns import with_named_columns, with_times
 from tuning.logs.description import LogDescription, read_description
 from tuning.logs.log import Log, check_samples
 from tuning.logs.quality import interpolate_invalid
@@ -41,26 +43,32 @@ from tuning.logs.units import UNITS, transducer_unit, unit
 def read_log(
     path: str | Path,
     *,
-    columns: Sequence[str] | None = None,
+    columns: Sequence[str] | str | None = None,
     units: Mapping[str, str] | str | None = None,
     time: str | None = None,
+    rate: float | None = None,
     run: str | None = None,
     missing: str = "refuse",
 ) -> Log:
-    """Read a log: separated values, LabVIEW (.lvm, .tdms), MATLAB, HDF5, netCDF or Parquet.
+    """Read a log: separated values, Excel, LabVIEW (.lvm, .tdms), universal files (.uff), MATLAB,
+    HDF5, netCDF or Parquet.
 
-    `columns` are the channels to keep, in this order; `units` the unit of columns by name (or one
-    for all channels), which prevails over the file; `time` the column of times, by default the one
-    called time or t, or the first with a unit of time. What is not given here is taken from the
-    TOML file beside the log, then from the log itself. `run` is the name of the run in a file of
-    several. Samples that are `missing` (empty cells, NaN) are refused or, with "mask", interpolated
-    and left out of fits.
+    `columns` are the channels to keep, in this order, as a sequence or separated by commas, with
+    units if the file has none: "time [s], a1 [g]". For a file without headings they are all its
+    columns in their order, "-" for one that is not needed. `units` are the unit of columns by name
+    (or one for all channels), which prevails over the file; `time` is the column of times, by
+    default the one called time or t, or the first with a unit of time; `rate` (Hz) the sampling
+    rate of a log without times. What is not given here is taken from the TOML file beside the log,
+    then from the log itself. `run` is the name of the run in a file of several. Samples that are
+    `missing` (empty cells, NaN) are refused or, with "mask", interpolated and left out of fits.
 
     Raises ValueError, naming file and line, for an empty or damaged log, unknown columns or units,
-    columns without a unit, cells that are not finite numbers, times that do not increase, and
-    several runs of which none is named.
+    columns without a name or a unit, cells that are not finite numbers, times that do not increase,
+    a rate beside a column of times, and several runs of which none is named.
     """
-    runs = read_logs(path, columns=columns, units=units, time=time, run=run, missing=missing)
+    runs = read_logs(
+        path, columns=columns, units=units, time=time, rate=rate, run=run, missing=missing
+    )
     if len(runs) > 1:
         names = ", ".join(repr(log.source.removeprefix(f"{path}:")) for log in runs)
         raise ValueError(f"{path}: it holds {len(runs)} runs, {names}; name one, or use read_logs")
@@ -70,9 +78,10 @@ def read_log(
 def read_logs(
     path: str | Path,
     *,
-    columns: Sequence[str] | None = None,
+    columns: Sequence[str] | str | None = None,
     units: Mapping[str, str] | str | None = None,
     time: str | None = None,
+    rate: float | None = None,
     run: str | None = None,
     missing: str = "refuse",
 ) -> list[Log]:
@@ -83,11 +92,12 @@ def read_logs(
     if missing not in ("refuse", "mask"):
         raise ValueError(f'missing samples can be "refuse"d or "mask"ed, not {missing!r}')
     path = Path(path)
-    tables = {
-        part: rows
-        for name, table in read_tables(path).items()
-        for part, rows in _split_runs(name, table).items()
-    }
+    tables = {}
+    for name, table in read_tables(path).items():
+        table, channels, declared = with_named_columns(path, table, columns)
+        table = with_times(path, table, rate, time)
+        for part, rows in _split_runs(name, table).items():
+            tables[part] = rows, channels, declared
     if run is not None and run not in tables:
         raise ValueError(f"{path}: it has no run {run!r}; it has {', '.join(map(repr, tables))}")
     description = read_description(path)
@@ -99,9 +109,16 @@ def read_logs(
     chosen = tables if run is None else {run: tables[run]}
     return [
         _make_log(
-            path, name if len(tables) > 1 else "", table, description, columns, units, time, missing
+            path,
+            name if len(tables) > 1 else "",
+            table,
+            description,
+            channels,
+            declared if units is None else units,
+            time,
+            missing,
         )
-        for name, table in chosen.items()
+        for name, (table, channels, declared) in chosen.items()
     ]
 
 
@@ -164,6 +181,7 @@ def _make_log(
         sensors=tuple(description.sensor(name) for name in channels),
         positions=tuple(description.position(name) for name in channels),
         actuators=tuple(description.actuator(name) for name in channels),
+        vehicle_sensors=tuple(description.vehicle_sensor(name) for name in channels),
         loads=description.loads_of(run),
         valid=valid[:, 1:],
         notes=tuple(notes),
@@ -202,8 +220,9 @@ def _time_column(path, table: LogTable, requested: str | None) -> str:
         if text in UNITS and UNITS[text].quantity == "time":
             return name
     raise ValueError(
-        f"{path}: no column is called time or has a unit of time; say which it is, "
-        f'e.g. time={table.names[0]!r}, or time = "{table.names[0]}" in {path.stem}.toml'
+        f"{path}: no column is called time or has a unit of time; say which it is, e.g. "
+        f'time={table.names[0]!r}, or time = "{table.names[0]}" in {path.stem}.toml, or give the '
+        "sampling rate of a log without times (rate)"
     )
 
 

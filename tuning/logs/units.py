@@ -90,6 +90,15 @@ def unit(text: str) -> Unit:
     return UNITS[name]
 
 
+def is_unit(text: str) -> bool:
+    """Whether a text is the name of a known unit."""
+    try:
+        unit(text)
+    except ValueError:
+        return False
+    return True
+
+
 _SENSITIVITY = re.compile(
     r"\s*(?P<size>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<out>[^\s/]+)\s*/(?P<of>.+)"
 )

@@ -1,156 +1,148 @@
-"""Modes from the response to ambient excitation, by maximum likelihood on the spectrum.
+"""Modes from the response to ambient excitation, by stochastic subspace identification.
 
-Under excitation whose spectrum is flat across a resonance, the power spectrum of channel c is
-
-    M_c(f) = b_c + d_c (f_0 / f)^2 + sum_k a_kc r^q / ((1 - r^2)^2 + (2 z_k r)^2),   r = f / f_k,
-
-with q = 0, 2, 4 for deflection, velocity, acceleration; b is the noise and d the drift. The power
-in the bins of a long record is independent and exponentially distributed about it, which gives the
-likelihood (Whittle 1953). Channels are added as if independent; the covariance is that of fully
-coherent channels, as they are near a resonance.
+A wide band is divided into bands of three octaves, each decimated to a rate of its own, so that the
+lags of a Hankel matrix hold many cycles of the lowest mode without thousands of rows.
 """
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import numpy as np
-from scipy.optimize import minimize
-from scipy.stats import norm
+from jaxtyping import Float
+from scipy.stats import t as student
 
-from tuning.logs.units import time_derivative
-from tuning.modal.decay_fit import MIN_BINS, inverse_transform
-from tuning.modal.decay_poles import (
-    FALSE_ALARM_PROBABILITY,
-    MAX_MODES,
-    Spectrum,
-    band_spectrum,
-)
-from tuning.modal.result import IdentifiedMode, ModeCandidates, rejection_reason
+from tuning.modal.preprocessing import Prepared, prepare
+from tuning.modal.result import IdentifiedMode, rejection_reason
+from tuning.modal.shapes import mac_matrix
+from tuning.modal.stabilisation import Chain, Diagram, chain_scatter, stabilise
+from tuning.modal.subspace import Poles, block_rows, decompose, poles_of_order, spread
 
-MIN_DAMPING_RATIO, INITIAL_DAMPING_RATIOS = 1e-5, (0.003, 0.01, 0.03)
-SMOOTHING_WIDTHS_BINS = (0, 1, 4, 12)  # half widths of the moving averages that show resonances
+MAX_ORDER = 60
+MAX_BAND_RATIO = 8.0  # upper over lower end of the bands that are identified one by one
+BAND_OVERLAP = 1.1  # by which such bands exceed their part
+DUPLICATE_SDS = 2.0  # standard deviations within which two poles are one
+DUPLICATE_MAC = 0.9
 
 
-def fit_ambient(values, rate: float, start: int, stop: int, band, quantities) -> ModeCandidates:
-    """Modes from the samples `start` to `stop` of a log (values: time, channel)."""
-    spectrum = band_spectrum(values[start:stop], rate, band)
-    modes, reasons = (), ()
-    if spectrum.bins.size >= MIN_BINS:
-        exponents = np.array([2 * time_derivative(name) for name in quantities])
-        modes = _find_modes(spectrum, exponents)
-        reasons = tuple(rejection_reason(mode, spectrum.duration, band) for mode in modes)
-    return ModeCandidates(
-        modes=modes,
-        rejection_reasons=reasons,
-        start=start,
-        stop=stop,
-        quantile=float(norm.ppf(0.975)),
-        measured=inverse_transform(spectrum.values, spectrum),
-        fitted=None,
+class Candidate(NamedTuple):
+    """A mode found, the reason for rejecting it (or none), and the length of its chain."""
+
+    mode: IdentifiedMode
+    reason: str
+    length: int
+
+
+def divided_band(band: tuple[float, float]) -> tuple[tuple[float, float], ...]:
+    """Parts of a band (Hz) of three octaves at most."""
+    count = max(int(np.ceil(np.log(band[1] / band[0]) / np.log(MAX_BAND_RATIO) - 1e-9)), 1)
+    edges = np.geomspace(band[0], band[1], count + 1).tolist()
+    return tuple(zip(edges[:-1], edges[1:], strict=True))
+
+
+def subspace_modes(
+    records: tuple[Float[np.ndarray, "time channel"], ...],
+    starts: tuple[float, ...],
+    rate: float,
+    band: tuple[float, float],
+    *,
+    data_driven: bool = False,
+    order: int | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[tuple[Candidate, ...], tuple[Diagram, ...]]:
+    """Candidate modes and the stabilisation diagram of each part of a band (Hz)."""
+    found: list[Candidate] = []
+    diagrams = []
+    parts = divided_band(band)
+    for low, high in parts:
+        if progress:
+            progress(f"modes from {low:.3g} Hz to {high:.4g} Hz")
+        inner = (low if low == band[0] else low / BAND_OVERLAP,
+                 high if high == band[1] else high * BAND_OVERLAP)  # fmt: skip
+        prepared = prepare(records, starts, rate, inner)
+        candidates, diagram = _modes_of_band(prepared, band, data_driven, order)
+        found += candidates
+        diagrams.append(diagram)
+    return _without_duplicates(found), tuple(diagrams)
+
+
+def _modes_of_band(prepared: Prepared, whole, data_driven, order):
+    """Candidates and diagram of records prepared for one band."""
+    scale = np.sqrt(
+        sum(np.sum(record**2, axis=0) for record in prepared.records)
+        / sum(len(record) for record in prepared.records)
+    )
+    scale = np.where(scale > 0, scale, 1.0)
+    records = tuple(record / scale for record in prepared.records)
+    channels, longest = records[0].shape[1], max(map(len, records))
+    rows = block_rows(prepared.rate, prepared.band[0], channels, longest)
+    subspace = decompose(records, prepared.rate, rows, data_driven)
+    highest = order or min(MAX_ORDER, 2 * rows * channels // 3)
+    parts = [poles_of_order(subspace, n) for n in range(2, highest + 1, 2)]
+    poles = Poles(*(np.concatenate([getattr(p, name) for p in parts]) for name in Poles._fields))
+    # Shapes in the units of the log.
+    scaled = poles._replace(shapes=poles.shapes * scale)
+    diagram = stabilise(scaled, prepared.band)
+    duration = sum(map(len, records)) / prepared.rate
+    candidates = []
+    for chain in diagram.chains:
+        mode = _mode(subspace, poles, chain, scale)
+        reason = rejection_reason(mode, duration, whole)
+        candidates.append(Candidate(mode, reason, chain.members.size))
+    return candidates, diagram
+
+
+def _mode(subspace, poles: Poles, chain: Chain, scale) -> IdentifiedMode:
+    """Mode of a chain: its representative, whose variance includes the scatter over orders."""
+    which = chain.best
+    own = spread(subspace, int(poles.orders[which]), complex(poles.poles[which]))
+    scatter = chain_scatter(poles, chain)
+    variances = np.diag(own.covariance) + np.square(scatter)
+    physical = own.shape * scale
+    largest = int(np.argmax(np.abs(physical)))
+    # The largest component in the units of the log may be another: the covariance follows.
+    unit = physical / physical[largest]
+    covariance = _rescaled(own.shape, own.shape_covariance, scale, largest)
+    return IdentifiedMode(
+        frequency=float(poles.frequencies[which]),
+        frequency_sd=float(np.sqrt(variances[0])),
+        damping_ratio=float(poles.damping_ratios[which]),
+        damping_sd=float(np.sqrt(variances[1])),
+        energy_share=float(poles.energies[which]),
+        shape=unit,
+        shape_covariance=covariance,
+        quantile=float(student.ppf(0.975, own.degrees_of_freedom)),
     )
 
 
-def _find_modes(spectrum: Spectrum, exponents) -> tuple[IdentifiedMode, ...]:
-    """Resonances, added one at a time as long as the likelihood gains more than by chance."""
-    power = np.abs(spectrum.values) ** 2
-    reference_power = np.median(power, axis=0) + 1e-30 * power.max()
-    power, bins, channels = power / reference_power, spectrum.bins, power.shape[1]
-    min_gain = channels + 2 + np.log(len(bins) / FALSE_ALARM_PROBABILITY)
-    data = (bins, power, exponents)
-    start = _maximise_likelihood(np.repeat([0.0, -2.0], channels), data)
-    best, parameters = start.fun, start.x
-    while parameters.size < (channels + 2) * MAX_MODES:
-        ratio = power / _model(parameters, bins, exponents)[0].T
-        starts = [np.append(parameters, guess) for guess in _initial_guesses(ratio, bins)]
-        trial = _maximise_likelihood(
-            min(starts, key=lambda start: _negative_log_likelihood(start, *data)[0]), data
-        )
-        if best - trial.fun < min_gain:
-            break
-        best, parameters = trial.fun, trial.x
-    return _identified_modes(parameters, data, reference_power)
+def _rescaled(shape, covariance, scale, largest):
+    """Covariance of a shape in other units, with another component equal to one."""
+    count = shape.size
+    unit = shape * scale / (shape[largest] * scale[largest])
+    # d unit = S (d shape - shape d shape_L / shape_L) / (shape_L s_L), complex linear.
+    transform = np.diag(scale + 0j)
+    transform[:, largest] -= unit * scale[largest]
+    transform = transform / (shape[largest] * scale[largest])
+    real = np.block([[transform.real, -transform.imag], [transform.imag, transform.real]])
+    return real @ covariance @ real.T if count else covariance
 
 
-def _initial_guesses(ratio, bins):
-    """Parameters (log f, log z, log a_c) of resonances where power exceeds the model most."""
-    guesses = set()
-    for width in SMOOTHING_WIDTHS_BINS:
-        window = np.ones(2 * width + 1) / np.sqrt(2 * width + 1)
-        guesses.add(int(np.argmax(np.convolve(ratio.sum(axis=1) - ratio.shape[1], window, "same"))))
-    for peak in sorted(guesses):
-        height = np.maximum(ratio[max(peak - 1, 0) : peak + 2].mean(axis=0), 0.1)
-        for damping in INITIAL_DAMPING_RATIOS:
-            level = np.log(height * (2 * damping) ** 2)
-            yield np.concatenate([[np.log(bins[peak]), np.log(damping)], level])
+def _without_duplicates(found: list[Candidate]) -> tuple[Candidate, ...]:
+    """Candidates that differ by more than their uncertainties, the longest chains first."""
+    kept: list[Candidate] = []
+    for one in sorted(found, key=lambda c: (bool(c.reason), c.mode.damping_sd / max(
+        c.mode.damping_ratio, 1e-12))):  # fmt: skip
+        same = any(_is_same(one.mode, other.mode) for other in kept)
+        if not same:
+            kept.append(one)
+    return tuple(sorted(kept, key=lambda c: c.mode.frequency))
 
 
-def _model(parameters, bins, exponents):
-    """Power of each channel and bin, and its derivatives (parameter, channel, bin).
-
-    Parameters are logarithms: b and d of all channels, then of each mode f_k, z_k and a_kc.
-    """
-    channels = exponents.size
-    gradient = np.zeros((parameters.size, channels, bins.size))
-    levels = np.exp(parameters[: 2 * channels])
-    drift = (bins[0] / bins) ** 2
-    for c in range(channels):
-        gradient[c, c] = levels[c]
-        gradient[channels + c, c] = levels[channels + c] * drift
-    model = gradient[: 2 * channels].sum(axis=0)
-    for offset in range(2 * channels, parameters.size, channels + 2):
-        square = (bins / np.exp(parameters[offset])) ** 2
-        damping = np.exp(parameters[offset + 1])
-        denominator = (1 - square) ** 2 + 4 * damping**2 * square
-        shapes = {q: square ** (q // 2) / denominator for q in set(exponents.tolist())}
-        by_square = (-2 * (1 - square) + 4 * damping**2) * square / denominator
-        by_damping = -8 * damping**2 * square / denominator
-        for c, q in enumerate(exponents.tolist()):
-            part = np.exp(parameters[offset + 2 + c]) * shapes[q]
-            gradient[offset, c] = part * (2 * by_square - q)
-            gradient[offset + 1, c] = part * by_damping
-            gradient[offset + 2 + c, c] = part
-            model[c] += part
-    return model, gradient
-
-
-def _negative_log_likelihood(parameters, bins, power, exponents):
-    """Negative logarithm of the likelihood, and its gradient."""
-    model, gradient = _model(parameters, bins, exponents)
-    ratio = power.T / model
-    cost = np.sum(np.log(model) + ratio)
-    return cost, gradient.reshape(parameters.size, -1) @ ((1 - ratio) / model).ravel()
-
-
-def _maximise_likelihood(parameters, data):
-    """Solution of scipy from a start, with frequencies in the band and bounded damping."""
-    bins, _, exponents = data
-    mode_bounds = [(np.log(bins[0]), np.log(bins[-1])), (np.log(MIN_DAMPING_RATIO), 0.0)]
-    mode_bounds += [(-60.0, 60.0)] * exponents.size
-    count = (parameters.size - 2 * exponents.size) // len(mode_bounds)
-    bounds = [(-30.0, 60.0)] * (2 * exponents.size) + mode_bounds * count
-    return minimize(_negative_log_likelihood, parameters, data, "L-BFGS-B", jac=True, bounds=bounds)
-
-
-def _identified_modes(parameters, data, reference_power) -> tuple[IdentifiedMode, ...]:
-    """Modes with standard deviations (sandwich covariance, coherent channels) and energies."""
-    bins, power, exponents = data
-    channels = exponents.size
-    model, gradient = _model(parameters, bins, exponents)
-    relative = gradient / model
-    channel_rows, summed_rows = relative.reshape(parameters.size, -1), relative.sum(axis=1)
-    inverse = np.linalg.pinv(channel_rows @ channel_rows.T, hermitian=True)
-    covariance = inverse @ (summed_rows @ summed_rows.T) @ inverse
-    deviation = np.sqrt(np.diag(covariance))
-    found = []
-    for offset in range(2 * channels, parameters.size, channels + 2):
-        frequency, damping = np.exp(parameters[offset : offset + 2])
-        part = gradient[offset + 2 + np.arange(channels), np.arange(channels)].T
-        found.append(
-            IdentifiedMode(
-                frequency=float(frequency),
-                frequency_sd=float(frequency * deviation[offset]),
-                damping_ratio=float(damping),
-                damping_sd=float(damping * deviation[offset + 1]),
-                energy_share=float(
-                    np.sum(part * reference_power) / np.sum(power * reference_power)
-                ),
-            )
-        )
-    return tuple(sorted(found))
+def _is_same(a: IdentifiedMode, b: IdentifiedMode) -> bool:
+    """Whether two poles agree in frequency, damping and shape within their uncertainties."""
+    frequency_sd = np.hypot(a.frequency_sd, b.frequency_sd)
+    damping_sd = np.hypot(a.damping_sd, b.damping_sd)
+    return bool(
+        abs(a.frequency - b.frequency) < DUPLICATE_SDS * frequency_sd
+        and abs(a.damping_ratio - b.damping_ratio) < DUPLICATE_SDS * damping_sd
+        and mac_matrix(a.shape[None], b.shape[None])[0, 0] > DUPLICATE_MAC
+    )

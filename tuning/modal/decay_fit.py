@@ -1,6 +1,9 @@
-"""Modes from a free decay: window, poles, and rejection of poles that are not reproduced."""
+"""Modes from free decays: poles, shapes, and rejection of poles that are not reproduced."""
+
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Complex, Float
 from scipy.stats import t as student
 
 from tuning.modal.decay_poles import (
@@ -11,97 +14,66 @@ from tuning.modal.decay_poles import (
     pole_parameters,
     refine,
 )
-from tuning.modal.result import IdentifiedMode, ModeCandidates, rejection_reason
-from tuning.modal.window import band_pass
+from tuning.modal.result import IdentifiedMode, rejection_reason
 
 MIN_BINS = 8  # bins of a spectrum to find poles in
-TRIM_PARTS = 16  # parts of a window, by which it is shortened or extended
-LATE_START_SHARE = 0.3  # of a window, after which its modes must predict its first part
-MAX_UNPREDICTED_ENERGY = 0.5  # share of the energy of a part that belongs to the decay
-MAX_PREDICTING_MODES = 6  # modes for predictions
 MAX_POLE_SHIFT_SD = 4.0  # standard deviations by which a pole may differ in a shorter window
 SHORTER_WINDOW_CUT = 0.2  # share of the window that is cut off for a shorter one
 WEAK_ENERGY_SHARE = 0.2  # of the strongest mode's energy; below it poles must be reproduced
 NOT_REPRODUCED = "not the same in parts of the window"
 
 
-def fit_decay(values, rate: float, start: int, stop: int, band) -> ModeCandidates | None:
-    """Modes from the free decay between two samples of a log (values: time, channel).
+class DecayFit(NamedTuple):
+    """Modes of free decays with the reasons for rejecting them, and the fit in the band.
 
-    A weak mode must be reproduced in the window without its first and without its last fifth. The
-    change of a pole there, beyond what noise explains, adds to its uncertainty (frequency and
-    damping of a real structure depend slightly on amplitude). None if the band has too few bins.
+    `measured` and `fitted` have a column for each channel of each decay.
     """
-    spectrum = band_spectrum(values[start:stop], rate, band)
+
+    modes: tuple[IdentifiedMode, ...]
+    reasons: tuple[str, ...]
+    measured: Float[np.ndarray, "sample column"]
+    fitted: Float[np.ndarray, "sample column"]
+
+
+def fit_decay(
+    values: Float[np.ndarray, "sample column"],
+    rate: float,
+    band: tuple[float, float],
+    channels: int,
+    poles: Complex[np.ndarray, " start"] | None = None,
+) -> DecayFit | None:
+    """Modes from free decays of one length, side by side (column: the channels of each decay).
+
+    `poles` (1/s) are those to start from, of a subspace method. A weak mode must be reproduced in
+    the window without its first and without its last fifth. The change of a pole there, beyond what
+    noise explains, adds to its uncertainty (frequency and damping of a real structure depend
+    slightly on amplitude). None if the band has too few bins.
+    """
+    count = len(values)
+    spectrum = band_spectrum(values, rate, band)
     if spectrum.bins.size < MIN_BINS:
         return None
-    found = find_poles(spectrum)
-    cut = int(SHORTER_WINDOW_CUT * (stop - start))
+    found = find_poles(spectrum, start=poles)
+    cut = int(SHORTER_WINDOW_CUT * count)
     shorter_spectra = [
         band_spectrum(values[first:last], rate, band)
-        for first, last in ((start + cut, stop), (start, stop - cut))
+        for first, last in ((cut, count), (0, count - cut))
     ]
     shorter_fits = [_refit(found, spectrum, other) for other in shorter_spectra]
-    modes = _identified_modes(found, _nonstationary_variance(found, shorter_fits), spectrum)
+    modes = _identified_modes(
+        found, _nonstationary_variance(found, shorter_fits), spectrum, channels
+    )
     reasons = [rejection_reason(mode, spectrum.duration, band) for mode in modes]
     not_reproduced = _not_reproduced(found, shorter_fits, spectrum)
-    return ModeCandidates(
+    return DecayFit(
         modes=modes,
-        rejection_reasons=tuple(
+        reasons=tuple(
             why or (NOT_REPRODUCED if gone else "")
             for gone, why in zip(not_reproduced, reasons, strict=True)
         ),
-        start=start,
-        stop=stop,
-        quantile=float(student.ppf(0.975, max(found.degrees_of_freedom, 3.0))),
         measured=inverse_transform(found.model + found.residual, spectrum),
         fitted=inverse_transform(found.model, spectrum),
     )
-
-
-def trim_to_free_decay(values, rate: float, start: int, stop: int, band) -> tuple[int, int]:
-    """Range of samples (start, stop) around a roughly known decay that is free of excitation.
-
-    The beginning is cut, in coarse steps and then in fine ones, as long as the modes of the later
-    part do not predict it backwards. The end is moved on as long as they predict the next samples.
-    """
-    for part in (max((stop - start) // TRIM_PARTS, 1), max((stop - start) // (4 * TRIM_PARTS), 1)):
-        while stop - start > TRIM_PARTS // 2 * part:
-            late = start + int(LATE_START_SHARE * (stop - start))
-            if (
-                _unpredicted_energy(values, rate, (late, stop), (start, start + part), band)
-                < MAX_UNPREDICTED_ENERGY
-            ):
-                break
-            start += part
-    part = max((stop - start) // TRIM_PARTS, 1)
-    while stop + part <= len(values):
-        if (
-            _unpredicted_energy(values, rate, (start, stop), (stop, stop + part), band)
-            > MAX_UNPREDICTED_ENERGY
-        ):
-            break
-        stop += part
-    return start, stop
-
-
-def _unpredicted_energy(values, rate, fitted_range, predicted_range, band) -> float:
-    """Share of the energy of predicted samples that modes of the fitted ones do not explain."""
-    spectrum = band_spectrum(values[fitted_range[0] : fitted_range[1]], rate, band)
-    if spectrum.bins.size < MIN_BINS:
-        return 0.0
-    found = find_poles(spectrum, max_modes=MAX_PREDICTING_MODES)
-    times = (np.arange(*predicted_range) - fitted_range[0]) / rate
-    predicted = (np.exp(np.multiply.outer(times, found.poles)) @ found.amplitudes).real
-    # Filtered together with the samples that follow: a filter is inaccurate at the ends.
-    first, last = (
-        min(fitted_range[0], predicted_range[0]),
-        max(fitted_range[1], 2 * predicted_range[1] - predicted_range[0]),
-    )
-    measured = band_pass(values[first:last], rate, band)[
-        predicted_range[0] - first : predicted_range[1] - first
-    ]
-    return float(np.sum((measured - predicted) ** 2) / np.sum(measured**2))
 
 
 def inverse_transform(values, spectrum: Spectrum):
@@ -158,9 +130,12 @@ def _energy_shares(found: PoleFit, spectrum: Spectrum):
     return energies / total
 
 
-def _identified_modes(found: PoleFit, scatter, spectrum: Spectrum) -> tuple[IdentifiedMode, ...]:
+def _identified_modes(
+    found: PoleFit, scatter, spectrum: Spectrum, channels: int
+) -> tuple[IdentifiedMode, ...]:
     """Frequency |p| / 2 pi and damping ratio s / |p| of each pole, with standard deviations."""
     modes = []
+    quantile = float(student.ppf(0.975, max(found.degrees_of_freedom, 3.0)))
     for k, (pole, share) in enumerate(
         zip(found.poles, _energy_shares(found, spectrum), strict=True)
     ):
@@ -169,6 +144,7 @@ def _identified_modes(found: PoleFit, scatter, spectrum: Spectrum) -> tuple[Iden
         rate, angular_frequency, size = -pole.real, pole.imag, abs(pole)
         by_frequency = np.array([rate, angular_frequency]) / size / (2 * np.pi)
         by_damping = np.array([angular_frequency**2, -rate * angular_frequency]) / size**3
+        shape, shape_covariance = _shape(found, k, channels)
         modes.append(
             IdentifiedMode(
                 frequency=float(size / (2 * np.pi)),
@@ -176,6 +152,28 @@ def _identified_modes(found: PoleFit, scatter, spectrum: Spectrum) -> tuple[Iden
                 damping_ratio=float(rate / size),
                 damping_sd=float(np.sqrt(by_damping @ covariance @ by_damping)),
                 energy_share=float(share),
+                shape=shape,
+                shape_covariance=shape_covariance,
+                quantile=quantile,
             )
         )
     return tuple(modes)
+
+
+def _shape(found: PoleFit, mode: int, channels: int):
+    """Shape common to all decays (largest component one), and the covariance of its parts.
+
+    The amplitudes (decay, channel) are of rank one: shape times participation. Their variance is
+    that of the noise at the mode's frequency, divided by the energy of its decaying sinusoid.
+    """
+    amplitudes = found.amplitudes[mode].reshape(-1, channels)
+    _, sizes, rows = np.linalg.svd(amplitudes, full_matrices=False)
+    shape = rows[0]
+    largest = int(np.argmax(np.abs(shape)))
+    unit = shape / shape[largest]
+    noise = found.amplitude_variance[mode].reshape(-1, channels).mean(axis=0)
+    # Along the largest component's participation, each component's variance is noise / size^2.
+    participation = (sizes[0] * np.abs(shape[largest])) ** 2
+    variance = (noise + np.abs(unit) ** 2 * noise[largest]) / max(participation, 1e-300)
+    variance[largest] = 0.0
+    return unit, np.diag(np.concatenate([variance, variance]) / 2)

@@ -52,13 +52,14 @@ class PoleFit(NamedTuple):
 
     `poles` (1/s) are in the upper half plane, ascending; `covariance` is that of (s_1, w_1, s_2,
     w_2, ...), minus their real parts and their imaginary parts; `amplitudes` are those at the start
-    of the window; `model` is the part of the spectrum due to modes; `degrees_of_freedom` are those
-    of the noise level, for intervals.
+    of the window and `amplitude_variance` their variances; `model` is the part of the spectrum due
+    to modes; `degrees_of_freedom` are those of the noise level, for intervals.
     """
 
     poles: Complex[np.ndarray, " mode"]
     covariance: Float[np.ndarray, "parameter parameter"]
     amplitudes: Complex[np.ndarray, "mode channel"]
+    amplitude_variance: Float[np.ndarray, "mode channel"]
     model: Complex[np.ndarray, "bin channel"]
     residual: Complex[np.ndarray, "bin channel"]
     noise: Float[np.ndarray, "bin channel"]
@@ -76,8 +77,15 @@ def band_spectrum(
     return Spectrum(bins[keep], np.fft.rfft(values, axis=0)[keep], count, 1 / rate)
 
 
-def find_poles(spectrum: Spectrum, max_modes: int = MAX_MODES) -> PoleFit:
-    """Poles, `max_modes` at most, of the modes that are significant in a free decay's spectrum."""
+def find_poles(
+    spectrum: Spectrum,
+    max_modes: int = MAX_MODES,
+    start: Complex[np.ndarray, " start"] | None = None,
+) -> PoleFit:
+    """Poles, `max_modes` at most, of the modes that are significant in a free decay's spectrum.
+
+    `start` are poles (1/s) to begin with; those in the band are refined, and kept if significant.
+    """
     channels = spectrum.values.shape[1]
     # Chi-square tail: half the drop in weighted squares is what the likelihood gains.
     trials = 4 * spectrum.bins.size
@@ -93,6 +101,11 @@ def find_poles(spectrum: Spectrum, max_modes: int = MAX_MODES) -> PoleFit:
         * _smooth(np.abs(spectrum.values) ** 2, NEARBY_BINS)
         / (2 * NEARBY_BINS + 1)
     )
+    if start is not None and start.size:
+        frequencies = start.imag / (2 * np.pi)
+        inside = (frequencies > spectrum.bins[0]) & (frequencies < spectrum.bins[-1])
+        level = _robust_level(spectrum.values) + misfit_level
+        best = refine(start[inside][: spectrum.bins.size // 4], spectrum, level, COARSE_TOLERANCE)
     while best.poles.size < min(max_modes, spectrum.bins.size // 4):
         level = _robust_level(best.residual) + misfit_level
         guess = _initial_pole(spectrum, best.residual, level)
@@ -306,8 +319,16 @@ def _fit_amplitudes(poles, spectrum: Spectrum, level) -> PoleFit:
         poles=poles,
         covariance=inverse @ score @ inverse,
         amplitudes=(pairs[..., 0] + 1j * pairs[..., 1]).T,
+        amplitude_variance=_amplitude_variance(poles, spectrum, noise),
         model=model,
         residual=residual,
         noise=noise,
         degrees_of_freedom=float(2 * np.median(count)),
     )
+
+
+def _amplitude_variance(poles, spectrum: Spectrum, noise):
+    """Variance of each amplitude (mode, channel) beside modes that are well apart."""
+    columns = _modal_columns(poles, spectrum)[0]  # bin, mode, 2
+    energy = np.sum(np.abs(columns) ** 2, axis=2)
+    return 2 / np.maximum(np.einsum("jk,jc->kc", energy / 2, 1 / noise), 1e-300)

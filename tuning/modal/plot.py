@@ -45,7 +45,8 @@ def _draw_log(axes, fit, channel, unit):
         times[::size][: len(pieces)], pieces.min(axis=1), pieces.max(axis=1),
         color=GREY, linewidth=0.6, edgecolor=GREY,
     )  # fmt: skip
-    axes.axvspan(*fit.window, color=FIT, alpha=0.15, linewidth=0)
+    for window in fit.windows:
+        axes.axvspan(*window, color=FIT, alpha=0.15, linewidth=0)
     axes.text(
         fit.window[0], 0.97, f" {fit.window[0]:.2f} to {fit.window[1]:.2f} s", color=FIT,
         transform=axes.get_xaxis_transform(), va="top",
@@ -60,7 +61,7 @@ def _draw_spectrum(axes, fit, channel, unit):
     values = fit.log.values[inside, channel]
     window = np.hanning(values.size)
     amplitude = np.abs(np.fft.rfft((values - values.mean()) * window)) * 2 / window.sum()
-    bins = np.fft.rfftfreq(values.size, 1 / fit.log.sample_rate)
+    bins = np.fft.rfftfreq(values.size, np.ptp(fit.log.times[inside]) / (values.size - 1))
     keep = (bins >= fit.band[0]) & (bins <= fit.band[1])
     axes.semilogy(bins[keep], amplitude[keep], color=INK, linewidth=0.9)
     for mode, reason in fit.rejected:
@@ -89,5 +90,5 @@ def _draw_fit(axes, residual_axes, fit, channel, unit):
         ha="right", transform=residual_axes.transAxes,
     )  # fmt: skip
     residual_axes.set_ylim(np.array(axes.get_ylim()) / 2)
-    axes.set(ylabel=f"{fit.log.names[channel]} ({unit})", xlim=fit.window)
-    residual_axes.set(xlabel="time (s)", ylabel="residual", xlim=fit.window)
+    axes.set(ylabel=f"{fit.log.names[channel]} ({unit})", xlim=fit.windows[0])
+    residual_axes.set(xlabel="time (s)", ylabel="residual", xlim=fit.windows[0])

@@ -3,19 +3,24 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
-MAX_RELATIVE_DAMPING_SD = 0.3  # standard deviation of a damping ratio over the ratio
+from tuning.modal.shapes import phase_collinearity
+
+MAX_RELATIVE_FREQUENCY_SD = 0.02
 MAX_DAMPING_RATIO = 0.2
 MIN_CYCLES = 4.0  # cycles of a mode in the window
 MIN_ENERGY_SHARE = 0.002  # of the energy of the log in the band
+MIN_COLLINEARITY = 0.5  # modal phase collinearity, of three channels or more
 MAX_BAND_SHARE = 0.98  # of the upper end of the band; a mode above may be the flank of another
 
 
 class IdentifiedMode(NamedTuple):
     """A mode: undamped natural frequency (Hz) and damping ratio, with standard deviations.
 
-    `energy_share` is its share of the energy of the log in the band.
+    `energy_share` is its share of the energy of the log in the band. `shape` has a largest
+    component of one; `shape_covariance` is that of its real parts, then its imaginary parts.
+    `correlation` is that of frequency and damping ratio.
     """
 
     frequency: float
@@ -23,21 +28,27 @@ class IdentifiedMode(NamedTuple):
     damping_ratio: float
     damping_sd: float
     energy_share: float
+    shape: Complex[np.ndarray, " channel"]
+    shape_covariance: Float[np.ndarray, "part part"]
+    quantile: float = 1.96
+
+    @property
+    def collinearity(self) -> float:
+        """Modal phase collinearity of the shape: 1 if all channels move in phase or antiphase."""
+        return float(phase_collinearity(self.shape[None])[0])
 
 
 class ModeCandidates(NamedTuple):
     """Candidate modes with the reason for rejecting each (empty for a mode that is accepted).
 
-    `start` and `stop` are the samples used; `quantile` times a standard deviation is half a 95 %
-    interval; `measured` and `fitted` are the part in the band of the log and of the fit (None
-    without a fit in time).
+    `windows` (s) are the parts of the log used; `times`, `measured` and `fitted` are the part in
+    the band of the log and of the fit (None without a fit in time), for the first window.
     """
 
     modes: tuple[IdentifiedMode, ...]
     rejection_reasons: tuple[str, ...]
-    start: int
-    stop: int
-    quantile: float
+    windows: tuple[tuple[float, float], ...]
+    times: Float[np.ndarray, " sample"]
     measured: Float[np.ndarray, "sample channel"]
     fitted: Float[np.ndarray, "sample channel"] | None
 
@@ -46,14 +57,16 @@ def rejection_reason(mode: IdentifiedMode, duration: float, band: tuple[float, f
     """Reason why a mode found in `duration` seconds is not well identified; empty if it is."""
     if not band[0] <= mode.frequency <= MAX_BAND_SHARE * band[1]:
         return "at the edge of the band"
-    if mode.damping_ratio < 2 * mode.damping_sd:
+    if not mode.quantile * mode.damping_sd < mode.damping_ratio:
         return "damping not distinguishable from none: hum, or a mode too weak or too short"
     if mode.damping_ratio > MAX_DAMPING_RATIO:
         return "damped so strongly that it may be no mode"
     if mode.frequency * duration < MIN_CYCLES:
         return "too few cycles in the window"
-    if mode.damping_sd > MAX_RELATIVE_DAMPING_SD * mode.damping_ratio:
-        return f"damping uncertain by {100 * mode.damping_sd / mode.damping_ratio:.0f} %"
+    if mode.frequency_sd > MAX_RELATIVE_FREQUENCY_SD * mode.frequency:
+        return f"frequency uncertain by {100 * mode.frequency_sd / mode.frequency:.1f} %"
     if mode.energy_share < MIN_ENERGY_SHARE:
         return f"{100 * mode.energy_share:.2f} % of the energy"
+    if mode.shape.size >= 3 and mode.collinearity < MIN_COLLINEARITY:
+        return f"a complex shape (modal phase collinearity {mode.collinearity:.2f})"
     return ""

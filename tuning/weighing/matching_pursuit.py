@@ -1,7 +1,8 @@
-"""Matching pursuit: loads that explain the readings of a log by static influence lines.
+"""Matching pursuit: loads that explain the readings of a log as forces crossing the beam.
 
 Loads are added, singly and in pairs, where they explain most of the residual, and all are then
-refined together. The dynamic part of the response stays in the residual.
+refined together. The dynamic part of the response stays in the residual, but for velocities and
+accelerations (see `unit_force`).
 """
 
 from typing import NamedTuple
@@ -13,43 +14,51 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.mass import MovingMass
-from jaxbeam.model.statics import influence_line
 from tuning.logs.log import Log
+from tuning.logs.pairing import sensor_readings
+from tuning.weighing.unit_force import UnitForce
 
-POSITION_COUNT = 201  # points of an influence line
-SPEED_COUNT = 16  # candidates in each direction
-ENTRY_TIME_COUNT = 80  # candidates for each speed
+SPEED_COUNT = 16  # candidates in each direction,
+VIBRATING_SPEED_COUNT = 64  # or so many, if a sensor feels the vibration: its phase tells the speed
+REFINED_COUNT = 4  # candidates of different speeds that are refined
+ENTRY_TIME_COUNT = 80  # candidates for each speed at least,
+ENTRIES_PER_PERIOD = 8  # and in a period of the first mode, if a sensor feels the vibration,
+MAX_ENTRY_TIME_COUNT = 400  # and at most
+MAX_PAIRED = 2000  # candidates that are tried in pairs
 MAX_SAMPLES = 300  # of a log; a longer one is thinned out
 
 
 class MatchingPursuitResult(NamedTuple):
-    """Loads, and the root mean square (m) of the residual."""
+    """Loads, and the root mean square of the residual, relative to that of the readings."""
 
     loads: list[MovingMass]
     residual_rms: float
 
 
 class MatchingPursuit:
-    """Quasi-static readings of candidate loads on a beam, and those of a log.
+    """Readings of candidate loads on a beam, and those of a log.
 
-    The mean is subtracted from all readings, and with it any offset. `readings_rms` (m) is the root
-    mean square of the readings of the log.
+    The mean is subtracted from all readings, and with it any offset; those of one quantity are
+    divided by their root mean square.
     """
 
     def __init__(self, case: Case, log: Log, speeds: tuple[float, float], both_ways: bool):
         stride = max(log.times.size // MAX_SAMPLES, 1)
-        chosen = [i for i, actuator in enumerate(log.actuators) if actuator is None]
         self.times = log.times[::stride]
-        self.readings = _centred(log.values[::stride, chosen])
-        self.readings_rms = float(np.sqrt(np.mean(self.readings**2)))
-        self.length = float(concrete(case.beam.length))
-        self.positions = np.linspace(0, self.length, POSITION_COUNT)
-        sensors = np.array([float(concrete(sensor.position)) for sensor in case.sensors])
-        weight = float(concrete(case.run.gravity))
-        self.influence_lines = np.asarray(influence_line(case, sensors, self.positions)) * weight
+        self.unit_force = UnitForce(case, float(log.times[-1] - log.times[0]))
+        self.length = self.unit_force.length
+        readings = _centred(sensor_readings(case, log)[0][::stride])
+        quantities = np.array([sensor.quantity for sensor in case.sensors])
+        alike = quantities[:, None] == quantities[None, :]
+        rms = np.sqrt(np.mean(readings**2, axis=0) @ alike / alike.sum(axis=0))
+        self.scale = 1 / np.maximum(rms, 1e-300)
+        self.readings = readings * self.scale
+        self.weight = float(concrete(case.run.gravity))
+        vibrates = bool(self.unit_force.vibrates.any())
         signs = (1.0, -1.0) if both_ways else (1.0,)
-        tried = [sign * speed for sign in signs for speed in np.geomspace(*speeds, SPEED_COUNT)]
-        self.candidates = [(s, entry) for s in tried for entry in self._entry_times(s)]
+        count = VIBRATING_SPEED_COUNT if vibrates else SPEED_COUNT
+        tried = [sign * speed for sign in signs for speed in np.geomspace(*speeds, count)]
+        self.candidates = [(s, entry) for s in tried for entry in self._entry_times(s, vibrates)]
         self.candidate_readings = np.array(
             [self._unit_mass_readings(*each).ravel() for each in self.candidates]
         )
@@ -75,43 +84,58 @@ class MatchingPursuit:
         if count == 0:
             return np.empty((0, 3))
         fewer = self._find_loads(count - 1)
-        tried = [np.vstack([fewer, self._best_load(self._residual(fewer))])]
+        tried = [np.vstack([fewer, load]) for load in self._best_loads(self._residual(fewer))]
         if count > 1:
             fewer = self._find_loads(count - 2)
             tried.append(np.vstack([fewer, self._best_pair(self._residual(fewer))]))
         return min((self._refine(numbers) for numbers in tried), key=self._residual_rms)
 
-    def _best_load(self, residual: Float[np.ndarray, "time sensor"]) -> Float[np.ndarray, "load 3"]:
-        """The load that explains most of the residual."""
+    def _best_loads(
+        self, residual: Float[np.ndarray, "time sensor"]
+    ) -> list[Float[np.ndarray, "load 3"]]:
+        """The loads of different speeds that explain most of the residual, each alone."""
         gains = np.maximum(self.candidate_readings @ residual.ravel(), 0.0) / self.candidate_norms
-        best = int(np.argmax(gains))
-        return np.array([[gains[best] / self.candidate_norms[best], *self.candidates[best]]])
+        found: dict[float, int] = {}
+        for i in np.argsort(-gains, kind="stable").tolist():
+            found.setdefault(self.candidates[i][0], i)
+            if len(found) == REFINED_COUNT:
+                break
+        return [
+            np.array([[gains[i] / self.candidate_norms[i], *self.candidates[i]]])
+            for i in found.values()
+        ]
 
     def _best_pair(self, residual: Float[np.ndarray, "time sensor"]) -> Float[np.ndarray, "load 3"]:
-        """The two loads that explain most of the residual, by least squares for all pairs."""
-        columns = self.candidate_readings / self.candidate_norms[:, None]
-        gains, overlap = columns @ residual.ravel(), columns @ columns.T
+        """The two loads that explain most of the residual, by least squares for all pairs.
+
+        Of many candidates those are paired that explain most of it alone.
+        """
+        gains = self.candidate_readings @ residual.ravel() / self.candidate_norms
+        chosen = np.sort(np.argsort(-gains, kind="stable")[:MAX_PAIRED])
+        gains, norms = gains[chosen], self.candidate_norms[chosen]
+        columns = self.candidate_readings[chosen] / norms[:, None]
+        overlap = columns @ columns.T
         determinant = np.maximum(1 - overlap**2, 1e-3)
         first = (gains[:, None] - overlap * gains[None, :]) / determinant
         both = (first > 0) & (first.T > 0)
         explained = np.where(both, first * gains[:, None] + first.T * gains[None, :], -np.inf)
         i, j = np.unravel_index(np.argmax(explained), explained.shape)
-        masses = first[i, j] / self.candidate_norms[i], first[j, i] / self.candidate_norms[j]
-        return np.array([[masses[0], *self.candidates[i]], [masses[1], *self.candidates[j]]])
+        pair = (first[i, j] / norms[i], i), (first[j, i] / norms[j], j)
+        return np.array([[mass, *self.candidates[chosen[n]]] for mass, n in pair])
 
-    def _entry_times(self, speed: float) -> Float[np.ndarray, " entry"]:
+    def _entry_times(self, speed: float, vibrates: bool) -> Float[np.ndarray, " entry"]:
         """Entry times (s) with which at least half of the crossing lies within the log."""
-        half = self.length / abs(speed) / 2
-        return np.linspace(self.times[0] - half, self.times[-1] - half, ENTRY_TIME_COUNT)
+        half, count = self.length / abs(speed) / 2, ENTRY_TIME_COUNT
+        if vibrates:
+            period = 1 / self.unit_force.frequencies.min()
+            needed = int(ENTRIES_PER_PERIOD * (self.times[-1] - self.times[0]) / period)
+            count = min(max(count, needed), MAX_ENTRY_TIME_COUNT)
+        return np.linspace(self.times[0] - half, self.times[-1] - half, count)
 
     def _unit_mass_readings(self, speed: float, entry: float) -> Float[np.ndarray, "time sensor"]:
-        """Quasi-static readings (m) while one kilogram crosses."""
-        start = 0.0 if speed > 0 else self.length
-        position = start + speed * (self.times - entry)
-        table = [
-            np.interp(position, self.positions, line, 0.0, 0.0) for line in self.influence_lines.T
-        ]
-        return _centred(np.stack(table, axis=1))
+        """Readings while the weight of one kilogram crosses."""
+        readings = self.unit_force.readings(float(speed), self.times - entry)
+        return _centred(self.weight * readings) * self.scale
 
     def _residual(
         self, load_parameters: Float[np.ndarray, "load 3"]
@@ -137,7 +161,7 @@ class MatchingPursuit:
             load_parameters[:, 2] + crossing_time,
         )
         found = scipy.optimize.least_squares(
-            lambda x: self._residual(x.reshape(-1, 3)).ravel() / self.readings_rms,
+            lambda x: self._residual(x.reshape(-1, 3)).ravel(),
             load_parameters.ravel(),
             bounds=(least.ravel(), most.ravel()),
             x_scale=np.maximum(np.abs(load_parameters), 1e-3).ravel(),

@@ -1,8 +1,8 @@
-"""Weighing in motion: number, masses, speeds and entry times of loads, from deflections alone.
+"""Weighing in motion: number, masses, speeds and entry times of loads, from readings alone.
 
-Starts come from static influence lines (`matching_pursuit`); then all loads are fitted together
-with the full dynamics. Loads are added until the residuals are white noise or Schwarz's criterion
-(BIC) rises.
+Starts come from the readings of forces that cross (`matching_pursuit`); then all loads are fitted
+together with the full dynamics. Loads are added until the residuals are white noise or Schwarz's
+criterion (BIC) rises.
 """
 
 import dataclasses
@@ -64,23 +64,23 @@ def weigh(
 ) -> Weighing:
     """Masses, speeds and entry times of the loads that crossed a known beam in a log.
 
+    Sensors may measure any quantity of the beam: deflection, strain, acceleration, and so on.
     `speeds` (m/s) are the lowest and highest possible ones, in both directions or, without
     `both_ways`, from the left only; at most `max_count` loads are found. Offsets of the sensors are
     fitted as well. Loads of the case or the log are not used.
 
-    Raises ValueError if a sensor does not measure deflection, speeds are not 0 < low < high, or no
-    load is found in the log, and as `identify` does.
+    Raises ValueError if there is no sensor, speeds are not 0 < low < high, or no load is found in
+    the log, and as `identify` does.
     """
     low, high = speeds
     if not 0 < low < high:
         raise ValueError(f"speeds must be 0 < low < high in m/s; they are {low:g} and {high:g}")
-    others = [i for i, sensor in enumerate(case.sensors) if sensor.quantity != "deflection"]
-    if others or not case.sensors:
-        what = f"sensors.{others[0]} does not measure" if others else "no sensor measures"
-        raise ValueError(f"weighing needs deflections; {what} them")
+    if not case.sensors:
+        raise ValueError("weighing needs a sensor on the beam; the case has none")
+    case = dataclasses.replace(case, vehicle_sensors=())
     pursuit = MatchingPursuit(case, log, (low, high), both_ways)
     first = pursuit.find(1)
-    if first.residual_rms > _MAX_RESIDUAL_SHARE * pursuit.readings_rms:
+    if first.residual_rms > _MAX_RESIDUAL_SHARE:
         raise ValueError(f"{log.source}: no load is found in it at these speeds")
     found = first
     while len(found.loads) < max_count and (

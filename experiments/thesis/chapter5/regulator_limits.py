@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
 import jaxbeam as jb
 from experiments.thesis.cases import with_modes
@@ -162,7 +162,7 @@ def growth_remark(interpretations: Mapping[str, TimeVaryingLoops]) -> str:
     return "Few states, 0.509 kg. " + "; ".join(parts)
 
 
-def draw_poles(partial_feedback: jb.Case, interpretation: str) -> Figure:
+def draw_poles(partial_feedback: jb.Case, interpretation: str) -> Figure | SubFigure:
     """Fig. 5.18, few states: frozen poles along a crossing, and the growth of deviations.
 
     The last twentieth of the crossing is left out: there the pole of the shaker's lag moves far

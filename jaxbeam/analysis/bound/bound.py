@@ -26,10 +26,11 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.prescribed import Prescribed
+from jaxbeam.integrator.static_shapes import static_shapes
+from jaxbeam.integrator.step_size import choose_step_size, run_peaks
 from jaxbeam.model.channels import accepts_commands
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.simulation.command_limits import command_ranges
-from jaxbeam.simulation.integration_plan import choose_step_size, run_peaks, static_shapes
 from jaxbeam.simulation.record import Record
 
 DEFAULT_PERIOD = 0.01  # s, over which commands are held without a sampled controller

@@ -21,17 +21,14 @@ from jaxbeam.integrator.events import EventSchedule, controller_schedule
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.propagators import NODE_COUNT
+from jaxbeam.integrator.static_shapes import StaticShapes, static_shapes
+from jaxbeam.integrator.step_size import choose_step_size
 from jaxbeam.integrator.time_grid import grid_by_schedule
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
-from jaxbeam.simulation.integration_plan import (
-    StaticShapes,
-    choose_step_size,
-    static_shapes,
-    steps_per_interval,
-)
+from jaxbeam.simulation.integration_plan import steps_per_interval
 
 TOLERANCE = 1e-9  # relative to the largest deflection
 MAX_BATCH_SIZE = 1024  # unit commands at once; more take gigabytes

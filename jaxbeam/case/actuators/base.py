@@ -6,6 +6,7 @@ from typing import ClassVar
 import equinox as eqx
 from jaxtyping import Float
 
+from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.module import Module
 
@@ -47,7 +48,7 @@ class SectionStiffening(eqx.Module):
     mass_per_length: Float[Array, ""]
 
 
-class AbstractActuator(Module):
+class AbstractActuator(ReprWithUnits, Module):
     """Interface of actuators.
 
     To add one, write a file in `jaxbeam.case.actuators` with a subclass that declares its `kind`.

@@ -3,11 +3,12 @@
 import equinox as eqx
 from jaxtyping import Float
 
+from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import POSITIVE, number
 from jaxbeam.runtime.arrays import Array
 
 
-class Segment(eqx.Module):
+class Segment(ReprWithUnits, eqx.Module):
     """Length of a beam over which stiffness and mass are constant or polynomials.
 
     Each property is one number, or the coefficients c_0, c_1, ... of

@@ -11,6 +11,7 @@ import equinox as eqx
 from jaxtyping import Float
 
 from jaxbeam.case.declared_checks import validate_exactly_one
+from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import INCREASING, concrete, is_concrete, number
 from jaxbeam.case.loads.force_history import ForceHistory
 from jaxbeam.case.loads.vehicle_model import VehicleModel
@@ -22,7 +23,7 @@ from jaxbeam.case.trajectory import (
 from jaxbeam.runtime.arrays import Array, xp
 
 
-class AbstractLoad(eqx.Module):
+class AbstractLoad(ReprWithUnits, eqx.Module):
     """Interface of loads. A subclass that declares a `kind` is one of case files."""
 
     kind: ClassVar[str]

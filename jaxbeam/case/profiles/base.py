@@ -5,13 +5,14 @@ from typing import ClassVar
 
 from jaxtyping import Float
 
+from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.module import Module
 
 Heights = tuple[Float[Array, "*x"], Float[Array, "*x"], Float[Array, "*x"]]
 
 
-class AbstractProfile(Module):
+class AbstractProfile(ReprWithUnits, Module):
     """Height r(x) (m, positive upwards) of the surface, before, on and behind the beam.
 
     A wheel at x that travels at v = x' and a = x'' rolls over the height y = w + r and feels

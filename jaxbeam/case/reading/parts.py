@@ -9,7 +9,7 @@ from jaxbeam.case.aliases import current_keys, current_kind
 from jaxbeam.case.declared_checks import check_field, describe_value, missing_error, suggestion
 from jaxbeam.case.fields import describe_shape, fits_shape
 from jaxbeam.case.kinds import kinds
-from jaxbeam.case.quantities import OF_QUANTITY, QUANTITIES
+from jaxbeam.case.quantities import OF_QUANTITY, unit_of
 from jaxbeam.case.reading.units import in_si
 
 
@@ -25,6 +25,7 @@ def read_part(address: str, table: dict[str, Any], part_class: type) -> Any:
         part_class = _class_of_kind(address, values.pop("kind", None), part_class)
     fields = {field.name: field for field in dataclasses.fields(part_class) if field.metadata}
     values = current_keys(address, values, fields)
+    default_quantity = fields["quantity"].default if "quantity" in fields else None
     for key, value in values.items():
         if key not in fields:
             raise ValueError(
@@ -36,7 +37,9 @@ def read_part(address: str, table: dict[str, Any], part_class: type) -> Any:
         elif "parts" in fields[key].metadata:
             values[key] = read_parts(f"{address}.{key}", value, fields[key].metadata["parts"])
         else:
-            values[key] = _in_si(f"{address}.{key}", value, _unit(fields[key], values))
+            values[key] = _in_si(
+                f"{address}.{key}", value, _unit(fields[key], values, default_quantity)
+            )
             _check_type(f"{address}.{key}", values[key], fields[key])
     for name, field in fields.items():
         if field.default is dataclasses.MISSING and name not in values:
@@ -72,13 +75,12 @@ def _in_si(address: str, value: Any, unit: str) -> Any:
     return in_si(value, unit, address) if unit and isinstance(value, str | list) else value
 
 
-def _unit(field: dataclasses.Field, values: dict[str, Any]) -> str:
+def _unit(field: dataclasses.Field, values: dict[str, Any], default_quantity: Any) -> str:
     """SI unit of an entry of a table, "" for a word or a count."""
     unit = field.metadata.get("unit", "")
     if unit == OF_QUANTITY:
-        quantity = values.get("quantity", "deflection")
-        known = isinstance(quantity, str) and quantity in QUANTITIES
-        return QUANTITIES[quantity].unit if known else unit
+        quantity = values.get("quantity", default_quantity)
+        return (unit_of(quantity) if isinstance(quantity, str) else None) or unit
     return unit
 
 

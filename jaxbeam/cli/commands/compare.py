@@ -8,8 +8,8 @@ from cyclopts import Parameter
 
 import jaxbeam as jb
 from jaxbeam.case.reading.toml_file import read_toml
-from jaxbeam.cli.arguments import check_suffix, parse_sweep_values, refuse_option
-from jaxbeam.cli.options import CaseOptions, Output, Over, table
+from jaxbeam.cli.arguments import parse_sweep_values, refuse_option
+from jaxbeam.cli.options import CaseOptions, DrawingOptions, Output, Over, table
 
 if TYPE_CHECKING:
     from jaxbeam.analysis.compare import Comparison, MetricsOverCases, PerformanceMetrics
@@ -23,6 +23,7 @@ def compare(
     over: Over = (),
     period: float | None = None,
     output: Output = None,
+    pictures: DrawingOptions = DrawingOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Compare controllers on a case, beside the least peak that any controller can achieve.
@@ -38,10 +39,10 @@ def compare(
         Time (s) for which commands are held in the least achievable peak; if left out, the
         shortest period of the controllers, or 0.01.
     output
-        Draw deflections and commands to this file, OUT.png.
+        Draw deflections and commands to this file, OUT.png, OUT.svg or OUT.pdf.
     """
     values = parse_sweep_values(over)
-    check_suffix(output, ".png", "a comparison")
+    pictures.check(output)
     refuse_option(bool(output and over), "a picture shows one load case: leave out -o or --over")
     options.check_outputs(output)
     for file in controllers:
@@ -60,7 +61,8 @@ def compare(
     if output:
         from jaxbeam.plot import plot_comparison
 
-        plot_comparison(comparisons[0]).savefig(output)
+        figure = plot_comparison(comparisons[0], ax=pictures.page(), title=pictures.title)
+        pictures.save(figure, output)
     if not over:
         options.report(_to_dict(comparisons[0]), _lines(comparisons[0]), output)
         return

@@ -5,8 +5,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jaxbeam.case.reading.toml_file import read_toml
-from jaxbeam.cli.arguments import check_suffix
-from jaxbeam.cli.options import OutputOptions, PrintOptions, numbers_of, print_message, table
+from jaxbeam.cli.options import (
+    DrawingOptions,
+    OutputOptions,
+    PrintOptions,
+    numbers_of,
+    print_message,
+    table,
+)
 
 if TYPE_CHECKING:
     from jaxbeam.case.loads.base import AbstractLoad
@@ -16,7 +22,12 @@ GRAVITY = 9.81  # m/s^2, of vehicles without a case
 
 
 def describe(
-    source: str = "", /, *, plot: Path | None = None, options: OutputOptions = OutputOptions()
+    source: str = "",
+    /,
+    *,
+    plot: Path | None = None,
+    pictures: DrawingOptions = DrawingOptions(),
+    options: OutputOptions = OutputOptions(),
 ) -> None:
     """Describe vehicles, static wheel loads and frequencies, and cases in numbers.
 
@@ -26,9 +37,9 @@ def describe(
         Vehicle file or case file, TOML, or a vehicle or train of the library by name; its names are
         listed if left out.
     plot
-        Draw the vehicles to this file, OUT.png.
+        Draw the vehicles to this file, OUT.png, OUT.svg or OUT.pdf.
     """
-    check_suffix(plot, ".png", "a picture")
+    pictures.check(plot)
     options.check_outputs(plot)
     if not source:
         _list_library(options)
@@ -54,7 +65,9 @@ def describe(
         from jaxbeam.plot import plot_vehicles
 
         titles = [result["title"] for result in results]
-        plot_vehicles(_loads(source, content), titles).savefig(drawn)
+        title = pictures.title or ""
+        figure = plot_vehicles(_loads(source, content), titles, ax=pictures.page(), title=title)
+        pictures.save(figure, drawn)
     options.report({"vehicles": results} | about, lines, drawn)
 
 

@@ -1,13 +1,17 @@
-"""Command `export`: gains of a controller, for a real-time system."""
+"""Command `export`: a controller as a program in C, or its gains, for a real-time system."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from jaxbeam.cli.arguments import refuse_option
 from jaxbeam.cli.options import CaseOptions
 
+if TYPE_CHECKING:
+    import jaxbeam as jb
+
+PROGRAM_FILES = (".h", ".c", "_samples.h", "_check.c")  # of jaxbeam.c_code, added to the name
 # Those of jaxbeam.files.export.WRITERS (a test compares), known before JAX is imported.
 GAIN_FILES = (".csv", ".mat", ".tdms", ".h")
 
@@ -20,23 +24,33 @@ def export(
     points: int = 1001,
     options: CaseOptions = CaseOptions(),
 ) -> None:
-    """Write the gains of a controller, and the filters of its sensors, for a real-time system.
+    """Write a controller for a real-time system, with its estimator and the filters of its sensors.
+
+    As a program in C99 for a controller of any kind: source, header, samples of a simulated run and
+    a loop that checks the commands for them. Or as a table of gains, for those that are one.
 
     Parameters
     ----------
     case
-        Case file with a controller that is a table of gains, TOML.
+        Case file with a controller that has a period, TOML.
     output
-        GAINS.csv, .mat, .tdms or .h (C).
+        NAME.c for a program, whose files and functions begin with NAME; GAINS.csv, .mat, .tdms or
+        .h (C) for gains.
     points
         Number of points of the gain table over the crossing; 1001 if left out.
     """
     endings = ", ".join(GAIN_FILES)
+    is_program = output.suffix == ".c"
     refuse_option(
-        output.suffix not in GAIN_FILES, f"gains are written to {endings}, not to {output}"
+        not is_program and output.suffix not in GAIN_FILES,
+        f"gains are written to {endings}, and programs to .c, not to {output}",
     )
-    options.check_outputs(output)
+    files = [output.with_name(output.stem + ending) for ending in PROGRAM_FILES]
+    options.check_outputs(*(files if is_program else [output]))
     parsed_case = options.read(case)
+    if is_program:
+        _write_program(parsed_case, output, files, options)
+        return
 
     from jaxbeam.files.export import export_gains, write_gains
 
@@ -46,4 +60,28 @@ def export(
         {"crc32": gains.checksum, "test_command": gains.test_command},
         [f"check value {gains.checksum}"],
         output,
+    )
+
+
+def _write_program(case: "jb.Case", output: Path, files: list[Path], options: CaseOptions) -> None:
+    """Write the program of a controller in C, and print its cost and how to check it."""
+    from jaxbeam.c_code import export_c, write_c
+
+    program = export_c(case, output.stem)
+    write_c(program, output.parent, options.overwrite)
+    sources = f"{output} {files[-1]}"
+    options.report(
+        {
+            "files": list(program.files),
+            "operations_per_step": program.operations,
+            "state_bytes": program.state_bytes,
+            "constant_bytes": program.constant_bytes,
+            "recorded_samples": program.samples,
+        },
+        [
+            f"at worst {program.operations} operations a step; in double precision"
+            f" {program.state_bytes} bytes of state, {program.constant_bytes} of constants",
+            f"check: cc -std=c99 {sources} -lm && ./a.out, over {program.samples} samples",
+        ],
+        *files,
     )

@@ -7,14 +7,13 @@ from cyclopts import Parameter
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import (
-    TABLE_SUFFIXES,
     check_suffix,
-    figure_path,
     frequency_grid,
     input_output_pair,
     stationary_mass,
 )
-from jaxbeam.cli.options import CaseOptions, Output, table
+from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, table
+from jaxbeam.files.endings import RESULTS, TABLES
 
 
 def modes(
@@ -23,6 +22,7 @@ def modes(
     *,
     output: Output = None,
     plot: bool = False,
+    pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Compute natural frequencies and damping ratios.
@@ -32,31 +32,23 @@ def modes(
     case
         Case file, TOML.
     output
-        Write the table to this file: OUT.csv, .xlsx, .mat or .parquet.
+        Write the table to this file, OUT.csv, .xlsx, .mat or .parquet, or OUT.nc or .zarr with the
+        mode shapes.
     plot
         Draw the mode shapes to CASE_modes.png in this folder.
     """
-    check_suffix(output, TABLE_SUFFIXES[0], "a table of modes", TABLE_SUFFIXES[1:])
-    picture = figure_path(None, case.with_stem(f"{case.stem}_modes")) if plot else None
+    check_suffix(output, TABLES[0], "a table of modes", RESULTS)
+    picture = pictures.path(plot, None, case.with_stem(f"{case.stem}_modes"))
     options.check_outputs(output, picture)
     parsed_case = options.read(case)
     found = jb.modes(parsed_case)
     if picture:
         from jaxbeam.plot import plot_modes
 
-        plot_modes(parsed_case, found).savefig(picture)
+        figure = plot_modes(parsed_case, found, ax=pictures.page(), title=pictures.title)
+        pictures.save(figure, picture)
     if output:
-        import numpy as np
-
-        from jaxbeam.files.tables import write_table
-
-        heads = ("mode", "frequency (Hz)", "damping ratio")
-        numbers = (
-            np.arange(1.0, 1 + len(found.frequencies)),
-            found.frequencies,
-            found.damping_ratios,
-        )
-        write_table(output, dict(zip(heads, numbers, strict=True)), options.overwrite)
+        jb.save(found, output, options.overwrite)
     rows = zip(found.frequencies, found.damping_ratios, strict=True)
     options.report(
         {"frequencies_hz": found.frequencies, "damping_ratios": found.damping_ratios},
@@ -83,6 +75,7 @@ def frf(
     points: int = 2000,
     output: Output = None,
     plot: bool = False,
+    pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Compute frequency responses without the loads; print resonances and antiresonances.
@@ -105,12 +98,12 @@ def frf(
     points
         Number of frequencies, logarithmically spaced; 2000 if left out.
     output
-        Write the responses to this netCDF file, OUT.nc.
+        Write the responses to this file: OUT.nc, .zarr, .csv, .xlsx, .mat or .parquet.
     plot
         Draw magnitude and phase to a PNG beside the output, or to CASE_frf.png in this folder.
     """
-    check_suffix(output, ".nc", "a frequency response")
-    picture = figure_path(output, case.with_stem(f"{case.stem}_frf")) if plot else None
+    check_suffix(output, ".nc", "a frequency response", RESULTS)
+    picture = pictures.path(plot, output, case.with_stem(f"{case.stem}_frf"))
     options.check_outputs(output, picture)
     frequencies = frequency_grid(from_, to, points)
     pairs = [input_output_pair(text) for text in pair] or None
@@ -121,11 +114,12 @@ def frf(
 
     response = frequency_response(parsed_case, frequencies, pairs, masses)
     if output:
-        response.to_netcdf(output, options.overwrite)
+        jb.save(response, output, options.overwrite)
     if picture:
         from jaxbeam.plot import plot_frequency_response
 
-        plot_frequency_response(response).savefig(picture)
+        figure = plot_frequency_response(response, ax=pictures.page(), title=pictures.title)
+        pictures.save(figure, picture)
     columns = zip(response.pairs, response.magnitude.T, response.phase.T, strict=True)
     lines = []
     for i, channel_pair in enumerate(response.pairs):

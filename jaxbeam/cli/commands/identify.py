@@ -4,7 +4,6 @@ from pathlib import Path
 
 from jaxbeam.cli.arguments import (
     check_exists,
-    figure_path,
     parse_assignment,
     parse_bounds,
     refuse_option,
@@ -14,6 +13,7 @@ from jaxbeam.cli.options import (
     CaseOptions,
     Free,
     Output,
+    PictureOptions,
     Resume,
     Seed,
     Starts,
@@ -40,6 +40,7 @@ def identify(
     report: Path | None = None,
     output: Output = None,
     plot: bool = False,
+    pictures: PictureOptions = PictureOptions(),
     resume: Resume = False,
     options: CaseOptions = CaseOptions(),
 ) -> None:
@@ -83,7 +84,7 @@ def identify(
         refuse_option(
             resume and not output, "--resume goes on with what is kept beside the output: -o"
         )
-        picture = figure_path(output, logs[0]) if plot else None
+        picture = pictures.path(plot, output, logs[0])
         options.check_outputs(output, _with_suffix(output, ".npz"), picture)
         if report:
             check_report_folder(report, options.overwrite)
@@ -111,7 +112,7 @@ def identify(
         assessment = _assess(
             fit, profile, draws, {"seed": seed, "noise": noise}, validate, output, resume
         )
-        _write_and_print(fit, assessment, report, output, picture, options)
+        _write_and_print(fit, assessment, report, output, picture, pictures, options)
         return
     refuse_option(
         bool(output or options.set_),
@@ -122,14 +123,18 @@ def identify(
         any(given),
         "the options of fits are for fitting a case; name what is free with --free ADDRESS",
     )
+    refuse_option(
+        pictures.picture is not None and len(logs) > 1,
+        "--picture names one file, and each log has a picture: use --plot",
+    )
     check_exists("log file", *logs)
     if case:
         print_message(
             f"nothing is named with --free, so {case} is not used; modes of the free decay:"
         )
-    pictures = [figure_path(None, log) if plot else None for log in logs]
-    options.check_outputs(*pictures)
-    _identify_modes(logs, pictures, options)
+    files_of_logs = [pictures.path(plot, None, log) for log in logs]
+    options.check_outputs(*files_of_logs)
+    _identify_modes(logs, files_of_logs, pictures, options)
 
 
 def _with_suffix(output: Path | None, suffix: str) -> Path | None:
@@ -209,7 +214,9 @@ def _assess(fit, profile, draws, sampling, validate, output, resume) -> dict:
     return assessment
 
 
-def _write_and_print(fit, assessment, report, output, picture, options: CaseOptions) -> None:
+def _write_and_print(
+    fit, assessment, report, output, picture, pictures, options: CaseOptions
+) -> None:
     """Write case, fit, picture and report, print the result, and remove the checkpoints."""
     from jaxbeam.files.case_file import save_case
     from tuning.fit.report import write_report
@@ -219,7 +226,7 @@ def _write_and_print(fit, assessment, report, output, picture, options: CaseOpti
         save_case(fit.case, output, overwrite=True)  # checked before the work
         save_fit(fit, output.with_suffix(".npz"), overwrite=True)
     if picture:
-        fit.plot().savefig(picture)
+        pictures.save(pictures.titled(fit.plot()), picture)
     if report:
         write_report(report, fit, overwrite=True, **assessment)
     _remove_checkpoints(output)
@@ -238,16 +245,16 @@ def _write_and_print(fit, assessment, report, output, picture, options: CaseOpti
     options.report(content, lines, output, _with_suffix(output, ".npz"), picture, page)
 
 
-def _identify_modes(logs, pictures, options: CaseOptions) -> None:
+def _identify_modes(logs, files, pictures: PictureOptions, options: CaseOptions) -> None:
     enable_compile_cache()
     import tuning
 
     content = {}
-    for log, picture in zip(logs, pictures, strict=True):
+    for log, picture in zip(logs, files, strict=True):
         fit = tuning.identify_modes(tuning.read_log(log))
         content[str(log)] = fit.to_dict()
         if picture:
-            fit.plot().savefig(picture)
+            pictures.save(pictures.titled(fit.plot()), picture)
         if not options.json_:
             options.report({}, [f"{log}\n{fit}"], picture)
     if options.json_:

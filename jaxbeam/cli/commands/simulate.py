@@ -5,8 +5,9 @@ import warnings
 from pathlib import Path
 
 import jaxbeam as jb
-from jaxbeam.cli.arguments import TABLE_SUFFIXES, check_suffix, figure_path
-from jaxbeam.cli.options import CaseOptions, Output, print_plausibility, table
+from jaxbeam.cli.arguments import check_suffix
+from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, print_plausibility, table
+from jaxbeam.files.endings import RESULTS
 
 MAX_WHEELS = 8  # of a load, or bodies, with a row each
 
@@ -18,6 +19,7 @@ def simulate(
     output: Output = None,
     plot: bool = False,
     animate: Path | None = None,
+    pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Simulate a case: peaks at sensors, contact forces, commands; the whole record on request.
@@ -27,16 +29,19 @@ def simulate(
     case
         Case file, TOML.
     output
-        Write the record to this netCDF file, OUT.nc, or what sensors measure, contact forces and
-        commands to a table: OUT.csv, .xlsx, .mat or .parquet.
+        Write all of the record to this file, OUT.nc or OUT.zarr, or what sensors measure, contact
+        forces and commands to a table: OUT.csv, .xlsx, .mat or .parquet.
     plot
         Draw the record to a PNG beside the output, or named after the case.
     animate
-        Write an animation of the run to this file, OUT.gif.
+        Write an animation of the run to this file, OUT.gif, or OUT.mp4 if ffmpeg is installed.
     """
-    check_suffix(output, ".nc", "a record", TABLE_SUFFIXES)
-    check_suffix(animate, ".gif", "an animation")
-    picture = figure_path(output, case) if plot else None
+    check_suffix(output, ".nc", "a record", RESULTS)
+    if animate:
+        from jaxbeam.plot.traffic.film import check_film
+
+        check_film(animate)
+    picture = pictures.path(plot, output, case)
     options.check_outputs(output, picture, animate)
     parsed_case = options.read(case)
     plausibility = print_plausibility(parsed_case, options)
@@ -51,11 +56,13 @@ def simulate(
     if picture:
         from jaxbeam.plot import plot_record
 
-        plot_record(record).savefig(picture)
+        figure = plot_record(record, ax=pictures.page(), title=pictures.title)
+        pictures.save(figure, picture)
     if animate:
         from jaxbeam.plot import animate as write_animation
 
-        write_animation(record, animate, overwrite=options.overwrite)
+        look = {"title": pictures.title, "size": pictures.inches()}
+        write_animation(record, animate, overwrite=options.overwrite, **look)
     content = _to_dict(record) | {"plausibility": plausibility}
     options.report(content, _lines(record), output, picture, animate)
 

@@ -3,8 +3,7 @@
 import math
 from pathlib import Path
 
-from jaxbeam.cli.arguments import figure_path
-from jaxbeam.cli.options import CaseOptions, table
+from jaxbeam.cli.options import CaseOptions, PictureOptions, table
 
 
 def stability(
@@ -14,6 +13,7 @@ def stability(
     limits: bool = False,
     headway: float | None = None,
     plot: bool = False,
+    pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Compute stability margins, poles with loads frozen along the crossing, and growth over it.
@@ -31,7 +31,7 @@ def stability(
     plot
         Draw the poles along the crossing to CASE_poles.png in this folder.
     """
-    picture = figure_path(None, case.with_stem(f"{case.stem}_poles")) if plot else None
+    picture = pictures.path(plot, None, case.with_stem(f"{case.stem}_poles"))
     options.check_outputs(picture)
     parsed_case = options.read(case)
 
@@ -62,7 +62,9 @@ def stability(
     if picture:
         from jaxbeam.plot import plot_poles
 
-        plot_poles(poles, crossing_growth, parsed_case.title).savefig(picture)
+        title = parsed_case.title if pictures.title is None else pictures.title
+        figure = plot_poles(poles, crossing_growth, title, ax=pictures.page())
+        pictures.save(figure, picture)
     worst = int(poles.largest_real_part.argmax())
     content = {
         "stable_without_loads": stable,

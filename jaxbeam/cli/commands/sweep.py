@@ -9,7 +9,6 @@ from cyclopts import Parameter
 import jaxbeam as jb
 from jaxbeam.cli.arguments import (
     check_suffix,
-    figure_path,
     parse_sweep_values,
     refuse_option,
 )
@@ -17,6 +16,7 @@ from jaxbeam.cli.options import (
     CaseOptions,
     Output,
     Over,
+    PictureOptions,
     PrintOptions,
     print_plausibility,
     table,
@@ -34,6 +34,7 @@ def sweep(
     scheduler: str | None = None,
     precision: str = "double",
     plot: bool = False,
+    pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Simulate a case for many values of some of its parameters.
@@ -43,7 +44,8 @@ def sweep(
     case
         Case file, TOML.
     output
-        Write the results to this zarr store, OUT.zarr, block by block.
+        Write the results to this zarr store, OUT.zarr, block by block; or at the end, a row for
+        each run, to OUT.csv, .xlsx, .mat or .parquet, or all to OUT.nc.
     paired
         Pair the values of all parameters one by one instead of computing all combinations.
     resume
@@ -64,10 +66,16 @@ def sweep(
     refuse_option(
         bool(scheduler) and not output, "--scheduler needs a store for the results: -o OUT.zarr"
     )
-    check_suffix(output, ".zarr", "a sweep")
-    picture = figure_path(output, case.with_stem(f"{case.stem}_sweep")) if plot else None
+    check_suffix(output, ".zarr", "a sweep", RESULTS)
+    store = output if output and output.suffix == ".zarr" else None
+    for option, is_given in (("--resume", resume), ("--scheduler", bool(scheduler))):
+        refuse_option(
+            is_given and store is None,
+            f"{option} needs a store, written block by block: -o OUT.zarr",
+        )
+    picture = pictures.path(plot, output, case.with_stem(f"{case.stem}_sweep"))
     refuse_option(
-        plot and not 0 < sum(len(given) > 1 for given in values.values()) < 3,
+        bool(picture) and not 0 < sum(len(given) > 1 for given in values.values()) < 3,
         "--plot draws peaks over one or two parameters with several values; leave it out",
     )
     if not resume:
@@ -81,7 +89,7 @@ def sweep(
         results = jb.sweep(
             parsed_case,
             values,
-            store=output,
+            store=store,
             resume=resume,
             overwrite=options.overwrite,
             paired=paired,
@@ -89,10 +97,13 @@ def sweep(
             precision=precision,
             client=client,
         )
+    if output and not store:
+        jb.save(results, output, options.overwrite)
     if picture:
         from jaxbeam.plot import plot_sweep
 
-        plot_sweep(results).savefig(picture)
+        figure = plot_sweep(results, ax=pictures.page(), title=pictures.title)
+        pictures.save(figure, picture)
     values = {address: results[address].to_numpy().tolist() for address in values}  # in SI units
     peaks = {str(name): results[name] for name in results if str(name).startswith("peak_")}
     del peaks["peak_time"]
@@ -143,14 +154,14 @@ def _lines(case: "jb.Case", peaks, failed, values) -> list[str]:
 
 
 def native(*, remove: bool = False, options: PrintOptions = PrintOptions()) -> None:
-    """Compile the C code for this machine, once; sweeps of peaks use it from then on.
+    """Compile the C code of sweeps now, or say why that fails.
 
-    Needs a C compiler.
+    The first sweep of a thousand runs or more does so by itself where there is a C compiler.
 
     Parameters
     ----------
     remove
-        Remove the compiled code; sweeps use XLA again.
+        Remove the compiled code; sweeps use XLA until this command compiles it again.
     """
     from jaxbeam.integrator import native_peaks
 

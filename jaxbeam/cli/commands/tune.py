@@ -8,13 +8,12 @@ from cyclopts import Parameter
 from jaxbeam.cli.arguments import (
     check_exists,
     check_suffix,
-    figure_path,
     named_number,
     named_numbers,
     parse_bounds,
     refuse_option,
 )
-from jaxbeam.cli.options import CaseOptions, Free, Output, Resume, Seed, Starts
+from jaxbeam.cli.options import CaseOptions, Free, Output, PictureOptions, Resume, Seed, Starts
 
 
 def tune(
@@ -44,6 +43,7 @@ def tune(
     least_peaks: Annotated[bool, Parameter(negative="--no-least-peaks")] = True,
     output: Output = None,
     plot: bool = False,
+    pictures: PictureOptions = PictureOptions(),
     resume: Resume = False,
     options: CaseOptions = CaseOptions(),
 ) -> None:
@@ -127,7 +127,7 @@ def tune(
         bool(lexicographic and (weights or limits)),
         "--lexicographic takes the place of --objective and --limit",
     )
-    picture = figure_path(output, case.with_suffix(".tuned")) if plot else None
+    picture = pictures.path(plot, output, case.with_suffix(".tuned"))
     check_suffix(output, ".toml", "a tuned case")
     pareto_limits = _pareto_limits(pareto) if pareto else None
     integer_choices = dict(_integer_choices(text) for text in integers)
@@ -191,7 +191,7 @@ def tune(
             **start_options, **search_options,
         )  # fmt: skip
         tuned = (result,)
-    _write_and_print(result, tuned, files, picture, options)
+    _write_and_print(result, tuned, files, picture, pictures, options)
     if output:
         output.with_suffix(".search.npz").unlink(missing_ok=True)
 
@@ -214,7 +214,7 @@ def _checkpoint(output: Path | None) -> Path | None:
     return None if output is None else output.with_suffix(".search.npz")
 
 
-def _write_and_print(result, tuned, files, picture, options: CaseOptions) -> None:
+def _write_and_print(result, tuned, files, picture, pictures, options: CaseOptions) -> None:
     """Write the tuned cases and the picture, and print the result."""
     from jaxbeam.files.case_file import save_case
 
@@ -222,7 +222,7 @@ def _write_and_print(result, tuned, files, picture, options: CaseOptions) -> Non
         save_case(one.case, file, overwrite=True)  # checked before the work
     if picture:
         drawn = result if hasattr(result, "plot") else tuned[0]
-        drawn.plot().savefig(picture)
+        pictures.save(pictures.titled(drawn.plot()), picture)
     summaries = [one.to_dict() for one in tuned]
     options.report(
         summaries[0] if len(summaries) == 1 else {"front": summaries},

@@ -22,7 +22,7 @@ def weigh(
     Parameters
     ----------
     case
-        Case file, TOML, with sensors of deflection; its loads are ignored.
+        Case file, TOML, with sensors on the beam; its loads are ignored.
     log
         Log of the sensors during the crossing.
     speeds

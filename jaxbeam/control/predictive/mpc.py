@@ -31,6 +31,7 @@ from jaxbeam.control.predictive.prediction import (
     repeat_plant,
     sampled_plant,
 )
+from jaxbeam.control.predictive.preview import preview
 from jaxbeam.control.predictive.qp import METHODS
 from jaxbeam.control.state_controller import AbstractStateController, deflection_rows
 from jaxbeam.model.state_space import Plant
@@ -102,7 +103,9 @@ class MPC(AbstractStateController):
 
     @property
     def runs_compiled(self) -> bool:
-        return self.loads != "ignored" or super().runs_compiled
+        return (self.loads, self.prediction) != ("ignored", "time-invariant") or (
+            super().runs_compiled
+        )
 
     def validate(self, case):
         outputs = len(case.sensors) if self.positions is None else self.positions.shape[0]
@@ -169,9 +172,8 @@ class MPC(AbstractStateController):
             soft_limit=self.soft_limit,
             soft_weight=self.soft_weight,
             terminal_cost=self._terminal_cost(sampled, C, weights, vehicles),
-            loaded_plant=loaded_plant,
-            period=self.period,
-            delay=self.delay,
+            preview=loaded_plant and preview(loaded_plant, self.period, self.delay),
+            delayed=self.delay is not None,
             known_weights=self.loads == "known",
             solver=self.solver,
         )
@@ -182,7 +184,11 @@ class MPC(AbstractStateController):
             return design_plant
         if self.loads == "ignored":
             return None
-        return eqx.tree_at(lambda m: m.loads.wheels.inertia, design_plant, replace_fn=xp.zeros_like)
+        return eqx.tree_at(
+            lambda m: m.loads.wheels.inertia,
+            design_plant,
+            replace_fn=lambda inertia: np.zeros(inertia.shape),
+        )
 
     def _terminal_cost(self, sampled, C, weights, vehicles):
         """P of the terminal cost, of the incremental model under its regulator, or None.

@@ -8,16 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.controller import ControlStep
-from jaxbeam.control.predictive.prediction import (
-    Prediction,
-    SampledPlant,
-    predict,
-    sampled_plant,
-)
+from jaxbeam.control.predictive.prediction import Prediction, SampledPlant, predict
+from jaxbeam.control.predictive.preview import Preview
 from jaxbeam.control.predictive.qp import solve_qp
 from jaxbeam.control.state_law import AbstractStateLaw
-from jaxbeam.model.state_space import Plant
-from jaxbeam.runtime.arrays import Array, block_diag, set_at, solve, vmap, xp
+from jaxbeam.runtime.arrays import Array, block_diag, set_at, solve, xp
 
 
 class CommandLimits(NamedTuple):
@@ -40,10 +35,10 @@ class QuadraticProgram(NamedTuple):
 class MPCLaw(AbstractStateLaw):
     """Predictive law of a design plant; its state is the state of the plant at the last sample.
 
-    `sampled_plant` and `prediction` are those of the unloaded plant; with a `loaded_plant` both are
-    computed at each sample from that plant frozen in the middle of each period, without the weights
-    of the loads if not `known_weights`. The states are those of the beam, then those of the
-    vehicles of the loaded plant, and with a delay the last commands. `output_weights` are those of
+    `sampled_plant` and `prediction` are those of the unloaded plant; with a `preview` both are
+    computed at each sample, with the loads on their way, without their weights if not
+    `known_weights`. The states are those of the beam, then those of the vehicles of the preview,
+    and with a delay the last commands. `output_weights` are those of
     squared deflections in each period, `move_weights` those of squared moves.
     """
 
@@ -57,16 +52,15 @@ class MPCLaw(AbstractStateLaw):
     soft_limit: Float[Array, " *output"] | None
     soft_weight: Float[Array, ""]
     terminal_cost: Float[Array, "augmented augmented"] | None
-    loaded_plant: Plant | None
-    period: Float[Array, ""]
-    delay: Float[Array, ""] | None
+    preview: Preview | None
+    delayed: bool = eqx.field(static=True)
     known_weights: bool = eqx.field(static=True)
     solver: str = eqx.field(static=True)
 
     @property
     def vehicle_states(self) -> int:
         """Number of states of vehicles in the prediction."""
-        return 0 if self.loaded_plant is None else self.loaded_plant.vehicle_states
+        return 0 if self.preview is None else self.preview.plant.vehicle_states
 
     @property
     def needs_vehicles(self):
@@ -79,7 +73,7 @@ class MPCLaw(AbstractStateLaw):
         previous_state, previous_command, state = state, measurement.command, estimate.state
         if self.vehicle_states:
             state = xp.concatenate([state, estimate.vehicles])
-        if self.delay is not None:
+        if self.delayed:
             state = xp.concatenate([state, previous_command])
         past_plant, prediction, weights = self._predict(t, estimate)
         predicted_state = (
@@ -94,25 +88,16 @@ class MPCLaw(AbstractStateLaw):
 
         These are the weights of the loads, and one for other known disturbances.
         """
-        if self.loaded_plant is None:
+        if self.preview is None:
             return self.sampled_plant, self.prediction, xp.zeros(0)
-        plant = self.loaded_plant
-        states = plant.modal_model.state_count + plant.vehicle_states
+        plant = self.preview.plant
         weights = plant.augmented_start[plant.vehicle_states :]
         if not self.known_weights:
             weights = xp.zeros_like(weights)
         elif estimate.weights is not None:
             known = weights[estimate.weights.shape[0] :]
             weights = xp.concatenate([estimate.weights, known])
-
-        def sample(time):
-            system = plant.augmented(time)
-            A, known_inputs = system.A[:states, :states], system.A[:states, states:]
-            return sampled_plant(A, system.B[:states], known_inputs, self.period, self.delay)
-
-        horizon = self.move_maps.shape[0]
-        midpoints = t + (xp.arange(-1, horizon) + 0.5) * self.period
-        plants = vmap(sample)(midpoints)
+        plants = self.preview.sampled_plants(t, -1, self.move_maps.shape[0] + 1)
         past, future = (jax.tree.map(lambda p, s=s: p[s], plants) for s in (0, slice(1, None)))
         return past, predict(future, self.C, self.move_maps, weights), weights
 

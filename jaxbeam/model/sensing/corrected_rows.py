@@ -180,10 +180,12 @@ def _added(rows, index, values):
     return set_at(rows, np.array(index), rows[np.array(index)] + values)
 
 
-def corrected_places(case: Case, model: ModalModel) -> Float[Array, " place"] | None:
+def corrected_places(
+    case: Case, model: ModalModel, sensors: Sequence[Sensor]
+) -> Float[Array, " place"] | None:
     """Positions (m) of the sensors whose peaks are statically corrected; None without any.
 
     There the influence of a load has a kink or a jump, so that steps end where a wheel passes.
     """
-    places = [sensor.position for sensor in case.sensors if sensor.bends]
+    places = [sensor.position for sensor in sensors if sensor.bends]
     return xp.stack(places) if places and is_supported(case, model.modes.layout) else None

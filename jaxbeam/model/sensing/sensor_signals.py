@@ -20,6 +20,7 @@ from jaxbeam.case.filters import (
     second_order_sections,
     steady_filter_state,
 )
+from jaxbeam.case.loads.planar.sensors import VehicleSensor
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.numerics.discretisation import c2d, evaluate_cubics, hermite_cubics
 from jaxbeam.numerics.normal_samples import normal_samples
@@ -27,11 +28,12 @@ from jaxbeam.runtime.arrays import Array, scan, stop_gradient, take, xp
 
 CLOCK_TOLERANCE_PERIODS = 1e-6  # a time this much before a sampling instant counts as at it
 
+AnySensor = Sensor | VehicleSensor
 Sections = Float[Array, "section 6 ..."] | None  # None: no digital filter
 FilterState = Float[Array, "section 2 *batch"] | None
 
 
-def sensor_sections(sensor: Sensor, period: Float[Array, ""] | float) -> Sections:
+def sensor_sections(sensor: AnySensor, period: Float[Array, ""] | float) -> Sections:
     """Second-order sections of the sensor's digital filter, None if it has none.
 
     Designed for the sensor's own sampling period, or for `period` (s) if it has none. Raises
@@ -43,13 +45,13 @@ def sensor_sections(sensor: Sensor, period: Float[Array, ""] | float) -> Section
     return second_order_sections(sensor.filter, period if own is None else own)
 
 
-def initial_filter_state(sensor: Sensor, sections: Sections, value) -> FilterState:
+def initial_filter_state(sensor: AnySensor, sections: Sections, value) -> FilterState:
     """State of the digital filter at rest under a constant true value (SI unit of the quantity)."""
     return None if sections is None else steady_filter_state(sections, to_reading(sensor, value))
 
 
 def filtered_reading(
-    sensor: Sensor, sections: Sections, filter_state: FilterState, value, noise=None
+    sensor: AnySensor, sections: Sections, filter_state: FilterState, value, noise=None
 ) -> tuple[Float[Array, " *batch"], FilterState]:
     """Reading of a true value (both in the SI unit of the quantity), and the filter state after it.
 
@@ -60,7 +62,7 @@ def filtered_reading(
     return (reading, None) if sections is None else filter_step(sections, filter_state, reading)
 
 
-def to_reading(sensor: Sensor, value, noise=None) -> Float[Array, "..."]:
+def to_reading(sensor: AnySensor, value, noise=None) -> Float[Array, "..."]:
     """Reading before the digital filter: offset, noise, range and resolution applied to the value.
 
     Derivatives are zero where the range clips; through rounding they are those of the unrounded
@@ -83,13 +85,13 @@ def noise_samples(seed: int, sensors: int, samples: int) -> Float[Array, "sample
     return xp.array(columns).reshape(sensors, samples).T
 
 
-def needs_times(sensor: Sensor) -> bool:
+def needs_times(sensor: AnySensor) -> bool:
     """Whether readings depend on more than the simultaneous true value, hence on the times."""
     return not (sensor.filter is None and sensor.sampling_period is None and sensor.delay is None)
 
 
 def sampled_readings(
-    sensor: Sensor,
+    sensor: AnySensor,
     times: Float[Array, " time"],
     values: Float[Array, " time"],
     rates: Float[Array, " time"] | None,
@@ -145,7 +147,7 @@ def _apply_filter(filter: Filter, times, spacing, values, rates):
     return states @ row, states @ (row @ matrix) + values * (row @ column)
 
 
-def _check_times(sensor: Sensor, times) -> None:
+def _check_times(sensor: AnySensor, times) -> None:
     if sensor.filter is None or not is_concrete(times):
         return
     steps = np.diff(concrete(times))

@@ -9,6 +9,7 @@ from jaxbeam.plot.style import (
     GREY,
     annotate,
     format_number,
+    label_height,
     load_colour,
     margin_labels,
     tinted,
@@ -54,7 +55,7 @@ def draw_forces(axes, record: Record) -> None:
                 names.append(label)
                 tints.append(tint)
     _mark_losses(axes, record)
-    axes.set_ylabel(f"contact force ({unit})")
+    label_height(axes, "contact force", unit)
     margin_labels(axes, heights, names, tints)
 
 
@@ -136,5 +137,5 @@ def draw_accelerations(axes, record: Record) -> None:
         who = f"{load} {name}" if several else name
         names.append(f"{who} {format_number(peak)} {unit}")
         tints.append(shade)
-    axes.set_ylabel(f"body ({unit})")
+    label_height(axes, "body", unit)
     margin_labels(axes, heights, names, tints)

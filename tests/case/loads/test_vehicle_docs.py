@@ -10,7 +10,7 @@ from jaxbeam.vehicles.trains import trains
 from tests.modules import ROOT
 
 TEXT = (ROOT / "docs" / "vehicles.md").read_text(encoding="utf-8")
-KINDS, FILE = re.findall(r"^```toml\n(.*?)^```", TEXT, re.M | re.S)
+KINDS, FILE, SENSORS = re.findall(r"^```toml\n(.*?)^```", TEXT, re.M | re.S)
 BEAM = {"length": 25.0, "flexural_rigidity": 4.8e10, "mass_per_length": 18358.0}
 
 
@@ -21,6 +21,13 @@ def test_loads_of_the_page_are_valid():
         "oscillator", "quarter-car", "half-car", "wagon", "axles", "varying-force", "pedestrian",
         "crowd", "vehicle"
     }  # fmt: skip
+
+
+def test_sensors_of_the_page_are_valid():
+    loads = [one for one in tomllib.loads(KINDS)["loads"] if one["kind"] == "quarter-car"]
+    case = case_from_dict({"beam": BEAM, "loads": loads, **tomllib.loads(SENSORS)})
+    check_case(case)
+    assert case.vehicle_sensors[0].body == "axle"
 
 
 def test_vehicle_file_of_the_page_is_valid(tmp_path):

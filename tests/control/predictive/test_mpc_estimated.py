@@ -1,6 +1,7 @@
 """Predictive control behind a Kalman filter of three of twelve modes; known loads."""
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -16,6 +17,7 @@ from jaxbeam.case.controller import Measurement
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.estimation.kalman import Kalman
 from tests.control.predictive.test_mpc import PATCH, PERIOD, THESIS, beam_case, mpc
+from tests.oracles.held_period import over_period
 
 INTENSITY, NOISE = 0.05, 1e-6
 SAMPLES, SUBSTEPS = 40, 4
@@ -129,15 +131,19 @@ def test_known_loads_within_limits():
     plant = under_force.unloaded.discretize(PERIOD)
     A, B, C = (np.asarray(x) for x in (plant.A, plant.B[:, 0], plant.C[0]))
 
-    @eqx.filter_jit
-    def force_inputs(times):
-        return jax.vmap(lambda t: under_force.at(t).discretize(PERIOD).B[:, 1])(times)
+    def matrices_at(t):
+        system = under_force.at(t)
+        return np.asarray(system.A), np.asarray(system.B)
+
+    @functools.cache
+    def force_input(period):
+        start = period * PERIOD
+        return over_period(matrices_at, start, start + PERIOD)[1][:, 1] * 0.4 * 9.81
 
     horizon, moves, weight = THESIS["horizon"], THESIS["moves"], THESIS["move_weight"]
     previous_state, previous, found = np.zeros(6), 0.0, []
     for k, state in enumerate(states):
-        midpoints = (k + np.arange(-1, horizon) + 0.5) * PERIOD
-        past, *future = np.asarray(force_inputs(jnp.asarray(midpoints))) * 0.4 * 9.81
+        past, *future = map(force_input, range(k - 1, k + horizon))
         unexplained = state - (A @ previous_state + B * previous + past)
         fixed = state, previous, future, unexplained
 

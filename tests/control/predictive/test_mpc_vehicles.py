@@ -1,48 +1,44 @@
 """Predictive control of a beam under a vehicle on a rough surface, against an explicit program.
 
-Plant by scipy's exponential of the matrices in `test_crossing_vehicles`, frozen in the middle of
-each period; moves by least squares.
+Plant by scipy's integration of the matrices in `test_crossing_vehicles`; moves by least squares.
 """
+
+import functools
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.linalg import expm
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.estimator import Estimate
 from tests.control.optimal import test_crossing_vehicles as crossing
+from tests.oracles.held_period import over_period
 
 PERIOD, HORIZON, MOVES, MOVE_WEIGHT = 0.02, 9, 4, 3e-7
 SETTINGS = {"horizon": HORIZON, "moves": MOVES, "move_weight": MOVE_WEIGHT, "period": PERIOD}
-STATES, TIME = 8, 0.24
+STATES, SAMPLE = 8, 12
 
 
-def sampled(t):
-    """A, B and known inputs over the period from t (s)."""
-    A, B = crossing.plant(t + PERIOD / 2)
-    size = A.shape[0]
-    full = np.pad(np.hstack([A, B]), ((0, 1), (0, 0)))
-    transition = expm(full * PERIOD)[:size]
-    return (
-        transition[:STATES, :STATES],
-        transition[:STATES, size:],
-        transition[:STATES, STATES:size],
-    )
+@functools.cache
+def sampled(period):
+    """A, B and known inputs over a period, counted from t = 0."""
+    start = period * PERIOD
+    A, B = over_period(crossing.plant, start, start + PERIOD)
+    return A[:STATES, :STATES], B[:STATES], A[:STATES, STATES:]
 
 
 def explicit_move(state, previous_state, previous_command):
     """First move of the minimum of the sum of w^2 at 1 m and of the weighted moves squared."""
     constants = crossing.START[STATES:]
     row = np.pad(crossing.SPAN.shapes(1.0), (0, STATES - crossing.MODES))
-    A, B, E = sampled(TIME - PERIOD)
+    A, B, E = sampled(SAMPLE - 1)
     unexplained = state - (A @ previous_state + B[:, 0] * previous_command + E @ constants)
 
     def residuals(moves):
         x, command, found = state, previous_command, []
         for i in range(HORIZON):
-            A, B, E = sampled(TIME + i * PERIOD)
+            A, B, E = sampled(SAMPLE + i)
             command = command + (moves[i] if i < MOVES else 0.0)
             x = A @ x + B[:, 0] * command + E @ constants + unexplained
             found.append(row @ x)
@@ -62,7 +58,7 @@ def test_moves_foresee_the_vehicle_and_the_profile():
     state, previous = draws * scale
     estimate = Estimate(state[:4], vehicles=state[4:])
     measurement = Measurement(np.zeros(1), state[:4], np.array([0.7]))
-    step = design.step(previous, estimate, measurement, np.asarray(TIME))
+    step = design.step(previous, estimate, measurement, np.asarray(SAMPLE * PERIOD))
     expected = 0.7 + explicit_move(state, previous, 0.7)
     assert_allclose(step.command, [expected], rtol=1e-7)
 

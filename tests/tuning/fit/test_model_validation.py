@@ -33,6 +33,7 @@ from tuning.fit.uncertainty.posterior import _log_density, draw_by_nuts, sample,
 from tuning.fit.uncertainty.profile import profile
 
 VALUES = np.array(list(TRUTH.values()))
+NAMES = ["sensor 0"]
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def test_whiteness_of_known_noise():
 def test_no_remarks_on_the_residuals_of_a_good_fit(plain):
     channels = plain.channel_residuals
     assert [(c.log, c.sensor) for c in channels] == [(0, 0), (1, 0), (2, 0)]
-    assert residual_remarks(channels, ["run 0", "run 1", "run 2"]) == []
+    assert residual_remarks(channels, ["run 0", "run 1", "run 2"], NAMES) == []
     np.testing.assert_allclose([c.noise for c in channels], NOISE, rtol=0.2)
 
 
@@ -75,7 +76,7 @@ def test_remarks_on_a_delayed_channel_and_autocorrelated_residuals(plain):
     _, channel, _ = refitted.channel_residuals
     assert channel.time_shift == pytest.approx(0.004, abs=4 * channel.time_shift_sd)
     assert channel.time_shift_sd < 0.001
-    autocorrelation, delay = residual_remarks([channel], ["run 0", "run 1", "run 2"])
+    autocorrelation, delay = residual_remarks([channel], ["run 0", "run 1", "run 2"], NAMES)
     assert autocorrelation.startswith(
         "run 1: residuals are no white noise, so the model misses something"
     )

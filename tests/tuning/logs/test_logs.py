@@ -113,7 +113,7 @@ def test_mistakes_beside_the_log(tmp_path, text, message):
         ("# only a comment\n", "the log is empty"),
         ("t [s],d [mm]\n", "the log is empty: there are column names but no rows"),
         ("t [s],d [mm]\n0,1\n", "at least two samples"),
-        ("0,1\n1,2\n", "line 1: the first line must name the columns"),
+        ("0,1\n1,2\n", "line 1: the file has no headings"),
         ("t [s],d [mm]\n0,1\n1,x\n", "line 3, column 'd': 'x' is no number"),
         (
             "t [s],d [mm]\n0,1\n1,\n",

@@ -73,7 +73,22 @@ def parquet(path):
     files.write_table(pyarrow.table(columns, schema=pyarrow.schema(fields)), path)
 
 
+def xlsx(path, runs=("",)):
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    for i, run in enumerate(runs):
+        sheet = book.active if i == 0 else book.create_sheet()
+        sheet.title = run or "log"
+        for row in (["Logger 7"], [], ["time", "d1", "d2"], ["s", "mm", "[mm]"]):
+            sheet.append(row)
+        for row in np.column_stack([TIMES, D1 + i, D2 + i]).tolist():
+            sheet.append(row)
+    book.create_sheet("remarks").append(["nothing to report"])
+    book.save(path)
+
+
 FORMATS = {
+    "run.xlsx": xlsx,
     "run.tdms": tdms,
     "run.h5": hdf5,
     "rate.h5": hdf5_by_rate,
@@ -212,5 +227,7 @@ def test_formats_are_found_in_the_modules_of_the_readers():
     suffixes = [suffix for log_format in readers.FORMATS for suffix in log_format.suffixes]
     assert len(set(suffixes)) == len(suffixes)
     binary = {suffix for f in readers.FORMATS if not f.is_text for suffix in f.suffixes}
-    assert binary == {".tdms", ".mat", ".h5", ".hdf5", ".nc", ".parquet"}
+    assert binary == {
+        ".tdms", ".mat", ".h5", ".hdf5", ".nc", ".parquet", ".xlsx", ".uff", ".unv"
+    }  # fmt: skip
     assert set(suffixes) - binary == {".csv", ".tsv", ".txt", ".dat", ".lvm"}

@@ -7,9 +7,15 @@ import importlib
 import pkgutil
 from pathlib import Path
 
-from tuning.logs.readers.table import LogFormat, LogTable, is_time_name, read_bytes
+from tuning.logs.readers.table import (
+    LogFormat,
+    LogTable,
+    is_time_name,
+    parse_heading,
+    read_bytes,
+)
 
-__all__ = ["LogTable", "is_time_name", "read_tables"]
+__all__ = ["LogTable", "is_time_name", "parse_heading", "read_tables"]
 
 _MODULES = (
     importlib.import_module(f"{__name__}.{found.name}") for found in pkgutil.iter_modules(__path__)

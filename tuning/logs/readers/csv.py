@@ -1,80 +1,120 @@
-"""Separated values (.csv, .tsv, .txt, .dat): names with units in the first line, numbers below.
+"""Separated values (.csv, .tsv, .txt, .dat): names with units in the headings, numbers below.
 
     time (s); d1 [mm]; d2 [mm]
     0,000; 0,12; -0,03
 
-Lines at the top that start with `#` are comments.
+Lines that start with `#`, `%` or `//` are comments. Other lines above the headings are skipped; a
+line of units may follow the headings. A file without headings is read with columns that the user
+names.
 """
 
 import csv
 import io
+import re
 from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.readers.table import LogFormat, LogTable, parse_heading, parse_numbers, read_text
+from tuning.logs.readers.headings import MAX_HEADING_ROWS, Headings, find_headings
+from tuning.logs.readers.table import LogFormat, LogTable, parse_numbers, read_text
+
+_COMMENTS = ("#", "%", "//")
+_SPACED_DECIMAL_COMMAS = re.compile(r"^\s*[-+]?\d+,\d+([eE][-+]?\d+)?\s+[-+]?\d+(,\d+)?")
+_SPACED_NUMBERS = re.compile(r"^\s*[-+]?[\d.]+([eE][-+]?\d+)?\s+[-+]?[\d.]+[\s\d.eE+-]*$")
 
 
 def read_csv(path: Path) -> dict[str, LogTable]:
-    """Table of a file of values separated by tabs, semicolons or commas.
+    """Table of a file of values separated by tabs, semicolons, commas or spaces.
 
-    The separator is the first of these three that occurs in the line of names. Unless it is the
-    comma, numbers may have a decimal comma. Units stand in brackets or parentheses after names.
+    The separator is that of most lines. Unless it is the comma, numbers may have a decimal comma.
+    Units stand in brackets or parentheses after names, or in the line below.
 
-    Raises ValueError, naming file and line, for a missing line of names, a row of another length
-    and a cell that is no number.
+    Raises ValueError, naming file and line, for a row of another length, a cell that is no number,
+    and numbers with both decimal commas and decimal points.
     """
-    text = read_text(path)
-    header_index = 0
-    text_lines = text.splitlines(keepends=True)
-    while header_index < len(text_lines) and (
-        not text_lines[header_index].strip() or text_lines[header_index].startswith("#")
-    ):
-        header_index += 1
-    if header_index == len(text_lines):
-        raise ValueError(f"{path}: the log is empty: it has comments only")
-    separator = next((mark for mark in "\t;" if mark in text_lines[header_index]), ",")
-    rows, lines = _nonempty_rows(path, text_lines, header_index, separator)
-    if not rows:
-        raise ValueError(f"{path}: the log is empty: no cell has anything in it")
-    headings = [cell.strip() for cell in rows[0]]
-    if _all_numbers(headings):
-        raise ValueError(
-            f"{path}, line {header_index + 1}: the first line must name the columns, "
-            f"e.g. time [s]{separator}d1 [mm]"
-        )
-    if not headings[-1]:
-        headings.pop()
-    # A separator that ends every line closes the last column; it opens no new one.
-    trailing = len(headings) + 1
-    rows = [row[:-1] if len(row) == trailing and not row[-1].strip() else row for row in rows[1:]]
-    lines = lines[1:]
-    names, units = zip(*map(parse_heading, headings), strict=True)
-    decimal_comma = separator != "," and _has_decimal_comma(path, rows, lines)
-    values = parse_numbers(path, names, rows, lines, decimal_comma)
-    return {"": LogTable(names, units, values, np.array(lines))}
+    numbered = [
+        (number, line)
+        for number, line in enumerate(read_text(path).splitlines(), 1)
+        if line.strip("\ufeff\t;, ") and not line.lstrip("\ufeff \t\"'").startswith(_COMMENTS)
+    ]
+    if not numbered:
+        raise ValueError(f"{path}: the log is empty: it has comments only, or no cell with text")
+    numbers, lines = zip(*numbered, strict=True)
+    separator = _separator(lines)
+    top, _ = _rows(path, lines[: 2 * MAX_HEADING_ROWS], numbers, separator)
+    headings = find_headings(top)
+    width = len(headings.names) or (len(top[headings.first_row]) if top else 0)
+    first = headings.first_row
+    values, numbers = _numbers(path, lines[first:], numbers[first:], separator, headings, width)
+    has_headings = bool(headings.names)
+    names = headings.names or tuple(f"column {i + 1}" for i in range(values.shape[1]))
+    units = headings.units or (None,) * len(names)
+    table = LogTable(
+        names, units, values, np.array(numbers), notes=headings.notes, has_headings=has_headings
+    )
+    return {"": table}
 
 
-def _nonempty_rows(path, kept, top, separator):
-    """Cells of the rows that are not empty, from the line of names on, and their line numbers."""
-    reader = csv.reader(io.StringIO("".join(kept[top:])), delimiter=separator)
-    rows, lines = [], []
+def _separator(lines) -> str:
+    """Separator of most lines: tab, semicolon, spaces or comma, in this order."""
+    sample = lines[-200:]
+    for mark in "\t;":
+        if 2 * sum(mark in line for line in sample) >= len(sample):
+            return mark
+    for pattern in (_SPACED_DECIMAL_COMMAS, _SPACED_NUMBERS):
+        if 2 * sum(bool(pattern.match(line)) for line in sample) >= len(sample):
+            return " "
+    return ","
+
+
+def _rows(path, lines, numbers, separator):
+    """Cells of lines, and the number of the last line of each row."""
+    if separator == " ":
+        return [line.split() for line in lines], list(numbers)
+    reader = csv.reader(list(lines), delimiter=separator)
+    rows, last = [], []
     try:
         for row in reader:
-            if any(cell.strip() for cell in row):
-                rows.append(row)
-                lines.append(top + reader.line_num)
+            rows.append(row)
+            last.append(numbers[reader.line_num - 1])
     except csv.Error as error:
-        raise ValueError(f"{path}, line {top + reader.line_num}: {error}") from None
-    return rows, lines
+        raise ValueError(f"{path}, line {numbers[reader.line_num - 1]}: {error}") from None
+    return rows, last
 
 
-def _all_numbers(cells) -> bool:
+def _numbers(path, lines, numbers, separator, headings: Headings, width: int):
+    """Values (row, column) of the lines of numbers, and their line numbers."""
+    values = _fast_numbers(lines, separator, width)
+    if values is not None:
+        return values, numbers
+    rows, numbers = _rows(path, lines, numbers, separator)
+    # A separator that ends every line closes the last column; it opens no new one.
+    names = headings.names
+    if not names:
+        if rows and all(not row[-1].strip() for row in rows):
+            width -= 1
+        names = [f"column {i + 1}" for i in range(width)]
+    trailing = len(names) + 1
+    rows = [row[:-1] if len(row) == trailing and not row[-1].strip() else row for row in rows]
+    decimal_comma = separator != "," and _has_decimal_comma(path, rows, numbers)
+    return parse_numbers(path, names, rows, numbers, decimal_comma), numbers
+
+
+def _fast_numbers(lines, separator, width):
+    """Values by the parser of NumPy; None for lines that need a closer look."""
+    text = "\n".join(lines)
+    if separator != "," and "," in text:
+        if "." in text:
+            return None
+        text = text.replace(",", ".")
+    if not lines or '"' in text:
+        return None
+    delimiter = None if separator == " " else separator
     try:
-        [float(cell.replace(",", ".")) for cell in cells]
+        values = np.loadtxt(io.StringIO(text), delimiter=delimiter, comments=None, ndmin=2)
     except ValueError:
-        return False
-    return True
+        return None
+    return values if values.shape == (len(lines), width) else None
 
 
 def _has_decimal_comma(path, rows, lines) -> bool:

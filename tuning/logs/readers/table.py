@@ -20,7 +20,8 @@ class LogTable:
 
     `units` are those of the columns as named in the file, or None; `lines` the line numbers of the
     rows, None for a file without lines; `time` the name of the column of times, where the format
-    defines it; `notes` sentences on how it was read.
+    defines it; `notes` sentences on how it was read. `has_headings` is False for columns without
+    names in the file, which are called column 1, column 2, ...
     """
 
     names: tuple[str, ...]
@@ -29,6 +30,7 @@ class LogTable:
     lines: Int[np.ndarray, " row"] | None = None
     time: str | None = None
     notes: tuple[str, ...] = ()
+    has_headings: bool = True
 
 
 class LogFormat(NamedTuple):

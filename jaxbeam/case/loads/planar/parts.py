@@ -6,11 +6,12 @@ Positions are in m along the vehicle, forward positive, from any common origin.
 import equinox as eqx
 from jaxtyping import Float
 
+from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, number
 from jaxbeam.runtime.arrays import Array
 
 
-class VehicleBody(eqx.Module):
+class VehicleBody(ReprWithUnits, eqx.Module):
     """Rigid body; without `inertia` it has a height only, like the lumped mass of an axle."""
 
     name: str = choice("name of the body")
@@ -21,7 +22,7 @@ class VehicleBody(eqx.Module):
     position: Float[Array, ""] = number("m", "centre of mass, forward positive", default=0.0)
 
 
-class VehicleSpring(eqx.Module):
+class VehicleSpring(ReprWithUnits, eqx.Module):
     """Vertical spring and damper between two bodies at a position, and those between their pitches.
 
     A vertical force acts on both bodies along one line, so that they share the position.
@@ -40,7 +41,7 @@ class VehicleSpring(eqx.Module):
     )
 
 
-class VehicleHinge(eqx.Module):
+class VehicleHinge(ReprWithUnits, eqx.Module):
     """Point at which two bodies have the same height, exactly, such as a fifth wheel."""
 
     first: str = choice("name of a body")
@@ -48,7 +49,7 @@ class VehicleHinge(eqx.Module):
     position: Float[Array, ""] = number("m", "position, forward positive")
 
 
-class VehicleAxle(eqx.Module):
+class VehicleAxle(ReprWithUnits, eqx.Module):
     """Axle under a body: on a suspension, on a tyre, or on both with its mass in between.
 
     Without a tyre it stays on the surface, where its mass is unsprung, as that of a wheelset;

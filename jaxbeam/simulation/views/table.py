@@ -22,6 +22,7 @@ def record_columns(
     columns = {"time (s)": np.asarray(times)}
     for i, sensor in enumerate(case.sensors):
         head = f"{sensor.name or f'sensor {i}'} {sensor.quantity}{_in_brackets(sensor.unit)}"
+        head = f"sensor {i} {head}" if head in columns else head  # of equal names
         columns[head] = sensor_values[:, i]
     for i, label in enumerate(wheel_labels(case)):
         columns[f"load {label} contact force (N)"] = contact_force[:, i]

@@ -1,0 +1,134 @@
+"""Assessment of a bridge by a code: its checks as text, Markdown and plain numbers."""
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+from jaxbeam.files.report import text_table
+
+SATISFIED, NOT_SATISFIED, INFORMATION = "satisfied", "not satisfied", "information"
+REQUIRED, NOT_REQUIRED = "required", "not required"
+
+
+@dataclasses.dataclass(frozen=True)
+class CodeCheck:
+    """One check: what is compared with which limit, by which clause, and the outcome.
+
+    `value` and `limit` are in `unit` (None where there is none); `remark` has the other numbers.
+    """
+
+    subject: str
+    clause: str
+    value: float | None
+    limit: float | None
+    unit: str
+    outcome: str
+    remark: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Assessment:
+    """Checks of a bridge by a code, its inputs, and what is not checked and not in the model.
+
+    `sources` are the open sources of the numbers of the code by clause.
+    """
+
+    title: str
+    code: str
+    inputs: dict[str, Any]
+    checks: tuple[CodeCheck, ...]
+    not_checked: tuple[str, ...]
+    not_in_model: tuple[str, ...]
+    sources: dict[str, str]
+
+    @property
+    def failed(self) -> tuple[CodeCheck, ...]:
+        """Checks that are not satisfied."""
+        return tuple(check for check in self.checks if check.outcome == NOT_SATISFIED)
+
+    @property
+    def verdict(self) -> str:
+        """What the checks say together; never a certificate."""
+        if self.failed:
+            subjects = ", ".join(check.subject for check in self.failed)
+            found = f"not satisfied: {subjects}"
+        else:
+            found = "the checks made are satisfied"
+        return (
+            f"{found}. This is no certificate: what is listed as not checked and not in the model"
+            " remains to be shown."
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and texts by name."""
+        return dataclasses.asdict(self) | {"verdict": self.verdict}
+
+    def _rows(self) -> list[list[str]]:
+        return [
+            [
+                check.subject,
+                "" if check.value is None else f"{check.value:.4g}",
+                "" if check.limit is None else f"{check.limit:.4g}",
+                "" if check.unit == "1" else check.unit,
+                check.outcome,
+                check.clause,
+            ]
+            for check in self.checks
+        ]
+
+    @property
+    def _inputs(self) -> list[str]:
+        return [f"{name}: {value}" for name, value in self.inputs.items()]
+
+    @property
+    def lines(self) -> list[str]:
+        """Lines of the report as text."""
+        remarks = [f"  {c.subject}: {c.remark}" for c in self.checks if c.remark]
+        return [
+            f"{self.title}, {self.code}",
+            *(f"  {line}" for line in self._inputs),
+            "",
+            *text_table(HEADER, self._rows(), "<>><<<"),
+            "",
+            *remarks,
+            "",
+            "not checked:",
+            *(f"  {item}" for item in self.not_checked),
+            "not in the model, hence not certified:",
+            *(f"  {item}" for item in self.not_in_model),
+            "",
+            f"verdict: {self.verdict}",
+        ]
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines)
+
+    def to_markdown(self) -> str:
+        """The report as Markdown, with the sources of the numbers of the code."""
+        rows = [HEADER, ["---"] * len(HEADER), *self._rows()]
+        table = ["| " + " | ".join(row) + " |" for row in rows]
+        parts = [
+            f"# {self.title}",
+            f"Checks by {self.code}. {self.verdict}",
+            "\n".join(f"- {line}" for line in self._inputs),
+            "\n".join(table),
+            "\n".join(f"- {c.subject}: {c.remark}" for c in self.checks if c.remark),
+            "## Not checked",
+            "\n".join(f"- {item}" for item in self.not_checked),
+            "## Not in the model, hence not certified",
+            "\n".join(f"- {item}" for item in self.not_in_model),
+            "## Sources of the numbers",
+            "\n".join(f"- {clause}: {source}" for clause, source in self.sources.items()),
+        ]
+        return "\n\n".join(part for part in parts if part) + "\n"
+
+    def save(self, path: str | os.PathLike, overwrite: bool = False) -> None:
+        """Write the report as Markdown. Raises FileExistsError unless `overwrite`."""
+        path = Path(path)
+        if path.exists() and not overwrite:
+            raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
+        path.write_text(self.to_markdown(), encoding="utf-8")
+
+
+HEADER = ["check", "value", "limit", "unit", "outcome", "clause"]

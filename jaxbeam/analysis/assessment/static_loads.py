@@ -1,0 +1,82 @@
+"""Largest static effects of trains and of LM71 from influence lines."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.analysis.assessment.formulas import code_numbers
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import concrete
+from jaxbeam.model.influence import held_positions, influence_line
+
+LINE_POINTS = 801  # along the beam, between which influence lines are linear
+FRONT_POSITIONS = 8001  # of the first axle of a train
+
+
+class Section(NamedTuple):
+    """Place (m) along the beam where a quantity is compared, and its name there."""
+
+    name: str
+    quantity: str
+    x: float
+
+
+class TabulatedLine(NamedTuple):
+    """Influence line (per newton) at load positions (m); zero off the beam."""
+
+    positions: Float[np.ndarray, " position"]
+    values: Float[np.ndarray, " position"]
+
+    def at(self, x: Float[np.ndarray, "*place"]) -> Float[np.ndarray, "*place"]:
+        """Values at positions x (m)."""
+        return np.interp(x, self.positions, self.values, left=0.0, right=0.0)
+
+
+def tabulated_line(case: Case, section: Section) -> TabulatedLine:
+    """Influence line of a section, with a point at its kink."""
+    length = float(concrete(case.beam.length))
+    places = np.linspace(0.0, length, LINE_POINTS)
+    places = np.unique(np.concatenate([places, [section.x], held_positions(case)]))
+    line = influence_line(case, section.x, places, quantity=section.quantity)
+    return TabulatedLine(places, np.asarray(line))
+
+
+def largest_under_train(line: TabulatedLine, offsets, forces) -> float:
+    """Largest absolute static effect of axles (N) at offsets (m) behind the first."""
+    length = line.positions[-1]
+    fronts = np.linspace(0.0, length + offsets[-1], FRONT_POSITIONS)
+    kinks = line.positions[np.argmax(np.abs(line.values))] + offsets  # an axle at the peak
+    fronts = np.concatenate([fronts, kinks])
+    total = np.zeros(fronts.size)
+    for offset, force in zip(offsets, forces, strict=True):
+        total += force * line.at(fronts - offset)
+    return float(np.max(np.abs(total)))
+
+
+def largest_under_lm71(line: TabulatedLine) -> float:
+    """Largest absolute effect of LM71 (characteristic, no factors) for a line per newton.
+
+    Four axles, and 80 kN/m from 0.8 m beyond them where it is unfavourable; they are on the beam,
+    in part or wholly, at the worst place. Axles that relieve are not left out.
+    """
+    numbers = code_numbers()["load_model_71"]
+    axles, gap = np.array(numbers["axles"]), numbers["gap"]
+    length = line.positions[-1]
+    first = np.linspace(-axles[-1], length, FRONT_POSITIONS)
+    peak = line.positions[np.argmax(np.abs(line.values))]
+    first = np.concatenate([first, peak - axles])
+    effect = []
+    for sign in (1.0, -1.0):
+        signed = TabulatedLine(line.positions, sign * line.values)
+        unfavourable = np.maximum(signed.values, 0.0)
+        steps = np.diff(signed.positions) * (unfavourable[1:] + unfavourable[:-1]) / 2
+        area = np.concatenate([[0.0], np.cumsum(steps)])
+        inside = [
+            np.interp(end, signed.positions, area) for end in (first - gap, first + axles[-1] + gap)
+        ]
+        loaded = area[-1] - (inside[1] - inside[0])
+        from_axles = signed.at(first[:, None] + axles).sum(axis=1)
+        total = numbers["axle_force"] * from_axles + numbers["line_load"] * loaded
+        effect.append(float(np.max(total)))
+    return max(effect)

@@ -1,0 +1,1 @@
+"""Characteristic sections of a beam, and their influence lines."""

@@ -1,0 +1,5 @@
+/* The nearest number to x between two limits. */
+static real clamp(real x, real low, real high)
+{
+    return x < low ? low : x > high ? high : x;
+}

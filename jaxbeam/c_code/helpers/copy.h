@@ -1,0 +1,6 @@
+/* result = values */
+static void copy(real *result, const real *values, int count)
+{
+    int i;
+    for (i = 0; i < count; i++) result[i] = values[i];
+}

@@ -1,0 +1,133 @@
+"""C code of filters with a constant gain, and of the inversion of mode shapes."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxbeam.c_code.source import CSource
+from jaxbeam.c_code.writers import EstimateCode, write_filter
+from jaxbeam.control.state_law import TrueState
+from jaxbeam.estimation.constant_gain import ConstantGainFilter
+from jaxbeam.estimation.inversion import InversionFilter
+from jaxbeam.estimation.sampled_plant import Transition
+
+
+@write_filter.register
+def _(filter: TrueState, code: CSource) -> EstimateCode:
+    code.given_states = np.shape(filter.state_map)[0]
+    return EstimateCode(code.true_state, code.given_states)
+
+
+@write_filter.register
+def _(filter: ConstantGainFilter, code: CSource) -> EstimateCode:
+    x = code.state("estimate", np.zeros(np.shape(filter.C)[1]), "estimated states")
+    model = FilterModel(*transition_matrices(filter.transition), filter.C, filter.D, filter.gain)
+    write_filter_step(
+        code, FilterModel(*(np.asarray(part)[None] for part in model)), filter.offset, x
+    )
+    return EstimateCode(x, filter.plant_states)
+
+
+@write_filter.register
+def _(filter: InversionFilter, code: CSource) -> EstimateCode:
+    modes, sensors = np.shape(filter.mode_shape_inverse)
+    x = code.state("estimate", np.zeros(filter.plant_states), "estimated states")
+    reading = code.work("deflection", sensors, "readings less offsets")
+    coordinate = code.work("coordinate", modes, "coordinates that fit the readings")
+    offset = code.constant("reading_offset", filter.offset)
+    inverse = code.constant("mode_shape_inverse", filter.mode_shape_inverse)
+    if filter.actuator_transition is not None:
+        code.add(
+            "/* Estimate: states of the actuators from beam and commands of the last period */"
+        )
+        _write_actuator_states(code, filter, x, modes)
+    gain = float(filter.difference_gain)
+    smoothing = 1 - gain * float(filter.period)
+    code.add(
+        f"/* Estimate: coordinates from the deflections, rates from their differences */\n"
+        f"for (i = 0; i < {sensors}; i++) {reading}[i] = {code.readings}[i] - {offset}[i];",
+        sensors,
+    )
+    code.multiply(coordinate, inverse, reading, modes, sensors)
+    code.add(
+        f"""
+for (i = 0; i < {modes}; i++) {{
+    {x}[{modes} + i] = (real){smoothing!r} * {x}[{modes} + i]
+                       + (real){gain!r} * ({coordinate}[i] - {x}[i]);
+    {x}[i] = {coordinate}[i];
+}}""",
+        4 * modes,
+    )
+    return EstimateCode(x, filter.plant_states)
+
+
+def _write_actuator_states(code: CSource, filter: InversionFilter, x: str, modes: int) -> None:
+    """States of the actuators over a period, driven by the held beam and the commands."""
+    transition: Any = filter.actuator_transition
+    beam = 2 * modes
+    A, previous, present = (np.asarray(part) for part in transition_matrices(transition))
+    # The beam is held over the whole period: its columns of both inputs add.
+    by_state = np.concatenate([previous[:, :beam] + present[:, :beam], A], axis=1)
+    matrices = by_state, previous[:, beam:], present[:, beam:]
+    matrices = tuple(matrix[None] for matrix in matrices)
+    write_prediction(code, matrices, "actuator", x, f"{x} + {beam}")
+
+
+class FilterModel(NamedTuple):
+    """Matrices of a filter: those of x, of u until the previous sample and u since; C, D, gain."""
+
+    A: Any
+    previous: Any
+    present: Any
+    C: Any
+    D: Any
+    gain: Any
+
+
+def transition_matrices(transition: Transition) -> tuple[Any, Any, Any]:
+    """Matrices of the states, of the command until the previous sample, and of that since."""
+    return transition.matrix, transition.previous_input_matrix, transition.input_matrix
+
+
+def write_filter_step(code: CSource, model: FilterModel, offset, x: str) -> None:
+    """Prediction of the states x over a period, and correction by the readings.
+
+    The matrices of the model have a first axis of samples.
+    """
+    sensors, states = np.shape(model.C)[1:]
+    code.add("/* Estimate: prediction over a period, then correction by the readings */")
+    write_prediction(code, model[:3], "filter", x, x)
+    innovation = code.work("innovation", sensors, "readings less predicted ones")
+    offset = code.constant("reading_offset", offset)
+    code.add(
+        f"for (i = 0; i < {sensors}; i++) {innovation}[i] = {code.readings}[i] - {offset}[i];",
+        sensors,
+    )
+    C = code.per_sample("filter_C", model.C)
+    code.multiply_add(innovation, C, x, sensors, states, -1)
+    if np.any(model.D):
+        D = code.per_sample("filter_D", model.D)
+        code.multiply_add(innovation, D, code.command, sensors, code.actuators, -1)
+    gain = code.per_sample("filter_gain", model.gain)
+    code.multiply_add(x, gain, innovation, states, sensors)
+
+
+def write_prediction(code: CSource, matrices, name: str, x: str, place: str) -> None:
+    """Prediction over a period from the states x, put in a place among them.
+
+    The command that acted until the previous sample is kept for a model that needs it. The matrices
+    have a first axis of samples.
+    """
+    A, previous, present = matrices
+    _, rows, columns = np.shape(A)
+    predicted = code.work(f"{name}_prediction", rows, "predicted states")
+    code.multiply(predicted, code.per_sample(f"{name}_A", A), x, rows, columns)
+    if np.any(previous):
+        last = code.state(f"{name}_last", np.zeros(code.actuators), "commands before")
+        matrix = code.per_sample(f"{name}_B_last", previous)
+        code.multiply_add(predicted, matrix, last, rows, code.actuators)
+        code.add(f"copy({last}, {code.command}, {code.actuators});")
+    if np.any(present):
+        matrix = code.per_sample(f"{name}_B", present)
+        code.multiply_add(predicted, matrix, code.command, rows, code.actuators)
+    code.add(f"copy({place}, {predicted}, {rows});")

@@ -1,0 +1,178 @@
+"""Closed loop of a designed law, recorded: inputs of a program in C, and expected commands."""
+
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.case.case import Case
+from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep, Measurement
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.filters import filter_step
+from jaxbeam.case.sensors import Sensor
+from jaxbeam.integrator.integrate import (
+    integrate_history,
+    longest_force_step,
+    max_stable_step,
+)
+from jaxbeam.integrator.propagators import NODE_COUNT
+from jaxbeam.model.load_set import load_set
+from jaxbeam.model.modal_model import modal_model
+from jaxbeam.model.modes import Layout
+from jaxbeam.model.sensing.sensor_signals import Sections, initial_filter_state, sensor_sections
+from jaxbeam.runtime.arrays import Array, any_jax, known, vmap, xp
+from jaxbeam.runtime.compiling import compiled, compiled_if_traced
+from jaxbeam.simulation.closed_loop import loop_schedule
+from jaxbeam.simulation.integration_plan import (
+    IntegrationPlan,
+    static_shapes,
+    steps_per_interval,
+)
+from jaxbeam.simulation.simulate import integration_setup
+
+MIN_COMPILED = 300  # samples from which compilation pays
+SAME_TIME_SHARE = 1e-9  # of a period
+
+
+class RecordedLoop(NamedTuple):
+    """Samples of a loop: times (s), readings before their digital filters, states of the plant.
+
+    `commands` are those that the law gives at each sample, after limits and resolution.
+    """
+
+    times: Float[np.ndarray, " sample"]
+    readings: Float[np.ndarray, "sample sensor"]
+    states: Float[np.ndarray, "sample state"]
+    commands: Float[np.ndarray, "sample actuator"]
+
+
+class FilteredLaw(AbstractSampledLaw):
+    """A law behind the digital filters of its sensors, which start from rest."""
+
+    law: AbstractSampledLaw
+    sections: tuple[Sections, ...]
+    sensors: tuple[Sensor, ...]
+
+    def initial_state(self):
+        pairs = zip(self.sensors, self.sections, strict=True)
+        return self.law.initial_state(), [initial_filter_state(*pair, 0.0) for pair in pairs]
+
+    def step(self, state, measurement, t):
+        law_state, filter_states = state
+        readings, after = [], []
+        for sections, filter_state, reading in zip(
+            self.sections, filter_states, measurement.readings, strict=True
+        ):
+            if sections is not None:
+                reading, filter_state = filter_step(sections, filter_state, reading)
+            readings.append(reading)
+            after.append(filter_state)
+        filtered = xp.stack(readings) if readings else measurement.readings
+        measurement = Measurement(filtered, measurement.state, measurement.command)
+        step = self.law.step(law_state, measurement, t)
+        if not any_jax(measurement):  # also of laws that use JAX for known numbers
+            step = known(step)
+        return ControlStep(step.command, (step.state, after), step.solved)
+
+
+class DesignedController(AbstractController):
+    """Controller with a law that is designed already."""
+
+    law_to_run: Any = None
+    is_compiled: bool = eqx.field(static=True, default=False)
+
+    @property
+    def runs_compiled(self):
+        return self.is_compiled
+
+    def design_law(self, plant):
+        return self.law_to_run
+
+
+def filters_in_program(case: Case) -> tuple[Sections, ...]:
+    """Sections of the digital filters that act on samples at the period of the controller.
+
+    None for a sensor without one, or with a sampling period of its own: its readings come filtered.
+    """
+    period = case.controller.period
+    return tuple(
+        None if sensor.sampling_period is not None else sensor_sections(sensor, period)
+        for sensor in case.sensors
+    )
+
+
+def command_lag(case: Case) -> int:
+    """Samples from the one of a command to the first at which it acts already."""
+    delay = 0.0 if case.controller.delay is None else float(concrete(case.controller.delay))
+    return math.floor(delay / float(concrete(case.controller.period)) + SAME_TIME_SHARE) + 1
+
+
+def recorded_loop(case: Case, law: AbstractSampledLaw, max_samples: int) -> RecordedLoop:
+    """Loop of a case with a designed law, over the run or its first samples.
+
+    Raises ValueError if the loop diverges.
+    """
+    controller, sections = case.controller, filters_in_program(case)
+    sensors = tuple(
+        sensor if part is None else eqx.tree_at(lambda s: s.filter, sensor, None)
+        for sensor, part in zip(case.sensors, sections, strict=True)
+    )
+    period, duration = (float(concrete(x)) for x in (controller.period, case.run.duration))
+    # The command of a sample is read where it acts, up to a whole delay later.
+    delay = 0.0 if controller.delay is None else float(concrete(controller.delay))
+    later = math.ceil(delay / period - SAME_TIME_SHARE)
+    count = min(math.floor(duration / period * (1 + 1e-12)) + 1, max_samples + later)
+    times = np.arange(max(count, later + 2)) * period
+    is_compiled = controller.runs_compiled and len(times) >= MIN_COMPILED
+    recorded = DesignedController(
+        period=controller.period,
+        delay=controller.delay,
+        resolution=controller.resolution,
+        law_to_run=FilteredLaw(law, sections, case.sensors),
+        is_compiled=is_compiled,
+    )
+    case = eqx.tree_at(
+        lambda c: (c.sensors, c.controller), case, (sensors, recorded), is_leaf=lambda x: x is None
+    )
+    plan = _plan(case, times)
+    run = _run_compiled if is_compiled else _run
+    readings, states, commands = (np.asarray(part) for part in run(case, plan, times))
+    if not all(np.isfinite(part).all() for part in (readings, states, commands)):
+        raise ValueError("the closed loop diverges, so that there are no commands to check it by")
+    end = len(times) - later
+    return RecordedLoop(times[:end], readings[:end], states[:end], commands[later:])
+
+
+def _plan(case: Case, times: Float[np.ndarray, " sample"]) -> IntegrationPlan:
+    """Plan with the longest stable steps, without a trial run: any motion of the beam will do."""
+    shapes, schedule = static_shapes(case), loop_schedule(case, times)
+    longest = _longest_step(case, shapes.layout)
+    substeps = steps_per_interval(float(schedule.lengths.max()), float(longest))
+    return IntegrationPlan(shapes, substeps, 0, False, 0.0, schedule)
+
+
+@compiled_if_traced
+def _longest_step(case: Case, layout: Layout) -> Array:
+    """Longest stable time step (s) of the beam under its loads."""
+    loads = load_set(case)
+    stable = max_stable_step(modal_model(case, layout), loads)
+    return xp.minimum(stable, longest_force_step(case, loads))
+
+
+def _run_loop(case: Case, plan: IntegrationPlan, times) -> tuple[Array, Array, Array]:
+    """Readings, states of the plant and acting commands at the samples."""
+    discrete, loads, policy, sample_steps, steps = integration_setup(case, plan, times, None)
+    _, states, commands, observed, _ = integrate_history(
+        discrete, loads, max_loads=plan.shapes.max_loads, steps=steps, policy=policy
+    )
+    plant = policy.plant
+    states = states[sample_steps, : plant.modal_model.state_count, 0]
+    held = commands[..., 0].reshape(commands.shape[0], NODE_COUNT, -1)
+    sample_steps = xp.minimum(sample_steps, held.shape[0] - 1)
+    return observed[0][sample_steps, ..., 0], vmap(plant.from_modal)(states), held[sample_steps, 0]
+
+
+_run = compiled_if_traced(_run_loop)
+_run_compiled = compiled(_run_loop)

@@ -1,0 +1,1 @@
+"""Commands about results that an engineer signs: code checks and influence lines."""

@@ -1,0 +1,32 @@
+"""Endings of the files that results are written to, and the packages that write them.
+
+Nothing heavy is imported, so that the command line checks endings at once.
+"""
+
+import importlib.util
+import os
+from pathlib import Path
+
+TABLES = (".csv", ".xlsx", ".mat", ".parquet")  # columns of numbers with heads
+DATASETS = (".nc", ".zarr")  # everything, with units and coordinates
+RESULTS = (*DATASETS, *TABLES)
+PACKAGES = {".xlsx": "openpyxl", ".parquet": "pyarrow"}
+
+
+def check_ending(path: str | os.PathLike, content: str, allowed: tuple[str, ...] = RESULTS) -> None:
+    """Check that a result can be written to a file by its ending.
+
+    Raises ValueError for another ending than those allowed, ImportError, with what to install, if
+    the package that writes it is missing.
+    """
+    ending = Path(path).suffix
+    if ending not in allowed:
+        first = Path(path).with_suffix(allowed[0])
+        others = f", or {', '.join(allowed[1:])}" if allowed[1:] else ""
+        raise ValueError(f"{content} is written to a {allowed[0]} file; call it {first}{others}")
+    package = PACKAGES.get(ending, "")
+    if package and importlib.util.find_spec(package) is None:
+        raise ImportError(
+            f"{ending} files need {package}, which is not installed: pip install {package}, or"
+            " 'jaxbeam[tables]'"
+        )

@@ -1,0 +1,130 @@
+"""Step size of a run without controller, by the error of its deflections.
+
+A run of the case is compared with one whose steps are half as long. The order of the error is at
+least CONVERGENCE_ORDER, so that the next trial is close to the longest step that suffices.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.case.case import Case, concrete_case, replace
+from jaxbeam.case.fields import concrete
+from jaxbeam.integrator.discrete_model import discrete_model
+from jaxbeam.integrator.integrate import integrate_history, integrate_peaks
+from jaxbeam.integrator.running_peaks import RunningPeaks
+from jaxbeam.integrator.static_shapes import StaticShapes, model_limits
+from jaxbeam.integrator.time_grid import grid_by_step_length
+from jaxbeam.model.load_set import load_set
+from jaxbeam.model.modal_model import ModalModel, modal_model
+from jaxbeam.runtime.arrays import Array, xp
+
+MAX_STEPS = 10**8  # samples or time steps of a run; more exceed memory or take days
+MAX_TRIALS = 40  # step sizes tried
+CONVERGENCE_ORDER = 9  # assumed order of the error in the step; the true order is higher
+MAX_DIVERGED_HALVINGS = 6  # halvings of the step after which a run that overflows is given up
+TRIAL_POSITIONS = (0.13, 0.29, 0.47, 0.62, 0.88)  # x / length at which errors are measured
+
+
+def check_step_count(count: float, step: float) -> None:
+    """Raise RuntimeError if a run has more than MAX_STEPS time steps, of `step` (s)."""
+    if not count <= MAX_STEPS:
+        raise RuntimeError(
+            f"the run takes {count:.1e} time steps of {step:.1e} s, more than {MAX_STEPS:.0e}:"
+            " check stiffnesses, masses and damping, shorten the run, or keep fewer modes"
+            " (beam.modes)"
+        )
+
+
+def longest_trial_step(case: Case, shapes: StaticShapes) -> float:
+    """Longest step (s) of trial runs."""
+    return min(float(model_limits(case, shapes.layout)[0]), float(concrete(case.run.duration)))
+
+
+def choose_step_size(case: Case, shapes: StaticShapes, tolerance: float) -> tuple[float, float]:
+    """Longest step (s) whose deflections at TRIAL_POSITIONS meet the `tolerance`, and their error.
+
+    The step is shortened until dividing it by two changes no deflection at the ends of its steps by
+    more than the tolerance, relative to the largest; the error is that change. Peaks alone would
+    hide errors, as the deflection is stationary there. Raises RuntimeError if no step meets it.
+    """
+    case = concrete_case(case)
+    step = longest_trial_step(case, shapes)
+    check_step_count(float(concrete(case.run.duration)) / step, step)
+    model = modal_model(case, shapes.layout, shapes.coupled)
+    case = _without_later_vibration(case, model)
+    halvings = 0
+    for _ in range(MAX_TRIALS):
+        coarse, fine = (_trial_run(case, model, shapes, step, divided) for divided in (1, 2))
+        error = largest_change(coarse, fine)
+        if error <= tolerance:
+            return step, error
+        shrink = 0.5
+        if np.isfinite(error):
+            shrink = np.clip(0.9 * (tolerance / error) ** (1 / CONVERGENCE_ORDER), 0.2, 0.8)
+        elif (halvings := halvings + 1) > MAX_DIVERGED_HALVINGS:
+            break
+        step = step * float(shrink)
+    raise no_step_error(tolerance)
+
+
+def _without_later_vibration(case: Case, model: ModalModel) -> Case:
+    """The case until one period of the lowest mode after the last exit.
+
+    Free vibration is exact with any step, and no error grows in it.
+    """
+    lowest = float(np.sqrt(np.maximum(np.min(model.modes.stiffness), 0.0)))
+    last_exit = float(np.max(load_set(case).entry_exit_times(), initial=0.0))
+    end = last_exit + 2 * np.pi / lowest if lowest > 0 else np.inf
+    return replace(case, {"run.duration": min(end, float(concrete(case.run.duration)))})
+
+
+def _trial_run(
+    case: Case, model: ModalModel, shapes: StaticShapes, max_step: float, divided: int
+) -> np.ndarray:
+    """Deflections (m) at TRIAL_POSITIONS, (boundary and position, batch), of known numbers.
+
+    The boundaries are those of steps of at most `max_step` (s), each `divided` into so many.
+    """
+    grid = grid_by_step_length(case, model, np.asarray(max_step), refinement=divided)
+    discrete, steps = discrete_model(model, grid, None), int(grid.step_count)
+    _, states, *_ = integrate_history(
+        discrete, load_set(case), max_loads=shapes.max_loads, steps=steps
+    )
+    return trial_deflections(case, model, states[::divided])
+
+
+def trial_deflections(case: Case, model: ModalModel, states):
+    """Deflections (m) at TRIAL_POSITIONS from states (boundary, state, batch)."""
+    rows = model.shapes(case.beam.length * xp.array(TRIAL_POSITIONS), (0,))[0]
+    deflections = rows @ states[:, 0 : 2 * case.beam.modes : 2]
+    return deflections.reshape(-1, deflections.shape[-1])
+
+
+def run_peaks(
+    case: Case,
+    shapes: StaticShapes,
+    max_step: Float[Array, ""],
+    positions: Float[Array, " sensor"],
+) -> RunningPeaks:
+    """Running peaks of an uncontrolled run at positions (m), in steps of at most `max_step` (s)."""
+    model = modal_model(case, shapes.layout, shapes.coupled)
+    grid = grid_by_step_length(case, model, max_step)
+    discrete = discrete_model(model, grid, positions)
+    return integrate_peaks(discrete, load_set(case), max_loads=shapes.max_loads)[0]
+
+
+def largest_change(coarse: np.ndarray, fine: np.ndarray) -> float:
+    """Largest change of responses (value, batch), relative to the largest value of each run."""
+    if not np.any(fine):
+        return 0.0
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        return float(np.max(np.abs(coarse - fine) / np.max(np.abs(fine), axis=0), initial=0.0))
+
+
+def no_step_error(tolerance: float) -> RuntimeError:
+    return RuntimeError(
+        f"no time step makes the response agree to {tolerance:g}; it is unstable, or its "
+        "frequencies are too far apart: check stiffnesses, masses and damping, or keep fewer modes "
+        "(beam.modes); or a law in continuous time switches too often: give it a period, or a "
+        "larger tolerance"
+    )

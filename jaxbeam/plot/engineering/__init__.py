@@ -1,0 +1,1 @@
+"""Figures of results that an engineer signs."""

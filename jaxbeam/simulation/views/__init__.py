@@ -1,0 +1,1 @@
+"""Views of records: as text, as tables, as labelled datasets."""

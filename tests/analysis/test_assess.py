@@ -1,0 +1,172 @@
+"""Code checks of railway bridges against hand-computed values and an independent program."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.analysis.assessment.formulas import (
+    counted_frequency,
+    frequency_limits,
+    irregularity_factor,
+    running_factor,
+    static_dynamic_factor,
+)
+from jaxbeam.analysis.assessment.high_speed import train_response
+from jaxbeam.analysis.assessment.static_loads import (
+    Section,
+    largest_under_lm71,
+    largest_under_train,
+    tabulated_line,
+)
+from jaxbeam.analysis.sections.characteristic_points import characteristic_points
+from jaxbeam.vehicles.trains import trains
+from tests.modules import ROOT
+
+DATA = json.loads((ROOT / "tests" / "data" / "railway_code.json").read_text())
+BRIDGE = jb.Case(jb.Beam(25.0, 3e10, 15000.0, damping_ratio=0.01), title="25 m")
+TWO_SPANS = jb.Case(jb.Beam(40.0, 3e10, 15000.0), supports=[jb.Support(20.0)])
+
+
+def outcome(assessment, start):
+    return next(check for check in assessment.checks if check.subject.startswith(start))
+
+
+def test_increments_of_annex_c():
+    length, frequency = DATA["annex_c"]["L_phi"], DATA["annex_c"]["n0"]
+    for row in DATA["annex_c"]["cases"]:
+        speed = row["v_kmh"] / 3.6
+        first = running_factor(speed, length, frequency)
+        second = irregularity_factor(speed, length, frequency)
+        assert_allclose([first, second], [row["phi1"], row["phi2"]], rtol=1e-7)
+    assert running_factor(2 * length * frequency * 0.8, length, frequency) == 1.325
+    assert irregularity_factor(30.0, 20.0, 1.0) == pytest.approx(0.0)  # 50 (1/4 - 1) / e < 0
+
+
+def test_limits_of_the_first_frequency_and_dynamic_factors():
+    """94.76 / 25^0.748, 23.58 / 25^0.592, 80 / 10; 2.16 / 4.8 + 0.73, 1.44 / 4.8 + 0.82."""
+    assert_allclose(frequency_limits(25.0), [3.507222, 8.530332], rtol=1e-5)
+    assert_allclose(frequency_limits(10.0), [8.0, 16.928756], rtol=1e-5)
+    assert_allclose(static_dynamic_factor([1.0, 25.0, 100.0], "standard"), [2.0, 1.18, 1.0])
+    assert_allclose(static_dynamic_factor([1.0, 25.0, 100.0], "careful"), [1.67, 1.12, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("frequencies", "expected"),
+    [([3.5, 14.2, 32.0], 32.0), ([5.0, 8.0, 9.0], 30.0), ([24.0, 25.0, 26.0], 36.0), ([2.0], 30.0)],
+)
+def test_modes_that_count(frequencies, expected):
+    assert counted_frequency(frequencies) == expected
+
+
+def test_lm71_at_midspan_of_one_span():
+    """Axles at 0, +-1.6 and 3.2 m of midspan, line loads outside a block of 6.4 m."""
+    line = tabulated_line(BRIDGE, Section("", "moment", 12.5))
+    axles = 250e3 * (4 * 12.5 - 6.4) / 2
+    lines = 80e3 * (25.0**2 / 8 - (6.4 * 12.5 - (2.4**2 + 4.0**2) / 2) / 2)
+    assert_allclose(largest_under_lm71(line), axles + lines, rtol=1e-5)
+
+
+def test_lm71_over_the_inner_support():
+    """Against sums over a fine grid of the closed form, -a (l^2 - a^2) / (4 l^2), of both spans."""
+    s = np.linspace(0.0, 40.0, 40001)
+    a = np.minimum(s, 40.0 - s)
+    moment = a * (20.0**2 - a**2) / (4 * 20.0**2)
+    first = np.linspace(-5.0, 41.0, 461)
+    best = 0.0
+    for x in first:
+        outside = (s < x - 0.8) | (s > x + 5.6)
+        axles = np.interp(x + 1.6 * np.arange(4), s, moment, left=0, right=0).sum()
+        best = max(best, 250e3 * axles + 80e3 * np.trapezoid(moment * outside, s))
+    line = tabulated_line(TWO_SPANS, Section("", "moment", 20.0))
+    assert_allclose(largest_under_lm71(line), best, rtol=2e-3)
+
+
+def test_static_train():
+    train, expected = trains()["HSLM-A1"], DATA["hslm_a1"]["static"]
+    for quantity, value in (("moment", expected["M_max"]), ("deflection", -expected["w_min"])):
+        line = tabulated_line(BRIDGE, Section("", quantity, 12.5))
+        found = largest_under_train(line, train.offsets, train.forces)
+        assert_allclose(found, value, rtol=1e-4)
+
+
+def test_characteristic_points():
+    names = [point.name for point in characteristic_points(TWO_SPANS)]
+    assert names == [
+        *("support 1", "quarter 1", "midspan 1", "three quarters 1", "support 2"),
+        *("quarter 2", "midspan 2", "three quarters 2", "support 3"),
+    ]
+    overhang = dataclasses.replace(TWO_SPANS, beam=jb.Beam(40.0, 3e10, 15e3, ends="pinned-free"))
+    assert [p.name for p in characteristic_points(overhang)][-2:] == [
+        "three quarters 2",
+        "right end",
+    ]
+
+
+@pytest.mark.slow
+def test_peaks_over_speed_are_found_and_refined():
+    """Three modes around the resonance of HSLM-A1 at 230 km/h; the reference samples 2.5 km/h."""
+    beam = dataclasses.replace(BRIDGE.beam, modes=3)
+    sensors = (jb.Sensor(12.5, "acceleration"), jb.Sensor(12.5))
+    case = dataclasses.replace(BRIDGE, beam=beam)
+    found = train_response(case, "HSLM-A1", sensors, 225 / 3.6, 235 / 3.6)
+    expected = DATA["hslm_a1"]
+    assert found.change < 0.01
+    assert 1.0 <= found.peaks[:, 0].max() / max(expected["a_max_abs_3modes"]) < 1.01
+    assert 1.0 <= found.peaks[:, 1].max() / -min(expected["w_min"]) < 1.01
+    whole = jb.assess(
+        BRIDGE, 235 / 3.6 / 1.2, lowest_speed="225 km/h", trains=["HSLM-A1"], dynamic=True
+    )
+    deck = outcome(whole, "deck acceleration")
+    assert deck.outcome == "not satisfied" and "3 modes count" in deck.remark
+    assert_allclose(deck.value, found.peaks[:, 0].max(), rtol=1e-3)
+    moment = outcome(whole, "HSLM against LM71, moment")
+    irregular = DATA["annex_c"]["cases"][-1]["phi2"] * expected["static"]["M_max"]
+    assert 1.0 <= (moment.value - irregular) / max(expected["M_max"]) < 1.01
+    assert moment.outcome == "satisfied" and "LM71 governs" in moment.remark
+
+
+def test_flow_of_the_report(tmp_path):
+    slow, fast = jb.assess(BRIDGE, "160 km/h"), jb.assess(BRIDGE, "250 km/h", dynamic=False)
+    assert outcome(slow, "dynamic analysis").outcome == "not required"
+    assert outcome(fast, "dynamic analysis").outcome == "required"
+    limp = dataclasses.replace(BRIDGE, beam=jb.Beam(25.0, 1e10, 15e3, damping_ratio=0.01))
+    assert "outside the limits" in outcome(jb.assess(limp, 40.0, dynamic=False), "dynamic").remark
+    damped = jb.assess(BRIDGE, 40.0, added_damping=0.004)
+    assert_allclose(outcome(damped, "damping").value, 0.014)
+    assert "no certificate" in slow.verdict and "skew" in " ".join(slow.not_in_model)
+    for text in (str(slow), slow.to_markdown()):
+        assert "EN 1991-2, 6.4.4, figure 6.10" in text and "limits 3.507 and 8.53 Hz" in text
+    slow.save(tmp_path / "report.md")
+    assert "## Sources of the numbers" in (tmp_path / "report.md").read_text()
+    with pytest.raises(FileExistsError, match="exists already"):
+        slow.save(tmp_path / "report.md")
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match="the beam has 2 spans; give determinant_length"):
+        jb.assess(TWO_SPANS, 40.0)
+    assert jb.assess(TWO_SPANS, 40.0, determinant_length="24 m").inputs["determinant length"]
+    with pytest.raises(ValueError, match="track cannot be 'ballast'; did you mean 'ballasted'"):
+        jb.assess(BRIDGE, 40.0, track="ballast")
+    with pytest.raises(ValueError, match="'HSLM-A11' is no train of forces; did you mean"):
+        jb.assess(BRIDGE, 40.0, trains=["HSLM-A11"])
+    with pytest.raises(ValueError, match="line_speed must be positive"):
+        jb.assess(BRIDGE, -1.0)
+    free = dataclasses.replace(BRIDGE, beam=jb.Beam(25.0, 3e10, 15e3, ends="free-free"))
+    with pytest.raises(ValueError, match="can move as a rigid body"):
+        jb.assess(free, 40.0)
+    rayleigh = dataclasses.replace(BRIDGE.beam, damping_ratio=[0.01, 0.02], modes=2)
+    with pytest.raises(ValueError, match="set beam.modes to 3 or more"):
+        jb.assess(dataclasses.replace(BRIDGE, beam=rayleigh), 40.0)
+    controlled = dataclasses.replace(
+        BRIDGE,
+        actuators=[jb.PointForce(12.5)],
+        sensors=[jb.Sensor(12.5)],
+        controller=jb.Feedback(gains=[1.0]),
+    )
+    with pytest.raises(ValueError, match="active control cannot be certified"):
+        jb.assess(controlled, 40.0)

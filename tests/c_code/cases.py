@@ -1,0 +1,153 @@
+"""Small cases, one for each kind of controller and estimator, whose C code is tested."""
+
+import numpy as np
+
+import jaxbeam as jb
+from jaxbeam.case.case import Run
+from jaxbeam.control.feedback import Feedback
+from jaxbeam.control.load_identification import LoadIdentification
+from jaxbeam.control.optimal.crossing_lqr import FiniteLQR
+from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
+from jaxbeam.control.optimal.scheduled_lqr import ScheduledLQR
+from jaxbeam.control.output_feedback import OutputFeedback
+from jaxbeam.control.prescribed import Prescribed
+from jaxbeam.control.scheduled_feedback import ScheduledFeedback
+
+PERIOD = 5e-3
+
+
+def rig(controller, **changes):
+    """Beam with two shakers, three sensors and a mass that crosses in 0.25 s."""
+    parts = {
+        "actuators": [jb.Shaker(0.2, 2000.0, 5.0, limits=(-4.0, 4.0)), jb.PointForce(0.45)],
+        "sensors": [jb.Sensor(0.2), jb.Sensor(0.4), jb.Sensor(0.3, "velocity")],
+        "loads": [jb.MovingMass(mass=0.4, speed=2.4, entry_time=0.02)],
+        "run": Run(duration=0.3),
+    }
+    beam = jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2)
+    return jb.Case(beam, controller=controller, **(parts | changes))
+
+
+FILTERED = [jb.Sensor(0.2, filter=jb.Filter(40.0, 3), offset=1e-4), jb.Sensor(0.4, resolution=1e-5)]
+WEIGHTS = {
+    "state_weight": [1e4, 1e2, 1.0, 0.1, 0.0],
+    "command_weight": [1e-4, 1e-3],
+    "period": PERIOD,
+}
+WEAK = WEIGHTS | {"command_weight": [1e-2, 1e-1]}
+KALMAN = jb.Kalman(0.02, 1e-5)
+TWO_LOADS = [
+    jb.MovingMass(mass=0.4, speed=2.4, entry_time=0.02),
+    jb.MovingMass(mass=0.2, speed=3.0, entry_time=0.1),
+]
+ESTIMATED = jb.Kalman(0.02, 1e-5, loads="estimated", weight_deviation=1.0)
+SHORT = {"loads": [jb.MovingMass(mass=0.4, speed=15.0)], "run": Run(duration=0.06)}
+CASES = {
+    "feedback": rig(Feedback([2e3, 1e3], higher_gains=[[1e8, 2e8]], period=PERIOD)),
+    "feedback-cubic": rig(Feedback([5e8, 1e8], power=3, period=PERIOD), sensors=FILTERED),
+    "output-feedback": rig(
+        OutputFeedback([[2e3, 0.0, 5.0], [0.0, -1e3, 1.0]], period=PERIOD, delay=PERIOD)
+    ),
+    "pd": rig(jb.PD([2e3, 1e3], rate_gains=[10.0, 5.0], lag=1e-2, period=PERIOD)),
+    "lead": rig(jb.Lead([2e3, 1e3], zero=5.0, pole=[20.0, 30.0], period=PERIOD)),
+    "ppf": rig(
+        jb.PositivePositionFeedback([1e3, 1e3], 8.0, damping_ratio=0.3, period=PERIOD, delay=1e-3)
+    ),
+    "prescribed": rig(
+        Prescribed(
+            [0.1, 0.2],
+            amplitudes=[[1.0, 2.0], [0.5, 0.0]],
+            frequencies=[3.0, 11.0],
+            phases=[[0.0, 1.0], [2.0, 0.0]],
+            times=[0.05, 0.1, 0.3],
+            values=[[0.0, 1.0, -1.0], [2.0, 0.0, 1.0]],
+            period=PERIOD,
+        )
+    ),
+    "feedforward": rig(
+        jb.Feedforward(
+            [-0.05, 0.05],
+            shares=[0.0, 0.3, 1.0],
+            values=[[0.0, 5.0, 0.0], [1.0, 2.0, 3.0]],
+            lead=2e-3,
+            period=PERIOD,
+            resolution=1e-2,
+        ),
+        loads=TWO_LOADS,
+    ),
+    "internal-model": rig(
+        jb.InternalModel(
+            [-1e-3, 0.0, 1e-3],
+            values=[[4.0, 0.0, -4.0], [3.0, 0.0, -3.0]],
+            notches=[30.0, 60.0],
+            period=PERIOD,
+        ),
+        sensors=FILTERED,
+    ),
+    "feedback-scheduled": rig(
+        ScheduledFeedback(
+            [0.2, 0.5],
+            [[1e3, 2e3], [1e3, 3e3]],
+            load_identification=LoadIdentification(gates=[-0.05, 0.05]),
+            period=PERIOD,
+        )
+    ),
+    "feedback-stepped": rig(
+        ScheduledFeedback(
+            [0.2, 0.3, 0.5],
+            [[1e8, 2e8, 3e8], [1e8, 3e8, 3e8]],
+            power=3,
+            between="stepped",
+            load_identification=LoadIdentification(threshold=2e-5),
+            period=PERIOD,
+        )
+    ),
+    "state": rig(jb.StateFeedback(np.full((2, 5), 2.0), period=PERIOD)),
+    "lqr-observer": rig(jb.LQR(**WEIGHTS, estimator=jb.Observer(speed=3.0))),
+    "dlqr-kalman": rig(DiscreteLQR(**WEIGHTS, delay=2e-3, estimator=KALMAN), sensors=FILTERED),
+    "lqr-inversion": rig(jb.LQR(**WEIGHTS, estimator=jb.Inversion(1e-2), delay=2 * PERIOD)),
+    "mpc": rig(jb.MPC(8, 3, [1e-10, 1e-10], estimator=KALMAN, period=PERIOD, delay=1e-3)),
+    "mpc-soft": rig(
+        jb.MPC(
+            6,
+            2,
+            1e-9,
+            soft_limit=1e-4,
+            terminal="none",
+            laguerre_pole=0.4,
+            estimator=jb.Inversion(),
+            period=PERIOD,
+        )
+    ),
+    "mpc-hildreth": rig(
+        jb.MPC(3, 2, 1e-10, solver="hildreth", period=PERIOD, loads="known"), **SHORT
+    ),
+    "mpc-varying": rig(jb.MPC(3, 2, 1e-10, period=PERIOD, prediction="time-varying"), **SHORT),
+    "kalman-known": rig(
+        jb.LQR(**WEAK, estimator=jb.Kalman(0.02, 1e-5, loads="known"), delay=2e-3), **SHORT
+    ),
+    "kalman-estimated": rig(
+        jb.MPC(3, 1, 1e-10, loads="known", estimator=ESTIMATED, period=PERIOD),
+        **SHORT | {"actuators": [jb.PointForce(0.2, limits=(-0.5, 0.5))]},
+    ),
+    "mpc-vehicle": rig(
+        jb.MPC(3, 1, 1e-10, loads="known", estimator=KALMAN, period=PERIOD),
+        **SHORT | {"loads": [jb.Oscillator(0.3, 900.0, 2.0, speed=15.0)]},
+    ),
+    "mpc-unconstrained": rig(jb.MPC(6, 2, 1e-10, solver="unconstrained", period=PERIOD)),
+}
+# Their designs compile for seconds.
+DESIGNED_TABLES = {
+    "lqr-finite": rig(FiniteLQR(**WEAK, points=60, after="fade", fade_time=0.02, estimator=KALMAN)),
+    "lqr-scheduled": rig(
+        ScheduledLQR(
+            **WEIGHTS,
+            masses=[0.2, 0.5],
+            speeds=[2.0, 3.0],
+            points=60,
+            loads="known",
+            load_identification=LoadIdentification(gates=[-0.05, 0.05]),
+            estimator=jb.Observer(speed=3.0),
+        )
+    ),
+}

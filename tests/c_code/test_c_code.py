@@ -1,0 +1,77 @@
+"""C code of controllers: the commands of recorded loops, under strict compilers and sanitizers."""
+
+import functools
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from jaxbeam.c_code import CProgram, export_c, write_c
+from tests.c_code.cases import CASES, DESIGNED_TABLES
+
+COMPILER, CPP_COMPILER = shutil.which("cc") or shutil.which("gcc"), shutil.which("c++")
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
+
+STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic"]
+SANITIZED = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+ALL = CASES | DESIGNED_TABLES
+KINDS = [*CASES, *(pytest.param(kind, marks=pytest.mark.slow) for kind in DESIGNED_TABLES)]
+ROUNDING, SINGLE_ROUNDING = 1e-12, 1e-2  # of the largest command
+MIN_OPERATIONS_SHARE = 0.3  # of the stated operations that a loop without a quadratic program takes
+
+
+@functools.cache
+def exported(kind: str) -> CProgram:
+    return export_c(ALL[kind], "law")
+
+
+def checked(kind: str, folder: Path, *options: str) -> tuple[float, int]:
+    """Error of the commands relative to the largest, and bytes of the state, of a compiled check."""
+    write_c(exported(kind), folder)
+    assert COMPILER is not None
+    build = [COMPILER, *STRICT, *options, "-o", "check", "law.c", "law_check.c", "-lm"]
+    subprocess.run(build, cwd=folder, check=True)
+    ended = subprocess.run([folder / "check"], capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    found = re.search(
+        r"largest command (\S+), largest error (\S+) of it, (\d+) bytes", ended.stdout
+    )
+    assert found and float(found[1]) > 0.1
+    return float(found[2]), int(found[3])
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", KINDS)
+def test_program_gives_the_commands_of_the_loop(kind, tmp_path):
+    """To rounding, without warnings, memory errors and undefined behaviour; the memory is stated."""
+    error, state_bytes = checked(kind, tmp_path, *SANITIZED)
+    assert error < ROUNDING
+    assert state_bytes == exported(kind).state_bytes
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", KINDS)
+def test_program_in_single_precision(kind, tmp_path):
+    error, state_bytes = checked(kind, tmp_path, "-DLAW_REAL=float")
+    assert 0 < error < SINGLE_ROUNDING
+    assert state_bytes <= exported(kind).state_bytes
+
+
+@pytest.mark.skipif(CPP_COMPILER is None, reason="needs a C++ compiler")
+@pytest.mark.parametrize("kind", KINDS)
+def test_operations_at_worst_are_stated(kind, tmp_path):
+    """Counted by a type of numbers that counts its operations, in C++."""
+    program = exported(kind)
+    write_c(program, tmp_path)
+    gated = ["-DGATED"] * ("law_gate(" in program.files["law.h"])
+    counter = Path(__file__).with_name("count_operations.cpp")
+    assert CPP_COMPILER is not None
+    build = [CPP_COMPILER, "-O0", f"-I{tmp_path}", *gated, "-o", tmp_path / "count", counter]
+    subprocess.run(build, check=True)
+    run = subprocess.run([tmp_path / "count"], capture_output=True, text=True, check=True)
+    counted = int(run.stdout)
+    assert counted <= program.operations
+    if "interior_point" not in program.files["law.c"] and "hildreth" not in program.files["law.c"]:
+        assert counted >= MIN_OPERATIONS_SHARE * program.operations

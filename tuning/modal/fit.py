@@ -1,0 +1,166 @@
+"""Modes identified from a log, with all that was chosen on the way."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from tuning.logs.log import Log
+from tuning.modal.harmonics import Line
+from tuning.modal.result import IdentifiedMode
+from tuning.modal.shapes import mac_matrix
+from tuning.modal.stabilisation import Diagram
+
+
+class Choice(NamedTuple):
+    """An automatic choice, and the option that overrides it."""
+
+    text: str
+    option: str
+
+
+@dataclass(frozen=True, eq=False)
+class ModalFit:
+    """Modes identified from a log, ascending in frequency.
+
+    `modes` are those well identified, `rejected` the others with the reason. `kind` is "free
+    decay" or "ambient"; `windows` (s) are the parts of the log used, `band` (Hz) that of the
+    search; `lines` are harmonic lines that were subtracted. `choices` are the automatic choices,
+    `notes` sentences on the log. `diagrams` are stabilisation diagrams, one for each part of the
+    band. `times` and `measured` are the log in the first window and the band, `fitted` is the
+    response of the modes to it for a free decay, else None.
+    """
+
+    modes: tuple[IdentifiedMode, ...]
+    rejected: tuple[tuple[IdentifiedMode, str], ...]
+    kind: str
+    method: str
+    windows: tuple[tuple[float, float], ...]
+    band: tuple[float, float]
+    lines: tuple[Line, ...]
+    choices: tuple[Choice, ...]
+    notes: tuple[str, ...]
+    diagrams: tuple[Diagram, ...]
+    log: Log
+    times: Float[np.ndarray, " sample"]
+    measured: Float[np.ndarray, "sample channel"]
+    fitted: Float[np.ndarray, "sample channel"] | None
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """Start and end (s) of all that was used of the log."""
+        return self.windows[0][0], self.windows[-1][1]
+
+    @property
+    def frequencies(self) -> Float[np.ndarray, " mode"]:
+        """Natural frequencies in Hz."""
+        return np.array([mode.frequency for mode in self.modes])
+
+    @property
+    def damping_ratios(self) -> Float[np.ndarray, " mode"]:
+        """Damping ratios."""
+        return np.array([mode.damping_ratio for mode in self.modes])
+
+    @property
+    def frequency_intervals(self) -> Float[np.ndarray, "mode 2"]:
+        """95 % intervals of the natural frequencies in Hz."""
+        half = np.array([mode.quantile * mode.frequency_sd for mode in self.modes])
+        return self.frequencies[:, None] + np.multiply.outer(half, [-1.0, 1.0])
+
+    @property
+    def damping_intervals(self) -> Float[np.ndarray, "mode 2"]:
+        """95 % intervals of the damping ratios."""
+        half = np.array([mode.quantile * mode.damping_sd for mode in self.modes])
+        return self.damping_ratios[:, None] + np.multiply.outer(half, [-1.0, 1.0])
+
+    @property
+    def shapes(self) -> Complex[np.ndarray, "mode channel"]:
+        """Mode shapes, each with a largest component of one."""
+        return np.array([mode.shape for mode in self.modes]).reshape(len(self.modes), -1)
+
+    @property
+    def mac(self) -> Float[np.ndarray, "mode mode"]:
+        """Modal assurance criterion of the shapes with each other."""
+        return mac_matrix(self.shapes, self.shapes)
+
+    def __str__(self) -> str:
+        (start, stop), (low, high) = self.window, self.band
+        several = f" ({len(self.windows)} decays)" if len(self.windows) > 1 else ""
+        lines = [
+            f"{self.log.source}: {self.kind} from {start:.3f} s to {stop:.3f} s{several}, "
+            f"{low:.3g} Hz to {high:.4g} Hz",
+            *(f"  {note}" for note in self.notes),
+            *(f"  {choice.text}  [{choice.option}]" for choice in self.choices),
+        ]
+        if self.lines:
+            listed = ", ".join(
+                f"{one.frequency:.3f} Hz ({100 * one.share:.2g} %)" for one in self.lines
+            )
+            lines.append(f"  harmonic lines, no modes (share of the variance): {listed}")
+        if self.modes:
+            lines.append("  frequency (Hz)  +- 95 %    damping ratio  +- 95 %     energy")
+        else:
+            lines.append("  no mode is well identified")
+        for mode in self.modes:
+            lines.append(
+                f"  {mode.frequency:14.4f}  {mode.quantile * mode.frequency_sd:7.4f}    "
+                f"{mode.damping_ratio:13.5f}  {mode.quantile * mode.damping_sd:7.5f}    "
+                f"{100 * mode.energy_share:5.1f} %"
+            )
+        if self.rejected:
+            lines.append("  not well identified:")
+        for mode, reason in self.rejected:
+            lines.append(f"  {mode.frequency:14.4f}  {reason}")
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict:
+        """Plain numbers for JSON: modes with 95 % intervals and shapes, and what was chosen."""
+        intervals = zip(self.modes, self.frequency_intervals, self.damping_intervals, strict=True)
+        return {
+            "kind": self.kind,
+            "method": self.method,
+            "window_s": list(self.window),
+            "windows_s": [list(window) for window in self.windows],
+            "band_hz": list(self.band),
+            "channels": list(self.log.names),
+            "choices": [{"choice": c.text, "option": c.option} for c in self.choices],
+            "notes": list(self.notes),
+            "harmonic_lines": [
+                {"frequency_hz": line.frequency, "share": line.share} for line in self.lines
+            ],
+            "frequencies_hz": self.frequencies.tolist(),
+            "damping_ratios": self.damping_ratios.tolist(),
+            "modes": [
+                {
+                    "frequency_hz": mode.frequency,
+                    "frequency_sd_hz": mode.frequency_sd,
+                    "frequency_95_hz": frequency.tolist(),
+                    "damping_ratio": mode.damping_ratio,
+                    "damping_sd": mode.damping_sd,
+                    "damping_95": damping.tolist(),
+                    "energy_share": mode.energy_share,
+                    "shape_real": mode.shape.real.tolist(),
+                    "shape_imag": mode.shape.imag.tolist(),
+                    "phase_collinearity": mode.collinearity,
+                }
+                for mode, frequency, damping in intervals
+            ],
+            "mac": self.mac.tolist(),
+            "rejected": [
+                {"frequency_hz": mode.frequency, "damping_ratio": mode.damping_ratio, "why": why}
+                for mode, why in self.rejected
+            ],
+        }
+
+    def plot(self, path=None):
+        """Figure of log, spectrum and fit; saved to `path` if given."""
+        from tuning.modal.plot import plot_modal_fit
+
+        return plot_modal_fit(self, path)
+
+    def plot_shapes(self, path=None, length: float | None = None):
+        """Figure of mode shapes on the beam and their MAC matrix; saved to `path` if given."""
+        from tuning.modal.shape_plot import plot_mode_shapes
+
+        return plot_mode_shapes(self, path, length)

@@ -1,0 +1,102 @@
+"""Harmonic lines of motors, shakers and mains hum: found, named and subtracted.
+
+A line is found by the F-test of several tapers (Thomson 1982; Percival and Walden 1993, section
+10.11): its power exceeds that of the continuous spectrum within the bandwidth of the tapers. It
+must have the same amplitude and phase throughout the record, which a resonance has not.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.signal.windows import dpss
+from scipy.stats import f as f_distribution
+
+TAPERS, TIME_BANDWIDTH = 7, 4.0
+FALSE_ALARM_PROBABILITY = 1e-3  # of a line in noise, in a whole spectrum
+PARTS = 8  # parts of a record in which a line is followed
+MIN_COHERENCE = 0.9  # length of the mean of its complex amplitudes over their rms
+MAX_LINES = 30
+
+
+class Line(NamedTuple):
+    """A harmonic line: frequency (Hz) and its share of the variance of the record."""
+
+    frequency: float
+    share: float
+
+
+def harmonic_lines(
+    record: Float[np.ndarray, "time channel"], rate: float, band: tuple[float, float]
+) -> tuple[Line, ...]:
+    """Lines in a record within a band (Hz), ascending in frequency."""
+    count, channels = record.shape
+    if count < 16 * TAPERS:
+        return ()
+    tapers = dpss(count, TIME_BANDWIDTH, TAPERS)
+    size = 1 << int(np.ceil(np.log2(2 * count)))
+    bins = np.fft.rfftfreq(size, 1 / rate)
+    inside = (bins > band[0]) & (bins < band[1])
+    level = tapers.sum(axis=1)
+    level[1::2] = 0.0  # those of odd tapers vanish
+    norm = np.sum(level**2)
+    limit = f_distribution.isf(
+        FALSE_ALARM_PROBABILITY / (channels * max(np.sum(inside) // 2, 1)), 2, 2 * TAPERS - 2
+    )
+    found: list[float] = []
+    variance = np.maximum(record.var(axis=0), 1e-300)
+    for channel in range(channels):
+        spectra = np.fft.rfft(tapers * record[:, channel], size, axis=1)
+        amplitude = level @ spectra / norm
+        rest = np.sum(np.abs(spectra - np.multiply.outer(level, amplitude)) ** 2, axis=0)
+        ratio = (TAPERS - 1) * np.abs(amplitude) ** 2 * norm / np.maximum(rest, 1e-300)
+        power = np.abs(amplitude) ** 2
+        peak = (power > np.roll(power, 1)) & (power >= np.roll(power, -1))
+        found += bins[inside & peak & (ratio > limit)].tolist()
+    lines: list[float] = []
+    for frequency in sorted(found):
+        refined = _followed(record, rate, frequency, variance)
+        if refined is not None and all(abs(refined - f) > 2 * rate / count for f in lines):
+            lines.append(refined)
+    shares = [
+        float(np.mean(np.abs(_amplitudes(record, rate, f, 1)[0]) ** 2 / 2 / variance))
+        for f in lines
+    ]
+    ranked = sorted(zip(shares, lines, strict=True), reverse=True)[:MAX_LINES]
+    return tuple(sorted(Line(f, share) for share, f in ranked))
+
+
+def _amplitudes(record, rate, frequency, parts):
+    """Complex amplitudes of a line in equal parts of a record (part, channel), by Hann windows."""
+    size = len(record) // parts
+    times = np.arange(size * parts) / rate
+    shifted = record[: size * parts] * np.exp(-2j * np.pi * frequency * times)[:, None]
+    window = np.hanning(size)
+    pieces = shifted.reshape(parts, size, -1)
+    return 2 * np.einsum("t,ptc->pc", window, pieces) / window.sum()
+
+
+def _followed(record, rate, frequency, variance) -> float | None:
+    """The frequency refined by the phase from part to part; None if the line does not last."""
+    size = len(record) // PARTS
+    step = size / rate
+    for _ in range(3):
+        z = _amplitudes(record, rate, frequency, PARTS)
+        channel = int(np.argmax(np.sum(np.abs(z) ** 2, axis=0) / variance))
+        product = np.sum(z[1:, channel] * z[:-1, channel].conj())
+        change = np.angle(product) / (2 * np.pi * step)
+        frequency += change
+    z = _amplitudes(record, rate, frequency, PARTS)[:, channel]
+    coherence = np.abs(np.mean(z)) / np.sqrt(np.mean(np.abs(z) ** 2))
+    return float(frequency) if coherence > MIN_COHERENCE else None
+
+
+def without_lines(
+    record: Float[np.ndarray, "time channel"], rate: float, frequencies: tuple[float, ...]
+) -> Float[np.ndarray, "time channel"]:
+    """The record less the sinusoids of some frequencies (Hz), fitted by least squares."""
+    if not frequencies:
+        return record
+    phases = 2 * np.pi * np.multiply.outer(np.arange(len(record)) / rate, frequencies)
+    basis = np.concatenate([np.cos(phases), np.sin(phases)], axis=1)
+    return record - basis @ np.linalg.lstsq(basis, record, rcond=None)[0]

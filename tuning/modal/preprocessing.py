@@ -1,0 +1,147 @@
+"""Pre-processing of logs for modal identification: offset and drift, band, decimation.
+
+Every step is visible in the notes of a result and can be set by the user.
+"""
+
+from fractions import Fraction
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import percentile_filter
+from scipy.signal import butter, detrend, firwin, resample_poly, sosfiltfilt, welch
+
+RATE_OVER_BAND = 2.56  # sampling rate after decimation over the upper end of the band
+MIN_SEGMENTS = 16  # segments averaged for the spectrum that decides the band
+BACKGROUND_OCTAVES = 1.0  # width of the running median that is the background of resonances
+RESONANCE_RATIO = 4.0  # of the spectrum over its background: 6 dB
+BAND_ENERGY_SHARE = 0.98  # of the kinetic energy of resonances, below the upper end of the band
+BAND_MARGIN = 1.3  # of the ends of the band beyond the outermost resonances
+MIN_CYCLES = 8.0  # cycles of the lowest frequency in the longest record
+
+
+class Prepared(NamedTuple):
+    """Records ready for identification, one rate (Hz), with the times of their first samples (s).
+
+    `band` (Hz) is that in which modes are sought.
+    """
+
+    records: tuple[Float[np.ndarray, "time channel"], ...]
+    starts: tuple[float, ...]
+    rate: float
+    band: tuple[float, float]
+
+
+def kinetic_band(
+    records: tuple[Float[np.ndarray, "time channel"], ...],
+    rate: float,
+    derivatives: tuple[int, ...],
+) -> tuple[float, float]:
+    """Band (Hz) of the resonances that hold the kinetic energy of a vibration.
+
+    Resonances are where the spectrum exceeds its background (running median over an octave) by
+    6 dB; their excess is converted to velocities by `derivatives`, the order of each channel as a
+    time derivative. Drift and noise, however strong, are background. Without resonances the band is
+    all that the log can show.
+    """
+    longest = max(len(record) for record in records)
+    lowest = MIN_CYCLES * rate / longest
+    bins, power = _average_spectrum(records, rate)
+    keep = (bins >= lowest) & (bins <= 0.45 * rate)
+    bins, power = bins[keep], power[keep]
+    excess = resonance_excess(bins, power)
+    exponents = 2.0 * (1 - np.asarray(derivatives))
+    kinetic = excess * (2 * np.pi * bins[:, None]) ** exponents
+    # Channels of one quantity are added as they are; different quantities have equal weights.
+    kinds = np.asarray(derivatives)
+    scale = np.array([kinetic[:, kinds == kind].sum() for kind in derivatives])
+    kinetic = np.sum(kinetic / np.where(scale > 0, scale, 1.0), axis=1)
+    if not kinetic.any():
+        return lowest, 0.4 * rate
+    share = np.cumsum(kinetic) / kinetic.sum()
+    low = bins[np.searchsorted(share, 1 - BAND_ENERGY_SHARE)]
+    high = bins[min(int(np.searchsorted(share, BAND_ENERGY_SHARE)), bins.size - 1)]
+    high = min(high * BAND_MARGIN, 0.4 * rate)
+    return float(max(low / BAND_MARGIN**2, lowest)), float(high)
+
+
+def strongest_frequency(
+    records: tuple[Float[np.ndarray, "time channel"], ...],
+    rate: float,
+    derivatives: tuple[int, ...],
+    band: tuple[float, float],
+) -> float:
+    """Frequency (Hz) in a band of the resonance at which the spectrum of velocities is largest.
+
+    Without resonances it is the geometric mean of the band.
+    """
+    bins, power = _average_spectrum(records, rate)
+    keep = (bins >= band[0]) & (bins <= band[1]) & (bins > 0)
+    if keep.sum() < 8:
+        return float(np.sqrt(band[0] * band[1]))
+    bins, power = bins[keep], power[keep]
+    exponents = 2.0 * (1 - np.asarray(derivatives))
+    kinetic = resonance_excess(bins, power) * (2 * np.pi * bins[:, None]) ** exponents
+    if not kinetic.any():
+        return float(np.sqrt(band[0] * band[1]))
+    return float(bins[np.argmax(np.sum(kinetic, axis=1))])
+
+
+def _average_spectrum(records, rate):
+    """Frequencies (Hz) and power spectral densities (bin, channel), averaged over records."""
+    total = sum(len(record) for record in records)
+    size = min(max(2 * total // (MIN_SEGMENTS + 1), 64), max(len(r) for r in records))
+    sums, weight = 0.0, 0
+    for record in records:
+        if len(record) >= size:
+            bins, power = welch(record, rate, "hann", size, detrend="linear", axis=0)
+            sums, weight = sums + len(record) * power, weight + len(record)
+    return bins, sums / weight
+
+
+def resonance_excess(
+    bins: Float[np.ndarray, " bin"], power: Float[np.ndarray, "bin channel"]
+) -> Float[np.ndarray, "bin channel"]:
+    """Power above the background where it stands out by 6 dB, else zero."""
+    points = max(512, 2 * bins.size)
+    grid = np.geomspace(bins[0], bins[-1], points)
+    width = max(int(BACKGROUND_OCTAVES * points / np.log2(bins[-1] / bins[0])), 3)
+    found = []
+    for column in power.T:
+        level = np.interp(grid, bins, np.log(column + 1e-300))
+        background = np.exp(
+            np.interp(bins, grid, percentile_filter(level, 50, width, mode="nearest"))
+        )
+        found.append(np.where(column > RESONANCE_RATIO * background, column - background, 0.0))
+    return np.stack(found, axis=1)
+
+
+def prepare(
+    records: tuple[Float[np.ndarray, "time channel"], ...],
+    starts: tuple[float, ...],
+    rate: float,
+    band: tuple[float, float],
+) -> Prepared:
+    """Records without offset and drift, decimated for a band (Hz).
+
+    The anti-alias filter is a linear-phase FIR filter (Kaiser window, 80 dB), applied without
+    delay; the lower end of the band is that of a Butterworth high-pass filter of order 2, applied
+    forwards and backwards at half of it.
+    """
+    target = RATE_OVER_BAND * band[1]
+    ratio = Fraction(min(target / rate, 1.0)).limit_denominator(200)
+    if ratio < 1 and ratio * 200 < 1:
+        ratio = Fraction(1, int(rate / target))
+    found = []
+    new_rate = rate * float(ratio)
+    sos = butter(2, min(band[0] / 2, 0.4 * new_rate), "highpass", fs=new_rate, output="sos")
+    for record in records:
+        values = detrend(record, axis=0)
+        if ratio < 1:
+            up, down = ratio.numerator, ratio.denominator
+            taps = firwin(20 * max(up, down) + 1, 0.9 / max(up, down), window=("kaiser", 8.0))
+            values = resample_poly(values, up, down, axis=0, window=taps)
+        if len(values) > 60:
+            values = sosfiltfilt(sos, values, axis=0)
+        found.append(values)
+    return Prepared(tuple(found), starts, new_rate, band)

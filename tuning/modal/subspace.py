@@ -1,0 +1,266 @@
+"""Stochastic subspace identification from output covariances, with uncertainties.
+
+The outputs of a linear structure under broadband excitation have covariances R_l = C A^(l-1) G
+(l > 0), so that the block Hankel matrix of R_1 ... R_(p+q) is the product of observability and
+controllability matrices (Peeters and De Roeck 1999). Its column space gives C, and A by shift
+invariance. The data-driven variant weights the columns by the inverse square root of the covariance
+of the past outputs, which makes the left singular vectors those of the projection of future on past
+outputs (Van Overschee and De Moor 1996, unweighted principal components). The response after a blow
+obeys the same equations if each covariance is a sum over the same instants.
+
+Uncertainties are those of the covariances, estimated from blocks of the records, propagated through
+singular value decomposition and eigenvalue problem to first order (Pintelon, Guillaume and
+Schoukens 2007; Reynders, Pintelon and De Roeck 2008; Doehler and Mevel 2013).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+from scipy.fft import next_fast_len
+
+LOWEST_CYCLES = 8.0  # cycles of the lowest frequency of the band in the lags of half a matrix
+MAX_ROWS = 240  # rows of half a Hankel matrix: block rows times channels
+MIN_BLOCK_ROWS = 8
+MAX_BLOCKS = 24  # blocks of the records for the covariance of the covariances
+MIN_BLOCK_LAGS = 2  # length of a block over the largest lag
+
+
+class Subspace(NamedTuple):
+    """Singular value decomposition of a Hankel matrix, and perturbations of the matrix by blocks.
+
+    `rotated` holds U^T dH_b V for the deviation of each block from the mean, scaled so that the sum
+    of squares over blocks is a variance. `channels` are the rows of a block; `step` is the sampling
+    step (s); `total` the variance of each channel.
+    """
+
+    left: Float[np.ndarray, "row row"]
+    values: Float[np.ndarray, " column"]
+    right: Float[np.ndarray, "column column"]
+    rotated: Float[np.ndarray, "block row column"]
+    channels: int
+    step: float
+    total: Float[np.ndarray, " channel"]
+
+
+class Poles(NamedTuple):
+    """Poles of the models of one or more orders, in the upper half plane, with their shapes.
+
+    `poles` in 1/s; `shapes` have unit norm; `energies` are the variance of the outputs due to each
+    mode over the total variance.
+    """
+
+    orders: Int[np.ndarray, " pole"]
+    poles: Complex[np.ndarray, " pole"]
+    shapes: Complex[np.ndarray, "pole channel"]
+    energies: Float[np.ndarray, " pole"]
+
+    @property
+    def frequencies(self) -> Float[np.ndarray, " pole"]:
+        """Natural frequencies |p| / 2 pi in Hz."""
+        return np.abs(self.poles) / (2 * np.pi)
+
+    @property
+    def damping_ratios(self) -> Float[np.ndarray, " pole"]:
+        """Damping ratios -Re p / |p|."""
+        return -self.poles.real / np.maximum(np.abs(self.poles), 1e-300)
+
+
+class Spread(NamedTuple):
+    """Covariance of a pole's frequency (Hz) and damping ratio, and its shape with the covariance.
+
+    The shape has a largest component of one; its covariance is that of real parts, then imaginary
+    parts. `degrees_of_freedom` are those of all, for intervals.
+    """
+
+    covariance: Float[np.ndarray, "2 2"]
+    shape: Complex[np.ndarray, " channel"]
+    shape_covariance: Float[np.ndarray, "part part"]
+    degrees_of_freedom: float
+
+
+def block_rows(rate: float, lowest: float, channels: int, samples: int) -> int:
+    """Block rows of half a Hankel matrix: lags of eight cycles of the lowest frequency (Hz).
+
+    At most 240 rows with all channels, and so many that a record holds twelve blocks of twice all
+    lags.
+    """
+    wanted = int(np.ceil(LOWEST_CYCLES * rate / lowest))
+    return max(min(wanted, MAX_ROWS // channels, samples // 48), MIN_BLOCK_ROWS)
+
+
+def block_covariances(
+    records: tuple[Float[np.ndarray, "time channel"], ...], lags: int, blocks: int
+) -> tuple[Float[np.ndarray, "block lag channel channel"], Float[np.ndarray, " block"]]:
+    """Sums y(t + l) y(t)^T of each block of the records for l = 0 ... lags, and their counts.
+
+    In each record the sums of all lags are over the same instants t.
+    """
+    usable = np.array([max(len(record) - lags, 0) for record in records], float)
+    shares = np.maximum(np.round(blocks * usable / usable.sum()), usable > 0).astype(int)
+    sums, counts = [], []
+    for record, parts, count in zip(records, shares, usable.astype(int), strict=True):
+        if parts == 0:
+            continue
+        size = count // parts
+        length = next_fast_len(size + lags, real=True)
+        products = np.empty((parts, lags + 1, record.shape[1], record.shape[1]))
+        for part in range(parts):
+            first = part * size
+            later = np.fft.rfft(record[first : first + size + lags], length, axis=0)
+            base = np.fft.rfft(record[first : first + size], length, axis=0)
+            cross = later[:, :, None] * base[:, None, :].conj()
+            products[part] = np.fft.irfft(cross, length, axis=0)[: lags + 1]
+        sums.append(products)
+        counts.append(np.full(parts, size, float))
+    return np.concatenate(sums), np.concatenate(counts)
+
+
+def decompose(
+    records: tuple[Float[np.ndarray, "time channel"], ...],
+    rate: float,
+    rows: int,
+    data_driven: bool = False,
+    as_blocks: bool = False,
+) -> Subspace:
+    """Subspace of the Hankel matrix of the output covariances of all records together.
+
+    `rows` are the block rows. Each record is divided into blocks, or is one block (`as_blocks`).
+    """
+    lags = 2 * rows
+    total = sum(len(record) for record in records)
+    blocks = len(records) if as_blocks else int(
+        np.clip(total // (MIN_BLOCK_LAGS * lags), 2, MAX_BLOCKS)
+    )  # fmt: skip
+    sums, counts = block_covariances(records, lags, blocks)
+    mean = sums.sum(axis=0) / counts.sum()
+    channels = mean.shape[1]
+    index = np.add.outer(np.arange(rows + 1), np.arange(rows)) + 1
+
+    def hankel(covariances):
+        return covariances[index].transpose(0, 2, 1, 3).reshape((rows + 1) * channels, -1)
+
+    weight = _past_weight(mean, rows) if data_driven else None
+
+    def weighted(matrix):
+        return matrix if weight is None else matrix @ weight
+
+    left, values, right = np.linalg.svd(weighted(hankel(mean)))
+    count = len(counts)
+    scale = np.sqrt(count / max(count - 1, 1))
+    rotated = np.stack(
+        [
+            scale * (left.T @ weighted(hankel((one - size * mean) / counts.sum()))) @ right.T
+            for one, size in zip(sums, counts, strict=True)
+        ]
+    )
+    total_variance = np.einsum("cc->c", mean[0])
+    return Subspace(left, values, right.T, rotated, channels, 1 / rate, total_variance)
+
+
+def _past_weight(mean, rows):
+    """Inverse square root of the covariance of the past outputs, a block Toeplitz matrix."""
+    channels = mean.shape[1]
+    blocks = np.empty((rows, rows, channels, channels))
+    for i in range(rows):
+        for j in range(rows):
+            blocks[i, j] = mean[j - i] if j >= i else mean[i - j].T
+    toeplitz = blocks.transpose(0, 2, 1, 3).reshape(rows * channels, -1)
+    sizes, vectors = np.linalg.eigh((toeplitz + toeplitz.T) / 2)
+    kept = np.maximum(sizes, 1e-10 * sizes[-1])
+    return vectors @ (vectors / np.sqrt(kept)).T
+
+
+class _Realisation(NamedTuple):
+    """Model of one order: eigenvalues, right and left eigenvectors, pseudo-inverse and matrix."""
+
+    eigenvalues: Complex[np.ndarray, " state"]
+    vectors: Complex[np.ndarray, "state state"]
+    lefts: Complex[np.ndarray, "state state"]
+    inverse: Float[np.ndarray, "state row"]
+    system: Float[np.ndarray, "state state"]
+
+
+def _realise(subspace: Subspace, order: int) -> _Realisation:
+    """State matrix by shift invariance of the first left singular vectors."""
+    basis, c = subspace.left[:, :order], subspace.channels
+    q, r = np.linalg.qr(basis[:-c])
+    inverse = np.linalg.solve(r, q.T)
+    system = inverse @ basis[c:]
+    eigenvalues, vectors = np.linalg.eig(system)
+    return _Realisation(eigenvalues, vectors, np.linalg.pinv(vectors), inverse, system)
+
+
+def poles_of_order(subspace: Subspace, order: int) -> Poles:
+    """Poles of the model of an even order; the state matrix is that of `order` singular vectors."""
+    model = _realise(subspace, order)
+    keep = (model.eigenvalues.imag > 0) & (np.abs(model.eigenvalues) > 1e-6)
+    eigenvalues = model.eigenvalues[keep]
+    shapes = (subspace.left[: subspace.channels, :order] @ model.vectors[:, keep]).T
+    energies = _energies(subspace, order, eigenvalues, model.vectors[:, keep], model.lefts[keep])
+    norms = np.linalg.norm(shapes, axis=1, keepdims=True)
+    return Poles(
+        np.full(eigenvalues.size, order),
+        np.log(eigenvalues) / subspace.step,
+        shapes / np.maximum(norms, 1e-300),
+        energies,
+    )
+
+
+def spread(subspace: Subspace, order: int, pole: complex) -> Spread:
+    """First-order uncertainty of a pole of the model of an order.
+
+    A perturbation of the singular vectors within their span changes the basis of the state only, so
+    that the part outside of it moves poles and shapes:
+
+        u_l^T du_k = (s_k K_lk + s_l K_kl) / (s_k^2 - s_l^2),   K = U^T dH V,   l > order >= k.
+    """
+    c, step, s = subspace.channels, subspace.step, subspace.values
+    model = _realise(subspace, order)
+    which = int(np.argmin(np.abs(np.log(model.eigenvalues + 0j) / step - pole)))
+    eigenvalue, vector = model.eigenvalues[which], model.vectors[:, which]
+    basis, complement, rank = subspace.left[:, :order], subspace.left[:, order:], s.size
+    inner, outer, k = s[:order], s[order:], subspace.rotated
+    outside = np.zeros((len(k), subspace.left.shape[0] - order, order))
+    gap = inner**2 - outer[:, None] ** 2
+    gap = np.where(gap <= 1e-12 * s[0] ** 2, np.inf, gap)
+    outside[:, : rank - order] = (
+        inner * k[:, order:rank, :order]
+        + outer[:, None] * k[:, :order, order:rank].transpose(0, 2, 1)
+    ) / gap
+    outside[:, rank - order :] = k[:, rank:, :order] / np.maximum(inner, 1e-12 * s[0])
+    moved = outside @ vector  # block, complement
+    # dA phi = O+ (dO_lower - lambda dO_upper) phi + (O^T O)^-1 dO_upper^T (O_lower - O_upper A) phi
+    turn = model.inverse @ (complement[c:] - eigenvalue * complement[:-c])
+    misfit = complement[:-c].T @ ((basis[c:] - basis[:-c] @ model.system) @ vector)
+    gram = model.inverse @ model.inverse.T
+    changes = moved @ turn.T + (outside.transpose(0, 2, 1) @ misfit) @ gram.T
+    modal = changes @ model.lefts.T  # block, state
+    poles = np.log(eigenvalue) / step
+    pole_changes = modal[:, which] / (eigenvalue * step)
+    size = np.abs(poles)
+    radial = np.real(np.conj(poles) * pole_changes) / size
+    stacked = np.stack(
+        [radial / (2 * np.pi), -pole_changes.real / size + poles.real * radial / size**2], axis=-1
+    )
+    # Shape C phi, with the largest component one.
+    distance = eigenvalue - model.eigenvalues
+    others = np.where(np.arange(order) == which, 0, 1 / np.where(distance == 0, np.inf, distance))
+    vector_changes = (modal * others) @ model.vectors.T
+    shape = basis[:c] @ vector
+    shape_changes = moved @ complement[:c].T + vector_changes @ basis[:c].T
+    largest = int(np.argmax(np.abs(shape)))
+    unit = shape / shape[largest]
+    unit_changes = (shape_changes - shape_changes[:, [largest]] * unit) / shape[largest]
+    parts = np.concatenate([unit_changes.real, unit_changes.imag], axis=1)
+    return Spread(stacked.T @ stacked, unit, parts.T @ parts, float(max(len(k) - 1, 1)))
+
+
+def _energies(subspace: Subspace, order, eigenvalues, modes, lefts):
+    """Share of each mode in the variance of the outputs, from R_0 = sum_k 2 Re(C m l G / p)."""
+    c = subspace.channels
+    observed = subspace.left[:c, :order] @ modes
+    controlled = lefts @ (subspace.values[:order, None] * subspace.right[:c, :order].T)
+    variance = 2 * np.real(observed * controlled.T / eigenvalues)
+    scale = np.maximum(subspace.total, 1e-300)
+    return np.mean(variance / scale[:, None], axis=0)
