@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
-from jaxbeam.cli.arguments import TABLE_SUFFIXES, check_suffix, figure_path
+from jaxbeam.cli.arguments import check_suffix, figure_path
 from jaxbeam.cli.options import CaseOptions, Output, table
+from jaxbeam.files.endings import TABLES
 
 
 def influence(
@@ -39,7 +40,7 @@ def influence(
     plot
         Draw them to CASE_influence.png in this folder, or beside the output.
     """
-    check_suffix(output, TABLE_SUFFIXES[0], "a table of influence lines", TABLE_SUFFIXES[1:])
+    check_suffix(output, TABLES[0], "a table of influence lines", TABLES[1:])
     picture = figure_path(output, case.with_stem(f"{case.stem}_influence")) if plot else None
     options.check_outputs(output, picture)
     parsed_case = options.read(case)
