@@ -25,10 +25,11 @@ TEXT = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for 
 
 def command_lines(program: str) -> list[str]:
     """Lines of code blocks that call a program, continued lines joined, without comments."""
-    blocks = re.findall(
-        r"^```(?:\w*|\{run-command\})\n(.*?)^```", "\n".join(TEXT.values()), re.M | re.S
+    found = re.findall(
+        r"^(?:```|:::)(\S*)[^\n]*\n(.*?)^(?:```|:::)$", "\n".join(TEXT.values()), re.M | re.S
     )
-    blocks = [block for block in blocks if ":fails:" not in block]
+    blocks = [text for kind, text in found if kind in ("", "console", "{run-command}")]
+    blocks = [text for text in blocks if ":fails:" not in text]
     lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
     return [re.sub(r"\s+#.*", "", line) for line in lines if line.startswith(f"{program} ")]
 
@@ -55,7 +56,7 @@ def test_commands_are_accepted(capsys, line):
 
 def test_options_exist():
     named = {option for span in spans() for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", span)}
-    modules = {"--quick", "--modes", "--keep", "--extra"}  # of benchmarks and of uv
+    modules = {"--quick", "--modes", "--keep", "--extra", "--group"}  # of benchmarks and of uv
     assert named - modules <= options_of_commands()
 
 

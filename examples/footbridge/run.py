@@ -8,11 +8,11 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 
 
-def main(out: Path = Path("out/examples")) -> dict[float, float]:
+def main(out: Path = Path("out/examples"), count: int = 17) -> dict[float, float]:
     """Peak accelerations (m/s^2) at midspan by pace (Hz), printed and drawn."""
     case = jb.load_case(Path(__file__).parent / "case.toml")
     peaks = {}
-    for pace in np.linspace(1.6, 2.4, 17):
+    for pace in np.linspace(1.6, 2.4, count):
         record = jb.simulate(jb.replace(case, {"loads.0.pace": pace}))
         peaks[round(float(pace), 3)] = float(abs(record.sensor_values[:, 0]).max())
     worst = max(peaks, key=lambda pace: peaks[pace])

@@ -7,8 +7,8 @@ import numpy as np
 import jaxbeam as jb
 from jaxbeam.plot import plot_record
 
-TOLERANCE = 5e-6  # m, within which the tool must stay
-STOP = 0.65  # s
+TOLERANCE = 1e-5  # m, within which the tool must stay
+STOP = 3.0 / 4.5  # s
 
 
 def main(out: Path = Path("out/examples")) -> float:
