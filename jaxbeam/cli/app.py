@@ -18,6 +18,7 @@ from jaxbeam.cli.commands.export import export
 from jaxbeam.cli.commands.frequency import frf, modes, state_space
 from jaxbeam.cli.commands.identify import identify
 from jaxbeam.cli.commands.models import compare_models, design_experiment
+from jaxbeam.cli.commands.modes_from_log import modes_from_log
 from jaxbeam.cli.commands.new import new
 from jaxbeam.cli.commands.schema import schema
 from jaxbeam.cli.commands.simulate import simulate
@@ -32,7 +33,14 @@ COMMANDS = {
     "Simulation": (new, check, describe, modes, frf, simulate, sweep),
     "Engineering": (assess, influence),
     "Control": (compare, stability, state_space, tune, export),
-    "Identification": (identify, identify_responses, weigh, compare_models, design_experiment),
+    "Identification": (
+        identify,
+        modes_from_log,
+        identify_responses,
+        weigh,
+        compare_models,
+        design_experiment,
+    ),
     "Other": (demo, reproduce, schema, native),
 }
 

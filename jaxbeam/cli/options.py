@@ -32,7 +32,10 @@ PICTURES = (".png", ".svg", ".pdf")
 Output = Annotated[Path | None, Parameter(("-o", "--output"))]
 Free = Annotated[
     tuple[str, ...],
-    Parameter(help="ADDRESS[=LOW:HIGH]: a free parameter and its bounds; repeat it for more."),
+    Parameter(
+        help="ADDRESS[=LOW:HIGH]: a free parameter and its bounds, also with units, as"
+        " beam.flexural_rigidity='8 GN m^2:12 GN m^2'; repeat it for more."
+    ),
 ]
 Over = Annotated[
     tuple[str, ...],

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.case import Case
+from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
 from jaxbeam.case.loads.force_history import ForceHistory
 from jaxbeam.case.loads.vehicle_model import VehicleModel
@@ -144,6 +145,14 @@ class LoadSet(Module):
         for group in self.wheels.vehicles:
             on_ground[group.wheels] = True
         return on_ground
+
+    @property
+    def prescribed(self) -> Bool[np.ndarray, " wheel"]:
+        """Whether the force of each wheel is given: neither mass nor spring can change it."""
+        inertia = self.wheels.inertia
+        if is_jax(inertia) and not is_concrete(inertia):
+            return np.zeros(self.wheel_count, bool)
+        return ~np.any(concrete(inertia), axis=1) & ~self.on_ground
 
     @property
     def load_of_wheel(self) -> list[int]:

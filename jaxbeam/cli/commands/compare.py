@@ -50,6 +50,7 @@ def compare(
     parsed_case = options.read(case)
 
     from jaxbeam.analysis.compare import compare, metrics_over_cases
+    from jaxbeam.case.display.addresses import value_words
     from jaxbeam.case.validation import check_case
 
     laws = _read_controllers(case, parsed_case, controllers)
@@ -69,7 +70,8 @@ def compare(
     overall = metrics_over_cases(comparisons)
     lines = []
     for run, comparison in zip(runs, comparisons, strict=True):
-        lines.append("; ".join(f"{address} = {value:g}" for address, value in run.items()))
+        values_in_words = (value_words(parsed_case, *one) for one in run.items())
+        lines.append("; ".join(values_in_words))
         lines += _lines(comparison)
     options.report(
         {

@@ -6,6 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from jaxbeam.cli.arguments import (
+    bounds_in_si,
     check_exists,
     check_suffix,
     named_number,
@@ -142,7 +143,8 @@ def tune(
     import tuning  # sets XLA's threads, therefore before the case is read
 
     parsed_case = options.read(case)
-    loads = tuning.read_load_cases(cases)
+    bounds = bounds_in_si(parsed_case, bounds)
+    loads = tuning.read_load_cases(cases, parsed_case)
     if fit is not None:
         parsed_case, loads = _with_identified_plant(
             parsed_case, loads, fit, plants, posterior, seed
