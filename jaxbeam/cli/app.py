@@ -9,9 +9,8 @@ from typing import NoReturn
 
 from cyclopts import App, CycloptsError, Group, Parameter
 
-from jaxbeam.cli.commands.check import check
 from jaxbeam.cli.commands.compare import compare
-from jaxbeam.cli.commands.describe import describe
+from jaxbeam.cli.commands.describe import check, describe
 from jaxbeam.cli.commands.engineering.assess import assess
 from jaxbeam.cli.commands.engineering.influence import influence
 from jaxbeam.cli.commands.export import export

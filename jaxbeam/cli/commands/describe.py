@@ -1,11 +1,13 @@
-"""Command about cases and vehicles: `describe`."""
+"""Commands about cases and vehicles: `describe`, `check`."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jaxbeam as jb
 from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.cli.options import (
+    CaseOptions,
     DrawingOptions,
     OutputOptions,
     PrintOptions,
@@ -19,6 +21,22 @@ if TYPE_CHECKING:
     from jaxbeam.case.loads.vehicle_model import VehicleModel
 
 GRAVITY = 9.81  # m/s^2, of vehicles without a case
+
+
+def check(case: Path, /, *, options: CaseOptions = CaseOptions()) -> None:
+    """Check a case without running it: errors, and warnings of what looks wrong, as units.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML.
+    """
+    found = jb.check(options.read(case))
+    for warning in found.warnings:
+        print_message(f"warning: {warning}")
+    number = len(found.warnings)
+    words = "nothing looks wrong" if not number else f"{number} warning{'s' * (number > 1)}"
+    options.report(numbers_of(found), [f"plausibility: {found}", words])
 
 
 def describe(
@@ -73,8 +91,6 @@ def describe(
 
 def _about_case(path: str) -> tuple[dict[str, Any], list[str]]:
     """What a case is, in numbers by their names in JSON and in words."""
-    import jaxbeam as jb
-
     case = jb.load_case(path)
     found, frequencies = jb.check(case), jb.modes(case).frequencies
     for warning in found.warnings:
