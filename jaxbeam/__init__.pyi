@@ -74,6 +74,7 @@ from .control.optimal.crossing_lqr import (
     FiniteLQR as FiniteLQR,
     StepLQR as StepLQR,
 )
+from .control.optimal.integral_lqr import IntegralLQR as IntegralLQR
 from .control.optimal.lqr import LQR as LQR
 from .control.optimal.sampled_lqr import DiscreteLQR as DiscreteLQR
 from .control.optimal.sampling_loss import sampling_limit as sampling_limit
