@@ -1,5 +1,6 @@
 """Loads of a run: trajectories of their wheels, numbers of the wheels, vehicles above them."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -92,6 +93,22 @@ class WheelSet(Module):
     damping: Float[Array, "wheel batch"] | None = None
     vehicles: tuple[VehicleGroup, ...] = ()
     histories: dict[int, ForceHistory] = eqx.field(default_factory=dict)
+
+    def scaled(self, factor: Float[Array, ""]) -> "WheelSet":
+        """Wheels and vehicles of similar loads, with all masses, springs and dampers in proportion.
+
+        The frequencies of the vehicles stay. Forces over time stay as they are.
+        """
+        groups = tuple(
+            dataclasses.replace(group, B=group.B / factor, H=group.H * factor)
+            for group in self.vehicles
+        )
+        springs = [
+            part if part is None else part * factor for part in (self.stiffness, self.damping)
+        ]
+        return WheelSet(
+            self.inertia * factor, self.weight * factor, *springs, groups, self.histories
+        )
 
 
 class LoadSet(Module):

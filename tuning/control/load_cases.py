@@ -11,10 +11,11 @@ import jax
 import numpy as np
 from scipy.stats.qmc import LatinHypercube
 
-from jaxbeam.case.case import Case, crossing_times, replace
+from jaxbeam.case.case import Case, crossing_times, replace, unit_at, value_at
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.reading.tables import COUNT, NUMBERS, TABLE, check_entry, check_table
 from jaxbeam.case.reading.toml_file import read_toml
+from jaxbeam.case.reading.units import in_si, is_quantity
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.files.case_file import with_settings
 
@@ -94,24 +95,25 @@ def latin_hypercube(
     return tuple(dict(zip(ranges, map(float, row), strict=True)) for row in rows)
 
 
-def read_load_cases(path: str | os.PathLike) -> LoadCases:
+def read_load_cases(path: str | os.PathLike, case: Case | None = None) -> LoadCases:
     """Read load cases from a TOML file with tables [training] and [held_out].
 
     Each table has lists of values by address in quotes, such as "loads.0.mass" = [0.2, 0.5]; its
     runs are all combinations. With `draws = 12` (and `seed = 1`, 0 if left out) the lists are
-    ranges, low and high, of which the runs are a Latin hypercube.
+    ranges, low and high, of which the runs are a Latin hypercube. With the `case` whose values they
+    are, entries may have units: "loads.0.speed" = ["60 km/h", "90 km/h"].
 
     Raises ValueError, naming the file and the key, for faulty content; OSError if the file cannot
     be read.
     """
     content = read_toml(path, "file of load cases")
     try:
-        return _load_cases(content)
+        return _load_cases(content, case)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _load_cases(content: dict[str, Any]) -> LoadCases:
+def _load_cases(content: dict[str, Any], case: Case | None) -> LoadCases:
     """Load cases from the tables of their file."""
     unknown = set(content) - set(TABLES)
     if unknown:
@@ -122,6 +124,10 @@ def _load_cases(content: dict[str, Any]) -> LoadCases:
         table = dict(content.get(name, {}))
         draw_options = {key: table.pop(key) for key in ("draws", "seed") if key in table}
         for address, entries in table.items():
+            if case is not None and isinstance(entries, list) and any(map(is_quantity, entries)):
+                value_at(case, address)  # says what is wrong with the address
+                entries = in_si(entries, unit_at(case, address), f"{name}.{address}")
+                table[address] = entries
             check_entry(f"{name}.{address}", entries, VALUES)
         runs[name] = _table_runs(table, draw_options, name)
     return LoadCases(**runs)

@@ -2,7 +2,13 @@
 
 from pathlib import Path
 
-from jaxbeam.cli.arguments import check_exists, parse_bounds, parse_range, refuse_option
+from jaxbeam.cli.arguments import (
+    bounds_in_si,
+    check_exists,
+    parse_bounds,
+    parse_range,
+    refuse_option,
+)
 from jaxbeam.cli.options import CaseOptions, Free, Output
 
 
@@ -100,7 +106,7 @@ def identify_responses(
 
     parsed_case = options.read(case)
     measured = tuning.responses_of(tuning.read_log(log), segment)
-    fit = tuning.identify_responses(parsed_case, measured, bounds)
+    fit = tuning.identify_responses(parsed_case, measured, bounds_in_si(parsed_case, bounds))
     if output:
         save_case(fit.case, output, overwrite=True)  # checked before the work
     options.report(fit.to_dict(), [str(fit)], output)
