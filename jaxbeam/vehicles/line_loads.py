@@ -31,7 +31,8 @@ def line_loads() -> dict[str, CodeLineLoad]:
     names = ("force_per_length", "lengths", "gaps", "axle_offsets", "axle_forces")
     return {
         table["name"]: CodeLineLoad(
-            *(np.array(table.get(name, []), float) for name in names), content["source"]
+            source=content["source"],
+            **{name: np.array(table.get(name, []), float) for name in names},
         )
         for table in content["loads"]
     }

@@ -13,6 +13,9 @@ from jaxbeam.case.loads.planar.vehicle import PlanarVehicle
 from jaxbeam.case.loads.vehicle_model import VehicleModel
 from jaxbeam.runtime.arrays import Array, block_diag, xp
 
+PER_WHEEL = ("static_loads", "wheel_masses", "contact_stiffness", "contact_damping")
+MATRICES = ("mass", "damping", "stiffness")
+
 
 class Coach(eqx.Module):
     """Vehicles of one kind in a train, `count` one behind the other.
@@ -82,8 +85,6 @@ class TrainLoad(AbstractVehicleLoad):
 def _coupled(models: list[VehicleModel], behind) -> VehicleModel:
     """Vehicles one behind the other as one; names begin with the number of each, from 1."""
     names = tuple(f"coach {i + 1} {name}" for i, one in enumerate(models) for name in one.names)
-    lists = ("static_loads", "wheel_masses", "contact_stiffness", "contact_damping")
-    matrices = ("mass", "damping", "stiffness")
     rows, column = [], 0
     for one in models:
         size, dofs = one.wheel_map.shape
@@ -91,10 +92,7 @@ def _coupled(models: list[VehicleModel], behind) -> VehicleModel:
         row = xp.zeros((size, column)), one.wheel_map, xp.zeros((size, rest))
         rows.append(xp.concatenate(row, axis=1))
         column += dofs
-    return VehicleModel(
-        xp.concatenate(behind),
-        *(xp.concatenate([getattr(one, name) for one in models]) for name in lists),
-        *(block_diag(*(getattr(one, name) for one in models)) for name in matrices),
-        xp.concatenate(rows),
-        names,
-    )
+    lists = {name: xp.concatenate([getattr(one, name) for one in models]) for name in PER_WHEEL}
+    matrices = {name: block_diag(*(getattr(one, name) for one in models)) for name in MATRICES}
+    offsets, wheel_map = xp.concatenate(behind), xp.concatenate(rows)
+    return VehicleModel(offsets=offsets, wheel_map=wheel_map, names=names, **lists, **matrices)
