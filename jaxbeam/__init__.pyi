@@ -32,6 +32,7 @@ from .case.filters import Filter as Filter
 from .case.loads.axles import Axles as Axles
 from .case.loads.force import MovingForce as MovingForce
 from .case.loads.half_car import HalfCar as HalfCar
+from .case.loads.line_load import LineLoad as LineLoad
 from .case.loads.mass import MovingMass as MovingMass
 from .case.loads.oscillator import Oscillator as Oscillator
 from .case.loads.planar.files import load_vehicle as load_vehicle
@@ -42,6 +43,7 @@ from .case.loads.planar.parts import (
     VehicleSpring as VehicleSpring,
 )
 from .case.loads.planar.sensors import VehicleSensor as VehicleSensor
+from .case.loads.planar.train import Coach as Coach, TrainLoad as TrainLoad
 from .case.loads.quarter_car import QuarterCar as QuarterCar
 from .case.loads.varying_force import VaryingForce as VaryingForce
 from .case.loads.vehicle import VehicleLoad as VehicleLoad

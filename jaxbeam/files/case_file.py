@@ -64,10 +64,12 @@ def read_case(path: str | os.PathLike) -> Case:
 def _find_vehicle_files(content: dict[str, Any], folder: Path) -> None:
     """Paths of vehicle files, which are relative to the case file, as they are from here."""
     loads = content.get("loads")
-    for table in loads if isinstance(loads, list) else ():
-        model = table.get("model") if isinstance(table, dict) else None
-        if isinstance(model, str) and is_path(model):
-            table["model"] = str(folder / model)
+    for load in loads if isinstance(loads, list) else ():
+        coaches = load.get("coaches") if isinstance(load, dict) else None
+        for table in (load, *(coaches if isinstance(coaches, list) else ())):
+            model = table.get("model") if isinstance(table, dict) else None
+            if isinstance(model, str) and is_path(model):
+                table["model"] = str(folder / model)
 
 
 def load_controller(path: str | os.PathLike) -> AbstractController:

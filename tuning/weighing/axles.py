@@ -115,8 +115,8 @@ class AxleWeighing:
             *text_table(header, rows, ">>><><"),
             f"gross weight by Moses' method {gross / 1e3:.5g} kN, standard error"
             f" {gross_error / 1e3:.3g} kN, at {geometry.speed:.4g} m/s",
-            f"dynamic wheel forces of {self.dynamic.share:.2g} of the static ones (standard"
-            " deviation) are in these intervals, not in those below",
+            f"the intervals above allow for dynamic wheel forces of {self.dynamic.share:.2g} of the"
+            " static ones (standard deviation), those below do not",
         ]
         return "\n".join([*lines, "", str(self.fit)])
 
