@@ -24,7 +24,7 @@ from jaxbeam.analysis.assessment.formulas import (
 )
 from jaxbeam.analysis.assessment.high_speed import TrainResponse, train_response
 from jaxbeam.analysis.assessment.static_loads import (
-    Section,
+    CheckedSection,
     largest_under_lm71,
     largest_under_train,
     tabulated_line,
@@ -307,8 +307,8 @@ def _train_checks(case, trains, speeds, track, factors) -> list[CodeCheck]:
         if p.name.startswith("support") and 0 < p.x < float(concrete(case.beam.length))
     ]
     sections = [
-        *(Section(f"moment at {p.name}", "moment", p.x) for p in (*middles, *inner)),
-        *(Section(f"deflection at {p.name}", "deflection", p.x) for p in middles),
+        *(CheckedSection(f"moment at {p.name}", "moment", p.x) for p in (*middles, *inner)),
+        *(CheckedSection(f"deflection at {p.name}", "deflection", p.x) for p in middles),
     ]
     sensors = (
         *(Sensor(p.x, "acceleration") for p in decks),
@@ -346,7 +346,11 @@ def _acceleration_check(case, decks, responses, track: str, speeds) -> CodeCheck
 
 
 def _section_checks(
-    case: Case, sections: list[Section], responses: list[TrainResponse], first: int, factors: Any
+    case: Case,
+    sections: list[CheckedSection],
+    responses: list[TrainResponse],
+    first: int,
+    factors: Any,
 ) -> list[CodeCheck]:
     """HSLM with irregularities of the track, against alpha Phi LM71, at each section."""
     length, frequency, highest, maintenance, classification = factors
