@@ -127,8 +127,16 @@ def record_envelope(
             other = xp.where(larger, every[0], every[-1])
         low, high = (_extremes(sign * sides, times, motion, other, sign) for sign in (-1.0, 1.0))
         found.append([*low[:3], *high[:3], *low[3:], *high[3:]])
-    joined = list(map(xp.concatenate, zip(*found, strict=True)))
-    return RecordEnvelope(positions, *joined[:6], quantity, *joined[6:], coincident=coincident)
+    low, low_time, low_place, high, high_time, high_place, *others = map(
+        xp.concatenate, zip(*found, strict=True)
+    )
+    with_low, with_high = others or (None, None)
+    return RecordEnvelope(
+        *(positions, low, low_time, low_place, high, high_time, high_place, quantity),
+        smallest_coincident=with_low,
+        largest_coincident=with_high,
+        coincident=coincident,
+    )
 
 
 def _extremes(values, times, motion: Motion, other, sign: float):
