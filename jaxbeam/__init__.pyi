@@ -1,8 +1,3 @@
-from .analysis.amplification import (
-    Envelope as Envelope,
-    amplification as amplification,
-    envelope as envelope,
-)
 from .analysis.assessment.assess import assess as assess
 from .analysis.assessment.assessment import Assessment as Assessment, CodeCheck as CodeCheck
 from .analysis.bound.bound import bound as bound
@@ -16,6 +11,11 @@ from .analysis.ride import (
     weighted_acceleration as weighted_acceleration,
     weighted_rms as weighted_rms,
     wheel_unloading as wheel_unloading,
+)
+from .analysis.sections.amplification import (
+    Envelope as Envelope,
+    amplification as amplification,
+    envelope as envelope,
 )
 from .analysis.sections.characteristic_points import characteristic_points as characteristic_points
 from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
