@@ -111,6 +111,8 @@ def _under_loads(
     ends = np.where(windows < NEVER, windows, np.nan)
     start = float(np.nanmin(ends[:, 0])) if np.isfinite(ends[:, 0]).any() else 0.0
     last = max(float(np.nanmax(np.append(ends, start))), start)
+    if np.any(windows[:, 1] >= NEVER):  # a load that stays on the beam
+        last = max(last, float(case.run.duration))
     times = np.linspace(start, last, TIMES)
     position, speed, _ = map(np.asarray, loads.kinematics(times))
     x = np.linspace(0.0, float(case.beam.length), POSITIONS)

@@ -123,9 +123,9 @@ class CaseOptions(OutputOptions):
             a: parse_value(v) for a, v in (parse_assignment("--set", text) for text in self.set_)
         }
         enable_compile_cache()
-        from jaxbeam.files.case_file import with_settings
+        from jaxbeam.files.case_file import load_case_with
 
-        return with_settings(jb.load_case(path), changes)
+        return load_case_with(path, changes)
 
 
 @Parameter(name="*")

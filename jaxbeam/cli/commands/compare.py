@@ -125,6 +125,7 @@ def _metrics_to_dict(metrics: "PerformanceMetrics") -> dict:
     margin = metrics.stability_margin
     unstable = margin.unstable
     stability_margin = {
+        "verdict": margin.verdict,
         "gain": margin.gain,
         "delay": margin.delay,
         "obstacle": margin.obstacle,
@@ -203,7 +204,8 @@ def _lines(comparison: "Comparison") -> list[str]:
 def _margin_text(metrics: "PerformanceMetrics", number: float) -> str:
     if metrics.stability_margin.obstacle:
         return "-"
-    return "unstable" if metrics.stability_margin.gain == 0 else f"{number:.3g}"
+    margin = metrics.stability_margin
+    return margin.verdict if margin.verdict == "unstable" else f"{number:.3g}"
 
 
 def _overall_to_dict(metrics: "MetricsOverCases") -> dict:

@@ -67,7 +67,15 @@ def simulate(
 
     amplification = record_amplification(record)
     content = _to_dict(record, amplification) | {"plausibility": plausibility}
-    options.report(content, _lines(record, amplification), output, picture, animate)
+    lines = _lines(record, amplification)
+    controller = parsed_case.controller
+    if controller is not None and not controller.open_loop:
+        from jaxbeam.analysis.crossing_margin import stability_margin
+
+        margin = stability_margin(parsed_case)
+        content["stability"] = margin.verdict
+        lines.append(f"the loop is {margin}")
+    options.report(content, lines, output, picture, animate)
 
 
 def _to_dict(record: "jb.Record", amplification: "list[float | None]") -> dict:

@@ -225,10 +225,20 @@ def _write_and_print(result, tuned, files, picture, pictures, options: CaseOptio
     if picture:
         drawn = result if hasattr(result, "plot") else tuned[0]
         pictures.save(pictures.titled(drawn.plot()), picture)
-    summaries = [one.to_dict() for one in tuned]
+    from jaxbeam.analysis.crossing_margin import stability_margin
+
+    loops = [stability_margin(one.case) for one in tuned]
+    summaries = [
+        one.to_dict() | {"stability": loop.verdict} for one, loop in zip(tuned, loops, strict=True)
+    ]
+    closed = [
+        f"the tuned loop is {loop}"
+        for one, loop in zip(tuned, loops, strict=True)
+        if not one.case.controller.open_loop
+    ]
     options.report(
         summaries[0] if len(summaries) == 1 else {"front": summaries},
-        [str(result)],
+        [str(result), *closed],
         *files,
         picture,
     )

@@ -20,6 +20,8 @@ def weigh(
     speeds: str,
     max_loads: int = 3,
     one_way: bool = False,
+    axles: int | None = None,
+    calibration: Path | None = None,
     output: Output = None,
     options: CaseOptions = CaseOptions(),
 ) -> None:
@@ -37,21 +39,34 @@ def weigh(
         Largest number of loads to try.
     one_way
         Search loads from the left only.
+    axles
+        Weigh one vehicle or train of so many axles: their forces and spacings.
+    calibration
+        Log of a vehicle of known axle loads (in the TOML file beside it), for the influence lines.
     output
         Write the case with the identified loads to this file, TOML.
     """
     options.check_outputs(output)
     speed_range = parse_range("--speeds", speeds, "m/s, such as 0.5:3")
     check_exists("log file", log)
+    if calibration is not None:
+        check_exists("log file", calibration)
+        refuse_option(axles is None, "--calibration is for Moses' method: say how many --axles")
     options.check_case(case)
 
     import tuning  # sets XLA's threads, therefore before the case is read
     from jaxbeam.files.case_file import save_case
 
-    parsed_case = options.read(case)
-    weighing = tuning.weigh(
-        parsed_case, tuning.read_log(log), speed_range, max_loads, both_ways=not one_way
-    )
+    parsed_case, read = options.read(case), tuning.read_log(log)
+    if axles is None:
+        weighing = tuning.weigh(parsed_case, read, speed_range, max_loads, both_ways=not one_way)
+    else:
+        lines = None
+        if calibration is not None:
+            lines = tuning.calibrate_influence_lines(parsed_case, tuning.read_log(calibration))
+        weighing = tuning.weigh_axles(
+            parsed_case, read, speed_range, axles, both_ways=not one_way, influence_lines=lines
+        )
     if output:
         save_case(weighing.fit.case, output, overwrite=True)  # checked before the work
     options.report(weighing.to_dict(), [str(weighing)], output)
