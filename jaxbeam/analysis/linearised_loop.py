@@ -6,6 +6,8 @@ delayed commands. The matrices are derivatives of the loop's dynamics, so every 
 them. Limits, ranges and resolution are left out.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -16,6 +18,7 @@ from jaxbeam.analysis.frozen_loop import PERIOD_TOLERANCE, LoopDynamics, LoopTim
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
+from jaxbeam.model.linear_system import Signal, StateSpace
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.arrays import Array, known, scan, solve, stop_gradient, xp, zeros
 from jaxbeam.runtime.compiling import LOW_OPTIMISATION, compiled
@@ -42,6 +45,21 @@ class LinearisedLoop(eqx.Module):
     def closed_matrix(self) -> Float[Array, "state state"]:
         """State matrix A + B K of the closed loop."""
         return self.A + self.B @ self.K
+
+    def to_control(self) -> Any:
+        """A `control.StateSpace` of python-control: the loop opened at the commands.
+
+        From the commands that act to those that the law returns, L(s) = K (s - A)^-1 B; with
+        `control.feedback(loop, sign=1)` the loop is closed. Raises ImportError, saying what to
+        install, if that package is missing.
+        """
+        commands = tuple(Signal(f"command_{i}", "") for i in range(self.B.shape[1]))
+        states = tuple(Signal(f"x_{i}", "") for i in range(self.A.shape[0]))
+        returned = tuple(Signal(f"law_{i}", "") for i in range(self.B.shape[1]))
+        D, period = xp.zeros((len(returned), len(commands))), self.period
+        period = None if period is None else xp.asarray(period)
+        signals = states, commands, returned
+        return StateSpace(self.A, self.B, self.K, D, *signals, period).to_control()
 
     def growth_rate(self) -> Float[Array, ""]:
         """Largest real part of the poles in 1/s; differentiable to first order, on a CPU.

@@ -66,6 +66,7 @@ def source_text(name: str, title: list[str], code: CSource) -> str:
     body = "\n".join(code.lines)
     indices = [i for i in ("i", "j", "sample") if _uses(body, i)]
     declared = [f"    int {', '.join(indices)};"] if indices else []
+    declared += [f"    {variable};" for variable in code.variables]
     unused = [f"    (void){word};" for word in ("measurements", "t") if not _uses(body, word)]
     return f"""{_comment(title)}
 #include "{name}.h"

@@ -15,9 +15,10 @@ from jaxbeam.cli.commands.describe import describe
 from jaxbeam.cli.commands.engineering.assess import assess
 from jaxbeam.cli.commands.engineering.influence import influence
 from jaxbeam.cli.commands.export import export
-from jaxbeam.cli.commands.frequency import frf, modes
+from jaxbeam.cli.commands.frequency import frf, modes, state_space
 from jaxbeam.cli.commands.identify import identify
 from jaxbeam.cli.commands.models import compare_models, design_experiment
+from jaxbeam.cli.commands.modes_from_log import modes_from_log
 from jaxbeam.cli.commands.new import new
 from jaxbeam.cli.commands.schema import schema
 from jaxbeam.cli.commands.simulate import simulate
@@ -31,8 +32,15 @@ from jaxbeam.cli.options import print_message
 COMMANDS = {
     "Simulation": (new, check, describe, modes, frf, simulate, sweep),
     "Engineering": (assess, influence),
-    "Control": (compare, stability, tune, export),
-    "Identification": (identify, identify_responses, weigh, compare_models, design_experiment),
+    "Control": (compare, stability, state_space, tune, export),
+    "Identification": (
+        identify,
+        modes_from_log,
+        identify_responses,
+        weigh,
+        compare_models,
+        design_experiment,
+    ),
     "Other": (demo, reproduce, schema, native),
 }
 

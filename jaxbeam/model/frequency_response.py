@@ -146,8 +146,8 @@ def frequency_response(
     ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
     ... )
     >>> responses = jb.frequency_response(case, [5.0, 20.0])
-    >>> print(dict(responses.sizes))
-    X
+    >>> print(responses.values.shape)  # frequency, pair
+    (2, 1)
     """
     check_case(case)
     frequencies, masses = (

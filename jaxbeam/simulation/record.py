@@ -17,7 +17,7 @@ from jaxbeam.files.tables import write_result
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.measurement import sensor_readings
-from jaxbeam.model.sensing.output_rows import quantity_history
+from jaxbeam.model.sensing.output_rows import quantity_history, sensor_history
 from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readings
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
@@ -155,10 +155,8 @@ class Record(TableViews, eqx.Module):
     @property
     def sensor_values(self) -> Float[Array, "time sensor"]:
         """True quantity of each sensor in its SI unit: without offset, filters and noise."""
-        columns = [
-            self.at(s.position, s.quantity, s.fibre_distance, s.section_modulus)
-            for s in self.case.sensors
-        ]
+        parts = self.case, self.modes, self.motion
+        columns = [sensor_history(*parts, sensor) for sensor in self.case.sensors]
         return xp.array(columns).reshape(-1, self.times.shape[0]).T
 
     @property

@@ -99,8 +99,12 @@ def record_envelope(
         extremes.append(
             [*_extremes(-sides, times, motion, -1.0), *_extremes(sides, times, motion, 1.0)]
         )
-    joined = map(xp.concatenate, zip(*extremes, strict=True))
-    return RecordEnvelope(positions, *joined, quantity)
+    low, low_time, low_place, high, high_time, high_place = map(
+        xp.concatenate, zip(*extremes, strict=True)
+    )
+    return RecordEnvelope(
+        positions, low, low_time, low_place, high, high_time, high_place, quantity
+    )
 
 
 def _extremes(values, times, motion: Motion, sign: float):

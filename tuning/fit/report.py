@@ -30,8 +30,8 @@ def write_report(
 
     Raises FileExistsError if the folder is not empty and `overwrite` is not set.
 
-    It has `profiles` of parameters, a `posterior`, predictions of `held_out` logs and the comparison with
-    other `models` where they are given.
+    It has `profiles` of parameters, a `posterior`, predictions of `held_out` logs and the
+    comparison with other `models` where they are given.
     """
     sections = report_sections(fit, profiles, posterior, held_out, models)
     title = fit.case.title or "Identification"

@@ -14,8 +14,15 @@ from scipy.stats import t as student
 from tuning.modal.preprocessing import Prepared, prepare
 from tuning.modal.result import IdentifiedMode, rejection_reason
 from tuning.modal.shapes import mac_matrix
-from tuning.modal.stabilisation import Chain, Diagram, chain_scatter, stabilise
-from tuning.modal.subspace import Poles, block_rows, decompose, poles_of_order, spread
+from tuning.modal.stabilisation import Chain, Diagram, stabilise
+from tuning.modal.subspace import (
+    Poles,
+    Spread,
+    block_rows,
+    decompose,
+    poles_of_order,
+    spreads,
+)
 
 MAX_ORDER = 60
 MAX_BAND_RATIO = 8.0  # upper over lower end of the bands that are identified one by one
@@ -75,6 +82,8 @@ def _modes_of_band(prepared: Prepared, whole, data_driven, order):
     records = tuple(record / scale for record in prepared.records)
     channels, longest = records[0].shape[1], max(map(len, records))
     rows = block_rows(prepared.rate, prepared.band[0], channels, longest)
+    if order is not None:
+        rows = max(rows, order // channels + 1)
     subspace = decompose(records, prepared.rate, rows, data_driven)
     highest = order or min(MAX_ORDER, 2 * rows * channels // 3)
     parts = [poles_of_order(subspace, n) for n in range(2, highest + 1, 2)]
@@ -84,19 +93,31 @@ def _modes_of_band(prepared: Prepared, whole, data_driven, order):
     diagram = stabilise(scaled, prepared.band)
     duration = sum(map(len, records)) / prepared.rate
     candidates = []
+    spread_of = _all_spreads(subspace, poles, diagram.chains)
     for chain in diagram.chains:
-        mode = _mode(subspace, poles, chain, scale)
+        mode = _mode(poles, chain, spread_of, scale)
         reason = rejection_reason(mode, duration, whole)
         candidates.append(Candidate(mode, reason, chain.members.size))
     return candidates, diagram
 
 
-def _mode(subspace, poles: Poles, chain: Chain, scale) -> IdentifiedMode:
-    """Mode of a chain: its representative, whose variance includes the scatter over orders."""
-    which = chain.best
-    own = spread(subspace, int(poles.orders[which]), complex(poles.poles[which]))
-    scatter = chain_scatter(poles, chain)
-    variances = np.diag(own.covariance) + np.square(scatter)
+def _all_spreads(subspace, poles: Poles, chains: tuple[Chain, ...]) -> dict[int, Spread]:
+    """Uncertainties of the members of chains, by index."""
+    members = np.concatenate([chain.members for chain in chains]) if chains else np.zeros(0, int)
+    found: dict[int, Spread] = {}
+    for order in np.unique(poles.orders[members]):
+        chosen = members[poles.orders[members] == order]
+        found |= zip(
+            chosen.tolist(), spreads(subspace, int(order), poles.poles[chosen]), strict=True
+        )
+    return found
+
+
+def _mode(poles: Poles, chain: Chain, found: dict[int, Spread], scale) -> IdentifiedMode:
+    """Mode of a chain: its pole with the least uncertainty, by the determinant of covariance."""
+    which = min(chain.members.tolist(), key=lambda k: np.linalg.det(found[k].covariance))
+    own = found[which]
+    variances = np.diag(own.covariance)
     physical = own.shape * scale
     largest = int(np.argmax(np.abs(physical)))
     # The largest component in the units of the log may be another: the covariance follows.

@@ -153,14 +153,11 @@ class ModalFit:
             ],
         }
 
-    def plot(self, path=None):
-        """Figure of log, spectrum and fit; saved to `path` if given."""
+    def plot(self, path=None, length: float | None = None):
+        """Figure of log, spectrum with stabilisation diagram, fit, and shapes on the beam.
+
+        `length` (m) is that of the beam; it is saved to `path` if given.
+        """
         from tuning.modal.plot import plot_modal_fit
 
-        return plot_modal_fit(self, path)
-
-    def plot_shapes(self, path=None, length: float | None = None):
-        """Figure of mode shapes on the beam and their MAC matrix; saved to `path` if given."""
-        from tuning.modal.shape_plot import plot_mode_shapes
-
-        return plot_mode_shapes(self, path, length)
+        return plot_modal_fit(self, path, length)

@@ -1,4 +1,4 @@
-"""Figure of identified modes: the log and its window, the spectrum, the fit and its residual."""
+"""Figure of identified modes: log and windows, spectrum with stabilisation diagram, fit, shapes."""
 
 from pathlib import Path
 
@@ -7,17 +7,23 @@ from matplotlib.figure import Figure
 
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.plot.style import COLOURS, GREY, INK, use_style
+from tuning.modal.shape_plot import draw_shapes
 
 FIT, MODE = COLOURS[:2]
 MAX_POINTS = 4000  # of the log; a longer one is drawn as the range of each of so many pieces
 
 
 @use_style
-def plot_modal_fit(fit, path: str | Path | None = None) -> Figure:
-    """Figure of a `ModalFit`, for the channel with most energy; saved if a path is given."""
+def plot_modal_fit(fit, path: str | Path | None = None, length: float | None = None) -> Figure:
+    """Figure of a `ModalFit`, for the channel with most energy; saved if a path is given.
+
+    Shapes are drawn if there are several channels, over their positions if the log has them, on a
+    beam of some `length` (m).
+    """
     decays = fit.fitted is not None
-    figure = Figure(figsize=(9, 9.5 if decays else 6))
-    heights = (1, 1.6, 1.3, 0.6) if decays else (1, 1.6)
+    shapes = len(fit.log.names) > 1 and bool(fit.modes)
+    heights = (1, 1.6) + (1.3, 0.6) * decays + (1.4,) * shapes
+    figure = Figure(figsize=(9, 2.3 * sum(heights)))
     rows = figure.subplots(len(heights), 1, height_ratios=heights)
     strongest = int(np.argmax(np.sum(fit.measured**2, axis=0)))
     quantity = QUANTITIES.get(fit.log.quantities[strongest])
@@ -26,6 +32,8 @@ def plot_modal_fit(fit, path: str | Path | None = None) -> Figure:
     _draw_spectrum(rows[1], fit, strongest, unit)
     if decays:
         _draw_fit(rows[2], rows[3], fit, strongest, unit)
+    if shapes:
+        draw_shapes(rows[-1], fit, length)
     figure.suptitle(f"{Path(fit.log.source).name}: modes from {_kind_text(fit)}")
     if path is not None:
         figure.savefig(path)
@@ -75,6 +83,21 @@ def _draw_spectrum(axes, fit, channel, unit):
             textcoords="offset points", va="top", fontsize=8, color=MODE,
         )  # fmt: skip
     axes.set(xlabel="frequency (Hz)", ylabel=f"amplitude ({unit})", xlim=fit.band)
+    for line in fit.lines:
+        axes.axvline(line.frequency, color=GREY, linewidth=1.2, linestyle="--")
+    if fit.diagrams:
+        _draw_diagram(axes.twinx(), fit)
+
+
+def _draw_diagram(axes, fit):
+    """Poles of the models of each order: stable ones filled, those of noise small."""
+    for diagram in fit.diagrams:
+        poles, stable = diagram.poles, diagram.stable
+        shown = (poles.damping_ratios > 0) & (poles.damping_ratios < 0.2)
+        noise, modes = shown & ~stable, shown & stable
+        axes.plot(poles.frequencies[noise], poles.orders[noise], ".", color=GREY, markersize=1.5)
+        axes.plot(poles.frequencies[modes], poles.orders[modes], "o", color=FIT, markersize=2.5)
+    axes.set(ylabel="order of the model", xlim=fit.band)
 
 
 def _draw_fit(axes, residual_axes, fit, channel, unit):

@@ -207,8 +207,8 @@ def poles_of_order(subspace: Subspace, order: int) -> Poles:
     )
 
 
-def spread(subspace: Subspace, order: int, pole: complex) -> Spread:
-    """First-order uncertainty of a pole of the model of an order.
+def spreads(subspace: Subspace, order: int, poles: Complex[np.ndarray, " chosen"]) -> list[Spread]:
+    """First-order uncertainties of some poles of the model of an order.
 
     A perturbation of the singular vectors within their span changes the basis of the state only, so
     that the part outside of it moves poles and shapes:
@@ -217,43 +217,54 @@ def spread(subspace: Subspace, order: int, pole: complex) -> Spread:
     """
     c, step, s = subspace.channels, subspace.step, subspace.values
     model = _realise(subspace, order)
-    which = int(np.argmin(np.abs(np.log(model.eigenvalues + 0j) / step - pole)))
-    eigenvalue, vector = model.eigenvalues[which], model.vectors[:, which]
+    all_poles = np.log(model.eigenvalues + 0j) / step
+    which = np.argmin(np.abs(all_poles[:, None] - poles), axis=0)
+    eigenvalues, vectors = model.eigenvalues[which], model.vectors[:, which]
     basis, complement, rank = subspace.left[:, :order], subspace.left[:, order:], s.size
     inner, outer, k = s[:order], s[order:], subspace.rotated
-    outside = np.zeros((len(k), subspace.left.shape[0] - order, order))
     gap = inner**2 - outer[:, None] ** 2
     gap = np.where(gap <= 1e-12 * s[0] ** 2, np.inf, gap)
-    outside[:, : rank - order] = (
-        inner * k[:, order:rank, :order]
-        + outer[:, None] * k[:, :order, order:rank].transpose(0, 2, 1)
-    ) / gap
-    outside[:, rank - order :] = k[:, rank:, :order] / np.maximum(inner, 1e-12 * s[0])
-    moved = outside @ vector  # block, complement
-    # dA phi = O+ (dO_lower - lambda dO_upper) phi + (O^T O)^-1 dO_upper^T (O_lower - O_upper A) phi
-    turn = model.inverse @ (complement[c:] - eigenvalue * complement[:-c])
-    misfit = complement[:-c].T @ ((basis[c:] - basis[:-c] @ model.system) @ vector)
-    gram = model.inverse @ model.inverse.T
-    changes = moved @ turn.T + (outside.transpose(0, 2, 1) @ misfit) @ gram.T
-    modal = changes @ model.lefts.T  # block, state
-    poles = np.log(eigenvalue) / step
-    pole_changes = modal[:, which] / (eigenvalue * step)
-    size = np.abs(poles)
-    radial = np.real(np.conj(poles) * pole_changes) / size
-    stacked = np.stack(
-        [radial / (2 * np.pi), -pole_changes.real / size + poles.real * radial / size**2], axis=-1
+    outside = np.empty((len(k), subspace.left.shape[0] - order, order))
+    outside[:, : rank - order] = k[:, order:rank, :order] * (inner / gap)
+    outside[:, : rank - order] += k[:, :order, order:rank].transpose(0, 2, 1) * (
+        outer[:, None] / gap
     )
-    # Shape C phi, with the largest component one.
-    distance = eigenvalue - model.eigenvalues
-    others = np.where(np.arange(order) == which, 0, 1 / np.where(distance == 0, np.inf, distance))
-    vector_changes = (modal * others) @ model.vectors.T
-    shape = basis[:c] @ vector
-    shape_changes = moved @ complement[:c].T + vector_changes @ basis[:c].T
-    largest = int(np.argmax(np.abs(shape)))
-    unit = shape / shape[largest]
-    unit_changes = (shape_changes - shape_changes[:, [largest]] * unit) / shape[largest]
-    parts = np.concatenate([unit_changes.real, unit_changes.imag], axis=1)
-    return Spread(stacked.T @ stacked, unit, parts.T @ parts, float(max(len(k) - 1, 1)))
+    outside[:, rank - order :] = k[:, rank:, :order] / np.maximum(inner, 1e-12 * s[0])
+    moved = _times(outside, vectors)  # block, complement, pole
+    # dA phi = O+ (dO_lower - lambda dO_upper) phi + (O^T O)^-1 dO_upper^T (O_lower - O_upper A) phi
+    misfit = complement[:-c].T @ ((basis[c:] - basis[:-c] @ model.system) @ vectors)
+    gram = model.inverse @ model.inverse.T
+    changes = (model.inverse @ complement[c:]) @ moved
+    changes -= eigenvalues * ((model.inverse @ complement[:-c]) @ moved)
+    changes += gram @ _times(outside.transpose(0, 2, 1), misfit)
+    modal = model.lefts @ changes  # block, state, pole
+    found = []
+    for i, (state, eigenvalue) in enumerate(zip(which, eigenvalues, strict=True)):
+        pole = np.log(eigenvalue + 0j) / step
+        pole_changes = modal[:, state, i] / (eigenvalue * step)
+        size = np.abs(pole)
+        radial = np.real(np.conj(pole) * pole_changes) / size
+        by_damping = -pole_changes.real / size + pole.real * radial / size**2
+        stacked = np.stack([radial / (2 * np.pi), by_damping], axis=-1)
+        # Shape C phi, with the largest component one.
+        distance = eigenvalue - model.eigenvalues
+        others = np.where(distance == 0, 0, 1 / np.where(distance == 0, 1, distance))
+        vector_changes = (modal[:, :, i] * others) @ model.vectors.T
+        shape = basis[:c] @ vectors[:, i]
+        shape_changes = moved[:, :, i] @ complement[:c].T + vector_changes @ basis[:c].T
+        largest = int(np.argmax(np.abs(shape)))
+        unit = shape / shape[largest]
+        unit_changes = (shape_changes - shape_changes[:, [largest]] * unit) / shape[largest]
+        parts = np.concatenate([unit_changes.real, unit_changes.imag], axis=1)
+        found.append(Spread(stacked.T @ stacked, unit, parts.T @ parts, float(max(len(k) - 1, 1))))
+    return found
+
+
+def _times(real, complex_matrix):
+    """Product of a real array and a complex matrix, as two real products."""
+    count = complex_matrix.shape[1]
+    both = real @ np.concatenate([complex_matrix.real, complex_matrix.imag], axis=1)
+    return both[..., :count] + 1j * both[..., count:]
 
 
 def _energies(subspace: Subspace, order, eigenvalues, modes, lefts):

@@ -17,7 +17,6 @@ from jaxbeam.analysis.assessment.assessment import (
 )
 from jaxbeam.analysis.assessment.formulas import (
     code_numbers,
-    counted_frequency,
     frequency_limits,
     irregularity_factor,
     running_factor,
@@ -39,6 +38,7 @@ from jaxbeam.case.reading.units import in_si
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import modes
+from jaxbeam.model.sensing.mode_band import counted_frequency
 from jaxbeam.vehicles.trains import trains as library
 
 CODES = ("en1991-2",)
@@ -152,7 +152,7 @@ def _bridge(case: Case) -> Case:
             "an active control cannot be certified: leave the controller out of the case"
         )
     bridge = dataclasses.replace(
-        case, loads=(), sensors=(), controller=None, profile=None, run=Run(1.0)
+        case, loads=(), sensors=(), vehicle_sensors=(), controller=None, profile=None, run=Run(1.0)
     )
     check_case(bridge)
     return bridge
@@ -185,8 +185,8 @@ def _with_counted_modes(case: Case, added_damping: float) -> tuple[np.ndarray, C
         beam, modes=many, damping_ratio=0.0, rayleigh_damping=None, loss_factor=None, material=""
     )
     all_frequencies = concrete(modes(dataclasses.replace(case, beam=plain)).frequencies)
-    limit = counted_frequency(all_frequencies)
-    count = int(np.sum(all_frequencies <= limit * (1 + 1e-9)))
+    limit = float(counted_frequency(all_frequencies))
+    count = int(np.sum(all_frequencies <= limit))
     if count == many:
         raise ValueError(f"more than {many} modes lie below {limit:.4g} Hz: this is no bridge")
     if np.ndim(beam.damping_ratio) or beam.rayleigh_damping is not None:

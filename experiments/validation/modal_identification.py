@@ -1,0 +1,126 @@
+"""Modes of planted structures, identified by jaxbeam and by pyOMA-2, against the truth.
+
+    python -m experiments.validation.modal_identification ambient 10
+
+Random structures by finite elements (`tests/oracles/planted_structures.py`), each excited in one of
+several ways. Printed are, for each kind of excitation: the share of modes with more than 5 % of the
+energy that were found, of intervals that cover the truth, of modes that are none, and the quantiles
+of the errors of both programs, for the modes that pyOMA-2 finds stable.
+"""
+
+import sys
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from tests.oracles.planted_structures import Planted, random_structure, sampled
+from tuning.logs.log import Log
+from tuning.modal.fit import ModalFit
+from tuning.modal.identify_modes import identify_modes
+
+KINDS = ("ambient", "motor", "blows", "decay")
+MATCH_SHARE = 0.02  # relative error of a frequency within which a mode is one of the structure
+MIN_ENERGY = 0.05  # energy share of the modes that must be found
+DURATION = 300.0  # s
+
+
+class PlantedComparison(NamedTuple):
+    """Identified modes against planted ones.
+
+    `covered` tells, for each identified mode that is one of the structure, whether its intervals of
+    frequency and damping ratio hold the truth; `errors` are relative errors of both, and `found`
+    tells of each planted mode with 5 % of the energy whether it was identified.
+    """
+
+    covered: Float[np.ndarray, "mode 2"]
+    errors: Float[np.ndarray, "mode 2"]
+    false_modes: tuple[float, ...]
+    found: tuple[bool, ...]
+    missed: tuple[float, ...]
+
+
+def log_of(planted: Planted) -> Log:
+    """Log of velocities."""
+    channels = planted.values.shape[1]
+    return Log(
+        times=np.arange(len(planted.values)) / planted.rate,
+        values=planted.values,
+        names=tuple(f"v{i + 1}" for i in range(channels)),
+        quantities=("velocity",) * channels,
+        units=("m/s",) * channels,
+        source="planted",
+    )
+
+
+def compare(fit: ModalFit, planted: Planted) -> PlantedComparison:
+    """Pairs of identified and planted modes, each used once, the nearest poles first."""
+    structure = planted.structure
+    poles = 2 * np.pi * fit.frequencies * (-fit.damping_ratios + 1j)
+    truth = structure.poles
+    distance = np.abs(poles[:, None] - truth) / np.abs(truth)
+    pairs: dict[int, int] = {}
+    for flat in np.argsort(distance, axis=None):
+        mine, planted_mode = divmod(int(flat), truth.size)
+        near = abs(fit.frequencies[mine] / structure.frequencies[planted_mode] - 1) < MATCH_SHARE
+        if near and mine not in pairs and planted_mode not in pairs.values():
+            pairs[mine] = planted_mode
+    covered, errors = [], []
+    for mine, k in sorted(pairs.items()):
+        f, z = structure.frequencies[k], structure.damping_ratios[k]
+        low, high = fit.frequency_intervals[mine], fit.damping_intervals[mine]
+        covered.append([low[0] <= f <= low[1], high[0] <= z <= high[1]])
+        errors.append([fit.frequencies[mine] / f - 1, fit.damping_ratios[mine] / z - 1])
+    strong = np.flatnonzero(planted.energies > MIN_ENERGY)
+    seen = [int(k) in pairs.values() for k in strong]
+    return PlantedComparison(
+        np.array(covered, float).reshape(-1, 2),
+        np.array(errors, float).reshape(-1, 2),
+        tuple(f for i, f in enumerate(fit.frequencies.tolist()) if i not in pairs),
+        tuple(seen),
+        tuple(float(structure.frequencies[k]) for k, s in zip(strong, seen, strict=True) if not s),
+    )
+
+
+def assess(kind: str, seeds: Iterable[int], duration: float = DURATION) -> list[PlantedComparison]:
+    """PlantedComparison for each seed, printed as it comes."""
+    found = []
+    for seed in seeds:
+        planted = sampled(random_structure(seed), kind, seed, duration)
+        fit = identify_modes(log_of(planted))
+        one = compare(fit, planted)
+        found.append(one)
+        print(
+            f"{kind} {seed}: {fit.kind}, {len(fit.modes)} modes of {planted.energies.size}, "
+            f"covered {one.covered.sum(axis=0)} of {len(one.covered)}, false {one.false_modes}, "
+            f"missed {one.missed}",
+            flush=True,
+        )
+    return found
+
+
+def summary(found: list[PlantedComparison]) -> str:
+    """Shares over all seeds, and quantiles of the errors."""
+    covered = np.concatenate([one.covered for one in found])
+    errors = np.abs(np.concatenate([one.errors for one in found]))
+    seen = [s for one in found for s in one.found]
+    false = sum(len(one.false_modes) for one in found)
+    quantiles = np.quantile(errors, [0.5, 0.9], axis=0)
+    return (
+        f"found {np.mean(seen):.3f} of {len(seen)} strong modes; covered {covered.mean(axis=0)} of "
+        f"{len(covered)}; false {false / max(len(covered) + false, 1):.3f}; relative errors, "
+        f"median and 90 %: frequency {quantiles[:, 0]}, damping {quantiles[:, 1]}"
+    )
+
+
+def main(arguments: list[str]) -> None:
+    """Print the comparison for one kind or all, and a number of structures (10)."""
+    kinds = arguments[:1] or KINDS
+    count = int(arguments[1]) if len(arguments) > 1 else 10
+    for kind in kinds:
+        print(f"{kind}: {summary(assess(kind, range(count)))}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,63 @@
+"""Command `modes-from-log`: options, choices with the options that override them, errors."""
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def decay_log(folder):
+    """Log without headings: 12 Hz with damping ratio 0.01 in two channels, hum of 50 Hz, noise."""
+    times = np.arange(1500) / 300
+    wave = np.exp(2 * np.pi * 12 * times * (-0.01 + 1j))
+    random = np.random.default_rng(0)
+    values = np.stack([wave.real, -0.5 * wave.real], axis=1)
+    values += 0.05 * np.cos(2 * np.pi * 50 * times)[:, None] + 0.01 * random.normal(size=(1500, 2))
+    np.savetxt(folder / "node.csv", np.column_stack([times, values]), delimiter=",", fmt="%.6f")
+    return folder
+
+
+COLUMNS = "--columns t[s],a[g],b[g]"
+
+
+def test_modes_of_a_file_without_headings(run, decay_log):
+    printed = run(f"modes-from-log node.csv {COLUMNS} --band 5:60 --plot --length 2")
+    assert "excitation: a free decay  [--kind" in printed and "50.00" in printed
+    assert (decay_log / "node.png").read_bytes().startswith(b"\x89PNG")
+    found = run(f"modes-from-log node.csv {COLUMNS} --band 5:60 --json")
+    np.testing.assert_allclose(found["frequencies_hz"], [12], rtol=1e-3)
+    np.testing.assert_allclose(found["damping_ratios"], [0.01], rtol=0.05)
+    np.testing.assert_allclose(found["modes"][0]["shape_real"], [1, -0.5], atol=0.01)
+    assert {choice["option"].split()[0] for choice in found["choices"]} >= {"--kind", "--order"}
+    part = run(
+        f"modes-from-log node.csv {COLUMNS} --band 5:60 --from 0.5 --to 4 --channels b --order 10"
+        " --exclude 50 --count 1 --json"
+    )
+    assert part["channels"] == ["b"] and part["window_s"][0] == pytest.approx(0.5)
+    np.testing.assert_allclose(part["frequencies_hz"], [12], rtol=2e-3)
+
+
+def test_the_rate_of_a_file_without_times(run, decay_log):
+    rows = np.loadtxt(decay_log / "node.csv", delimiter=",")[:, 1:]
+    np.savetxt(decay_log / "untimed.csv", rows, delimiter=";", fmt="%.6f")
+    found = run("modes-from-log untimed.csv --columns a[g],b[g] --rate 300 --band 5:60 --json")
+    np.testing.assert_allclose(found["frequencies_hz"], [12], rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("", "modes-from-log needs a log"),
+        ("nothing.csv", "nothing.csv: there is no such log file"),
+        ("node.csv", "node.csv, line 1: the file has no headings; name its 3 columns"),
+        (f"node.csv {COLUMNS} --band 5", "--band takes LOW:HIGH in Hz, such as 5:45, not '5'"),
+        (f"node.csv {COLUMNS} --band 5:600", "not within 0 and half the sampling rate, 150 Hz"),
+        (f"node.csv {COLUMNS} --exclude x", "--exclude takes frequencies in Hz"),
+        (f"node.csv {COLUMNS} --from 3 --to 2", "--from must be less than --to"),
+        (f"node.csv {COLUMNS} --channels c", "the log has no channel 'c'; it has a, b"),
+        (f"node.csv {COLUMNS} --method x", "method must be"),
+        (f"node.csv {COLUMNS} --order 2", "the highest order must be at least 4, not 2"),
+        (f"node.csv {COLUMNS} --rate 100", "the log has a column of times, 't'"),
+    ],
+)
+def test_mistakes(refused, decay_log, line, message):
+    assert message in refused(f"modes-from-log {line}")
