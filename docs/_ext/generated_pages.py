@@ -61,10 +61,11 @@ BOUNDS = {
 
 
 # Arguments that docstrings do not explain again (`tests/test_docstrings.py` has their names).
-COMMON_ARGUMENTS = """Some arguments mean the same everywhere: ``case`` is a :py:obj:`Case <jaxbeam.Case>`,
-``record`` a :py:obj:`Record <jaxbeam.Record>`, ``fit`` a :py:obj:`Fit <tuning.Fit>`, ``path`` the
-path of a file, ``seed`` the seed of random numbers, ``progress`` whether a bar is shown, and
-``layout`` the order of the nodes of a beam, which is needed inside ``jit`` only."""
+COMMON_ARGUMENTS = """Some arguments mean the same everywhere: ``case`` is a
+:py:obj:`Case <jaxbeam.Case>`, ``record`` a :py:obj:`Record <jaxbeam.Record>`, ``fit`` a
+:py:obj:`Fit <tuning.Fit>`, ``path`` the path of a file, ``seed`` the seed of random numbers,
+``progress`` whether a bar is shown, and ``layout`` the order of the nodes of a beam, which is
+needed inside ``jit`` only."""
 
 
 def group_of(module: str) -> str:

@@ -219,7 +219,7 @@ def receptance_feedback(
 def closed_loop_poles(
     case: Case, feedback: ReceptanceFeedback, delay: float | None = None, count: int = 24
 ) -> Complex[np.ndarray, " pole"]:
-    """Rightmost poles (1/s) of the loop with non-negative imaginary part, the rightmost first.
+    """Rightmost poles (1/s) of the loop of a `feedback`, imaginary part not negative, in order.
 
     A delayed loop has infinitely many poles: the equation is collocated at Chebyshev points over
     the delay (Breda, Maset and Vermiglio, SIAM Journal on Scientific Computing 27, 2005), and the

@@ -60,7 +60,9 @@ def load_case(path: str | os.PathLike) -> Case:
 
 
 def read_case(path: str | os.PathLike) -> Case:
-    """The case of a TOML file, whose values are not validated yet; raises as `load_case`."""
+    """The case of a TOML file, whose values are not validated yet.
+
+    Raises ValueError and OSError as `load_case` does, but for the errors of `check_case`."""
     content = read_toml(path)
     _find_vehicle_files(content, Path(path).parent)
     try:

@@ -253,7 +253,7 @@ def mobility(
 ) -> Complex[Array, "..."]:
     """Mobility: velocity at x per force at y, in m/(N s); s x receptance, eq. (2.29).
 
-    Arguments are those of `receptance`.
+    Positions are those of `receptance`, other arguments those of `frequency_response`.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
@@ -274,7 +274,7 @@ def accelerance(
 ) -> Complex[Array, "..."]:
     """Accelerance: acceleration at x per force at y, in 1/kg, s^2 x receptance.
 
-    Arguments are those of `receptance`.
+    Positions are those of `receptance`, other arguments those of `frequency_response`.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
