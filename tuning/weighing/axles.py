@@ -134,8 +134,9 @@ def weigh_axles(
 
     `speeds` (m/s) are the lowest and highest possible ones, from the left or, with `both_ways`, in
     both directions; `axles` is their number. Moses' method has the influence lines of the case, or
-    those given (see `calibrate_influence_lines`). The fit has moving forces, the vibration of the
-    beam, and offsets of the sensors; loads and profile of case and log are not used.
+    the `influence_lines` given (see `calibrate_influence_lines`). The fit has moving forces, the
+    vibration of the beam, and offsets of the sensors; loads and profile of case and log are not
+    used.
 
     Raises ValueError if speeds are not 0 < low < high, there is no axle, or a sensor measures
     velocity or acceleration, and as `identify` does.
