@@ -55,7 +55,7 @@ class Plausibility:
         if self.first_frequency is not None:
             parts.append(f"first frequency {self.first_frequency:.4g} Hz")
         if self.deflection:
-            parts.append(f"span/deflection {self.span_over_deflection:.3g}")
+            parts.append(f"span/deflection {float(f'{self.span_over_deflection:.3g}'):.15g}")
         if self.mass_ratio is not None:
             parts.append(f"load/beam mass {self.mass_ratio:.3g}")
         if self.crossing_time is not None:
