@@ -1,5 +1,6 @@
-"""Command `new`: a commented case to start from."""
+"""Commands `new` and `schema`: a commented case to start from, and what editors complete it by."""
 
+import json
 from importlib import resources
 from pathlib import Path
 
@@ -31,3 +32,20 @@ def new(kind: str, /, *, output: Output = None, options: OutputOptions = OutputO
     title = read_toml(path)["title"]
     lines = [f"written: {path}", f"{title}; run it: jaxbeam simulate {path} --plot"]
     options.report({"path": str(path), "title": title}, lines)
+
+
+def schema(*, output: Output = None, options: OutputOptions = OutputOptions()) -> None:
+    """Write the JSON Schema of case files, with which editors complete and check TOML.
+
+    Parameters
+    ----------
+    output
+        Write it to this file; case.schema.json in this folder if left out.
+    """
+    path = output or Path("case.schema.json")
+    options.check_outputs(path)
+    from jaxbeam.files.json_schema import json_schema
+
+    path.write_text(json.dumps(json_schema(), indent=1) + "\n", encoding="utf-8")
+    line = f"written: {path}; begin a case file with the line: #:schema {path}"
+    options.report({"path": str(path)}, [line])

@@ -1,0 +1,37 @@
+"""JSON Schema of case files: it accepts what is a case, and refuses what is none."""
+
+import tomllib
+
+import pytest
+
+from jaxbeam.files.json_schema import json_schema
+from tests.modules import ROOT
+
+CASES = sorted([*ROOT.glob("examples/*/case.toml"), *ROOT.glob("jaxbeam/**/rigs/*.toml")])
+SCHEMA = json_schema()
+
+
+def errors(content):
+    """Messages of jsonschema, which nbmake needs as well."""
+    jsonschema = pytest.importorskip("jsonschema")
+    return [error.message for error in jsonschema.Draft202012Validator(SCHEMA).iter_errors(content)]
+
+
+@pytest.mark.parametrize("path", CASES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_cases_are_accepted(path):
+    assert errors(tomllib.loads(path.read_text(encoding="utf-8"))) == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"beam": {"length": -1.0}},
+        {"beam": {"lenght": 1.0}},
+        {"loads": [{"kind": "balloon"}]},
+        {"loads": [{"kind": "mass", "mass": [1.0]}]},
+        {"unknown": {}},
+    ],
+)
+def test_mistakes_are_refused(change):
+    assert errors({"beam": {"length": 1.0}}) == []
+    assert errors({"beam": {"length": 1.0}} | change)
