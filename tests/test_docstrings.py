@@ -1,12 +1,15 @@
-"""Docstrings: every public module, class, function and method has one, with its exceptions."""
+"""Docstrings: all that is public has one, with arguments, exceptions and examples that run."""
 
 import ast
 import doctest
 import importlib
 import inspect
+import re
 
 import pytest
 
+import jaxbeam
+import tuning
 from tests.modules import module_files, parse
 
 FILES = module_files()
@@ -60,3 +63,49 @@ def test_docstrings_say_what_is_raised(name):
 def test_examples_in_docstrings_print_what_they_show(name):
     results = doctest.testmod(importlib.import_module(name.removesuffix(".__init__")))
     assert results.attempted and not results.failed
+
+
+# What these arguments are is the same everywhere; the site says it once, above all functions.
+COMMON_ARGUMENTS = {"case", "path", "record", "fit", "progress", "seed", "layout"}
+PUBLIC_FUNCTIONS = {
+    f"{package.__name__}.{name}": inspect.unwrap(getattr(package, name))
+    for package in (jaxbeam, tuning)
+    for name in package.__all__
+    if callable(getattr(package, name)) and not inspect.isclass(getattr(package, name))
+}
+# Their examples, which need logs, fits or minutes, are the notebooks and the pages of the site.
+NO_EXAMPLE = {
+    "jaxbeam.identified_load",
+    *(name for name in PUBLIC_FUNCTIONS if name.startswith("tuning.")),
+} - {"tuning.full_grid", "tuning.latin_hypercube"}
+
+
+def words_of(docstring: str) -> set[str]:
+    """Words of a docstring, and of those of the public functions that it refers to in backticks."""
+    words = set(re.findall(r"\w+", docstring))
+    for name in re.findall(r"`(?:\w+\.)*(\w+)`", docstring):
+        other = PUBLIC_FUNCTIONS.get(f"jaxbeam.{name}") or PUBLIC_FUNCTIONS.get(f"tuning.{name}")
+        words |= set(re.findall(r"\w+", inspect.getdoc(other) or "")) if other else set()
+    return words
+
+
+@pytest.mark.parametrize("name", PUBLIC_FUNCTIONS)
+def test_public_functions_document_every_argument(name):
+    """By its name, also in the plural, in the docstring or one that it refers to."""
+    function = PUBLIC_FUNCTIONS[name]
+    words = words_of(inspect.getdoc(function) or "")
+    arguments = set(inspect.signature(function).parameters) - COMMON_ARGUMENTS
+    missing = {a for a in arguments if not {a, f"{a}s", a.removesuffix("s")} & words}
+    assert missing == set()
+
+
+@pytest.mark.parametrize("name", PUBLIC_FUNCTIONS)
+def test_public_functions_have_types_of_arguments_and_results(name):
+    signature = inspect.signature(PUBLIC_FUNCTIONS[name])
+    assert signature.return_annotation is not inspect.Signature.empty
+
+
+@pytest.mark.parametrize("name", sorted(PUBLIC_FUNCTIONS.keys() - NO_EXAMPLE))
+def test_public_functions_have_an_example(name):
+    """`test_examples_in_docstrings_print_what_they_show` runs it."""
+    assert ">>> " in (inspect.getdoc(PUBLIC_FUNCTIONS[name]) or "")

@@ -21,6 +21,7 @@ from tuning.control.tuning_result import TuningResult
 from tuning.fit.experiment_design import design_experiment
 from tuning.fit.frequency_responses import Responses, identify_responses, responses_of
 from tuning.fit.identify import Fit, identify
+from tuning.fit.modal_parameters import ModalParameterFit, identify_from_modes
 from tuning.fit.model_validation import compare_fits, cross_validate, predict_held_out
 from tuning.fit.report import write_report
 from tuning.fit.storage import load_fit, save_fit
@@ -48,6 +49,7 @@ __all__ = [
     "LoadCases",
     "Log",
     "ModalFit",
+    "ModalParameterFit",
     "Objective",
     "Prior",
     "Responses",
@@ -62,6 +64,7 @@ __all__ = [
     "find_faults",
     "full_grid",
     "identify",
+    "identify_from_modes",
     "identify_modes",
     "identify_responses",
     "latin_hypercube",

@@ -60,6 +60,14 @@ BOUNDS = {
 }
 
 
+# Arguments that docstrings do not explain again (`tests/test_docstrings.py` has their names).
+COMMON_ARGUMENTS = """Some arguments mean the same everywhere: ``case`` is a
+:py:obj:`Case <jaxbeam.Case>`, ``record`` a :py:obj:`Record <jaxbeam.Record>`, ``fit`` a
+:py:obj:`Fit <tuning.Fit>`, ``path`` the path of a file, ``seed`` the seed of random numbers,
+``progress`` whether a bar is shown, and ``layout`` the order of the nodes of a beam, which is
+needed inside ``jit`` only."""
+
+
 def group_of(module: str) -> str:
     """Page of a name that is defined in a module: that of the longest package that fits."""
     fitting = {
@@ -100,7 +108,7 @@ def api_index(names: dict[str, list[tuple[str, str]]]) -> str:
     lines = ["Functions and classes", "=====================", ""]
     lines += ["All are in ``import jaxbeam as jb`` or ``import tuning`` unless another module is"]
     lines += ['named. Shapes are in signatures, ``Float[Array, "time sensor"]``; all numbers are']
-    lines += ["in SI units.", "", ".. toctree::", "   :hidden:", ""]
+    lines += ["in SI units.", "", COMMON_ARGUMENTS, "", ".. toctree::", "   :hidden:", ""]
     lines += [f"   {page}" for page in names]
     for page, found in names.items():
         title = GROUPS[page][0]

@@ -84,7 +84,8 @@ class RunBase(SphinxDirective):
         if len(lines) > MAX_LINES:
             raise self.error(f"prints {len(lines)} lines; show fewer")
         shown = "\n".join(lines).replace(str(self.page.folder) + "/", "")
-        return [nodes.literal_block(shown, shown, language="text", classes=["output"])]
+        classes = ["output", "message"] if "fails" in self.options else ["output"]
+        return [nodes.literal_block(shown, shown, language="text", classes=classes)]
 
     def picture(self, suffix: str) -> Path:
         """Path of the next picture of the page, in the source folder."""
@@ -140,6 +141,7 @@ class Run(RunBase):
         names = self.page.names
         with warnings.catch_warnings():
             warnings.simplefilter("always")
+            warnings.simplefilter("ignore", ResourceWarning)  # files of one line of code
             exec(compile(tree, self.env.docname, "exec"), names)
             if last is not None:
                 return eval(compile(ast.Expression(last.value), self.env.docname, "eval"), names)

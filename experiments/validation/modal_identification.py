@@ -23,7 +23,7 @@ from tuning.modal.identify_modes import identify_modes
 KINDS = ("ambient", "motor", "blows", "decay")
 MATCH_SHARE = 0.02  # relative error of a frequency within which a mode is one of the structure
 MIN_ENERGY = 0.05  # energy share of the modes that must be found
-DURATION = 300.0  # s
+DURATIONS = {"ambient": 300.0, "motor": 300.0, "blows": 60.0, "decay": 20.0}  # s
 
 
 class PlantedComparison(NamedTuple):
@@ -83,11 +83,11 @@ def compare(fit: ModalFit, planted: Planted) -> PlantedComparison:
     )
 
 
-def assess(kind: str, seeds: Iterable[int], duration: float = DURATION) -> list[PlantedComparison]:
+def assess(kind: str, seeds: Iterable[int]) -> list[PlantedComparison]:
     """PlantedComparison for each seed, printed as it comes."""
     found = []
     for seed in seeds:
-        planted = sampled(random_structure(seed), kind, seed, duration)
+        planted = sampled(random_structure(seed), kind, seed, DURATIONS[kind])
         fit = identify_modes(log_of(planted))
         one = compare(fit, planted)
         found.append(one)

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbeam.analysis.linearised_loop import stationary_loops
 from jaxbeam.analysis.margins import margins
-from jaxbeam.analysis.stationary_loop import stationary_loops
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.fields import concrete
 from jaxbeam.control.predictive.mpc import MPC

@@ -76,6 +76,13 @@ def weighted_acceleration(
 
     The signal between samples is the one without content above half of their rate. Raises
     ValueError for times (s) that are not equally spaced, or less than 160 a second.
+
+    >>> import numpy as np
+    >>> import jaxbeam as jb
+    >>> times = np.arange(0.0, 20.0, 1 / 400)
+    >>> shaking = np.sqrt(2) * np.sin(2 * np.pi * 6.0 * times)  # rms 1 m/s^2, where W_k is about 1
+    >>> print(jb.weighted_acceleration(times, shaking).shape)
+    (8000,)
     """
     step = _time_step(times, WEIGHTED_BAND)
     acceleration = xp.asarray(acceleration)
@@ -94,6 +101,15 @@ def weighted_rms(
 
     a_w^2 = 1/T int a_w(t)^2 dt (ISO 2631-1, basic evaluation). Raises ValueError as
     `weighted_acceleration`.
+
+    `times` (s) are equally spaced.
+
+    >>> import numpy as np
+    >>> import jaxbeam as jb
+    >>> times = np.arange(0.0, 20.0, 1 / 400)
+    >>> shaking = np.sqrt(2) * np.sin(2 * np.pi * 6.0 * times)  # rms 1 m/s^2, where W_k is about 1
+    >>> print(f"{jb.weighted_rms(times, shaking):.2f}")
+    1.05
     """
     weighted = weighted_acceleration(times, acceleration)
     return xp.sqrt(xp.trapezoid(weighted**2, times, axis=0) / (times[-1] - times[0]))
@@ -106,6 +122,15 @@ def vibration_dose(
 
     The fourth power tells shocks from steady vibration (acoustic-glossary.co.uk, vibration dose).
     Raises ValueError as `weighted_acceleration`.
+
+    `times` (s) are equally spaced.
+
+    >>> import numpy as np
+    >>> import jaxbeam as jb
+    >>> times = np.arange(0.0, 20.0, 1 / 400)
+    >>> shaking = np.sqrt(2) * np.sin(2 * np.pi * 6.0 * times)  # rms 1 m/s^2, where W_k is about 1
+    >>> print(f"{jb.vibration_dose(times, shaking):.2f}")
+    2.47
     """
     weighted = weighted_acceleration(times, acceleration)
     return xp.trapezoid(weighted**4, times, axis=0) ** 0.25
@@ -121,6 +146,13 @@ def sperling_index(
     from 0.5 to 30 Hz, with the one-sided density G of the acceleration in (cm/s^2)^2/Hz, or the
     amplitudes a_f of its Fourier series: 4.42 times the weighted rms (m/s^2) to the power 0.3.
     Raises ValueError for times (s) that are not equally spaced, or less than 60 a second.
+
+    >>> import numpy as np
+    >>> import jaxbeam as jb
+    >>> times = np.arange(0.0, 20.0, 1 / 400)
+    >>> shaking = np.sqrt(2) * np.sin(2 * np.pi * 6.0 * times)  # rms 1 m/s^2, where W_k is about 1
+    >>> print(f"{jb.sperling_index(times, shaking):.2f}")
+    4.12
     """
     low, high = SPERLING_BAND
     step = _time_step(times, high)
@@ -139,6 +171,14 @@ def wheel_unloading(record: Record) -> Float[Array, " load"]:
     On the beam in continuous time, for vehicles on the ground before and behind it at the samples.
     1 means that a wheel just lifts; above 1 it would have to pull. NaN for wheels that are never
     seen and for those without static load.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> case = jb.Case(
+    ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingMass(mass=0.5, speed=2.0)]
+    ... )
+    >>> print(jb.wheel_unloading(jb.simulate(case)).shape)
+    (1,)
     """
     loads = load_set(record.case)
     static = loads.weight[:, 0]

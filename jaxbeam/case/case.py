@@ -157,6 +157,14 @@ def addresses(case: Case) -> dict[str, Float[Array, "..."]]:
     A list has an address as a whole, `beam.damping_ratio`, and one for each entry,
     `beam.damping_ratio.0`; an entry of a matrix has row and column, `controller.gain.0.2`. Where an
     address is taken, `loads.*.speed` stands for the speed of all loads, and so for other lists.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> case = jb.Case(
+    ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingMass(mass=0.5, speed=2.0)]
+    ... )
+    >>> print(jb.addresses(case)["loads.0.speed"])
+    2.0
     """
     numbers = {}
     for address, leaf in _leaves_by_address(case).items():
@@ -248,6 +256,14 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
 
     `loads.*.speed` sets the speed of all loads. It is differentiable by the values. Raises
     ValueError for an unknown address, one that some load lacks, or a wrong shape.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> case = jb.Case(
+    ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingMass(mass=0.5, speed=2.0)]
+    ... )
+    >>> print(jb.replace(case, {"loads.0.mass": 0.2}).loads[0].mass)
+    0.2
     """
     paths, structure = jax.tree_util.tree_flatten_with_path(case)
     leaves = [leaf for _, leaf in paths]

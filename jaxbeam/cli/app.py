@@ -10,10 +10,10 @@ from typing import NoReturn
 
 from cyclopts import App, CycloptsError, Group, Parameter
 
-from jaxbeam.cli.commands.check import check
 from jaxbeam.cli.commands.compare import compare
 from jaxbeam.cli.commands.describe import describe
 from jaxbeam.cli.commands.engineering.assess import assess
+from jaxbeam.cli.commands.engineering.check import check
 from jaxbeam.cli.commands.engineering.influence import influence
 from jaxbeam.cli.commands.export import export
 from jaxbeam.cli.commands.frequency import frf, modes, state_space

@@ -69,6 +69,16 @@ def receptances(case: Case, s, actuator: int = 0) -> Complex[Array, "pole sensor
 
     Of the beam with supports and actuators, without loads and filters of sensors. Raises ValueError
     for an invalid case, or an actuator that it does not have.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, damping_ratio=0.03),
+    ...     actuators=[jb.PointForce(0.3, limits=[-1.0, 1.0])],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
+    ... )
+    >>> print(jb.receptances(case, [10j, 20j]).shape)
+    (2, 1)
     """
     model = _checked_model(case, actuator)
     s = xp.asarray(s) + 0j
@@ -87,6 +97,13 @@ def fit_receptances(
     axis of frequencies, so a rational function is fitted to the values and their conjugates, for
     each sensor, to a relative `tolerance`: that of the noise (AAA: Nakatsukasa, Sete and Trefethen,
     SIAM Journal on Scientific Computing 40, 2018). Raises ValueError for arrays that do not fit.
+
+    >>> import numpy as np
+    >>> frequencies = np.linspace(0.1, 2.0, 40)
+    >>> s = 2j * np.pi * frequencies
+    >>> fitted = fit_receptances(frequencies, 1 / (s**2 + 0.4 * s + 16)[:, None])
+    >>> print(np.allclose(fitted(1.0 + 3.0j), 1 / ((1 + 3j) ** 2 + 0.4 * (1 + 3j) + 16)))
+    True
     """
     from scipy.interpolate import AAA  # imported here: it takes longer than all else
 
@@ -119,6 +136,16 @@ def receptance_gains(
     sensors do not change. Each complex pole takes two gains, each real one one; where gains are
     left, the smallest are taken. Raises ValueError if there are too few sensors, or if the poles
     cannot be assigned.
+
+    The `actuator` is driven with the `delay` (s) from measurement to command.
+
+    >>> import numpy as np
+    >>> pole = -1.0 + 5.0j
+    >>> assigned = 1 / (pole**2 + 16) * np.ones((1, 1))  # of a mass of 1 kg on a spring of 16 N/m
+    >>> law = receptance_gains(assigned, [pole])
+    >>> closed = pole**2 + 16 - (law.displacement + pole * law.velocity)
+    >>> print(np.abs(closed).max() < 1e-9)
+    True
     """
     assigned, poles = xp.asarray(assigned) + 0j, np.asarray(poles, complex)
     count = assigned.shape[1]
@@ -192,13 +219,23 @@ def receptance_feedback(
 def closed_loop_poles(
     case: Case, feedback: ReceptanceFeedback, delay: float | None = None, count: int = 24
 ) -> Complex[np.ndarray, " pole"]:
-    """Rightmost poles (1/s) of the loop with non-negative imaginary part, the rightmost first.
+    """Rightmost poles (1/s) of the loop of a `feedback`, imaginary part not negative, in order.
 
     A delayed loop has infinitely many poles: the equation is collocated at Chebyshev points over
     the delay (Breda, Maset and Vermiglio, SIAM Journal on Scientific Computing 27, 2005), and the
     `count` rightmost poles are refined by inverse iteration. `delay` (s) may differ from that of
     the design, which tells how robust it is. Loads and filters are left out. Raises ValueError for
     an invalid case; needs known numbers.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535),
+    ...     actuators=[jb.PointForce(position=0.21)],
+    ...     sensors=[jb.Sensor(position=0.18), jb.Sensor(position=0.39)],
+    ... )
+    >>> law = jb.receptance_feedback(case, [-12.8 + 127.5j, -30.7 + 511.5j])
+    >>> bool(abs(jb.closed_loop_poles(case, law) - (-12.8 + 127.5j)).min() < 1e-8)
+    True
     """
     case = concrete_case(case)
     model = _checked_model(case, feedback.actuator)

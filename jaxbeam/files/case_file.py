@@ -39,6 +39,17 @@ def load_case(path: str | os.PathLike) -> Case:
 
     Raises ValueError, with the file and the address or line, for invalid TOML, unknown keys or
     kinds, wrong types and the errors of `check_case`; OSError if the file cannot be read.
+
+    >>> import jaxbeam as jb
+    >>> import pathlib, tempfile
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "case.toml"
+    >>> _ = path.write_text('''[beam]
+    ... length = "25 m"
+    ... flexural_rigidity = 3e10
+    ... mass_per_length = 15e3
+    ... ''')
+    >>> print(jb.load_case(path).beam.length)
+    25.0
     """
     case = read_case(path)
     try:
@@ -49,7 +60,10 @@ def load_case(path: str | os.PathLike) -> Case:
 
 
 def read_case(path: str | os.PathLike) -> Case:
-    """The case of a TOML file, whose values are not validated yet; raises as `load_case`."""
+    """The case of a TOML file, whose values are not validated yet.
+
+    Raises ValueError and OSError as `load_case`, but for the errors of `check_case`.
+    """
     content = read_toml(path)
     _find_vehicle_files(content, Path(path).parent)
     try:
@@ -61,10 +75,12 @@ def read_case(path: str | os.PathLike) -> Case:
 def _find_vehicle_files(content: dict[str, Any], folder: Path) -> None:
     """Paths of vehicle files, which are relative to the case file, as they are from here."""
     loads = content.get("loads")
-    for table in loads if isinstance(loads, list) else ():
-        model = table.get("model") if isinstance(table, dict) else None
-        if isinstance(model, str) and is_path(model):
-            table["model"] = str(folder / model)
+    for load in loads if isinstance(loads, list) else ():
+        coaches = load.get("coaches") if isinstance(load, dict) else None
+        for table in (load, *(coaches if isinstance(coaches, list) else ())):
+            model = table.get("model") if isinstance(table, dict) else None
+            if isinstance(model, str) and is_path(model):
+                table["model"] = str(folder / model)
 
 
 def load_controller(path: str | os.PathLike) -> AbstractController:
@@ -89,6 +105,13 @@ def save_case(case: Case, path: str | os.PathLike, overwrite: bool = False) -> N
 
     `load_case` returns the same numbers to the last bit. Raises FileExistsError if the file exists
     and `overwrite` is not set, ValueError if a part of the case has no kind.
+
+    >>> import jaxbeam as jb
+    >>> import pathlib, tempfile
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "case.toml"
+    >>> jb.save_case(jb.Case(jb.Beam(25.0, 3e10, 15e3)), path)
+    >>> print(path.read_text().splitlines()[1])
+    length = 25.0  # m
     """
     text = _as_toml(case)
     try:

@@ -15,6 +15,12 @@ def profile_from_file(path: str | os.PathLike) -> TableProfile:
 
     Raises ValueError, with the file and the line, for anything else; OSError if the file cannot be
     read.
+
+    >>> import pathlib, tempfile
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "road.csv"
+    >>> _ = path.write_text(chr(10).join(["x, height", "0, 0", "5, 0.01", "10, 0"]))
+    >>> print(profile_from_file(path).positions)
+    [ 0.  5. 10.]
     """
     positions, heights = _read_points(Path(path))
     return TableProfile(positions, heights)

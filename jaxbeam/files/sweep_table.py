@@ -22,6 +22,13 @@ def sweep_columns(dataset: "xarray.Dataset") -> dict[str, np.ndarray]:
     Swept values, peaks of all sensors with their times, smallest contact forces in N, and whether
     the run failed (1) or not (0); histories are left out. `pandas.DataFrame(columns)` works. Raises
     ValueError for a dataset that is not that of a sweep.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> case = jb.Case(beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingForce(force=5.0, speed=2.0)])
+    >>> runs = jb.sweep(case, {"loads.0.speed": [1.0, 2.0]}, progress=False)
+    >>> print(next(iter(sweep_columns(runs))))
+    speed of the load (m/s)
     """
     if "failed" not in dataset or "case" not in dataset.attrs:
         raise ValueError("not a sweep of jaxbeam: the dataset lacks its runs or its case")

@@ -95,7 +95,7 @@ def _trial_run(
     _, states, *_ = integrate_history(
         discrete, load_set(case), max_loads=shapes.max_loads, steps=steps
     )
-    return trial_deflections(case, model, states[::divided])
+    return np.asarray(trial_deflections(case, model, states[::divided]))
 
 
 def trial_deflections(case: Case, model: ModalModel, states):

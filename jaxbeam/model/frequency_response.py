@@ -137,6 +137,17 @@ def frequency_response(
 
     Raises ValueError for an invalid case, negative frequencies, an unknown input or output, or a
     stationary mass that is negative or off the beam.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, damping_ratio=0.03),
+    ...     actuators=[jb.PointForce(0.3, limits=[-1.0, 1.0])],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
+    ... )
+    >>> responses = jb.frequency_response(case, [5.0, 20.0])
+    >>> print(responses.values.shape)  # frequency, pair
+    (2, 1)
     """
     check_case(case)
     frequencies, masses = (
@@ -204,6 +215,12 @@ def receptance(
 
     Positions x and y (m) may have any shapes; differentiable in them too. Other arguments and
     errors are those of `frequency_response`.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> static = jb.receptance(jb.Case(beam), [0.0], 0.3, 0.3)  # of three modes; L^3 / (48 E I)
+    >>> print(f"{abs(static[0]) * 48 * 11.68 / 0.6**3:.3f}")
+    0.998
     """
     check_case(case)
     frequencies, masses = (
@@ -234,7 +251,15 @@ def mobility(
     stationary_masses: StationaryMasses = (),
     layout: Layout | None = None,
 ) -> Complex[Array, "..."]:
-    """Mobility: velocity at x per force at y, in m/(N s); s x receptance, eq. (2.29)."""
+    """Mobility: velocity at x per force at y, in m/(N s); s x receptance, eq. (2.29).
+
+    Positions are those of `receptance`, other arguments those of `frequency_response`.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> print(jb.mobility(jb.Case(beam), [10.0, 20.0], 0.3, 0.3).shape)
+    (2,)
+    """
     response = receptance(case, frequencies, x, y, stationary_masses, layout)
     return _differentiated(frequencies, response)
 
@@ -247,7 +272,15 @@ def accelerance(
     stationary_masses: StationaryMasses = (),
     layout: Layout | None = None,
 ) -> Complex[Array, "..."]:
-    """Accelerance: acceleration at x per force at y, in 1/kg, s^2 x receptance."""
+    """Accelerance: acceleration at x per force at y, in 1/kg, s^2 x receptance.
+
+    Positions are those of `receptance`, other arguments those of `frequency_response`.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> print(jb.accelerance(jb.Case(beam), [10.0], 0.3, 0.3).shape)
+    (1,)
+    """
     return _differentiated(
         frequencies, mobility(case, frequencies, x, y, stationary_masses, layout)
     )

@@ -103,12 +103,11 @@ class WheelSet(Module):
             dataclasses.replace(group, B=group.B / factor, H=group.H * factor)
             for group in self.vehicles
         )
-        springs = [
+        stiffness, damping = (
             part if part is None else part * factor for part in (self.stiffness, self.damping)
-        ]
-        return WheelSet(
-            self.inertia * factor, self.weight * factor, *springs, groups, self.histories
         )
+        inertia, weight = self.inertia * factor, self.weight * factor
+        return WheelSet(inertia, weight, stiffness, damping, groups, self.histories)
 
 
 class LoadSet(Module):

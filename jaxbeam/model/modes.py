@@ -203,6 +203,11 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     of beams that are not uniform are in `model.theory.elements`.
     Differentiable in every number, at repeated frequencies too. Inside `jit`, pass the `layout`
     found outside by `mesh_layout(case)`.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> print(jb.modes(jb.Case(beam)).frequencies.round(2))
+    [ 20.39  81.55 183.49]
     """
     layout = mesh_layout(case) if layout is None else layout
     beam, found, to_rotation = case.beam, None, None

@@ -232,6 +232,14 @@ def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = 
     found outside by `model.modes.mesh_layout(case)`.
 
     Raises ValueError for other coordinates, and for "sine" if the modes are not such sines.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> case = jb.Case(
+    ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingMass(mass=0.5, speed=2.0)]
+    ... )
+    >>> print(jb.state_space(case).at(0.1).A.shape)
+    (6, 6)
     """
     return build_plant(case, compiled_modal_model(case, layout), coordinates)
 

@@ -210,6 +210,12 @@ def shear_force(case: Case, x, third_derivative) -> Float[Array, "..."]:
 
     `third_derivative` (..., *position) is that of the deflection by x, in 1/m^2. At a point force,
     the shear force to the right of it.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Case(jb.Beam(length=2.0, flexural_rigidity=6.0, mass_per_length=1.0))
+    >>> third = jb.influence_line(beam, x=0.5, load_positions=1.0, derivative=3)
+    >>> print(f"{jb.shear_force(beam, 0.5, third):.3f} N")  # half of 1 N at midspan
+    0.500 N
     """
     return section_stiffness(case, xp.asarray(x, float)) * third_derivative
 

@@ -143,6 +143,14 @@ def static_peak(
     `derivative` (up to 2) gives that x-derivative instead. The maximum is exact: between the events
     of a crossing the deflection is a polynomial in time. Differentiable in every number where the
     maximum is unique. Raises ValueError as `influence_line` does.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> case = jb.Case(
+    ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingMass(mass=0.5, speed=2.0)]
+    ... )
+    >>> print(f"{1e3 * jb.static_peak(case, 0.3):.2f} mm")
+    1.89 mm
     """
     x = xp.asarray(x, float)
     layout = _validated_layout(case, layout, x=x)

@@ -139,15 +139,22 @@ class Record(TableViews, eqx.Module):
         return section_forces.support_positions(self.case, self.modes)
 
     def envelope(
-        self, quantity: str = "moment", positions=None, fibre_distance=None, section_modulus=None
+        self,
+        quantity: str = "moment",
+        positions=None,
+        fibre_distance=None,
+        section_modulus=None,
+        coincident: str = "",
     ) -> RecordEnvelope:
         """Smallest and largest values of a quantity at positions (m), with times and loads.
 
         From the samples, free vibration included; by default at 101 equally spaced positions. The
         quantities are those of `at`; a moment has its peak as a load passes, so that a load should
-        move by a small part of the length between samples. Raises ValueError as `at` does.
+        move by a small part of the length between samples. With each value is that of another,
+        `coincident` quantity at the same place and time, if one is named. Raises ValueError as `at`
+        does.
         """
-        parameters = positions, fibre_distance, section_modulus
+        parameters = positions, fibre_distance, section_modulus, coincident
         return record_envelope(
             self.case, self.modes, self.motion, self.times, quantity, *parameters
         )

@@ -62,6 +62,15 @@ def simulate(
 
     Raises ValueError for an invalid case or times, RuntimeError if no time step meets the
     tolerance; warns (ContactLossWarning) of negative contact forces.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> case = jb.Case(
+    ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingMass(mass=0.5, speed=2.0)]
+    ... )
+    >>> record = jb.simulate(case)
+    >>> print(f"{1e3 * record.peak_deflection[0]:.2f} mm")
+    2.00 mm
     """
     if times is not None:
         _check_times(times)

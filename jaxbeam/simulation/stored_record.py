@@ -76,6 +76,15 @@ def read_record(path: str | os.PathLike) -> Record:
     """Record from a netCDF file or zarr store written by `Record.save`.
 
     Raises OSError if the file cannot be read, ValueError if it is not that of a record.
+
+    >>> import jaxbeam as jb
+    >>> import pathlib, tempfile
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> record = jb.simulate(jb.Case(beam, loads=[jb.MovingMass(mass=0.5, speed=2.0)]))
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.nc"
+    >>> record.save(path)
+    >>> print(jb.read_record(path).times.size)
+    1001
     """
     import xarray
 

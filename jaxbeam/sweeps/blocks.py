@@ -166,12 +166,9 @@ class Runner:
             calls = batch_indices.size // self.trial_batches
             parts = zip(np.split(batch_indices, calls), np.split(steps, calls), strict=True)
             results = [self._integrate(*part, None, single, extra_steps) for part in parts]
-            return self._compared_by_quantity(
-                *(
-                    np.concatenate([result.get(name, np.zeros(0)) for result in results])
-                    for name in ("peak_deflection", programs.MODAL_SUM_PEAK)
-                )
-            )
+            names = "peak_deflection", programs.MODAL_SUM_PEAK
+            columns = ([one.get(name, np.zeros(0)) for one in results] for name in names)
+            return self._compared_by_quantity(*map(np.concatenate, columns))
 
         search = self.crossing_rates, self.initial_steps, self.max_steps, count, self.tolerance
         steps, error = choose_step_sizes(peaks, *search, self.pool.map)

@@ -69,6 +69,15 @@ def sweep(
     `resume` or `overwrite`; OSError if it cannot be written, or another process writes it (an
     `InUseError`, which says which); RuntimeError if no time step meets the tolerance or workers
     keep dying.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> case = jb.Case(
+    ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingMass(mass=0.5, speed=2.0)]
+    ... )
+    >>> runs = jb.sweep(case, {"loads.0.speed": [1.0, 2.0]}, progress=False)
+    >>> print(dict(runs.peak_deflection.sizes))
+    {'loads.0.speed': 2, 'sensor': 1}
     """
     if client is not None and store is None:
         raise ValueError("workers write their blocks to a store; name one")

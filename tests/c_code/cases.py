@@ -59,6 +59,10 @@ ESTIMATED = jb.Kalman(0.02, 1e-5, loads="estimated", weight_deviation=1.0)
 SHORT = {"loads": [jb.MovingMass(mass=0.4, speed=15.0)], "run": Run(duration=0.06)}
 CASES = {
     "feedback": rig(Feedback([2e3, 1e3], higher_gains=[[1e8, 2e8]], period=PERIOD)),
+    "spring": rig(
+        Feedback([2e3], period=PERIOD),
+        actuators=[jb.SpringDamper(0.3, stiffness=100.0), jb.PointForce(0.45, limits=(-1.0, 1.0))],
+    ),
     "feedback-cubic": rig(Feedback([5e8, 1e8], power=3, period=PERIOD), sensors=FILTERED),
     "output-feedback": rig(
         OutputFeedback([[2e3, 0.0, 5.0], [0.0, -1e3, 1.0]], period=PERIOD, delay=PERIOD),
@@ -155,17 +159,18 @@ class GivenTables(AbstractController):
         schedules = [self.random_schedule() for _ in range(6)]
         grid = jax.tree.map(lambda *x: np.reshape(np.stack(x), (2, 3, *x[0].shape)), *schedules)
         grids = np.array([0.3, 0.5]), np.array([1.0, 2.0, 3.0])
-        numbers = plant.case.beam.length, plant.case.run.gravity, np.array(2.4)
+        numbers = plant.case.beam.length, np.array(2.4)
         source = self.identification.identifier(plant, plant)
-        law = ScheduledGainLaw(grid, *grids, *numbers, source, self.nearest)
+        law = ScheduledGainLaw(grid, *grids, *numbers, source, self.nearest, 1)
         return SampledStateLaw(law, TrueState(np.eye(5)))
 
     def random_schedule(self) -> GainSchedule:
         """Table of five cubics from 0.02 to 0.2 s, then a gain that fades."""
-        columns, inner = 5 + self.family, np.sort(RANDOM.uniform(size=4))
+        weights = np.array([2.9, 1.0] if self.family else [])
+        columns, inner = 5 + weights.size, np.sort(RANDOM.uniform(size=4))
         coefficients = 20.0 * RANDOM.normal(size=(5, 4, 2, columns))
         table = GainTable(np.concatenate([[0.0], inner, [1.0]]), coefficients)
-        final, weights = 20.0 * RANDOM.normal(size=(2, columns)), np.zeros(int(self.family))
+        final = 20.0 * RANDOM.normal(size=(2, columns))
         times = np.array(0.02), np.array(0.2), np.array(0.03)
         return GainSchedule(table, final, weights, *times, self.family)
 

@@ -46,7 +46,7 @@ def test_header_states_cost_and_meaning(program):
     assert f"Cost of a step at worst: {program.operations} additions" in header
     assert f"{program.state_bytes} bytes of state, {program.constant_bytes} bytes" in header
     assert "void gates_gate(gates_state *s, int gate, gates_real t);" in header
-    assert "readings of the 3 sensors in SI units" in header
+    assert "readings of the sensors (3), in SI units" in header
 
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")

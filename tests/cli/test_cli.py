@@ -76,6 +76,10 @@ REFUSED = [
     ("identify case.toml log.csv --free beam.length=0:b", "'b' is not a number"),
     ("identify case.toml log.csv --free beam.length=1:2m", "give both bounds a unit, as in 8 GN"),
     ("identify case.toml log.csv --free beam.length -o case.toml", "case.toml exists; choose"),
+    (
+        "weigh case.toml old.nc --speeds 5:20 --calibration old.nc",
+        "--calibration is for Moses' method: say how many --axles",
+    ),
 ]
 
 

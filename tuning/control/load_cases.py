@@ -72,7 +72,12 @@ def _all_pairs(
 
 
 def full_grid(values: Mapping[str, Sequence[float | int]]) -> tuple[AddressValues, ...]:
-    """Full grid: every combination of the values given by address."""
+    """Full grid: every combination of the values given by address.
+
+    >>> import tuning
+    >>> print(*tuning.full_grid({"loads.0.mass": [0.2, 0.4]}))
+    {'loads.0.mass': 0.2} {'loads.0.mass': 0.4}
+    """
     rows = itertools.product(*values.values())
     return tuple(dict(zip(values, map(float, row), strict=True)) for row in rows)
 
@@ -83,6 +88,10 @@ def latin_hypercube(
     """Latin hypercube: `count` draws of values, evenly spread over a range for each address.
 
     Raises ValueError for a count below 1 or a range that does not ascend.
+
+    >>> import tuning
+    >>> len(tuning.latin_hypercube({"loads.0.mass": (0.2, 0.4)}, count=5))
+    5
     """
     if count < 1:
         raise ValueError(f"the number of draws must be 1 or more, not {count}")

@@ -105,7 +105,8 @@ def lexicographic(
     """Tune for metrics in order of rank: each is minimised subject to limits on those before it.
 
     The limit on a metric is its minimum plus the share `slack` of it. There is one result for each
-    metric; the last one is that for all. Other arguments are those of `tune`.
+    metric; the last one is that for all. `aggregation` is that of an
+    `Objective`, over the runs. Other arguments are those of `tune`.
 
     Raises ValueError as `tune` does, for an unknown metric and one that is named twice.
     """

@@ -15,6 +15,8 @@ def with_identified_plant(case: Case, found: Fit | Posterior) -> Case:
 
     Parameters of loads and of single logs stay as they are in the case. Raises ValueError if the
     case lacks an address, or if no parameter of the plant was identified.
+
+    `found` is the identification, by likelihood or with its posterior.
     """
     values = found.means if isinstance(found, Posterior) else found.values
     return replace(case, _plant_values(found.addresses, values))
@@ -29,6 +31,8 @@ def draw_plants(found: Fit | Posterior, count: int, seed: int = 0) -> tuple[Addr
 
     Raises ValueError for a fit with unidentifiable parameters, for a count below 1 or above the
     number of draws of the posterior, and if too few draws lie within the bounds.
+
+    `found` is the identification; equal seeds give equal draws.
     """
     if count < 1:
         raise ValueError(f"the number of plants must be 1 or more, not {count}")

@@ -29,6 +29,9 @@ def write_report(
     """Write a report on a fit, report.md and report.html with figures, to a folder.
 
     Raises FileExistsError if the folder is not empty and `overwrite` is not set.
+
+    It has `profiles` of parameters, a `posterior`, predictions of `held_out` logs and the
+    comparison with other `models` where they are given.
     """
     sections = report_sections(fit, profiles, posterior, held_out, models)
     title = fit.case.title or "Identification"

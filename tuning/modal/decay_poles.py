@@ -22,6 +22,8 @@ from scipy.optimize import least_squares
 
 NOISE_SMOOTHING_BINS = 12  # bins on either side over which the noise level is averaged
 MAX_MODES = 24
+CLEAR_GAIN = 20.0  # least gains in likelihood of a mode that is not tried to be left out
+MAX_ADDED_MODES = 6  # to those that a subspace method has found
 FALSE_ALARM_PROBABILITY = 1e-4  # of a mode found in noise, over all bins
 # No structure is exactly linear: the misfit of a strong mode looks like weak ones beside it. What
 # is below this share of the amplitudes nearby is not taken for a mode.
@@ -106,6 +108,7 @@ def find_poles(
         inside = (frequencies > spectrum.bins[0]) & (frequencies < spectrum.bins[-1])
         level = _robust_level(spectrum.values) + misfit_level
         best = refine(start[inside][: spectrum.bins.size // 4], spectrum, level, COARSE_TOLERANCE)
+        max_modes = min(max_modes, best.poles.size + MAX_ADDED_MODES)
     while best.poles.size < min(max_modes, spectrum.bins.size // 4):
         level = _robust_level(best.residual) + misfit_level
         guess = _initial_pole(spectrum, best.residual, level)
@@ -126,7 +129,11 @@ def _prune_poles(best: PoleFit, spectrum: Spectrum, misfit_level, min_gain: floa
     """Remove poles, weakest first, that are not significant beside the others."""
     level = _robust_level(best.residual) + misfit_level
     best = refine(best.poles, spectrum, level)
-    for pole in best.poles[np.argsort(np.sum(np.abs(best.amplitudes), axis=1))]:
+    # What a mode well apart from others explains; a fit without it is tried only if that is little.
+    gains = np.sum(np.abs(best.amplitudes) ** 2 / best.amplitude_variance, axis=1)
+    order = np.argsort(np.sum(np.abs(best.amplitudes), axis=1))
+    weak = [k for k in order if gains[k] < CLEAR_GAIN * min_gain]
+    for pole in best.poles[weak]:
         nearest = int(np.argmin(np.abs(best.poles - pole)))
         trial = refine(np.delete(best.poles, nearest), spectrum, level, COARSE_TOLERANCE)
         if (

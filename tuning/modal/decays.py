@@ -18,6 +18,7 @@ BLOW_SIGNAL_SHARE = 0.25  # of the rms of the signal around, likewise
 MIN_DECAY_CYCLES = 8.0  # of the strongest vibration
 MIN_FALL_NEPERS = 1.5  # of the energy over a decay
 MIN_LINEARITY = 0.6  # share of the variance of the log energy that a straight line explains
+MAX_COLUMNS = 24  # channels times decays that are fitted together
 FLOOR_RATIO = 2.0  # energy at which a decay ends, over that of the quietest parts
 
 
@@ -143,12 +144,16 @@ def stacked(
     """Decays of one length side by side, channels of the first before those of the second ...
 
     The common length is the median; decays of less than half of it are left out, and those between
-    shorten it.
+    shorten it. Of more than 24 columns in all, the decays with most energy are kept.
     """
     lengths = np.array([one.stop - one.start for one in decays])
     used = tuple(
         one for one, length in zip(decays, lengths, strict=True) if 2 * length >= np.median(lengths)
     )
+    most = max(MAX_COLUMNS // records[0].shape[1], 1)
+    energies = [np.sum(records[one.record][one.start : one.stop] ** 2) for one in used]
+    kept = np.sort(np.argsort(energies)[::-1][:most])
+    used = tuple(used[i] for i in kept)
     length = min(int(np.median(lengths)), min(one.stop - one.start for one in used))
     parts = [records[one.record][one.start : one.start + length] for one in used]
     return np.hstack(parts), used

@@ -39,7 +39,6 @@ def harmonic_lines(
     inside = (bins > band[0]) & (bins < band[1])
     level = tapers.sum(axis=1)
     level[1::2] = 0.0  # those of odd tapers vanish
-    norm = np.sum(level**2)
     limit = f_distribution.isf(
         FALSE_ALARM_PROBABILITY / (channels * max(np.sum(inside) // 2, 1)), 2, 2 * TAPERS - 2
     )
@@ -47,16 +46,20 @@ def harmonic_lines(
     variance = np.maximum(record.var(axis=0), 1e-300)
     for channel in range(channels):
         spectra = np.fft.rfft(tapers * record[:, channel], size, axis=1)
-        amplitude = level @ spectra / norm
-        rest = np.sum(np.abs(spectra - np.multiply.outer(level, amplitude)) ** 2, axis=0)
-        ratio = (TAPERS - 1) * np.abs(amplitude) ** 2 * norm / np.maximum(rest, 1e-300)
-        power = np.abs(amplitude) ** 2
+        power, ratio = _line_test(spectra, level)
         peak = (power > np.roll(power, 1)) & (power >= np.roll(power, -1))
-        found += bins[inside & peak & (ratio > limit)].tolist()
+        # Between two bins the ratio of a line is smaller: it is computed again at its frequency.
+        found += bins[inside & peak & (ratio > limit / 10)].tolist()
     lines: list[float] = []
+    times = np.arange(count) / rate
     for frequency in sorted(found):
+        if any(abs(frequency - f) <= 2 * rate / count for f in lines):
+            continue
         refined = _followed(record, rate, frequency, variance)
-        if refined is not None and all(abs(refined - f) > 2 * rate / count for f in lines):
+        if refined is None or any(abs(refined - f) <= 2 * rate / count for f in lines):
+            continue
+        shifted = record * np.exp(-2j * np.pi * refined * times)[:, None]
+        if np.max(_line_test(tapers @ shifted, level)[1]) > limit:
             lines.append(refined)
     shares = [
         float(np.mean(np.abs(_amplitudes(record, rate, f, 1)[0]) ** 2 / 2 / variance))
@@ -64,6 +67,15 @@ def harmonic_lines(
     ]
     ranked = sorted(zip(shares, lines, strict=True), reverse=True)[:MAX_LINES]
     return tuple(sorted(Line(f, share) for share, f in ranked))
+
+
+def _line_test(spectra, level):
+    """Power of a line at each frequency, and its ratio to the rest within the tapers' bandwidth."""
+    norm = np.sum(level**2)
+    amplitude = level @ spectra / norm
+    rest = np.sum(np.abs(spectra - np.multiply.outer(level, amplitude)) ** 2, axis=0)
+    power = np.abs(amplitude) ** 2
+    return power, (TAPERS - 1) * power * norm / np.maximum(rest, 1e-300)
 
 
 def _amplitudes(record, rate, frequency, parts):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tuning.modal.shapes import mac_matrix, phase_collinearity
+from tuning.modal.shapes import mac_matrix
 from tuning.modal.subspace import Poles
 
 MAX_FREQUENCY_CHANGE = 0.01  # relative, between neighbouring orders
@@ -120,17 +120,3 @@ def _representative(poles: Poles, members) -> int:
     values = poles.poles[members]
     centre = np.median(values.real) + 1j * np.median(values.imag)
     return int(members[np.argmin(np.abs(values - centre))])
-
-
-def chain_scatter(poles: Poles, chain: Chain) -> tuple[float, float]:
-    """Standard deviations of frequency (Hz) and damping ratio over the orders, by medians."""
-    frequency, damping = poles.frequencies[chain.members], poles.damping_ratios[chain.members]
-    return (
-        float(1.4826 * np.median(np.abs(frequency - np.median(frequency)))),
-        float(1.4826 * np.median(np.abs(damping - np.median(damping)))),
-    )
-
-
-def complexity(poles: Poles) -> Float[np.ndarray, " pole"]:
-    """Modal phase collinearity of each pole's shape; 1 with one channel."""
-    return phase_collinearity(poles.shapes)

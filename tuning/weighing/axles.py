@@ -115,8 +115,8 @@ class AxleWeighing:
             *text_table(header, rows, ">>><><"),
             f"gross weight by Moses' method {gross / 1e3:.5g} kN, standard error"
             f" {gross_error / 1e3:.3g} kN, at {geometry.speed:.4g} m/s",
-            f"dynamic wheel forces of {self.dynamic.share:.2g} of the static ones (standard"
-            " deviation) are in these intervals, not in those below",
+            f"the intervals above allow for dynamic wheel forces of {self.dynamic.share:.2g} of the"
+            " static ones (standard deviation), those below do not",
         ]
         return "\n".join([*lines, "", str(self.fit)])
 
@@ -134,8 +134,9 @@ def weigh_axles(
 
     `speeds` (m/s) are the lowest and highest possible ones, from the left or, with `both_ways`, in
     both directions; `axles` is their number. Moses' method has the influence lines of the case, or
-    those given (see `calibrate_influence_lines`). The fit has moving forces, the vibration of the
-    beam, and offsets of the sensors; loads and profile of case and log are not used.
+    the `influence_lines` given (see `calibrate_influence_lines`). The fit has moving forces, the
+    vibration of the beam, and offsets of the sensors; loads and profile of case and log are not
+    used.
 
     Raises ValueError if speeds are not 0 < low < high, there is no axle, or a sensor measures
     velocity or acceleration, and as `identify` does.

@@ -26,6 +26,11 @@ def characteristic_points(case: Case) -> list[CharacteristicPoint]:
     """Supports, quarter points and midspans of all spans, and free ends, from left to right.
 
     Spans and supports are counted from 1; of an overhang the points are those of a span.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> print([point[0] for point in jb.characteristic_points(jb.Case(beam))][:2])
+    ['support 1', 'quarter 1']
     """
     length, held = float(concrete(case.beam.length)), set(held_positions(case).tolist())
     points = [CharacteristicPoint(f"support {i}", x) for i, x in enumerate(sorted(held), 1)]

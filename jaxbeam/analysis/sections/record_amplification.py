@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxbeam.analysis.amplification import AMPLIFIED, static_amplified
+from jaxbeam.analysis.sections.amplification import AMPLIFIED, static_amplified
 from jaxbeam.case.case import Case
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.load_set import load_set

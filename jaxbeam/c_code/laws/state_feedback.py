@@ -109,15 +109,20 @@ for (i = 0; i < {code.actuators}; i++) {code.output}[i] = 0;
 def _(law: ScheduledGainLaw, code: CSource, estimate: EstimateCode) -> None:
     load = write_load_source(law.load_source, code)
     schedules, masses, speeds = law.schedules, len(law.masses), len(law.speeds)
-    columns, weights = np.shape(schedules.final_gain)[-1], int(schedules.load_feedforward)
+    lightest = np.asarray(schedules.load_weights)[0, 0]
+    columns, weights = np.shape(schedules.final_gain)[-1], len(lightest)
     x = _fed_back(code, schedules, estimate, weights)
     grids = code.constant("masses", law.masses), code.constant("speeds", law.speeds)
     nearest = int(law.nearest)
     mass_ends = f"(real){float(law.masses[0])!r}, (real){float(law.masses[-1])!r}"
     weight_line = ""
     if weights:
-        place, gravity = f"{x}[{columns - 1}]", float(law.gravity)
-        weight_line = f"\n    {place} = clamp(mass, {mass_ends}) * (real){gravity!r};"
+        place, known = f"{x} + {columns - weights}", code.constant("load_weights", lightest)
+        code.add(f"copy({place}, {known}, {weights});")
+        own = f"for (i = 0; i < {law.weight_count}; i++)\n        ({place})[i]"
+        weight_line = f"\n    {own} *= clamp(mass, {mass_ends}) / {grids[0]}[0];"
+        if schedules.load_feedforward and estimate.weights is not None:
+            weight_line = f"\n    copy({place}, {estimate.weights}, {estimate.wheels});"
     command = _command_text(code, schedules, x, columns, "design")
     code.add(
         f"""
@@ -139,5 +144,8 @@ if ({load.speed_identified}) {{
 {indent(command, "        ")}
     }}
 }}""",
-        30 + 6 * (masses + speeds) + 4 * (_command_operations(code, schedules, columns) + 2),
+        30
+        + 6 * (masses + speeds)
+        + 4 * weights
+        + 4 * (_command_operations(code, schedules, columns) + 2),
     )

@@ -249,13 +249,15 @@ def _lines(result: dict[str, Any], is_part: bool) -> list[str]:
 
 def _list_library(options: PrintOptions) -> None:
     from jaxbeam.case.loads.planar.files import load_vehicle, vehicle_names
+    from jaxbeam.vehicles.line_loads import line_loads
     from jaxbeam.vehicles.trains import trains
 
     vehicles = {name: load_vehicle(name).title for name in vehicle_names()}
     rows = [(name, title) for name, title in vehicles.items()]
     rows += [(name, f"{len(train.offsets)} axles") for name, train in trains().items()]
+    rows += [(name, "line load") for name in line_loads()]
     width = max(len(name) for name, _ in rows)
     options.report(
-        {"vehicles": list(vehicles), "trains": list(trains())},
+        {"vehicles": list(vehicles), "trains": list(trains()), "line_loads": list(line_loads())},
         [f"{name:{width}}  {what}" for name, what in rows],
     )

@@ -49,14 +49,13 @@ def stability(
     parsed_case = options.read(case)
 
     from jaxbeam.analysis.crossing_margin import stability_margin
-    from jaxbeam.analysis.linearised_loop import linearised_loop
+    from jaxbeam.analysis.linearised_loop import linearised_loop, loop_with_mass_at
     from jaxbeam.analysis.stability import frozen_poles, growth, stream
     from jaxbeam.analysis.stability_limits import (
         largest_frozen_pole,
         load_stability_limits,
         stream_excess,
     )
-    from jaxbeam.analysis.stationary_loop import loop_with_mass_at
 
     along_crossing = stability_margin(parsed_case)
     # Before the first load: loads off the beam leave the loop as it is.

@@ -33,6 +33,16 @@ def sampling_limit(case: Case) -> Float[Array, " mode"]:
     multiples of the limit too, and poor near it and in between. Not for use inside `jit`.
 
     Raises ValueError for an invalid case.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, damping_ratio=0.03),
+    ...     actuators=[jb.PointForce(0.3, limits=[-1.0, 1.0])],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
+    ... )
+    >>> print(jb.sampling_limit(case).round(4))
+    [0.0245 0.0061 0.0027]
     """
     check_case(case)
     return xp.asarray(np.pi / _oscillatory_modes(state_space(case).unloaded)[0].imag)

@@ -139,6 +139,8 @@ def sample(
     Raises ValueError for a direction that is not identifiable and has no prior, an unknown word
     for the noise, and a checkpoint that is damaged or of another sampling; FileExistsError if the
     checkpoint exists and `resume` is not set; ImportError without blackjax.
+
+    The No-U-Turn sampler runs `chains` at once, and adapts in `warmup` steps that are dropped.
     """
     if fit.unidentifiable:
         raise ValueError(

@@ -58,6 +58,8 @@ def profile(fit: Fit, address: str, points: int = 4) -> Profile:
     anew.
 
     Raises ValueError if the parameter is not free.
+
+    The `address` is one of those that were free in the fit.
     """
     if address not in fit.addresses:
         raise ValueError(f"{address} is not free in this fit; free are {', '.join(fit.addresses)}")

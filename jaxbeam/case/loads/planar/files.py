@@ -54,6 +54,12 @@ def load_vehicle(model: str | os.PathLike) -> PlanarVehicle:
 
     Raises ValueError for an unknown name, and with the file and the address for whatever is wrong
     in a file; OSError if it cannot be read.
+
+    `model` is the name, or the path of the file.
+
+    >>> import jaxbeam as jb
+    >>> print(jb.load_vehicle("truck-5-axle").title)
+    Articulated truck: tractor with two axles, trailer with three
     """
     if isinstance(model, str) and not is_path(model):
         if model not in vehicle_names():

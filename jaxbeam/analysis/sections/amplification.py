@@ -111,7 +111,7 @@ def amplification(
     >>> print(f"{jb.amplification(case, x=[0.3])[0]:.2f}")
     1.06
     >>> print(f"{jb.amplification(case, x=[0.3], quantity='moment')[0]:.2f}")
-    1.05
+    1.03
     """
     parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
     if quantity not in AMPLIFIED:

@@ -1,0 +1,113 @@
+"""Subspace identification of structures by finite elements, beside pyOMA-2."""
+
+import numpy as np
+import pytest
+
+from experiments.validation.modal_identification import compare, log_of
+from tests.oracles.planted_structures import Structure, random_structure, sampled
+from tuning import identify_modes
+from tuning.modal.harmonics import harmonic_lines, without_lines
+from tuning.modal.shapes import mac_matrix, normalised, phase_collinearity
+from tuning.modal.subspace import decompose, poles_of_order, spreads
+
+
+def free_response(times):
+    """Two channels of two damped modes, without noise, and their poles."""
+    poles = 2 * np.pi * np.array([3.0, 3.03]) * (-np.array([0.01, 0.02]) + 1j)
+    shapes = np.array([[1.0, 0.5], [0.4, -1.0]])
+    return np.real(np.exp(np.multiply.outer(times, poles)) @ shapes), poles, shapes
+
+
+@pytest.mark.parametrize("data_driven", [False, True])
+def test_poles_and_shapes_of_a_noiseless_decay_are_exact(data_driven):
+    """The covariances of a decay obey the equations of the method, whatever its length."""
+    values, poles, shapes = free_response(np.arange(300) / 20)
+    subspace = decompose((values,), 20.0, 20, data_driven)
+    found = poles_of_order(subspace, 4)
+    order = np.argsort(found.frequencies)
+    # The data-driven weight is computed with a relative accuracy of 1e-10 of its eigenvalues.
+    rtol = 1e-3 if data_driven else 1e-7
+    np.testing.assert_allclose(found.poles[order], poles, rtol=rtol)
+    assert np.all(np.diag(mac_matrix(found.shapes[order], shapes + 0j)) > 1 - 1e-5)
+
+
+def test_first_order_uncertainty_agrees_with_differences():
+    """The change of a pole for a small change of one block is that of a perturbed matrix."""
+    random = np.random.default_rng(0)
+    values, _, _ = free_response(np.arange(2000) / 20)
+    values = values + 1e-3 * random.normal(size=values.shape)
+    subspace = decompose((values[:1000], values[1000:]), 20.0, 12, as_blocks=True)
+    pole = poles_of_order(subspace, 4).poles[:1]
+    (own,) = spreads(subspace, 4, pole)
+    matrix = (subspace.left[:, : subspace.values.size] * subspace.values) @ subspace.right.T
+    step, shifts = 1e-4, []
+    for block in subspace.rotated:
+        change = subspace.left @ block @ subspace.right.T
+        moved = []
+        for sign in (-step, step):
+            left, sizes, right = np.linalg.svd(matrix + sign * change)
+            one = subspace._replace(left=left, values=sizes, right=right.T)
+            others = poles_of_order(one, 4).poles
+            moved.append(others[np.argmin(np.abs(others - pole))])
+        shifts.append((np.abs(moved[1]) - np.abs(moved[0])) / (2 * np.pi * 2 * step))
+    assert np.sqrt(own.covariance[0, 0]) == pytest.approx(np.linalg.norm(shifts), rel=1e-4)
+
+
+def small_structure(seed):
+    """Three modes, two of them 5 % apart, in two channels."""
+    whole = random_structure(1)
+    frequencies, damping = np.array([4.0, 4.2, 9.0]), np.array([0.01, 0.015, 0.008])
+    return Structure(frequencies, damping, whole.shapes[:3, :2], whole.inputs[:3])
+
+
+@pytest.mark.parametrize("kind", ["ambient", "motor"])
+def test_intervals_cover_planted_modes(kind):
+    """Three logs, as the whole experiment is too long: at most one of nine modes is missed."""
+    found = []
+    for seed in range(3):
+        planted = sampled(small_structure(seed), kind, seed, 150.0)
+        fit = identify_modes(log_of(planted), band=(2.0, 11.0))
+        found.append(compare(fit, planted))
+        if kind == "motor":
+            lines = [line.frequency for line in fit.lines]
+            inside = [line for line in planted.lines if line < 11.0]
+            np.testing.assert_allclose(lines, inside, atol=0.01)
+    covered = np.concatenate([one.covered for one in found])
+    assert covered.mean() > 0.85, covered
+    assert sum(len(one.false_modes) for one in found) <= 1
+    assert np.mean([seen for one in found for seen in one.found]) > 0.85
+
+
+def test_as_good_as_another_program():
+    """Modes that pyOMA-2 finds at a fixed order of the same log are found, as accurately."""
+    ssi = pytest.importorskip("pyoma2.functions.ssi")
+    planted = sampled(small_structure(0), "ambient", 3, 200.0)
+    fit = identify_modes(log_of(planted), band=(2.0, 11.0))
+    values = planted.values - planted.values.mean(axis=0)
+    hankel, _ = ssi.build_hank(Y=values.T, Yref=values.T, br=40, method="cov", calc_unc=False)
+    observability, states, outputs, _ = ssi.SSI_fast(hankel, 40, 20)
+    frequencies = ssi.SSI_poles(observability, states, outputs, 20, 1 / planted.rate)[0]
+    theirs = np.asarray(frequencies)[:, -1]
+    for truth, mine in zip(planted.structure.frequencies, fit.frequencies, strict=True):
+        own = abs(mine / truth - 1)
+        assert own < max(3 * np.nanmin(np.abs(theirs / truth - 1)), 5e-3)
+
+
+def test_a_line_is_found_and_subtracted():
+    times = np.arange(4000) / 100
+    random = np.random.default_rng(0)
+    noise = random.normal(size=(4000, 1))
+    line = 0.6 * np.cos(2 * np.pi * 7.123 * times + 0.4)[:, None]
+    (found,) = harmonic_lines(noise + line, 100.0, (1.0, 40.0))
+    assert found.frequency == pytest.approx(7.123, abs=1e-3)
+    assert found.share == pytest.approx(0.18 / 1.18, rel=0.2)
+    rest = without_lines(noise + line, 100.0, (found.frequency,))
+    np.testing.assert_allclose(rest, noise, atol=0.15)
+    assert harmonic_lines(noise, 100.0, (1.0, 40.0)) == ()
+
+
+def test_complexity_and_normalisation_of_shapes():
+    shapes = np.array([[1j, -0.5j, 0.2j], [1.0, 1j, -1.0]])
+    np.testing.assert_allclose(phase_collinearity(shapes)[0], 1.0)
+    assert phase_collinearity(shapes)[1] < 0.2
+    np.testing.assert_allclose(normalised(shapes[:1])[0], [1, -0.5, 0.2], atol=1e-12)

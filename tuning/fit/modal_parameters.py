@@ -1,0 +1,243 @@
+"""Parameters of a case from identified modes, by gradients through the eigenvalue problem.
+
+    fit = identify_from_modes(case, identify_modes(log), {"beam.flexural_rigidity": (1e6, 1e8)})
+
+Frequencies, damping ratios and shapes of the case are compared with the identified ones, weighted
+by their covariance (Friswell and Mottershead, Finite Element Model Updating in Structural Dynamics,
+chapter 8). Modes are paired by frequency and modal assurance criterion, anew at every solution.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+from jaxtyping import Float
+from scipy.stats import norm
+
+from jaxbeam.case.case import Case, replace
+from jaxbeam.model.modes import mesh_layout, modes
+from tuning.fit.least_squares import WEAK_PRIOR_WIDTH
+from tuning.fit.summary import parameter_table
+from tuning.fit.uncertainty.covariance import t_quantile, uncertainty
+from tuning.modal.fit import ModalFit
+from tuning.modal.shapes import mac_matrix
+from tuning.parameters.free import FreeParameter, free_parameters, to_unbounded
+from tuning.parameters.prior import Prior
+
+MIN_RELATIVE_FREQUENCY_SD = 1e-4  # of a frequency; clocks and temperature allow no better
+MIN_RELATIVE_DAMPING_SD = 1e-2
+MIN_SHAPE_SD = 1e-2  # of a component over the largest: calibration and places of sensors
+MAX_PAIRINGS = 6
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ModalParameterFit:
+    """Parameters fitted to identified modes (SI units), named as in `tuning.Fit`.
+
+    `pairs` are (identified mode, mode of the case), counted from 0, with their modal assurance
+    criterion (1 without shapes); `frequencies` those of the fitted case (Hz) for each pair.
+    `misfit` is the root mean square of the residuals in standard deviations; beyond one, the errors
+    are widened by it.
+    """
+
+    parameters: list[FreeParameter]
+    values: Float[np.ndarray, " parameter"]
+    errors: Float[np.ndarray, " parameter"]
+    correlation: Float[np.ndarray, "parameter parameter"]
+    unidentifiable: list[dict[str, float]]
+    quantile: float
+    misfit: float
+    pairs: tuple[tuple[int, int, float], ...]
+    frequencies: Float[np.ndarray, " pair"]
+    identified: ModalFit
+    case: Case
+
+    @property
+    def addresses(self) -> list[str]:
+        """Addresses of the free parameters."""
+        return [parameter.address for parameter in self.parameters]
+
+    @property
+    def intervals(self) -> Float[np.ndarray, "parameter 2"]:
+        """95 % intervals; infinite for parameters that the modes do not determine."""
+        half = self.quantile * self.errors
+        return np.stack([self.values - half, self.values + half], axis=1)
+
+    def __str__(self) -> str:
+        lines = list(parameter_table(self.parameters, self.values, self.intervals))
+        for (mine, other, mac), frequency in zip(self.pairs, self.frequencies, strict=True):
+            measured = self.identified.modes[mine].frequency
+            lines.append(
+                f"mode {other + 1} of the case: {frequency:.4f} Hz, identified {measured:.4f} Hz, "
+                f"MAC {mac:.3f}"
+            )
+        lines.append(f"residuals are {self.misfit:.2g} standard deviations (rms)")
+        for change in self.unidentifiable:
+            listed = ", ".join(f"{address} {step:+.2g}" for address, step in change.items())
+            lines.append(f"the modes do not tell changes of {listed} together")
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict:
+        """Parameters with their intervals (SI units), pairs of modes and misfit, for JSON."""
+        rows = zip(self.addresses, self.values.tolist(), self.intervals.tolist(), strict=True)
+        return {
+            "numbers": {name: {"value": v, "interval_95": pair} for name, v, pair in rows},
+            "pairs": [
+                {"identified": mine, "mode": other, "mac": mac} for mine, other, mac in self.pairs
+            ],
+            "misfit": self.misfit,
+            "unidentifiable": self.unidentifiable,
+        }
+
+
+def identify_from_modes(
+    case: Case,
+    identified: ModalFit,
+    free: Mapping[str, tuple[float, float] | Prior | None] | Sequence[str],
+) -> ModalParameterFit:
+    """Fit parameters of a case to identified modes.
+
+    Shapes count if the log has the positions of its sensors, or says which sensors of the case they
+    are; damping ratios if a damping of the case is free.
+
+    Raises ValueError without identified modes, for more parameters than data, and for fewer modes
+    of the case than were identified.
+    """
+    if not identified.modes:
+        raise ValueError(f"{identified.log.source}: no mode is well identified, nothing to fit to")
+    bounds = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free)
+    parameters = free_parameters([case], bounds, 1.0)
+    places = _places(case, identified)
+    with_damping = any("damping" in parameter.address for parameter in parameters)
+    layout, addresses = mesh_layout(case), [parameter.address for parameter in parameters]
+
+    def solved(values):
+        found = modes(replace(case, dict(zip(addresses, values, strict=True))), layout)
+        shapes = jnp.zeros((0, found.frequencies.size)) if places is None else found.shapes(places)
+        return found.frequencies, found.damping_ratios, shapes
+
+    start = np.array([parameter.start for parameter in parameters], float)
+    frequencies, _, shapes = map(np.asarray, solved(start))
+    if frequencies.size < len(identified.modes):
+        raise ValueError(
+            f"the case has {frequencies.size} modes, {len(identified.modes)} were identified: "
+            "raise beam.modes"
+        )
+    y = np.asarray(to_unbounded(parameters, start))
+    pairs = _paired(identified, frequencies, shapes, places is not None)
+    for _ in range(MAX_PAIRINGS):
+        y, values, residuals, jacobian = _solve(
+            identified, pairs, solved, parameters, y, places is not None, with_damping
+        )
+        frequencies, _, shapes = map(np.asarray, solved(values))
+        again = _paired(identified, frequencies, shapes, places is not None)
+        if [p[:2] for p in again] == [p[:2] for p in pairs]:
+            break
+        pairs = again
+    count = residuals.size - len(parameters)
+    misfit = float(np.sqrt(np.mean(residuals**2)))
+    excess = np.sqrt(np.sum(residuals**2) / count) if count > 0 else 1.0
+    widened = max(float(excess), 1.0)
+    sizes = np.array([parameter.typical_size for parameter in parameters], float)
+    found = uncertainty(addresses, jacobian / widened, sizes)
+    final = {a: float(v) for a, v in zip(addresses, values, strict=True)}
+    return ModalParameterFit(
+        parameters=parameters,
+        values=values,
+        errors=found.errors,
+        correlation=found.correlation,
+        unidentifiable=found.unidentifiable,
+        quantile=t_quantile(float(count)) if widened > 1 else float(norm.ppf(0.975)),
+        misfit=misfit,
+        pairs=again,
+        frequencies=frequencies[[other for _, other, _ in again]],
+        identified=identified,
+        case=replace(case, final),
+    )
+
+
+def _places(case: Case, identified: ModalFit) -> Float[np.ndarray, " channel"] | None:
+    """Positions (m) of the channels; None if they are not known or of other quantities."""
+    log, places = identified.log, []
+    for i, position in enumerate(log.positions):
+        sensor = log.sensors[i]
+        if position is None and sensor is not None and sensor < len(case.sensors):
+            position = float(case.sensors[sensor].position)
+        if position is None or log.quantities[i] not in ("deflection", "velocity", "acceleration"):
+            return None
+        places.append(position)
+    return np.array(places) if len(places) > 1 else None
+
+
+def _paired(identified: ModalFit, frequencies, shapes, has_shapes) -> tuple:
+    """Pairs of identified modes and modes of the case with the least sum of distances."""
+    mine = identified.frequencies
+    cost = np.abs(np.log(mine[:, None] / np.maximum(frequencies, 1e-9)))
+    mac = np.ones(cost.shape)
+    if has_shapes:
+        mac = mac_matrix(identified.shapes, shapes.T.astype(complex))
+        cost = cost + (1 - mac)
+    rows, columns = scipy.optimize.linear_sum_assignment(cost)
+    return tuple((int(i), int(j), float(mac[i, j])) for i, j in zip(rows, columns, strict=True))
+
+
+def _solve(identified, pairs, solved, parameters, y, has_shapes, with_damping):
+    """Least squares from search variables: those, values, residuals and Jacobian by values."""
+    chosen = np.array([other for _, other, _ in pairs])
+    measured = [identified.modes[mine] for mine, _, _ in pairs]
+    f = np.array([mode.frequency for mode in measured])
+    f_sd = np.array([mode.frequency_sd for mode in measured])
+    f_sd = np.maximum(f_sd / f, MIN_RELATIVE_FREQUENCY_SD)
+    z = np.array([mode.damping_ratio for mode in measured])
+    z_sd = np.array([mode.damping_sd for mode in measured]) / z
+    z_sd = np.maximum(z_sd, MIN_RELATIVE_DAMPING_SD)
+    largest = [int(np.argmax(np.abs(mode.shape.real))) for mode in measured]
+    whitening = [_whitening(mode, k) for mode, k in zip(measured, largest, strict=True)]
+
+    def residual(values):
+        frequencies, damping, shapes = solved(values)
+        parts = [(jnp.log(frequencies[chosen]) - np.log(f)) / f_sd]
+        if with_damping:
+            parts.append((jnp.log(damping[chosen]) - np.log(z)) / z_sd)
+        if has_shapes:
+            for i, mode in enumerate(measured):
+                own = shapes[:, chosen[i]] / shapes[largest[i], chosen[i]]
+                parts.append(whitening[i] @ (own - mode.shape.real / mode.shape.real[largest[i]]))
+        parts.append(jnp.stack([p.prior.prior_residual(values[i])
+                                for i, p in enumerate(parameters)]))  # fmt: skip
+        return jnp.concatenate(parts)
+
+    def values_at(point):
+        return jnp.stack([p.from_unbounded(point[i]) for i, p in enumerate(parameters)])
+
+    both = jax.jit(lambda point: (residual(values_at(point)),
+                                  jax.jacfwd(lambda p: residual(values_at(p)))(point)))  # fmt: skip
+    # A weak prior around the start bounds what the modes do not tell; errors leave it out.
+    widths = WEAK_PRIOR_WIDTH * np.array([p.unbounded_size for p in parameters])
+    found = scipy.optimize.least_squares(
+        lambda point: np.concatenate([np.asarray(both(point)[0]), (point - y) / widths]),
+        y,
+        lambda point: np.vstack([np.asarray(both(point)[1]), np.diag(1 / widths)]),
+        x_scale="jac",
+        xtol=1e-12,
+        ftol=1e-12,
+    )
+    values = np.asarray(values_at(jnp.asarray(found.x)))
+    slopes = np.diag(np.asarray(jax.jacfwd(values_at)(jnp.asarray(found.x))))
+    count = len(parameters)
+    with_prior = [p.prior.mean is not None for p in parameters]
+    kept = np.concatenate([np.ones(found.fun.size - 2 * count, bool), with_prior])
+    return found.x, values, found.fun[:-count][kept], (found.jac / slopes)[:-count][kept]
+
+
+def _whitening(mode, largest: int) -> Float[np.ndarray, "row channel"]:
+    """Matrix that makes the real parts of a shape of unit covariance; none of the component one."""
+    count = mode.shape.size
+    others = [i for i in range(count) if i != largest]
+    covariance = mode.shape_covariance[np.ix_(others, others)] + MIN_SHAPE_SD**2 * np.eye(count - 1)
+    rows = np.zeros((count - 1, count))
+    rows[:, others] = np.linalg.inv(np.linalg.cholesky(covariance))
+    return rows
