@@ -208,7 +208,7 @@ def test_units_on_the_command_line(run, capsys):
 
 def test_a_case_is_described_in_numbers(run):
     printed = run("describe case.toml")
-    assert "beam of 0.6 m, pinned-pinned: E I = 11.68 N m^2, 0.535 kg/m" in printed
+    assert "beam of 0.6 m, pinned-pinned: E I = 11.68 N m², 0.535 kg/m" in printed
     assert f"natural frequencies (Hz): {frequency(1):.5g}, {frequency(2):.5g}" in printed
     assert f"critical speed: {2 * 0.6 * frequency(1):.4g} m/s" in printed
 

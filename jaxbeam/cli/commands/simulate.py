@@ -63,7 +63,7 @@ def simulate(
 
         look = {"title": pictures.title, "size": pictures.inches()}
         write_animation(record, animate, overwrite=options.overwrite, **look)
-    from jaxbeam.analysis.record_amplification import record_amplification
+    from jaxbeam.analysis.sections.record_amplification import record_amplification
 
     amplification = record_amplification(record)
     content = _to_dict(record, amplification) | {"plausibility": plausibility}
