@@ -95,7 +95,7 @@ def test_case_file_with_the_name_of_the_log(tmp_path):
         ("[columns]\nd1 = 3", "columns.d1: give a unit"),
         ("[columns]\nd3 = 'mm'", "no column 'd3'; did you mean 'd1'|no column 'd3'"),
         ("[[loads]]\nkind = 'mass'\nmas = 1", "loads.0 has no key 'mas'; .*'mass'"),
-        ("[[loads]]\nkind = 'train'", "loads.0.kind cannot be 'train'"),
+        ("[[loads]]\nkind = 'tram'", "loads.0.kind cannot be 'tram'"),
         ("[[loads]]\nkind = 'mass'\nspeed = 1", "run.toml: loads.0.mass"),
         ("[columns", "run.toml: "),
     ],
