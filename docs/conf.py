@@ -22,9 +22,9 @@ extensions = [
     "sphinx_design",
     "copied_pages",
     "generated_pages",
-    "mathml",
     "plain_docstrings",
     "run_code",
+    "svg_math",
 ]
 exclude_patterns = ["_ext", "_static", "figures", "_run"]
 suppress_warnings = ["myst.header", "mystnb.unknown_mime_type"]
@@ -48,7 +48,7 @@ html_css_files = ["site.css"]
 html_favicon = "_static/beam.svg"
 html_copy_source = False
 html_show_sourcelink = False
-html_math_renderer = "mathml"
+html_math_renderer = "svg"
 html_theme_options = {
     "logo": {"text": f"jaxbeam {version}", "image_light": "_static/beam.svg"},
     "navbar_end": ["theme-switcher"],

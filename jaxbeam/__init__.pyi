@@ -1,8 +1,3 @@
-from .analysis.amplification import (
-    Envelope as Envelope,
-    amplification as amplification,
-    envelope as envelope,
-)
 from .analysis.assessment.assess import assess as assess
 from .analysis.assessment.assessment import Assessment as Assessment, CodeCheck as CodeCheck
 from .analysis.bound.bound import bound as bound
@@ -16,6 +11,11 @@ from .analysis.ride import (
     weighted_acceleration as weighted_acceleration,
     weighted_rms as weighted_rms,
     wheel_unloading as wheel_unloading,
+)
+from .analysis.sections.amplification import (
+    Envelope as Envelope,
+    amplification as amplification,
+    envelope as envelope,
 )
 from .analysis.sections.characteristic_points import characteristic_points as characteristic_points
 from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
@@ -32,6 +32,7 @@ from .case.filters import Filter as Filter
 from .case.loads.axles import Axles as Axles
 from .case.loads.force import MovingForce as MovingForce
 from .case.loads.half_car import HalfCar as HalfCar
+from .case.loads.line_load import LineLoad as LineLoad
 from .case.loads.mass import MovingMass as MovingMass
 from .case.loads.oscillator import Oscillator as Oscillator
 from .case.loads.planar.files import load_vehicle as load_vehicle
@@ -42,6 +43,7 @@ from .case.loads.planar.parts import (
     VehicleSpring as VehicleSpring,
 )
 from .case.loads.planar.sensors import VehicleSensor as VehicleSensor
+from .case.loads.planar.train import Coach as Coach, TrainLoad as TrainLoad
 from .case.loads.quarter_car import QuarterCar as QuarterCar
 from .case.loads.varying_force import VaryingForce as VaryingForce
 from .case.loads.vehicle import VehicleLoad as VehicleLoad
@@ -74,6 +76,7 @@ from .control.optimal.crossing_lqr import (
     FiniteLQR as FiniteLQR,
     StepLQR as StepLQR,
 )
+from .control.optimal.integral_lqr import IntegralLQR as IntegralLQR
 from .control.optimal.lqr import LQR as LQR
 from .control.optimal.sampled_lqr import DiscreteLQR as DiscreteLQR
 from .control.optimal.sampling_loss import sampling_limit as sampling_limit

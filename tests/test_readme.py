@@ -9,13 +9,27 @@ import pytest
 from jaxbeam.cli.app import COMMANDS, app, current_words
 from tests.modules import ROOT
 
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-TEXT = {page.name: page.read_text(encoding="utf-8") for page in PAGES}
+# Not the pages that a build of the site writes among its sources.
+WRITTEN = ("docs/reference/api/", "docs/reference/case_file/", "docs/reference/commands.md")
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "examples" / "README.md",
+    *(
+        page
+        for page in sorted((ROOT / "docs").rglob("*.md"))
+        if not page.relative_to(ROOT).as_posix().startswith(WRITTEN)
+    ),
+]
+TEXT = {page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for page in PAGES}
 
 
 def command_lines(program: str) -> list[str]:
     """Lines of code blocks that call a program, continued lines joined, without comments."""
-    blocks = re.findall(r"^```\w*\n(.*?)^```", "\n".join(TEXT.values()), re.M | re.S)
+    found = re.findall(
+        r"^(?:```|:::)(\S*)[^\n]*\n(.*?)^(?:```|:::)$", "\n".join(TEXT.values()), re.M | re.S
+    )
+    blocks = [text for kind, text in found if kind in ("", "console", "{run-command}")]
+    blocks = [text for text in blocks if ":fails:" not in text]
     lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
     return [re.sub(r"\s+#.*", "", line) for line in lines if line.startswith(f"{program} ")]
 
@@ -42,7 +56,7 @@ def test_commands_are_accepted(capsys, line):
 
 def test_options_exist():
     named = {option for span in spans() for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", span)}
-    modules = {"--quick", "--modes", "--keep", "--extra"}  # of benchmarks and of uv
+    modules = {"--quick", "--modes", "--keep", "--extra", "--group"}  # of benchmarks and of uv
     assert named - modules <= options_of_commands()
 
 
@@ -58,10 +72,13 @@ def test_modules_exist():
         assert importlib.util.find_spec(module), module
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_to_files(page):
-    targets = re.findall(r"\]\((?!http)([^)#]+)\)", TEXT[page.name])
-    assert [target for target in targets if not (page.parent / target).exists()] == []
+@pytest.mark.parametrize("name", TEXT)
+def test_links_lead_to_files(name):
+    targets = re.findall(r"\]\((?!http)([^)#\s]+)(?:#[^)]*)?\)", TEXT[name])
+    paths = [(ROOT / name).parent.joinpath(target).resolve() for target in targets]
+    paths = [path.relative_to(ROOT).as_posix() for path in paths]
+    written = (*WRITTEN, "docs/tutorials/notebooks/")
+    assert [p for p in paths if not (ROOT / p).exists() and not p.startswith(written)] == []
 
 
 def test_files_in_sentences_exist():
@@ -69,3 +86,36 @@ def test_files_in_sentences_exist():
         span for span in spans() if re.fullmatch(r"(jaxbeam|tuning|experiments|tests)/.*", span)
     ]
     assert [path for path in paths if not (ROOT / path).exists()] == []
+
+
+def same_words(shown: str, printed: str) -> bool:
+    """Whether two lines have the same words, and numbers that agree to two per cent."""
+
+    def agree(a: str, b: str) -> bool:
+        try:
+            x, y = float(a.rstrip("%")), float(b.rstrip("%"))
+        except ValueError:
+            return a == b
+        return abs(x - y) <= 0.02 * abs(x)
+
+    pairs = list(zip(shown.split(), printed.split(), strict=False))
+    return len(shown.split()) == len(printed.split()) and all(agree(*pair) for pair in pairs)
+
+
+@pytest.mark.slow
+def test_the_three_jobs_print_what_readme_shows(capsys, monkeypatch):
+    """Lines are shown in their order; dots stand for those left out."""
+    monkeypatch.chdir(ROOT)
+    section = TEXT["README.md"].split("## Three jobs in Python")[1]
+    code = re.search(r"```python\n(.*?)```", section, re.S)
+    shown = re.search(r"```text\n(.*?)```", section, re.S)
+    assert code and shown
+    exec(code[1], {})
+    printed = iter(capsys.readouterr().out.splitlines())
+    for line in shown[1].splitlines():
+        if line != "...":
+            error = "estimated error" in line  # its size varies between machines
+            words = line.split("; estimated")[0] if error else line
+            assert any(
+                same_words(words, one.split("; estimated")[0] if error else one) for one in printed
+            ), f"README shows, but the code does not print: {line}"

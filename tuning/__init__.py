@@ -34,10 +34,18 @@ from tuning.logs.reading import read_log, read_logs
 from tuning.modal.fit import ModalFit
 from tuning.modal.identify_modes import identify_modes
 from tuning.parameters.prior import Prior
+from tuning.weighing.axles import AxleWeighing, weigh_axles
+from tuning.weighing.influence_lines import (
+    InfluenceLines,
+    calibrate_influence_lines,
+    model_influence_lines,
+)
 from tuning.weighing.weigh import weigh
 
 __all__ = [
+    "AxleWeighing",
     "Fit",
+    "InfluenceLines",
     "LoadCases",
     "Log",
     "ModalFit",
@@ -48,6 +56,7 @@ __all__ = [
     "StabilityConstraint",
     "TuningResult",
     "align_logs",
+    "calibrate_influence_lines",
     "compare_fits",
     "cross_validate",
     "design_experiment",
@@ -62,6 +71,7 @@ __all__ = [
     "lexicographic",
     "load_fit",
     "mask",
+    "model_influence_lines",
     "pareto",
     "predict_held_out",
     "profile",
@@ -75,6 +85,7 @@ __all__ = [
     "tune_integers",
     "tune_reduced",
     "weigh",
+    "weigh_axles",
     "with_identified_plant",
     "write_report",
 ]

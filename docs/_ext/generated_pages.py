@@ -89,7 +89,8 @@ def api_page(title: str, names: list[tuple[str, str]]) -> str:
         one = getattr(importlib.import_module(module), name)
         directive = "autoclass" if inspect.isclass(one) else "autofunction"
         lines += [f".. {directive}:: {module}.{name}"]
-        lines += ["   :members:"] if inspect.isclass(one) else []
+        if inspect.isclass(one):
+            lines += ["   :members:", "   :exclude-members: validate"]
         lines += [""]
     return "\n".join(lines)
 

@@ -71,6 +71,21 @@ def field_table(one: type) -> list[str]:
     return lines
 
 
+def shape(annotation: str) -> str:
+    """Type of a field as readers of a table want it: a number, or an array with its axes."""
+
+    def of_array(match):
+        axes = match[1].split()
+        if not axes:
+            return "number"
+        if len(axes) == 1 and axes[0].startswith("*"):
+            return f"number or ({axes[0][1:]},)"
+        return f"({', '.join(axes)}{',' * (len(axes) == 1)})"
+
+    text = re.sub(r"(?:Float|Int|Bool|Complex)\[[\w.]+, '([^']*)'\]", of_array, annotation)
+    return text.replace(" | None", " or none")
+
+
 def class_body(one: type) -> list[ast.stmt]:
     """Statements of a class, from its source."""
     try:
@@ -94,7 +109,7 @@ def field_row(one: type, name: str, node: ast.AnnAssign) -> tuple[str, ...]:
     shown = "" if default in (dataclasses.MISSING, None, "", ()) else str(default)
     unit = metadata.get("unit", "")
     meaning = as_text(metadata.get("meaning", ""))
-    return name, ast.unparse(node.annotation), "" if unit == "1" else unit, shown, meaning
+    return name, shape(ast.unparse(node.annotation)), "" if unit == "1" else unit, shown, meaning
 
 
 def source_of(function) -> ast.FunctionDef | None:

@@ -57,7 +57,7 @@ def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
     """
     case = one_span_case(modes)
     over = {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS}
-    runner = sweep_specification(case, over, False, False, TOLERANCE, "double").runner()
+    runner = sweep_specification(case, over, False, False, TOLERANCE, "double").runner(native=False)
     steps, _ = runner.choose_step_sizes()
     mask = np.ones(SPEEDS.size, bool)
     models = jax.tree.map(lambda leaf: np.repeat(leaf[:1], SPEEDS.size, axis=0), runner.models)

@@ -75,13 +75,8 @@ class Comparison(eqx.Module):
         if metrics.saturated.any():
             shares = ", ".join(f"{share:.1%}" for share in metrics.saturated)
             parts.append(f"at the limits {shares} of the run")
-        unstable = metrics.stability_margin.unstable
-        if unstable is not None:
-            parts.append(
-                f"unstable with stationary loads at their positions of t = {unstable.start:.3g} to"
-                f" {unstable.end:.3g} s: deviations grow by {unstable.rate:.3g} 1/s at"
-                f" {unstable.frequency:.3g} Hz, so lower the gains, or shorten filters and delays"
-            )
+        if metrics.stability_margin.unstable is not None:
+            parts.append(str(metrics.stability_margin))
         for i, oscillation in enumerate(metrics.limit_cycles):
             if oscillation.oscillates:
                 how = "is in a limit cycle" if oscillation.limit_cycle else "oscillates"

@@ -1,19 +1,17 @@
-"""Stability margin along a crossing: the smallest over positions of stationary loads."""
+"""Stability along a crossing: the verdict, and the smallest margin over positions of the loads.
 
-import dataclasses
+The verdict of every command and report is that of `stability_margin`.
+"""
+
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 
-from jaxbeam.analysis.frozen_loop import LoopDynamics, loop_dynamics
-from jaxbeam.analysis.linearised_loop import LinearisedLoop, linearise, loop_timing
+from jaxbeam.analysis.linearised_loop import stationary_loops
 from jaxbeam.analysis.margins import margins
-from jaxbeam.case.case import Case, concrete_case, crossing_times
+from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.fields import concrete
 from jaxbeam.control.predictive.mpc import MPC
-from jaxbeam.model.modes import mesh_layout
-from jaxbeam.runtime.arrays import xp
 
 LOAD_POSITIONS = 13  # load positions along a crossing at which margins are computed
 MIN_RATE = 1e-6  # 1/s; a pole whose real part is smaller counts as marginally stable
@@ -45,6 +43,25 @@ class StabilityMargin(NamedTuple):
     obstacle: str = ""
     unstable: UnstableInterval | None = None
 
+    @property
+    def verdict(self) -> str:
+        """The loop along the crossing: "stable", "unstable", or "undetermined"."""
+        if self.obstacle:
+            return "undetermined"
+        return "stable" if self.unstable is None else "unstable"
+
+    def __str__(self):
+        if self.obstacle:
+            return f"{self.verdict}: {self.obstacle}"
+        if self.unstable is None:
+            return "stable with stationary loads at all their positions"
+        start, end, rate, frequency = self.unstable
+        return (
+            f"unstable with stationary loads at their positions of t = {start:.3g} to {end:.3g} s:"
+            f" deviations grow by {rate:.3g} 1/s at {frequency:.3g} Hz, so lower the gains, or"
+            " shorten filters and delays"
+        )
+
 
 def stability_margin(case: Case) -> StabilityMargin:
     """Stability margin of the closed loop of a case, the smallest along the crossing.
@@ -58,15 +75,12 @@ def stability_margin(case: Case) -> StabilityMargin:
     if isinstance(controller, MPC) and controller.solver != "unconstrained":
         return _no_margin("a constrained MPC law is not linear at its limits")
     try:
-        timing = loop_timing(case)
+        times = _crossing_times(case)
+        found = stationary_loops(case, times)
     except ValueError as error:
         return _no_margin(str(error))
-    loop = loop_dynamics(case, mesh_layout(concrete_case(case)))
     loops, unstable = [], []
-    for t in _crossing_times(case):
-        stationary = _without_constant_states(
-            linearise(_with_stationary_loads(loop, t), timing, xp.asarray(t))
-        )
+    for t, stationary in zip(times, found, strict=True):
         if not np.all(np.isfinite(stationary.closed_matrix)):
             return _no_margin("the law has no equilibrium under stationary loads")
         rightmost = complex(stationary.poles()[0])
@@ -89,28 +103,6 @@ def stability_margin(case: Case) -> StabilityMargin:
 
 def _no_margin(obstacle: str) -> StabilityMargin:
     return StabilityMargin(np.nan, np.nan, obstacle)
-
-
-def _with_stationary_loads(loop: LoopDynamics, t: float) -> LoopDynamics:
-    """Loop with stationary loads at their positions of t (s)."""
-    loop, zero = loop.freeze_loads(xp.asarray(t)), xp.zeros(())
-    stationary = tuple(
-        dataclasses.replace(load, speed=zero, acceleration=zero)
-        for load in loop.augmented_plant.loads.trajectories
-    )
-    return eqx.tree_at(lambda loop: loop.augmented_plant.loads.trajectories, loop, stationary)
-
-
-def _without_constant_states(loop: LinearisedLoop) -> LinearisedLoop:
-    """Sampled loop without constant states, such as those of a completed load identification."""
-    if loop.period is None:
-        return loop
-    size = loop.A.shape[0]
-    constant = np.all(np.asarray(loop.A) == np.eye(size), axis=1) & ~np.any(loop.B, axis=1)
-    kept = ~constant
-    return LinearisedLoop(
-        loop.A[kept][:, kept], loop.B[kept], loop.K[:, kept], loop.period, loop.modal_states
-    )
 
 
 def _crossing_times(case: Case) -> np.ndarray:

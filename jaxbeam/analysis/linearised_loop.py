@@ -3,8 +3,12 @@
 In continuous time z' = A z + B u, u = K z; with a sampling period z_(k+1) = A z_k + B u_k from
 sample to sample, where z also holds the states of filters, estimators and laws and the queue of
 delayed commands. The matrices are derivatives of the loop's dynamics, so every controller has
-them. Limits, ranges and resolution are left out.
+them. Limits, ranges and resolution are left out. Frozen loads keep position, speed and
+acceleration; stationary ones rest at their positions.
 """
+
+import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,10 +16,20 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
-from jaxbeam.analysis.frozen_loop import PERIOD_TOLERANCE, LoopDynamics, LoopTiming, loop_dynamics
+from jaxbeam.analysis.frozen_loop import (
+    PERIOD_TOLERANCE,
+    FrozenTrajectory,
+    LoopDynamics,
+    LoopTiming,
+    loop_dynamics,
+)
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.loads.mass import MovingMass
+from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
+from jaxbeam.model.linear_system import Signal, StateSpace
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.arrays import Array, known, scan, solve, stop_gradient, xp, zeros
 from jaxbeam.runtime.compiling import LOW_OPTIMISATION, compiled
@@ -42,6 +56,21 @@ class LinearisedLoop(eqx.Module):
     def closed_matrix(self) -> Float[Array, "state state"]:
         """State matrix A + B K of the closed loop."""
         return self.A + self.B @ self.K
+
+    def to_control(self) -> Any:
+        """A `control.StateSpace` of python-control: the loop opened at the commands.
+
+        From the commands that act to those that the law returns, L(s) = K (s - A)^-1 B; with
+        `control.feedback(loop, sign=1)` the loop is closed. Raises ImportError, saying what to
+        install, if that package is missing.
+        """
+        commands = tuple(Signal(f"command_{i}", "") for i in range(self.B.shape[1]))
+        states = tuple(Signal(f"x_{i}", "") for i in range(self.A.shape[0]))
+        returned = tuple(Signal(f"law_{i}", "") for i in range(self.B.shape[1]))
+        D, period = xp.zeros((len(returned), len(commands))), self.period
+        period = None if period is None else xp.asarray(period)
+        signals = states, commands, returned
+        return StateSpace(self.A, self.B, self.K, D, *signals, period).to_control()
 
     def growth_rate(self) -> Float[Array, ""]:
         """Largest real part of the poles in 1/s; differentiable to first order, on a CPU.
@@ -153,3 +182,74 @@ def _equilibrium(change, start):
     state = scan(newton_step, start, length=NEWTON_ITERATIONS)[0]
     # Derivatives of the poles by the equilibrium, non-zero for a nonlinear law, are left out.
     return stop_gradient(xp.where(xp.all(xp.isfinite(state)), state, start))
+
+
+def stationary_loops(case: Case, times) -> list[LinearisedLoop]:
+    """Loops of a case with its loads stationary at their positions of some times (s).
+
+    They are linearised about the equilibrium under the loads. Raises ValueError as
+    `linearised_loop`.
+    """
+    timing = loop_timing(case)
+    loop = loop_dynamics(case, mesh_layout(concrete_case(case)))
+    return [
+        without_constant_states(linearise(_with_stationary_loads(loop, t), timing, xp.asarray(t)))
+        for t in times
+    ]
+
+
+def loop_with_mass_at(case: Case, position: float, mass: float) -> LinearisedLoop:
+    """Loop of a case with one stationary mass (kg) at a position (m), and without its loads.
+
+    The law is that of the case, at the time at which the first load of the case is there: a
+    schedule has the gains of that time. It is linearised about the equilibrium under the mass.
+    Raises ValueError for a position off the beam, a negative mass, and as `linearised_loop`.
+    """
+    length = float(concrete(case.beam.length))
+    if not 0 <= position <= length:
+        raise ValueError(f"the mass at {position:g} m is off the beam, 0 to {length:g} m")
+    if not 0 <= mass < np.inf:
+        raise ValueError(f"the mass at {position:g} m must be positive, in kg; it is {mass:g}")
+    timing = loop_timing(case)
+    loop = loop_dynamics(case, mesh_layout(concrete_case(case)))
+    alone = dataclasses.replace(case, loads=(MovingMass(mass=mass, speed=1.0),), profile=None)
+    zero, one = xp.zeros(()), xp.ones(())
+    path = FrozenTrajectory(
+        xp.asarray(position), zero, zero, one, xp.ones(1, bool), case.beam.length
+    )
+    loads = dataclasses.replace(load_set(alone), trajectories=(path,))
+    loop = eqx.tree_at(lambda loop: loop.augmented_plant.loads, loop, loads)
+    t = xp.asarray(_passage_time(case, position))
+    return without_constant_states(linearise(loop, timing, t))
+
+
+def without_constant_states(loop: LinearisedLoop) -> LinearisedLoop:
+    """Sampled loop without constant states, such as those of a completed load identification."""
+    if loop.period is None:
+        return loop
+    size = loop.A.shape[0]
+    constant = np.all(np.asarray(loop.A) == np.eye(size), axis=1) & ~np.any(loop.B, axis=1)
+    kept = ~constant
+    return LinearisedLoop(
+        loop.A[kept][:, kept], loop.B[kept], loop.K[:, kept], loop.period, loop.modal_states
+    )
+
+
+def _with_stationary_loads(loop: LoopDynamics, t: float) -> LoopDynamics:
+    """Loop with stationary loads at their positions of t (s)."""
+    loop, zero = loop.freeze_loads(xp.asarray(t)), xp.zeros(())
+    stationary = tuple(
+        dataclasses.replace(load, speed=zero, acceleration=zero)
+        for load in loop.augmented_plant.loads.trajectories
+    )
+    return eqx.tree_at(lambda loop: loop.augmented_plant.loads.trajectories, loop, stationary)
+
+
+def _passage_time(case: Case, position: float) -> float:
+    """Time (s) at which the first wheel of the first load is at a position (m); 0 if never."""
+    trajectories = load_set(case).trajectories
+    if not trajectories:
+        return 0.0
+    times = concrete(trajectories[0].passage_times(xp.asarray([position])))
+    times = times[np.abs(times) < NEVER]
+    return float(times[0]) if times.size else 0.0

@@ -3,10 +3,12 @@
 The loop is broken at one command while the others stay closed.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import scipy
+from jaxtyping import Float
 
 from jaxbeam.analysis.linearised_loop import LinearisedLoop
 from jaxbeam.case.fields import concrete
@@ -35,22 +37,11 @@ class Margins(NamedTuple):
 def margins(loop: LinearisedLoop, actuator: int = 0) -> Margins:
     """Margins of a stable loop at one command, from the frequency response of the loop gain.
 
-    The loop gain is L(s) = K (s - A)^-1 B, with s = i omega, or exp(i omega period) in a sampled
-    loop, and the critical point is 1, as u = L u. Raises ValueError for an unstable loop.
+    The loop gain is that of `loop_gain`. Raises ValueError for an unstable loop.
     """
     if np.any(loop.poles().real >= 0):
         raise ValueError("margins need a stable closed loop, and this one is unstable")
-    A, B, K = (np.asarray(concrete(part)) for part in (loop.A, loop.B, loop.K))
-    others = np.arange(B.shape[1]) != actuator
-    A = A + B[:, others] @ K[others]
-    column, row = B[:, actuator], K[actuator]
-    values, transfer = _transfer_function(A, column, row)
-
-    def response(omega):
-        s = 1j * np.atleast_1d(omega)
-        return transfer(s if loop.period is None else np.exp(s * loop.period))
-
-    omega = _frequency_grid(values, loop.period)
+    omega, response = loop_gain(loop, actuator)
     curve = response(omega)
 
     def crossings(function):
@@ -82,6 +73,26 @@ def margins(loop: LinearisedLoop, actuator: int = 0) -> Margins:
         modulus_margin=min(least.fun, abs(1 - curve[nearest])),
     )
     return Margins(*map(float, found))
+
+
+def loop_gain(
+    loop: LinearisedLoop, actuator: int = 0
+) -> tuple[Float[np.ndarray, " frequency"], Callable]:
+    """Frequencies (rad/s) that resolve the loop gain L at one command, and L as their function.
+
+    L(s) = K (s - A)^-1 B, with s = i omega, or exp(i omega period) in a sampled loop, broken at the
+    command while the others stay closed; the critical point is 1, as u = L u.
+    """
+    A, B, K = (np.asarray(concrete(part)) for part in (loop.A, loop.B, loop.K))
+    others = np.arange(B.shape[1]) != actuator
+    A = A + B[:, others] @ K[others]
+    values, transfer = _transfer_function(A, B[:, actuator], K[actuator])
+
+    def response(omega):
+        s = 1j * np.atleast_1d(omega)
+        return transfer(s if loop.period is None else np.exp(s * loop.period))
+
+    return _frequency_grid(values, loop.period), response
 
 
 def _transfer_function(A, column, row):

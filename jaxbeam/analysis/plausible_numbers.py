@@ -55,7 +55,7 @@ class Plausibility:
         if self.first_frequency is not None:
             parts.append(f"first frequency {self.first_frequency:.4g} Hz")
         if self.deflection:
-            parts.append(f"span/deflection {self.span_over_deflection:.3g}")
+            parts.append(f"span/deflection {float(f'{self.span_over_deflection:.3g}'):.15g}")
         if self.mass_ratio is not None:
             parts.append(f"load/beam mass {self.mass_ratio:.3g}")
         if self.crossing_time is not None:
@@ -111,6 +111,8 @@ def _under_loads(
     ends = np.where(windows < NEVER, windows, np.nan)
     start = float(np.nanmin(ends[:, 0])) if np.isfinite(ends[:, 0]).any() else 0.0
     last = max(float(np.nanmax(np.append(ends, start))), start)
+    if np.any(windows[:, 1] >= NEVER):  # a load that stays on the beam
+        last = max(last, float(case.run.duration))
     times = np.linspace(start, last, TIMES)
     position, speed, _ = map(np.asarray, loads.kinematics(times))
     x = np.linspace(0.0, float(case.beam.length), POSITIONS)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxbeam.c_code.recorded_loop import (
     RecordedLoop,
     command_lag,
+    designs_compiled,
     filters_in_program,
     recorded_loop,
 )
@@ -21,7 +22,6 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.kinds import import_modules, kind_of
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.optimal.crossing_lqr import AbstractCrossingRegulator
 from jaxbeam.control.state_controller import AbstractStateController
 from jaxbeam.control.state_law import SampledStateLaw, TrueState
 from jaxbeam.model.modes import mesh_layout
@@ -67,14 +67,14 @@ def export_c(case: Case, name: str) -> CProgram:
     if controller.period is None:
         raise ValueError("controller.period is missing: a real controller samples; give its period")
     import_modules("jaxbeam.c_code.laws")
-    integrates = isinstance(controller, AbstractCrossingRegulator)
-    design = _designed_compiled if integrates else _designed
+    design = _designed_compiled if designs_compiled(controller) else _designed
     law = known(design(case, mesh_layout(case)))
     code = _source(case)
     try:
         write_law(law, code)
     except NoCCodeError as error:
-        raise ValueError(f"controller.kind = {kind_of(type(controller))!r}: {error}") from None
+        kind = kind_of(type(controller)) or type(controller).__name__
+        raise ValueError(f"controller.kind {kind!r} cannot be exported as C: {error}") from None
     _write_limits(case, code)
     loop = recorded_loop(case, law, MAX_SAMPLES)
     given = _given_states(law, loop, code)
@@ -117,6 +117,7 @@ def _source(case: Case) -> CSource:
     period, duration = (float(concrete(x)) for x in (case.controller.period, case.run.duration))
     samples = int(np.floor(duration / period * (1 + 1e-12))) + 1
     code = CSource(len(case.sensors), len(case.actuators), period, samples)
+    code.compiles = designs_compiled(case.controller)
     code.work("reading", len(case.sensors), "readings behind the digital filters")
     code.state("acting", np.zeros(len(case.actuators)), "commands that act at the sample")
     code.work("wanted", len(case.actuators), "commands of the law, before the limits")

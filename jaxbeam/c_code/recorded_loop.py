@@ -1,5 +1,6 @@
 """Closed loop of a designed law, recorded: inputs of a program in C, and expected commands."""
 
+import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, Cont
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.filters import filter_step
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.control.state_controller import AbstractStateController
 from jaxbeam.integrator.integrate import (
     integrate_history,
     longest_force_step,
@@ -91,6 +93,13 @@ class DesignedController(AbstractController):
         return self.law_to_run
 
 
+def designs_compiled(controller: AbstractController) -> bool:
+    """Whether design and steps of the law take long without compilation, not its filter alone."""
+    if isinstance(controller, AbstractStateController):
+        controller = dataclasses.replace(controller, estimator=None, nominal_plant=None)
+    return controller.runs_compiled
+
+
 def filters_in_program(case: Case) -> tuple[Sections, ...]:
     """Sections of the digital filters that act on samples at the period of the controller.
 
@@ -125,7 +134,8 @@ def recorded_loop(case: Case, law: AbstractSampledLaw, max_samples: int) -> Reco
     later = math.ceil(delay / period - SAME_TIME_SHARE)
     count = min(math.floor(duration / period * (1 + 1e-12)) + 1, max_samples + later)
     times = np.arange(max(count, later + 2)) * period
-    is_compiled = controller.runs_compiled and len(times) >= MIN_COMPILED
+    many = len(times) >= MIN_COMPILED
+    is_compiled = designs_compiled(controller) or (controller.runs_compiled and many)
     recorded = DesignedController(
         period=controller.period,
         delay=controller.delay,

@@ -37,6 +37,8 @@ class CSource:
 
     readings, command, time, output = "s->reading", "s->acting", "t", "s->wanted"
 
+    compiles = False  # whether numbers of the law at samples are worth a compilation
+
     def __init__(self, sensors: int, actuators: int, period: float, samples: int):
         self.sensors, self.actuators = sensors, actuators
         self.period, self.samples = period, samples
@@ -47,6 +49,7 @@ class CSource:
         self.constants: dict[str, np.ndarray] = {}
         self.members: dict[str, Member] = {}
         self.counters: dict[str, str] = {}
+        self.variables: list[str] = []
         self.lines: list[str] = []
         self.notes: list[str] = []
         self.operations = 0
@@ -150,7 +153,7 @@ class CSource:
 
     def helper_texts(self) -> list[str]:
         """Texts of the helpers that the statements use, in an order that C accepts."""
-        return [text for _, text in _closure("\n".join([*self.lines, *self.first_gate_lines]))]
+        return helpers_of("\n".join([*self.lines, *self.first_gate_lines]))
 
 
 def _unique(name: str, taken: Container[str]) -> str:
@@ -168,6 +171,11 @@ class _Helper(NamedTuple):
 def _helpers() -> dict[str, _Helper]:
     files = sorted(HELPERS.glob("*.h"))
     return {f.stem: _Helper(f.stem, f.read_text(encoding="utf-8").strip()) for f in files}
+
+
+def helpers_of(text: str) -> list[str]:
+    """Texts of the helpers that a text in C calls, in an order that C accepts."""
+    return [helper.text for helper in _closure(text)]
 
 
 def _closure(text: str) -> Sequence[_Helper]:

@@ -15,7 +15,7 @@ def at_samples(function: Callable, code: CSource, varies: bool = True) -> tuple[
     A function that does not vary is evaluated once.
     """
     times = code.period * np.arange(code.samples if varies else 1)
-    if len(times) >= MIN_COMPILED:
+    if len(times) > 1 and (code.compiles or len(times) >= MIN_COMPILED):
         return tuple(np.asarray(part) for part in jax.jit(jax.vmap(function))(times))
     rows = [function(t) for t in times]
     return tuple(

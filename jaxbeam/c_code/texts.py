@@ -66,6 +66,7 @@ def source_text(name: str, title: list[str], code: CSource) -> str:
     body = "\n".join(code.lines)
     indices = [i for i in ("i", "j", "sample") if _uses(body, i)]
     declared = [f"    int {', '.join(indices)};"] if indices else []
+    declared += [f"    {variable};" for variable in code.variables]
     unused = [f"    (void){word};" for word in ("measurements", "t") if not _uses(body, word)]
     return f"""{_comment(title)}
 #include "{name}.h"
@@ -166,8 +167,8 @@ int main(void)
 def _cost_lines(code: CSource) -> list[str]:
     return [
         f"Written by jaxbeam {version('jaxbeam')}; C99, fixed memory, no library but math.h.",
-        f"Cost of a step at worst: {code.operations} additions, multiplications, divisions,"
-        " comparisons and functions of math.h.",
+        f"Cost of a step at worst: {code.operations} additions, multiplications, divisions,",
+        "comparisons and functions of math.h.",
         f"Memory in double precision: {code.state_bytes} bytes of state,"
         f" {code.constant_bytes} bytes of constants.",
     ]
@@ -175,7 +176,7 @@ def _cost_lines(code: CSource) -> list[str]:
 
 def _measurements(code: CSource) -> str:
     """What the measurements are, as a sentence."""
-    text = f"Measurements are the readings of the {code.sensors} sensors in SI units"
+    text = f"Measurements are the readings of the sensors ({code.sensors}), in SI units"
     if code.given_states:
         text += (
             f",\n   then the {code.given_states} states of the model that the law is designed for"
@@ -202,8 +203,7 @@ void {name}_gate({name}_state *s, int gate, real t)
     const int load = (gate ? s->passages_2++ : s->passages_1++) % {code.gate_loads};
     s->gate_times[2 * load + gate] = t;
     if (gate) return;
-    s->gate_times[2 * load + 1] = (real)1e30;
-{_lines("    " + line for line in code.first_gate_lines)}
+    {" ".join(["s->gate_times[2 * load + 1] = (real)1e30;", *code.first_gate_lines])}
 }}
 """
 

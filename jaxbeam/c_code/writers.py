@@ -40,9 +40,7 @@ class LoadCode(NamedTuple):
 
 def no_c_code(part: Any) -> NoCCodeError:
     """Error for a law, filter or source of a class that has no writer."""
-    return NoCCodeError(
-        f"it cannot be exported as C: jaxbeam.c_code.laws has no code for {type(part).__name__}"
-    )
+    return NoCCodeError(f"there is no code for its {type(part).__name__} in jaxbeam.c_code.laws")
 
 
 @singledispatch

@@ -5,15 +5,17 @@ measurements into commands: at samples, or in continuous time. Controllers are i
 """
 
 import abc
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, number
 from jaxbeam.case.former_arguments import AcceptsFormerArguments
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.module import Module
 
 Command = Float[Array, " actuator"]
@@ -106,6 +108,48 @@ class AbstractStaticLaw(AbstractSampledLaw, AbstractContinuousLaw):
         return ControlStep(self.command(state, measurement, t), state)
 
 
+class LawOfCommanded(AbstractSampledLaw, AbstractContinuousLaw):
+    """A law of the `active` actuators among `count`; the others receive no command."""
+
+    law: Any
+    active: tuple[int, ...] = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+
+    @property
+    def filters(self):
+        return self.law.filters
+
+    @property
+    def state_count(self):
+        return self.law.state_count
+
+    def initial_state(self):
+        return self.law.initial_state()
+
+    def step(self, state, measurement, t):
+        command, state, solved = self.law.step(state, self._own(measurement), t)
+        return ControlStep(self._all(command), state, solved)
+
+    def command(self, state, measurement, t):
+        return self._all(self.law.command(state, self._own(measurement), t))
+
+    def rates(self, state, measurement, command, t):
+        own = command[np.array(self.active)]
+        return self.law.rates(state, self._own(measurement), own, t)
+
+    def _own(self, measurement: Measurement) -> Measurement:
+        command = measurement.command[np.array(self.active)]
+        return Measurement(measurement.readings, measurement.state, command)
+
+    def _all(self, command) -> Command:
+        return set_at(xp.zeros(self.count), np.array(self.active), command)
+
+
+def commanded(actuators: Sequence[Any]) -> tuple[int, ...]:
+    """Indices of the actuators that take commands: all but springs and dampers."""
+    return tuple(i for i, actuator in enumerate(actuators) if actuator.command_unit != "1")
+
+
 class AbstractController(ReprWithUnits, eqx.Module, metaclass=AcceptsFormerArguments):
     """Settings of a controller.
 
@@ -120,6 +164,8 @@ class AbstractController(ReprWithUnits, eqx.Module, metaclass=AcceptsFormerArgum
 
     kind: ClassVar[str]
     open_loop: ClassVar[bool] = False  # whether the command depends on time alone
+    # Whether the settings have entries for actuators that take commands only, not for springs.
+    leaves_passive_out: ClassVar[bool] = False
 
     period: Float[Array, ""] | None = number(
         "s", "sampling period; continuous time if left out", POSITIVE, default=None, kw_only=True
@@ -154,7 +200,14 @@ class AbstractController(ReprWithUnits, eqx.Module, metaclass=AcceptsFormerArgum
 
     def law(self, plant: Any) -> Any:
         """Law designed for the nominal plant, or for the plant of the case if there is none."""
-        return self.design_law(plant if self.nominal_plant is None else self.nominal_plant)
+        plant = plant if self.nominal_plant is None else self.nominal_plant
+        active = None if plant is None else commanded(plant.case.actuators)
+        if active is None or not self.leaves_passive_out:
+            return self.design_law(plant)
+        count = len(plant.case.actuators)
+        if len(active) == count:
+            return self.design_law(plant)
+        return LawOfCommanded(self.design_law(plant.of_actuators(active)), active, count)
 
     def validate(self, case: Any) -> str | None:
         """Error of these settings in a case, as "key must ...", or None; before any compilation."""

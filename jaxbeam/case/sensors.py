@@ -58,6 +58,13 @@ class Sensor(ReprWithUnits, Module):
     section_modulus: Float[Array, ""] | None = number(
         "m^3", "bending moment over stress; negative for a fibre above the axis", default=None
     )
+    mode_band: str = choice(
+        "modes of the reading: all, or those up to the largest of 30 Hz, 1.5 f_1 and f_3"
+        " (EN 1990, A2.4.4.2.1)",
+        "all",
+        "en1990",
+        default="all",
+    )
     name: str = choice("label in results; its number and quantity if left out", default="")
 
     def __post_init__(self):
@@ -124,6 +131,11 @@ class Sensor(ReprWithUnits, Module):
             return (
                 f"{address}.section_modulus would have no effect on {words};"
                 " leave it out, or set quantity to 'stress'"
+            )
+        if self.mode_band != "all" and self.bends:
+            return (
+                f"{address}.mode_band would have no effect on {words}, which has all modes by the"
+                " static correction; leave it out"
             )
         if modulus is not None and is_concrete(modulus) and concrete(modulus) == 0:
             return f"{address}.section_modulus must not be zero"

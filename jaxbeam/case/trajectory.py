@@ -136,7 +136,7 @@ class BrakingTrajectory(AbstractPiecewiseTrajectory):
 
 
 class StandingTrajectory(AbstractPiecewiseTrajectory):
-    """A place on the beam at which a load acts from `entry_time` (s) on."""
+    """A place on the beam at which a load acts from `entry_time` (s) on; wheels off it do not."""
 
     position: Float[Array, ""]
     entry_time: Float[Array, ""]
@@ -154,7 +154,9 @@ class StandingTrajectory(AbstractPiecewiseTrajectory):
         return self.entry_time[None], xp.stack([self.position, zero, zero, zero])[None]
 
     def entry_exit_times(self, behind=0.0):
-        entry = self.entry_time + xp.zeros(xp.shape(behind))
+        place = self.position - xp.asarray(behind)
+        on_beam = (place >= 0) & (place <= self.length)
+        entry = xp.where(on_beam, self.entry_time, NEVER)
         return entry, xp.full(entry.shape, NEVER)
 
     def passage_times(self, positions, behind=0.0):

@@ -9,6 +9,7 @@ import itertools
 from collections.abc import Iterator
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -16,6 +17,7 @@ from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.beam_parts.properties import has
 from jaxbeam.case.case import Case, parts
+from jaxbeam.case.controller import commanded
 from jaxbeam.case.declared_checks import (
     POSITION_TOLERANCE,
     check_fields,
@@ -242,7 +244,12 @@ def _check_controller(case: Case) -> None:
     if not case.actuators:
         raise ValueError("controller has nothing to command: add an actuator, or leave it out")
     nominal = controller.nominal_plant
-    error = controller.validate(case if nominal is None else nominal.case)
+    designed_for = case if nominal is None else nominal.case
+    if controller.leaves_passive_out:
+        active = commanded(designed_for.actuators)
+        actuators = tuple(designed_for.actuators[i] for i in active)
+        designed_for = eqx.tree_at(lambda c: c.actuators, designed_for, actuators)
+    error = controller.validate(designed_for)
     if error is not None:
         raise ValueError(f"controller.{error}")
     for i, sensor in enumerate(case.sensors):

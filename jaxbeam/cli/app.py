@@ -2,6 +2,7 @@
 
 import atexit
 import gc
+import os
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
@@ -9,13 +10,13 @@ from typing import NoReturn
 
 from cyclopts import App, CycloptsError, Group, Parameter
 
-from jaxbeam.cli.commands.check import check
 from jaxbeam.cli.commands.compare import compare
 from jaxbeam.cli.commands.describe import describe
 from jaxbeam.cli.commands.engineering.assess import assess
+from jaxbeam.cli.commands.engineering.check import check
 from jaxbeam.cli.commands.engineering.influence import influence
 from jaxbeam.cli.commands.export import export
-from jaxbeam.cli.commands.frequency import frf, modes
+from jaxbeam.cli.commands.frequency import frf, modes, state_space
 from jaxbeam.cli.commands.identify import identify
 from jaxbeam.cli.commands.logs.modes_from_log import modes_from_log
 from jaxbeam.cli.commands.models import compare_models, design_experiment
@@ -32,7 +33,7 @@ from jaxbeam.cli.options import print_message
 COMMANDS = {
     "Simulation": (new, check, describe, modes, frf, simulate, sweep),
     "Engineering": (assess, influence),
-    "Control": (compare, stability, tune, export),
+    "Control": (compare, stability, state_space, tune, export),
     "Identification": (
         identify,
         modes_from_log,
@@ -98,6 +99,9 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         _relax_garbage_collection()
     try:
         app(list(current_words(arguments)), exit_on_error=False, print_error=False)
+    except BrokenPipeError:  # the reader of the output, as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
     except MemoryError as error:
         print_message(f"not enough memory: {error}")
         sys.exit(1)

@@ -2,12 +2,17 @@
 
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxbeam.case.reading.units import is_quantity, number_and_unit
 from jaxbeam.files.endings import check_ending
+
+if TYPE_CHECKING:
+    from jaxbeam.case.case import Case
+
+Bounds = tuple[float, float] | tuple[str, str]  # in SI units, or texts with units
 
 
 def parse_assignment(option: str, text: str) -> tuple[str, str]:
@@ -167,18 +172,48 @@ def split_case_and_logs(
     return (cases[0] if cases else None), logs
 
 
-def parse_bounds(text: str, option: str = "--free") -> tuple[str, tuple[float, float] | None]:
+def parse_bounds(text: str, option: str = "--free") -> tuple[str, Bounds | None]:
     """Address and bounds of ADDRESS or ADDRESS=LOW:HIGH; None without bounds.
 
-    Raises ValueError if the bounds are no two increasing numbers.
+    Bounds with units, as 8 GN m^2:12 GN m^2, stay texts until the case is read (`bounds_in_si`).
+    Raises ValueError if the bounds are no two increasing numbers, or one alone has a unit.
     """
     address, equals, value = text.partition("=")
     if not equals:
         return address, None
-    bounds = _parse_numbers(option, text, value.split(":"))
+    entries = [entry.strip() for entry in value.split(":")]
+    with_unit = [is_quantity(entry) for entry in entries]
+    if len(entries) == 2 and all(with_unit):
+        return address, (entries[0], entries[1])
+    if any(with_unit):
+        raise ValueError(f"{option} {text}: give both bounds a unit, as in 8 GN m^2:12 GN m^2")
+    bounds = _parse_numbers(option, text, entries)
     if len(bounds) != 2 or bounds[0] >= bounds[1]:
         raise ValueError(f"{option} {text}: bounds are LOW:HIGH, such as 5:20")
     return address, (bounds[0], bounds[1])
+
+
+def bounds_in_si(
+    case: "Case", bounds: Mapping[str, Bounds | None], option: str = "--free"
+) -> dict[str, tuple[float, float] | None]:
+    """Bounds by address in the SI units of a case.
+
+    Raises ValueError for an address that the case lacks, a unit that does not fit, and bounds that
+    do not increase.
+    """
+    from jaxbeam.case.case import unit_at, value_at
+    from jaxbeam.case.reading.units import in_si
+
+    converted = {}
+    for address, pair in bounds.items():
+        if pair is not None and isinstance(pair[0], str):
+            value_at(case, address)  # says what is wrong with the address
+            low, high = in_si(list(pair), unit_at(case, address), f"{option} {address}")
+            if low >= high:
+                raise ValueError(f"{option} {address}: bounds are LOW:HIGH, such as 5:20")
+            pair = low, high
+        converted[address] = pair
+    return converted
 
 
 def parse_range(option: str, text: str, unit_and_example: str) -> tuple[float, float]:

@@ -32,7 +32,10 @@ PICTURES = (".png", ".svg", ".pdf")
 Output = Annotated[Path | None, Parameter(("-o", "--output"))]
 Free = Annotated[
     tuple[str, ...],
-    Parameter(help="ADDRESS[=LOW:HIGH]: a free parameter and its bounds; repeat it for more."),
+    Parameter(
+        help="ADDRESS[=LOW:HIGH]: a free parameter and its bounds, also with units, as"
+        " beam.flexural_rigidity='8 GN m^2:12 GN m^2'; repeat it for more."
+    ),
 ]
 Over = Annotated[
     tuple[str, ...],
@@ -120,9 +123,9 @@ class CaseOptions(OutputOptions):
             a: parse_value(v) for a, v in (parse_assignment("--set", text) for text in self.set_)
         }
         enable_compile_cache()
-        from jaxbeam.files.case_file import with_settings
+        from jaxbeam.files.case_file import load_case_with
 
-        return with_settings(jb.load_case(path), changes)
+        return load_case_with(path, changes)
 
 
 @Parameter(name="*")

@@ -119,6 +119,7 @@ class PD(AbstractCompensator):
     """Proportional feedback and a smoothed rate: u = -(g + r s / (lag s + 1)) y."""
 
     kind: ClassVar[str] = "pd"
+    leaves_passive_out: ClassVar[bool] = True
 
     rate_gains: Float[Array, " *actuator"] = number(
         "command per reading per s", "gain of the rate of the reading"
@@ -136,6 +137,7 @@ class Lead(AbstractCompensator):
     """Phase lead: u = -g (1 + s / z) / (1 + s / p) y; a phase lag if the zero z is above p."""
 
     kind: ClassVar[str] = "lead"
+    leaves_passive_out: ClassVar[bool] = True
 
     zero: Float[Array, " *actuator"] = number(
         "Hz", "corner frequency of the zero, where the gain starts to rise", POSITIVE
@@ -161,6 +163,7 @@ class PositivePositionFeedback(AbstractCompensator):
     """
 
     kind: ClassVar[str] = "ppf"
+    leaves_passive_out: ClassVar[bool] = True
 
     frequency: Float[Array, " *actuator"] = number("Hz", "frequency of the oscillator", POSITIVE)
     damping_ratio: Float[Array, " *actuator"] = number(

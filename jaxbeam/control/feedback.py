@@ -37,6 +37,7 @@ class Feedback(AbstractStaticController):
     """
 
     kind: ClassVar[str] = "feedback"
+    leaves_passive_out: ClassVar[bool] = True
 
     gains: Float[Array, " actuator"] = number(
         "command per reading^power", "one gain for each actuator"

@@ -29,6 +29,7 @@ class Feedforward(AbstractController):
     """
 
     kind: ClassVar[str] = "feedforward"
+    leaves_passive_out: ClassVar[bool] = True
     open_loop: ClassVar[bool] = True
 
     gates: Float[Array, "2"] = number("m", "positions of the gates, in the order of passage")

@@ -33,6 +33,7 @@ class InternalModel(AbstractController):
     """
 
     kind: ClassVar[str] = "internal-model"
+    leaves_passive_out: ClassVar[bool] = True
 
     readings: Float[Array, " breakpoint"] = number("m", "deflections due to the load", INCREASING)
     values: Float[Array, "actuator breakpoint"] = number(

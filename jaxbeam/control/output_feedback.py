@@ -17,6 +17,7 @@ class OutputFeedback(AbstractStaticController):
     """
 
     kind: ClassVar[str] = "output-feedback"
+    leaves_passive_out: ClassVar[bool] = True
 
     gains: Float[Array, "actuator sensor"] = number(
         "command per reading", "row of gains of the sensors for each actuator"

@@ -18,6 +18,7 @@ class Prescribed(AbstractStaticController):
     """
 
     kind: ClassVar[str] = "prescribed"
+    leaves_passive_out: ClassVar[bool] = True
     open_loop: ClassVar[bool] = True
 
     offsets: Float[Array, " actuator"] = number(

@@ -12,7 +12,7 @@ from jaxbeam.estimation.constant_gain import ConstantGainFilter, sensor_offsets
 from jaxbeam.estimation.continuous import ContinuousCrossingFilter, TimeInvariantFilter
 from jaxbeam.estimation.crossing_filter import CrossingFilter
 from jaxbeam.estimation.gains import kalman_gain, sampled_kalman_gain
-from jaxbeam.estimation.observability import mode_count, observability_error
+from jaxbeam.estimation.observability import detectability_error, mode_count
 from jaxbeam.estimation.sampled_plant import PERIOD_ROUNDING
 from jaxbeam.estimation.sensor_chain import filtered_plant, sensor_chain
 from jaxbeam.model.state_space import Plant
@@ -38,7 +38,8 @@ class Kalman(AbstractEstimator):
     Filters of the sensors and their delays of up to `max_delay_periods` periods are part of the
     plant, so that innovations are white. Noise is that of the samples: behind a digital filter it
     is coloured. The beam is at rest one period before the first sample. Not modelled are sampling
-    periods of the sensors' own, nor the direct effect of the white forces on accelerometers.
+    periods of the sensors' own, nor the direct effect of the white forces on accelerometers. Modes
+    that no sensor observes need damping: their estimate is that of the model.
 
     Without a period the filter acts in continuous time (Kalman-Bucy): the noise of readings is
     white with the `measurement_intensity`, that of samples with variance intensity / period; the
@@ -210,7 +211,7 @@ class Kalman(AbstractEstimator):
                 return f"{name} must be one number or {size}, not {value.shape[0]}"
         if system is None:
             return None
-        return observability_error(system) or self._interval_error(case, system)
+        return detectability_error(system) or self._interval_error(case, system)
 
     def _interval_error(self, case, system) -> str | None:
         """Error if an interval of the gain table is too long for the fastest mode, or None."""

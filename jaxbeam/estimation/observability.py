@@ -1,5 +1,7 @@
 """Observability of the modes of a beam by a set of sensors, and conditioning of their shapes."""
 
+import warnings
+
 import numpy as np
 from jaxtyping import Float
 
@@ -12,6 +14,10 @@ UNOBSERVABLE = 1e-9  # relative to the most observable mode; below, a mode is un
 
 class ConditioningWarning(UserWarning):
     """Mode shapes at the sensors are ill-conditioned."""
+
+
+class DetectabilityWarning(UserWarning):
+    """No sensor observes a mode, which decays by itself."""
 
 
 def mode_count(system: StateSpace) -> int:
@@ -41,8 +47,8 @@ def conditioning(system: StateSpace) -> Float[Array, ""]:
     return values[0] / values[-1]
 
 
-def unobservable_mode(system: StateSpace) -> float | None:
-    """Frequency (Hz) of an unobservable mode, or None if there is none.
+def unobservable_poles(system: StateSpace) -> list[complex]:
+    """Poles (1/s) of the modes of the beam that no output observes, one of each pair.
 
     By Hautus' test on the states of the beam alone: no free motion of the beam at one frequency may
     leave all outputs zero.
@@ -54,19 +60,51 @@ def unobservable_mode(system: StateSpace) -> float | None:
     A, C = A * scale / scale[:, None], C * scale
     C = C / np.maximum(np.linalg.norm(C, axis=1, keepdims=True), np.finfo(float).tiny)
     matrix_norm = np.linalg.norm(A, 2)
+    found = []
     for value in np.linalg.eigvals(A):
         pencil = np.concatenate([(A - value * np.eye(2 * modes)) / matrix_norm, C])
-        if np.linalg.svd(pencil, compute_uv=False)[-1] < UNOBSERVABLE:
-            return float(np.abs(value) / (2 * np.pi))
-    return None
+        if value.imag >= 0 and np.linalg.svd(pencil, compute_uv=False)[-1] < UNOBSERVABLE:
+            found.append(complex(value))
+    return sorted(found, key=abs)
 
 
 def observability_error(system: StateSpace) -> str | None:
     """Error of sensors that leave a mode unobservable, as "kind needs ...", or None."""
-    hertz = unobservable_mode(system)
-    if hertz is None:
+    poles = unobservable_poles(system)
+    if not poles:
         return None
     return (
         f"kind needs sensors that observe every mode: none of {len(system.outputs)} observes"
-        f" the one at {hertz:.4g} Hz; move one off its nodes, add one, or design for fewer modes"
+        f" the one at {_hertz(poles[0])} Hz; move one off its nodes, add one, or design for fewer"
+        " modes"
     )
+
+
+def detectability_error(system: StateSpace) -> str | None:
+    """Error of sensors that leave an undamped mode unobservable, as "kind needs ...", or None.
+
+    The estimate of a damped mode that no sensor observes is that of the model alone, whose error
+    decays by itself: that is a `DetectabilityWarning`.
+    """
+    poles = unobservable_poles(system)
+    undamped = [pole for pole in poles if pole.real > -UNOBSERVABLE * abs(pole)]
+    if undamped:
+        return (
+            "kind needs sensors that observe every mode without damping: none of"
+            f" {len(system.outputs)} observes the one at {_hertz(undamped[0])} Hz; move one off its"
+            " nodes, add one, or give it damping"
+        )
+    if poles:
+        which = " and ".join(f"{_hertz(pole)} Hz" for pole in poles)
+        warnings.warn(
+            f"no sensor observes the mode{'s' if len(poles) > 1 else ''} at {which}: the estimate"
+            " there is that of the model, which no reading corrects",
+            DetectabilityWarning,
+            stacklevel=2,
+        )
+    return None
+
+
+def _hertz(pole: complex) -> str:
+    """Frequency of a pole in Hz."""
+    return f"{abs(pole) / (2 * np.pi):.4g}"

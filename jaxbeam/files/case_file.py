@@ -24,6 +24,7 @@ from jaxbeam.case.loads.vehicle import IMPLIED
 from jaxbeam.case.reading.parts import read_part, read_parts
 from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.case.validation import check_case
+from jaxbeam.files.kind_changes import change_kind
 from jaxbeam.files.profile_file import with_profile_file
 
 for package in ("jaxbeam.case", "jaxbeam.control", "jaxbeam.estimation"):
@@ -39,23 +40,36 @@ def load_case(path: str | os.PathLike) -> Case:
     Raises ValueError, with the file and the address or line, for invalid TOML, unknown keys or
     kinds, wrong types and the errors of `check_case`; OSError if the file cannot be read.
     """
-    content = read_toml(path)
-    _find_vehicle_files(content, Path(path).parent)
+    case = read_case(path)
     try:
-        case = case_from_dict(with_profile_file(content, path))
         check_case(case)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return case
 
 
+def read_case(path: str | os.PathLike) -> Case:
+    """The case of a TOML file, whose values are not validated yet.
+
+    Raises ValueError and OSError as `load_case`, but for the errors of `check_case`.
+    """
+    content = read_toml(path)
+    _find_vehicle_files(content, Path(path).parent)
+    try:
+        return case_from_dict(with_profile_file(content, path))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
 def _find_vehicle_files(content: dict[str, Any], folder: Path) -> None:
     """Paths of vehicle files, which are relative to the case file, as they are from here."""
     loads = content.get("loads")
-    for table in loads if isinstance(loads, list) else ():
-        model = table.get("model") if isinstance(table, dict) else None
-        if isinstance(model, str) and is_path(model):
-            table["model"] = str(folder / model)
+    for load in loads if isinstance(loads, list) else ():
+        coaches = load.get("coaches") if isinstance(load, dict) else None
+        for table in (load, *(coaches if isinstance(coaches, list) else ())):
+            model = table.get("model") if isinstance(table, dict) else None
+            if isinstance(model, str) and is_path(model):
+                table["model"] = str(folder / model)
 
 
 def load_controller(path: str | os.PathLike) -> AbstractController:
@@ -141,6 +155,14 @@ def case_to_dict(case: Case, whole: bool = False) -> dict[str, Any]:
     return content
 
 
+def load_case_with(path: str | os.PathLike, settings: dict[str, Any]) -> Case:
+    """The case of a file with other entries at some addresses, validated as it is then.
+
+    `settings` are those of `with_settings`. Raises as `load_case` and `with_settings`.
+    """
+    return with_settings(read_case(path), settings) if settings else load_case(path)
+
+
 def with_settings(case: Case, settings: dict[str, Any]) -> Case:
     """A validated copy of a case with other entries at some addresses, as in its case file.
 
@@ -154,8 +176,11 @@ def with_settings(case: Case, settings: dict[str, Any]) -> Case:
         for address, value in settings.items()
         for one in each_address(current_address(address), list_sizes(case))
     ]
+    each.sort(key=lambda setting: not setting[0].endswith(".kind"))  # kinds first
     for address, value in each:
         *path, last = address.split(".")
+        if last == "kind" and len(path) == 1:
+            content.setdefault(path[0], {})
         node: Any = content
         implied: Any = whole
         for key in path:
@@ -164,6 +189,8 @@ def with_settings(case: Case, settings: dict[str, Any]) -> Case:
                 node[key] = implied  # an entry of what a word implies
             node = _child(node, key)
         if isinstance(node, dict):
+            if last == "kind":
+                change_kind(path, node, value)
             node[last] = value
             for name in IMPLIED.get(last, ()) if path[:1] == ["loads"] else ():
                 node.pop(name, None)

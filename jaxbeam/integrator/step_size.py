@@ -22,11 +22,16 @@ MAX_STEPS = 10**8  # samples or time steps of a run; more exceed memory or take 
 MAX_TRIALS = 40  # step sizes tried
 CONVERGENCE_ORDER = 9  # assumed order of the error in the step; the true order is higher
 MAX_DIVERGED_HALVINGS = 6  # halvings of the step after which a run that overflows is given up
+NO_STEP = (
+    "no time step makes the response agree to {:g}; it is unstable, or its frequencies are too far"
+    " apart: check stiffnesses, masses and damping, or keep fewer modes (beam.modes); or a law in"
+    " continuous time switches too often: give it a period, or a larger tolerance"
+)
 TRIAL_POSITIONS = (0.13, 0.29, 0.47, 0.62, 0.88)  # x / length at which errors are measured
 
 
 def check_step_count(count: float, step: float) -> None:
-    """Raise RuntimeError if a run has more than MAX_STEPS time steps, of `step` (s)."""
+    """Raises RuntimeError if a run has more than MAX_STEPS time steps, of `step` (s)."""
     if not count <= MAX_STEPS:
         raise RuntimeError(
             f"the run takes {count:.1e} time steps of {step:.1e} s, more than {MAX_STEPS:.0e}:"
@@ -64,7 +69,7 @@ def choose_step_size(case: Case, shapes: StaticShapes, tolerance: float) -> tupl
         elif (halvings := halvings + 1) > MAX_DIVERGED_HALVINGS:
             break
         step = step * float(shrink)
-    raise no_step_error(tolerance)
+    raise RuntimeError(NO_STEP.format(tolerance))
 
 
 def _without_later_vibration(case: Case, model: ModalModel) -> Case:
@@ -90,7 +95,7 @@ def _trial_run(
     _, states, *_ = integrate_history(
         discrete, load_set(case), max_loads=shapes.max_loads, steps=steps
     )
-    return trial_deflections(case, model, states[::divided])
+    return np.asarray(trial_deflections(case, model, states[::divided]))
 
 
 def trial_deflections(case: Case, model: ModalModel, states):
@@ -119,12 +124,3 @@ def largest_change(coarse: np.ndarray, fine: np.ndarray) -> float:
         return 0.0
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         return float(np.max(np.abs(coarse - fine) / np.max(np.abs(fine), axis=0), initial=0.0))
-
-
-def no_step_error(tolerance: float) -> RuntimeError:
-    return RuntimeError(
-        f"no time step makes the response agree to {tolerance:g}; it is unstable, or its "
-        "frequencies are too far apart: check stiffnesses, masses and damping, or keep fewer modes "
-        "(beam.modes); or a law in continuous time switches too often: give it a period, or a "
-        "larger tolerance"
-    )

@@ -1,5 +1,6 @@
 """Loads of a run: trajectories of their wheels, numbers of the wheels, vehicles above them."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.case import Case
+from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
 from jaxbeam.case.loads.force_history import ForceHistory
 from jaxbeam.case.loads.vehicle_model import VehicleModel
@@ -92,6 +94,21 @@ class WheelSet(Module):
     vehicles: tuple[VehicleGroup, ...] = ()
     histories: dict[int, ForceHistory] = eqx.field(default_factory=dict)
 
+    def scaled(self, factor: Float[Array, ""]) -> "WheelSet":
+        """Wheels and vehicles of similar loads, with all masses, springs and dampers in proportion.
+
+        The frequencies of the vehicles stay. Forces over time stay as they are.
+        """
+        groups = tuple(
+            dataclasses.replace(group, B=group.B / factor, H=group.H * factor)
+            for group in self.vehicles
+        )
+        stiffness, damping = (
+            part if part is None else part * factor for part in (self.stiffness, self.damping)
+        )
+        inertia, weight = self.inertia * factor, self.weight * factor
+        return WheelSet(inertia, weight, stiffness, damping, groups, self.histories)
+
 
 class LoadSet(Module):
     """All loads of a run: trajectories, distances of wheels behind the first (m), wheels.
@@ -127,6 +144,14 @@ class LoadSet(Module):
         for group in self.wheels.vehicles:
             on_ground[group.wheels] = True
         return on_ground
+
+    @property
+    def prescribed(self) -> Bool[np.ndarray, " wheel"]:
+        """Whether the force of each wheel is given: neither mass nor spring can change it."""
+        inertia = self.wheels.inertia
+        if is_jax(inertia) and not is_concrete(inertia):
+            return np.zeros(self.wheel_count, bool)
+        return ~np.any(concrete(inertia), axis=1) & ~self.on_ground
 
     @property
     def load_of_wheel(self) -> list[int]:

@@ -9,6 +9,7 @@ wheel. Heights and pitch of vehicles are measured from static equilibrium.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
@@ -80,10 +81,13 @@ class Plant(Module):
         one = xp.ones(int(has_known_disturbance(self.loads)))
         return xp.concatenate([vehicles, self.weights, one])
 
-    def on_static_loads(self) -> "Plant":
-        """The plant without springs of vehicles: wheels have their static loads and masses."""
-        wheels = dataclasses.replace(self.loads.wheels, stiffness=None, damping=None, vehicles=())
-        return dataclasses.replace(self, loads=dataclasses.replace(self.loads, wheels=wheels))
+    def of_actuators(self, indices: Sequence[int]) -> "Plant":
+        """The plant with the commands of some actuators only; the others act as they are."""
+        actuators = tuple(self.case.actuators[i] for i in indices)
+        case = eqx.tree_at(lambda c: c.actuators, self.case, actuators)
+        columns = self.modal_model.command_matrix[:, np.array(indices, int)]
+        model = eqx.tree_at(lambda m: m.command_matrix, self.modal_model, columns)
+        return dataclasses.replace(self, case=case, modal_model=model)
 
     def from_modal(self, states: Float[Array, "state *batch"]) -> Float[Array, "state *batch"]:
         """States of the beam from those of the modal model, with the order (q_1, q_1', ...)."""

@@ -3,7 +3,10 @@ from .compare import plot_comparison as plot_comparison
 from .engineering.influence import plot_influence as plot_influence
 from .envelope import plot_envelope as plot_envelope
 from .fit import FitPanel as FitPanel, plot_fit as plot_fit
-from .frequency import plot_frequency_response as plot_frequency_response
+from .frequency import (
+    plot_frequency_response as plot_frequency_response,
+    plot_loop_gain as plot_loop_gain,
+)
 from .front import plot_pareto_front as plot_pareto_front
 from .modes import plot_modes as plot_modes
 from .poles import plot_poles as plot_poles

@@ -24,11 +24,11 @@ from jaxbeam.integrator.static_shapes import StaticShapes, static_shapes
 from jaxbeam.integrator.step_size import (
     MAX_DIVERGED_HALVINGS,
     MAX_STEPS,
+    NO_STEP,
     check_step_count,
     choose_step_size,
     largest_change,
     longest_trial_step,
-    no_step_error,
     trial_deflections,
 )
 from jaxbeam.integrator.time_grid import grid_by_schedule
@@ -203,4 +203,4 @@ def _halve_until_converged(
         if halvings >= MAX_DIVERGED_HALVINGS and not np.isfinite(fine).all():
             break
         coarse = fine
-    raise no_step_error(tolerance)
+    raise RuntimeError(NO_STEP.format(tolerance))

@@ -25,8 +25,18 @@ def contact_sentence(case: Case, lost_times, lost_positions, lowest_forces) -> s
     """Where and when (s, m) wheels first would have to pull, and their smallest forces (N).
 
     Times are NaN for wheels that press on the beam throughout. The first of many wheels are listed.
+    Prescribed forces may be negative: these pull because they were given so.
     """
-    lost = np.flatnonzero(np.isfinite(lost_times))
+    negative, prescribed = np.isfinite(lost_times), load_set(case).prescribed
+    lost = np.flatnonzero(negative & ~prescribed)
+    pulling = np.flatnonzero(negative & prescribed)
+    if pulling.size and not lost.size:
+        i = int(pulling[np.argmin(lowest_forces[pulling])])
+        more = f" and {pulling.size - 1} others" if pulling.size > 1 else ""
+        return (
+            f"the prescribed force of load {wheel_labels(case)[i]}{more} is negative at times, down"
+            f" to {lowest_forces[i]:.4g} N, as given"
+        )
     if case.loads and not _any_on_beam(case):
         return "no load is on the beam during the run"
     if not lost.size:

@@ -17,7 +17,7 @@ from jaxbeam.files.tables import write_result
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.measurement import sensor_readings
-from jaxbeam.model.sensing.output_rows import quantity_history
+from jaxbeam.model.sensing.output_rows import quantity_history, sensor_history
 from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readings
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
@@ -139,15 +139,22 @@ class Record(TableViews, eqx.Module):
         return section_forces.support_positions(self.case, self.modes)
 
     def envelope(
-        self, quantity: str = "moment", positions=None, fibre_distance=None, section_modulus=None
+        self,
+        quantity: str = "moment",
+        positions=None,
+        fibre_distance=None,
+        section_modulus=None,
+        coincident: str = "",
     ) -> RecordEnvelope:
         """Smallest and largest values of a quantity at positions (m), with times and loads.
 
         From the samples, free vibration included; by default at 101 equally spaced positions. The
         quantities are those of `at`; a moment has its peak as a load passes, so that a load should
-        move by a small part of the length between samples. Raises ValueError as `at` does.
+        move by a small part of the length between samples. With each value is that of another,
+        `coincident` quantity at the same place and time, if one is named. Raises ValueError as `at`
+        does.
         """
-        parameters = positions, fibre_distance, section_modulus
+        parameters = positions, fibre_distance, section_modulus, coincident
         return record_envelope(
             self.case, self.modes, self.motion, self.times, quantity, *parameters
         )
@@ -155,10 +162,8 @@ class Record(TableViews, eqx.Module):
     @property
     def sensor_values(self) -> Float[Array, "time sensor"]:
         """True quantity of each sensor in its SI unit: without offset, filters and noise."""
-        columns = [
-            self.at(s.position, s.quantity, s.fibre_distance, s.section_modulus)
-            for s in self.case.sensors
-        ]
+        parts = self.case, self.modes, self.motion
+        columns = [sensor_history(*parts, sensor) for sensor in self.case.sensors]
         return xp.array(columns).reshape(-1, self.times.shape[0]).T
 
     @property

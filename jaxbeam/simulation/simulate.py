@@ -75,7 +75,7 @@ def simulate(
         case, dataclasses.replace(plan, error=0.0), times, xp.asarray(plan.error)
     )
     if is_concrete(record.contact_lost_time):
-        lost = np.isfinite(concrete(record.contact_lost_time))
+        lost = np.isfinite(concrete(record.contact_lost_time)) & ~load_set(case).prescribed
         if lost.any() and np.isnan(concrete(record.diverged_time)):
             warnings.warn(record.verdict, ContactLossWarning, stacklevel=2)
     return record
@@ -140,7 +140,10 @@ def simulate_readings(
 
 
 class Histories(NamedTuple):
-    """Deflection (m) at given positions, commands and contact forces (N) of a run."""
+    """Deflection (m) at given positions, commands and contact forces (N) of a run.
+
+    Forces of wheels off the beam are zero, also those of vehicles on the ground.
+    """
 
     deflection: Float[Array, "time position"]
     command: Float[Array, "time actuator"]
@@ -157,7 +160,9 @@ def simulate_histories(
     _, outputs, modal, _ = _integrate(case, plan, times, None)
     motion = outputs.motion
     deflection = motion.coordinates @ modal.shapes(positions).T
-    return Histories(deflection, motion.command, motion.contact_force)
+    on_beam = xp.isfinite(motion.load_position)
+    contact_force = xp.where(on_beam, motion.contact_force, 0.0)
+    return Histories(deflection, motion.command, contact_force)
 
 
 class IntegrationSetup(NamedTuple):

@@ -31,9 +31,6 @@ MAX_BLOCK_RUNS = 512  # about; a block is one call of the compiled program and o
 MIN_BLOCKS = 8  # of a large sweep, to use all cores
 MAX_TRIAL_RUNS = 256  # about; runs per call while step sizes are measured
 MIN_TRIAL_BATCHES = 4  # for which step sizes are measured
-# Longest step of forces where peaks are those of moments and the like, relative to that of others:
-# a peak as an axle passes is exact with any step, and trials of such runs would mislead the search.
-CORRECTED_SHARE = 0.4
 MAX_TRIAL_BATCHES = 16  # more of one run each cost more than the steps that they would save
 
 
@@ -151,8 +148,7 @@ class Runner:
         crossing_time = np.min(times_on_beam, axis=1, initial=np.inf)
         crossing_time = np.where(np.isfinite(crossing_time), crossing_time, duration)
         self.crossing_rates = 1 / crossing_time
-        bends = any(sensor.bends for sensor in self.case.sensors)
-        limits = np.minimum(limits, self.force_steps * (CORRECTED_SHARE if bends else 1.0))
+        limits = np.minimum(limits, self.force_steps)
         self.max_steps = np.minimum(limits, duration)
         if self.schedule is not None and self.case.controller is not None:  # steps end at events
             self.max_steps = np.minimum(self.max_steps, self.schedule.lengths.max())
@@ -170,8 +166,9 @@ class Runner:
             calls = batch_indices.size // self.trial_batches
             parts = zip(np.split(batch_indices, calls), np.split(steps, calls), strict=True)
             results = [self._integrate(*part, None, single, extra_steps) for part in parts]
-            found = np.concatenate([result["peak_deflection"] for result in results])
-            return self._compared_by_quantity(found)
+            names = "peak_deflection", programs.MODAL_SUM_PEAK
+            columns = ([one.get(name, np.zeros(0)) for one in results] for name in names)
+            return self._compared_by_quantity(*map(np.concatenate, columns))
 
         search = self.crossing_rates, self.initial_steps, self.max_steps, count, self.tolerance
         steps, error = choose_step_sizes(peaks, *search, self.pool.map)
@@ -182,13 +179,21 @@ class Runner:
             )
         return steps, error
 
-    def _compared_by_quantity(self, peaks):
+    def _compared_by_quantity(self, peaks, modal_sums):
         """Peaks (path, batch, sensor), those of each quantity as further runs of the batch.
 
-        Small peaks of one quantity then are not judged by large ones of another unit.
+        Small peaks of one quantity then are not judged by large ones of another unit. Of statically
+        corrected quantities the sums of the modes count as well.
         """
-        quantities = np.array([sensor.quantity for sensor in self.case.sensors])
+        sensors = self.case.sensors
+        quantities = np.array([sensor.quantity for sensor in sensors])
         parts = [peaks * (quantities == quantity) for quantity in np.unique(quantities)]
+        if modal_sums.size:
+            own = np.array([sensor.bends for sensor in sensors])
+            sums = np.zeros_like(peaks)
+            sums[..., own] = modal_sums
+            kinds = np.unique(quantities[own])
+            parts += [sums * (quantities == quantity) for quantity in kinds]
         return np.concatenate(parts, axis=1)
 
     def run_count(self, block: int) -> int:
@@ -203,7 +208,9 @@ class Runner:
         substeps = None
         if self.histories:
             substeps = steps_per_interval(float(self.schedule.lengths.max()), steps.min())
-        return self._integrate(batch_indices, steps[batch_indices], substeps, self.single)
+        results = self._integrate(batch_indices, steps[batch_indices], substeps, self.single)
+        results.pop(programs.MODAL_SUM_PEAK, None)
+        return results
 
     def _programs_to_compile(self, program, shared_values):
         """Programs that step sizes need, the slowest to compile first, and template arguments."""

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from jaxbeam.case.case import Case
+from jaxbeam.case.case import Case, unit_at
+from jaxbeam.case.display.addresses import address_words
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.simulation.integration_plan import sample_times
 from jaxbeam.simulation.result_variables import SWEEP_VARIABLES, sensor_coordinates
@@ -126,7 +127,11 @@ def _to_dataset(
             attributes,
         )
     coordinates: dict[str, Any] = {
-        address: ("run" if specification.paired else address, values)
+        address: (
+            "run" if specification.paired else address,
+            values,
+            {"units": unit_at(case, address) or "1", "long_name": address_words(case, address)},
+        )
         for address, values in specification.axes.items()
     }
     coordinates |= sensor_coordinates(case)

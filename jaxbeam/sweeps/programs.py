@@ -15,6 +15,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxbeam.case.case import Case, replace
+from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule
@@ -30,6 +31,7 @@ from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
 from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.static_correction import is_supported
 from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,
     PARALLEL_COMPILATION,
@@ -83,12 +85,28 @@ class Program(NamedTuple):
         substeps = jnp.ceil(jnp.max(self.schedule.lengths) / max_step).astype(int) + extra_steps
         return grid_by_schedule(varied, model, self.schedule, self.substeps or substeps, places)
 
+    def modal_sums(self, varied: Case) -> list[Sensor]:
+        """Sensors whose peaks are statically corrected, and are followed as sums of the modes."""
+        if not is_supported(varied, self.shapes.layout):
+            return []
+        return [sensor for sensor in varied.sensors if sensor.bends]
+
     def discretise(self, model, shared_values, step_size, policy=None):
-        """Discrete model of a batch, with peaks of what the sensors measure."""
+        """Discrete model of a batch, with peaks of what the sensors measure.
+
+        Those that are statically corrected are followed by their sums of the modes, which show the
+        error of a step: peaks as an axle passes a sensor are exact with any step.
+        """
         varied, grid = self.case_with(shared_values), self.grid(model, shared_values, step_size)
-        outputs = sensor_rows(model, varied, varied.sensors)
-        correction = static_correction(model, varied, varied.sensors, outputs)
+        sums = self.modal_sums(varied)
+        sensors = *varied.sensors, *sums
+        outputs = sensor_rows(model, varied, sensors)
+        correction = static_correction(model, varied, sensors, outputs, len(sums))
         return discrete_model(model, grid, None, policy, outputs, correction)
+
+
+# Peaks of the modal sums of corrected quantities among the results: for step sizes only.
+MODAL_SUM_PEAK = "modal_sum_peak"
 
 
 @compiled(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)
@@ -219,7 +237,10 @@ def _results(program: Program, discrete, varied: Case, loads: LoadSet, policy=No
         history["deflection"] = jnp.einsum("sm,tml->lts", rows, modal)
     if policy is not None:
         history["controller_failures"] = policy.failures(memory)
-    return running_peaks.peaks()._asdict() | history
+    peaks, count = running_peaks.peaks(), len(varied.sensors)
+    history[MODAL_SUM_PEAK] = peaks.peak_deflection[:, count:]
+    own = peaks.peak_deflection[:, :count], peaks.peak_time[:, :count]
+    return peaks._replace(peak_deflection=own[0], peak_time=own[1])._asdict() | history
 
 
 def _map_masked(function, mask, values):

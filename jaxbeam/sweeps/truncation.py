@@ -11,7 +11,7 @@ from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensing.output_rows import quantity_history
+from jaxbeam.model.sensing.output_rows import sensor_history
 from jaxbeam.model.static_correction import (
     Motion,
     corrected_history,
@@ -131,8 +131,7 @@ def truncation_errors(record: Record) -> Float[Array, " sensor"]:
 
 
 def _history(record: Record, sensor: Sensor):
-    channel = sensor.position, sensor.quantity, sensor.fibre_distance, sensor.section_modulus
-    return quantity_history(record.case, record.modes, record.motion, *channel)
+    return sensor_history(record.case, record.modes, record.motion, sensor)
 
 
 def _with_fewer_modes(record: Record) -> Record | None:

@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from jaxbeam.case.aliases import current_address
 from jaxbeam.case.case import Case, addresses
+from jaxbeam.case.display.addresses import address_words
 from jaxbeam.case.joint_addresses import ALL
 from jaxbeam.files.case_file import case_to_dict, with_settings
 from jaxbeam.sweeps import MAX_RUNS, store as sweep_store
@@ -71,11 +72,14 @@ class WordSweep:
             values = values.reshape(*sizes, *values.shape[1:])
             variables[name] = ((*self.words, *first.dims), values, first.attrs)
         coordinates: dict[str, Any] = {
-            address: list(words) for address, words in self.words.items()
+            address: (address, list(words), {"long_name": address_words(self.case, address)})
+            for address, words in self.words.items()
         }
         texts = [json.dumps(case_to_dict(case)) for case in self.cases]
         coordinates["cases"] = (tuple(self.words), np.reshape(texts, sizes))
         joined = xarray.Dataset(variables, coordinates | dict(datasets[0].coords))
+        for address in set(self.dims) - set(self.words):  # of a train that is written as numbers
+            joined[address].attrs["long_name"] = address_words(self.case, address)
         return joined.transpose(*self.dims, ...).assign_attrs(
             title=self.case.title,
             case=json.dumps(case_to_dict(self.case)),

@@ -7,7 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.amplification import amplification, envelope
+from jaxbeam.analysis.record_amplification import record_amplification
+from jaxbeam.analysis.sections.amplification import amplification, envelope
 
 LENGTH, RIGIDITY, DENSITY, FORCE = 0.6, 11.68, 0.535, 5.0
 POSITIONS = np.array([0.15, 0.3, 0.4])
@@ -87,6 +88,19 @@ def test_amplification_of_slow_and_fast_forces():
     assert_allclose(fast, -envelope(crossing(15.0), middle).lowest / static, rtol=1e-12)
     assert 1.6 < fast[0] < 1.8  # near its largest, at 0.62 of the critical speed
     assert_allclose(amplification(crossing(0.05, modes=6), middle), 1.0, atol=3e-3)
+
+
+def test_record_has_amplification_where_the_static_deflection_is_known():
+    """At sensors of deflection, but not over a support, nor with rigid-body modes or control."""
+    sensors = [jb.Sensor(0.3), jb.Sensor(0.6), jb.Sensor(0.2, "velocity"), jb.Sensor(0.3, "moment")]
+    case = dataclasses.replace(crossing(2.0), sensors=sensors)
+    at_sensor, *others, moment = record_amplification(jb.simulate(case))
+    assert_allclose(at_sensor, amplification(case, [0.3])[0], rtol=1e-6)
+    assert_allclose(moment, amplification(case, [0.3], quantity="moment")[0], rtol=1e-4)
+    assert others == [None, None]
+    free = dataclasses.replace(case, beam=dataclasses.replace(case.beam, ends="free-free"))
+    free = dataclasses.replace(free, sensors=sensors[:1])
+    assert record_amplification(jb.simulate(free)) == [None]
 
 
 def test_envelope_of_moments_against_the_record_and_amplification_of_a_slow_force():

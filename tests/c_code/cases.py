@@ -1,17 +1,27 @@
 """Small cases, one for each kind of controller and estimator, whose C code is tested."""
 
+import dataclasses
+
+import equinox as eqx
+import jax
 import numpy as np
 
 import jaxbeam as jb
 from jaxbeam.case.case import Run
+from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.feedback import Feedback
 from jaxbeam.control.load_identification import LoadIdentification
 from jaxbeam.control.optimal.crossing_lqr import FiniteLQR
+from jaxbeam.control.optimal.gain_schedules import GainSchedule
 from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
-from jaxbeam.control.optimal.scheduled_lqr import ScheduledLQR
+from jaxbeam.control.optimal.scheduled_lqr import ScheduledGainLaw, ScheduledLQR
 from jaxbeam.control.output_feedback import OutputFeedback
+from jaxbeam.control.predictive.prediction import SampledPlant
+from jaxbeam.control.predictive.preview import Preview
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.scheduled_feedback import ScheduledFeedback
+from jaxbeam.control.state_law import SampledStateLaw, TrueState
+from jaxbeam.numerics.gain_table import GainTable
 
 PERIOD = 5e-3
 
@@ -29,6 +39,11 @@ def rig(controller, **changes):
 
 
 FILTERED = [jb.Sensor(0.2, filter=jb.Filter(40.0, 3), offset=1e-4), jb.Sensor(0.4, resolution=1e-5)]
+LATE = [
+    jb.Sensor(0.2, filter=jb.Filter(40.0), delay=7e-3, noise=1e-6),
+    jb.Sensor(0.4, filter=jb.Filter(20.0), sampling_period=2 * PERIOD),
+    jb.Sensor(0.3, "velocity", filter=jb.Filter(30.0, realisation="analogue")),
+]
 WEIGHTS = {
     "state_weight": [1e4, 1e2, 1.0, 0.1, 0.0],
     "command_weight": [1e-4, 1e-3],
@@ -44,9 +59,14 @@ ESTIMATED = jb.Kalman(0.02, 1e-5, loads="estimated", weight_deviation=1.0)
 SHORT = {"loads": [jb.MovingMass(mass=0.4, speed=15.0)], "run": Run(duration=0.06)}
 CASES = {
     "feedback": rig(Feedback([2e3, 1e3], higher_gains=[[1e8, 2e8]], period=PERIOD)),
+    "spring": rig(
+        Feedback([2e3], period=PERIOD),
+        actuators=[jb.SpringDamper(0.3, stiffness=100.0), jb.PointForce(0.45, limits=(-1.0, 1.0))],
+    ),
     "feedback-cubic": rig(Feedback([5e8, 1e8], power=3, period=PERIOD), sensors=FILTERED),
     "output-feedback": rig(
-        OutputFeedback([[2e3, 0.0, 5.0], [0.0, -1e3, 1.0]], period=PERIOD, delay=PERIOD)
+        OutputFeedback([[2e3, 0.0, 5.0], [0.0, -1e3, 1.0]], period=PERIOD, delay=PERIOD),
+        sensors=LATE,
     ),
     "pd": rig(jb.PD([2e3, 1e3], rate_gains=[10.0, 5.0], lag=1e-2, period=PERIOD)),
     "lead": rig(jb.Lead([2e3, 1e3], zero=5.0, pole=[20.0, 30.0], period=PERIOD)),
@@ -119,25 +139,94 @@ CASES = {
             period=PERIOD,
         )
     ),
-    "mpc-hildreth": rig(
-        jb.MPC(3, 2, 1e-10, solver="hildreth", period=PERIOD, loads="known"), **SHORT
-    ),
-    "mpc-varying": rig(jb.MPC(3, 2, 1e-10, period=PERIOD, prediction="time-varying"), **SHORT),
     "kalman-known": rig(
         jb.LQR(**WEAK, estimator=jb.Kalman(0.02, 1e-5, loads="known"), delay=2e-3), **SHORT
     ),
-    "kalman-estimated": rig(
-        jb.MPC(3, 1, 1e-10, loads="known", estimator=ESTIMATED, period=PERIOD),
-        **SHORT | {"actuators": [jb.PointForce(0.2, limits=(-0.5, 0.5))]},
+    "mpc-unconstrained": rig(jb.MPC(6, 2, 1e-10, solver="unconstrained", period=PERIOD)),
+}
+
+
+class GivenTables(AbstractController):
+    """Random tables of gains over the crossing, for the true state of the beam."""
+
+    family: bool = eqx.field(static=True, default=False)
+    nearest: bool = eqx.field(static=True, default=False)
+    identification: LoadIdentification | None = None
+
+    def design_law(self, plant):
+        if not self.family:
+            return SampledStateLaw(self.random_schedule(), TrueState(np.eye(5)))
+        schedules = [self.random_schedule() for _ in range(6)]
+        grid = jax.tree.map(lambda *x: np.reshape(np.stack(x), (2, 3, *x[0].shape)), *schedules)
+        grids = np.array([0.3, 0.5]), np.array([1.0, 2.0, 3.0])
+        numbers = plant.case.beam.length, np.array(2.4)
+        source = self.identification.identifier(plant, plant)
+        law = ScheduledGainLaw(grid, *grids, *numbers, source, self.nearest, 1)
+        return SampledStateLaw(law, TrueState(np.eye(5)))
+
+    def random_schedule(self) -> GainSchedule:
+        """Table of five cubics from 0.02 to 0.2 s, then a gain that fades."""
+        weights = np.array([2.9, 1.0] if self.family else [])
+        columns, inner = 5 + weights.size, np.sort(RANDOM.uniform(size=4))
+        coefficients = 20.0 * RANDOM.normal(size=(5, 4, 2, columns))
+        table = GainTable(np.concatenate([[0.0], inner, [1.0]]), coefficients)
+        final = 20.0 * RANDOM.normal(size=(2, columns))
+        times = np.array(0.02), np.array(0.2), np.array(0.03)
+        return GainSchedule(table, final, weights, *times, self.family)
+
+
+class VaryingPlants(Preview):
+    """Stands for the preview of a crossing, which takes a compilation: plants that vary in time."""
+
+    sampled: SampledPlant | None = None
+
+    def sampled_plants(self, t, first, count):
+        periods = np.floor(t / PERIOD + 0.5) + first + np.arange(count)
+        share = np.where(periods < 9, 0.2 * np.sin(0.5 * periods), 0.1)[:, None, None]
+        assert self.sampled is not None
+        A, B, _ = self.sampled
+        E = 1e-4 * np.ones((count, A.shape[0], self.plant.augmented_start.shape[0]))
+        return SampledPlant(A * (1 + 0.1 * share), B * (1 - share), E * (1 + share))
+
+
+class VaryingMPC(AbstractController):
+    """MPC with tables over time: of its settings, for plants that vary, with known weights."""
+
+    settings: jb.MPC | None = None
+
+    def design_law(self, plant):
+        settings = dataclasses.replace(self.settings, period=self.period, delay=self.delay)
+        law = settings.law(plant)
+        none = np.zeros(1), (), np.zeros(0, int), np.zeros((0, 1, 1))
+        plants = VaryingPlants(plant, self.period, self.delay, *none, law.law.sampled_plant)
+        law = eqx.tree_at(lambda s: s.law.preview, law, plants, is_leaf=lambda x: x is None)
+        return dataclasses.replace(law, law=dataclasses.replace(law.law, known_weights=True))
+
+
+RANDOM = np.random.default_rng(0)
+GATES = LoadIdentification(gates=[-0.05, 0.05])
+CASES["table"] = rig(GivenTables(period=PERIOD))
+CASES["family"] = rig(GivenTables(family=True, identification=GATES, period=3 * PERIOD))
+CASES["nearest"] = rig(
+    GivenTables(family=True, nearest=True, identification=GATES, period=3 * PERIOD)
+)
+CASES["mpc-varying"] = rig(
+    VaryingMPC(
+        settings=jb.MPC(3, 2, 1e-10, solver="hildreth", period=PERIOD), period=PERIOD, delay=1e-3
     ),
+    run=Run(duration=0.06),
+)
+CASES["mpc-estimated"] = rig(
+    VaryingMPC(settings=jb.MPC(3, 1, 1e-10, estimator=ESTIMATED, period=PERIOD), period=PERIOD),
+    **SHORT,
+)
+
+# Their designs compile for seconds.
+DESIGNED_TABLES = {
     "mpc-vehicle": rig(
         jb.MPC(3, 1, 1e-10, loads="known", estimator=KALMAN, period=PERIOD),
         **SHORT | {"loads": [jb.Oscillator(0.3, 900.0, 2.0, speed=15.0)]},
     ),
-    "mpc-unconstrained": rig(jb.MPC(6, 2, 1e-10, solver="unconstrained", period=PERIOD)),
-}
-# Their designs compile for seconds.
-DESIGNED_TABLES = {
     "lqr-finite": rig(FiniteLQR(**WEAK, points=60, after="fade", fade_time=0.02, estimator=KALMAN)),
     "lqr-scheduled": rig(
         ScheduledLQR(

@@ -28,7 +28,7 @@ def exported(kind: str) -> CProgram:
 
 
 def checked(kind: str, folder: Path, *options: str) -> tuple[float, int]:
-    """Error of the commands relative to the largest, and bytes of the state, of a check."""
+    """Error of the commands relative to the largest, and bytes of the state, as a check prints."""
     write_c(exported(kind), folder)
     assert COMPILER is not None
     build = [COMPILER, *STRICT, *options, "-o", "check", "law.c", "law_check.c", "-lm"]
@@ -45,7 +45,7 @@ def checked(kind: str, folder: Path, *options: str) -> tuple[float, int]:
 @needs_compiler
 @pytest.mark.parametrize("kind", KINDS)
 def test_program_gives_the_commands_of_the_loop(kind, tmp_path):
-    """To rounding, without warnings and undefined behaviour; the memory is stated."""
+    """To rounding, without warnings and memory errors; the memory is stated."""
     error, state_bytes = checked(kind, tmp_path, *SANITIZED)
     assert error < ROUNDING
     assert state_bytes == exported(kind).state_bytes

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.case.display.addresses import address_words
+from jaxbeam.case.display.addresses import address_words, value_words
 from jaxbeam.case.display.prefixes import unit_scale, with_prefix
 
 BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.02)
@@ -98,3 +98,9 @@ CASE = jb.Case(
 )
 def test_addresses_in_words(address, words):
     assert address_words(CASE, address) == words
+
+
+def test_values_in_words():
+    assert value_words(CASE, "loads.0.speed", 2.0) == "speed of load 0: 2 m/s"
+    assert value_words(CASE, "beam.damping_ratio", 0.01) == "damping ratio of the beam: 0.01"
+    assert value_words(CASE, "loads.1.train", "HSLM-A2") == "train of train 1: HSLM-A2"

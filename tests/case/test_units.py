@@ -150,7 +150,7 @@ def test_every_declared_unit_is_known_or_depends_on_other_entries(unit):
 def test_numbers_alone_import_no_units():
     code = (
         "import sys, jaxbeam as jb\n"
-        "jb.check(jb.load_case('examples/railway_bridge.toml'))\n"
+        "jb.check(jb.load_case('examples/railway_bridge/case.toml'))\n"
         "assert 'pint' not in sys.modules\n"
         "jb.Beam(length='25 m')\n"
         "assert 'pint' in sys.modules"

@@ -74,7 +74,12 @@ REFUSED = [
     ("identify log.csv -o fit.toml", "-o and --set are for fitting a case; name what is free"),
     ("identify case.toml log.csv --free beam.length=2:1", "bounds are LOW:HIGH, such as 5:20"),
     ("identify case.toml log.csv --free beam.length=0:b", "'b' is not a number"),
+    ("identify case.toml log.csv --free beam.length=1:2m", "give both bounds a unit, as in 8 GN"),
     ("identify case.toml log.csv --free beam.length -o case.toml", "case.toml exists; choose"),
+    (
+        "weigh case.toml old.nc --speeds 5:20 --calibration old.nc",
+        "--calibration is for Moses' method: say how many --axles",
+    ),
 ]
 
 
@@ -109,6 +114,7 @@ def test_simulate_prints_and_writes_the_same(run, folder):
         "sensors",
         "peak_deflection",
         "lowest_contact_force",
+        "largest_contact_force",
         "wheel_unloading",
         "contact_lost_time",
         "error_estimate",
@@ -116,7 +122,11 @@ def test_simulate_prints_and_writes_the_same(run, folder):
         "verdict",
         "plausibility",
     }
+    factors = [sensor["dynamic_amplification"] for sensor in found["sensors"]]
+    np.testing.assert_allclose(factors, jb.amplification(record.case, [0.3, 0.15]), rtol=1e-6)
+    assert found["largest_contact_force"] == [float(record.contact_force.max())]
     printed = run("simulate case.toml -o out.nc --plot --animate out.gif")
+    assert f"{factors[0]:.4g}" in printed and " steps" not in printed
     assert f"{float(record.peak_deflection[0]):.6g}" in printed
     assert "written: out.nc" in printed
     assert (folder / "out.nc").stat().st_size > 0
@@ -299,6 +309,22 @@ def test_frequency_responses(run, folder):
     assert (folder / "out.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_sweep_prints_where_peaks_are_and_writes_rows(run, folder):
+    """Largest and smallest peak of a sensor, as the rows of the file have them."""
+    line = "sweep case.toml --over loads.0.speed=0.5,1,2 -o out.csv"
+    printed = run(line)
+    heads, *rows = (row.split(",") for row in (folder / "out.csv").read_text().splitlines())
+    assert heads[:2] == ["speed of the load (m/s)", "sensor 0 peak deflection (m)"]
+    peaks = {float(row[1]): row[0] for row in rows}
+    for words, peak in (("largest", max(peaks)), ("smallest", min(peaks))):
+        found = [one.split() for one in printed.splitlines() if one.split()[:1] == ["0"]]
+        (own,) = [row for row in found if words in row]
+        assert own[-3] == f"{peak:.6g}" and float(own[-1]) == float(peaks[peak])
+    least = min(float(row[heads.index("load 0 lowest contact force (N)")]) for row in rows)
+    assert f"smallest contact force {least:.6g} N, at speed of the load " in printed
+    assert "no run loses contact" in printed
+
+
 def test_paired_sweep(run):
     line = "sweep case.toml --over loads.0.mass=0.1,0.5 --over loads.0.speed=0.5,1 --paired"
     assert np.shape(run(f"{line} --json")["peak_deflection"]) == (2, 2)
@@ -357,7 +383,7 @@ def test_identify_a_case(run, folder):
     (folder / "log.toml").write_text("[columns]\nw = { unit = 'm', sensor = 0 }\n")
     run(
         "identify case.toml log.csv --set beam.flexural_rigidity=10"
-        " --free beam.flexural_rigidity=5:20 -o fit.toml --plot"
+        " --free beam.flexural_rigidity=0.005kN*m^2:20N*m^2 -o fit.toml --plot"
     )
     fitted = load_case(folder / "fit.toml")
     np.testing.assert_allclose(fitted.beam.bending_stiffness, 11.68, rtol=1e-4)

@@ -32,7 +32,25 @@ def test_vehicle_file(folder, run):
 
 def test_case_file(run):
     printed = run("describe case.toml")
-    assert "loads.0: mass" in printed and "weight 0.004905 kN, mass 0.5 kg" in printed
+    assert "loads.0: mass" in printed and "weight 4.905 N, mass 0.5 kg" in printed
+
+
+def test_case_of_a_train_in_words(run, folder):
+    """Units with prefixes, when the loads are on the beam, the first and the last of 50 axles."""
+    run("new railway-bridge")
+    printed = run("describe railway-bridge.toml")
+    for text in (
+        "beam of 25 m, pinned-pinned: E I = 30 GN m², 15000 kg/m",
+        "1/3732 of the span of 25 m",
+        "critical speed: 177.7 m/s (639.8 km/h)",
+        "loads.0: HSLM-A1 at 60 m/s (216 km/h), on the beam from 0 s to 7.042 s",
+        "the run ends at 16 s",
+        "sensors: midspan (deflection at 12.5 m), deck (acceleration at 12.5 m)",
+        "50 wheels, of which",
+        "397.525",
+    ):
+        assert text in printed
+    assert len(printed.splitlines()) < 35
 
 
 def test_library(run):

@@ -2,7 +2,8 @@
 
 import pytest
 
-MARGIN = {"gain": None, "delay": None, "obstacle": None, "unstable": None}
+MARGIN = {"verdict": None, "gain": None, "delay": None, "obstacle": None, "unstable": None}
+MARGINS = [{"gain": None, "gain_down": None, "phase": None, "delay": None, "distance": None}]
 LIMIT_CYCLES = [{"extra": None, "frequency": None, "at_limits": None}]
 COMPARISON = {
     "uncontrolled_peak": None,
@@ -75,6 +76,7 @@ KEYS = {
         "effort": None,
         "saturated": None,
         "verdict": None,
+        "stability": None,
         "plausibility": PLAUSIBILITY,
     },
     "describe case.toml": {
@@ -100,11 +102,12 @@ KEYS = {
         "peak_deflection": None,
         "plausibility": PLAUSIBILITY,
     },
-    "stability controlled.toml --limits --headway 0.5": {
+    "stability controlled.toml --limits --headway 0.5 --mass-at 0.2=0.3": {
+        "verdict": None,
+        "along_crossing": {"gain": None, "delay": None, "obstacle": None},
         "stable_without_loads": None,
-        "margins": [
-            {"gain": None, "gain_down": None, "phase": None, "delay": None, "distance": None}
-        ],
+        "margins": MARGINS,
+        "mass_at": [{"position": None, "mass": None, "verdict": None, "margins": MARGINS}],
         "largest_real_part": None,
         "at_time": None,
         "largest_growth": None,

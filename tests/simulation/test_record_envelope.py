@@ -46,6 +46,16 @@ def test_shear_on_both_sides_of_a_slow_force(slow):
     assert_allclose(found.smallest[:-1], -1e5 * (X / 30)[:-1], rtol=0, atol=1e3)
 
 
+def test_coincident_shear_of_the_largest_moment(slow):
+    """With the force at x its shear forces there are P (1 - x / L) and -P x / L: the larger."""
+    found = slow.envelope("moment", X, coincident="shear")
+    share = X[2:-2] / 30
+    expected = 1e5 * np.maximum(share, 1 - share)
+    assert_allclose(np.abs(found.largest_coincident[2:-2]), expected, rtol=0, atol=1e3)
+    assert list(found.columns)[-1] == "shear (N) at largest"
+    assert found.to_xarray()["largest_coincident"].attrs["units"] == "N"
+
+
 def test_deflections_are_those_between_samples_nearly():
     case = dataclasses.replace(
         SLOW, loads=[jb.MovingMass(mass=2e4, speed=25.0)], run=jb.Run(2.0, sample_rate=1000.0)

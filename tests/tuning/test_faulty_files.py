@@ -2,6 +2,7 @@
 
 import pytest
 
+import jaxbeam as jb
 from tuning.control.load_cases import read_load_cases
 from tuning.logs.description import read_description
 
@@ -51,3 +52,21 @@ def test_faulty_description(tmp_path, text):
         read_description(tmp_path / "log.csv")
     assert str(error.value).startswith(f"{path}: ")
     assert len(str(error.value)) < 300 + len(str(path))
+
+
+def test_load_cases_with_units(tmp_path):
+    """In SI units; a unit of another kind, or an address that does not exist, is refused."""
+    path, beam = tmp_path / "loads.toml", jb.Beam(25.0, 3e10, 1.5e4)
+    case = jb.Case(beam, loads=[jb.MovingForce(force=1e5, speed=20.0)])
+    path.write_text('[training]\n"loads.0.speed" = ["36 km/h", "72 km/h"]\n"loads.0.force" = [1]\n')
+    runs = read_load_cases(path, case).training
+    assert [run["loads.0.speed"] for run in runs] == pytest.approx([10.0, 20.0])
+    with pytest.raises(ValueError, match="must be a list of numbers"):
+        read_load_cases(path)
+    for address, message in (
+        ("loads.0.mass", "no number at address 'loads.0.mass'"),
+        ("loads.0.force", "training.loads.0.force.0 must be in N"),
+    ):
+        path.write_text(f'[training]\n"{address}" = ["36 km/h"]\n')
+        with pytest.raises(ValueError, match=message):
+            read_load_cases(path, case)

@@ -7,18 +7,22 @@ import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 from scipy.stats.qmc import LatinHypercube
 
-from jaxbeam.case.case import Case, crossing_times, replace
+from jaxbeam.case.case import Case, crossing_times, replace, unit_at, value_at
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.reading.tables import COUNT, NUMBERS, TABLE, check_entry, check_table
 from jaxbeam.case.reading.toml_file import read_toml
+from jaxbeam.case.reading.units import in_si, is_quantity
 from jaxbeam.case.trajectory import NEVER
+from jaxbeam.files.case_file import with_settings
 
 AddressValues = dict[str, float]  # values of the case by address
 TABLES = ("training", "held_out")
 VALUES = NUMBERS._replace(description='a list of numbers, such as "loads.0.mass" = [0.2, 0.5]')
+COUNTS = ("seed", "count", "waves")  # names of whole numbers, which are not numbers of a case
 MAX_LOAD_CASES = 100_000
 # Addresses of the plant begin with these.
 PLANT_PREFIXES = ("beam.", "supports.", "actuators.", "sensors.")
@@ -27,6 +31,9 @@ PLANT_PREFIXES = ("beam.", "supports.", "actuators.", "sensors.")
 @dataclasses.dataclass(frozen=True)
 class LoadCases:
     """Values of the case, by address, that differ from run to run: loads, plants, anything.
+
+    Vehicles and profiles are numbers like others, `loads.0.body_mass`; `profile.seed` is another
+    realisation of a random profile.
 
     The tuning minimises the objective of the `training` runs; `held_out` runs are simulated with
     its result only.
@@ -64,14 +71,14 @@ def _all_pairs(
     return tuple({**run, **plant} for run in runs for plant in plants)
 
 
-def full_grid(values: Mapping[str, Sequence[float]]) -> tuple[AddressValues, ...]:
+def full_grid(values: Mapping[str, Sequence[float | int]]) -> tuple[AddressValues, ...]:
     """Full grid: every combination of the values given by address."""
     rows = itertools.product(*values.values())
     return tuple(dict(zip(values, map(float, row), strict=True)) for row in rows)
 
 
 def latin_hypercube(
-    ranges: Mapping[str, Sequence[float]], count: int, seed: int = 0
+    ranges: Mapping[str, Sequence[float | int]], count: int, seed: int = 0
 ) -> tuple[AddressValues, ...]:
     """Latin hypercube: `count` draws of values, evenly spread over a range for each address.
 
@@ -88,24 +95,25 @@ def latin_hypercube(
     return tuple(dict(zip(ranges, map(float, row), strict=True)) for row in rows)
 
 
-def read_load_cases(path: str | os.PathLike) -> LoadCases:
+def read_load_cases(path: str | os.PathLike, case: Case | None = None) -> LoadCases:
     """Read load cases from a TOML file with tables [training] and [held_out].
 
     Each table has lists of values by address in quotes, such as "loads.0.mass" = [0.2, 0.5]; its
     runs are all combinations. With `draws = 12` (and `seed = 1`, 0 if left out) the lists are
-    ranges, low and high, of which the runs are a Latin hypercube.
+    ranges, low and high, of which the runs are a Latin hypercube. With the `case` whose values they
+    are, entries may have units: "loads.0.speed" = ["60 km/h", "90 km/h"].
 
     Raises ValueError, naming the file and the key, for faulty content; OSError if the file cannot
     be read.
     """
     content = read_toml(path, "file of load cases")
     try:
-        return _load_cases(content)
+        return _load_cases(content, case)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _load_cases(content: dict[str, Any]) -> LoadCases:
+def _load_cases(content: dict[str, Any], case: Case | None) -> LoadCases:
     """Load cases from the tables of their file."""
     unknown = set(content) - set(TABLES)
     if unknown:
@@ -116,6 +124,10 @@ def _load_cases(content: dict[str, Any]) -> LoadCases:
         table = dict(content.get(name, {}))
         draw_options = {key: table.pop(key) for key in ("draws", "seed") if key in table}
         for address, entries in table.items():
+            if case is not None and isinstance(entries, list) and any(map(is_quantity, entries)):
+                value_at(case, address)  # says what is wrong with the address
+                entries = in_si(entries, unit_at(case, address), f"{name}.{address}")
+                table[address] = entries
             check_entry(f"{name}.{address}", entries, VALUES)
         runs[name] = _table_runs(table, draw_options, name)
     return LoadCases(**runs)
@@ -146,8 +158,18 @@ def _table_runs(table, draw_options, where: str) -> tuple[AddressValues, ...]:
 
 
 def run_case(case: Case, run: AddressValues) -> Case:
-    """The case of a run. Raises ValueError if it ends before its loads have left the beam."""
-    changed = replace(case, run)
+    """The case of a run, with the seed of a random profile, say, as well as numbers.
+
+    Raises ValueError if it ends before its loads have left the beam, and for a count that is not
+    whole.
+    """
+    changed = replace(case, {a: v for a, v in run.items() if not _is_count(case, a)})
+    counts = {address: value for address, value in run.items() if _is_count(case, address)}
+    for address, value in counts.items():
+        if value != round(value):
+            raise ValueError(f"{address} takes a whole number, not {value:g}")
+    if counts:
+        changed = with_settings(changed, {a: round(value) for a, value in counts.items()})
     last = crossing_times(changed)[:, 1].max(initial=0.0)
     duration = float(concrete(changed.run.duration))
     if last < NEVER and last > duration:
@@ -156,6 +178,34 @@ def run_case(case: Case, run: AddressValues) -> Case:
             f" at {last:.4g} s: simulate longer"
         )
     return changed
+
+
+def run_cases(case: Case, runs: Sequence[AddressValues]) -> list[Case]:
+    """The cases of some runs, alike in structure: see `run_case`.
+
+    Where a count differs, as the seed of a profile, profiles are sums of given waves.
+
+    Raises ValueError as `run_case`, and for a count that changes the structure.
+    """
+    cases = [run_case(case, run) for run in runs]
+    counts = dict.fromkeys(a for run in runs for a in run if _is_count(case, a))
+    if not counts:
+        return cases
+    if case.profile is not None:
+        cases = [dataclasses.replace(own, profile=own.profile.by_numbers()) for own in cases]
+    shapes = {str(jax.tree.map(np.shape, own)) for own in cases}
+    if len(shapes) > 1:
+        raise ValueError(
+            f"runs that differ in {', '.join(counts)} cannot be simulated together, as their cases"
+            " have different structures: tune for one value of it"
+        )
+    return cases
+
+
+def _is_count(case: Case, address: str) -> bool:
+    """Whether the entry of a case at an address is a whole number such as a seed."""
+    name = address.rpartition(".")[2]
+    return name in COUNTS and address.startswith(("profile.", "run.", "loads."))
 
 
 def _describe(run: AddressValues) -> str:

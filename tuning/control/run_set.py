@@ -25,7 +25,7 @@ from jaxbeam.simulation.integration_plan import (
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import Histories, simulate, simulate_histories
 from tuning.control.fixed_design import with_fixed_design
-from tuning.control.load_cases import PLANT_PREFIXES, AddressValues, run_case
+from tuning.control.load_cases import PLANT_PREFIXES, AddressValues, run_cases
 from tuning.control.objective import Sharpness, run_metrics
 
 PEAK_TOLERANCE = 1e-4  # of the largest deflection
@@ -122,7 +122,7 @@ def make_run_set(
     positions = jnp.asarray(positions, float).reshape(-1)
     if positions.size == 0:
         raise ValueError("there is no deflection to reduce: add a sensor, or give positions (m)")
-    cases = [run_case(case, run) for run in runs]
+    cases = run_cases(case, runs)
     times = sample_times(case)
     # Most of the time goes into compiling programs that do not depend on each other.
     with ThreadPoolExecutor(3) as pool:

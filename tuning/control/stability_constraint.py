@@ -15,7 +15,7 @@ from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.arrays import Array
 from tuning.aliases import accepts_old_arguments
 from tuning.control.fixed_design import with_fixed_design
-from tuning.control.load_cases import AddressValues, run_case
+from tuning.control.load_cases import AddressValues, run_cases
 from tuning.control.run_set import RunSet
 
 STABILITY_PENALTY_SLOPE = 1.0  # added to the objective for each 1/s of violation
@@ -54,7 +54,7 @@ class StabilityConstraint:
     def violation_of_runs(self, case: Case, run_set: RunSet):
         """`violation_function` for a case, along the crossings or all runs of its run set."""
         if self.crossings:
-            return self.violation_function([run_case(case, run) for run in self.crossings])
+            return self.violation_function(run_cases(case, self.crossings))
         return self.violation_function(run_set.cases, run_set.nominal)
 
     def violation_function(self, cases: list[Case], nominal: Mapping[str, Any] | None = None):

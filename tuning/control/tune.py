@@ -244,6 +244,10 @@ def _run_set_result(name, run_set: RunSet, objective, before, after) -> RunSetRe
     unnamed = dataclasses.replace(run_set, runs=())
     metrics = [_metrics_of(unnamed, _histories(records, run_set.positions)) for records in pairs]
     values = [objective.weighted_metrics(found) for found in metrics]
+    metrics_before, metrics_after = (
+        {name: float(objective.aggregate(part)) for name, part in found.items()}
+        for found in metrics
+    )
     return RunSetResult(
         name=name,
         runs=tuple(run_set.runs),
@@ -253,7 +257,8 @@ def _run_set_result(name, run_set: RunSet, objective, before, after) -> RunSetRe
         least_peaks=run_set.uncontrolled["least"],
         saturated_share=np.array([float(np.asarray(r.saturated).mean()) for r in pairs[1]]),
         objective=[float(objective.aggregate(own)) for own in values],
-        metrics={name: float(objective.aggregate(part)) for name, part in metrics[1].items()},
+        metrics=metrics_after,
+        metrics_before=metrics_before,
     )
 
 

@@ -32,7 +32,8 @@ class RunSetResult:
 
     Peaks are in m; `least_peaks` are the least achievable ones, NaN if not computed.
     `saturated_share` is the share of the time after tuning in which a command is at a limit;
-    `objective` has the values before and after; `metrics` are those after tuning, aggregated.
+    `objective` has the values before and after; `metrics` are those after tuning, aggregated, and
+    `metrics_before` those before it.
     """
 
     name: str
@@ -44,6 +45,7 @@ class RunSetResult:
     saturated_share: Float[np.ndarray, " run"]
     objective: list[float]
     metrics: dict[str, float] = dataclasses.field(default_factory=dict)
+    metrics_before: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def attained_shares(self, peaks: Float[np.ndarray, " run"]) -> Float[np.ndarray, " run"]:
         """Shares of the attainable reduction that some peaks (m) attain, by run."""
@@ -113,8 +115,8 @@ class TuningResult:
         if not math.isfinite(last.peaks_after.max()):
             return f"{sentence}; a {last.name} run diverges: not fit for use"
         sentence += (
-            f"; worst {last.name} run: peak {reductions[worst]:.1%} below no control"
-            f" ({before:.1%} before tuning)"
+            f"; worst {last.name} run: peak {_beside_no_control(reductions[worst])}"
+            f" ({_beside_no_control(before, reductions[worst])} before tuning)"
         )
         if np.isfinite(last.least_peaks).all():
             shares = last.attained_shares(last.peaks_after)
@@ -142,6 +144,7 @@ class TuningResult:
         lines = text_table(("parameter", "before", "after", "unit", ""), rows, "<>><<")
         for outcome in self.run_sets:
             lines += ["", *_run_table(outcome)]
+        lines += ["", *_metric_table(self.objective, self.run_sets)]
         if len(self.start_results) > 1:
             lines += ["", "minima by start:", *_start_lines(self.start_results)]
         if self.rejected_steps:
@@ -174,6 +177,10 @@ class TuningResult:
                     },
                     "objective_before": outcome.objective[0],
                     "objective_after": outcome.objective[1],
+                    "metrics": {
+                        name: {"before": outcome.metrics_before.get(name), "after": value}
+                        for name, value in outcome.metrics.items()
+                    },
                 }
                 for outcome in self.run_sets
             },
@@ -204,6 +211,34 @@ class TuningResult:
             for outcome in self.run_sets
         ]
         return plot_tuning(panels, self.history, title=self.case.title)
+
+
+def _beside_no_control(reduction: float, other: float = -math.inf) -> str:
+    """A share of the peak without control, below or above it; short where another says as much."""
+    side = "below" if reduction >= 0 else "above"
+    same_side = (reduction >= 0) == (other >= 0) and math.isfinite(other)
+    return f"{abs(reduction):.1%}" if same_side else f"{abs(reduction):.1%} {side} no control"
+
+
+def _metric_table(objective: Objective, run_sets: list[RunSetResult]) -> list[str]:
+    """Lines of a table of the metrics that were tuned or limited, before and after, by run set."""
+    header, rows = ["metric", "weight", "limit"], []
+    for outcome in run_sets:
+        header += [f"{outcome.name} before", "after"]
+    for name in dict.fromkeys([*objective.weights, *objective.limits]):
+        known = [o for o in run_sets if name in o.metrics and name in o.metrics_before]
+        if len(known) < len(run_sets):
+            return []
+        values = [v for o in run_sets for v in (o.metrics_before[name], o.metrics[name])]
+        chosen = (objective.weights.get(name), objective.limits.get(name))
+        settings = ["-" if value is None else f"{value:g}" for value in chosen]
+        rows.append([name, *settings, *(f"{value:.4g}" for value in values)])
+    words = {"worst": "worst of the runs", "mean": "mean of the runs"}
+    tail = f"mean of the worst {objective.tail_share:.0%} of the runs"
+    return [
+        f"what was tuned, {words.get(objective.aggregation, tail)}",
+        *text_table(header, rows, "<" + ">" * (len(header) - 1)),
+    ]
 
 
 def _run_labels(outcome: RunSetResult) -> list[str]:

@@ -2,43 +2,26 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from jaxbeam.analysis.assessment.assessment import (
-    INFORMATION,
-    NOT_REQUIRED,
-    NOT_SATISFIED,
-    REQUIRED,
-    SATISFIED,
-    Assessment,
-    CodeCheck,
+from jaxbeam.analysis.assessment.assessment import REQUIRED, Assessment
+from jaxbeam.analysis.assessment.formulas import code_numbers
+from jaxbeam.analysis.assessment.static_checks import (
+    analysis_check,
+    damping_checks,
+    factor_checks,
+    frequency_check,
 )
-from jaxbeam.analysis.assessment.formulas import (
-    code_numbers,
-    counted_frequency,
-    frequency_limits,
-    irregularity_factor,
-    running_factor,
-    static_dynamic_factor,
-)
-from jaxbeam.analysis.assessment.high_speed import TrainResponse, train_response
-from jaxbeam.analysis.assessment.static_loads import (
-    Section,
-    largest_under_lm71,
-    largest_under_train,
-    tabulated_line,
-)
-from jaxbeam.analysis.sections.characteristic_points import characteristic_points, spans
-from jaxbeam.case.beam_parts.damping import MATERIALS
+from jaxbeam.analysis.assessment.train_checks import train_checks
+from jaxbeam.analysis.sections.characteristic_points import spans
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.declared_checks import suggestion
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.reading.units import in_si
-from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import modes
+from jaxbeam.model.sensing.mode_band import counted_frequency
 from jaxbeam.vehicles.trains import trains as library
 
 CODES = ("en1991-2",)
@@ -107,17 +90,17 @@ def assess(
     length = _determinant_length(bridge, determinant_length)
     frequencies, bridge = _with_counted_modes(bridge, added_damping)
     checks = [
-        _frequency_check(bridge, length, frequencies[0]),
-        _analysis_check(length, frequencies[0], speed),
-        *_damping_checks(bridge, added_damping),
-        *_factor_checks(length, frequencies[0], speed, maintenance),
+        frequency_check(bridge, length, frequencies[0]),
+        analysis_check(length, frequencies[0], speed),
+        *damping_checks(bridge, added_damping),
+        *factor_checks(length, frequencies[0], speed, maintenance),
     ]
     is_required = checks[1].outcome == REQUIRED
     if dynamic or (dynamic is None and is_required):
         highest = numbers["line_speed"]["design_factor"] * speed
         lowest = min(lowest, highest / 1.2)
         factors = length, frequencies[0], highest, maintenance, classification
-        checks += _train_checks(bridge, trains, (lowest, highest), track, factors)
+        checks += train_checks(bridge, trains, (lowest, highest), track, factors)
     left_out = list(numbers["left_out"]["items"])
     if not (dynamic or (dynamic is None and is_required)):
         left_out.insert(0, "deck acceleration and HSLM: no dynamic analysis was made")
@@ -152,7 +135,7 @@ def _bridge(case: Case) -> Case:
             "an active control cannot be certified: leave the controller out of the case"
         )
     bridge = dataclasses.replace(
-        case, loads=(), sensors=(), controller=None, profile=None, run=Run(1.0)
+        case, loads=(), sensors=(), vehicle_sensors=(), controller=None, profile=None, run=Run(1.0)
     )
     check_case(bridge)
     return bridge
@@ -185,8 +168,8 @@ def _with_counted_modes(case: Case, added_damping: float) -> tuple[np.ndarray, C
         beam, modes=many, damping_ratio=0.0, rayleigh_damping=None, loss_factor=None, material=""
     )
     all_frequencies = concrete(modes(dataclasses.replace(case, beam=plain)).frequencies)
-    limit = counted_frequency(all_frequencies)
-    count = int(np.sum(all_frequencies <= limit * (1 + 1e-9)))
+    limit = float(counted_frequency(all_frequencies))
+    count = int(np.sum(all_frequencies <= limit))
     if count == many:
         raise ValueError(f"more than {many} modes lie below {limit:.4g} Hz: this is no bridge")
     if np.ndim(beam.damping_ratio) or beam.rayleigh_damping is not None:
@@ -200,184 +183,3 @@ def _with_counted_modes(case: Case, added_damping: float) -> tuple[np.ndarray, C
         ratio = ratios[0]
     beam = dataclasses.replace(plain, modes=count, damping_ratio=ratio)
     return all_frequencies[:count], dataclasses.replace(case, beam=beam)
-
-
-def _frequency_check(case: Case, length: float, frequency: float) -> CodeCheck:
-    numbers = code_numbers()["frequency_limits"]
-    lower, upper = frequency_limits(length)
-    within = lower <= frequency <= upper and length <= numbers["longest_span"]
-    remark = f"limits {float(lower):.4g} and {float(upper):.4g} Hz at {length:g} m"
-    if length > numbers["longest_span"]:
-        remark += ", beyond the 100 m of the figure"
-    remark += "; within them" if within else "; outside them"
-    return CodeCheck(
-        "first natural frequency n0",
-        numbers["clause"],
-        float(frequency),
-        None,
-        "Hz",
-        INFORMATION,
-        remark,
-    )
-
-
-def _analysis_check(length: float, frequency: float, speed: float) -> CodeCheck:
-    """Whether a dynamic analysis is required, as far as the flow chart is open."""
-    numbers, limits = code_numbers()["line_speed"], frequency_limits(length)
-    fast = 3.6 * speed > numbers["static_limit_kmh"] * (1 + 1e-9)
-    longest = code_numbers()["frequency_limits"]["longest_span"]
-    outside = not limits.lower <= frequency <= limits.upper or length > longest
-    reasons = []
-    if fast:
-        reasons.append(
-            "the line speed is above 200 km/h (tables v/n0 of annex F, which may waive it, are not"
-            " used)"
-        )
-    if outside:
-        reasons.append("n0 is outside the limits of figure 6.10")
-    return CodeCheck(
-        "dynamic analysis",
-        numbers["clause"],
-        3.6 * speed,
-        numbers["static_limit_kmh"],
-        "km/h",
-        REQUIRED if reasons else NOT_REQUIRED,
-        " and ".join(reasons) or "up to 200 km/h, n0 within the limits",
-    )
-
-
-def _damping_checks(case: Case, added: float) -> list[CodeCheck]:
-    """Damping ratios of the analysis, against table 6.6 if a material was named."""
-    ratios = np.atleast_1d(concrete(case.beam.damping_ratio))
-    remark = f"{added:g} of it added by 6.4.6.4" if added else "nothing added by 6.4.6.4"
-    span = np.float64(max(b - a for a, b in spans(case)))
-    bounds = {name: float(entry.at(span)) for name, entry in MATERIALS.items()}
-    listed = ", ".join(f"{name} {bound:.4g}" for name, bound in bounds.items())
-    return [
-        CodeCheck(
-            "damping ratio",
-            "EN 1991-2, 6.4.6.3.1, table 6.6",
-            float(ratios.min()),
-            None,
-            "1",
-            INFORMATION,
-            f"{remark}; lower bounds for a span of {span:g} m: {listed}",
-        )
-    ]
-
-
-def _factor_checks(length, frequency, speed, maintenance: str) -> list[CodeCheck]:
-    annex, factors = code_numbers()["annex_c"], code_numbers()["dynamic_factors"]
-    first = float(running_factor(speed, length, frequency))
-    second = float(irregularity_factor(speed, length, frequency))
-    own = factors[maintenance]
-    share = own["track_irregularity"]
-    static = float(static_dynamic_factor(length, maintenance))
-    remark = f"phi' = {first:.4g}, phi'' = {second:.4g}, of which {share:g} by the maintenance"
-    return [
-        CodeCheck(
-            "1 + phi' + phi'' of real trains at line speed",
-            annex["clause"],
-            1 + first + share * second,
-            None,
-            "1",
-            INFORMATION,
-            remark,
-        ),
-        CodeCheck(
-            f"dynamic factor {own['name']} of LM71",
-            factors["clause"],
-            static,
-            None,
-            "1",
-            INFORMATION,
-            f"{maintenance} maintenance",
-        ),
-    ]
-
-
-def _train_checks(case, trains, speeds, track, factors) -> list[CodeCheck]:
-    """Deck acceleration, and each moment and deflection against LM71."""
-    points = characteristic_points(case)
-    decks = [p for p in points if not p.name.startswith("support")]
-    middles = [p for p in points if p.name.startswith("midspan")]
-    inner = [
-        p
-        for p in points
-        if p.name.startswith("support") and 0 < p.x < float(concrete(case.beam.length))
-    ]
-    sections = [
-        *(Section(f"moment at {p.name}", "moment", p.x) for p in (*middles, *inner)),
-        *(Section(f"deflection at {p.name}", "deflection", p.x) for p in middles),
-    ]
-    sensors = (
-        *(Sensor(p.x, "acceleration") for p in decks),
-        *(Sensor(section.x, section.quantity) for section in sections),
-    )
-    responses = [train_response(case, train, sensors, *speeds) for train in trains]
-    return [
-        _acceleration_check(case, decks, responses, track, speeds),
-        *_section_checks(case, sections, responses, len(decks), factors),
-    ]
-
-
-def _acceleration_check(case, decks, responses, track: str, speeds) -> CodeCheck:
-    numbers = code_numbers()["acceleration"]
-    worst = max(responses, key=lambda one: one.peaks[:, : len(decks)].max())
-    at, place = np.unravel_index(
-        np.argmax(worst.peaks[:, : len(decks)]), (worst.speeds.size, len(decks))
-    )
-    value = float(worst.peaks[at, place])
-    change = max(one.change for one in responses)
-    remark = (
-        f"{worst.train} at {3.6 * worst.speeds[at]:.4g} km/h, {decks[place].name};"
-        f" {case.beam.modes} modes count; {3.6 * speeds[0]:.4g} to {3.6 * speeds[1]:.4g} km/h, the"
-        f" last refinement of the speeds changed the largest responses by {100 * change:.2g} %"
-    )
-    return CodeCheck(
-        f"deck acceleration, {track} track",
-        numbers["clause"],
-        value,
-        numbers[track],
-        "m/s^2",
-        SATISFIED if value <= numbers[track] else NOT_SATISFIED,
-        remark,
-    )
-
-
-def _section_checks(
-    case: Case, sections: list[Section], responses: list[TrainResponse], first: int, factors: Any
-) -> list[CodeCheck]:
-    """HSLM with irregularities of the track, against alpha Phi LM71, at each section."""
-    length, frequency, highest, maintenance, classification = factors
-    share = code_numbers()["dynamic_factors"][maintenance]["track_irregularity"]
-    irregular = share * float(irregularity_factor(highest, length, frequency))
-    static_factor = float(static_dynamic_factor(length, maintenance))
-    checks = []
-    for i, section in enumerate(sections):
-        line = tabulated_line(case, section)
-        limit = classification * static_factor * largest_under_lm71(line)
-        found = []
-        for one in responses:
-            train = library()[one.train]
-            static = largest_under_train(line, train.offsets, train.forces)
-            peaks = one.peaks[:, first + i]
-            at = int(np.argmax(peaks))
-            total = float(peaks[at]) + irregular * static
-            found.append((total, one.train, one.speeds[at], float(peaks[at]) / static - 1))
-        total, train, speed, increment = max(found)
-        remark = f"{train} at {3.6 * speed:.4g} km/h, phi'_dyn = {increment:.4g}"
-        governs = total > limit
-        remark += "; HSLM governs the design" if governs else "; LM71 governs the design"
-        checks.append(
-            CodeCheck(
-                f"HSLM against LM71, {section.name}",
-                "EN 1991-2, 6.4.6.5",
-                total,
-                limit,
-                "N m" if section.quantity == "moment" else "m",
-                NOT_SATISFIED if governs else SATISFIED,
-                remark,
-            )
-        )
-    return checks

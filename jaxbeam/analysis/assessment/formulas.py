@@ -76,13 +76,3 @@ def static_dynamic_factor(length, maintenance: str) -> Float[Array, "..."]:
     numbers = code_numbers()["dynamic_factors"][maintenance]
     factor = numbers["a"] / (xp.sqrt(xp.asarray(length, float)) - 0.2) + numbers["b"]
     return xp.clip(factor, *numbers["limits"])
-
-
-def counted_frequency(frequencies) -> float:
-    """Frequency (Hz) up to which modes count for accelerations: EN 1990, A2.4.4.2.1.
-
-    The largest of 30 Hz, 1.5 f_1 and f_3, of ascending frequencies (Hz).
-    """
-    numbers = code_numbers()["acceleration"]
-    third = frequencies[min(numbers["modes"], len(frequencies)) - 1]
-    return float(max(numbers["frequency"], numbers["first_mode_factor"] * frequencies[0], third))

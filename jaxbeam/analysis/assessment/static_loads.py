@@ -14,7 +14,7 @@ LINE_POINTS = 801  # along the beam, between which influence lines are linear
 FRONT_POSITIONS = 8001  # of the first axle of a train
 
 
-class Section(NamedTuple):
+class CheckedSection(NamedTuple):
     """Place (m) along the beam where a quantity is compared, and its name there."""
 
     name: str
@@ -33,7 +33,7 @@ class TabulatedLine(NamedTuple):
         return np.interp(x, self.positions, self.values, left=0.0, right=0.0)
 
 
-def tabulated_line(case: Case, section: Section) -> TabulatedLine:
+def tabulated_line(case: Case, section: CheckedSection) -> TabulatedLine:
     """Influence line of a section, with a point at its kink."""
     length = float(concrete(case.beam.length))
     places = np.linspace(0.0, length, LINE_POINTS)

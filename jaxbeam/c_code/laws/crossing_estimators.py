@@ -78,7 +78,7 @@ def _(filter: SampledWithVehicles, code: CSource) -> EstimateCode:
     code.add("/* States of the vehicles, driven by the estimated motion of the beam */")
     if inner.weights is not None:
         code.add(f"copy({x} + {beam + vehicles}, {inner.weights}, {inner.wheels});")
-    matrices = [np.asarray(part) for part in at_samples(model, code)]
+    matrices = [np.array(part) for part in at_samples(model, code)]
     # A run starts at rest: there is no period before it.
     matrices[0][0] = np.eye(vehicles, size, k=beam)
     matrices[1][0] = matrices[2][0] = 0.0

@@ -75,8 +75,7 @@ def _(law: MPCLaw, code: CSource, estimate: EstimateCode) -> None:
     code.multiply(move_work, move, minimiser, actuators, variables)
     code.add(
         f"for (i = 0; i < {actuators}; i++)\n"
-        f"    {code.output}[i] = {code.command}[i] + ({solved} ? {move_work}[i] : 0);"
-        + ("\n}" if limits else ""),
+        f"    {code.output}[i] = {code.command}[i] + ({solved} ? {move_work}[i] : 0);",
         actuators,
     )
 
@@ -88,12 +87,13 @@ def _copy_state(law: MPCLaw, code: CSource, estimate: EstimateCode, initial: str
     if law.vehicle_states:
         code.add(f"copy({initial} + {place}, {estimate.vehicles}, {law.vehicle_states});")
         place += law.vehicle_states
-    if law.delay is not None:
+    if law.delayed:
         code.add(f"copy({initial} + {place}, {code.command}, {code.actuators});")
 
 
 def _write_quadratic_program(law, code: CSource, program: _Program, minimiser, initial) -> None:
-    """The solution replaces the unconstrained minimiser; opens a block with `solved`."""
+    """The solution replaces the unconstrained minimiser; `solved` is whether there is one."""
+    code.variables += ["real scale", "int solved"]
     limits, variables = program.rows.shape[1:]
     h = code.work("limits", limits, "right-hand sides h")
     z = code.work("solution", variables, "solution of the least-distance form")
@@ -115,10 +115,8 @@ def _write_quadratic_program(law, code: CSource, program: _Program, minimiser, i
     method = "hildreth" if law.solver == "hildreth" else "interior_point"
     code.add(
         f"""
-{{
-const real scale = least_distance({h}, {G}, {minimiser}, {limits}, {variables});
-const int solved = scale <= 0
-    || {method}({z}, {G}, {h}, {limits}, {variables}, {steps}, {work});
+scale = least_distance({h}, {G}, {minimiser}, {limits}, {variables});
+solved = scale <= 0 || {method}({z}, {G}, {h}, {limits}, {variables}, {steps}, {work});
 if (!solved) {failures}++;
 if (scale > 0)
     for (i = 0; i < {variables}; i++) {minimiser}[i] += scale * {z}[i];""",
@@ -172,11 +170,10 @@ def _program(law: MPCLaw, code: CSource, wheels: int) -> _Program:
             limits = xp.concatenate([limits, (program.gamma - constant)[None]])
         return past, start.H, f.T, start.M, limits.T, start.gamma
 
-    past, H, f, M, limit_columns, gamma = at_samples(
-        numbers, code, varies=law.loaded_plant is not None
-    )
+    past, H, f, M, limit_columns, gamma = at_samples(numbers, code, varies=law.preview is not None)
     inverse_factor = np.linalg.inv(np.linalg.cholesky(H))
-    limit_columns[..., columns - 1] += gamma
+    to_one = np.eye(limit_columns.shape[-1])[columns - 1]
+    limit_columns = limit_columns + gamma[..., None] * to_one
     transposed = np.swapaxes(inverse_factor, -1, -2)
     rows = M @ transposed
     norms = np.sqrt(np.sum(rows**2, axis=-1, keepdims=True))

@@ -1,5 +1,7 @@
 """C code of laws that feed back an estimate of the state: gains, constant or over the crossing."""
 
+from textwrap import indent
+
 import numpy as np
 
 from jaxbeam.c_code.source import CSource, search_operations
@@ -42,24 +44,25 @@ def _fed_back(code: CSource, schedule: GainSchedule, estimate: EstimateCode, wei
     return x
 
 
-def _write_command(code, schedule: GainSchedule, x: str, columns: int, design: str) -> None:
-    """Command of one design of a table, minus its gain times x times `weight`, is added."""
+def _command_text(code, schedule: GainSchedule, x: str, columns: int, design: str) -> str:
+    """Statement that adds the command of one design of a table, times a `weight`."""
     intervals, powers = schedule.table.coefficients.shape[-4:-2]
-    size = intervals * powers * code.actuators * columns
+    size = code.actuators * columns
     breakpoints = code.constant("breakpoints", schedule.table.breakpoints)
     polynomials = code.constant("polynomials", schedule.table.coefficients)
     final_gain = code.constant("final_gain", schedule.final_gain)
-    code.add(
-        f"""
+    if design:
+        breakpoints += f" + {intervals + 1} * {design}"
+        polynomials += f" + {intervals * powers * size} * {design}"
+        final_gain += f" + {size} * {design}"
+    return f"""
 if (t >= start && t < end)
-    add_scheduled_command({code.output}, weight, {breakpoints} + {design} * {intervals + 1},
-                          {polynomials} + {design} * {size}, {intervals}, {powers},
+    add_scheduled_command({code.output}, weight, {breakpoints},
+                          {polynomials}, {intervals}, {powers},
                           (t - start) / (end - start), {x}, {code.actuators}, {columns});
 else if (t >= end)
-    multiply_add({code.output}, -weight * decay,
-                 {final_gain} + {design} * {code.actuators * columns}, {x}, {code.actuators},
-                 {columns});"""
-    )
+    multiply_add({code.output}, -weight * decay, {final_gain}, {x}, {code.actuators}, {columns});
+""".strip()
 
 
 def _command_operations(code: CSource, schedule: GainSchedule, columns: int) -> int:
@@ -94,43 +97,55 @@ def _(law: GainSchedule, code: CSource, estimate: EstimateCode) -> None:
 /* u = -K(t) x, from the first entry to the last exit by the table */
 for (i = 0; i < {code.actuators}; i++) {code.output}[i] = 0;
 {{
-const real start = {times}[0], end = {times}[1], weight = 1, decay = {_decay(law)};"""
+    const real start = {times}[0], end = {times}[1], weight = 1;
+    const real decay = {_decay(law)};
+{indent(_command_text(code, law, x, columns, ""), "    ")}
+}}""",
+        _command_operations(code, law, columns) + 5,
     )
-    _write_command(code, law, x, columns, "0")
-    code.add("}", _command_operations(code, law, columns) + 5)
 
 
 @write_state_law.register
 def _(law: ScheduledGainLaw, code: CSource, estimate: EstimateCode) -> None:
     load = write_load_source(law.load_source, code)
     schedules, masses, speeds = law.schedules, len(law.masses), len(law.speeds)
-    columns, weights = np.shape(schedules.final_gain)[-1], int(schedules.load_feedforward)
+    lightest = np.asarray(schedules.load_weights)[0, 0]
+    columns, weights = np.shape(schedules.final_gain)[-1], len(lightest)
     x = _fed_back(code, schedules, estimate, weights)
     grids = code.constant("masses", law.masses), code.constant("speeds", law.speeds)
     nearest = int(law.nearest)
     mass_ends = f"(real){float(law.masses[0])!r}, (real){float(law.masses[-1])!r}"
     weight_line = ""
     if weights:
-        weight_line = (
-            f"\n{x}[{columns - 1}] = clamp(mass, {mass_ends}) * (real){float(law.gravity)!r};"
-        )
+        place, known = f"{x} + {columns - weights}", code.constant("load_weights", lightest)
+        code.add(f"copy({place}, {known}, {weights});")
+        own = f"for (i = 0; i < {law.weight_count}; i++)\n        ({place})[i]"
+        weight_line = f"\n    {own} *= clamp(mass, {mass_ends}) / {grids[0]}[0];"
+        if schedules.load_feedforward and estimate.weights is not None:
+            weight_line = f"\n    copy({place}, {estimate.weights}, {estimate.wheels});"
+    command = _command_text(code, schedules, x, columns, "design")
     code.add(
         f"""
 /* u = -K(mass, speed, share) x, interpolated between the designs of a grid */
 for (i = 0; i < {code.actuators}; i++) {code.output}[i] = 0;
 if ({load.speed_identified}) {{
-const real mass = {load.mass_identified} ? {load.mass} : {grids[0]}[0];
-const real speed = fabs({load.speed}), start = {load.entry_time};
-const real end = start + (real){float(law.length)!r} / speed, decay = {_decay(schedules)};
-int mass_index[2], speed_index[2];
-real mass_weight[2], speed_weight[2];
-grid_weights({grids[0]}, {masses}, mass, {nearest}, mass_index, mass_weight);
-grid_weights({grids[1]}, {speeds}, speed, {nearest}, speed_index, speed_weight);{weight_line}
-for (i = 0; i < 4; i++) {{
-const real weight = mass_weight[i / 2] * speed_weight[i % 2];
-const int design = {speeds} * mass_index[i / 2] + speed_index[i % 2];
-if (!(weight > 0)) continue;""",
-        30 + 6 * (masses + speeds),
+    const real mass = {load.mass_identified} ? {load.mass} : {grids[0]}[0];
+    const real speed = fabs({load.speed}), start = {load.entry_time};
+    const real end = start + (real){float(law.length)!r} / speed;
+    const real decay = {_decay(schedules)};
+    int mass_index[2], speed_index[2];
+    real mass_weight[2], speed_weight[2];
+    grid_weights({grids[0]}, {masses}, mass, {nearest}, mass_index, mass_weight);
+    grid_weights({grids[1]}, {speeds}, speed, {nearest}, speed_index, speed_weight);{weight_line}
+    for (i = 0; i < 4; i++) {{
+        const real weight = mass_weight[i / 2] * speed_weight[i % 2];
+        const int design = {speeds} * mass_index[i / 2] + speed_index[i % 2];
+        if (!(weight > 0)) continue;
+{indent(command, "        ")}
+    }}
+}}""",
+        30
+        + 6 * (masses + speeds)
+        + 4 * weights
+        + 4 * (_command_operations(code, schedules, columns) + 2),
     )
-    _write_command(code, schedules, x, columns, "design")
-    code.add("}\n}", 4 * (_command_operations(code, schedules, columns) + 2))

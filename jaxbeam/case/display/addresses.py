@@ -1,6 +1,6 @@
 """Addresses of a case in words: "speed of load 1" for `loads.1.speed`."""
 
-from jaxbeam.case.case import Case
+from jaxbeam.case.case import Case, unit_at
 from jaxbeam.case.joint_addresses import ALL
 
 SINGULARS = {"bodies": "body", "masses": "mass"}
@@ -28,6 +28,15 @@ def address_words(case: Case, address: str) -> str:
     if owners and owners[-1] == f"the {field}":  # a train of the library
         return field
     return " of ".join([f"{_spaced(field)}{entry}", *reversed(owners)])
+
+
+def value_words(case: Case, address: str, value: float | str) -> str:
+    """A value at an address with its SI unit: "speed of the load: 2 m/s"."""
+    words = address_words(case, address)
+    if isinstance(value, str):
+        return f"{words}: {value}"
+    unit = unit_at(case, address)
+    return f"{words}: {value:.6g} {'' if unit == '1' else unit}".rstrip()
 
 
 def _of_list(parts, key: str, index: str) -> str:

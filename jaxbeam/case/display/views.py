@@ -1,5 +1,6 @@
 """Views of results for other libraries."""
 
+import abc
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,9 +13,9 @@ class TableViews:
     """Base of results that have columns of equally many numbers by their heads."""
 
     @property
+    @abc.abstractmethod
     def columns(self) -> dict[str, np.ndarray]:
         """Columns by head, with units, as "frequency (Hz)"."""
-        raise NotImplementedError
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """Columns as a table of pandas, the first of them as its index."""

@@ -31,6 +31,13 @@ class AbstractProfile(ReprWithUnits, Module):
         Where r' or r'' jumps, they are those on the right.
         """
 
+    def by_numbers(self) -> "AbstractProfile":
+        """The same profile with numbers in place of what is static, as a seed.
+
+        Profiles of equal structure share compiled programs.
+        """
+        return self
+
     def kinks(self) -> Float[Array, " kink"]:
         """Positions (m) at which r' or r'' jumps; their number depends on no number of the case."""
         return xp.zeros(0)

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.profiles.spectral import AbstractSpectralProfile
+from jaxbeam.case.profiles.spectrum import SpectrumProfile
 from jaxbeam.runtime.arrays import Array, xp
 
 
@@ -43,6 +44,10 @@ class AbstractRandomProfile(AbstractSpectralProfile):
         wavenumbers = xp.sqrt(edges[:-1] * edges[1:])
         amplitudes = self.scale * xp.sqrt(2 * self.density(wavenumbers) * xp.diff(edges))
         return wavenumbers, amplitudes, random_phases(self.seed, self.waves)
+
+    def by_numbers(self):
+        wavenumbers, amplitudes, phases = self.lines()
+        return SpectrumProfile(wavenumbers, amplitudes, phases, self.switch_on, self.contact_length)
 
     def validate(self, address):
         lowest, highest = self.wavenumber_range()

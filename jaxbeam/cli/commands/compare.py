@@ -50,6 +50,7 @@ def compare(
     parsed_case = options.read(case)
 
     from jaxbeam.analysis.compare import compare, metrics_over_cases
+    from jaxbeam.case.display.addresses import value_words
     from jaxbeam.case.validation import check_case
 
     laws = _read_controllers(case, parsed_case, controllers)
@@ -69,7 +70,8 @@ def compare(
     overall = metrics_over_cases(comparisons)
     lines = []
     for run, comparison in zip(runs, comparisons, strict=True):
-        lines.append("; ".join(f"{address} = {value:g}" for address, value in run.items()))
+        values_in_words = (value_words(parsed_case, *one) for one in run.items())
+        lines.append("; ".join(values_in_words))
         lines += _lines(comparison)
     options.report(
         {
@@ -123,6 +125,7 @@ def _metrics_to_dict(metrics: "PerformanceMetrics") -> dict:
     margin = metrics.stability_margin
     unstable = margin.unstable
     stability_margin = {
+        "verdict": margin.verdict,
         "gain": margin.gain,
         "delay": margin.delay,
         "obstacle": margin.obstacle,
@@ -201,7 +204,8 @@ def _lines(comparison: "Comparison") -> list[str]:
 def _margin_text(metrics: "PerformanceMetrics", number: float) -> str:
     if metrics.stability_margin.obstacle:
         return "-"
-    return "unstable" if metrics.stability_margin.gain == 0 else f"{number:.3g}"
+    margin = metrics.stability_margin
+    return margin.verdict if margin.verdict == "unstable" else f"{number:.3g}"
 
 
 def _overall_to_dict(metrics: "MetricsOverCases") -> dict:

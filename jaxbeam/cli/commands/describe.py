@@ -15,10 +15,14 @@ from jaxbeam.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from jaxbeam.case.case import Case
     from jaxbeam.case.loads.base import AbstractLoad
     from jaxbeam.case.loads.vehicle_model import VehicleModel
 
 GRAVITY = 9.81  # m/s^2, of vehicles without a case
+FAST = 5.0  # m/s, from where speeds are in km/h too
+MAX_LOADS = 6  # of a case that are described
+MAX_WHEELS = 12  # of a load of a case with a row each
 
 
 def describe(
@@ -59,7 +63,7 @@ def describe(
     is_case = is_file and ("beam" in content or "loads" in content)
     about, lines = _about_case(source) if is_case else ({}, [])
     for result in results:
-        lines += [*([""] if lines else []), *_lines(result)]
+        lines += [*([""] if lines else []), *_lines(result, is_case)]
     drawn = plot if results else None
     if drawn:
         from jaxbeam.plot import plot_vehicles
@@ -74,33 +78,77 @@ def describe(
 def _about_case(path: str) -> tuple[dict[str, Any], list[str]]:
     """What a case is, in numbers by their names in JSON and in words."""
     import jaxbeam as jb
+    from jaxbeam.case.display.prefixes import with_prefix
 
     case = jb.load_case(path)
     found, frequencies = jb.check(case), jb.modes(case).frequencies
     for warning in found.warnings:
         print_message(f"warning: {warning}")
-    beam = case.beam
-    held = f"{beam.ends}, {len(case.supports)} supports between" if case.supports else beam.ends
     lines = [
         case.title or Path(path).stem,
-        f"beam of {float(beam.length):.6g} m, {held}: E I = {float(beam.bending_stiffness):.6g}"
-        f" N m^2, {float(beam.linear_density):.6g} kg/m",
+        _beam_words(case),
         f"natural frequencies (Hz): {', '.join(f'{one:.5g}' for one in frequencies)}",
     ]
     if found.own_deflection is not None:
-        lines.append(f"static deflection under its own weight: {found.own_deflection:.4g} m")
-    if found.deflection:
+        own = with_prefix(found.own_deflection, "m")
+        lines.append(f"static deflection under its own weight: {own}")
+    if found.deflection and found.span_over_deflection:
         lines.append(
-            f"largest static deflection under the loads: {found.deflection:.4g} m, 1/"
-            f"{found.span_over_deflection:.4g} of the span of {found.span:.4g} m"
+            f"largest static deflection under the loads: {with_prefix(found.deflection, 'm')},"
+            f" 1/{found.span_over_deflection:.0f} of the span of {found.span:.4g} m"
         )
     if found.critical_speed is not None:
-        lines.append(f"critical speed: {found.critical_speed:.4g} m/s")
-    lines.append(f"plausibility: {found}")
-    if not case.loads:
-        lines.append("the case has no loads")
+        lines.append(f"critical speed: {_speed(found.critical_speed)}")
+    lines += [*_load_times(case), *_sensor_words(case), f"plausibility: {found}"]
     numbers = numbers_of(found) | {"frequencies_hz": frequencies}
     return {"case": numbers}, lines
+
+
+def _beam_words(case: "Case") -> str:
+    """Length, ends, supports, stiffness, mass and damping of the beam of a case."""
+    from jaxbeam.case.display.prefixes import with_prefix
+
+    beam, count = case.beam, len(case.supports)
+    held = f", {count} support{'s' * (count > 1)} between" if count else ""
+    rigidity = with_prefix(float(beam.bending_stiffness), "N m^2", 6)
+    return (
+        f"beam of {float(beam.length):.6g} m, {beam.ends}{held}: E I = {rigidity},"
+        f" {float(beam.linear_density):.6g} kg/m"
+    )
+
+
+def _speed(value: float) -> str:
+    """A speed in m/s, and of those that a vehicle may have on a road or a line in km/h too."""
+    text = f"{value:.4g} m/s"
+    return f"{text} ({3.6 * value:.4g} km/h)" if abs(value) >= FAST else text
+
+
+def _load_times(case: "Case") -> list[str]:
+    """When each load is on the beam, and how fast it enters; of more than a few loads the first."""
+    from jaxbeam.case.case import crossing_times
+    from jaxbeam.case.trajectory import NEVER
+
+    if not case.loads:
+        return ["the case has no loads"]
+    lines, duration = [], float(case.run.duration)
+    for i, (enter, leave) in enumerate(crossing_times(case)[:MAX_LOADS]):
+        load = case.loads[i]
+        name = getattr(load, "train", "") or getattr(load, "model", "") or load.kind
+        speed = getattr(load, "speed", None)
+        at = "" if speed is None else f" at {_speed(float(speed))}"
+        end = f"to {leave:.4g} s" if leave < NEVER else "on, where it stays"
+        lines.append(f"loads.{i}: {name}{at}, on the beam from {enter:.4g} s {end}")
+    if len(case.loads) > MAX_LOADS:
+        lines.append(f"and {len(case.loads) - MAX_LOADS} more loads")
+    return [*lines, f"the run ends at {duration:.4g} s"]
+
+
+def _sensor_words(case: "Case") -> list[str]:
+    sensors = [
+        f"{s.name or i} ({s.quantity} at {float(s.position):.4g} m)"
+        for i, s in enumerate(case.sensors)
+    ]
+    return [f"sensors: {', '.join(sensors)}"] if sensors else ["the case has no sensors"]
 
 
 def _loads(source: str, content: dict[str, Any]) -> "Sequence[AbstractLoad]":
@@ -168,22 +216,28 @@ def _result(
     }
 
 
-def _lines(result: dict[str, Any]) -> list[str]:
+def _lines(result: dict[str, Any], is_part: bool) -> list[str]:
+    """A vehicle in words; of a part of a case the first and the last of many wheels."""
     lines = [result["title"]]
     if result["source"]:
         lines.append(f"source: {result['source']}")
     mass = "" if result["mass"] is None else f", mass {result['mass']:.6g} kg"
-    lines.append(
-        f"weight {result['weight'] / 1e3:.6g} kN{mass}, wheelbase {result['wheelbase']:.6g} m"
-    )
+    base = f", wheelbase {result['wheelbase']:.6g} m" if len(result["offsets"]) > 1 else ""
+    weight = result["weight"]
+    words = f"{weight:.6g} N" if abs(weight) < 1e3 else f"{weight / 1e3:.6g} kN"
+    lines.append(f"weight {words}{mass}{base}")
     columns = zip(result["offsets"], result["static_loads"], result["unsprung_masses"], strict=True)
-    lines += table(
-        ("wheel", "behind the first (m)", "static load (kN)", "unsprung mass (kg)"),
-        [
-            (i, f"{offset:.6g}", f"{load / 1e3:.6g}", f"{mass:.6g}")
-            for i, (offset, load, mass) in enumerate(columns, 1)
-        ],
-    )
+    rows = [
+        (str(i), f"{offset:.6g}", f"{load / 1e3:.6g}", f"{mass:.6g}")
+        for i, (offset, load, mass) in enumerate(columns, 1)
+    ]
+    if is_part and len(rows) > MAX_WHEELS:
+        lines.append(f"{len(rows)} wheels, of which")
+        rows = [*rows[: MAX_WHEELS - 1], rows[-1]]
+    if len(rows) > 1:
+        lines += table(
+            ("wheel", "behind the first (m)", "static load (kN)", "unsprung mass (kg)"), rows
+        )
     if result["degrees_of_freedom"]:
         lines.append(f"degrees of freedom: {', '.join(result['degrees_of_freedom'])}")
         frequencies = ", ".join(f"{frequency:.5g}" for frequency in result["frequencies_hz"])
@@ -195,13 +249,15 @@ def _lines(result: dict[str, Any]) -> list[str]:
 
 def _list_library(options: PrintOptions) -> None:
     from jaxbeam.case.loads.planar.files import load_vehicle, vehicle_names
+    from jaxbeam.vehicles.line_loads import line_loads
     from jaxbeam.vehicles.trains import trains
 
     vehicles = {name: load_vehicle(name).title for name in vehicle_names()}
     rows = [(name, title) for name, title in vehicles.items()]
     rows += [(name, f"{len(train.offsets)} axles") for name, train in trains().items()]
+    rows += [(name, "line load") for name in line_loads()]
     width = max(len(name) for name, _ in rows)
     options.report(
-        {"vehicles": list(vehicles), "trains": list(trains())},
+        {"vehicles": list(vehicles), "trains": list(trains()), "line_loads": list(line_loads())},
         [f"{name:{width}}  {what}" for name, what in rows],
     )

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from jaxbeam.cli.arguments import (
+    bounds_in_si,
     check_exists,
     parse_assignment,
     parse_bounds,
@@ -94,8 +95,9 @@ def identify(
 
         import tuning  # sets XLA's threads, therefore before the case is read
 
-        priors = _priors(*arguments)
         parsed_case = options.read(case)
+        bounds, normals, scales = arguments
+        priors = _priors(bounds_in_si(parsed_case, bounds), normals, scales)
         if options.overwrite and not resume:
             _remove_checkpoints(output)
         fit = tuning.identify(

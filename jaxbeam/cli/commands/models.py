@@ -2,7 +2,13 @@
 
 from pathlib import Path
 
-from jaxbeam.cli.arguments import check_exists, parse_assignment, parse_bounds, refuse_option
+from jaxbeam.cli.arguments import (
+    bounds_in_si,
+    check_exists,
+    parse_assignment,
+    parse_bounds,
+    refuse_option,
+)
 from jaxbeam.cli.options import (
     CaseOptions,
     Output,
@@ -119,6 +125,7 @@ def design_experiment(
     from jaxbeam.files.case_file import save_case
 
     parsed_case = options.read(case)
+    bounds = bounds_in_si(parsed_case, bounds, "--vary")
     design = tuning.design_experiment(parsed_case, free, bounds, target=target, noise=noise)
     if output:
         save_case(design.case, output, overwrite=True)  # checked before the work

@@ -63,11 +63,22 @@ def simulate(
 
         look = {"title": pictures.title, "size": pictures.inches()}
         write_animation(record, animate, overwrite=options.overwrite, **look)
-    content = _to_dict(record) | {"plausibility": plausibility}
-    options.report(content, _lines(record), output, picture, animate)
+    from jaxbeam.analysis.record_amplification import record_amplification
+
+    amplification = record_amplification(record)
+    content = _to_dict(record, amplification) | {"plausibility": plausibility}
+    lines = _lines(record, amplification)
+    controller = parsed_case.controller
+    if controller is not None and not controller.open_loop:
+        from jaxbeam.analysis.crossing_margin import stability_margin
+
+        margin = stability_margin(parsed_case)
+        content["stability"] = margin.verdict
+        lines.append(f"the loop is {margin}")
+    options.report(content, lines, output, picture, animate)
 
 
-def _to_dict(record: "jb.Record") -> dict:
+def _to_dict(record: "jb.Record", amplification: "list[float | None]") -> dict:
     """Numbers of a record by their names in JSON (SI units)."""
     from jaxbeam.case.sensors import sensor_labels
 
@@ -77,13 +88,19 @@ def _to_dict(record: "jb.Record") -> dict:
         "sensors": [
             {"name": label, "quantity": s.quantity, "unit": s.unit, "position": s.position}
             | extremes
-            for label, s, extremes in zip(
-                sensor_labels(sensors), sensors, _extremes_of_sensors(record), strict=True
+            | {"dynamic_amplification": factor}
+            for label, s, extremes, factor in zip(
+                sensor_labels(sensors),
+                sensors,
+                _extremes_of_sensors(record),
+                amplification,
+                strict=True,
             )
         ],
         # None at sensors of other quantities.
         "peak_deflection": [peak if s.quantity == "deflection" else None for s, peak in peaks],
         "lowest_contact_force": record.lowest_contact_force,
+        "largest_contact_force": record.contact_force.max(axis=0),
         "wheel_unloading": jb.wheel_unloading(record),
         "contact_lost_time": record.contact_lost_time,
         "error_estimate": record.error_estimate,
@@ -121,6 +138,7 @@ def _wheel_lines(record: "jb.Record") -> list[str]:
 
     loads, labels = load_set(record.case), wheel_labels(record.case)
     static, lowest = np.asarray(loads.weight)[:, 0], np.asarray(record.lowest_contact_force)
+    largest = np.max(record.contact_force, axis=0, initial=0.0)
     unloading = np.asarray(jb.wheel_unloading(record))
     load_of_wheel, rows = np.array(loads.load_of_wheel), []
     for load in np.unique(load_of_wheel):
@@ -128,14 +146,16 @@ def _wheel_lines(record: "jb.Record") -> list[str]:
         if wheels.size > MAX_WHEELS:
             worst = wheels[np.argmax(np.nan_to_num(unloading[wheels], nan=-np.inf))]
             names = [f"{labels[worst]}, lowest of {wheels.size}"]
+            largest[worst] = np.max(largest[wheels])
             wheels = np.array([worst])
         else:
             names = [str(labels[i]) for i in wheels]
         rows += [
-            (name, f"{static[i]:.6g}", f"{lowest[i]:.6g}", _percent(unloading[i]))
+            (name, *(f"{f[i]:.6g}" for f in (static, lowest, largest)), _percent(unloading[i]))
             for name, i in zip(names, wheels, strict=True)
         ]
-    header = ("load", "static load (N)", "lowest contact force (N)", "unloading")
+    forces = ("static load (N)", "lowest contact force (N)", "largest (N)")
+    header = ("load", *forces, "unloading")
     return table(header, rows)
 
 
@@ -181,7 +201,7 @@ def _ride(record: "jb.Record") -> "jb.RideMeasures | None":
     return jb.ride_measures(record)
 
 
-def _lines(record: "jb.Record") -> list[str]:
+def _lines(record: "jb.Record", amplification: "list[float | None]") -> list[str]:
     sensors = record.case.sensors
     rows = [
         (
@@ -195,11 +215,14 @@ def _lines(record: "jb.Record") -> list[str]:
             zip(sensors, _extremes_of_sensors(record), strict=True)
         )
     ]
+    header = ("sensor", "position (m)", "quantity", "smallest", "at (s)", "largest", "at (s)")
+    if any(factor is not None for factor in amplification):
+        header = (*header, "dynamic amplification")
+        factors = ("-" if factor is None else f"{factor:.4g}" for factor in amplification)
+        rows = [(*row, factor) for row, factor in zip(rows, factors, strict=True)]
     lines = [
         record.verdict,
-        *table(
-            ("sensor", "position (m)", "quantity", "smallest", "at (s)", "largest", "at (s)"), rows
-        ),
+        *table(header, rows),
         *_wheel_lines(record),
         *_body_lines(record),
     ]
@@ -212,4 +235,4 @@ def _lines(record: "jb.Record") -> list[str]:
                 for i, (peak, effort, share) in enumerate(rows)
             ],
         )
-    return [*lines, f"{record.steps} steps"]
+    return lines

@@ -2,8 +2,14 @@
 
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from jaxbeam.cli.arguments import stationary_mass
 from jaxbeam.cli.options import CaseOptions, PictureOptions, table
+
+if TYPE_CHECKING:
+    from jaxbeam.analysis.linearised_loop import LinearisedLoop
+    from jaxbeam.analysis.margins import Margins
 
 
 def stability(
@@ -12,11 +18,12 @@ def stability(
     *,
     limits: bool = False,
     headway: float | None = None,
+    mass_at: tuple[str, ...] = (),
     plot: bool = False,
     pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
-    """Compute stability margins, poles with loads frozen along the crossing, and growth over it.
+    """Tell whether the loop is stable along the crossing; compute margins, poles and growth.
 
     Parameters
     ----------
@@ -28,15 +35,21 @@ def stability(
     headway
         Time (s) between the loads of an endless stream: compute the largest Floquet multiplier;
         with --limits, also the critical mass and speed in the stream.
+    mass_at
+        POSITION=MASS in m and kg: margins with this stationary mass in place of the loads; repeat
+        it for more.
     plot
-        Draw the poles along the crossing to CASE_poles.png in this folder.
+        Draw the poles along the crossing to CASE_poles.png in this folder, and Bode and Nyquist
+        plots of the loop, broken at the first command, to CASE_loop.png.
     """
+    places = [stationary_mass(text) for text in mass_at]
     picture = pictures.path(plot, None, case.with_stem(f"{case.stem}_poles"))
-    options.check_outputs(picture)
+    loop_picture = picture and picture.with_stem(picture.stem.removesuffix("_poles") + "_loop")
+    options.check_outputs(picture, loop_picture)
     parsed_case = options.read(case)
 
-    from jaxbeam.analysis.linearised_loop import linearised_loop
-    from jaxbeam.analysis.margins import margins
+    from jaxbeam.analysis.crossing_margin import stability_margin
+    from jaxbeam.analysis.linearised_loop import linearised_loop, loop_with_mass_at
     from jaxbeam.analysis.stability import frozen_poles, growth, stream
     from jaxbeam.analysis.stability_limits import (
         largest_frozen_pole,
@@ -44,12 +57,14 @@ def stability(
         stream_excess,
     )
 
+    along_crossing = stability_margin(parsed_case)
     # Before the first load: loads off the beam leave the loop as it is.
     unloaded = linearised_loop(parsed_case, -1.0)
-    stable = bool(unloaded.poles().real.max() < 0)
-    loop_margins = (
-        [margins(unloaded, i) for i in range(len(parsed_case.actuators))] if stable else []
-    )
+    loops = {"no load": unloaded}
+    for position, mass in places:
+        loops[f"{mass:g} kg at {position:g} m"] = loop_with_mass_at(parsed_case, position, mass)
+    loop_margins = {name: _margins_of(loop) for name, loop in loops.items()}
+    stable = bool(loop_margins["no load"])
     poles = frozen_poles(parsed_case)
     crossing_growth = growth(parsed_case) if parsed_case.loads else None
     load_stream = None if headway is None else stream(parsed_case, headway)
@@ -60,23 +75,31 @@ def stability(
         name: load_stability_limits(parsed_case, measure) for name, measure in measures.items()
     }
     if picture:
-        from jaxbeam.plot import plot_poles
+        from jaxbeam.plot import plot_loop_gain, plot_poles
 
         title = parsed_case.title if pictures.title is None else pictures.title
         figure = plot_poles(poles, crossing_growth, title, ax=pictures.page())
         pictures.save(figure, picture)
+        figure = plot_loop_gain(loops, title=title, ax=pictures.page())
+        pictures.save(figure, loop_picture)
     worst = int(poles.largest_real_part.argmax())
     content = {
+        "verdict": along_crossing.verdict,
+        "along_crossing": {
+            "gain": along_crossing.gain,
+            "delay": along_crossing.delay,
+            "obstacle": along_crossing.obstacle,
+        },
         "stable_without_loads": stable,
-        "margins": [
+        "margins": [_margins_to_dict(entry) for entry in loop_margins["no load"]],
+        "mass_at": [
             {
-                "gain": entry.gain,
-                "gain_down": entry.lower_gain,
-                "phase": entry.phase,
-                "delay": entry.delay,
-                "distance": entry.modulus_margin,
+                "position": position,
+                "mass": mass,
+                "verdict": "stable" if found else "unstable",
+                "margins": [_margins_to_dict(entry) for entry in found],
             }
-            for entry in loop_margins
+            for (position, mass), found in zip(places, list(loop_margins.values())[1:], strict=True)
         ],
         "largest_real_part": poles.largest_real_part[worst],
         "at_time": poles.times[worst],
@@ -86,25 +109,36 @@ def stability(
             name: {"mass": limit.mass, "speed": limit.speed} for name, limit in load_limits.items()
         },
     }
-    lines = [f"without loads the loop is {'stable' if stable else 'unstable'}"]
+    lines = [f"the loop is {along_crossing}"]
+    if along_crossing.verdict == "stable":
+        lines.append(
+            f"along the crossing the gain margin is at least {along_crossing.gain:.4g}, the delay"
+            f" margin {along_crossing.delay:.4g} s"
+        )
+    lines += [f"unstable with {name}" for name, found in loop_margins.items() if not found]
     lines += table(
-        ("actuator", "gain margin", "phase margin (deg)", "delay margin (s)", "modulus margin"),
+        (
+            "load", "actuator", "gain margin", "phase margin (deg)", "delay margin (s)",
+            "modulus margin",
+        ),
         [
             (
+                name,
                 i,
                 f"{entry.gain:.4g}",
                 f"{math.degrees(entry.phase):.4g}",
                 f"{entry.delay:.4g}",
                 f"{entry.modulus_margin:.4g}",
             )
-            for i, entry in enumerate(loop_margins)
+            for name, found in loop_margins.items()
+            for i, entry in enumerate(found)
         ],
-    )
+    )  # fmt: skip
     if crossing_growth is not None:
         lines += [
             f"with the loads frozen where they are worst, at {poles.times[worst]:.4g} s, the"
             f" largest real part of a pole is {poles.largest_real_part[worst]:.4g} 1/s",
-            "over the crossing a deviation grows at most by a factor of"
+            "over the crossing a small deviation from rest grows at most by a factor of"
             f" {crossing_growth.factor.max():.4g}, to {crossing_growth.factor[-1]:.3g} at its end",
         ]
     if load_stream is not None:
@@ -118,7 +152,29 @@ def stability(
             if value is not None:
                 found = _limit_text(quantity, value, unit)
                 lines.append(f"with {name} the loop is unstable {found}")
-    options.report(content, lines, picture)
+    options.report(content, lines, picture, loop_picture)
+
+
+def _margins_of(loop: "LinearisedLoop") -> list["Margins"]:
+    """Margins at each command; none of an unstable loop."""
+    import numpy as np
+
+    from jaxbeam.analysis.margins import margins
+
+    if loop.poles().real.max() >= 0:
+        return []
+    with np.errstate(divide="ignore"):  # infinite margin of a loop without gain
+        return [margins(loop, i) for i in range(loop.B.shape[1])]
+
+
+def _margins_to_dict(entry: "Margins") -> dict[str, float]:
+    return {
+        "gain": entry.gain,
+        "gain_down": entry.lower_gain,
+        "phase": entry.phase,
+        "delay": entry.delay,
+        "distance": entry.modulus_margin,
+    }
 
 
 def _limit_text(quantity: str, value: float, unit: str) -> str:

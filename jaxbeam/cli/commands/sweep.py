@@ -1,8 +1,10 @@
 """Commands about many runs of a case: `sweep`, and `native`, the optional C code for it."""
 
+import math
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
@@ -21,6 +23,10 @@ from jaxbeam.cli.options import (
     print_plausibility,
     table,
 )
+from jaxbeam.files.endings import RESULTS
+
+if TYPE_CHECKING:
+    import xarray
 
 
 def sweep(
@@ -71,7 +77,7 @@ def sweep(
     for option, is_given in (("--resume", resume), ("--scheduler", bool(scheduler))):
         refuse_option(
             is_given and store is None,
-            f"{option} needs a store, written block by block: -o OUT.zarr",
+            f"{option} needs a store of blocks: -o OUT.zarr",
         )
     picture = pictures.path(plot, output, case.with_stem(f"{case.stem}_sweep"))
     refuse_option(
@@ -116,7 +122,7 @@ def sweep(
             **numbers,
             "plausibility": plausibility,
         },
-        _lines(parsed_case, peaks, results["failed"], values),
+        _lines(parsed_case, results, list(values)),
         output,
         picture,
     )
@@ -136,21 +142,50 @@ def _print_plausibility(case: "jb.Case", values, options: CaseOptions) -> dict:
     return print_plausibility(first, options, last)
 
 
-def _lines(case: "jb.Case", peaks, failed, values) -> list[str]:
-    """Number of runs, and the largest peak at each sensor with the parameters of its run."""
+def _lines(case: "jb.Case", results: "xarray.Dataset", addresses: Sequence[str]) -> list[str]:
+    """Number of runs, and of each sensor the largest and the smallest peak with its run."""
     rows = []
     for i, sensor in enumerate(case.sensors):
-        at_sensor = peaks[f"peak_{sensor.quantity}"].isel(sensor=i)
-        largest = at_sensor.isel(at_sensor.fillna(-1.0).argmax(...))
-        own = [largest[address].item() for address in values]
-        parameters = [value if isinstance(value, str) else f"{value:.6g}" for value in own]
+        peaks = results[f"peak_{sensor.quantity}"].isel(sensor=i)
         unit = f" ({sensor.unit})" if sensor.unit != "1" else ""
-        quantity = f"{sensor.quantity}{unit}"
-        rows.append((sensor.name or i, quantity, f"{float(largest):.6g}", *parameters))
-    return [
-        f"{failed.size} runs, {int(failed.sum())} failed; the largest peak at each sensor:",
-        *table(("sensor", "quantity", "peak", *(f"at {name}" for name in values)), rows),
-    ]
+        for words, missing, sign in (("largest", -1.0, 1.0), ("smallest", math.inf, -1.0)):
+            place = (sign * peaks.fillna(missing)).argmax(...)
+            run, time = peaks.isel(place), results["peak_time"].isel(sensor=i).isel(place)
+            row = (sensor.name or i, f"{sensor.quantity}{unit}", words, f"{float(run):.6g}")
+            rows.append((*row, f"{float(time):.6g}", *_swept_values(run, addresses)))
+    failed = results["failed"]
+    runs = f"{failed.size} runs, {int(failed.sum())} failed"
+    header = ("sensor", "quantity", "peak", "size", "time (s)")
+    names = [_head(results[address]) for address in addresses]
+    lines = [f"{runs}; peaks are largest absolute values:", *table((*header, *names), rows)]
+    return [*lines, *_contact_lines(results, addresses)]
+
+
+def _head(values: "xarray.DataArray") -> str:
+    """What a swept dimension is, with its unit."""
+    unit = values.attrs.get("units", "1")
+    words = values.attrs.get("long_name", str(values.name))
+    return words if unit == "1" else f"{words} ({unit})"
+
+
+def _swept_values(run: "xarray.DataArray", addresses: Sequence[str]) -> list[str]:
+    values = [run[address].item() for address in addresses]
+    return [value if isinstance(value, str) else f"{value:.6g}" for value in values]
+
+
+def _contact_lines(results: "xarray.Dataset", addresses: Sequence[str]) -> list[str]:
+    """Smallest contact force of all runs, where it is, and how many runs lose contact."""
+    forces = results.get("lowest_contact_force")
+    if forces is None or not forces.size or not bool(forces.notnull().any()):
+        return []
+    least = forces.fillna(math.inf).min("load")
+    run, lost = least.isel(least.argmin(...)), int((least < 0).sum())
+    where = []
+    for address, value in zip(addresses, _swept_values(run, addresses), strict=True):
+        words, _, unit = _head(results[address]).partition(" (")
+        where.append(f"{words} {value} {unit.rstrip(')')}".rstrip())
+    words = f"contact is lost in {lost} runs" if lost else "no run loses contact"
+    return [f"smallest contact force {float(run):.6g} N, at {', '.join(where)}; {words}"]
 
 
 def native(*, remove: bool = False, options: PrintOptions = PrintOptions()) -> None:

@@ -6,6 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from jaxbeam.cli.arguments import (
+    bounds_in_si,
     check_exists,
     check_suffix,
     named_number,
@@ -142,7 +143,8 @@ def tune(
     import tuning  # sets XLA's threads, therefore before the case is read
 
     parsed_case = options.read(case)
-    loads = tuning.read_load_cases(cases)
+    bounds = bounds_in_si(parsed_case, bounds)
+    loads = tuning.read_load_cases(cases, parsed_case)
     if fit is not None:
         parsed_case, loads = _with_identified_plant(
             parsed_case, loads, fit, plants, posterior, seed
@@ -223,10 +225,20 @@ def _write_and_print(result, tuned, files, picture, pictures, options: CaseOptio
     if picture:
         drawn = result if hasattr(result, "plot") else tuned[0]
         pictures.save(pictures.titled(drawn.plot()), picture)
-    summaries = [one.to_dict() for one in tuned]
+    from jaxbeam.analysis.crossing_margin import stability_margin
+
+    loops = [stability_margin(one.case) for one in tuned]
+    summaries = [
+        one.to_dict() | {"stability": loop.verdict} for one, loop in zip(tuned, loops, strict=True)
+    ]
+    closed = [
+        f"the tuned loop is {loop}"
+        for one, loop in zip(tuned, loops, strict=True)
+        if not one.case.controller.open_loop
+    ]
     options.report(
         summaries[0] if len(summaries) == 1 else {"front": summaries},
-        [str(result)],
+        [str(result), *closed],
         *files,
         picture,
     )

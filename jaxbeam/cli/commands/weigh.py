@@ -2,7 +2,13 @@
 
 from pathlib import Path
 
-from jaxbeam.cli.arguments import check_exists, parse_bounds, parse_range, refuse_option
+from jaxbeam.cli.arguments import (
+    bounds_in_si,
+    check_exists,
+    parse_bounds,
+    parse_range,
+    refuse_option,
+)
 from jaxbeam.cli.options import CaseOptions, Free, Output
 
 
@@ -14,6 +20,8 @@ def weigh(
     speeds: str,
     max_loads: int = 3,
     one_way: bool = False,
+    axles: int | None = None,
+    calibration: Path | None = None,
     output: Output = None,
     options: CaseOptions = CaseOptions(),
 ) -> None:
@@ -31,21 +39,34 @@ def weigh(
         Largest number of loads to try.
     one_way
         Search loads from the left only.
+    axles
+        Weigh one vehicle or train of so many axles: their forces and spacings.
+    calibration
+        Log of a vehicle of known axle loads (in the TOML file beside it), for the influence lines.
     output
         Write the case with the identified loads to this file, TOML.
     """
     options.check_outputs(output)
     speed_range = parse_range("--speeds", speeds, "m/s, such as 0.5:3")
     check_exists("log file", log)
+    if calibration is not None:
+        check_exists("log file", calibration)
+        refuse_option(axles is None, "--calibration is for Moses' method: say how many --axles")
     options.check_case(case)
 
     import tuning  # sets XLA's threads, therefore before the case is read
     from jaxbeam.files.case_file import save_case
 
-    parsed_case = options.read(case)
-    weighing = tuning.weigh(
-        parsed_case, tuning.read_log(log), speed_range, max_loads, both_ways=not one_way
-    )
+    parsed_case, read = options.read(case), tuning.read_log(log)
+    if axles is None:
+        weighing = tuning.weigh(parsed_case, read, speed_range, max_loads, both_ways=not one_way)
+    else:
+        lines = None
+        if calibration is not None:
+            lines = tuning.calibrate_influence_lines(parsed_case, tuning.read_log(calibration))
+        weighing = tuning.weigh_axles(
+            parsed_case, read, speed_range, axles, both_ways=not one_way, influence_lines=lines
+        )
     if output:
         save_case(weighing.fit.case, output, overwrite=True)  # checked before the work
     options.report(weighing.to_dict(), [str(weighing)], output)
@@ -85,7 +106,7 @@ def identify_responses(
 
     parsed_case = options.read(case)
     measured = tuning.responses_of(tuning.read_log(log), segment)
-    fit = tuning.identify_responses(parsed_case, measured, bounds)
+    fit = tuning.identify_responses(parsed_case, measured, bounds_in_si(parsed_case, bounds))
     if output:
         save_case(fit.case, output, overwrite=True)  # checked before the work
     options.report(fit.to_dict(), [str(fit)], output)

@@ -8,11 +8,13 @@ import math
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, concrete, count, is_concrete, number
+from jaxbeam.case.loads.vehicle_model import VehicleModel
 from jaxbeam.control.optimal.crossing_plant import crossing_plant
 from jaxbeam.control.optimal.gain_schedules import GainSchedule, crossing_events
 from jaxbeam.control.optimal.lqr import AbstractRegulator
@@ -83,7 +85,7 @@ class AbstractCrossingRegulator(AbstractRegulator):
     def gain_schedule(self, plant: Plant, design_plant: Plant) -> GainSchedule:
         """Schedule designed for one plant, for the times of entry and exit of the other."""
         table, shares = self.gain_table(design_plant), self.feedback_shares
-        vehicle_states = self.vehicle_states(design_plant)
+        vehicle_states = design_plant.vehicle_states
         load_weights = xp.zeros(0)
         if self.load_feedforward:
             load_weights = design_plant.augmented_start[design_plant.vehicle_states :]
@@ -107,10 +109,6 @@ class AbstractCrossingRegulator(AbstractRegulator):
             self.load_feedforward,
             vehicle_states,
         )
-
-    def vehicle_states(self, plant: Plant) -> int:
-        """Number of states of vehicles that are fed back, after those of the beam."""
-        return plant.vehicle_states
 
     def events(self, case: Case) -> Float[np.ndarray, " event"]:
         """Times (s) of entry and exit between which the table runs, ascending."""
@@ -164,25 +162,45 @@ class AbstractFiniteHorizonRegulator(AbstractCrossingRegulator):
 class StepLQR(AbstractCrossingRegulator):
     """Regulator of the plant frozen at each time, eqs (3.10) and (3.11) of the thesis.
 
-    Vehicles are static wheel loads and the masses of wheels in its design.
+    States of vehicles, about static equilibrium, are fed back too, with no weight of their own;
+    the vehicles need damping, for a stationary regulator to exist while they are off the beam.
     """
 
     kind: ClassVar[str] = "lqr-step"
 
-    def vehicle_states(self, plant):
-        return 0
-
     def gain_table(self, plant):
-        plant = plant.on_static_loads()
-
         def system_at(t):
             return plant.A(t), plant.B(t)
 
+        Q, R = self.weights(plant)
         return frozen_time_gains(
             system_at,
             breakpoints_between(crossing_events(plant), uniform_fractions(self.points)),
-            *self.weights(plant),
+            xp.pad(Q, (0, plant.vehicle_states)),
+            R,
         )
+
+    def validate(self, case):
+        for i, load in enumerate(self.design_loads(case)):
+            numbers = jax.tree.leaves((load, case.run.gravity))
+            if all(map(is_concrete, numbers)) and not _decays(load.vehicle(case.run.gravity)):
+                return (
+                    f"kind needs vehicles with damping: loads.{i} has a motion without, for which"
+                    " no stationary regulator exists off the beam; take kind 'lqr-finite'"
+                )
+        return super().validate(case)
+
+
+def _decays(vehicle: VehicleModel) -> bool:
+    """Whether all motions of a vehicle on rigid ground decay."""
+    count = len(vehicle.names)
+    if not count:
+        return True
+    parts = (vehicle.mass, vehicle.full_stiffness, vehicle.full_damping)
+    mass, stiffness, damping = (np.asarray(concrete(part)) for part in parts)
+    rates = -np.linalg.solve(mass, np.hstack([stiffness, damping]))
+    poles = np.linalg.eigvals(np.vstack([np.eye(count, 2 * count, k=count), rates]))
+    return bool(np.all(poles.real < -1e-9 * np.abs(poles)))
 
 
 class FiniteLQR(AbstractFiniteHorizonRegulator):

@@ -11,8 +11,6 @@ from jaxtyping import Float
 
 from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.fields import INCREASING, choice, concrete, is_concrete, number, part
-from jaxbeam.case.loads.base import AbstractVehicleLoad
-from jaxbeam.case.loads.mass import MovingMass
 from jaxbeam.control.load_identification import LoadIdentification, identification_error
 from jaxbeam.control.load_identifiers import AbstractLoadSource, given_load
 from jaxbeam.control.optimal.crossing_lqr import AbstractFiniteHorizonRegulator, interval_error
@@ -30,7 +28,9 @@ class ScheduledLQR(AbstractFiniteHorizonRegulator):
     the design if left out), at constant speed. Between them commands are "interpolated" linearly,
     or those of the "nearest" design are used; outside, the mass or speed is clamped to the grid.
     The tables are stretched to the speed of the load, also outside the grid. With loads "known" the
-    weight of that mass is fed forward, as in `AugmentedLQR`.
+    weight of that mass is fed forward, as in `AugmentedLQR`. States of a vehicle are fed back; one
+    of another mass is similar to that of the design: all its masses, springs and dampers are in
+    proportion, so that its frequencies stay.
 
     Mass, speed and entry time are those of the load in the design, or identified by
     `load_identification`: then the command is zero until the speed is identified, and the lightest
@@ -73,10 +73,10 @@ class ScheduledLQR(AbstractFiniteHorizonRegulator):
             self.masses,
             speeds,
             plant.case.beam.length,
-            design_plant.case.run.gravity,
             jnp.abs(load.speed),
             source,
             self.between == "nearest",
+            design_plant.weights.shape[0],
         )
 
     def validate(self, case):
@@ -100,18 +100,22 @@ class ScheduledLQR(AbstractFiniteHorizonRegulator):
 class ScheduledGainLaw(AbstractStateLaw):
     """Gain schedules (mass, speed) and the source of the load, whose state is that of the law.
 
-    `design_speed` (m/s) is the speed of the load in the design; gravity (m/s^2) turns the mass into
-    the weight that is fed forward.
+    `design_speed` (m/s) is the speed of the load in the design. What is fed forward are weights in
+    proportion to the mass and, with a profile, the constant 1.
     """
 
     schedules: GainSchedule
     masses: Float[Array, " mass"]
     speeds: Float[Array, " speed"]
     length: Float[Array, ""]
-    gravity: Float[Array, ""]
     design_speed: Float[Array, ""]
     load_source: AbstractLoadSource
     nearest: bool = eqx.field(static=True)
+    weight_count: int = eqx.field(static=True)
+
+    @property
+    def needs_vehicles(self):
+        return self.schedules.needs_vehicles
 
     def initial_state(self):
         return self.load_source.initial_state()
@@ -121,10 +125,11 @@ class ScheduledGainLaw(AbstractStateLaw):
         mass = jnp.where(load.mass_identified, load.mass, self.masses[0])
         speed, entry = jnp.abs(load.speed), load.entry_time
         end = entry + self.length / speed
-        load_weights = jnp.zeros(0)
-        if self.schedules.load_feedforward:
-            clamped_mass = jnp.clip(mass, self.masses[0], self.masses[-1])
-            load_weights = (clamped_mass * self.gravity)[None]
+        # In proportion to the mass between the designs, which differ in it alone.
+        clamped_mass = jnp.clip(mass, self.masses[0], self.masses[-1])
+        lightest = self.schedules.load_weights[0, 0]
+        constant = jnp.arange(lightest.shape[0]) >= self.weight_count
+        load_weights = jnp.where(constant, lightest, lightest * clamped_mass / self.masses[0])
 
         def command_of(schedule):
             stretched = dataclasses.replace(
@@ -152,15 +157,13 @@ def _any_not_positive(values) -> bool:
 def _with_crossing_load(plant: Plant, mass, speed) -> Plant:
     """Plant with another mass (kg) at another constant speed (m/s), in the same direction.
 
-    Instead of a vehicle, it is a mass.
+    A vehicle of another mass is a similar one, of the same frequencies.
     """
-    load = plant.case.loads[0]
-    if isinstance(load, AbstractVehicleLoad):
-        load = MovingMass(mass, load.speed, load.entry_time)
+    load, gravity = plant.case.loads[0], plant.case.run.gravity
     changed = eqx.tree_at(
-        lambda x: (x.mass, x.speed, x.deceleration),
-        load,
-        (mass, jnp.sign(load.speed) * speed, jnp.zeros(())),
+        lambda x: (x.speed, x.deceleration), load, (jnp.sign(load.speed) * speed, jnp.zeros(()))
     )
     case = eqx.tree_at(lambda c: c.loads, plant.case, (changed,))
-    return dataclasses.replace(plant, case=case, loads=load_set(case))
+    loads = load_set(case)
+    wheels = loads.wheels.scaled(mass / load.total_mass(gravity))
+    return dataclasses.replace(plant, case=case, loads=dataclasses.replace(loads, wheels=wheels))

@@ -101,14 +101,19 @@ class StaticCorrection(Module):
 
 
 def static_correction(
-    model: ModalModel, case: Case, sensors: Sequence[Sensor], outputs: OutputRows
+    model: ModalModel,
+    case: Case,
+    sensors: Sequence[Sensor],
+    outputs: OutputRows,
+    modal_sums: int = 0,
 ) -> StaticCorrection | None:
     """Static correction of the `outputs` of sensors, in the coordinates of their modal model.
 
-    None where no sensor measures a curvature, strain or section force, and for beams that can move
-    as a rigid body.
+    The last `modal_sums` of the sensors are left as sums of the modes. None where no sensor
+    measures a curvature, strain or section force, and for beams that can move as a rigid body.
     """
-    bending = [i for i, sensor in enumerate(sensors) if sensor.bends]
+    corrected = sensors[: len(sensors) - modal_sums]
+    bending = [i for i, sensor in enumerate(corrected) if sensor.bends]
     layout = model.modes.layout
     if not bending or not is_supported(case, layout):
         return None

@@ -4,7 +4,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.sensing.output_rows import quantity_history
+from jaxbeam.model.sensing.output_rows import sensor_history
 from jaxbeam.model.sensing.sensor_signals import (
     needs_times,
     noise_samples,
@@ -34,8 +34,7 @@ def sensor_readings(
     noise = noise_samples(case.run.seed, len(case.sensors), samples) if noisy else None
     columns = []
     for i, sensor in enumerate(case.sensors):
-        channel = sensor.position, sensor.quantity, sensor.fibre_distance, sensor.section_modulus
-        values = quantity_history(case, modes, motion, *channel)
+        values = sensor_history(case, modes, motion, sensor)
         noise_of_sensor = None if noise is None else noise[:, i]
         if not needs_times(sensor):
             columns.append(to_reading(sensor, values, noise_of_sensor))
@@ -47,7 +46,7 @@ def sensor_readings(
         rates_of_change = None
         if not (sensor.has_feedthrough or sensor.bends):
             rates = motion._replace(coordinates=motion.rates, rates=motion.accelerations)
-            rates_of_change = quantity_history(case, modes, rates, *channel)
+            rates_of_change = sensor_history(case, modes, rates, sensor)
         try:
             columns.append(
                 sampled_readings(sensor, times, values, rates_of_change, noise_of_sensor)

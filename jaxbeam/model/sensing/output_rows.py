@@ -19,6 +19,7 @@ from jaxbeam.case.quantities import Quantity, quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
+from jaxbeam.model.sensing.mode_band import band_weights, banded_fields
 from jaxbeam.model.static_correction import (
     Motion,
     active_moments,
@@ -116,7 +117,8 @@ def sensor_rows(model: ModalModel, case: Case, sensors: Sequence[Sensor]) -> Out
     rows, on_commands = [], []
     for sensor, quantity in zip(sensors, quantities, strict=True):
         x, parameters = sensor.position, (sensor.fibre_distance, sensor.section_modulus)
-        rows.append(modal_row(model.fields, case, x, sensor.quantity, *parameters))
+        fields = banded_fields(model, sensor.mode_band)
+        rows.append(modal_row(fields, case, x, sensor.quantity, *parameters))
         active = active_moments(case, x)
         if quantity.has_active_moment:
             modulus = sensor.section_modulus if quantity.over_modulus else 1.0
@@ -146,8 +148,9 @@ def quantity_history(
     name: str,
     fibre_distance=None,
     section_modulus=None,
+    mode_band: str = "all",
 ) -> Float[Array, "time *position"]:
-    """History of a quantity at positions x (m) from the motion of the modes.
+    """History of a quantity at positions x (m) from the motion of the modes (of a band).
 
     Curvature and what follows from it are statically corrected (see `corrected_history`); at a load
     or support, and at the end of a patch, the shear force to the right of it. Raises ValueError for
@@ -156,7 +159,7 @@ def quantity_history(
     parameters = fibre_distance, section_modulus
     quantity = quantity_of(name, *parameters)
     if not quantity.bends:
-        rows = modal_row(modes.fields, case, x, name, *parameters)
+        rows = modal_row(modes.fields, case, x, name, *parameters) * band_weights(modes, mode_band)
         amplitudes = (motion.coordinates, motion.rates, motion.accelerations)
         return xp.tensordot(amplitudes[quantity.time_derivative], rows, axes=[1, -1])
     x = beside(case, x)
@@ -167,6 +170,14 @@ def quantity_history(
         active = xp.tensordot(motion.command, active_moments(case, x), axes=1)
         history = history + active / modulus
     return history
+
+
+def sensor_history(
+    case: Case, modes: Modes, motion: Motion, sensor: Sensor
+) -> Float[Array, " time"]:
+    """History of the true quantity of a sensor, in its SI unit; see `quantity_history`."""
+    channel = sensor.position, sensor.quantity, sensor.fibre_distance, sensor.section_modulus
+    return quantity_history(case, modes, motion, *channel, sensor.mode_band)
 
 
 def beside(case: Case, x, side: str = "right") -> Float[Array, "*position"]:

@@ -19,7 +19,7 @@ def test_loads_of_the_page_are_valid():
     check_case(case)
     assert {load.kind for load in case.loads} == {
         "oscillator", "quarter-car", "half-car", "wagon", "axles", "varying-force", "pedestrian",
-        "crowd", "vehicle"
+        "crowd", "vehicle", "line-load", "train"
     }  # fmt: skip
 
 

@@ -156,3 +156,16 @@ def test_too_wide_a_crowd():
     crowd = jb.Crowd(people=5, length=40.0, pace=1.9, pace_deviation=0.4, speed=1.4)
     with pytest.raises(ValueError, match="the slowest pace"):
         check_case(case_of(crowd))
+
+
+def test_a_given_force_below_zero_is_no_loss_of_contact():
+    """Harmonics of jogging, cut off after the fourth, go below zero between the steps."""
+    load = jb.Pedestrian(pace=2.6, activity="jogging", position=12.0)
+    record = jb.simulate(case_of(load, duration=2.0))  # without a warning, which would be an error
+    lowest = float(record.lowest_contact_force[0])
+    assert lowest < 0
+    assert (
+        f"force of load 0 is negative at times, down to {lowest:.4g} N, as given" in record.verdict
+    )
+    mass = jb.MovingMass(mass=10.0, speed=3.0)
+    assert load_set(case_of(load, mass)).prescribed.tolist() == [True, False]

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 from jaxtyping import Float
 
+from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, count, number, part
 from jaxbeam.case.filters import Filter
 from jaxbeam.case.quantities import BODY_QUANTITIES, OF_QUANTITY, QUANTITIES
@@ -12,7 +13,7 @@ from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.module import Module
 
 
-class VehicleSensor(Module):
+class VehicleSensor(ReprWithUnits, Module):
     """Sensor of the vertical motion of a body or an axle of a vehicle, positive upwards.
 
     `load` is the number of the load, `vehicle` that of the vehicle in its row, both from 0; `body`

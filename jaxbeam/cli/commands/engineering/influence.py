@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from jaxbeam.cli.arguments import check_suffix, figure_path
-from jaxbeam.cli.options import CaseOptions, Output, table
+from jaxbeam.cli.arguments import check_suffix
+from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, table
 from jaxbeam.files.endings import TABLES
 
 
@@ -17,6 +17,7 @@ def influence(
     section_modulus: float | None = None,
     output: Output = None,
     plot: bool = False,
+    pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Compute influence lines: values at a section over the position of a load of 1 N.
@@ -41,7 +42,7 @@ def influence(
         Draw them to CASE_influence.png in this folder, or beside the output.
     """
     check_suffix(output, TABLES[0], "a table of influence lines", TABLES[1:])
-    picture = figure_path(output, case.with_stem(f"{case.stem}_influence")) if plot else None
+    picture = pictures.path(plot, output, case.with_stem(f"{case.stem}_influence"))
     options.check_outputs(output, picture)
     parsed_case = options.read(case)
 
@@ -65,7 +66,8 @@ def influence(
     if picture:
         from jaxbeam.plot import plot_influence
 
-        plot_influence(parsed_case, found).savefig(picture)
+        figure = plot_influence(parsed_case, found, ax=pictures.page(), title=pictures.title)
+        pictures.save(figure, picture)
     rows = []
     for i, (head, values) in enumerate(list(found.columns.items())[1:]):
         low, high = values.argmin(), values.argmax()

@@ -1,0 +1,115 @@
+"""Loops with a stationary mass against matrices assembled here, and the verdict of all commands."""
+
+import json
+
+import control
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.analysis.crossing_margin import stability_margin
+from jaxbeam.analysis.linearised_loop import linearised_loop, loop_with_mass_at
+from jaxbeam.analysis.margins import loop_gain, margins
+from jaxbeam.analysis.stability import growth
+from jaxbeam.cli import main
+from tests.loop_as_oracle import span_of
+
+GAIN, PLACE, SENSOR, BANDWIDTH, FORCE = 40.0, 0.22, 0.25, 150.0, 5.0
+POSITION, MASS, PERIOD, CUBIC = 0.35, 0.8, 0.005, 3e9
+
+
+def lagging_case() -> jb.Case:
+    """Feedback through the lag of a shaker without suspension, in continuous time."""
+    shaker = jb.Shaker(PLACE, 0.0, 0.0, force_per_volt=FORCE, bandwidth=BANDWIDTH)
+    return jb.Case(
+        jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2),
+        actuators=[shaker],
+        sensors=[jb.Sensor(SENSOR)],
+        loads=[jb.MovingMass(mass=0.3, speed=1.0)],
+        controller=jb.Feedback([GAIN]),
+        run=jb.Run(0.6),
+    )
+
+
+def loop_of_matrices(case) -> control.StateSpace:
+    """From the command to the negative command of the law, with the mass at its position."""
+    span, n = span_of(case), 2
+    shape = span.shapes(POSITION)
+    compliance = np.linalg.inv(np.eye(n) + MASS * np.outer(shape, shape))
+    below = -compliance @ np.hstack([np.diag(span.frequencies**2), span.damping])
+    A = np.zeros((2 * n + 1, 2 * n + 1))
+    A[:n, n : 2 * n], A[n : 2 * n, : 2 * n] = np.eye(n), below
+    A[n : 2 * n, -1] = compliance @ span.shapes(PLACE)
+    A[-1, -1] = -BANDWIDTH
+    B = np.append(np.zeros(2 * n), BANDWIDTH * FORCE)[:, None]
+    C = GAIN * np.append(span.shapes(SENSOR), np.zeros(n + 1))
+    return control.StateSpace(A, B, C, 0)
+
+
+def test_margins_and_responses_with_a_mass_at_a_position():
+    case = lagging_case()
+    loop, expected = loop_with_mass_at(case, POSITION, MASS), loop_of_matrices(case)
+    found = margins(loop)
+    gain, phase, modulus, *_ = control.stability_margins(expected)
+    assert_allclose(found.gain, gain, rtol=1e-6)
+    assert_allclose(found.phase, np.radians(phase), rtol=1e-6)
+    assert_allclose(found.modulus_margin, modulus, rtol=1e-5)
+    frequencies = np.geomspace(1.0, 2000.0, 15)
+    response = control.frequency_response(expected, frequencies).complex
+    scale = np.max(np.abs(response))
+    assert_allclose(-loop_gain(loop)[1](frequencies), response, atol=1e-9 * scale)
+    exported = control.frequency_response(loop.to_control(), frequencies).complex
+    assert_allclose(-exported, response, atol=1e-9 * scale)
+    with pytest.raises(ValueError, match="off the beam, 0 to 0.6 m"):
+        loop_with_mass_at(case, 0.7, MASS)
+
+
+def cubic_case() -> jb.Case:
+    """A cubic law without gain at rest, whose gain under the load is too large for its delay."""
+    return jb.Case(
+        jb.Beam(0.6, 11.68, 0.535, 0.005, modes=1),
+        actuators=[jb.PointForce(0.3)],
+        sensors=[jb.Sensor(0.3)],
+        loads=[jb.MovingMass(mass=0.5, speed=1.0)],
+        controller=jb.Feedback([CUBIC], power=3, period=PERIOD, delay=PERIOD),
+        run=jb.Run(0.6, 200.0),
+    )
+
+
+def test_a_cubic_law_has_no_gain_at_rest_and_is_unstable_under_the_load():
+    case = cubic_case()
+    assert margins_at_rest(case) == np.inf and np.max(growth(case, 20).factor) < 1.1
+    assert stability_margin(case).verdict == "unstable"
+
+
+def margins_at_rest(case) -> float:
+    with np.errstate(divide="ignore"):
+        return margins(linearised_loop(case, -1.0)).gain
+
+
+@pytest.fixture
+def printed(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    jb.save_case(cubic_case(), "case.toml")
+
+    def run(line: str) -> str:
+        with pytest.raises(SystemExit) as ended:
+            main(line.split())
+        text = capsys.readouterr()
+        assert ended.value.code == 0, text.err
+        return text.out
+
+    return run
+
+
+def test_commands_have_one_verdict(printed, tmp_path):
+    sentence = str(stability_margin(cubic_case()))
+    text = printed("stability case.toml --mass-at 0.3=0.5 --mass-at 0.01=0.1 --plot")
+    assert f"the loop is {sentence}" in text
+    assert "unstable with 0.5 kg at 0.3 m" in text and "0.1 kg at 0.01 m  " in text
+    assert (tmp_path / "case_poles.png").exists() and (tmp_path / "case_loop.png").exists()
+    assert f"the loop is {sentence}" in printed("simulate case.toml")
+    assert sentence in printed("compare case.toml --period 0.05")
+    found = json.loads(printed("stability case.toml --json"))
+    assert found["verdict"] == "unstable" and found["stable_without_loads"]

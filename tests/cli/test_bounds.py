@@ -1,0 +1,37 @@
+"""Bounds of free parameters, with and without units."""
+
+import pytest
+
+import jaxbeam as jb
+from jaxbeam.cli.arguments import bounds_in_si, parse_bounds
+
+CASE = jb.Case(jb.Beam(25.0, 3e10, 1.5e4), loads=[jb.MovingForce(force=1e5, speed=20.0)])
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("beam.flexural_rigidity=8 GN m^2:12 GN m^2", (8e9, 12e9)),
+        ("beam.flexural_rigidity=8000 MN m^2 : 1.2e10 N m^2", (8e9, 12e9)),
+        ("loads.*.speed=36 km/h:20 m/s", (10.0, 20.0)),
+        ("beam.length=20:30", (20.0, 30.0)),
+        ("beam.length", None),
+    ],
+)
+def test_bounds_in_si_units(text, expected):
+    address, pair = parse_bounds(text)
+    found = bounds_in_si(CASE, {address: pair})[address]
+    assert found == (expected and pytest.approx(expected))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("beam.length=25 m:20 m", "--free beam.length: bounds are LOW:HIGH"),
+        ("beam.length=25 m:30 kg", "must be in m, or a unit of the same kind, not '30 kg'"),
+        ("beam.lenght=25 m:30 m", "did you mean .beam.length"),
+    ],
+)
+def test_bounds_that_are_refused(text, message):
+    with pytest.raises(ValueError, match=message):
+        bounds_in_si(CASE, dict([parse_bounds(text)]))

@@ -1,0 +1,213 @@
+"""Axle loads and spacings of a vehicle or train from readings of a bridge.
+
+Speed, entry time and distances of the axles are found with static influence lines, and their forces
+by Moses' method; from there all are fitted together to the vibrating bridge. The road is unknown:
+the intervals of both allow for dynamic wheel forces as large as the residuals say
+(`dynamic_forces`).
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.loads.axles import Axles
+from jaxbeam.files.report import text_table
+from tuning.fit.identify import identify
+from tuning.fit.result import Fit
+from tuning.logs.log import Log
+from tuning.logs.pairing import sensor_readings
+from tuning.weighing.dynamic_forces import (
+    DynamicErrors,
+    dynamic_errors,
+    dynamic_readings,
+    white_noise,
+)
+from tuning.weighing.influence_lines import InfluenceLines, check_static, model_influence_lines
+from tuning.weighing.moses import AxleGeometry, MosesFit, find_geometry, moses
+
+GAP_RANGE = (0.5, 1.6)  # of the distance to the next axle, within which it is fitted
+SPEED_RANGE = (0.8, 1.25)  # of the speed
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class AxleWeighing:
+    """Axle loads found in a log: by Moses' method, and by the fit with the vibration of the bridge.
+
+    The load of the fit has `forces` (N), `offsets` (m, behind the first axle), speed and entry
+    time. `dynamic` has the errors of the parameters of the fit on an unknown road, which are larger
+    than the fit's own.
+    """
+
+    moses: MosesFit
+    fit: Fit
+    dynamic: DynamicErrors
+
+    @property
+    def intervals(self) -> Float[np.ndarray, "parameter 2"]:
+        """95 % intervals of the parameters of the fit on an unknown road."""
+        values, half = self.fit.values, self.dynamic.half_widths
+        return np.stack([values - half, values + half], axis=1)
+
+    def _number(self, address: str) -> dict:
+        """Value, standard error and interval of a parameter of the fit."""
+        i = self.fit.addresses.index(address)
+        return {
+            "value": float(self.fit.values[i]),
+            "standard_error": float(self.dynamic.errors[i]),
+            "interval_95": self.intervals[i].tolist(),
+        }
+
+    @property
+    def load(self) -> Axles:
+        """The fitted axles."""
+        load = self.fit.cases[0].loads[0]
+        assert isinstance(load, Axles)
+        return load
+
+    def to_dict(self) -> dict:
+        """Axle loads with intervals by both methods, spacings and speed (SI units), for JSON."""
+        geometry = self.moses.geometry
+        count = len(self.moses.forces)
+        rows = zip(self.moses.forces, self.moses.errors, self.moses.intervals, strict=True)
+        gross, gross_error = self.moses.gross_weight
+        by_moses = [
+            {"value": float(force), "standard_error": float(error), "interval_95": pair.tolist()}
+            for force, error, pair in rows
+        ]
+        return {
+            "axles": [self._number(f"loads.0.forces.{i}") for i in range(count)],
+            "offsets": [self._number(f"loads.0.offsets.{i}") for i in range(1, count)],
+            "speed": self._number("loads.0.speed"),
+            "entry_time": self._number("loads.0.entry_time"),
+            "moses": {
+                "axles": by_moses,
+                "gross_weight": {"value": gross, "standard_error": gross_error},
+                "offsets": geometry.offsets[1:].tolist(),
+                "speed": geometry.speed,
+            },
+            "dynamic_share": self.dynamic.share,
+            "verdict": self.fit.verdict,
+        }
+
+    def __str__(self) -> str:
+        count, geometry = len(self.moses.forces), self.moses.geometry
+        rows = []
+        for i in range(count):
+            low, high = self.moses.intervals[i] / 1e3
+            own_low, own_high = self._number(f"loads.0.forces.{i}")["interval_95"]
+            rows.append(
+                (
+                    str(i + 1),
+                    f"{float(concrete(self.load.offsets)[i]):.4g}",
+                    f"{float(concrete(self.load.forces)[i]) / 1e3:.4g}",
+                    f"{own_low / 1e3:.4g} to {own_high / 1e3:.4g}",
+                    f"{self.moses.forces[i] / 1e3:.4g}",
+                    f"{low:.4g} to {high:.4g}",
+                )
+            )
+        gross, gross_error = self.moses.gross_weight
+        header = ("axle", "at (m)", "fitted (kN)", "95 % interval", "Moses (kN)", "95 % interval")
+        lines = [
+            f"{count} axles found",
+            *text_table(header, rows, ">>><><"),
+            f"gross weight by Moses' method {gross / 1e3:.5g} kN, standard error"
+            f" {gross_error / 1e3:.3g} kN, at {geometry.speed:.4g} m/s",
+            f"the intervals above allow for dynamic wheel forces of {self.dynamic.share:.2g} of the"
+            " static ones (standard deviation), those below do not",
+        ]
+        return "\n".join([*lines, "", str(self.fit)])
+
+
+def weigh_axles(
+    case: Case,
+    log: Log,
+    speeds: tuple[float, float],
+    axles: int,
+    *,
+    both_ways: bool = False,
+    influence_lines: InfluenceLines | None = None,
+) -> AxleWeighing:
+    """Forces and distances of the axles of one vehicle or train that crossed a known beam in a log.
+
+    `speeds` (m/s) are the lowest and highest possible ones, from the left or, with `both_ways`, in
+    both directions; `axles` is their number. Moses' method has the influence lines of the case, or
+    those given (see `calibrate_influence_lines`). The fit has moving forces, the vibration of the
+    beam, and offsets of the sensors; loads and profile of case and log are not used.
+
+    Raises ValueError if speeds are not 0 < low < high, there is no axle, or a sensor measures
+    velocity or acceleration, and as `identify` does.
+    """
+    low, high = speeds
+    if not 0 < low < high:
+        raise ValueError(f"speeds must be 0 < low < high in m/s; they are {low:g} and {high:g}")
+    if axles < 1:
+        raise ValueError(f"the number of axles must be 1 or more, not {axles}")
+    check_static(case)
+    case = dataclasses.replace(case, loads=(), vehicle_sensors=(), profile=None)
+    lines = model_influence_lines(case) if influence_lines is None else influence_lines
+    readings, valid = sensor_readings(case, log)
+    geometry = find_geometry(lines, log.times, readings, (low, high), axles, both_ways)
+    static = moses(lines, geometry, log.times, readings, valid, found=True)
+    fit = identify(case, *axle_problem(case, log, static))
+    problem = fit.least_squares
+    jacobian = problem.linearised(fit.values)[1][0]
+    errors = errors_of_fit(lines, fit.addresses, fit.values, jacobian, fit.noise[0], log.times,
+                           readings, readings - fit.fitted[0], valid)  # fmt: skip
+    return AxleWeighing(static, fit, errors)
+
+
+def errors_of_fit(
+    lines: InfluenceLines,
+    addresses: list[str],
+    values: Float[np.ndarray, " parameter"],
+    jacobian: Float[np.ndarray, "time sensor parameter"],
+    noise: Float[np.ndarray, " sensor"],
+    times: Float[np.ndarray, " time"],
+    readings: Float[np.ndarray, "time sensor"],
+    residuals: Float[np.ndarray, "time sensor"],
+    valid: np.ndarray,
+) -> DynamicErrors:
+    """Errors of the parameters of `axle_problem` on an unknown road.
+
+    `noise` is the standard deviation of the residuals, by which the fit has weighted the sensors.
+    """
+    found = dict(zip(addresses, values, strict=True))
+    axles = sum(address.startswith("loads.0.forces") for address in addresses)
+    forces = np.array([found[f"loads.0.forces.{i}"] for i in range(axles)])
+    offsets = np.array([0.0, *(found[f"loads.0.offsets.{i}"] for i in range(1, axles))])
+    length = float(lines.positions[-1])
+    at = AxleGeometry(found["loads.0.speed"], found["loads.0.entry_time"], offsets, length)
+    waves = dynamic_readings(lines.at(at.positions(times)), forces, times)
+    rows = np.moveaxis(jacobian, 2, 1)
+    return dynamic_errors(rows, waves, residuals, white_noise(readings, valid), valid / noise)
+
+
+def axle_problem(
+    case: Case, log: Log, static: MosesFit
+) -> tuple[Log, dict[str, tuple[float, float] | None]]:
+    """The log with the axles of Moses' method as its load, and the free parameters of the fit."""
+    geometry = static.geometry
+    least = 1e-2 * max(float(np.max(static.forces)), 1e-12)
+    load = Axles(
+        offsets=geometry.offsets,
+        forces=np.maximum(static.forces, least),
+        speed=geometry.speed,
+        entry_time=geometry.entry_time,
+    )
+    gaps = np.diff(geometry.offsets)
+    free: dict[str, tuple[float, float] | None] = {}
+    for i in range(len(static.forces)):
+        free[f"loads.0.forces.{i}"] = None
+    for i in range(1, len(static.forces)):
+        # Neighbours keep their order: each stays on its side of the middle between them.
+        behind = gaps[i] / 2 if i < len(gaps) else GAP_RANGE[1] * gaps[i - 1]
+        at = geometry.offsets[i]
+        free[f"loads.0.offsets.{i}"] = (at - GAP_RANGE[0] * gaps[i - 1], at + 0.98 * behind)
+    free["loads.0.speed"] = tuple(sorted(share * geometry.speed for share in SPEED_RANGE))
+    crossing = geometry.length / abs(geometry.speed)
+    free["loads.0.entry_time"] = (geometry.entry_time - crossing, geometry.entry_time + crossing)
+    free |= {f"sensors.{i}.offset": None for i in range(len(case.sensors))}
+    return dataclasses.replace(log, loads=(load,)), free
