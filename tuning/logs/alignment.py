@@ -74,7 +74,7 @@ def align_logs(logs: Sequence[Log]) -> Log:
 
 def _single_record(log: Log):
     rate, records, _ = even_records(log)
-    if len(records) > 1:
+    if len(records) != 1:
         raise ValueError(f"{log.source}: a log with gaps cannot be aligned; cut it at its gaps")
     return rate, records[0].start, records[0].values
 
