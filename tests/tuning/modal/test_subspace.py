@@ -60,6 +60,17 @@ def small_structure(seed):
     return Structure(frequencies, damping, whole.shapes[:3, :2], whole.inputs[:3])
 
 
+@pytest.mark.xfail(reason="of two modes 3 % apart, a log of 200 s often shows one")
+def test_close_modes_are_found_in_a_short_log():
+    found = []
+    for seed in range(3):
+        structure = small_structure(seed)
+        close = structure.frequencies * np.array([1.0, 4.12 / 6.0, 1.0])
+        planted = sampled(structure._replace(frequencies=close), "ambient", seed, 200.0)
+        found.append(compare(identify_modes(log_of(planted), band=(2.0, 11.0)), planted))
+    assert np.mean([seen for one in found for seen in one.found]) > 0.95
+
+
 @pytest.mark.parametrize("kind", ["ambient", "motor"])
 def test_intervals_cover_planted_modes(kind):
     """Two logs of what `experiments.validation.modal_identification` does with many."""
@@ -79,10 +90,13 @@ def test_intervals_cover_planted_modes(kind):
     assert np.mean([seen for one in found for seen in one.found]) > 0.85
 
 
-def test_as_good_as_another_program():
+@pytest.mark.parametrize(
+    "seed", [0, pytest.param(3, marks=pytest.mark.xfail(reason="the lowest mode is rejected"))]
+)
+def test_as_good_as_another_program(seed):
     """Modes that pyOMA-2 finds at a fixed order of the same log are found, as accurately."""
     ssi = pytest.importorskip("pyoma2.functions.ssi")
-    planted = sampled(small_structure(0), "ambient", 0, 200.0)
+    planted = sampled(small_structure(seed), "ambient", seed, 200.0)
     fit = identify_modes(log_of(planted), band=(2.0, 11.0))
     values = planted.values - planted.values.mean(axis=0)
     hankel, _ = ssi.build_hank(Y=values.T, Yref=values.T, br=40, method="cov", calc_unc=False)
