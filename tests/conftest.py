@@ -66,6 +66,17 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: -slow[item.path])
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _sweeps_in_xla():
+    """No large sweep of a test compiles the C integrator, which rounds otherwise, for later ones.
+
+    Tests of it have cache folders of their own.
+    """
+    native_peaks = sys.modules.get("jaxbeam.integrator.native_peaks")
+    if native_peaks and not native_peaks.available():
+        native_peaks.LIBRARY.remove()
+
+
 @pytest.fixture(autouse=True)
 def _close_figures():
     """Close the figures of a test: matplotlib warns of many open ones, and warnings are errors."""
