@@ -13,7 +13,7 @@ import jaxbeam as jb
 from jaxbeam.files.case_file import load_case, with_settings
 from tests.modules import ROOT
 
-CASE = load_case(ROOT / "examples" / "railway_bridge.toml")
+CASE = load_case(ROOT / "examples" / "railway_bridge" / "case.toml")
 SPEEDS = np.array([165.0, 230.0, 307.5, 332.5])  # km/h
 PEAKS = {
     "HSLM-A1": [7.449978, 17.82763, 8.37692, 7.573409],

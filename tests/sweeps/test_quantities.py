@@ -92,7 +92,7 @@ def test_peaks_under_a_slow_axle_are_the_static_ones():
 
 def test_moments_of_a_high_speed_train_converge_to_those_of_an_independent_program():
     """Case 3c of `trains.json`: HSLM-A1 at 230 km/h, 160 modes, corrected."""
-    case = load_case(ROOT / "examples" / "railway_bridge.toml")
+    case = load_case(ROOT / "examples" / "railway_bridge" / "case.toml")
     case = with_settings(case, {"loads.0.train": "HSLM-A1", "run.duration": 8.0, "beam.modes": 3})
     case = dataclasses.replace(case, sensors=(jb.Sensor(12.5, "moment"),))
     found = jb.sweep(case, {"loads.0.speed": [230 / 3.6]}, progress=False)
