@@ -286,14 +286,9 @@ def _(primals, tangents):
     return inverse, tangent_of_inverse
 
 
-@_one_matrix_per_call
-def _lstsq(matrix, right):
-    return jnp.linalg.lstsq(matrix, right)[0]
-
-
 def lstsq(matrix, right) -> Any:
-    """Least-squares solution (row,) first, as in `jax.numpy.linalg`, without derivatives."""
-    return (_lstsq(matrix, right),)
+    """Least-squares solution of least norm (row,) first, as in `jax.numpy.linalg`."""
+    return (pinv(matrix) @ right,)
 
 
 @jax.custom_jvp

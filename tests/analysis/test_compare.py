@@ -254,7 +254,10 @@ def test_metrics_over_several_load_cases(comparison, folder, monkeypatch, capsys
         ),
         ("compare weak.toml --controllers none.toml", "cannot read the case file none.toml"),
         ("compare weak.toml --controllers odd.toml", "odd.toml: controller must be one table"),
-        ("compare weak.toml -o out.pdf", "a comparison is written to a .png file"),
+        (
+            "compare weak.toml -o out.gif",
+            "a picture is written to a .png file; call it out.png, or .svg, .pdf",
+        ),
     ],
 )
 def test_errors_are_named(folder, monkeypatch, capsys, line, message):

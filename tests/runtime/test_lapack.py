@@ -149,6 +149,11 @@ def test_eigenvalues_without_derivative_and_least_squares():
     found = jax.vmap(lambda *system: xp.linalg.lstsq(*system)[0])(some, right)
     assert_allclose(found, np.linalg.solve(some, right[..., None])[..., 0], rtol=1e-9)
 
+    def loss(share):
+        return xp.sum(xp.linalg.lstsq(some[0][:, :2] + share * some[1][:, :2], right[0])[0] ** 2)
+
+    assert_allclose(jax.grad(loss)(0.3), central(loss, 0.3, 1e-5), rtol=1e-6)
+
 
 def test_exponentials_of_any_size_of_matrix():
     for size in (1e-9, 0.1, 3.0, 400.0):
