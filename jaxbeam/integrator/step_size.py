@@ -45,6 +45,7 @@ def longest_trial_step(case: Case, shapes: StaticShapes) -> float:
     return min(float(model_limits(case, shapes.layout)[0]), float(concrete(case.run.duration)))
 
 
+@np.errstate(all="ignore")  # of extreme numbers, and of runs that diverge
 def choose_step_size(case: Case, shapes: StaticShapes, tolerance: float) -> tuple[float, float]:
     """Longest step (s) whose deflections at TRIAL_POSITIONS meet the `tolerance`, and their error.
 
@@ -59,8 +60,7 @@ def choose_step_size(case: Case, shapes: StaticShapes, tolerance: float) -> tupl
     case = _without_later_vibration(case, model)
     halvings = 0
     for _ in range(MAX_TRIALS):
-        with np.errstate(all="ignore"):  # of runs that diverge
-            coarse, fine = (_trial_run(case, model, shapes, step, divided) for divided in (1, 2))
+        coarse, fine = (_trial_run(case, model, shapes, step, divided) for divided in (1, 2))
         error = largest_change(coarse, fine)
         if error <= tolerance:
             return step, error
@@ -79,8 +79,7 @@ def _without_later_vibration(case: Case, model: ModalModel) -> Case:
     Free vibration is exact with any step, and no error grows in it.
     """
     lowest = float(np.sqrt(np.maximum(np.min(model.modes.stiffness), 0.0)))
-    with np.errstate(all="ignore"):  # of extreme numbers
-        last_exit = float(np.max(load_set(case).entry_exit_times(), initial=0.0))
+    last_exit = float(np.max(load_set(case).entry_exit_times(), initial=0.0))
     end = last_exit + 2 * np.pi / lowest if lowest > 0 else np.inf
     return replace(case, {"run.duration": min(end, float(concrete(case.run.duration)))})
 
