@@ -12,6 +12,7 @@ MAX_WHEELS = 120  # of a record with amplification, as its static peaks take abo
 NEGLIGIBLE = 1e-6  # share of the largest static value of a quantity that counts as none
 
 
+@np.errstate(all="ignore")  # of extreme numbers
 def record_amplification(record: Record) -> list[float | None]:
     """Largest absolute over largest static value of the quantity of each sensor of a record.
 
@@ -40,6 +41,7 @@ def _static(case: Case, sensor: Sensor) -> float | None:
         return None
     parameters = sensor.fibre_distance, sensor.section_modulus
     try:
-        return float(static_amplified(case, [sensor.position], sensor.quantity, *parameters)[0])
+        value = float(static_amplified(case, [sensor.position], sensor.quantity, *parameters)[0])
     except ValueError:
         return None
+    return value if np.isfinite(value) else None
