@@ -1,12 +1,14 @@
 """Command line of tunings: calls of the library, files written, and refusals."""
 
 import json
+import types
 
 import numpy as np
 import pytest
 
 import jaxbeam as jb
 import tuning
+from jaxbeam.analysis import crossing_margin
 from jaxbeam.cli import main
 from tests.tuning.small_rig import GAIN, RIGIDITY, rig
 from tests.tuning.stand_in import dataset, fit, least_squares
@@ -80,6 +82,8 @@ def test_arguments_of_the_other_kinds_of_tuning(call, monkeypatch):
     arguments = {}
 
     class Result:
+        case = types.SimpleNamespace(controller=types.SimpleNamespace(open_loop=True))
+
         def to_dict(self):
             return {"verdict": "fine"}
 
@@ -101,12 +105,15 @@ def test_arguments_of_the_other_kinds_of_tuning(call, monkeypatch):
     class Reduced:
         tuned = Result()
 
+    margin = crossing_margin.StabilityMargin(2.0, 0.1)
+    monkeypatch.setattr(crossing_margin, "stability_margin", lambda case: margin)
     monkeypatch.setattr(tuning, "lexicographic", lexicographic)
     monkeypatch.setattr(tuning, "tune_reduced", tune_reduced)
     monkeypatch.setattr(tuning, "tune_integers", tune_integers)
-    assert json.loads(call(f"{TUNE} --lexicographic peak,effort --json")[1]) == {"verdict": "fine"}
+    printed = {"verdict": "fine", "stability": "stable"}
+    assert json.loads(call(f"{TUNE} --lexicographic peak,effort --json")[1]) == printed
     assert json.loads(call(f"{TUNE} --integers controller.power=1,3 --json")[1])
-    assert json.loads(call(f"{TUNE} --states 1 --starts 2 --json")[1]) == {"verdict": "fine"}
+    assert json.loads(call(f"{TUNE} --states 1 --starts 2 --json")[1]) == printed
     assert arguments == {
         "states": (1, [GAIN], 2),
         "lexicographic": (["peak", "effort"], "worst"),
