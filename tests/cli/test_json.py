@@ -64,10 +64,12 @@ KEYS = {
                 "smallest_time": None,
                 "largest": None,
                 "largest_time": None,
+                "dynamic_amplification": None,
             }
         ],
         "peak_deflection": None,
         "lowest_contact_force": None,
+        "largest_contact_force": None,
         "wheel_unloading": None,
         "contact_lost_time": None,
         "error_estimate": None,
