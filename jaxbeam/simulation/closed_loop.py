@@ -15,6 +15,7 @@ from jaxbeam.integrator.events import EventSchedule, controller_schedule
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Layout
+from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensing.sensor_signals import noise_samples, sensor_sections
 from jaxbeam.model.state_space import state_space
@@ -86,11 +87,15 @@ def closed_loop(
     noise = None
     if noisy and any(sensor.noise is not None for sensor in case.sensors):
         noise = noise_samples(case.run.seed, len(case.sensors), schedule.max_readings)
+    measured_rows = None
+    if any(sensor.has_feedthrough for sensor in case.sensors):
+        measured_rows = sensor_rows(model, case, case.sensors)
     return SampledLoop(
         plant=plant,
         law=law,
         model=model,
         output_rows=output_rows,
+        measured_rows=measured_rows,
         state_bound=_state_bound(case, model),
         loads=loads,
         schedule=schedule,

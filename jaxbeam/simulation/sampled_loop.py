@@ -17,7 +17,7 @@ from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.model.contact import contact_at
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.model.sensing.sensor_signals import filtered_reading, initial_filter_state
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, cond, is_jax, take, vmap, xp
@@ -44,13 +44,15 @@ class SampledLoop(AbstractInputPolicy):
     """Input policy of a sampled law; runs of a batch share the law, each has its own memory.
 
     The model includes the analogue filters of the sensors; `filter_sections` are those of the
-    digital ones.
+    digital ones. `measured_rows` are those of the quantities, of which accelerations follow from
+    the forces too; None without accelerations.
     """
 
     plant: Plant
     law: AbstractSampledLaw
     model: ModalModel
     output_rows: Float[Array, "sensor state"]
+    measured_rows: OutputRows | None
     state_bound: Float[Array, " state"]
     loads: LoadSet
     schedule: EventSchedule
@@ -123,7 +125,12 @@ class SampledLoop(AbstractInputPolicy):
     def _sample_sensors(self, memory, state, info):
         """Filter states and readings after the samples that are due at an event."""
         readings, filter_states, histories = memory.readings, [], []
-        signals = self._sensor_inputs(state, memory.command, info.start)
+        signals = cond(
+            xp.any(take(self.schedule.reading, info.event) >= 0),
+            lambda state: self._sensor_inputs(state, memory.command, info.start),
+            lambda state: xp.zeros((self.output_rows.shape[0], state.shape[1])),
+            state,
+        )
         for i, sensor in enumerate(self.plant.case.sensors):
             number = take(self.schedule.reading, (info.event, i))
             noise = None if self.noise is None else take(self.noise, (number, i))
@@ -145,13 +152,10 @@ class SampledLoop(AbstractInputPolicy):
     def _sensor_inputs(self, state, command, time):
         """Inputs of the sensors (sensor, batch) at a time (s)."""
         signals = self.output_rows @ state[: self.model.state_count]
-        sensors = self.plant.case.sensors
-        if not any(sensor.has_feedthrough for sensor in sensors):
+        if self.measured_rows is None:
             return signals
         contact = contact_at(self.model, self.loads, time, state, command)
-        return sensor_rows(self.model, self.plant.case, sensors).with_accelerations(
-            signals, contact.modal_acceleration
-        )
+        return self.measured_rows.with_accelerations(signals, contact.modal_acceleration)
 
     def _step_law(self, law_state, readings, state, command, time):
         """Step of the law for each run of the batch."""
