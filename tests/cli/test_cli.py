@@ -229,11 +229,14 @@ def test_modes_as_a_table(run, folder):
 
 
 def test_assess_cites_clauses(run, refused, folder):
-    line = "assess case.toml --line-speed 30 --code en1991-2"
+    """A bridge of 25 m and 7.1 Hz at 108 km/h needs no dynamic analysis."""
+    bridge = "--set beam.length=25 --set beam.flexural_rigidity=1.2e11"
+    bridge += " --set beam.mass_per_length=15000"
+    line = f"assess case.toml {bridge} --line-speed 30 --code en1991-2"
     assert "EN 1991-2, annex C" in run(f"{line} -o report.md")
     assert (folder / "report.md").read_text().startswith("# one span, one ball")
     found = run(f"{line} --json")
-    assert found["checks"][1]["outcome"] == "required"  # 15 Hz at 0.6 m: below 80 / 0.6
+    assert "not required" in {check["outcome"] for check in found["checks"]}
     assert "track cannot be 'gravel'" in refused(f"{line} --track gravel")
 
 
