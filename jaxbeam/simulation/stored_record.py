@@ -44,7 +44,7 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
         for name, shape in shapes.items()
         if 0 in shape and name not in dataset.variables
     }
-    dataset = dataset.assign(empty)
+    dataset = _with_extremes(dataset.assign(empty), case)
     mode_variables = {name: f"mode_{name}" for name in MODE_VARIABLES}
     required = (*_STORED_VARIABLES, *mode_variables.values(), "time")
     missing = [name for name in required if name not in dataset.variables]
@@ -66,6 +66,20 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
         controller_readings=xp.asarray(dataset["measured"].values) if _is_sampled(case) else None,
         **values,
     )
+
+
+def _with_extremes(dataset: "xarray.Dataset", case: Case) -> "xarray.Dataset":
+    """The dataset of release 0.1.0 with extremes of the samples: of deflections, else NaN."""
+    if "smallest" in dataset.variables or "deflection" not in dataset.variables:
+        return dataset
+    measured = np.array([sensor.quantity == "deflection" for sensor in case.sensors], bool)
+    values, times = dataset["deflection"].values, dataset["time"].values
+    found = {}
+    for name, index in (("smallest", values.argmin(axis=0)), ("largest", values.argmax(axis=0))):
+        extreme = np.take_along_axis(values, index[None], axis=0)[0]
+        found[name] = ("sensor", np.where(measured, extreme, np.nan))
+        found[f"{name}_time"] = ("sensor", np.where(measured, times[index], np.nan))
+    return dataset.assign(found)
 
 
 def _is_sampled(case: Case) -> bool:

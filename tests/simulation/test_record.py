@@ -185,11 +185,11 @@ def test_verdict_names_contact_loss_and_error(record):
     lost = eqx.tree_at(
         lambda r: (r.contact_lost_time, r.contact_lost_position, r.lowest_contact_force),
         record,
-        (jnp.array([nan, 0.25]), jnp.array([nan, 0.9]), jnp.array([1.0, -0.5])),
+        (jnp.array([0.25, nan]), jnp.array([0.9, nan]), jnp.array([-0.5, 1.0])),
     )
-    assert "load 1 loses contact, first at t = 0.25 s, x = 0.9 m" in lost.verdict
+    assert "load 0 loses contact, first at t = 0.25 s, x = 0.9 m" in lost.verdict
     assert "(smallest contact force -0.5 N)" in lost.verdict
-    assert "load 0" not in lost.verdict
+    assert "load 1" not in lost.verdict
 
 
 def test_record_without_loads_and_sensors(tmp_path):
