@@ -238,6 +238,7 @@ def test_assess_cites_clauses(run, refused, folder):
     found = run(f"{line} --json")
     assert "not required" in {check["outcome"] for check in found["checks"]}
     assert "track cannot be 'gravel'" in refused(f"{line} --track gravel")
+    assert "line_speed takes a number in m/s" in refused("assess case.toml --line-speed fast")
 
 
 def test_influence_lines_as_a_table(run, refused, folder):
@@ -249,6 +250,7 @@ def test_influence_lines_as_a_table(run, refused, folder):
     found = run("influence case.toml --quantity shear --at 150mm --json")
     assert max(found["shear at quarter 1 (1)"]) == pytest.approx(0.75, abs=0.02)
     assert "did you mean 'reaction'" in refused("influence case.toml --quantity reactions")
+    assert "--at takes a number in m" in refused("influence case.toml --at middle")
 
 
 def test_an_accelerometer_is_not_reported_as_deflection(run):

@@ -18,7 +18,7 @@ from jaxbeam.analysis.sections.characteristic_points import spans
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.declared_checks import suggestion
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.reading.units import in_si
+from jaxbeam.case.reading.units import number_in_si
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import modes
 from jaxbeam.model.sensing.mode_band import counted_frequency
@@ -77,9 +77,9 @@ def assess(
         if train not in library() or library()[train].forces is None:
             raise ValueError(f"{train!r} is no train of forces; {suggestion(train, HSLM_A)}")
     numbers = code_numbers()
-    speed = float(in_si(line_speed, "m/s", "line_speed"))
+    speed = number_in_si(line_speed, "m/s", "line_speed")
     lowest = numbers["line_speed"]["lowest"] if lowest_speed is None else lowest_speed
-    lowest = float(in_si(lowest, "m/s", "lowest_speed"))
+    lowest = number_in_si(lowest, "m/s", "lowest_speed")
     positive = {"line_speed": speed, "lowest_speed": lowest, "classification": classification}
     for name, number in positive.items():
         if not 0 < number < np.inf:
@@ -143,7 +143,7 @@ def _bridge(case: Case) -> Case:
 
 def _determinant_length(case: Case, given) -> float:
     if given is not None:
-        length = float(in_si(given, "m", "determinant_length"))
+        length = number_in_si(given, "m", "determinant_length")
         if not 0 < length < np.inf:
             raise ValueError(f"determinant_length must be positive; it is {length:g} m")
         return length

@@ -46,6 +46,20 @@ def in_si(value: Any, unit: str, name: str) -> Any:
     return _number_in_si(value, unit, name) if is_quantity(value) else value
 
 
+def number_in_si(value: Any, unit: str, name: str) -> float:
+    """A number, or a text with a number and perhaps a unit, as a number in a SI unit.
+
+    Raises ValueError, with `name` and text, for anything else.
+    """
+    converted = in_si(value, unit, name)
+    try:
+        return float(converted)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{name} takes a number in {unit}, or one with a unit, not {value!r}"
+        ) from None
+
+
 @functools.cache
 def _registry() -> Any:
     import pint

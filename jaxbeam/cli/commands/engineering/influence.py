@@ -47,11 +47,9 @@ def influence(
     parsed_case = options.read(case)
 
     from jaxbeam.analysis.sections.influence_table import influence_table
-    from jaxbeam.case.reading.units import in_si
+    from jaxbeam.case.reading.units import number_in_si
 
-    sections = tuple(
-        float(in_si(text, "m", "--at")) if not _is_number(text) else float(text) for text in at
-    )
+    sections = tuple(number_in_si(text, "m", "--at") for text in at)
     found = influence_table(
         parsed_case,
         quantity,
@@ -84,11 +82,3 @@ def influence(
 
 def _value_and_place(found, values, index) -> tuple[str, str]:
     return f"{values[index]:.6g}", f"{found.positions[index]:.6g}"
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
