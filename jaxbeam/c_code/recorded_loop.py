@@ -79,7 +79,7 @@ class FilteredLaw(AbstractSampledLaw):
         return ControlStep(step.command, (step.state, after), step.solved)
 
 
-class DesignedController(AbstractController):
+class _DesignedController(AbstractController):
     """Controller with a law that is designed already."""
 
     law_to_run: Any = None
@@ -136,7 +136,7 @@ def recorded_loop(case: Case, law: AbstractSampledLaw, max_samples: int) -> Reco
     times = np.arange(max(count, later + 2)) * period
     many = len(times) >= MIN_COMPILED
     is_compiled = designs_compiled(controller) or (controller.runs_compiled and many)
-    recorded = DesignedController(
+    recorded = _DesignedController(
         period=controller.period,
         delay=controller.delay,
         resolution=controller.resolution,
