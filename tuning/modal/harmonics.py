@@ -2,7 +2,8 @@
 
 A line is found by the F-test of several tapers (Thomson 1982; Percival and Walden 1993, section
 10.11): its power exceeds that of the continuous spectrum within the bandwidth of the tapers. It
-must have the same amplitude and phase throughout the record, which a resonance has not.
+must have the same amplitude and phase throughout the record, which a resonance has not, nor the
+decay of a lightly damped mode.
 """
 
 from typing import NamedTuple
@@ -16,6 +17,7 @@ TAPERS, TIME_BANDWIDTH = 7, 4.0
 FALSE_ALARM_PROBABILITY = 1e-3  # of a line in noise, in a whole spectrum
 PARTS = 8  # parts of a record in which a line is followed
 MIN_COHERENCE = 0.9  # length of the mean of its complex amplitudes over their rms
+MIN_FALL, FALL_SDS = 0.1, 4.0  # nepers over a record, and standard deviations, of a decay
 MAX_LINES = 30
 
 
@@ -100,7 +102,18 @@ def _followed(record, rate, frequency, variance) -> float | None:
         frequency += change
     z = _amplitudes(record, rate, frequency, PARTS)[:, channel]
     coherence = np.abs(np.mean(z)) / np.sqrt(np.mean(np.abs(z) ** 2))
-    return float(frequency) if coherence > MIN_COHERENCE else None
+    lasts = coherence > MIN_COHERENCE and not _falls(np.abs(z))
+    return float(frequency) if lasts else None
+
+
+def _falls(sizes):
+    """Whether amplitudes from part to part fall, beyond their scatter, as those of a decay."""
+    across = np.arange(sizes.size) - (sizes.size - 1) / 2
+    level = np.log(np.maximum(sizes, 1e-300))
+    slope = across @ level / (across @ across)
+    scatter = np.sum((level - level.mean() - slope * across) ** 2) / (sizes.size - 2)
+    deviation = np.sqrt(scatter / (across @ across))
+    return slope * sizes.size < -MIN_FALL and slope < -FALL_SDS * deviation
 
 
 def without_lines(

@@ -33,24 +33,15 @@ class IdentifiedMode(NamedTuple):
     quantile: float = 1.96
 
     @property
+    def pole(self) -> complex:
+        """Pole -z w + i w sqrt(1 - z^2) in 1/s, w the undamped angular frequency."""
+        root = -self.damping_ratio + 1j * np.sqrt(max(1 - self.damping_ratio**2, 0.0))
+        return complex(2 * np.pi * self.frequency * root)
+
+    @property
     def collinearity(self) -> float:
         """Modal phase collinearity of the shape: 1 if all channels move in phase or antiphase."""
         return float(phase_collinearity(self.shape[None])[0])
-
-
-class ModeCandidates(NamedTuple):
-    """Candidate modes with the reason for rejecting each (empty for a mode that is accepted).
-
-    `windows` (s) are the parts of the log used; `times`, `measured` and `fitted` are the part in
-    the band of the log and of the fit (None without a fit in time), for the first window.
-    """
-
-    modes: tuple[IdentifiedMode, ...]
-    rejection_reasons: tuple[str, ...]
-    windows: tuple[tuple[float, float], ...]
-    times: Float[np.ndarray, " sample"]
-    measured: Float[np.ndarray, "sample channel"]
-    fitted: Float[np.ndarray, "sample channel"] | None
 
 
 def rejection_reason(mode: IdentifiedMode, duration: float, band: tuple[float, float]) -> str:
