@@ -46,7 +46,9 @@ class IdentifiedMode(NamedTuple):
 
 def rejection_reason(mode: IdentifiedMode, duration: float, band: tuple[float, float]) -> str:
     """Reason why a mode found in `duration` seconds is not well identified; empty if it is."""
-    if not band[0] <= mode.frequency <= MAX_BAND_SHARE * band[1]:
+    half_width = max(mode.damping_ratio, 0.0) * mode.frequency  # where the power is half
+    highest = min(MAX_BAND_SHARE * band[1], band[1] - half_width)
+    if not band[0] + half_width <= mode.frequency <= highest:
         return "at the edge of the band"
     if not mode.quantile * mode.damping_sd < mode.damping_ratio:
         return "damping not distinguishable from none: hum, or a mode too weak or too short"
