@@ -16,7 +16,7 @@ MIN_SEGMENTS = 8  # segments averaged for the spectrum that decides the band
 BACKGROUND_OCTAVES = 1.0  # width of the running quantile that is the background of resonances
 BACKGROUND_PERCENT = 25  # below the peaks of a pair of modes, however much of an octave they fill
 RESONANCE_RATIO = 6.0  # of the spectrum over its background: 8 dB
-BAND_ENERGY_SHARE = 0.98  # of the kinetic energy of resonances, below the upper end of the band
+BAND_ENERGY_SHARE = 0.99  # of the kinetic energy of resonances, below the upper end of the band
 BAND_MARGIN = 1.3  # of the ends of the band beyond the outermost resonances
 MIN_CYCLES = 8.0  # cycles of the lowest frequency in the longest record
 

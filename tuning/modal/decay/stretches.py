@@ -20,6 +20,7 @@ QUIET_QUANTILE = 0.2  # of the blocks, by their prediction errors
 BLOW_SD = 10.0  # prediction errors of quiet blocks, beyond which the structure is struck
 BLOW_SIGNAL_SHARE = 0.25  # of the rms of the signal around, likewise
 BLOW_LOCAL_SD = 8.0  # or of the errors around it; normal errors reach six in a day of samples
+CONTACT_SAMPLES = 4  # within which past and future fail after a blow
 MIN_ENERGY_RISE = 2.0  # energy in two cycles after a blow over that before it
 MIN_DECAY_CYCLES = 8.0  # of the strongest vibration
 MIN_FALL_NEPERS = 1.0  # of the energy over a decay
@@ -77,11 +78,8 @@ def _is_large(error, around, span):
 
 
 def _widened(samples):
-    """Samples and their neighbours on either side."""
-    wide = samples.copy()
-    wide[1:] |= samples[:-1]
-    wide[:-1] |= samples[1:]
-    return wide
+    """Samples and their neighbours within `CONTACT_SAMPLES` on either side."""
+    return np.convolve(samples, np.ones(2 * CONTACT_SAMPLES + 1), "same") > 0.5
 
 
 def _prediction_errors(values, scale):
