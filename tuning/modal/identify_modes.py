@@ -20,7 +20,7 @@ from tuning.logs.units import time_derivative
 from tuning.modal.ambient import Candidate, subspace_modes
 from tuning.modal.decay.modes import Decays, excited, free_decay_modes
 from tuning.modal.fit import Choice, ModalFit
-from tuning.modal.harmonics import harmonic_lines, without_lines
+from tuning.modal.harmonics import Line, harmonic_lines, is_steady, without_lines
 from tuning.modal.preprocessing import kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels
 from tuning.modal.stabilisation import Diagram
@@ -95,6 +95,7 @@ def identify_modes(
             progress=progress,
         )
         found = (*ambient, None)
+        lines += _wandering_lines(ambient[0], cleaned, samples, used_band)
     found = _Found(*found)
     if kind is None:
         says = _kind_words(found, struck, lines)
@@ -139,6 +140,17 @@ def _subtract_lines(samples: Samples, band, exclude):
     return lines, tuple(without_lines(one, samples.rate, frequencies) for one in centred)
 
 
+def _wandering_lines(candidates, cleaned, samples, band) -> tuple[Line, ...]:
+    """Candidates of steady amplitude: lines of machines whose speed wanders."""
+    record = max(prepare(cleaned, samples.starts, samples.rate, band).records, key=len)
+    rate = samples.rate * len(record) / max(map(len, cleaned))
+    return tuple(
+        Line(c.mode.frequency, min(c.mode.energy_share, 1.0), c.mode.pole)
+        for c in candidates
+        if is_steady(record, rate, c.mode.frequency, c.mode.damping_ratio)
+    )
+
+
 def _result(logs, samples, found: _Found, band, lines, choices, method, count, exclude):
     """The fit: candidates divided into modes and rejected ones."""
     resolution = samples.rate / max(len(record) for record in samples.records)
@@ -149,8 +161,10 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, count, e
         hit = [one for one in lines if abs(mode.frequency - one.frequency) < 2 * resolution]
         if near:
             reason = f"excluded, {near[0]:g} Hz"
-        elif hit and not reason and found.decays is None and mode.damping_ratio < 0.002:
+        elif hit and found.decays is None and mode.damping_ratio < 0.002:
             reason = f"a harmonic line, {hit[0].frequency:.3f} Hz"
+        elif any(one.pole == mode.pole for one in lines):
+            reason = "of steady amplitude: a harmonic line that wanders"
         (rejected if reason else modes).append((mode, reason))
     modes.sort(key=lambda pair: -pair[0].energy_share)
     if count is not None:
