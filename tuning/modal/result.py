@@ -18,9 +18,9 @@ MAX_BAND_SHARE = 0.98  # of the upper end of the band; a mode above may be the f
 class IdentifiedMode(NamedTuple):
     """A mode: undamped natural frequency (Hz) and damping ratio, with standard deviations.
 
-    `energy_share` is its share of the energy of the log in the band. `shape` has a largest
-    component of one; `shape_covariance` is that of its real parts, then its imaginary parts.
-    `correlation` is that of frequency and damping ratio.
+    `energy_share` is its share of the energy of a channel in the band, on average over channels.
+    `shape` has a largest component of one; `shape_covariance` is that of its real parts, then its
+    imaginary parts.
     """
 
     frequency: float

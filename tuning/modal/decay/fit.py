@@ -1,5 +1,6 @@
 """Modes from free decays: poles, shapes, and rejection of poles that are not reproduced."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -27,11 +28,13 @@ WEAK_ENERGY_SHARE = 0.2  # of the strongest mode's energy; below it poles must b
 class DecayFit(NamedTuple):
     """Modes of free decays, and the fit in the band.
 
-    `gone` tells which modes are not reproduced in shorter windows; `measured` and `fitted` have a
-    column for each channel of each decay, `fitted` with drift and leakage into the band.
+    `energies` are sums of squared samples of each mode in each column; `gone` tells which modes are
+    not reproduced in shorter windows; `measured` and `fitted` have a column for each channel of
+    each decay, `fitted` with drift and leakage into the band.
     """
 
     modes: tuple[IdentifiedMode, ...]
+    energies: Float[np.ndarray, "mode column"]
     gone: tuple[bool, ...]
     measured: Float[np.ndarray, "sample column"]
     fitted: Float[np.ndarray, "sample column"]
@@ -68,6 +71,7 @@ def fit_decay(
     gone = _not_reproduced(found, shorter, spectrum)
     return DecayFit(
         modes=modes,
+        energies=_energies(found, spectrum),
         gone=tuple(gone.tolist()),
         measured=inverse_transform(spectrum.values, spectrum),
         fitted=inverse_transform(spectrum.values - found.residual, spectrum),
@@ -94,7 +98,7 @@ def _not_reproduced(found: PoleFit, others, spectrum: Spectrum):
         change = np.abs(pole_parameters(other.poles) - pole_parameters(found.poles)) / deviation
         change = np.where(other.poles.real > 0, np.inf, np.max(change.reshape(-1, 2), axis=1))
         moved = np.maximum(moved, np.where(told, change, 0.0))
-    share = _energy_shares(found, spectrum)
+    share = np.sum(_energies(found, spectrum), axis=1)
     return (moved > MAX_POLE_SHIFT_SD) & (share < WEAK_ENERGY_SHARE * np.max(share, initial=0.0))
 
 
@@ -119,15 +123,13 @@ def _nonstationary_variance(found: PoleFit, others):
     return extra
 
 
-def _energy_shares(found: PoleFit, spectrum: Spectrum):
-    """Share of each mode in the energy of the samples, added over channels."""
+def _energies(found: PoleFit, spectrum: Spectrum) -> Float[np.ndarray, "mode column"]:
+    """Sums of squared samples of each mode in each column."""
     rates = 2 * -found.poles.real * spectrum.duration
     decay_factor = np.where(
         np.abs(rates) < 1e-6, 1.0, -np.expm1(-rates) / np.where(rates, rates, 1)
     )
-    energies = 0.5 * np.sum(np.abs(found.amplitudes) ** 2, axis=1) * decay_factor
-    total = 2 * np.sum(np.abs(spectrum.values) ** 2) / spectrum.samples**2
-    return energies / total
+    return 0.5 * spectrum.samples * np.abs(found.amplitudes) ** 2 * decay_factor[:, None]
 
 
 def _identified_modes(
@@ -136,9 +138,7 @@ def _identified_modes(
     """Frequency |p| / 2 pi and damping ratio s / |p| of each pole, with standard deviations."""
     modes = []
     quantile = float(student.ppf(0.975, max(found.degrees_of_freedom, 3.0)))
-    for k, (pole, share) in enumerate(
-        zip(found.poles, _energy_shares(found, spectrum), strict=True)
-    ):
+    for k, pole in enumerate(found.poles):
         covariance = found.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
         covariance = covariance + np.diag(scatter[2 * k : 2 * k + 2])
         rate, angular_frequency, size = -pole.real, pole.imag, abs(pole)
@@ -151,7 +151,7 @@ def _identified_modes(
                 frequency_sd=float(np.sqrt(by_frequency @ covariance @ by_frequency)),
                 damping_ratio=float(rate / size),
                 damping_sd=float(np.sqrt(by_damping @ covariance @ by_damping)),
-                energy_share=float(share),
+                energy_share=math.nan,  # told by `energies`
                 shape=shape,
                 shape_covariance=shape_covariance,
                 quantile=quantile,

@@ -97,11 +97,12 @@ def free_decay_modes(
         sum(_within(getattr(fit, name), samples.rate, part) for part, fit in fits)
         for name in ("measured", "fitted")
     )
-    energy = np.sum(measured**2)
+    energy = np.sum(measured**2, axis=0)
     limit = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_ENERGY
-    found = _candidates(fits, energy, len(windows) / samples.rate, band)
+    by_channel = energy.reshape(-1, channels).sum(axis=0)
+    found = _candidates(fits, by_channel, len(windows) / samples.rate, band)
     good = any(not one.reason for one in found)
-    if kind is None and not (good and np.sum((measured - fitted) ** 2) < limit * energy):
+    if kind is None and not (good and np.sum((measured - fitted) ** 2) < limit * energy.sum()):
         return None
     return found, diagrams, Decays(used, measured[:, :channels], fitted[:, :channels])
 
@@ -115,13 +116,15 @@ def _within(values, rate, part):
 
 
 def _candidates(fits, energy, duration, band) -> tuple[Candidate, ...]:
-    """Modes of each part of the band, with their shares in the energy of the whole."""
+    """Modes of each part of the band, with their shares in the energy of the channels."""
     found = []
     for part, fit in fits:
-        share = np.sum(fit.measured**2) / max(energy, 1e-300)
-        for mode, gone in zip(fit.modes, fit.gone, strict=True):
+        decays = fit.energies.shape[1] // energy.size
+        by_channel = fit.energies.reshape(-1, decays, energy.size).sum(axis=1)
+        shares = np.mean(by_channel / np.maximum(energy, 1e-300), axis=1)
+        for mode, share, gone in zip(fit.modes, shares.tolist(), fit.gone, strict=True):
             if part[0] <= mode.frequency < part[1] or len(fits) == 1:
-                mode = mode._replace(energy_share=float(mode.energy_share * share))
+                mode = mode._replace(energy_share=share)
                 reason = rejection_reason(mode, duration, band) or (NOT_REPRODUCED if gone else "")
                 found.append(Candidate(mode, reason, 1))
     return without_duplicates(found)

@@ -103,13 +103,15 @@ def find_poles(
         * _smooth(np.abs(spectrum.values) ** 2, NEARBY_BINS)
         / (2 * NEARBY_BINS + 1)
     )
+    nuisance = _nuisance_columns(spectrum).shape[1]
+    most = max(2 * spectrum.bins.size - nuisance, 0) // 3  # a third of the numbers are left over
     if start is not None and start.size:
         frequencies = start.imag / (2 * np.pi)
         inside = (frequencies > spectrum.bins[0]) & (frequencies < spectrum.bins[-1])
         level = _robust_level(spectrum.values) + misfit_level
-        best = refine(start[inside][: spectrum.bins.size // 4], spectrum, level, COARSE_TOLERANCE)
+        best = refine(start[inside][:most], spectrum, level, COARSE_TOLERANCE)
         max_modes = min(max_modes, best.poles.size + MAX_ADDED_MODES)
-    while best.poles.size < min(max_modes, spectrum.bins.size // 4):
+    while best.poles.size < min(max_modes, most):
         level = _robust_level(best.residual) + misfit_level
         guess = _initial_pole(spectrum, best.residual, level)
         trial = refine(np.append(best.poles, guess), spectrum, level, COARSE_TOLERANCE)

@@ -22,7 +22,7 @@ BLOW_SIGNAL_SHARE = 0.25  # of the rms of the signal around, likewise
 BLOW_LOCAL_SD = 8.0  # or of the errors around it; normal errors reach six in a day of samples
 CONTACT_SAMPLES = 4  # within which past and future fail after a blow
 MIN_ENERGY_RISE = 2.0  # energy in two cycles after a blow over that before it
-MIN_DECAY_CYCLES = 8.0  # of the strongest vibration
+MIN_DECAY_CYCLES = 5.0  # of the strongest vibration
 MIN_FALL_NEPERS = 1.0  # of the energy over a decay
 MIN_LINEARITY = 0.6  # share of the variance of the log energy that a straight line explains
 MAX_COLUMNS = 24  # channels times decays that are fitted together
@@ -120,7 +120,7 @@ def free_decays(
     """Decays between the struck samples of records, in samples of these.
 
     `records` are those of the band, at the `rate` (Hz) after decimation; `frequency` (Hz) is that
-    of the strongest vibration. A decay lasts at least eight cycles, in which the energy falls by
+    of the strongest vibration. A decay lasts at least five cycles, in which the energy falls by
     one neper, along a line or after a blow that raised it; it ends when 99.9 % of the energy above
     the least has passed.
     """
