@@ -26,9 +26,7 @@ PERIOD, MASS, SPEED = 2e-4, 0.501, 0.5  # s, kg, m/s, of Fig. 5.4
 SENSOR, TOLERANCE = 1, 1e-4
 
 
-def observed_regulator(
-    rig: jb.Case, state_weights, command_weight: float, inconsistency: str
-) -> Finding:
+def observed_regulator(rig: jb.Case, state_weights, command_weight: float) -> Finding:
     """Reduction (%) of the peak by the observed regulator.
 
     `command_weight` is the other printed R, that of the experiments.
@@ -41,7 +39,9 @@ def observed_regulator(
         OTHER_SHAKER: _reduction(with_other_shaker(rig), state_weights, COMMAND_WEIGHT),
     }
     literal = _reduction(rig, state_weights, COMMAND_WEIGHT)
-    return make_finding(published.OBSERVED_REGULATOR, literal, alternatives, inconsistency)
+    return make_finding(
+        published.OBSERVED_REGULATOR, literal, alternatives, null=("no control", 0.0)
+    )
 
 
 def _reduction(rig: jb.Case, state_weights, command_weight: float) -> float:
