@@ -21,6 +21,7 @@ import dataclasses
 import numpy as np
 
 import jaxbeam as jb
+from experiments.studies.hand_set import HAND_SET, trapezium
 from experiments.studies.held_out import (
     CUBIC_CUTOFFS,
     CUBIC_FEEDBACK,
@@ -40,13 +41,13 @@ from tuning.control.run_set import RunSet, make_run_set
 
 DELAY = 0.02  # s
 IDEAL, BENCH = "tuned, ideal", "tuned, bench"
-DRAWN_LAWS = (CUBIC_FEEDBACK, BENCH, EXTRA_DELAY_LAW)
+DRAWN_LAWS = (CUBIC_FEEDBACK, HAND_SET, BENCH, EXTRA_DELAY_LAW)
 
 
 def run(load_rig) -> ExperimentResult:
     """Shares of the achievable reduction on rigs B and C, for held-out loads."""
     studies = [run_study(rig, load_rig(rig)) for rig in ("B", "C")]
-    remarks = [line for one in studies for line in one.remarks((CUBIC_FEEDBACK, IDEAL, BENCH))]
+    remarks = [line for one in studies for line in one.remarks((CUBIC_FEEDBACK, HAND_SET, BENCH))]
     title = "One tuned table of commands for all loads, held-out loads"
     return ExperimentResult((), {"shares": draw(studies, DRAWN_LAWS, title)}, tuple(remarks))
 
@@ -58,6 +59,7 @@ def run_study(rig: str, case: jb.Case) -> HeldOutStudy:
     controlled_cases = {
         CUBIC_FEEDBACK: with_feedback(case, 3, CUBIC_CUTOFFS[rig]),
         IDEAL: dataclasses.replace(case, controller=ideal),
+        HAND_SET: dataclasses.replace(case, controller=with_bench_delay(trapezium(rig))),
         BENCH: dataclasses.replace(case, controller=with_bench_delay(ideal)),
         EXTRA_DELAY_LAW: dataclasses.replace(case, controller=with_bench_delay(ideal, EXTRA_DELAY)),
     }

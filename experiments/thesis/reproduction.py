@@ -36,6 +36,7 @@ MODULES = (
     "thesis.chapter7.predictive_control",
     "studies.tuned_feedforward",
     "studies.sensor_feedback",
+    "studies.fragility",
 )
 OUTPUT_FOLDER = "out/reproduce"
 

@@ -134,9 +134,9 @@ def assign_verdicts(findings: Sequence[Finding]) -> list[FindingVerdicts]:
 
     Numbers that repeat others count for nothing. One that is within tolerance is "met by the null
     model" if that meets it too, "fitted to it" if a parameter was; else "reproduced", if the thesis
-    taken at its word meets it, or "explained". One that is not is "cannot be right" if there is a
-    proof, else "not reproduced". No interpretation that is less likely than the null model explains
-    anything.
+    taken at its word gives the same, or "explained". One that is not is "cannot be right" if there
+    is a proof, else "not reproduced". No interpretation that is less likely than the null model
+    explains anything.
     """
     assigned = []
     for one in findings:
@@ -146,7 +146,9 @@ def assign_verdicts(findings: Sequence[Finding]) -> list[FindingVerdicts]:
             key: sum(each.misfit(key) for each in group) for key in (*one.interpretations, None)
         }
         met, null_met = one.within_tolerance(name), one.null_within_tolerance
-        literal_met = one.within_tolerance(LITERAL)
+        as_printed = np.isclose(
+            one.interpretations[name], one.interpretations[LITERAL], rtol=1e-9, atol=0
+        )
         used = one.published.has_label(one.fitted[name]) if name in one.fitted else 0 * met
         likely = misfits[name] < misfits[None]
         verdicts = [
@@ -159,7 +161,7 @@ def assign_verdicts(findings: Sequence[Finding]) -> list[FindingVerdicts]:
             else FITTED
             if used[i]
             else REPRODUCED
-            if literal_met[i]
+            if as_printed[i]
             else EXPLAINED
             for i in range(met.size)
         ]

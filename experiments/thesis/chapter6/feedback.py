@@ -204,7 +204,9 @@ def _one_span(case: jb.Case):
         make_finding(published.FREE_VIBRATION_FREQUENCY, frequency, null=("one mode", frequency)),
     ]
     oscillating, filters = oscillation_findings(with_feedback(case, 3, ONE_SPAN_CUTOFF))
-    schedule, remark = derived_schedules(with_feedback(case, 1, ONE_SPAN_CUTOFF), MASSES)
+    schedule, remark = derived_schedules(
+        with_feedback(case, 1, ONE_SPAN_CUTOFF), MASSES[:: len(MASSES) - 1]
+    )
     heaviest = {name: row[len(MASSES) - 1] for name, row in zip(LAWS, records, strict=True)}
     figures = {
         "one-span": _draw(heaviest, "One span, 0.509 kg (Figs 6.3, 6.5)"),

@@ -30,8 +30,10 @@ def test_verdicts():
     assert verdicts(make_finding(TWO, [1.1, 22.1], null=FAR)) == [[REPRODUCED, NOT_REPRODUCED]]
     proof = make_finding(TWO, [1.1, 22.1], null=FAR, impossible="of that")
     assert verdicts(proof) == [[REPRODUCED, IRREPRODUCIBLE]]
-    other = make_finding(TWO, [1.1, 0.0], {"else": [1.0, 20.0]}, null=FAR)
+    other = make_finding(TWO, [1.1, 0.0], {"else": [1.1, 20.0]}, null=FAR)
     assert verdicts(other) == [[REPRODUCED, EXPLAINED]]
+    nearer = make_finding(TWO, [1.1, 0.0], {"else": [1.0, 20.0]}, null=FAR)
+    assert verdicts(nearer) == [[EXPLAINED, EXPLAINED]]
     nothing = make_finding(TWO, [np.nan, np.inf], null=FAR)
     assert verdicts(nothing) == [[NOT_REPRODUCED, NOT_REPRODUCED]]
     with pytest.raises(ValueError, match="2 numbers are printed"):
