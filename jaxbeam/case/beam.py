@@ -45,7 +45,8 @@ class Support(ReprWithUnits, eqx.Module):
     """Support at a position along a beam, rigid or elastic.
 
     Without a `stiffness` it holds the deflection rigidly; with one it is a vertical spring.
-    Supports enter the modes of the beam, except for their dampers, which couple the modes.
+    Supports enter the modes of the beam, except for their dampers, which couple the modes. A run
+    starts at rest on settled supports: see `jaxbeam.model.settlement`.
     """
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
@@ -58,6 +59,9 @@ class Support(ReprWithUnits, eqx.Module):
     )
     mass: Float[Array, ""] | None = number(
         "kg", "mass of an elastic bearing that moves with the beam", NOT_NEGATIVE, default=None
+    )
+    settlement: Float[Array, ""] | None = number(
+        "m", "lowering of its foot before the run, positive downwards", default=None
     )
 
 

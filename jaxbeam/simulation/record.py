@@ -17,7 +17,7 @@ from jaxbeam.files.tables import write_result
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.measurement import sensor_readings
-from jaxbeam.model.sensing.output_rows import quantity_history, sensor_history
+from jaxbeam.model.sensing.output_rows import sensor_history
 from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readings
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
@@ -109,12 +109,13 @@ class Record(TableViews, eqx.Module):
 
         Strain is that of the fibre at `fibre_distance` z (m) above the neutral axis, -z w_xx;
         stress the moment over the `section_modulus` (m^3). Curvature, strain and section forces are
-        statically corrected, hence right with few modes (see `corrected_history`). Raises
-        ValueError for an unknown quantity, strain without a fibre distance, or stress without a
-        section modulus.
+        statically corrected, hence right with few modes (see `corrected_history`). Moments, shear
+        forces and stresses include those of settled supports; sensors and all other quantities are
+        zero at the start of a run. Raises ValueError for an unknown quantity, strain without a
+        fibre distance, or stress without a section modulus.
         """
         parameters = fibre_distance, section_modulus
-        return quantity_history(self.case, self.modes, self.motion, x, quantity, *parameters)
+        return section_forces.history(self.case, self.modes, self.motion, x, quantity, *parameters)
 
     def bending_moment(self, x) -> Float[Array, "time ..."]:
         """Bending moment at positions x (m) in N m, positive where the beam sags: E I w_xx."""
