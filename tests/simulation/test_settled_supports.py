@@ -128,7 +128,7 @@ def test_gradients_of_the_surface():
 
     values = jnp.array([0.2, EI, 2.0])
     expected = central(heights, values)
-    assert_allclose(jax.jacfwd(heights)(values), expected, rtol=1e-8, atol=1e-10)
+    assert_allclose(jax.jit(jax.jacfwd(heights))(values), expected, rtol=1e-8, atol=1e-10)
 
 
 def test_sweep_of_settlement():

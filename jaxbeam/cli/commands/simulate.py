@@ -6,7 +6,13 @@ from pathlib import Path
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import check_suffix
-from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, print_plausibility, table
+from jaxbeam.cli.options import (
+    CaseOptions,
+    LabelledPictureOptions,
+    Output,
+    print_plausibility,
+    table,
+)
 from jaxbeam.files.endings import RESULTS
 
 MAX_WHEELS = 8  # of a load, or bodies, with a row each
@@ -19,7 +25,7 @@ def simulate(
     output: Output = None,
     plot: bool = False,
     animate: Path | None = None,
-    pictures: PictureOptions = PictureOptions(),
+    pictures: LabelledPictureOptions = LabelledPictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Simulate a case: peaks at sensors, contact forces, commands; the whole record on request.
@@ -44,6 +50,7 @@ def simulate(
     picture = pictures.path(plot, output, case)
     options.check_outputs(output, picture, animate)
     parsed_case = options.read(case)
+    labels = pictures.sensor_labels(parsed_case)
     plausibility = print_plausibility(parsed_case, options)
 
     from jaxbeam.simulation.simulate import ContactLossWarning
@@ -56,7 +63,7 @@ def simulate(
     if picture:
         from jaxbeam.plot import plot_record
 
-        figure = plot_record(record, ax=pictures.page(), title=pictures.title)
+        figure = plot_record(record, ax=pictures.page(), title=pictures.title, labels=labels)
         pictures.save(figure, picture)
     if animate:
         from jaxbeam.plot import animate as write_animation
