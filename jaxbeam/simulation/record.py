@@ -20,6 +20,7 @@ from jaxbeam.simulation import section_forces
 from jaxbeam.simulation.extremes import Extremes
 from jaxbeam.simulation.labels import contact_sentence
 from jaxbeam.simulation.record_envelope import RecordEnvelope, record_envelope
+from jaxbeam.simulation.truncation import MAX_SAMPLES, truncation_errors
 from jaxbeam.simulation.views.record_views import RecordViews
 
 if TYPE_CHECKING:
@@ -167,6 +168,18 @@ class Record(RecordViews):
         """
         return Extremes(self.smallest, self.smallest_time, self.largest, self.largest_time)
 
+    @property
+    def truncation_errors(self) -> Float[Array, " sensor"]:
+        """What the modes left out change, relative to the largest value at each sensor, about.
+
+        See `jaxbeam.simulation.truncation`: of deflections the static correction, of others the
+        dynamic part of the three highest modes, from up to 400 samples. `error_estimate` is that of
+        the time steps. NaN where it is not known.
+        """
+        chosen = np.unique(np.linspace(0, self.times.shape[0] - 1, MAX_SAMPLES).astype(int))
+        motion = Motion(*(part[chosen] for part in self.motion))
+        return truncation_errors(self.case, self.modes, motion)
+
     def _at_sensors(self, quantity: str) -> Float[Array, "time sensor"]:
         return self.at(self.case.sensor_positions, quantity)
 
@@ -262,5 +275,7 @@ class Record(RecordViews):
         failures = int(concrete(self.failures)[-1])
         if failures:
             parts.append(f"the controller found no solution in {failures} of its steps")
-        parts.append(f"estimated error {float(concrete(self.error_estimate)):.1e} of the peak")
+        parts.append(
+            f"estimated error of the steps {float(concrete(self.error_estimate)):.1e} of the peak"
+        )
         return "; ".join(parts)

@@ -160,7 +160,17 @@ def _lines(case: "jb.Case", results: "xarray.Dataset", addresses: Sequence[str])
     header = ("sensor", "quantity", "peak", "size", "time (s)")
     names = [_head(results[address]) for address in addresses]
     lines = [f"{runs}; peaks are largest absolute values:", *table((*header, *names), rows)]
-    return [*lines, *_contact_lines(results, addresses)]
+    return [*lines, *_truncation_lines(results), *_contact_lines(results, addresses)]
+
+
+def _truncation_lines(results: "xarray.Dataset") -> list[str]:
+    """Sentence on what the modes left out change of the peaks of each quantity, where known."""
+    errors = [
+        f"{name.removeprefix('peak_')} {peaks.attrs['truncation_error']:.1e}"
+        for name, peaks in ((str(name), results[name]) for name in results)
+        if "truncation_error" in peaks.attrs
+    ]
+    return [f"modes left out change the largest peaks by about: {', '.join(errors)}"] * bool(errors)
 
 
 def _head(values: "xarray.DataArray") -> str:
