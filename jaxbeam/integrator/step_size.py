@@ -117,7 +117,7 @@ def run_peaks(
     model = modal_model(case, shapes.layout, shapes.coupled)
     grid = grid_by_step_length(case, model, max_step)
     discrete = discrete_model(model, grid, positions)
-    return integrate_peaks(discrete, load_set(case), max_loads=shapes.max_loads)[0]
+    return integrate_peaks(discrete, load_set(case, shapes.layout), max_loads=shapes.max_loads)[0]
 
 
 def rounding_deflection(case: Case, model: ModalModel) -> float:

@@ -177,7 +177,7 @@ def _closed_loop_trial_run(case, shapes, schedule, substeps):
     Peaks would hide errors: where a command saturates, the deflection has its error everywhere but
     at a peak, where it is stationary.
     """
-    loads = load_set(case)
+    loads = load_set(case, shapes.layout)
     policy = closed_loop(case, shapes.layout, loads, schedule)
     grid = grid_by_schedule(case, policy.model, schedule, substeps)
     discrete = discrete_model(policy.model, grid, None, policy)
