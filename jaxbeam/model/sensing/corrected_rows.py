@@ -8,9 +8,10 @@ with the exact influence G of a force F_l at x_l on the quantity at x. The last 
 accelerations and commands; the residual of the loads depends on where they are.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import chebyshev
@@ -81,6 +82,25 @@ class LoadInfluence(Module):
         influence = xp.einsum("...k,...ko->...o", table, take(self.series, piece))
         return xp.concatenate([influence, -influence], -1) if self.mirrored else influence
 
+    def plus(self, other: "LoadInfluence") -> "LoadInfluence":
+        """Sum with another, whose breaks are among those of this one."""
+
+        def values(x):
+            return other.of_forces_at(x, x)
+
+        added = _to_series(self.breaks, self.series.shape[1], values)
+        return eqx.tree_at(lambda one: one.series, self, self.series + added)
+
+
+def _to_series(breaks, terms: int, function: Callable) -> Float[Array, "piece term output"]:
+    """Chebyshev series between breaks (m) through the values (..., output) of a function."""
+    points = chebyshev.chebpts1(terms)
+    middle, half = (breaks[1:] + breaks[:-1]) / 2, xp.diff(breaks) / 2
+    values = function(middle[:, None] + half[:, None] * points)
+    scale = np.where(np.arange(terms) == 0, 1.0, 2.0)[:, None] / terms
+    to_series = scale * chebyshev.chebvander(points, terms - 1).T
+    return xp.einsum("kp,spo->sko", to_series, values)
+
 
 def load_influence(
     case: Case,
@@ -100,16 +120,15 @@ def load_influence(
         breakpoints.append(np.linspace(0.0, 1.0, PARTS + 1))
     breaks = case.beam.length * xp.sort(xp.clip(xp.concatenate(breakpoints), 0.0, 1.0))
     terms = terms if uniform else max(terms, PART_TERMS)
-    points = chebyshev.chebpts1(terms)
-    middle, half = (breaks[1:] + breaks[:-1]) / 2, xp.diff(breaks) / 2
-    x = middle[:, None] + half[:, None] * points
-    values = -piecewise_chebyshev(modes.nodes, modes.series @ on_modes, x, (0,))[0]
-    for one, factor, index in greens:
-        at = np.s_[..., np.array(index, int)]
-        values = set_at(values, at, values[at] + factor * one(x / case.beam.length))
-    scale = np.where(np.arange(terms) == 0, 1.0, 2.0)[:, None] / terms
-    to_series = scale * chebyshev.chebvander(points, terms - 1).T
-    return LoadInfluence(breaks, xp.einsum("kp,spo->sko", to_series, values))
+
+    def influence(x):
+        values = -piecewise_chebyshev(modes.nodes, modes.series @ on_modes, x, (0,))[0]
+        for one, factor, index in greens:
+            at = np.s_[..., np.array(index, int)]
+            values = set_at(values, at, values[at] + factor * one(x / case.beam.length))
+        return values
+
+    return LoadInfluence(breaks, _to_series(breaks, terms, influence))
 
 
 class StaticCorrection(Module):
@@ -118,21 +137,26 @@ class StaticCorrection(Module):
     rows: CorrectionRows
     influence: LoadInfluence
 
+    def scaled(self, share) -> "StaticCorrection":
+        """This share of the correction."""
+        influence = eqx.tree_at(
+            lambda one: one.series, self.influence, share * self.influence.series
+        )
+        return StaticCorrection(jax.tree.map(lambda row: share * row, self.rows), influence)
+
 
 def static_correction(
     model: ModalModel,
     case: Case,
     sensors: Sequence[Sensor],
     outputs: OutputRows,
-    modal_sums: int = 0,
 ) -> StaticCorrection | None:
     """Static correction of the `outputs` of sensors, in the coordinates of their modal model.
 
-    The last `modal_sums` of the sensors are left as sums of the modes. None where no sensor
-    measures a curvature, strain or section force, and for beams that can move as a rigid body.
+    None where no sensor measures a curvature, strain or section force, and for beams that can move
+    as a rigid body.
     """
-    corrected = sensors[: len(sensors) - modal_sums]
-    bending = [i for i, sensor in enumerate(corrected) if sensor.bends]
+    bending = [i for i, sensor in enumerate(sensors) if sensor.bends]
     layout = model.modes.layout
     if not bending or not is_supported(case, layout):
         return None
