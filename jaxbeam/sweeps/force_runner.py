@@ -49,13 +49,12 @@ class ForceRunner:
         phase = 2 * (SAMPLE_DIVISOR * allowed) ** (1 / SAMPLE_ORDER)
         count = len(self.batches.run_index)
         phase = float(np.clip(phase, LEAST_PHASE, LARGEST_PHASE))
-        sample = stratified_sample(np.arange(1.0, count + 1), min(TRIAL_RUNS, count))
-        coarse, fine = (
-            np.stack(
-                [self._peaks(run, phases[run] / ratio).peak_deflection for run in sample.tolist()]
-            )
-            for ratio in (1.0, REFINEMENT)
-        )
+        sample = stratified_sample(np.arange(1.0, count + 1), min(TRIAL_RUNS, count)).tolist()
+
+        def peaks(phase):
+            return np.stack([self._peaks(run, phase).peak_deflection for run in sample])
+
+        coarse, fine = peaks(phase), peaks(phase / REFINEMENT)
         error = float(np.nanmax(relative_changes(coarse, fine), initial=0.0))
         return np.full(count, phase), error
 
