@@ -22,6 +22,7 @@ def frequency(n: int, rigidity: float = 11.68) -> float:
 
 REFUSED = [
     ("simulat case.toml", 'Unknown command "simulat". Did you mean "simulate"?'),
+    ("simulate case.toml more", "simulate takes no further 'more'; see jaxbeam simulate --help"),
     ("simulate", "requires an argument"),
     ("simulate case.toml --plott", "--plott"),
     ("simulate none.toml", "cannot read the case file none.toml: no such file or directory"),
