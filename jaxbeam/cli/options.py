@@ -26,6 +26,7 @@ from jaxbeam.cli.arguments import (
     parse_value,
 )
 from jaxbeam.files.report import text_table
+from jaxbeam.runtime.whole_file import whole_file
 
 PICTURES = (".png", ".svg", ".pdf")
 
@@ -179,7 +180,8 @@ class DrawingOptions:
         size = self.inches()
         if size is not None:
             whole.set_size_inches(size)
-        whole.savefig(path, dpi=self.dpi)
+        with whole_file(path, overwrite=True) as beside:  # refused before, where it is not asked
+            whole.savefig(beside, dpi=self.dpi)
 
 
 @Parameter(name="*")
