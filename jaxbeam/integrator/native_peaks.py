@@ -31,6 +31,7 @@ from jaxbeam.integrator.step_matrices import CHUNK_STEPS
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.model.settlement import has_settlement
 from jaxbeam.numerics.gauss import lagrange_coefficients
 from jaxbeam.numerics.peak_search import (
     ESTIMATE_ITERATIONS,
@@ -88,6 +89,7 @@ def supports(case: Case) -> bool:
     plain = (
         case.controller is None
         and case.profile is None
+        and not has_settlement(case)
         and not any(
             load.vehicle(case.run.gravity).names or load.force_histories() for load in case.loads
         )
