@@ -90,7 +90,7 @@ def _remark(loops: Mapping[str, tuple[ObservedLoop, ObservedLoop]]) -> str:
         parts.append(
             f"{name}: peak at 0.25 m {_peak_reduction(uncontrolled, controlled):+.0f} % below no"
             f" control, q1 of the observer off by at most"
-            f" {100 * off / np.abs(controlled.states[:, 0]).max():.0f} % of its largest"
+            f" {100 * off / np.abs(controlled.states[:, 0]).max():.2g} % of its largest"
         )
     return f"Observer in the loop, {OTHER_SHAKER}. " + "; ".join(parts)
 
