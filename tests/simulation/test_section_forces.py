@@ -214,6 +214,29 @@ def test_a_force_standing_on_two_spans(a):
     assert_allclose(inner[-1], reactions[1] - weight_there, rtol=0, atol=1e-8)
 
 
+@pytest.mark.parametrize("controlled", [False, True])
+def test_a_force_on_a_support_takes_no_shorter_steps(controlled):
+    """It deflects nothing, so that no step meets a tolerance relative to the deflection."""
+    parts: dict = {}
+    if controlled:
+        parts["actuators"] = [jb.Shaker(0.4, 0.0, 0.0, 1.0)]
+        parts["sensors"], parts["controller"] = [jb.Sensor(0.5)], jb.Feedback([1.0], period=0.1)
+    beam = jb.Beam(length=2.0, damping_ratio=0.05, modes=3, **UNIT)
+    beside, on = (
+        integration_plan(
+            jb.Case(
+                beam,
+                supports=[jb.Support(1.0)],
+                loads=[jb.MovingForce(force=2.0, times=[0.0, 9.0], positions=[x, x])],
+                run=jb.Run(1.0, sample_rate=10.0),
+                **parts,
+            )
+        ).substeps
+        for x in (0.9, 1.0)
+    )
+    assert on <= beside
+
+
 def test_sides_other_than_left_and_right_are_refused():
     record = standing(0.5, jb.Beam(length=1.0, **UNIT))
     with pytest.raises(ValueError, match="side must be 'left' or 'right' of x, not 'top'"):
