@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.case import Case, value_at
+from jaxbeam.case.case import Case, concrete_case, value_at
 from jaxbeam.integrator.events import sample_schedule
 from jaxbeam.integrator.static_shapes import StaticShapes, max_concurrent_loads
 from jaxbeam.model.load_set import load_set
@@ -79,8 +79,13 @@ class Runner:
         self.shapes = StaticShapes(layout, has_coupling(case), max_loads, native)
         # The C library makes its own step matrices.
         self.discretise_separately = case.controller is None and not native
-        entries, exits = self._compile_programs()
-        limits = self._make_models()
+        self.known_outputs = None
+        if self.same_model:
+            limits = self._make_shared_model()
+            entries, exits = self._compile_programs()
+        else:
+            entries, exits = self._compile_programs()
+            limits = self._make_models()
         self._set_step_limits(entries, exits, limits)
 
     def _set_block_size(self):
@@ -105,11 +110,19 @@ class Runner:
         return np.asarray(times), np.asarray(steps)
 
     def _model_groups(self) -> list:
-        """Indices of batches whose models are made in one call: one batch if all share a model."""
-        if self.same_model:
-            return [[0]]
+        """Indices of batches whose models are made in one call."""
         count = self.batches.run_index.shape[0]
         return list(np.resize(np.arange(count), (self.block_count, self.batches_per_block)))
+
+    def _make_shared_model(self) -> Float[np.ndarray, " path"]:
+        """Make model and outputs that all batches share, of known numbers; longest stable steps."""
+        program = programs.Program(concrete_case(self.case), self.shapes, *self.addresses)
+        values = self.batches.shared_values[0]
+        model, limit = programs.model_and_limit(program, values)
+        self.models = jax.tree.map(lambda leaf: np.asarray(leaf)[None], model)
+        if self.case.controller is None:
+            self.known_outputs = jax.tree.map(np.asarray, program.outputs(model, values))
+        return _stable_steps(np.repeat(np.asarray(limit), self.batches.run_index.shape[0]))
 
     def _compile_programs(self) -> tuple[np.ndarray, np.ndarray]:
         """Compile the programs for step sizes; entry and exit times (path, load) in s."""
@@ -132,13 +145,8 @@ class Runner:
             programs.modal_models(program, self.batches.shared_values[group])
             for group in self._model_groups()
         ]
-        if self.same_model:
-            self.models, limit = groups[0]
-            limits = np.repeat(np.asarray(limit), count)
-        else:
-            self.models, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *groups)
-        limits = limits[:count]
-        return np.where(np.isfinite(limits), limits, np.inf)  # such a run fails with any step
+        self.models, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *groups)
+        return _stable_steps(limits[:count])
 
     def _set_step_limits(self, entries, exits, limits):
         """Crossing rates (1/s), longest steps and initial steps (s) of all batches."""
@@ -165,10 +173,10 @@ class Runner:
         def peaks(batch_indices, steps, extra_steps=0, single=False):
             calls = batch_indices.size // self.trial_batches
             parts = zip(np.split(batch_indices, calls), np.split(steps, calls), strict=True)
-            results = [self._integrate(*part, None, single, extra_steps) for part in parts]
-            names = "peak_deflection", programs.MODAL_SUM_PEAK
-            columns = ([one.get(name, np.zeros(0)) for one in results] for name in names)
-            return self._compared_by_quantity(*map(np.concatenate, columns))
+            settings = None, single, extra_steps, False
+            results = [self._integrate(*part, *settings) for part in parts]
+            found = [one["peak_deflection"] for one in results]
+            return self._compared_by_quantity(np.concatenate(found))
 
         search = self.crossing_rates, self.initial_steps, self.max_steps, count, self.tolerance
         steps, error = choose_step_sizes(peaks, *search, self.pool.map)
@@ -179,22 +187,15 @@ class Runner:
             )
         return steps, error
 
-    def _compared_by_quantity(self, peaks, modal_sums):
+    def _compared_by_quantity(self, peaks):
         """Peaks (path, batch, sensor), those of each quantity as further runs of the batch.
 
-        Small peaks of one quantity then are not judged by large ones of another unit. Of statically
-        corrected quantities the sums of the modes count as well.
+        Small peaks of one quantity then are not judged by large ones of another unit.
         """
-        sensors = self.case.sensors
-        quantities = np.array([sensor.quantity for sensor in sensors])
-        parts = [peaks * (quantities == quantity) for quantity in np.unique(quantities)]
-        if modal_sums.size:
-            own = np.array([sensor.bends for sensor in sensors])
-            sums = np.zeros_like(peaks)
-            sums[..., own] = modal_sums
-            kinds = np.unique(quantities[own])
-            parts += [sums * (quantities == quantity) for quantity in kinds]
-        return np.concatenate(parts, axis=1)
+        quantities = np.array([sensor.quantity for sensor in self.case.sensors])
+        return np.concatenate(
+            [peaks * (quantities == one) for one in np.unique(quantities)], axis=1
+        )
 
     def run_count(self, block: int) -> int:
         """Number of runs in a block, without padding."""
@@ -208,17 +209,16 @@ class Runner:
         substeps = None
         if self.histories:
             substeps = steps_per_interval(float(self.schedule.lengths.max()), steps.min())
-        results = self._integrate(batch_indices, steps[batch_indices], substeps, self.single)
-        results.pop(programs.MODAL_SUM_PEAK, None)
-        return results
+        return self._integrate(batch_indices, steps[batch_indices], substeps, self.single)
 
     def _programs_to_compile(self, program, shared_values):
         """Programs that step sizes need, the slowest to compile first, and template arguments."""
-        model_template, _ = programs.modal_models.template(program, shared_values)
         indices = np.zeros(self.batches_per_block, int)
         step_size, mask = (np.ones(self.batches_per_block), indices), indices > 0
-        models = model_template
-        if not self.same_model:
+        if self.same_model:
+            models = self.models
+        else:
+            model_template, _ = programs.modal_models.template(program, shared_values)
             models = jax.tree.map(lambda leaf: leaf[indices], model_template)
         discretise_arguments = program, mask, models, self.batches.shared_values[indices], step_size
         if self.discretise_separately:
@@ -231,10 +231,13 @@ class Runner:
         )
         if self.discretise_separately:
             yield programs.discrete_models, discretise_arguments
-        yield programs.modal_models, (program, shared_values)
+        if not self.same_model:
+            yield programs.modal_models, (program, shared_values)
 
-    def _integrate(self, batch_indices, steps, substeps, single, extra_steps=0):
-        """Results of at most a block of batches by name."""
+    def _integrate(
+        self, batch_indices, steps, substeps, single, extra_steps=0, corrected: bool = True
+    ):
+        """Results of at most a block of batches by name; statically corrected, or not."""
         # Fewer batches are spread over the block, so that each device has its part.
         rows = np.arange(batch_indices.size) * self.batches_per_block // batch_indices.size
         mask = np.zeros(self.batches_per_block, bool)
@@ -242,7 +245,7 @@ class Runner:
         nearest_row = np.cumsum(mask) - 1
         batch_indices, steps = batch_indices[nearest_row], steps[nearest_row]
         step_size = steps, np.full(batch_indices.size, extra_steps)
-        program, models = self.program(substeps), self._models_of(batch_indices)
+        program, models = self.program(substeps, corrected), self._models_of(batch_indices)
         shared_values, batched_values = self._values_of(batch_indices)
         if self.discretise_separately:
             models = programs.discrete_models(program, mask, models, shared_values, step_size)
@@ -274,16 +277,22 @@ class Runner:
         """Shared and batched values of batches."""
         return self.batches.shared_values[batch_indices], self.batches.batched_values[batch_indices]
 
-    def program(self, substeps: int | None = None) -> programs.Program:
-        """Static data of the programs; with `substeps` per sample interval, also for histories."""
+    def program(self, substeps: int | None = None, corrected: bool = True) -> programs.Program:
+        """Data of the programs; with `substeps` per sample interval, also for histories."""
         scheduled = substeps is not None or self.case.controller is not None
         sampling = (self.schedule if scheduled else None), substeps
-        return programs.Program(self.case, self.shapes, *self.addresses, *sampling)
+        outputs = self.known_outputs, np.asarray(float(corrected))
+        return programs.Program(self.case, self.shapes, *self.addresses, *sampling, *outputs)
 
 
 def _round_up(count: int, unit: int) -> int:
     """Smallest multiple of a unit that is at least a count."""
     return -(-count // unit) * unit
+
+
+def _stable_steps(limits) -> Float[np.ndarray, " path"]:
+    """Longest stable steps (s), infinite where there is none: such a run fails with any step."""
+    return np.where(np.isfinite(limits), limits, np.inf)
 
 
 def _values_at(case: Case, batches: Batches, address: str) -> Float[np.ndarray, " path"]:

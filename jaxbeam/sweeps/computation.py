@@ -18,6 +18,7 @@ from jaxbeam.sweeps import cluster, store as sweep_store
 from jaxbeam.sweeps.batches import Batches
 from jaxbeam.sweeps.block_store import BlockStore, MemoryStore
 from jaxbeam.sweeps.blocks import Runner
+from jaxbeam.sweeps.force_runner import ForceRunner
 from jaxbeam.sweeps.specification import SweepSpecification
 from jaxbeam.sweeps.truncation import estimated_errors, is_corrected
 
@@ -86,7 +87,9 @@ def count_as_done(progress_bar: tqdm, runs: int) -> None:
     progress_bar.refresh()
 
 
-def _compute(runner: Runner, blocks: list[int], steps, block_store: BlockStore) -> Iterator[int]:
+def _compute(
+    runner: Runner | ForceRunner, blocks: list[int], steps, block_store: BlockStore
+) -> Iterator[int]:
     """Numbers of blocks as they are computed, on all cores, and stored."""
     results = runner.pool.map(lambda block: (block, runner.compute_block(block, steps)), blocks)
     # An error or an interrupt closes the iterator, which cancels blocks not yet started.
