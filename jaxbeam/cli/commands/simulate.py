@@ -23,12 +23,13 @@ def simulate(
     /,
     *,
     output: Output = None,
-    plot: bool = False,
     animate: Path | None = None,
     pictures: LabelledPictureOptions = LabelledPictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Simulate a case: peaks at sensors, contact forces, commands; the whole record on request.
+
+    `--plot` draws the record to a PNG beside the output, or named after the case.
 
     Parameters
     ----------
@@ -37,8 +38,6 @@ def simulate(
     output
         Write all of the record to this file, OUT.nc or OUT.zarr, or what sensors measure, contact
         forces and commands to a table: OUT.csv, .xlsx, .mat or .parquet.
-    plot
-        Draw the record to a PNG beside the output, or named after the case.
     animate
         Write an animation of the run to this file, OUT.gif, or OUT.mp4 if ffmpeg is installed.
     """
@@ -47,7 +46,7 @@ def simulate(
         from jaxbeam.plot.traffic.film import check_film
 
         check_film(animate)
-    picture = pictures.path(plot, output, case)
+    picture = pictures.path(output, case)
     options.check_outputs(output, picture, animate)
     parsed_case = options.read(case)
     labels = pictures.sensor_labels(parsed_case)
