@@ -16,6 +16,7 @@ from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import Motion, corrected_history
 from jaxbeam.model.statics import static_deflection_per_command
 from jaxbeam.simulation.corrected_deflection import corrected_deflection
+from jaxbeam.simulation.stored_record import record_from_xarray
 from tests.differences import central
 from tests.modules import ROOT
 from tests.oracles.section_elements import crossing, modes
@@ -192,6 +193,28 @@ def test_equilibrium():
     bearing = 0.3 * np.asarray(record.at(0.0, "acceleration"))
     assert_allclose(total - bearing, 0, atol=1e-8)
     assert_allclose(moment, 0, atol=1e-8)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_section_forces_of_a_record_from_a_file(tmp_path, kept):
+    """Also from files of releases that did not keep the rotations of a Timoshenko beam."""
+    case = jb.Case(
+        complete_beam(ends="clamped-pinned"),
+        loads=[jb.MovingForce(force=2.0, speed=0.7)],
+        run=jb.Run(1 / 0.7, sample_rate=10.0),
+    )
+    record = jb.simulate(case)
+    dataset = record.to_xarray()
+    assert_allclose(dataset["reaction"].sel(support=1.0), record.reactions[:, 1])
+    if kept:
+        record.save(tmp_path / "record.nc")
+        found = jb.read_record(tmp_path / "record.nc")
+    else:
+        former = dataset.drop_vars(["mode_rotation_series", "reaction"])
+        found = record_from_xarray(former)
+    assert_allclose(found.bending_moment(0.4), record.bending_moment(0.4), rtol=1e-12)
+    assert_allclose(found.shear_force(0.4), record.shear_force(0.4), rtol=1e-12)
+    assert_allclose(found.reactions, record.reactions, rtol=1e-12)
 
 
 def test_static_closed_forms():
