@@ -42,6 +42,7 @@ def test_settled_supports(folder, run):
     moment = 3 * 11.68 * 1e-3 / 0.3**2
     expected = f"settled: supports.0 by 1 mm; moments locked in from 0 N m to {moment:.4g} N m"
     assert expected in run("describe case.toml")
+    assert f"{expected}; sensors read changes from there" in run("simulate case.toml")
 
 
 def test_case_of_a_train_in_words(run, folder):

@@ -98,7 +98,7 @@ def _about_case(path: str) -> tuple[dict[str, Any], list[str]]:
             f"largest static deflection under the loads: {with_prefix(found.deflection, 'm')},"
             f" 1/{found.span_over_deflection:.0f} of the span of {found.span:.4g} m"
         )
-    lines += _settlement_words(case)
+    lines += settlement_words(case)
     if found.critical_speed is not None:
         lines.append(f"critical speed: {_speed(found.critical_speed)}")
     lines += [*_load_times(case), *_sensor_words(case), f"plausibility: {found}"]
@@ -119,7 +119,7 @@ def _beam_words(case: "Case") -> str:
     )
 
 
-def _settlement_words(case: "Case") -> list[str]:
+def settlement_words(case: "Case") -> list[str]:
     """What settles, and the smallest and largest moment that this locks in."""
     import numpy as np
 

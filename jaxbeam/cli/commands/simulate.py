@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import check_suffix
+from jaxbeam.cli.commands.describe import settlement_words
 from jaxbeam.cli.options import (
     CaseOptions,
     LabelledPictureOptions,
@@ -74,6 +75,8 @@ def simulate(
     amplification = record_amplification(record)
     content = _to_dict(record, amplification) | {"plausibility": plausibility}
     lines = _lines(record, amplification)
+    for words in settlement_words(parsed_case):
+        lines.append(f"{words}; sensors read changes from there")
     controller = parsed_case.controller
     if controller is not None and not controller.open_loop:
         from jaxbeam.analysis.crossing_margin import stability_margin
