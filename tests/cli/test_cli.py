@@ -75,7 +75,7 @@ REFUSED = [
     ("identify log.csv -o fit.toml", "-o and --set are for fitting a case; name what is free"),
     ("identify case.toml log.csv --free beam.length=2:1", "bounds are LOW:HIGH, such as 5:20"),
     ("identify case.toml log.csv --free beam.length=0:b", "'b' is not a number"),
-    ("identify case.toml log.csv --free beam.length=1:2m", "give both bounds a unit, as in 8 GN"),
+    ("identify case.toml log.csv --free beam.length=1:2m", "give both numbers a unit, as in 8 GN"),
     ("identify case.toml log.csv --free beam.length -o case.toml", "case.toml exists; choose"),
     (
         "weigh case.toml old.nc --speeds 5:20 --calibration old.nc",
