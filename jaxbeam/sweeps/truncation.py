@@ -81,26 +81,34 @@ def estimated_errors(case: Case, worst: dict[str, dict[str, float]]) -> dict[str
     rotations the error is the static one; others are estimated from that run (see
     `truncation_errors`), without a controller.
     """
-    errors = static_shares(case)
+    errors, records = static_shares(case), {}
     quantities = [sensor.quantity for sensor in case.sensors]
     if case.controller is not None:
         return errors
     for quantity, numbers in worst.items():
         if quantity in errors:
             continue
-        of_run = concrete_case(replace(case, numbers))
-        times = np.linspace(0.0, float(of_run.run.duration), SAMPLES)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ContactLossWarning)
-            try:
-                record = simulate(of_run, times, tolerance=ESTIMATE_TOLERANCE)
-            except RuntimeError:  # no step was found: the peaks are kept, their error is not known
-                continue
+        key = tuple(numbers.items())
+        if key not in records:
+            records[key] = _record_for_estimates(concrete_case(replace(case, numbers)))
+        if records[key] is None:
+            continue
         own = np.array(quantities) == quantity
-        found = np.asarray(truncation_errors(record))[own]
+        found = np.asarray(truncation_errors(records[key]))[own]
         if np.isfinite(found).any():
             errors[quantity] = float(np.nanmax(found))
     return errors
+
+
+def _record_for_estimates(case: Case) -> Record | None:
+    """Record of a run; None where no step is found: its peaks are kept, their error not known."""
+    times = np.linspace(0.0, float(case.run.duration), SAMPLES)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ContactLossWarning)
+        try:
+            return simulate(case, times, tolerance=ESTIMATE_TOLERANCE)
+        except RuntimeError:
+            return None
 
 
 def truncation_errors(record: Record) -> Float[Array, " sensor"]:
