@@ -18,6 +18,7 @@ import dataclasses
 import numpy as np
 
 import jaxbeam as jb
+from experiments.studies.hand_set import HAND_DRAWN
 from experiments.studies.held_out import (
     CUBIC_CUTOFFS,
     CUBIC_FEEDBACK,
@@ -36,6 +37,7 @@ from experiments.studies.tune_sensor_feedback import (
     DELAY,
     FOLDER,
     READING_OFFSET,
+    initial_law,
     with_noise_and_filters,
 )
 from experiments.thesis.cases import with_modes
@@ -49,7 +51,7 @@ from tuning.control.load_cases import run_case
 from tuning.control.run_set import make_run_set
 
 SENSORS_ONLY = "tuned, sensors only"
-DRAWN_LAWS = (CUBIC_FEEDBACK, SENSORS_ONLY, EXTRA_DELAY_LAW)
+DRAWN_LAWS = (CUBIC_FEEDBACK, HAND_DRAWN, SENSORS_ONLY, EXTRA_DELAY_LAW)
 SEED = 1  # of the noise; tuned with another
 CROSSING_POSITIONS = 24  # positions of the load at which poles are computed
 LONG_PERIOD = 0.015  # s: the longest sampling period of the bench
@@ -61,7 +63,7 @@ def run(load_rig) -> ExperimentResult:
     for rig in ("B", "C"):
         study = run_study(rig, load_rig(rig))
         studies.append(study)
-        remarks += study.remarks((CUBIC_FEEDBACK, SENSORS_ONLY))
+        remarks += study.remarks((CUBIC_FEEDBACK, HAND_DRAWN, SENSORS_ONLY))
         controlled, uncontrolled = worst_real_parts(rig, load_rig(rig))
         remarks.append(
             f"largest real part of frozen poles, {1e3 * EXTRA_DELAY:g} ms later and the beam 10 %"
@@ -86,6 +88,7 @@ def run_study(rig: str, case: jb.Case) -> HeldOutStudy:
     feedback_case = with_feedback(dataclasses.replace(case, run=bench.run), 3, CUBIC_CUTOFFS[rig])
     run_sets = {
         CUBIC_FEEDBACK: make_run_set(feedback_case, loads),
+        HAND_DRAWN: make_run_set(dataclasses.replace(bench, controller=initial_law(rig)), loads),
         SENSORS_ONLY: make_run_set(bench, loads, least_peaks=True),
         EXTRA_DELAY_LAW: make_run_set(dataclasses.replace(bench, controller=delayed_law), loads),
     }

@@ -20,10 +20,17 @@ from tuning.logs.log import Log
 from tuning.modal.fit import ModalFit
 from tuning.modal.identify_modes import identify_modes
 
-KINDS = ("ambient", "motor", "blows", "decay")
+KINDS = ("ambient", "motor", "shaken", "blows", "decay", "crossing")
 MATCH_SHARE = 0.02  # relative error of a frequency within which a mode is one of the structure
 MIN_ENERGY = 0.05  # energy share of the modes that must be found
-DURATIONS = {"ambient": 300.0, "motor": 300.0, "blows": 60.0, "decay": 20.0}  # s
+DURATIONS = {
+    "ambient": 300.0,
+    "motor": 300.0,
+    "shaken": 60.0,
+    "blows": 60.0,
+    "decay": 20.0,
+    "crossing": 60.0,
+}  # s
 
 
 class PlantedComparison(NamedTuple):

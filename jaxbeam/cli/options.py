@@ -201,6 +201,28 @@ class PictureOptions(DrawingOptions):
         return path
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class LabelledPictureOptions(PictureOptions):
+    """Options of a command that draws what sensors measure, on request."""
+
+    labels: Annotated[
+        str, Parameter(help="NAME,NAME,...: names of the sensors in pictures, in their order.")
+    ] = ""
+
+    def sensor_labels(self, case: "jb.Case") -> list[str] | None:
+        """Names of the sensors of a case in pictures, None if left out.
+
+        Raises ValueError for another number of names than sensors.
+        """
+        names = [name.strip() for name in self.labels.split(",")] if self.labels else None
+        if names is not None and len(names) != len(case.sensors):
+            raise ValueError(
+                f"--labels names {len(names)} sensors; the case has {len(case.sensors)}"
+            )
+        return names
+
+
 def print_plausibility(
     case: "jb.Case", options: PrintOptions, *others: "jb.Case"
 ) -> dict[str, Any]:

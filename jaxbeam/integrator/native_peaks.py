@@ -33,9 +33,13 @@ from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
+<<<<<<< HEAD
 from jaxbeam.model.sensing.corrected_rows import StaticCorrection
 from jaxbeam.model.sensing.linear_outputs import linear_outputs
 from jaxbeam.model.sensing.output_rows import OutputRows
+=======
+from jaxbeam.model.settlement import has_settlement
+>>>>>>> main
 from jaxbeam.numerics.gauss import lagrange_coefficients
 from jaxbeam.numerics.peak_search import (
     ESTIMATE_ITERATIONS,
@@ -93,6 +97,7 @@ def supports(case: Case) -> bool:
     plain = (
         case.controller is None
         and case.profile is None
+        and not has_settlement(case)
         and not any(
             load.vehicle(case.run.gravity).names or load.force_histories() for load in case.loads
         )

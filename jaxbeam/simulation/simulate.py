@@ -199,7 +199,8 @@ def integration_setup(
 
     Its peaks are those of what the `monitored` sensors measure, upwards, then downwards.
     """
-    loads, layout = load_set(case), plan.shapes.layout
+    layout = plan.shapes.layout
+    loads = load_set(case, layout)
     if case.controller is None:
         model, policy = modal_model(case, layout, plan.shapes.coupled), None
         # From rest at t = 0 to the first sample in steps as those between samples.

@@ -76,7 +76,7 @@ class Program(NamedTuple):
 
         def wheels_of_run(values):
             pairs = zip(self.batched_addresses, values, strict=True)
-            loads = load_set(replace(varied, dict(pairs)))
+            loads = load_set(replace(varied, dict(pairs)), self.shapes.layout)
             wheels = loads.wheels
             if loads.massless:  # known to be, which `vmap` would hide: no equations of contact
                 wheels = eqx.tree_at(_inertia, wheels, None)
@@ -86,7 +86,7 @@ class Program(NamedTuple):
         if wheels.inertia is None:
             massless = np.zeros(wheels.weight.shape)
             wheels = eqx.tree_at(_inertia, wheels, massless, is_leaf=lambda leaf: leaf is None)
-        return dataclasses.replace(load_set(varied), wheels=wheels)
+        return dataclasses.replace(load_set(varied, self.shapes.layout), wheels=wheels)
 
     def grid(self, model, shared_values, step_size):
         """Time grid of a batch for a longest step (s) and a number of extra steps per event."""
@@ -117,8 +117,15 @@ class Program(NamedTuple):
 def modal_models(program: Program, shared_values):
     """Models of batches, and their longest stable steps (s)."""
 
+<<<<<<< HEAD
     # `map` is less to trace than `vmap`.
     return jax.lax.map(lambda values: model_and_limit(program, values), shared_values)
+=======
+    def model_and_limit(values):
+        varied = program.case_with(values)
+        model = modal_model(varied, program.shapes.layout, program.shapes.coupled)
+        return model, max_stable_step(model, load_set(varied, program.shapes.layout))
+>>>>>>> main
 
 
 def model_and_limit(program: Program, shared_values):

@@ -149,8 +149,15 @@ def test_pictures_have_endings_sizes_and_titles(run, folder):
         run(f"{line} --picture out.svg --title Anew --overwrite")
         text = (folder / "out.svg").read_text()
         assert "<!-- Anew -->" in text and "one span, one ball" not in text
+    run("simulate case.toml --picture out.svg --labels near,far --overwrite")
+    assert "<!-- near" in (folder / "out.svg").read_text()
     run("modes case.toml --picture out.pdf")
     assert (folder / "out.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_labels_name_every_sensor(refused):
+    message = refused("simulate case.toml --plot --labels one")
+    assert message == "--labels names 1 sensors; the case has 2"
 
 
 def test_film_needs_ffmpeg(run, refused, folder, monkeypatch):

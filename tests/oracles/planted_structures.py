@@ -109,7 +109,7 @@ class Planted(NamedTuple):
     structure: Structure
     values: np.ndarray
     rate: float
-    energies: np.ndarray  # share of each mode in the variance of the response
+    energies: np.ndarray  # share of each mode in the variance of the response (after a crossing)
     lines: tuple[float, ...] = ()
 
 
@@ -124,8 +124,19 @@ def _finished(structure, clean, rate, random, lines=(), cycles=None):
     return values + 5 * clean.std() + drift[:, None]
 
 
+def _shaken(forces, structure, random, fine):
+    """Fill in a shaker's force with four harmonics and weak ambient forces; the harmonics (Hz)."""
+    speed = structure.frequencies[0] * random.uniform(0.8, 1.2)
+    turns = speed * np.arange(len(forces)) / fine
+    forces[:] = 0.1 * random.normal(size=forces.shape)
+    for harmonic, size in ((1, 1.0), (2, 0.4), (3, 0.3), (4, 0.1)):
+        forces[:, 0] += size * np.cos(2 * np.pi * harmonic * turns + harmonic)
+    return tuple(speed * harmonic for harmonic in (1, 2, 3, 4))
+
+
 def sampled(structure: Structure, kind: str, seed: int, duration: float) -> Planted:
-    """A log of a structure; `kind` is ambient, motor (with harmonics), blows or decay."""
+    """A log of a structure; `kind` is ambient, motor (with harmonics), blows, decay, shaken or
+    crossing (a rough load over the exciters in the first half of the log)."""
     random = np.random.default_rng(1000 + seed)
     rate = 2.56 * structure.frequencies[-1] * random.uniform(1.2, 2.5)
     fine = FINER * rate
@@ -139,6 +150,13 @@ def sampled(structure: Structure, kind: str, seed: int, duration: float) -> Plan
         starts = np.arange(0.05 * duration, duration - 0.5 * period, period)
         for start in starts:
             forces[int(start * fine), random.integers(4)] = fine
+    elif kind == "shaken":
+        lines = _shaken(forces, structure, random, fine)
+    elif kind == "crossing":
+        half = count // 2
+        places = np.linspace(-0.5, 3.5, half)
+        shares = np.maximum(1 - np.abs(np.subtract.outer(places, np.arange(4))), 0)
+        forces[:half] = shares * (10 + random.normal(size=(half, 1)))
     else:
         forces[0] = random.normal(size=4) * fine
     if kind == "motor":
@@ -151,6 +169,7 @@ def sampled(structure: Structure, kind: str, seed: int, duration: float) -> Plan
         parts.append(response(one, forces, fine)[::FINER])
     parts = np.stack(parts)
     clean = parts.sum(axis=0)
-    energies = np.mean(parts.var(axis=1) / clean.var(axis=0), axis=1)
+    free = slice(len(clean) // 2 + 1, None) if kind == "crossing" else slice(None)
+    energies = np.mean(parts[:, free].var(axis=1) / clean[free].var(axis=0), axis=1)
     values = _finished(structure, clean, rate, random, lines)
     return Planted(structure, values, rate, energies, lines)

@@ -60,24 +60,34 @@ def subspace_modes(
     found: list[Candidate] = []
     diagrams = []
     parts = divided_band(band)
+    variance = _variance(prepare(records, starts, rate, band).records)
     for low, high in parts:
         if progress:
             progress(f"modes from {low:.3g} Hz to {high:.4g} Hz")
-        inner = (low if low == band[0] else low / BAND_OVERLAP,
-                 high if high == band[1] else high * BAND_OVERLAP)  # fmt: skip
-        prepared = prepare(records, starts, rate, inner)
-        candidates, diagram = _modes_of_band(prepared, band, data_driven, order)
+        prepared = prepare(records, starts, rate, overlapping((low, high), band))
+        candidates, diagram = _modes_of_band(prepared, band, variance, data_driven, order)
         found += candidates
         diagrams.append(diagram)
-    return _without_duplicates(found), tuple(diagrams)
+    return without_duplicates(found), tuple(diagrams)
 
 
-def _modes_of_band(prepared: Prepared, whole, data_driven, order):
-    """Candidates and diagram of records prepared for one band."""
-    scale = np.sqrt(
-        sum(np.sum(record**2, axis=0) for record in prepared.records)
-        / sum(len(record) for record in prepared.records)
-    )
+def overlapping(part: tuple[float, float], band: tuple[float, float]) -> tuple[float, float]:
+    """A part of a band (Hz) with a tenth of its neighbours."""
+    low, high = part
+    return max(low / BAND_OVERLAP, band[0]), min(high * BAND_OVERLAP, band[1])
+
+
+def _variance(records):
+    """Mean square of each channel of all records together."""
+    return sum(np.sum(record**2, axis=0) for record in records) / sum(map(len, records))
+
+
+def _modes_of_band(prepared: Prepared, whole, variance, data_driven, order):
+    """Candidates and diagram of records prepared for one part of the band `whole`.
+
+    `variance` is that of the channels in the whole band.
+    """
+    scale = np.sqrt(_variance(prepared.records))
     scale = np.where(scale > 0, scale, 1.0)
     records = tuple(record / scale for record in prepared.records)
     channels, longest = records[0].shape[1], max(map(len, records))
@@ -85,6 +95,7 @@ def _modes_of_band(prepared: Prepared, whole, data_driven, order):
     if order is not None:
         rows = max(rows, order // channels + 1)
     subspace = decompose(records, prepared.rate, rows, data_driven)
+    subspace = subspace._replace(total=np.maximum(variance / scale**2, 1e-300))
     highest = order or min(MAX_ORDER, 2 * rows * channels // 3)
     parts = [poles_of_order(subspace, n) for n in range(2, highest + 1, 2)]
     poles = Poles(*(np.concatenate([getattr(p, name) for p in parts]) for name in Poles._fields))
@@ -147,8 +158,8 @@ def _rescaled(shape, covariance, scale, largest):
     return real @ covariance @ real.T if count else covariance
 
 
-def _without_duplicates(found: list[Candidate]) -> tuple[Candidate, ...]:
-    """Candidates that differ by more than their uncertainties, the longest chains first."""
+def without_duplicates(found: list[Candidate]) -> tuple[Candidate, ...]:
+    """Candidates that differ by more than their uncertainties, ascending; the best are kept."""
     kept: list[Candidate] = []
     for one in sorted(found, key=lambda c: (bool(c.reason), c.mode.damping_sd / max(
         c.mode.damping_ratio, 1e-12))):  # fmt: skip

@@ -2,7 +2,8 @@
 
 A line is found by the F-test of several tapers (Thomson 1982; Percival and Walden 1993, section
 10.11): its power exceeds that of the continuous spectrum within the bandwidth of the tapers. It
-must have the same amplitude and phase throughout the record, which a resonance has not.
+must have the same amplitude and phase throughout the record, which a resonance has not, nor the
+decay of a lightly damped mode.
 """
 
 from typing import NamedTuple
@@ -16,14 +17,24 @@ TAPERS, TIME_BANDWIDTH = 7, 4.0
 FALSE_ALARM_PROBABILITY = 1e-3  # of a line in noise, in a whole spectrum
 PARTS = 8  # parts of a record in which a line is followed
 MIN_COHERENCE = 0.9  # length of the mean of its complex amplitudes over their rms
+MIN_FALL, FALL_SDS = 0.1, 4.0  # nepers over a record, and standard deviations, of a decay
+RAYLEIGH_RATIO = 0.5227  # deviation over mean of the envelope of a random vibration
+RATIO_SD, STEADY_SDS = 0.23, 4.0  # deviation of its estimate from one value, and limit in these
+STEADY_RATIO = 0.35  # of the envelope of a line in noise of a tenth of its power
+HALF_POWER_WIDTHS = 4.0  # half width of the filter around a pole
 MAX_LINES = 30
 
 
 class Line(NamedTuple):
-    """A harmonic line: frequency (Hz) and its share of the variance of the record."""
+    """A harmonic line: frequency (Hz) and its share of the variance of the record.
+
+    `pole` (1/s) is that of a line that wanders and was taken for a mode; other lines are subtracted
+    before modes are sought.
+    """
 
     frequency: float
     share: float
+    pole: complex | None = None
 
 
 def harmonic_lines(
@@ -61,12 +72,15 @@ def harmonic_lines(
         shifted = record * np.exp(-2j * np.pi * refined * times)[:, None]
         if np.max(_line_test(tapers @ shifted, level)[1]) > limit:
             lines.append(refined)
-    shares = [
-        float(np.mean(np.abs(_amplitudes(record, rate, f, 1)[0]) ** 2 / 2 / variance))
-        for f in lines
-    ]
+    shares = [share_of(record, rate, f) for f in lines]
     ranked = sorted(zip(shares, lines, strict=True), reverse=True)[:MAX_LINES]
     return tuple(sorted(Line(f, share) for share, f in ranked))
+
+
+def share_of(record: Float[np.ndarray, "time channel"], rate: float, frequency: float) -> float:
+    """Share of a sinusoid (Hz) in the variance of a record, on average over channels."""
+    amplitude = _amplitudes(record, rate, frequency, 1)[0]
+    return float(np.mean(np.abs(amplitude) ** 2 / 2 / np.maximum(record.var(axis=0), 1e-300)))
 
 
 def _line_test(spectra, level):
@@ -100,7 +114,42 @@ def _followed(record, rate, frequency, variance) -> float | None:
         frequency += change
     z = _amplitudes(record, rate, frequency, PARTS)[:, channel]
     coherence = np.abs(np.mean(z)) / np.sqrt(np.mean(np.abs(z) ** 2))
-    return float(frequency) if coherence > MIN_COHERENCE else None
+    lasts = coherence > MIN_COHERENCE and not _falls(np.abs(z))
+    return float(frequency) if lasts else None
+
+
+def _falls(sizes):
+    """Whether amplitudes from part to part fall, beyond their scatter, as those of a decay."""
+    across = np.arange(sizes.size) - (sizes.size - 1) / 2
+    level = np.log(np.maximum(sizes, 1e-300))
+    slope = across @ level / (across @ across)
+    scatter = np.sum((level - level.mean() - slope * across) ** 2) / (sizes.size - 2)
+    deviation = np.sqrt(scatter / (across @ across))
+    return slope * sizes.size < -MIN_FALL and slope < -FALL_SDS * deviation
+
+
+def is_steady(
+    record: Float[np.ndarray, "time channel"], rate: float, frequency: float, damping_ratio: float
+) -> bool:
+    """Whether the vibration at a pole has the steady amplitude of a machine, though it may wander.
+
+    The envelope of a resonance under random excitation has Rayleigh's distribution, with a ratio of
+    deviation to mean of 0.52 (a kurtosis of 3 of the vibration; Jacobsen, Andersen and Brincker
+    2007), estimated from about as many independent values as the record has decay times.
+    """
+    independent = 2 * np.pi * damping_ratio * frequency * len(record) / rate
+    limit = min(STEADY_RATIO, RAYLEIGH_RATIO - STEADY_SDS * RATIO_SD / np.sqrt(independent + 1e-9))
+    if limit < 0:
+        return False
+    transform = np.fft.fft(record, axis=0)
+    bins = np.fft.fftfreq(len(record), 1 / rate)
+    half = HALF_POWER_WIDTHS * damping_ratio * frequency
+    transform *= np.where(
+        np.abs(bins - frequency) < half, np.cos(np.pi * (bins - frequency) / half / 2) ** 2, 0.0
+    )[:, None]
+    channel = int(np.argmax(np.sum(np.abs(transform) ** 2, axis=0) / record.var(axis=0)))
+    envelope = np.abs(np.fft.ifft(transform[:, channel]))
+    return bool(envelope.std() < limit * envelope.mean())
 
 
 def without_lines(

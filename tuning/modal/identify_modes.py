@@ -5,7 +5,7 @@
     fit.plot("modes.png")
 
 The excitation is recognised: free decays, after one blow or many or after a load has left the beam,
-are fitted together by poles (`decay_poles`), starting from those of a subspace method; all else is
+are fitted together by poles (`decay.poles`), starting from those of a subspace method; all else is
 a response to ambient excitation (`ambient`). Harmonic lines are subtracted. Modes that the log
 determines well are the result; others are listed with the reason for rejecting them.
 """
@@ -14,37 +14,20 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from tuning.logs.log import Log
-from tuning.logs.quality import find_faults
-from tuning.logs.records import even_records
 from tuning.logs.units import time_derivative
 from tuning.modal.ambient import Candidate, subspace_modes
-from tuning.modal.decay_fit import fit_decay
-from tuning.modal.decays import Stretch, free_decays, stacked
+from tuning.modal.decay.modes import Decays, excited, free_decay_modes
 from tuning.modal.fit import Choice, ModalFit
-from tuning.modal.harmonics import harmonic_lines, without_lines
-from tuning.modal.preprocessing import kinetic_band, prepare, strongest_frequency
+from tuning.modal.harmonics import Line, harmonic_lines, is_steady, without_lines
+from tuning.modal.preprocessing import kinetic_band, prepare
+from tuning.modal.samples import Samples, samples_of, with_channels
 from tuning.modal.stabilisation import Diagram
 
-MIN_SAMPLES = 64
 KINDS = ("free decay", "ambient")
 METHODS = ("covariance", "data")
-MIN_DECAY_ENERGY = 0.3  # share of the energy of a log in its decays, if they are to stand for it
-LONG_FALL_NEPERS = 3.5  # or fall of the energy that steady random vibration hardly shows
-MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
-MAX_RESIDUAL_OF_WINDOW = 0.05  # the same for a window that the user gives and that falls little
 TRANSIENT_SHARE = 0.01  # struck samples of a log with transients of crossing loads
-
-
-class _Samples(NamedTuple):
-    """Records of all logs in SI units, with the times of their first samples (s)."""
-
-    records: tuple[Float[np.ndarray, "time channel"], ...]
-    starts: tuple[float, ...]
-    rate: float
-    notes: tuple[str, ...]
 
 
 def identify_modes(
@@ -75,8 +58,8 @@ def identify_modes(
     """
     logs = [log] if isinstance(log, Log) else list(log)
     _check_arguments(count, kind, order, method)
-    logs = [_with_channels(one, channels) for one in logs]
-    samples = _samples(logs, window)
+    logs = [with_channels(one, channels) for one in logs]
+    samples = samples_of(logs, window)
     _check_band(logs[0], samples.rate, band)
     choices = []
     derivatives = tuple(time_derivative(name) for name in logs[0].quantities)
@@ -90,17 +73,19 @@ def identify_modes(
     lines, cleaned = _subtract_lines(samples, used_band, exclude)
     if lines:
         choices.append(Choice(f"{len(lines)} harmonic lines subtracted", "--exclude FREQUENCY"))
+    struck = excited(samples, derivatives, used_band)
     found = None
     if kind != "ambient":
-        found = _free_decay_modes(samples, cleaned, derivatives, used_band, kind, window, order)
+        found = free_decay_modes(
+            samples, struck, derivatives, used_band,
+            kind=kind, whole=window is not None, order=order,
+        )  # fmt: skip
     if kind == "free decay" and found is None:
         raise ValueError(f"{logs[0].source}: no free decay found; give its window, or kind ambient")
-    if kind is None:
-        says = _kind_words(found, samples, cleaned, used_band, lines)
-        choices.append(Choice(says, "--kind ambient, --kind 'free decay', --from and --to"))
+    used_method = "decay"
     if found is None:
         used_method = method or "covariance"
-        candidates, diagrams = subspace_modes(
+        ambient = subspace_modes(
             cleaned,
             samples.starts,
             samples.rate,
@@ -109,9 +94,12 @@ def identify_modes(
             order=order,
             progress=progress,
         )
-        found = _Found(candidates, diagrams, None)
-    else:
-        used_method = "decay"
+        found = (*ambient, None)
+        lines += _wandering_lines(ambient[0], cleaned, samples, used_band)
+    found = _Found(*found)
+    if kind is None:
+        says = _kind_words(found, struck, lines)
+        choices.append(Choice(says, "--kind ambient, --kind 'free decay', --from and --to"))
     if method is None:
         choices.append(Choice(f"method {used_method}", f"--method {', '.join(METHODS)}"))
     if order is None:
@@ -121,86 +109,28 @@ def identify_modes(
 
 
 class _Found(NamedTuple):
-    """Candidates, diagrams, and the decays that were fitted with their samples (None: ambient)."""
+    """Candidates, diagrams, and the decays that were fitted (None: ambient)."""
 
     candidates: tuple[Candidate, ...]
     diagrams: tuple[Diagram, ...]
-    decays: tuple[tuple[Stretch, ...], Float[np.ndarray, "t c"], Float[np.ndarray, "t c"]] | None
+    decays: Decays | None
 
 
-def _free_decay_modes(samples, cleaned, derivatives, band, kind, window, order) -> _Found | None:
-    """Modes of the free decays in the records; None without any that stand for the log."""
-    prepared = prepare(cleaned, samples.starts, samples.rate, band)
-    frequency = strongest_frequency(prepared.records, prepared.rate, derivatives, band)
-    decays, _ = free_decays(prepared.records, prepared.rate, frequency)
-    ratio = samples.rate / prepared.rate
-    given = not decays and (kind == "free decay" or window is not None)
-    if given:
-        decays = tuple(Stretch(i, 0, len(r), 0.0) for i, r in enumerate(prepared.records))
-    if not decays or not (kind or given or _dominate(decays, prepared.records)):
-        return None
-    raw = tuple(
-        Stretch(
-            one.record,
-            int(np.ceil(one.start * ratio)),
-            min(int(one.stop * ratio), len(samples.records[one.record])),
-            one.fall,
-        )
-        for one in decays
-    )
-    windows, used = stacked(samples.records, raw)
-    if len(windows) < MIN_SAMPLES // 2:
-        return None
-    channels = samples.records[0].shape[1]
-    pieces = tuple(windows[:, i : i + channels] for i in range(0, windows.shape[1], channels))
-    starts = tuple(one.start / samples.rate for one in used)
-    candidates, diagrams = subspace_modes(pieces, starts, samples.rate, band, order=order)
-    poles = np.array(
-        [
-            2 * np.pi * c.mode.frequency
-            * (-c.mode.damping_ratio + 1j * np.sqrt(1 - c.mode.damping_ratio**2))
-            for c in candidates
-            if c.length > 1
-        ],
-        complex,
-    )  # fmt: skip
-    fit = fit_decay(windows, samples.rate, band, channels, poles)
-    if fit is None:
-        return None
-    residual = np.sum((fit.measured - fit.fitted) ** 2) / max(np.sum(fit.measured**2), 1e-300)
-    good = any(not why for why in fit.reasons)
-    limit = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_ENERGY
-    if kind is None and not (good and residual < limit):
-        return None
-    found = tuple(Candidate(mode, why, 1) for mode, why in zip(fit.modes, fit.reasons, strict=True))
-    return _Found(found, diagrams, (used, fit.measured[:, :channels], fit.fitted[:, :channels]))
-
-
-def _dominate(decays, records) -> bool:
-    """Whether decays hold much of the energy of a log, or fall farther than chance allows."""
-    inside = sum(np.sum(records[d.record][d.start : d.stop] ** 2) for d in decays)
-    whole = sum(np.sum(record**2) for record in records)
-    return bool(inside > MIN_DECAY_ENERGY * whole or max(d.fall for d in decays) > LONG_FALL_NEPERS)
-
-
-def _kind_words(found, samples, cleaned, band, lines) -> str:
+def _kind_words(found: _Found, struck, lines) -> str:
     """Sentence on the excitation."""
-    if found is not None and found.decays is not None:
-        number = len(found.decays[0])
+    if found.decays is not None:
+        number = len(found.decays.stretches)
         return f"excitation: {number} free decays, used together" if number > 1 else (
             "excitation: a free decay"
         )  # fmt: skip
-    share = sum(line.share for line in lines)
-    if share > 0.5:
+    if sum(line.share for line in lines) > 0.5:
         return "excitation: steady shaking, whose harmonic lines are no modes, and ambient"
-    prepared = prepare(cleaned, samples.starts, samples.rate, band)
-    _, struck = free_decays(prepared.records, prepared.rate, 2 * band[0])
-    if struck > TRANSIENT_SHARE:
+    if np.mean(np.concatenate(struck)) > TRANSIENT_SHARE:
         return "excitation: transients (crossing loads or blows) without a clear free decay"
     return "excitation: ambient"
 
 
-def _subtract_lines(samples: _Samples, band, exclude):
+def _subtract_lines(samples: Samples, band, exclude):
     """Harmonic lines, and the records without them and without excluded frequencies."""
     prepared = prepare(samples.records, samples.starts, samples.rate, band)
     longest = max(range(len(samples.records)), key=lambda i: len(samples.records[i]))
@@ -208,6 +138,17 @@ def _subtract_lines(samples: _Samples, band, exclude):
     frequencies = tuple(line.frequency for line in lines) + tuple(exclude)
     centred = (record - record.mean(axis=0) for record in samples.records)
     return lines, tuple(without_lines(one, samples.rate, frequencies) for one in centred)
+
+
+def _wandering_lines(candidates, cleaned, samples, band) -> tuple[Line, ...]:
+    """Candidates of steady amplitude: lines of machines whose speed wanders."""
+    record = max(prepare(cleaned, samples.starts, samples.rate, band).records, key=len)
+    rate = samples.rate * len(record) / max(map(len, cleaned))
+    return tuple(
+        Line(c.mode.frequency, min(c.mode.energy_share, 1.0), c.mode.pole)
+        for c in candidates
+        if is_steady(record, rate, c.mode.frequency, c.mode.damping_ratio)
+    )
 
 
 def _result(logs, samples, found: _Found, band, lines, choices, method, count, exclude):
@@ -220,8 +161,10 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, count, e
         hit = [one for one in lines if abs(mode.frequency - one.frequency) < 2 * resolution]
         if near:
             reason = f"excluded, {near[0]:g} Hz"
-        elif hit and not reason and found.decays is None and mode.damping_ratio < 0.002:
+        elif hit and found.decays is None and mode.damping_ratio < 0.002:
             reason = f"a harmonic line, {hit[0].frequency:.3f} Hz"
+        elif any(one.pole == mode.pole for one in lines):
+            reason = "of steady amplitude: a harmonic line that wanders"
         (rejected if reason else modes).append((mode, reason))
     modes.sort(key=lambda pair: -pair[0].energy_share)
     if count is not None:
@@ -261,79 +204,6 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, count, e
         measured=measured,
         fitted=fitted,
     )
-
-
-def _samples(logs: Sequence[Log], window) -> _Samples:
-    """Records of the logs in a window, and notes on the logs and their faults."""
-    records, starts, rates, notes = [], [], [], []
-    for log in logs:
-        start, stop = _sample_range(log, window)
-        if stop - start < MIN_SAMPLES:
-            raise ValueError(
-                f"{log.source}: {stop - start} samples are too few to identify modes from; "
-                f"at least {MIN_SAMPLES} are needed"
-            )
-        part = log if (start, stop) == (0, log.times.size) else _cut(log, start, stop)
-        rate, found, said = even_records(part)
-        rates.append(rate)
-        records += [record.values for record in found]
-        starts += [record.start for record in found]
-        faults = (str(fault).removeprefix(f"{log.source}: ") for fault in find_faults(part))
-        notes += [*log.notes, *said, *faults]
-        if log.names != logs[0].names or abs(rate / rates[0] - 1) > 1e-3:
-            raise ValueError(
-                f"{log.source}: logs identified together must have the same channels and sampling "
-                f"rate; {logs[0].source} has {', '.join(logs[0].names)} at {rates[0]:.6g} Hz, this "
-                f"one {', '.join(log.names)} at {rate:.6g} Hz"
-            )
-    return _Samples(tuple(records), tuple(starts), rates[0], tuple(dict.fromkeys(notes)))
-
-
-def _cut(log: Log, start: int, stop: int) -> Log:
-    """Part of a log."""
-    return Log(
-        log.times[start:stop], log.values[start:stop], log.names, log.quantities, log.units,
-        log.source, valid=log.valid[start:stop],
-    )  # fmt: skip
-
-
-def _with_channels(log: Log, channels: Sequence[str] | None) -> Log:
-    """The log with the channels of some names, by default all that are no commands."""
-    if channels is None:
-        kept = [i for i, actuator in enumerate(log.actuators) if actuator is None]
-    else:
-        unknown = [name for name in channels if name not in log.names]
-        if unknown:
-            raise ValueError(
-                f"{log.source}: the log has no channel {unknown[0]!r}; it has "
-                f"{', '.join(log.names)}"
-            )
-        kept = [log.names.index(name) for name in channels]
-    if kept == list(range(len(log.names))):
-        return log
-
-    def pick(entries):
-        return tuple(entries[i] for i in kept)
-
-    return Log(
-        log.times, log.values[:, kept], pick(log.names), pick(log.quantities), pick(log.units),
-        log.source, pick(log.sensors), pick(log.positions), pick(log.actuators), log.loads,
-        log.valid[:, kept], log.notes,
-    )  # fmt: skip
-
-
-def _sample_range(log: Log, window) -> tuple[int, int]:
-    """First and last (exclusive) sample of a window (s)."""
-    if window is None:
-        return 0, log.times.size
-    step = log.duration / (log.times.size - 1)
-    if not (log.times[0] <= window[0] < window[1] <= log.times[-1] + step):
-        raise ValueError(
-            f"{log.source}: the window from {window[0]:g} s to {window[1]:g} s is not within the "
-            f"log, {log.times[0]:.6g} s to {log.times[-1]:.6g} s"
-        )
-    start, stop = np.searchsorted(log.times, window)
-    return int(start), int(stop)
 
 
 def _check_band(log: Log, rate: float, band) -> None:

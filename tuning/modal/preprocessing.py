@@ -12,10 +12,11 @@ from scipy.ndimage import percentile_filter
 from scipy.signal import butter, detrend, firwin, resample_poly, sosfiltfilt, welch
 
 RATE_OVER_BAND = 2.56  # sampling rate after decimation over the upper end of the band
-MIN_SEGMENTS = 16  # segments averaged for the spectrum that decides the band
-BACKGROUND_OCTAVES = 1.0  # width of the running median that is the background of resonances
-RESONANCE_RATIO = 4.0  # of the spectrum over its background: 6 dB
-BAND_ENERGY_SHARE = 0.98  # of the kinetic energy of resonances, below the upper end of the band
+MIN_SEGMENTS = 8  # segments averaged for the spectrum that decides the band
+BACKGROUND_OCTAVES = 1.0  # width of the running quantile that is the background of resonances
+BACKGROUND_PERCENT = 25  # below the peaks of a pair of modes, however much of an octave they fill
+RESONANCE_RATIO = 6.0  # of the spectrum over its background: 8 dB
+BAND_ENERGY_SHARE = 0.99  # of the kinetic energy of resonances, below the upper end of the band
 BAND_MARGIN = 1.3  # of the ends of the band beyond the outermost resonances
 MIN_CYCLES = 8.0  # cycles of the lowest frequency in the longest record
 
@@ -39,8 +40,8 @@ def kinetic_band(
 ) -> tuple[float, float]:
     """Band (Hz) of the resonances that hold the kinetic energy of a vibration.
 
-    Resonances are where the spectrum exceeds its background (running median over an octave) by
-    6 dB; their excess is converted to velocities by `derivatives`, the order of each channel as a
+    Resonances are where the spectrum exceeds its background (lower quartile over an octave) by
+    8 dB; their excess is converted to velocities by `derivatives`, the order of each channel as a
     time derivative. Drift and noise, however strong, are background. Without resonances the band is
     all that the log can show.
     """
@@ -94,15 +95,17 @@ def _average_spectrum(records, rate):
     sums, weight = 0.0, 0
     for record in records:
         if len(record) >= size:
-            bins, power = welch(record, rate, "hann", size, detrend="linear", axis=0)
-            sums, weight = sums + len(record) * power, weight + len(record)
+            # Zeros around it give the first and last samples, of a decay say, their full weight.
+            padded = np.pad(detrend(record, axis=0), ((size // 2, size // 2), (0, 0)))
+            bins, power = welch(padded, rate, "hann", size, detrend="constant", axis=0)
+            sums, weight = sums + len(padded) * power, weight + len(record)
     return bins, sums / weight
 
 
 def resonance_excess(
     bins: Float[np.ndarray, " bin"], power: Float[np.ndarray, "bin channel"]
 ) -> Float[np.ndarray, "bin channel"]:
-    """Power above the background where it stands out by 6 dB, else zero."""
+    """Power above the background where it stands out by 8 dB, else zero."""
     points = max(512, 2 * bins.size)
     grid = np.geomspace(bins[0], bins[-1], points)
     width = max(int(BACKGROUND_OCTAVES * points / np.log2(bins[-1] / bins[0])), 3)
@@ -110,7 +113,9 @@ def resonance_excess(
     for column in power.T:
         level = np.interp(grid, bins, np.log(column + 1e-300))
         background = np.exp(
-            np.interp(bins, grid, percentile_filter(level, 50, width, mode="nearest"))
+            np.interp(
+                bins, grid, percentile_filter(level, BACKGROUND_PERCENT, width, mode="nearest")
+            )
         )
         found.append(np.where(column > RESONANCE_RATIO * background, column - background, 0.0))
     return np.stack(found, axis=1)

@@ -18,9 +18,9 @@ MAX_BAND_SHARE = 0.98  # of the upper end of the band; a mode above may be the f
 class IdentifiedMode(NamedTuple):
     """A mode: undamped natural frequency (Hz) and damping ratio, with standard deviations.
 
-    `energy_share` is its share of the energy of the log in the band. `shape` has a largest
-    component of one; `shape_covariance` is that of its real parts, then its imaginary parts.
-    `correlation` is that of frequency and damping ratio.
+    `energy_share` is its share of the energy of a channel in the band, on average over channels.
+    `shape` has a largest component of one; `shape_covariance` is that of its real parts, then its
+    imaginary parts.
     """
 
     frequency: float
@@ -33,29 +33,22 @@ class IdentifiedMode(NamedTuple):
     quantile: float = 1.96
 
     @property
+    def pole(self) -> complex:
+        """Pole -z w + i w sqrt(1 - z^2) in 1/s, w the undamped angular frequency."""
+        root = -self.damping_ratio + 1j * np.sqrt(max(1 - self.damping_ratio**2, 0.0))
+        return complex(2 * np.pi * self.frequency * root)
+
+    @property
     def collinearity(self) -> float:
         """Modal phase collinearity of the shape: 1 if all channels move in phase or antiphase."""
         return float(phase_collinearity(self.shape[None])[0])
 
 
-class ModeCandidates(NamedTuple):
-    """Candidate modes with the reason for rejecting each (empty for a mode that is accepted).
-
-    `windows` (s) are the parts of the log used; `times`, `measured` and `fitted` are the part in
-    the band of the log and of the fit (None without a fit in time), for the first window.
-    """
-
-    modes: tuple[IdentifiedMode, ...]
-    rejection_reasons: tuple[str, ...]
-    windows: tuple[tuple[float, float], ...]
-    times: Float[np.ndarray, " sample"]
-    measured: Float[np.ndarray, "sample channel"]
-    fitted: Float[np.ndarray, "sample channel"] | None
-
-
 def rejection_reason(mode: IdentifiedMode, duration: float, band: tuple[float, float]) -> str:
     """Reason why a mode found in `duration` seconds is not well identified; empty if it is."""
-    if not band[0] <= mode.frequency <= MAX_BAND_SHARE * band[1]:
+    half_width = max(mode.damping_ratio, 0.0) * mode.frequency  # where the power is half
+    highest = min(MAX_BAND_SHARE * band[1], band[1] - half_width)
+    if not band[0] + half_width <= mode.frequency <= highest:
         return "at the edge of the band"
     if not mode.quantile * mode.damping_sd < mode.damping_ratio:
         return "damping not distinguishable from none: hum, or a mode too weak or too short"

@@ -45,19 +45,41 @@ def run(load_rig) -> ExperimentResult:
         _mass_in_impedance_only(aluminium_beam)
     )
     transmitted = max(_peaks(_response(printed), 2), key=lambda pair: pair[1])
+    one_mode = dataclasses.replace(printed, modes=1)
+    null, null_with_mass = (_features(_response(one_mode, mass)) for mass in ((), STATIONARY_MASS))
+    null_transmitted = max(_peaks(_response(one_mode), 2), key=lambda pair: pair[1])
 
-    def by_beam(published_numbers, features, select):
+    def by_beam(published_numbers, features, null_features, select):
         values = {name: select(one) for name, one in features.items()}
-        return make_finding(published_numbers, values.pop(LITERAL), values)
+        first = values.pop(LITERAL)
+        return make_finding(
+            published_numbers, first, values, null=("one mode", select(null_features))
+        )
+
+    def drops(features):
+        return np.append(features["drops"], [np.nan] * 4)[:4]
 
     findings = (
-        by_beam(published.FORCE_DROPS, free, lambda one: one["drops"][:4]),
-        by_beam(published.SHAKER_GAIN, free, lambda one: [one["low"], one["peak"][1]]),
-        by_beam(published.SHAKER_PEAK_FREQUENCY, free, lambda one: one["peak"][0]),
-        make_finding(published.TRANSMITTED_PEAK_FREQUENCY, transmitted[0]),
-        by_beam(published.STATIONARY_MASS_DROP, with_mass, lambda one: one["drops"][0]),
-        by_beam(published.STATIONARY_MASS_PEAK_FREQUENCY, with_mass, lambda one: one["peak"][0]),
-        by_beam(published.STATIONARY_MASS_PEAK, with_mass, lambda one: one["peak"][1]),
+        by_beam(published.FORCE_DROPS, free, null, drops),
+        by_beam(published.SHAKER_GAIN, free, null, lambda one: [one["low"], one["peak"][1]]),
+        by_beam(published.SHAKER_PEAK_FREQUENCY, free, null, lambda one: one["peak"][0]),
+        make_finding(
+            published.TRANSMITTED_PEAK_FREQUENCY,
+            transmitted[0],
+            null=("one mode", null_transmitted[0]),
+        ),
+        by_beam(
+            published.STATIONARY_MASS_DROP, with_mass, null_with_mass, lambda one: one["drops"][0]
+        ),
+        by_beam(
+            published.STATIONARY_MASS_PEAK_FREQUENCY,
+            with_mass,
+            null_with_mass,
+            lambda one: one["peak"][0],
+        ),
+        by_beam(
+            published.STATIONARY_MASS_PEAK, with_mass, null_with_mass, lambda one: one["peak"][1]
+        ),
     )
     stiff = dataclasses.replace(printed, **{key: np.asarray(value) for key, value in RIGID.items()})
     return ExperimentResult(findings, {"responses": _draw(printed, stiff)})

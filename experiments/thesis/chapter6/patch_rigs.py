@@ -5,6 +5,8 @@ import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 import jaxbeam as jb
 from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import ContactLossWarning
@@ -39,3 +41,17 @@ def simulate_changes(case: jb.Case, changes: Sequence[Mapping[str, Any]]) -> lis
         # With too high gains the contact force becomes negative; the peaks show it.
         warnings.simplefilter("ignore", ContactLossWarning)
         return [jb.simulate(one, plan=plan) for one in cases]
+
+
+def static_extremes(case: jb.Case) -> tuple[np.ndarray, np.ndarray]:
+    """Largest static deflections down and up (m/kg), (sensor,), as a weight crosses the beam."""
+    model = jb.modes(case)
+    shapes_at_sensors, shapes = (
+        np.asarray(model.shapes(positions, 0))
+        for positions in (
+            np.array([float(sensor.position) for sensor in case.sensors]),
+            np.linspace(0.0, float(case.beam.length), 601),
+        )
+    )
+    lines = float(case.run.gravity) * shapes_at_sensors / np.asarray(model.stiffness) @ shapes.T
+    return lines.max(axis=1), -lines.min(axis=1)

@@ -5,8 +5,10 @@ from pathlib import Path
 from jaxbeam.cli.arguments import (
     bounds_in_si,
     check_exists,
+    pair_in_si,
     parse_assignment,
     parse_bounds,
+    parse_prior,
     refuse_option,
     split_case_and_logs,
 )
@@ -55,7 +57,8 @@ def identify(
     files
         [CASE.toml] LOG...: the case to fit, if any, and the logs, with all the runs they hold.
     prior
-        ADDRESS=MEAN:DEVIATION: normal prior of a free parameter; repeat it for more.
+        ADDRESS=MEAN:DEVIATION: normal prior of a free parameter, also with units, as
+        beam.length='25 m:10 cm'; repeat it for more.
     scale
         ADDRESS=log or ADDRESS=logit: scale on which a parameter is searched between its bounds.
     loss
@@ -97,6 +100,10 @@ def identify(
 
         parsed_case = options.read(case)
         bounds, normals, scales = arguments
+        normals = {
+            address: pair_in_si(parsed_case, address, pair, "--prior")
+            for address, pair in normals.items()
+        }
         priors = _priors(bounds_in_si(parsed_case, bounds), normals, scales)
         if options.overwrite and not resume:
             _remove_checkpoints(output)
@@ -166,17 +173,7 @@ def _prior_arguments(free, prior, scale) -> tuple[dict, dict, dict]:
     """
     bounds = dict(parse_bounds(text) for text in free)
     scales = dict(parse_assignment("--scale", text) for text in scale)
-    normals = {}
-    for text in prior:
-        address, value = parse_assignment("--prior", text)
-        try:
-            mean, deviation = map(float, value.split(":"))
-        except ValueError:
-            raise ValueError(
-                f"--prior takes ADDRESS=MEAN:DEVIATION, such as beam.damping_ratio=0.02:0.005, not "
-                f"{text!r}"
-            ) from None
-        normals[address] = mean, deviation
+    normals = dict(parse_prior(text) for text in prior)
     for address in (*scales, *normals):
         refuse_option(
             address not in bounds, f"{address} has a prior or a scale, but is not free: --free"

@@ -16,9 +16,9 @@ from jaxbeam.cli.arguments import (
 )
 from jaxbeam.cli.options import (
     CaseOptions,
+    LabelledPictureOptions,
     Output,
     Over,
-    PictureOptions,
     PrintOptions,
     print_plausibility,
     table,
@@ -40,7 +40,7 @@ def sweep(
     scheduler: str | None = None,
     precision: str = "double",
     plot: bool = False,
-    pictures: PictureOptions = PictureOptions(),
+    pictures: LabelledPictureOptions = LabelledPictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Simulate a case for many values of some of its parameters.
@@ -87,6 +87,7 @@ def sweep(
     if not resume:
         options.check_outputs(output, picture)
     parsed_case = options.read(case)
+    labels = pictures.sensor_labels(parsed_case)
     plausibility = _print_plausibility(parsed_case, values, options)
 
     from jaxbeam.sweeps.cluster import connect
@@ -108,7 +109,8 @@ def sweep(
     if picture:
         from jaxbeam.plot import plot_sweep
 
-        figure = plot_sweep(results, ax=pictures.page(), title=pictures.title)
+        look = {"title": pictures.title, "labels": labels}
+        figure = plot_sweep(results, ax=pictures.page(), **look)
         pictures.save(figure, picture)
     values = {address: results[address].to_numpy().tolist() for address in values}  # in SI units
     peaks = {str(name): results[name] for name in results if str(name).startswith("peak_")}
@@ -158,7 +160,17 @@ def _lines(case: "jb.Case", results: "xarray.Dataset", addresses: Sequence[str])
     header = ("sensor", "quantity", "peak", "size", "time (s)")
     names = [_head(results[address]) for address in addresses]
     lines = [f"{runs}; peaks are largest absolute values:", *table((*header, *names), rows)]
-    return [*lines, *_contact_lines(results, addresses)]
+    return [*lines, *_truncation_lines(results), *_contact_lines(results, addresses)]
+
+
+def _truncation_lines(results: "xarray.Dataset") -> list[str]:
+    """Sentence on what the modes left out change of the peaks of each quantity, where known."""
+    errors = [
+        f"{name.removeprefix('peak_')} {peaks.attrs['truncation_error']:.1e}"
+        for name, peaks in ((str(name), results[name]) for name in results)
+        if "truncation_error" in peaks.attrs
+    ]
+    return [f"modes left out change the largest peaks by about: {', '.join(errors)}"] * bool(errors)
 
 
 def _head(values: "xarray.DataArray") -> str:

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import Structure, random_structure, sampled
 from tuning import identify_modes
-from tuning.modal.harmonics import harmonic_lines, without_lines
+from tuning.modal.harmonics import harmonic_lines, is_steady, without_lines
 from tuning.modal.shapes import mac_matrix, normalised, phase_collinearity
 from tuning.modal.subspace import decompose, poles_of_order, spreads
 
@@ -126,3 +127,27 @@ def test_complexity_and_normalisation_of_shapes():
     np.testing.assert_allclose(phase_collinearity(shapes)[0], 1.0)
     assert phase_collinearity(shapes)[1] < 0.2
     np.testing.assert_allclose(normalised(shapes[:1])[0], [1, -0.5, 0.2], atol=1e-12)
+
+
+def test_lines_of_a_shaker_are_no_modes():
+    """Harmonics near and between the natural frequencies are named; none is a mode."""
+    for seed in range(2):
+        planted = sampled(small_structure(seed), "shaken", seed, 100.0)
+        fit = identify_modes(log_of(planted), band=(2.0, 11.0))
+        named = [line.frequency for line in fit.lines]
+        assert abs(planted.lines[0] - named[0]) < 0.01 and "steady shaking" in str(fit)
+        for line in planted.lines:
+            assert not np.any(np.abs(fit.frequencies - line) < 0.01)
+        assert not compare(fit, planted).false_modes, str(fit)
+
+
+def test_an_envelope_tells_a_line_that_wanders_from_a_resonance():
+    random = np.random.default_rng(3)
+    rate, count = 50.0, 15_000
+    phase = np.cumsum(0.02 * random.normal(size=count)) + 2 * np.pi * 4.0 * np.arange(count) / rate
+    line = np.cos(phase)[:, None] + 0.1 * random.normal(size=(count, 1))
+    assert is_steady(line, rate, 4.0, 0.01)
+    pole = np.exp(2 * np.pi * 4.0 * (-0.01 + 1j) / rate)
+    driven = lfilter([1.0], [1, -2 * pole.real, abs(pole) ** 2], random.normal(size=(count, 1)), 0)
+    assert not is_steady(driven, rate, 4.0, 0.01)
+    assert not is_steady(driven[:300], rate, 4.0, 0.01)

@@ -1,12 +1,14 @@
 """Modes from free decays: poles, shapes, and rejection of poles that are not reproduced."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy.signal import detrend
 from scipy.stats import t as student
 
-from tuning.modal.decay_poles import (
+from tuning.modal.decay.poles import (
     PoleFit,
     Spectrum,
     band_spectrum,
@@ -14,23 +16,26 @@ from tuning.modal.decay_poles import (
     pole_parameters,
     refine,
 )
-from tuning.modal.result import IdentifiedMode, rejection_reason
+from tuning.modal.result import IdentifiedMode
 
 MIN_BINS = 8  # bins of a spectrum to find poles in
 MAX_POLE_SHIFT_SD = 4.0  # standard deviations by which a pole may differ in a shorter window
 SHORTER_WINDOW_CUT = 0.2  # share of the window that is cut off for a shorter one
+MIN_ENERGY_LEFT = 0.1  # share of the energy of a mode in a shorter window that tells about it
 WEAK_ENERGY_SHARE = 0.2  # of the strongest mode's energy; below it poles must be reproduced
-NOT_REPRODUCED = "not the same in parts of the window"
 
 
 class DecayFit(NamedTuple):
-    """Modes of free decays with the reasons for rejecting them, and the fit in the band.
+    """Modes of free decays, and the fit in the band.
 
-    `measured` and `fitted` have a column for each channel of each decay.
+    `energies` are sums of squared samples of each mode in each column; `gone` tells which modes are
+    not reproduced in shorter windows; `measured` and `fitted` have a column for each channel of
+    each decay, `fitted` with drift and leakage into the band.
     """
 
     modes: tuple[IdentifiedMode, ...]
-    reasons: tuple[str, ...]
+    energies: Float[np.ndarray, "mode column"]
+    gone: tuple[bool, ...]
     measured: Float[np.ndarray, "sample column"]
     fitted: Float[np.ndarray, "sample column"]
 
@@ -50,29 +55,26 @@ def fit_decay(
     slightly on amplitude). None if the band has too few bins.
     """
     count = len(values)
+    values = detrend(values, axis=0)  # lines are among the drifts that the fit allows
     spectrum = band_spectrum(values, rate, band)
     if spectrum.bins.size < MIN_BINS:
         return None
     found = find_poles(spectrum, start=poles)
     cut = int(SHORTER_WINDOW_CUT * count)
-    shorter_spectra = [
-        band_spectrum(values[first:last], rate, band)
-        for first, last in ((cut, count), (0, count - cut))
+    # Of a mode that decays within its first fifth, the rest of a window says nothing.
+    lasting = np.exp(2 * found.poles.real * cut / rate) > MIN_ENERGY_LEFT
+    shorter = [
+        (_refit(found, spectrum, band_spectrum(values[first:last], rate, band)), told)
+        for first, last, told in ((cut, count, lasting), (0, count - cut, lasting | True))
     ]
-    shorter_fits = [_refit(found, spectrum, other) for other in shorter_spectra]
-    modes = _identified_modes(
-        found, _nonstationary_variance(found, shorter_fits), spectrum, channels
-    )
-    reasons = [rejection_reason(mode, spectrum.duration, band) for mode in modes]
-    not_reproduced = _not_reproduced(found, shorter_fits, spectrum)
+    modes = _identified_modes(found, _nonstationary_variance(found, shorter), spectrum, channels)
+    gone = _not_reproduced(found, shorter, spectrum)
     return DecayFit(
         modes=modes,
-        reasons=tuple(
-            why or (NOT_REPRODUCED if gone else "")
-            for gone, why in zip(not_reproduced, reasons, strict=True)
-        ),
-        measured=inverse_transform(found.model + found.residual, spectrum),
-        fitted=inverse_transform(found.model, spectrum),
+        energies=_energies(found, spectrum),
+        gone=tuple(gone.tolist()),
+        measured=inverse_transform(spectrum.values, spectrum),
+        fitted=inverse_transform(spectrum.values - found.residual, spectrum),
     )
 
 
@@ -91,12 +93,12 @@ def _not_reproduced(found: PoleFit, others, spectrum: Spectrum):
     the fit, but is no mode.
     """
     moved = np.zeros(found.poles.size)
-    for other in others:
+    for other, told in others:
         deviation = np.sqrt(np.diag(found.covariance) + np.diag(other.covariance))
         change = np.abs(pole_parameters(other.poles) - pole_parameters(found.poles)) / deviation
-        moved = np.maximum(moved, np.max(change.reshape(-1, 2), axis=1))
-        moved[other.poles.real > 0] = np.inf
-    share = _energy_shares(found, spectrum)
+        change = np.where(other.poles.real > 0, np.inf, np.max(change.reshape(-1, 2), axis=1))
+        moved = np.maximum(moved, np.where(told, change, 0.0))
+    share = np.sum(_energies(found, spectrum), axis=1)
     return (moved > MAX_POLE_SHIFT_SD) & (share < WEAK_ENERGY_SHARE * np.max(share, initial=0.0))
 
 
@@ -112,22 +114,22 @@ def _nonstationary_variance(found: PoleFit, others):
     For a uniform distribution over the range seen: a third of the square of half the range.
     """
     extra = np.zeros(2 * found.poles.size)
-    for other in others:
+    compared = np.sum([told for _, told in others], axis=0)
+    for other, told in others:
         expected = np.maximum(np.diag(other.covariance) - np.diag(found.covariance), 0)
         change = (pole_parameters(other.poles) - pole_parameters(found.poles)) ** 2
-        extra += np.where(change > 4 * expected, change - expected, 0) / 3 / len(others)
+        beyond = np.where(change > 4 * expected, change - expected, 0)
+        extra += np.repeat(told / np.maximum(compared, 1), 2) * beyond / 3
     return extra
 
 
-def _energy_shares(found: PoleFit, spectrum: Spectrum):
-    """Share of each mode in the energy of the samples, added over channels."""
+def _energies(found: PoleFit, spectrum: Spectrum) -> Float[np.ndarray, "mode column"]:
+    """Sums of squared samples of each mode in each column."""
     rates = 2 * -found.poles.real * spectrum.duration
     decay_factor = np.where(
         np.abs(rates) < 1e-6, 1.0, -np.expm1(-rates) / np.where(rates, rates, 1)
     )
-    energies = 0.5 * np.sum(np.abs(found.amplitudes) ** 2, axis=1) * decay_factor
-    total = 2 * np.sum(np.abs(found.model + found.residual) ** 2) / spectrum.samples**2
-    return energies / total
+    return 0.5 * spectrum.samples * np.abs(found.amplitudes) ** 2 * decay_factor[:, None]
 
 
 def _identified_modes(
@@ -136,9 +138,7 @@ def _identified_modes(
     """Frequency |p| / 2 pi and damping ratio s / |p| of each pole, with standard deviations."""
     modes = []
     quantile = float(student.ppf(0.975, max(found.degrees_of_freedom, 3.0)))
-    for k, (pole, share) in enumerate(
-        zip(found.poles, _energy_shares(found, spectrum), strict=True)
-    ):
+    for k, pole in enumerate(found.poles):
         covariance = found.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
         covariance = covariance + np.diag(scatter[2 * k : 2 * k + 2])
         rate, angular_frequency, size = -pole.real, pole.imag, abs(pole)
@@ -151,7 +151,7 @@ def _identified_modes(
                 frequency_sd=float(np.sqrt(by_frequency @ covariance @ by_frequency)),
                 damping_ratio=float(rate / size),
                 damping_sd=float(np.sqrt(by_damping @ covariance @ by_damping)),
-                energy_share=float(share),
+                energy_share=math.nan,  # told by `energies`
                 shape=shape,
                 shape_covariance=shape_covariance,
                 quantile=quantile,

@@ -52,7 +52,7 @@ class Spectrum(NamedTuple):
 class PoleFit(NamedTuple):
     """Poles fitted to a spectrum, and the residual.
 
-    `poles` (1/s) are in the upper half plane, ascending; `covariance` is that of (s_1, w_1, s_2,
+    `poles` (1/s) are in the upper half plane; `covariance` is that of (s_1, w_1, s_2,
     w_2, ...), minus their real parts and their imaginary parts; `amplitudes` are those at the start
     of the window and `amplitude_variance` their variances; `model` is the part of the spectrum due
     to modes; `degrees_of_freedom` are those of the noise level, for intervals.
@@ -103,13 +103,15 @@ def find_poles(
         * _smooth(np.abs(spectrum.values) ** 2, NEARBY_BINS)
         / (2 * NEARBY_BINS + 1)
     )
+    nuisance = _nuisance_columns(spectrum).shape[1]
+    most = max(2 * spectrum.bins.size - nuisance, 0) // 3  # a third of the numbers are left over
     if start is not None and start.size:
         frequencies = start.imag / (2 * np.pi)
         inside = (frequencies > spectrum.bins[0]) & (frequencies < spectrum.bins[-1])
         level = _robust_level(spectrum.values) + misfit_level
-        best = refine(start[inside][: spectrum.bins.size // 4], spectrum, level, COARSE_TOLERANCE)
+        best = refine(start[inside][:most], spectrum, level, COARSE_TOLERANCE)
         max_modes = min(max_modes, best.poles.size + MAX_ADDED_MODES)
-    while best.poles.size < min(max_modes, spectrum.bins.size // 4):
+    while best.poles.size < min(max_modes, most):
         level = _robust_level(best.residual) + misfit_level
         guess = _initial_pole(spectrum, best.residual, level)
         trial = refine(np.append(best.poles, guess), spectrum, level, COARSE_TOLERANCE)
@@ -121,7 +123,7 @@ def find_poles(
         best = trial
     best = _prune_poles(best, spectrum, misfit_level, min_gain)
     for _ in range(2):
-        best = refine(best.poles, spectrum, best.noise)
+        best = refine(best.poles[np.argsort(best.poles.imag)], spectrum, best.noise)
     return best
 
 
@@ -262,7 +264,7 @@ def refine(
     level: Float[np.ndarray, "bin channel"],
     accuracy: float = 1e-8,
 ) -> PoleFit:
-    """Poles refined together by least squares, weighted by the noise level.
+    """Poles refined together by least squares, weighted by the noise level, in the order given.
 
     The search ends when a step reduces the squares by less than the share `accuracy`.
     """
@@ -294,7 +296,6 @@ def refine(
         )
         poles = _poles_from_parameters((start + solved.x) / duration)
         poles = np.where(poles.imag < 0, poles.conj(), poles)
-        poles = poles[np.argsort(poles.imag)]
     return _fit_amplitudes(poles, spectrum, level)
 
 

@@ -1,0 +1,139 @@
+"""Modes of all free decays of a log, fitted together."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.signal import butter, detrend, sosfiltfilt
+
+from tuning.modal.ambient import (
+    Candidate,
+    divided_band,
+    overlapping,
+    subspace_modes,
+    without_duplicates,
+)
+from tuning.modal.decay.fit import fit_decay
+from tuning.modal.decay.stretches import Stretch, excited_samples, free_decays, stacked
+from tuning.modal.preprocessing import prepare, strongest_frequency
+from tuning.modal.result import rejection_reason
+from tuning.modal.samples import MIN_SAMPLES, Samples
+from tuning.modal.stabilisation import Diagram
+
+MIN_DECAY_ENERGY = 0.3  # share of the energy of a log in its decays, if they are to stand for it
+LONG_FALL_NEPERS = 2.5  # or fall of the energy; 95 % of that of an exponential falls by 3
+MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
+NOT_REPRODUCED = "not the same in parts of the window"
+MAX_RESIDUAL_OF_WINDOW = 0.05  # the same for a window that the user gives and that falls little
+
+
+class Decays(NamedTuple):
+    """Decays that were fitted, and the first of them, measured and fitted, in the band."""
+
+    stretches: tuple[Stretch, ...]
+    measured: Float[np.ndarray, "sample channel"]
+    fitted: Float[np.ndarray, "sample channel"]
+
+
+def excited(
+    samples: Samples, derivatives: tuple[int, ...], band: tuple[float, float]
+) -> tuple[Bool[np.ndarray, " time"], ...]:
+    """Samples of each record at which the structure is struck, at the rate of the log.
+
+    Below half the band (Hz) drift is removed; above it all frequencies count.
+    """
+    prepared = prepare(samples.records, samples.starts, samples.rate, band)
+    frequency = strongest_frequency(prepared.records, prepared.rate, derivatives, band)
+    sos = butter(2, band[0] / 2, "highpass", fs=samples.rate, output="sos")
+    return tuple(
+        excited_samples(
+            sosfiltfilt(sos, detrend(record, axis=0), axis=0), samples.rate, 1 / frequency
+        )
+        for record in samples.records
+    )
+
+
+def free_decay_modes(
+    samples: Samples,
+    struck: tuple[Bool[np.ndarray, " time"], ...],
+    derivatives: tuple[int, ...],
+    band: tuple[float, float],
+    *,
+    kind: str | None = None,
+    whole: bool = False,
+    order: int | None = None,
+) -> tuple[tuple[Candidate, ...], tuple[Diagram, ...], Decays] | None:
+    """Modes of the free decays between struck samples; None without any that stand for the log.
+
+    `derivatives` are the orders of the channels as time derivatives. Of a log in which none is
+    found, all is one decay if it is said to be (`kind`) or may be (`whole`, of a window that the
+    user gives).
+    """
+    prepared = prepare(samples.records, samples.starts, samples.rate, band)
+    frequency = strongest_frequency(prepared.records, prepared.rate, derivatives, band)
+    decays = free_decays(struck, prepared.records, prepared.rate, frequency)
+    given = not decays and (kind == "free decay" or whole)
+    if given:
+        decays = tuple(Stretch(i, 0, len(r), 0.0) for i, r in enumerate(samples.records))
+    ratio = prepared.rate / samples.rate
+    if not decays or not (kind or given or _dominate(decays, prepared.records, ratio)):
+        return None
+    windows, used = stacked(samples.records, decays)
+    if len(windows) < MIN_SAMPLES // 2:
+        return None
+    channels = samples.records[0].shape[1]
+    pieces = tuple(windows[:, i : i + channels] for i in range(0, windows.shape[1], channels))
+    starts = tuple(one.start / samples.rate for one in used)
+    candidates, diagrams = subspace_modes(pieces, starts, samples.rate, band, order=order)
+    poles = np.array([candidate.mode.pole for candidate in candidates], complex)
+    fits = [
+        (part, fit)
+        for part in divided_band(band)
+        if (fit := fit_decay(windows, samples.rate, overlapping(part, band), channels, poles))
+    ]
+    if not fits:
+        return None
+    measured, fitted = (
+        sum(_within(getattr(fit, name), samples.rate, part) for part, fit in fits)
+        for name in ("measured", "fitted")
+    )
+    energy = np.sum(measured**2, axis=0)
+    limit = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_ENERGY
+    by_channel = energy.reshape(-1, channels).sum(axis=0)
+    found = _candidates(fits, by_channel, len(windows) / samples.rate, band)
+    good = any(not one.reason for one in found)
+    if kind is None and not (good and np.sum((measured - fitted) ** 2) < limit * energy.sum()):
+        return None
+    return found, diagrams, Decays(used, measured[:, :channels], fitted[:, :channels])
+
+
+def _within(values, rate, part):
+    """Samples of the bins of a part of the band."""
+    transform = np.fft.rfft(values, axis=0)
+    bins = np.fft.rfftfreq(len(values), 1 / rate)
+    transform[(bins < part[0]) | (bins >= part[1])] = 0.0
+    return np.fft.irfft(transform, len(values), axis=0)
+
+
+def _candidates(fits, energy, duration, band) -> tuple[Candidate, ...]:
+    """Modes of each part of the band, with their shares in the energy of the channels."""
+    found = []
+    for part, fit in fits:
+        decays = fit.energies.shape[1] // energy.size
+        by_channel = fit.energies.reshape(-1, decays, energy.size).sum(axis=1)
+        shares = np.mean(by_channel / np.maximum(energy, 1e-300), axis=1)
+        for mode, share, gone in zip(fit.modes, shares.tolist(), fit.gone, strict=True):
+            if part[0] <= mode.frequency < part[1] or len(fits) == 1:
+                mode = mode._replace(energy_share=share)
+                reason = rejection_reason(mode, duration, band) or (NOT_REPRODUCED if gone else "")
+                found.append(Candidate(mode, reason, 1))
+    return without_duplicates(found)
+
+
+def _dominate(decays, records, ratio) -> bool:
+    """Whether decays hold much of the energy of a log, or fall farther than chance allows."""
+    inside = sum(
+        np.sum(records[d.record][int(d.start * ratio) : int(d.stop * ratio)] ** 2) for d in decays
+    )
+    whole = sum(np.sum(record**2) for record in records)
+    return bool(inside > MIN_DECAY_ENERGY * whole or max(d.fall for d in decays) > LONG_FALL_NEPERS)

@@ -1,0 +1,189 @@
+"""Free decays in a log: stretches after blows, or after a load has left, without excitation.
+
+Between blows the samples are predicted by the past ones, but for noise. An autoregressive model of
+each channel tells excitation by its prediction errors: a blow is an error far beyond those of the
+quietest parts of the log, and beyond those around it or not small beside the signal itself. The
+model is that of the log at its own rate, whose highest frequencies show a contact best, whatever
+the band in which modes are sought.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.signal import lfilter
+
+AR_ORDER = 24
+AR_ITERATIONS = 6
+AR_ROWS = 20_000  # equations from which its coefficients are found
+QUIET_QUANTILE = 0.2  # of the blocks, by their prediction errors
+BLOW_SD = 10.0  # prediction errors of quiet blocks, beyond which the structure is struck
+BLOW_SIGNAL_SHARE = 0.25  # of the rms of the signal around, likewise
+BLOW_LOCAL_SD = 8.0  # or of the errors around it; normal errors reach six in a day of samples
+CONTACT_SAMPLES = 4  # within which past and future fail after a blow
+MIN_ENERGY_RISE = 2.0  # energy in two cycles after a blow over that before it
+MIN_DECAY_CYCLES = 5.0  # of the strongest vibration
+MIN_FALL_NEPERS = 1.0  # of the energy over a decay
+MIN_LINEARITY = 0.6  # share of the variance of the log energy that a straight line explains
+MAX_COLUMNS = 24  # channels times decays that are fitted together
+FALL_PARTS = 10  # parts of a decay whose mean energies tell its fall
+CORE, WHOLE = 0.95, 0.999  # shares of the energy of a decay: for its fall, and for its end
+
+
+class Stretch(NamedTuple):
+    """Samples (start, stop) of a record between excitations, and the fall of energy in nepers."""
+
+    record: int
+    start: int
+    stop: int
+    fall: float
+
+
+def excited_samples(
+    record: Float[np.ndarray, "time channel"], rate: float, cycle: float
+) -> Bool[np.ndarray, " time"]:
+    """Samples at which the structure is struck; `cycle` (s) is that of its strongest vibration.
+
+    Neither the past samples predict them nor the coming ones: after a blow the past fails for as
+    many samples as the model has coefficients, before it the future. Two models must fail, one of
+    errors relative to the signal around, one of absolute errors, in which the loud parts count.
+    """
+    span = max(int(2 * cycle * rate), 16)
+    struck = np.zeros(len(record), bool)
+    for values in record.T:
+        if not values.any():
+            continue
+        around = np.sqrt(_moving_mean(values**2, span)) + 1e-12 * np.abs(values).max() + 1e-300
+        forward, backward = np.ones((2, values.size), bool)
+        for scale in (around, np.ones(values.size)):
+            forward &= _is_large(_prediction_errors(values, scale), around, span)
+            errors = _prediction_errors(values[::-1], scale[::-1])[::-1]
+            backward &= _is_large(errors, around, span)
+        struck |= _widened(forward) & _widened(backward)
+    return struck
+
+
+def _is_large(error, around, span):
+    """Errors beyond those of the quietest blocks, and not small beside the signal."""
+    size, found = max(span, 32), np.abs(error)
+    if error.size < 2 * size:
+        return found > BLOW_SIGNAL_SHARE * around
+    blocks = found[: error.size // size * size].reshape(-1, size)
+    quiet = np.sqrt(np.quantile(np.mean(blocks**2, axis=1), QUIET_QUANTILE))
+    medians = np.median(blocks, axis=1) / 0.6745  # standard deviations of normal errors
+    local = medians[np.minimum(np.arange(error.size) // size, len(medians) - 1)]
+    return (found > BLOW_SD * quiet) & (
+        (found > BLOW_SIGNAL_SHARE * around) | (found > BLOW_LOCAL_SD * local)
+    )
+
+
+def _widened(samples):
+    """Samples and their neighbours within `CONTACT_SAMPLES` on either side."""
+    return np.convolve(samples, np.ones(2 * CONTACT_SAMPLES + 1), "same") > 0.5
+
+
+def _prediction_errors(values, scale):
+    """Errors of an autoregressive model, zero where the past is too short.
+
+    The model has the least sum of absolute errors over a scale (by iteratively reweighted least
+    squares), so that excited samples, however strong, do not shape it.
+    """
+    order = min(AR_ORDER, values.size // 8)
+    step = max(values.size // AR_ROWS, 1)
+    past = np.lib.stride_tricks.sliding_window_view(values, order)[:-1:step]
+    target, scale = values[order::step], scale[order::step]
+    least = 1e-6 * values.std() + 1e-300
+    weight = 1 / scale**2
+    for _ in range(AR_ITERATIONS):
+        weighted = past * weight[:, None]
+        gram = past.T @ weighted
+        coefficients = np.linalg.lstsq(gram, weighted.T @ target, rcond=1e-14)[0]
+        weight = 1 / (scale * np.maximum(np.abs(target - past @ coefficients), least))
+    errors = lfilter(np.concatenate([[1.0], -coefficients[::-1]]), [1.0], values)
+    errors[:order] = 0.0
+    return errors
+
+
+def _moving_mean(values, width):
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    index = np.arange(values.size)
+    low, high = np.maximum(index - width // 2, 0), np.minimum(index + width // 2 + 1, values.size)
+    return (total[high] - total[low]) / (high - low)
+
+
+def free_decays(
+    struck: tuple[Bool[np.ndarray, " time"], ...],
+    records: tuple[Float[np.ndarray, "sample channel"], ...],
+    rate: float,
+    frequency: float,
+) -> tuple[Stretch, ...]:
+    """Decays between the struck samples of records, in samples of these.
+
+    `records` are those of the band, at the `rate` (Hz) after decimation; `frequency` (Hz) is that
+    of the strongest vibration. A decay lasts at least five cycles, in which the energy falls by
+    one neper, along a line or after a blow that raised it; it ends when 99.9 % of the energy above
+    the least has passed.
+    """
+    found = []
+    shortest = int(np.ceil(MIN_DECAY_CYCLES * rate / frequency))
+    width = max(int(2 * rate / frequency), 4)
+    for number, (marks, record) in enumerate(zip(struck, records, strict=True)):
+        ratio = marks.size / len(record)
+        scaled = record / np.maximum(record.std(axis=0), 1e-300)
+        energy = _moving_mean(np.sum(scaled**2, axis=1), width)
+        edges = np.concatenate([[-1], np.flatnonzero(marks), [marks.size]])
+        excited_from = 0
+        for i in np.flatnonzero(np.diff(edges) >= shortest * ratio):
+            start = 0 if i == 0 else int(edges[i]) + 2
+            stop = int(edges[i + 1]) - 1 if i + 2 < edges.size else marks.size
+            first, last = int(np.ceil(start / ratio)), int(stop / ratio)
+            before, excited_from = int(excited_from / ratio) - width, stop
+            if last - first < shortest:
+                continue
+            risen = energy[first : first + width].mean()
+            blow = i > 0 and (before < 0 or risen > MIN_ENERGY_RISE * energy[before])
+            fall, linearity = _fall(energy[first : first + _length(energy[first:last], CORE)])
+            if fall > MIN_FALL_NEPERS and (blow or linearity > MIN_LINEARITY):
+                length = max(_length(energy[first:last], WHOLE), shortest)
+                stop = min(stop, start + int(length * ratio))
+                found.append(Stretch(number, start, stop, fall))
+    return tuple(found)
+
+
+def _length(energy, share):
+    """Samples that hold a share of the energy above its least."""
+    total = np.cumsum(energy - energy.min())
+    return int(np.searchsorted(total, share * total[-1])) + 1
+
+
+def _fall(energy):
+    """Fall of the logarithm of the energy along its straight line, and how linear it is."""
+    parts = np.array_split(energy, FALL_PARTS)
+    level = np.log([part.mean() + 1e-300 for part in parts if part.size])
+    if level.size < 3:
+        return 0.0, 0.0
+    across = np.linspace(-1, 1, level.size)
+    slope, middle = np.polyfit(across, level, 1)
+    misfit = np.var(level - middle - slope * across)
+    return float(-2 * slope), float(1 - misfit / max(np.var(level), 1e-300))
+
+
+def stacked(
+    records: tuple[Float[np.ndarray, "time channel"], ...], decays: tuple[Stretch, ...]
+) -> tuple[Float[np.ndarray, "sample column"], tuple[Stretch, ...]]:
+    """Decays of one length side by side, channels of the first before those of the second ...
+
+    The common length is the median; decays of less than half of it are left out, and those between
+    shorten it. Of more than 24 columns in all, the decays with most energy are kept.
+    """
+    lengths = np.array([one.stop - one.start for one in decays])
+    used = tuple(
+        one for one, length in zip(decays, lengths, strict=True) if 2 * length >= np.median(lengths)
+    )
+    most = max(MAX_COLUMNS // records[0].shape[1], 1)
+    energies = [np.sum(records[one.record][one.start : one.stop] ** 2) for one in used]
+    kept = np.sort(np.argsort(energies)[::-1][:most])
+    used = tuple(used[i] for i in kept)
+    length = min(int(np.median(lengths)), min(one.stop - one.start for one in used))
+    parts = [records[one.record][one.start : one.start + length] for one in used]
+    return np.hstack(parts), used

@@ -1,0 +1,102 @@
+"""Samples of logs from which modes are identified: records in a window, with notes on faults."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from tuning.logs.log import Log
+from tuning.logs.quality import find_faults
+from tuning.logs.records import even_records
+
+MIN_SAMPLES = 64
+
+
+class Samples(NamedTuple):
+    """Records of all logs in SI units, with the times of their first samples (s)."""
+
+    records: tuple[Float[np.ndarray, "time channel"], ...]
+    starts: tuple[float, ...]
+    rate: float
+    notes: tuple[str, ...]
+
+
+def samples_of(logs: Sequence[Log], window: tuple[float, float] | None) -> Samples:
+    """Records of the logs in a window (s), and notes on the logs and their faults.
+
+    Raises ValueError for logs too short, not evenly sampled, or different in channels or rate, and
+    a window outside a log.
+    """
+    records, starts, rates, notes = [], [], [], []
+    for log in logs:
+        start, stop = _sample_range(log, window)
+        if stop - start < MIN_SAMPLES:
+            raise ValueError(
+                f"{log.source}: {stop - start} samples are too few to identify modes from; "
+                f"at least {MIN_SAMPLES} are needed"
+            )
+        part = log if (start, stop) == (0, log.times.size) else _part(log, start, stop)
+        rate, found, said = even_records(part)
+        rates.append(rate)
+        records += [record.values for record in found]
+        starts += [record.start for record in found]
+        faults = (str(fault).removeprefix(f"{log.source}: ") for fault in find_faults(part))
+        notes += [*log.notes, *said, *faults]
+        if log.names != logs[0].names or abs(rate / rates[0] - 1) > 1e-3:
+            raise ValueError(
+                f"{log.source}: logs identified together must have the same channels and sampling "
+                f"rate; {logs[0].source} has {', '.join(logs[0].names)} at {rates[0]:.6g} Hz, this "
+                f"one {', '.join(log.names)} at {rate:.6g} Hz"
+            )
+    return Samples(tuple(records), tuple(starts), rates[0], tuple(dict.fromkeys(notes)))
+
+
+def _part(log: Log, start: int, stop: int) -> Log:
+    """Part of a log."""
+    return Log(
+        log.times[start:stop], log.values[start:stop], log.names, log.quantities, log.units,
+        log.source, valid=log.valid[start:stop],
+    )  # fmt: skip
+
+
+def with_channels(log: Log, channels: Sequence[str] | None) -> Log:
+    """The log with the channels of some names, by default all that are no commands.
+
+    Raises ValueError for a channel that the log has not.
+    """
+    if channels is None:
+        kept = [i for i, actuator in enumerate(log.actuators) if actuator is None]
+    else:
+        unknown = [name for name in channels if name not in log.names]
+        if unknown:
+            raise ValueError(
+                f"{log.source}: the log has no channel {unknown[0]!r}; it has "
+                f"{', '.join(log.names)}"
+            )
+        kept = [log.names.index(name) for name in channels]
+    if kept == list(range(len(log.names))):
+        return log
+
+    def pick(entries):
+        return tuple(entries[i] for i in kept)
+
+    return Log(
+        log.times, log.values[:, kept], pick(log.names), pick(log.quantities), pick(log.units),
+        log.source, pick(log.sensors), pick(log.positions), pick(log.actuators), log.loads,
+        log.valid[:, kept], log.notes,
+    )  # fmt: skip
+
+
+def _sample_range(log: Log, window) -> tuple[int, int]:
+    """First and last (exclusive) sample of a window (s)."""
+    if window is None:
+        return 0, log.times.size
+    step = log.duration / (log.times.size - 1)
+    if not (log.times[0] <= window[0] < window[1] <= log.times[-1] + step):
+        raise ValueError(
+            f"{log.source}: the window from {window[0]:g} s to {window[1]:g} s is not within the "
+            f"log, {log.times[0]:.6g} s to {log.times[-1]:.6g} s"
+        )
+    start, stop = np.searchsorted(log.times, window)
+    return int(start), int(stop)
