@@ -33,13 +33,10 @@ from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
-<<<<<<< HEAD
 from jaxbeam.model.sensing.corrected_rows import StaticCorrection
 from jaxbeam.model.sensing.linear_outputs import linear_outputs
 from jaxbeam.model.sensing.output_rows import OutputRows
-=======
 from jaxbeam.model.settlement import has_settlement
->>>>>>> main
 from jaxbeam.numerics.gauss import lagrange_coefficients
 from jaxbeam.numerics.peak_search import (
     ESTIMATE_ITERATIONS,

@@ -117,22 +117,15 @@ class Program(NamedTuple):
 def modal_models(program: Program, shared_values):
     """Models of batches, and their longest stable steps (s)."""
 
-<<<<<<< HEAD
     # `map` is less to trace than `vmap`.
     return jax.lax.map(lambda values: model_and_limit(program, values), shared_values)
-=======
-    def model_and_limit(values):
-        varied = program.case_with(values)
-        model = modal_model(varied, program.shapes.layout, program.shapes.coupled)
-        return model, max_stable_step(model, load_set(varied, program.shapes.layout))
->>>>>>> main
 
 
 def model_and_limit(program: Program, shared_values):
     """Model of a batch, and its longest stable step (s)."""
     varied = program.case_with(shared_values)
     model = modal_model(varied, program.shapes.layout, program.shapes.coupled)
-    return model, max_stable_step(model, load_set(varied))
+    return model, max_stable_step(model, load_set(varied, program.shapes.layout))
 
 
 @compiled
