@@ -9,6 +9,7 @@ from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import is_supported, residual_flexibility
 from jaxbeam.model.statics import influence_line
+from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 
 SAMPLES = 400  # of the run from which errors of corrected quantities are estimated

@@ -138,13 +138,12 @@ def test_results_equal_those_of_xla(case, over):
     assert np.any(native.peak_deflection != plain.peak_deflection)
 
 
-def test_peaks_of_every_quantity_equal_those_of_xla():
-    """Both choose their steps, with errors of 1e-8; those of accelerations are the largest."""
-    native, plain = sweep_by_c_and_xla(MEASURED, {"loads.0.mass": [0.1, 0.5]})
+def test_peaks_of_every_quantity_equal_those_of_a_single_run():
+    found = jb.sweep(MEASURED, {"loads.0.mass": [0.5]}, tolerance=1e-8, progress=False)
+    record = jb.simulate(MEASURED, tolerance=1e-9)
+    largest = np.maximum(np.abs(record.smallest), record.largest)
     for i, name in enumerate(QUANTITIES):
-        found, expected = native[f"peak_{name}"][:, i], plain[f"peak_{name}"][:, i]
-        assert_allclose(found, expected, rtol=5e-8, err_msg=name)
-        assert np.any(found != expected)
+        assert_allclose(found[f"peak_{name}"][0, i], largest[i], rtol=2e-8, err_msg=name)
 
 
 def test_a_beam_without_loads_stays_at_rest():
