@@ -19,8 +19,7 @@ from jaxtyping import Bool
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_peaks as integrate_peaks_in_jax
-from jaxbeam.integrator.linear_outputs import linear_outputs
-from jaxbeam.integrator.monitored_rows import force_weights_at_peaks
+from jaxbeam.integrator.monitored_rows import force_weights_at_peaks, largest_per_energy
 from jaxbeam.integrator.propagators import (
     DOUBLINGS,
     GAUSS_NODES,
@@ -35,6 +34,7 @@ from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.corrected_rows import StaticCorrection
+from jaxbeam.model.sensing.linear_outputs import linear_outputs
 from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.model.settlement import has_settlement
 from jaxbeam.numerics.gauss import lagrange_coefficients
@@ -142,6 +142,8 @@ def integrate_peaks(
     shared = None if models.state_matrix.shape[0] == 1 else 0
     own = jax.tree.map(lambda leaf: leaf[0], models) if shared is None else models
     linear = jax.vmap(linear_outputs, (shared, 0, 0))(own, outputs, correction)
+    corrected = None if correction is None else correction.rows
+    bounds = jax.vmap(largest_per_energy, (shared, 0, 0))(own, outputs, corrected)
     count = linear.rows.shape[1]
     influence = np.zeros((1, 1)), np.zeros((1, 1, 0, count))
     if linear.influence is not None:
@@ -156,7 +158,7 @@ def integrate_peaks(
             grids.on_beam_intervals,
         ),
         *(*jax.vmap(LoadSet.cubics)(loads), loads.wheels.inertia, loads.wheels.weight),
-        *(linear.rows, linear.bounds, *influence),
+        *(linear.rows, bounds, *influence),
         *(part[None] for part in constants),
     )
     tasks, load_count, batch_size = loads.wheels.inertia.shape

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.case import Case, concrete_case, value_at
+from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.integrator.events import sample_schedule
 from jaxbeam.integrator.static_shapes import StaticShapes, max_concurrent_loads
 from jaxbeam.model.load_set import load_set
@@ -18,8 +18,7 @@ from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import sample_times, steps_per_interval
 from jaxbeam.sweeps import programs
-from jaxbeam.sweeps.batches import Batches
-from jaxbeam.sweeps.common_layout import common_layout
+from jaxbeam.sweeps.batches import Batches, common_layout, values_at
 from jaxbeam.sweeps.step_size import (
     choose_step_sizes,
     initial_step_sizes,
@@ -60,7 +59,7 @@ class Runner:
             )
         elif histories:
             self.schedule = sample_schedule(sample_times(case), True, end=case.run.duration)
-        # More threads than cores, as some wait for the results of others.
+        # More threads than cores, as some wait for others.
         self.pool = ThreadPoolExecutor(2 * (os.cpu_count() or 1))
         # The variant that measures step sizes is compiled below, others on first use.
         self._compile_lock, self._compiled_variants = threading.Lock(), {(None, False)}
@@ -150,7 +149,7 @@ class Runner:
 
     def _set_step_limits(self, entries, exits, limits):
         """Crossing rates (1/s), longest steps and initial steps (s) of all batches."""
-        duration = _values_at(self.case, self.batches, "run.duration")
+        duration = values_at(self.case, self.batches, "run.duration")
         times_on_beam = np.minimum(exits, duration[:, None]) - entries
         times_on_beam = np.where(times_on_beam > 0, times_on_beam, duration[:, None])
         crossing_time = np.min(times_on_beam, axis=1, initial=np.inf)
@@ -188,10 +187,7 @@ class Runner:
         return steps, error
 
     def _compared_by_quantity(self, peaks):
-        """Peaks (path, batch, sensor), those of each quantity as further runs of the batch.
-
-        Small peaks of one quantity then are not judged by large ones of another unit.
-        """
+        """Peaks (path, batch, sensor) of each quantity as further runs: they are not compared."""
         quantities = np.array([sensor.quantity for sensor in self.case.sensors])
         return np.concatenate(
             [peaks * (quantities == one) for one in np.unique(quantities)], axis=1
@@ -293,13 +289,6 @@ def _round_up(count: int, unit: int) -> int:
 def _stable_steps(limits) -> Float[np.ndarray, " path"]:
     """Longest stable steps (s), infinite where there is none: such a run fails with any step."""
     return np.where(np.isfinite(limits), limits, np.inf)
-
-
-def _values_at(case: Case, batches: Batches, address: str) -> Float[np.ndarray, " path"]:
-    """Number at an address in each batch."""
-    if address in batches.shared_addresses:
-        return batches.shared_values[:, batches.shared_addresses.index(address)]
-    return np.full(batches.shared_values.shape[0], float(value_at(case, address)))
 
 
 def _to_single_precision(leaf):

@@ -8,17 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case, replace
-from jaxbeam.integrator.linear_outputs import linear_outputs
-from jaxbeam.integrator.moving_forces import (
-    ForceSystem,
-    constant_speeds,
-    force_system,
-    peaks_of_forces,
-)
+from jaxbeam.integrator.forces.peaks import constant_speeds, peaks_of_forces
+from jaxbeam.integrator.forces.system import ForceSystem, force_system
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
+from jaxbeam.model.sensing.linear_outputs import linear_outputs
 from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.static_correction import is_supported
 from jaxbeam.sweeps.batches import Batches

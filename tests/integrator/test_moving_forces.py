@@ -7,9 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.integrator.linear_outputs import linear_outputs
-from jaxbeam.integrator.moving_forces import force_system, particular_solution
+from jaxbeam.integrator.forces.system import force_system, particular_solution
 from jaxbeam.model.modal_model import modal_model
+from jaxbeam.model.sensing.linear_outputs import linear_outputs
 from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.numerics.piecewise import piecewise_chebyshev
 from jaxbeam.sweeps.force_runner import force_runner

@@ -82,15 +82,16 @@ LONG = jb.Case(
     ],
     run=jb.Run(2.0),
 )
-# Every quantity, in beams whose modes are coupled by a damper, and not.
-QUANTITIES = ("velocity", "acceleration", "slope", "curvature", "strain", "moment", "shear")
+# Other quantities, on a beam whose modes are coupled by a damper.
+QUANTITIES = ("velocity", "acceleration", "strain", "moment", "shear")
 MEASURED = dataclasses.replace(
-    STREAM,
+    PLAIN,
     supports=[jb.Support(0.45, stiffness=2e4, damping=30.0)],
     sensors=[
         jb.Sensor(0.2, name, fibre_distance=2e-3 if name == "strain" else None)
         for name in QUANTITIES
     ],
+    run=jb.Run(0.7),
 )
 FEW = {"loads.0.mass": [0.1, 0.5], "loads.2.speed": [0.8, 1.2]}
 GRID = {"loads.0.mass": np.linspace(0.05, 1.0, 13), "loads.0.speed": [1.0, 2.0, 7.0]}
@@ -137,15 +138,12 @@ def test_results_equal_those_of_xla(case, over):
     assert np.any(native.peak_deflection != plain.peak_deflection)
 
 
-@pytest.mark.parametrize("supports", [MEASURED.supports, ()], ids=["damper", "plain"])
-def test_peaks_of_every_quantity_equal_those_of_xla(supports):
-    """Both choose their steps, with errors of 1e-8; those of accelerations are the largest."""
-    case = dataclasses.replace(MEASURED, supports=supports)
-    native, plain = sweep_by_c_and_xla(case, {"loads.0.mass": [0.1, 0.5]})
+def test_peaks_of_every_quantity_equal_those_of_a_single_run():
+    found = jb.sweep(MEASURED, {"loads.0.mass": [0.5]}, tolerance=1e-8, progress=False)
+    record = jb.simulate(MEASURED, tolerance=1e-9)
+    largest = np.maximum(np.abs(record.smallest), record.largest)
     for i, name in enumerate(QUANTITIES):
-        found, expected = native[f"peak_{name}"][:, i], plain[f"peak_{name}"][:, i]
-        assert_allclose(found, expected, rtol=5e-8, err_msg=name)
-        assert np.any(found != expected)
+        assert_allclose(found[f"peak_{name}"][0, i], largest[i], rtol=2e-8, err_msg=name)
 
 
 def test_a_beam_without_loads_stays_at_rest():

@@ -2,7 +2,6 @@
 
 from jaxtyping import Float
 
-from jaxbeam.integrator.monitored_rows import largest_per_energy
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.corrected_rows import LoadInfluence, StaticCorrection
 from jaxbeam.model.sensing.output_rows import OutputRows, row_on_states
@@ -14,12 +13,11 @@ class LinearOutputs(Module):
     """Outputs y = rows z + sum over the loads of influence(x) F, without commands.
 
     z are the states of the model, F the forces (N, upwards) of loads at x; `influence` is None
-    where they do not change the outputs at once. `bounds` are those of `largest_per_energy`.
+    where they do not change the outputs at once.
     """
 
     rows: Float[Array, "output state"]
     influence: LoadInfluence | None
-    bounds: Float[Array, " output"]
 
 
 def linear_outputs(
@@ -52,9 +50,4 @@ def linear_outputs(
         influence = LoadInfluence(model.modes.nodes, model.modes.series @ on_modes)
     if correction is not None:
         influence = correction.influence.plus(influence)
-    corrected = None if correction is None else correction.rows
-    return LinearOutputs(
-        xp.array(rows).reshape(count, model.state_count),
-        influence,
-        largest_per_energy(model, outputs, corrected),
-    )
+    return LinearOutputs(xp.array(rows).reshape(count, model.state_count), influence)
