@@ -45,6 +45,7 @@ from experiments.thesis.verdicts import (
 from jaxbeam.plot.style import colour, set_title, use_style
 
 SAMPLE_RATE = 200.0  # Hz
+Plants = Mapping[str, tuple[jb.Case, jb.Shaker]]  # designs and shakers by reading
 
 UNDAMPED_DESIGN = "R = 3e-4, 2.5 N/V, 80 N s/m in the plant only"  # for stability alone
 
@@ -141,7 +142,7 @@ def _finding(
     )
 
 
-def _partial_feedback_finding(runs: RegulatorRuns, plants, peaks, time_varying) -> Finding:
+def _partial_feedback_finding(runs: RegulatorRuns, plants: Plants, peaks, time_varying) -> Finding:
     """Reductions (%) with the first state fed back, and with the printed ones."""
     reductions = {}
     for name, plant in plants.items():
@@ -155,7 +156,7 @@ def _partial_feedback_finding(runs: RegulatorRuns, plants, peaks, time_varying) 
     return _finding(published.PARTIAL_FEEDBACK, reductions, 0.0)
 
 
-def _gain_scheduling_finding(runs: RegulatorRuns, plants) -> Finding:
+def _gain_scheduling_finding(runs: RegulatorRuns, plants: Plants) -> Finding:
     """Further reduction (points) for the heaviest mass by the gain designed for it.
 
     The other gain is designed for the lightest mass.
