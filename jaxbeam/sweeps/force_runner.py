@@ -59,8 +59,12 @@ class ForceRunner:
         return len(self._runs(block))
 
     def compute_block(self, block: int, steps) -> dict[str, np.ndarray]:
-        """Results (path, batch, ...) of a block by name."""
+        """Results (path, batch, ...) of a block by name; the last run repeated in a short block.
+
+        Blocks are of equal size, as those of `blocks.Runner`: stores find a block by its size.
+        """
         found = [self._peaks(run, steps[run])._asdict() for run in self._runs(block)]
+        found += [found[-1]] * (len(self._runs(0)) - len(found))
         return {name: np.stack([one[name] for one in found]) for name in found[0]}
 
     def _runs(self, block: int) -> range:

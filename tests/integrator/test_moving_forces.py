@@ -53,6 +53,15 @@ def test_peaks_equal_those_of_the_integrator(case):
     assert np.isnan(found["contact_lost_time"]).all()
 
 
+def test_stored_sweeps_whose_last_block_is_short_have_every_run_in_its_place(tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxbeam.sweeps.force_runner.BLOCK_RUNS", 4)
+    speeds = {"loads.0.speed": [20.0, 22.0, 24.0, 26.0, 28.0, 30.0]}
+    case = dataclasses.replace(TWO_SPANS, sensors=[jb.Sensor(8.0)])
+    in_memory = jb.sweep(case, speeds, progress=False)
+    stored = jb.sweep(case, speeds, store=tmp_path / "runs.zarr", progress=False)
+    assert_allclose(stored.peak_deflection, in_memory.peak_deflection, rtol=1e-12)
+
+
 @pytest.mark.parametrize("speed", [5.0, 60.0, -300.0])
 def test_particular_solutions_satisfy_their_equation(speed):
     model = modal_model(TWO_SPANS)
