@@ -7,6 +7,7 @@ from docutils.nodes import SkipNode
 
 ziamath.config.math.color = "currentColor"  # that of the text, in dark mode too
 SIZE = 17  # px
+MAX_HEIGHT = 8 * SIZE  # higher: a bracket around a sum, by \left and \right, was set wrongly
 
 
 def equation(latex: str, block: bool) -> str:
@@ -19,6 +20,8 @@ def equation(latex: str, block: bool) -> str:
         svg = picture.svg()
     except Exception as error:
         raise ValueError(f"cannot set the equation {latex.strip()}: {error!r}") from error
+    if picture.getsize()[1] > MAX_HEIGHT:
+        raise ValueError(f"set too high, take \\Bigl and \\Bigr: {latex.strip()}")
     label = html.escape(" ".join(latex.split()))
     look = "" if block else f' style="vertical-align:{picture.getyofst():.1f}px"'
     return svg.replace("<svg ", f'<svg role="img" aria-label="{label}" class="equation"{look} ', 1)

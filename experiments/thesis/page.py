@@ -30,20 +30,20 @@ from experiments.thesis.verdicts import (
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "explanation" / "thesis.md"
 BEGIN, END = "<!-- counts of verdicts -->", "<!-- end of counts -->"
-INTRODUCTION = """# What the thesis's numbers bear
+INTRODUCTION = """# Numbers of the thesis: reproduced or not
 
-Every number that the thesis prints and a computation can be compared with was gone through as by
-somebody who tries to refute it. The rules:
+For each number that the thesis prints and that can be computed, this page says whether jaxbeam
+finds the same. The words:
 
-- A computed number is *reproduced* if it follows from printed parameters to a unit of its last
-  digit, the rounding of those parameters included; a measured one within the scatter that the
-  thesis itself shows between its two spans and between series of one case.
-- It is *explained* if a reading of the text other than the literal one gives it, and no parameter
-  was fitted to that very number. One reading serves for all numbers of a group: the likeliest, with
-  all readings in the report.
-- It *cannot be right* only by a proof that the report shows; else it is *not reproduced*.
-- A number that a null model (no control, static, one mode) meets within the same tolerance counts
-  for nothing, nor does one that a parameter was fitted to, nor one that repeats another.
+- *Reproduced*: the computed number follows from the printed parameters to a unit of its last
+  printed digit, the rounding of these parameters included. For a measured number the tolerance is
+  the scatter that the thesis shows between its two spans and between series of one case.
+- *Explained*: another reading of the text than the literal one gives the number, without a
+  parameter fitted to it. One reading serves for all numbers of a group: the likeliest. The report
+  has all readings.
+- *Cannot be right*: the report shows a proof. *Not reproduced*: all others.
+- Not counted is a number that a null model (no control, static, or one mode) meets within the same
+  tolerance, one to which a parameter was fitted, and one that repeats another.
 
 This page is written from the report of `jaxbeam reproduce --all`, by
 `python -m experiments.thesis.page`.
@@ -66,11 +66,11 @@ def sentence(report: dict) -> str:
     found = counts(report)
     counted = sum(found[word] for word in VERDICTS)
     return (
-        f"Of {sum(found.values())} numbers that the thesis prints {counted} bear a verdict:"
+        f"The thesis prints {sum(found.values())} numbers that can be computed. {counted} count:"
         f" {found[REPRODUCED]} are reproduced, {found[EXPLAINED]} explained by a named reading,"
         f" {found[IRREPRODUCIBLE]} cannot be right and {found[NOT_REPRODUCED]} are not reproduced."
-        f" {found[NULL_MET]} a null model meets as well, to {found[FITTED]} a parameter was"
-        f" fitted, and {found[REPEATED]} repeat others: these count for nothing."
+        f" Not counted are {found[NULL_MET]} that a null model meets as well, {found[FITTED]} to"
+        f" which a parameter was fitted, and {found[REPEATED]} that repeat others."
     )
 
 

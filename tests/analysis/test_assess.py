@@ -147,7 +147,7 @@ def test_flow_of_the_report(tmp_path):
 
 
 def test_refusals():
-    with pytest.raises(ValueError, match="the beam has 2 spans; give determinant_length"):
+    with pytest.raises(ValueError, match="the beam has 2 spans; give their determinant length"):
         jb.assess(TWO_SPANS, 40.0)
     assert jb.assess(TWO_SPANS, 40.0, determinant_length="24 m").inputs["determinant length"]
     with pytest.raises(ValueError, match="track cannot be 'ballast'; did you mean 'ballasted'"):
