@@ -105,7 +105,7 @@ def latin_hypercube(
 
 
 def read_load_cases(path: str | os.PathLike, case: Case | None = None) -> LoadCases:
-    """Read load cases from a TOML file with tables [training] and [held_out].
+    r"""Read load cases from a TOML file with tables [training] and [held_out].
 
     Each table has lists of values by address in quotes, such as "loads.0.mass" = [0.2, 0.5]; its
     runs are all combinations. With `draws = 12` (and `seed = 1`, 0 if left out) the lists are
@@ -114,6 +114,13 @@ def read_load_cases(path: str | os.PathLike, case: Case | None = None) -> LoadCa
 
     Raises ValueError, naming the file and the key, for faulty content; OSError if the file cannot
     be read.
+
+    >>> from pathlib import Path
+    >>> import tuning
+    >>> tables = '[training]\n"loads.0.mass" = [0.2, 0.5]\n[held_out]\n"loads.0.mass" = [0.4]\n'
+    >>> _ = Path("loads.toml").write_text(tables)
+    >>> tuning.read_load_cases("loads.toml").held_out
+    ({'loads.0.mass': 0.4},)
     """
     content = read_toml(path, "file of load cases")
     try:

@@ -77,6 +77,16 @@ def responses_of(log: Log, segment: float | None = None, min_coherence: float = 
 
     Raises ValueError unless there is one command and a named sensor, for uneven sampling, and if
     hardly any frequency is coherent enough.
+
+    >>> import numpy as np
+    >>> import tuning
+    >>> u = np.random.default_rng(0).normal(size=4000)  # commands; readings follow a sample later
+    >>> values = np.column_stack([u, 2e-3 * np.roll(u, 1)])
+    >>> columns = ("u", "w1"), ("voltage", "deflection"), ("V", "m")
+    >>> index = {"sensors": (None, 0), "actuators": (0, None)}
+    >>> found = tuning.responses_of(tuning.Log(0.001 * np.arange(4000), values, *columns, **index))
+    >>> print(f"{abs(found.values).mean():.1e} m/V")
+    2.0e-03 m/V
     """
     commands = [i for i, actuator in enumerate(log.actuators) if actuator is not None]
     sensors = [i for i, sensor in enumerate(log.sensors) if sensor is not None]

@@ -105,6 +105,19 @@ def identify_from_modes(
 
     Raises ValueError without identified modes, for more parameters than data, and for fewer modes
     of the case than were identified.
+
+    >>> import numpy as np
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> times = 0.005 * np.arange(1600)
+    >>> decay = np.exp(-0.3 * times) * np.cos(2 * np.pi * 3.2 * times)
+    >>> columns = ("a1",), ("acceleration",), ("m/s^2",)
+    >>> noise = 1e-3 * np.random.default_rng(1).normal(size=times.size)
+    >>> modes = tuning.identify_modes(tuning.Log(times, (decay + noise)[:, None], *columns))
+    >>> case = jb.Case(jb.Beam(20.0, 8e9, 12e3, modes=1), sensors=[jb.Sensor(10.0)])
+    >>> fit = tuning.identify_from_modes(case, modes, ["beam.flexural_rigidity"])
+    >>> print(f"{float(fit.case.beam.flexural_rigidity):.2e} N m^2")
+    7.97e+09 N m^2
     """
     if not identified.modes:
         raise ValueError(f"{identified.log.source}: no mode is well identified, nothing to fit to")

@@ -52,6 +52,11 @@ def compare_fits(fits: Mapping[str, Fit]) -> list[ModelCriteria]:
     with the smallest residuals, the same for all models.
 
     Raises ValueError for fewer than two fits, and for fits to different samples.
+
+    >>> import tuning
+    >>> fit = tuning.load_fit("fit.npz")
+    >>> [model.name for model in tuning.compare_fits({"one": fit, "the same": fit})]
+    ['one', 'the same']
     """
     if len(fits) < 2:
         raise ValueError("give at least two fits to compare")

@@ -32,6 +32,12 @@ def write_report(
 
     It has `profiles` of parameters, a `posterior`, predictions of `held_out` logs and the
     comparison with other `models` where they are given.
+
+    >>> from pathlib import Path
+    >>> import tuning
+    >>> tuning.write_report("report", tuning.load_fit("fit.npz"))
+    >>> Path("report/report.md").exists()
+    True
     """
     sections = report_sections(fit, profiles, posterior, held_out, models)
     title = fit.case.title or "Identification"

@@ -47,6 +47,9 @@ def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None
     """Write a fit with its logs and case to a file (.npz), without any loss of precision.
 
     Raises FileExistsError if the file exists and `overwrite` is not set.
+
+    >>> import tuning
+    >>> tuning.save_fit(tuning.load_fit("fit.npz"), "copy.npz")
     """
     logs = fit.dataset.logs
     header = {
@@ -72,6 +75,10 @@ def load_fit(path: str | os.PathLike) -> Fit:
     """Fit from a file written by `save_fit`.
 
     Raises ValueError if there is no such file, or it is damaged or no fit.
+
+    >>> import tuning
+    >>> print(str(tuning.load_fit("fit.npz")).splitlines()[1])
+    beam.flexural_rigidity  N m^2   12.1      11  10.545 to 11.455
     """
     path = Path(path)
     if not path.is_file():

@@ -29,6 +29,15 @@ def align_logs(logs: Sequence[Log]) -> Log:
     with the correlation.
 
     Raises ValueError for logs that have gaps, or no common signal.
+
+    >>> import numpy as np
+    >>> import tuning
+    >>> signal = np.convolve(np.random.default_rng(0).normal(size=400), np.ones(5) / 5, "same")
+    >>> times, rest = 0.01 * np.arange(400), (("acceleration",), ("m/s^2",))
+    >>> a = tuning.Log(times, signal[:, None], ("a",), *rest)
+    >>> b = tuning.Log(times, np.roll(signal, 7)[:, None], ("b",), *rest)  # 0.07 s late
+    >>> tuning.align_logs([a, b]).names
+    ('a', 'b')
     """
     if len(logs) < 2:
         raise ValueError(f"alignment needs two logs or more, not {len(logs)}")

@@ -43,7 +43,15 @@ class Fault:
 
 
 def find_faults(log: Log) -> list[Fault]:
-    """Gaps, clock drift, gravity and offsets, spikes, clipped and stuck samples of a log."""
+    """Gaps, clock drift, gravity and offsets, spikes, clipped and stuck samples of a log.
+
+    >>> import numpy as np
+    >>> import tuning
+    >>> times = 0.01 * np.arange(200)
+    >>> values = np.where(times == 0.5, 9.0, np.sin(6 * times))[:, None]
+    >>> print(*tuning.find_faults(tuning.Log(times, values, ("d1",), ("deflection",), ("m",))))
+    log: d1 has spikes (one sample), first at t = 0.5 s
+    """
     found = [*_gaps(log), *_clock_drift(log), *_offsets(log)]
     for i, name in enumerate(log.names):
         for kind, rule in _SAMPLE_FAULTS.items():
@@ -59,6 +67,14 @@ def mask(log: Log, kinds: Sequence[str]) -> Log:
     Its `notes` say how many samples are left out; the values stay.
 
     Raises ValueError for a kind that cannot be masked.
+
+    >>> import numpy as np
+    >>> import tuning
+    >>> times = 0.01 * np.arange(200)
+    >>> values = np.where(times == 0.5, 9.0, np.sin(6 * times))[:, None]
+    >>> log = tuning.Log(times, values, ("d1",), ("deflection",), ("m",))
+    >>> int((~tuning.mask(log, ["spikes"]).valid).sum())
+    1
     """
     for kind in kinds:
         if kind not in _SAMPLE_FAULTS:

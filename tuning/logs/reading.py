@@ -50,7 +50,7 @@ def read_log(
     run: str | None = None,
     missing: str = "refuse",
 ) -> Log:
-    """Read a log: separated values, Excel, LabVIEW (.lvm, .tdms), universal files (.uff), MATLAB,
+    r"""Read a log: separated values, Excel, LabVIEW (.lvm, .tdms), universal files (.uff), MATLAB,
     HDF5, netCDF or Parquet.
 
     `columns` are the channels to keep, in this order, as a sequence or separated by commas, with
@@ -65,6 +65,13 @@ def read_log(
     Raises ValueError, naming file and line, for an empty or damaged log, unknown columns or units,
     columns without a name or a unit, cells that are not finite numbers, times that do not increase,
     a rate beside a column of times, and several runs of which none is named.
+
+    >>> from pathlib import Path
+    >>> import tuning
+    >>> _ = Path("run.csv").write_text("time [s],w1 [mm]\n0.0,0.0\n0.1,1.5\n0.2,0.5\n")
+    >>> log = tuning.read_log("run.csv")
+    >>> log.names, log.values[:, 0]
+    (('w1',), array([0.    , 0.0015, 0.0005]))
     """
     runs = read_logs(
         path, columns=columns, units=units, time=time, rate=rate, run=run, missing=missing
@@ -85,9 +92,15 @@ def read_logs(
     run: str | None = None,
     missing: str = "refuse",
 ) -> list[Log]:
-    """Read all runs in a file, one log for each, with the options of `read_log`.
+    r"""Read all runs in a file, one log for each, with the options of `read_log`.
 
     Raises ValueError as `read_log` does, and for a `run` that is not in the file.
+
+    >>> from pathlib import Path
+    >>> import tuning
+    >>> _ = Path("run.csv").write_text("time [s],w1 [mm]\n0.0,0.0\n0.1,1.5\n0.2,0.5\n")
+    >>> [log.source for log in tuning.read_logs("run.csv")]
+    ['run.csv']
     """
     if missing not in ("refuse", "mask"):
         raise ValueError(f'missing samples can be "refuse"d or "mask"ed, not {missing!r}')

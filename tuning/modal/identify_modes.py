@@ -55,6 +55,16 @@ def identify_modes(
     Raises ValueError for a log without evenly sampled records, or too short, a window outside the
     log, a band above half the sampling rate, an impossible count or order, unknown channels, kinds
     and methods, and logs that differ in channels or sampling rate.
+
+    >>> import numpy as np
+    >>> import tuning
+    >>> times = 0.005 * np.arange(1600)
+    >>> decay = np.exp(-0.3 * times) * np.cos(2 * np.pi * 3.2 * times)
+    >>> noise = 1e-3 * np.random.default_rng(1).normal(size=times.size)
+    >>> columns = ("a1",), ("acceleration",), ("m/s^2",)
+    >>> fit = tuning.identify_modes(tuning.Log(times, (decay + noise)[:, None], *columns))
+    >>> [f"{frequency:.2f} Hz" for frequency in fit.frequencies]
+    ['3.20 Hz']
     """
     logs = [log] if isinstance(log, Log) else list(log)
     _check_arguments(count, kind, order, method)

@@ -35,6 +35,14 @@ def model_influence_lines(case: Case) -> InfluenceLines:
 
     Raises ValueError for a sensor of velocity or acceleration, and a beam that can move as a rigid
     body.
+
+    >>> import numpy as np
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(jb.Beam(20.0, 8e9, 12e3), sensors=[jb.Sensor(10.0)])
+    >>> lines = tuning.model_influence_lines(case)
+    >>> print(f"{lines.at(np.array([10.0]))[0, 0]:.2e} m/N, {-(20**3) / 48 / 8e9:.2e} m/N")
+    -2.08e-08 m/N, -2.08e-08 m/N
     """
     check_static(case)
     unit_force = UnitForce(case, 1.0)
@@ -54,6 +62,18 @@ def calibrate_influence_lines(case: Case, log: Log, points: int = 41) -> Influen
 
     Raises ValueError if no load is known, for a sensor of velocity or acceleration, and for less
     than five points.
+
+    >>> import numpy as np
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> beam, truck = jb.Beam(20.0, 8e9, 12e3, 0.02), jb.MovingForce(force=3e5, speed=2.0)
+    >>> case = jb.Case(beam, sensors=[jb.Sensor(10.0)], loads=[truck], run=jb.Run(10.0, 20.0))
+    >>> record = jb.simulate(case)
+    >>> columns = ("w1",), ("deflection",), ("m",)
+    >>> log = tuning.Log(record.times, record.deflection, *columns, sensors=(0,))
+    >>> lines = tuning.calibrate_influence_lines(case, log)
+    >>> print(f"{lines.at(np.array([10.0]))[0, 0]:.2g} m/N")
+    -2.1e-08 m/N
     """
     check_static(case)
     if points < 5:
