@@ -31,7 +31,10 @@ class InfluenceLines(NamedTuple):
 
 
 def model_influence_lines(case: Case) -> InfluenceLines:
-    """Influence lines of a case, exact but for the interpolation between 201 points.
+    """Influence lines of a case at 201 points, linear in between.
+
+    Those of moments and the like are corrected statically; those of deflections are sums of the
+    modes of the case.
 
     Raises ValueError for a sensor of velocity or acceleration, and a beam that can move as a rigid
     body.
