@@ -50,7 +50,11 @@ html_copy_source = False
 html_show_sourcelink = False
 html_math_renderer = "svg"
 html_theme_options = {
-    "logo": {"text": f"jaxbeam {version}", "image_light": "_static/beam.svg"},
+    "logo": {
+        "text": f"jaxbeam {version}",
+        "image_light": "_static/beam.svg",
+        "image_dark": "_static/beam.svg",
+    },
     "navbar_end": ["theme-switcher"],
     "navbar_align": "left",
     "header_links_before_dropdown": 6,
