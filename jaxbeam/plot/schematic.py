@@ -106,9 +106,11 @@ def draw_schematic(axes, case: Case) -> None:
     gap = 1.04 * length * text_share(axes, max(map(len, texts), default=0) + 2)
     # Of more sensors than there is room for labels every second or third has one.
     labelled = list(texts.items())[:: 1 + int(gap * len(texts) / length)]
+    supports = [0.0, length, *(float(concrete(one.position)) for one in case.supports)]
     places = separate_labels([x for _, (_, x) in labelled], gap, (0.0, length))
     for (text, (i, _)), place in zip(labelled, places, strict=True):
-        offset = (0, -9 if crossed else 9)
+        above = any(abs(place - support) < gap / 2 for support in supports)
+        offset = (0, (-13 if above else -9) if crossed else 9)
         annotate(axes, text, (place, 0), offset, ha="center", color=colour(i), **side)
 
 
