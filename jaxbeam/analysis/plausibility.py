@@ -178,8 +178,8 @@ def _support_warnings(case: Case) -> Iterator[str]:
         drop = 0.0 if support.settlement is None else float(support.settlement)
         if abs(drop) > MOST_SETTLEMENT * length:
             yield (
-                f"supports.{i} settles by {drop:.4g} m, {abs(drop) / length:.2g} times the length of"
-                f" the beam: is supports.{i}.settlement in m, not in mm?"
+                f"supports.{i} settles by {drop:.4g} m, {abs(drop) / length:.2g} times the length"
+                f" of the beam: is supports.{i}.settlement in m, not in mm?"
             )
     unit = float(beam.bending_stiffness) / length
     for (left, k, first), (right, other_k, second) in itertools.pairwise(sorted(held)):

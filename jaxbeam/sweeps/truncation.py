@@ -9,6 +9,7 @@ from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import is_supported, residual_flexibility
 from jaxbeam.model.statics import influence_line
+from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 
 SAMPLES = 400  # of the run from which errors of corrected quantities are estimated
@@ -68,23 +69,31 @@ def estimated_errors(case: Case, worst: dict[str, dict[str, float]]) -> dict[str
     rotations the error is the static one; others are estimated from that run (see
     `Record.truncation_errors`), without a controller.
     """
-    errors = static_shares(case)
+    errors, records = static_shares(case), {}
     quantities = [sensor.quantity for sensor in case.sensors]
     if case.controller is not None:
         return errors
     for quantity, numbers in worst.items():
         if quantity in errors:
             continue
-        of_run = concrete_case(replace(case, numbers))
-        times = np.linspace(0.0, float(of_run.run.duration), SAMPLES)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ContactLossWarning)
-            try:
-                record = simulate(of_run, times, tolerance=ESTIMATE_TOLERANCE)
-            except RuntimeError:  # no step was found: the peaks are kept, their error is not known
-                continue
+        key = tuple(numbers.items())
+        if key not in records:
+            records[key] = _record_for_estimates(concrete_case(replace(case, numbers)))
+        if records[key] is None:
+            continue
         own = np.array(quantities) == quantity
-        found = np.asarray(record.truncation_errors)[own]
+        found = np.asarray(records[key].truncation_errors)[own]
         if np.isfinite(found).any():
             errors[quantity] = float(np.nanmax(found))
     return errors
+
+
+def _record_for_estimates(case: Case) -> Record | None:
+    """Record of a run; None where no step is found: its peaks are kept, their error not known."""
+    times = np.linspace(0.0, float(case.run.duration), SAMPLES)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ContactLossWarning)
+        try:
+            return simulate(case, times, tolerance=ESTIMATE_TOLERANCE)
+        except RuntimeError:
+            return None
