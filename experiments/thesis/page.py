@@ -46,8 +46,8 @@ somebody who tries to refute it. The rules:
   for nothing, nor does one that a parameter was fitted to, nor one that repeats another.
 
 This page is written from the report of `jaxbeam reproduce --all`, by
-`python -m experiments.thesis.page`. [Verdicts that changed](thesis_changes.md) has each number whose
-verdict was another one before these rules.
+`python -m experiments.thesis.page`. [Verdicts that changed](thesis_changes.md) has each number
+whose verdict was another one before these rules.
 """
 
 
