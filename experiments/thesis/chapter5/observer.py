@@ -87,10 +87,11 @@ def _remark(loops: Mapping[str, tuple[ObservedLoop, ObservedLoop]]) -> str:
     parts = []
     for name, (uncontrolled, controlled) in loops.items():
         off = np.abs(controlled.states[:, 0] - controlled.estimates[:, 0]).max()
+        change = _peak_reduction(uncontrolled, controlled)
+        side = "below" if change > 0 else "above"
         parts.append(
-            f"{name}: peak at 0.25 m {_peak_reduction(uncontrolled, controlled):+.0f} % below no"
-            f" control, q1 of the observer off by at most"
-            f" {100 * off / np.abs(controlled.states[:, 0]).max():.2g} % of its largest"
+            f"{name}: peak at 0.25 m {abs(change):.0f} % {side} no control, q1 of the"
+            f" observer off by at most {100 * off / np.abs(controlled.states[:, 0]).max():.2g} % of its largest"
         )
     return f"Observer in the loop, {OTHER_SHAKER}. " + "; ".join(parts)
 

@@ -24,12 +24,9 @@ PERIOD = 5e-3
 def runs():
     """A run without control and one under the observed regulator."""
     gains = observer_loop.design(RIG, PERIOD, STATE_WEIGHTS, COMMAND_WEIGHT)
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(observer_loop, "POSITIONS", 60)
-        return [
-            observer_loop.simulate_observed(RIG, PERIOD, each, after_exit=0.1)
-            for each in (None, gains)
-        ]
+    return [
+        observer_loop.simulate_observed(RIG, PERIOD, each, after_exit=0.1) for each in (None, gains)
+    ]
 
 
 def test_gain_is_that_of_the_sampled_regulator():
