@@ -1,6 +1,7 @@
 """Optimal control of one span with a shaker, by several interpretations: Tables 5.1 to 5.4."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -44,6 +45,7 @@ from experiments.thesis.verdicts import (
 )
 from jaxbeam.plot.style import colour, set_title, use_style
 
+Plants = Mapping[str, tuple[jb.Case, Any]]  # case and actuator of the plant, by interpretation
 SAMPLE_RATE = 200.0  # Hz
 
 UNDAMPED_DESIGN = "R = 3e-4, 2.5 N/V, 80 N s/m in the plant only"  # for stability alone
@@ -141,7 +143,7 @@ def _finding(
     )
 
 
-def _partial_feedback_finding(runs: RegulatorRuns, plants, peaks, time_varying) -> Finding:
+def _partial_feedback_finding(runs: RegulatorRuns, plants: Plants, peaks, time_varying) -> Finding:
     """Reductions (%) with the first state fed back, and with the printed ones."""
     reductions = {}
     for name, plant in plants.items():
@@ -155,7 +157,7 @@ def _partial_feedback_finding(runs: RegulatorRuns, plants, peaks, time_varying) 
     return _finding(published.PARTIAL_FEEDBACK, reductions, 0.0)
 
 
-def _gain_scheduling_finding(runs: RegulatorRuns, plants) -> Finding:
+def _gain_scheduling_finding(runs: RegulatorRuns, plants: Plants) -> Finding:
     """Further reduction (points) for the heaviest mass by the gain designed for it.
 
     The other gain is designed for the lightest mass.
