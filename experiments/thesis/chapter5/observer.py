@@ -5,6 +5,7 @@ modes and the shaker at 0.25 m. The observer is given the true weight of the loa
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -118,7 +119,8 @@ def _draw(loops: tuple[ObservedLoop, ObservedLoop], reference: ObservedLoop | No
     uncontrolled, controlled = loops
     modes = (controlled.states.shape[1] - 1) // 2
     figure = Figure(figsize=(7.2, 1.6 * (modes + 2)))
-    *rows, deflection, voltage = np.ravel(figure.subplots(modes + 2, 1, sharex=True))
+    panels: Any = figure.subplots(modes + 2, 1, sharex=True)
+    *rows, deflection, voltage = panels
     times = controlled.times
     for i, axes in enumerate(rows):
         if reference is not None:
