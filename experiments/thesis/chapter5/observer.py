@@ -5,7 +5,6 @@ modes and the shaker at 0.25 m. The observer is given the true weight of the loa
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -58,7 +57,7 @@ def observed_regulator(
     return finding, _figures(loops), _remark(loops)
 
 
-def sampled_loops(rig: jb.Case, state_weights) -> dict[str, tuple[ObservedLoop, ObservedLoop]]:
+def sampled_loops(rig: jb.Case, state_weights) -> dict[str, tuple[ObservedLoop, ...]]:
     """Runs without control and under the observed regulator, by sampling period, with noise."""
     moved = with_modes(jb.replace(rig, {"actuators.0.position": 0.25}), 2)
     two_mode_weights = [state_weights[i] for i in TWO_MODE_STATES]
@@ -84,7 +83,7 @@ def _peak_reduction(uncontrolled: ObservedLoop, controlled: ObservedLoop) -> flo
     return float(reduction(free, held))
 
 
-def _remark(loops: Mapping[str, tuple[ObservedLoop, ObservedLoop]]) -> str:
+def _remark(loops: Mapping[str, tuple[ObservedLoop, ...]]) -> str:
     """What the sampling period costs: reductions, and how far the observer is off."""
     parts = []
     for name, (uncontrolled, controlled) in loops.items():
@@ -111,7 +110,7 @@ def _figures(loops) -> dict[str, Figure]:
 
 
 @use_style
-def _draw(loops: tuple[ObservedLoop, ObservedLoop], reference: ObservedLoop | None, title: str):
+def _draw(loops: tuple[ObservedLoop, ...], reference: ObservedLoop | None, title: str):
     """Modal coordinates of plant and observer, deflection at 0.25 m, and voltage.
 
     The `reference` is the same loop sampled every 0.2 ms.
@@ -119,8 +118,7 @@ def _draw(loops: tuple[ObservedLoop, ObservedLoop], reference: ObservedLoop | No
     uncontrolled, controlled = loops
     modes = (controlled.states.shape[1] - 1) // 2
     figure = Figure(figsize=(7.2, 1.6 * (modes + 2)))
-    panels: Any = figure.subplots(modes + 2, 1, sharex=True)
-    *rows, deflection, voltage = panels
+    *rows, deflection, voltage = figure.subplots(modes + 2, 1, sharex=True, squeeze=False)[:, 0]
     times = controlled.times
     for i, axes in enumerate(rows):
         if reference is not None:

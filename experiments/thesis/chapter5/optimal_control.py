@@ -1,7 +1,6 @@
 """Optimal control of one span with a shaker, by several interpretations: Tables 5.1 to 5.4."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -45,8 +44,8 @@ from experiments.thesis.verdicts import (
 )
 from jaxbeam.plot.style import colour, set_title, use_style
 
-Plants = Mapping[str, tuple[jb.Case, Any]]  # case and actuator of the plant, by interpretation
 SAMPLE_RATE = 200.0  # Hz
+Plants = Mapping[str, tuple[jb.Case, jb.Shaker]]  # designs and shakers by reading
 
 UNDAMPED_DESIGN = "R = 3e-4, 2.5 N/V, 80 N s/m in the plant only"  # for stability alone
 
