@@ -14,8 +14,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
-from experiments.studies import tune_feedforward, tune_sensor_feedback
-from experiments.studies.hand_set import HAND_DRAWN, HAND_SET, trapezium
+from experiments.studies import tune_feedforward
+from experiments.studies.hand_set import HAND_DRAWN, HAND_SET, drawn_table, trapezium
 from experiments.studies.held_out import RIGIDITY
 from experiments.studies.loads import HELD_OUT_ENTRY_TIME
 from experiments.studies.sensor_feedback import SENSORS_ONLY, bench_case, with_cutoff
@@ -24,6 +24,7 @@ from experiments.thesis.cases import with_duration
 from experiments.thesis.verdicts import Experiment, ExperimentResult
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.plot.style import colour, set_title, use_style
+from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import ContactLossWarning
 from tuning.control.fixed_design import with_fixed_design
 
@@ -54,7 +55,10 @@ OTHER_FILTER = "filter of the other rig"
 
 def run(load_rig) -> ExperimentResult:
     """Shares of the attainable reduction under each change, and the lift by gates that misfire."""
-    shares = {name: shares_of(case) for name, case in changed_cases(load_rig(RIG)).items()}
+    plans = {}
+    shares = {
+        name: shares_of(by_law, plans) for name, by_law in changed_cases(load_rig(RIG)).items()
+    }
     remarks = [f"{MASS:g} kg at {SPEED:g} m/s; shares of what is attainable with each change"]
     for change, by_law in shares.items():
         text = ", ".join(f"{law} {share:.1%}" for law, share in by_law.items())
@@ -67,7 +71,6 @@ def laws(case: jb.Case) -> dict[str, jb.Case]:
     """The rig on the bench under each law."""
     stored = jb.load_case(tune_feedforward.FOLDER / f"{RIG}.toml").controller
     sensed = dataclasses.replace(bench_case(RIG, case), run=case.run)
-    drawn = tune_sensor_feedback.initial_law(RIG)
     return {
         HAND_SET: dataclasses.replace(case, controller=with_bench_delay(trapezium(RIG))),
         BENCH: dataclasses.replace(case, controller=with_bench_delay(stored)),
@@ -77,7 +80,7 @@ def laws(case: jb.Case) -> dict[str, jb.Case]:
                 with_bench_delay(stored), confirmation=np.asarray(CONFIRMATION)
             ),
         ),
-        HAND_DRAWN: dataclasses.replace(sensed, controller=drawn),
+        HAND_DRAWN: dataclasses.replace(sensed, controller=drawn_table(RIG)),
         SENSORS_ONLY: sensed,
     }
 
@@ -133,15 +136,21 @@ def with_gate_error(case: jb.Case, error: float) -> jb.Case:
     return dataclasses.replace(case, controller=dataclasses.replace(law, shares=shares))
 
 
-def shares_of(by_law: Mapping[str, jb.Case]) -> dict[str, float]:
-    """Shares of the attainable reduction of the peak, by law; the plant and the load are alike."""
+def shares_of(by_law: Mapping[str, jb.Case], plans: dict) -> dict[str, float]:
+    """Shares of the attainable reduction of the peak, by law; the plant and the load are alike.
+
+    `plans` keeps the integration plans, one for each law and number of loads.
+    """
     bound = None
     shares = {}
     for name, case in by_law.items():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ContactLossWarning)
             bound = bound or jb.bound(case)
-            shares[name] = float(bound.share(jb.simulate(case, tolerance=TOLERANCE)))
+            key = name, len(case.loads)
+            if key not in plans:
+                plans[key] = integration_plan(case, None, TOLERANCE)
+            shares[name] = float(bound.share(jb.simulate(case, plan=plans[key])))
     return shares
 
 

@@ -1,7 +1,8 @@
 """Laws drawn by hand on the patch rigs: the yardstick beside which tuned laws are judged.
 
-A trapezium of four numbers on the same gates as the tuned table, and the table over the deflection
-that the tuning of the sensors-only law starts from. No number of them was fitted to any run.
+A trapezium of four numbers on the same gates as the tuned table, and a table over the deflection
+that goes to the limits where the tuning of the sensors-only law starts to be flat. No number of
+them was fitted to any run.
 """
 
 import dataclasses
@@ -9,6 +10,7 @@ import dataclasses
 import numpy as np
 
 import jaxbeam as jb
+from experiments.studies import tune_sensor_feedback
 from experiments.studies.tune_feedforward import COMMAND_LIMITS, initial_law
 
 LOW, HIGH = COMMAND_LIMITS
@@ -28,3 +30,12 @@ def trapezium(rig: str) -> jb.Feedforward:
     shares = np.unique(np.concatenate([shares for shares, _ in tables]))
     values = np.array([np.interp(shares, *table) for table in tables])
     return dataclasses.replace(initial_law(rig), shares=shares, values=values)
+
+
+def drawn_table(rig: str) -> jb.InternalModel:
+    """The law drawn by hand over the sensors' readings: straight to the limits, then flat."""
+    law = tune_sensor_feedback.initial_law(rig)
+    flat_from, _, above = tune_sensor_feedback.INITIAL_TABLE[rig]  # m, -, V
+    ends = [HIGH, 0.0, LOW if above else 0.0]  # one span is not pressed down by its patch
+    row = np.interp(np.asarray(law.readings), [-flat_from, 0.0, flat_from], ends)
+    return dataclasses.replace(law, values=np.array([row] * law.values.shape[0]))

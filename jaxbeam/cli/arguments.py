@@ -182,15 +182,23 @@ def parse_bounds(text: str, option: str = "--free") -> tuple[str, Bounds | None]
     if not equals:
         return address, None
     entries = [entry.strip() for entry in value.split(":")]
-    with_unit = [is_quantity(entry) for entry in entries]
-    if len(entries) == 2 and all(with_unit):
-        return address, (entries[0], entries[1])
-    if any(with_unit):
-        raise ValueError(f"{option} {text}: give both bounds a unit, as in 8 GN m^2:12 GN m^2")
+    with_units = _both_with_units(f"{option} {text}", entries)
+    if with_units is not None:
+        return address, with_units
     bounds = _parse_numbers(option, text, entries)
     if len(bounds) != 2 or bounds[0] >= bounds[1]:
         raise ValueError(f"{option} {text}: bounds are LOW:HIGH, such as 5:20")
     return address, (bounds[0], bounds[1])
+
+
+def _both_with_units(option: str, entries: list[str]) -> tuple[str, str] | None:
+    """Two texts with units, None if none has one. Raises ValueError if only some have."""
+    with_unit = [is_quantity(entry) for entry in entries]
+    if len(entries) == 2 and all(with_unit):
+        return entries[0], entries[1]
+    if any(with_unit):
+        raise ValueError(f"{option}: give both numbers a unit, as in 8 GN m^2:12 GN m^2")
+    return None
 
 
 def bounds_in_si(
@@ -233,11 +241,9 @@ def parse_prior(text: str) -> tuple[str, Bounds]:
     """
     address, value = parse_assignment("--prior", text)
     entries = [entry.strip() for entry in value.split(":")]
-    with_unit = [is_quantity(entry) for entry in entries]
-    if len(entries) == 2 and all(with_unit):
-        return address, (entries[0], entries[1])
-    if any(with_unit):
-        raise ValueError(f"--prior {text}: give both numbers a unit, as in 8 GN m^2:1 GN m^2")
+    with_units = _both_with_units(f"--prior {text}", entries)
+    if with_units is not None:
+        return address, with_units
     try:
         mean, deviation = map(float, entries)
     except ValueError:

@@ -275,7 +275,6 @@ class Record(RecordViews):
         failures = int(concrete(self.failures)[-1])
         if failures:
             parts.append(f"the controller found no solution in {failures} of its steps")
-        parts.append(
-            f"estimated error of the steps {float(concrete(self.error_estimate)):.1e} of the peak"
-        )
+        error = float(concrete(self.error_estimate))
+        parts.append(f"estimated error of the steps {error:.1e} of the largest deflection")
         return "; ".join(parts)

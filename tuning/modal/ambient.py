@@ -9,10 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import t as student
+from scipy.stats import norm, t as student
 
+from tuning.modal.likelihood import refine_poles
 from tuning.modal.preprocessing import Prepared, prepare
-from tuning.modal.result import IdentifiedMode, rejection_reason
+from tuning.modal.result import IdentifiedMode, frequency_and_damping, rejection_reason
 from tuning.modal.shapes import mac_matrix
 from tuning.modal.stabilisation import Chain, Diagram, stabilise
 from tuning.modal.subspace import (
@@ -27,6 +28,7 @@ from tuning.modal.subspace import (
 MAX_ORDER = 60
 MAX_BAND_RATIO = 8.0  # upper over lower end of the bands that are identified one by one
 BAND_OVERLAP = 1.1  # by which such bands exceed their part
+MAX_SHIFT = 2.0  # of a pole by its likelihood, over its decay rate
 DUPLICATE_SDS = 2.0  # standard deviations within which two poles are one
 DUPLICATE_MAC = 0.9
 
@@ -54,9 +56,14 @@ def subspace_modes(
     *,
     data_driven: bool = False,
     order: int | None = None,
+    refine: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[tuple[Candidate, ...], tuple[Diagram, ...]]:
-    """Candidate modes and the stabilisation diagram of each part of a band (Hz)."""
+    """Candidate modes and the stabilisation diagram of each part of a band (Hz).
+
+    Of rejected modes those are accepted that the likelihood of periodograms needs (`refine`), but
+    not in free decays, whose periodograms are not random.
+    """
     found: list[Candidate] = []
     diagrams = []
     parts = divided_band(band)
@@ -65,7 +72,7 @@ def subspace_modes(
         if progress:
             progress(f"modes from {low:.3g} Hz to {high:.4g} Hz")
         prepared = prepare(records, starts, rate, overlapping((low, high), band))
-        candidates, diagram = _modes_of_band(prepared, band, variance, data_driven, order)
+        candidates, diagram = _modes_of_band(prepared, band, variance, data_driven, order, refine)
         found += candidates
         diagrams.append(diagram)
     return without_duplicates(found), tuple(diagrams)
@@ -82,7 +89,7 @@ def _variance(records):
     return sum(np.sum(record**2, axis=0) for record in records) / sum(map(len, records))
 
 
-def _modes_of_band(prepared: Prepared, whole, variance, data_driven, order):
+def _modes_of_band(prepared: Prepared, whole, variance, data_driven, order, refine):
     """Candidates and diagram of records prepared for one part of the band `whole`.
 
     `variance` is that of the channels in the whole band.
@@ -103,13 +110,42 @@ def _modes_of_band(prepared: Prepared, whole, variance, data_driven, order):
     scaled = poles._replace(shapes=poles.shapes * scale)
     diagram = stabilise(scaled, prepared.band)
     duration = sum(map(len, records)) / prepared.rate
-    candidates = []
     spread_of = _all_spreads(subspace, poles, diagram.chains)
-    for chain in diagram.chains:
-        mode = _mode(poles, chain, spread_of, scale)
-        reason = rejection_reason(mode, duration, whole)
-        candidates.append(Candidate(mode, reason, chain.members.size))
+    modes = [_mode(poles, chain, spread_of, scale) for chain in diagram.chains]
+    lengths = [chain.members.size for chain in diagram.chains]
+    reasons = [rejection_reason(mode, duration, whole) for mode in modes]
+    if refine and any(reasons):
+        modes, reasons = _decided(modes, reasons, records, prepared.rate, scale, duration, whole)
+    candidates = [Candidate(*found) for found in zip(modes, reasons, lengths, strict=True)]
     return candidates, diagram
+
+
+def _decided(modes, reasons, records, rate, scale, duration, whole):
+    """Modes and reasons with those rejected modes accepted that the likelihood needs."""
+    order = sorted(
+        range(len(modes)),
+        key=lambda k: (bool(reasons[k]), modes[k].damping_sd / modes[k].damping_ratio),
+    )
+    poles = np.array([modes[k].pole for k in order], complex)
+    shapes = np.array([modes[k].shape.real / scale for k in order])
+    certain = np.array([not reasons[k] for k in order])
+    modes, reasons = list(modes), list(reasons)
+    found = refine_poles(records, rate, poles, shapes, certain)
+    for k, one in zip(order, found, strict=True):
+        mode = modes[k]
+        if not reasons[k] or one is None or abs(one.pole - mode.pole) > MAX_SHIFT * -mode.pole.real:
+            continue
+        frequency, frequency_sd, damping, damping_sd = frequency_and_damping(*one)
+        better = mode._replace(
+            frequency=frequency,
+            frequency_sd=frequency_sd,
+            damping_ratio=damping,
+            damping_sd=damping_sd,
+            quantile=float(norm.ppf(0.975)),
+        )
+        if not rejection_reason(better, duration, whole):
+            modes[k], reasons[k] = better, ""
+    return modes, reasons
 
 
 def _all_spreads(subspace, poles: Poles, chains: tuple[Chain, ...]) -> dict[int, Spread]:

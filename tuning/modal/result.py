@@ -44,6 +44,25 @@ class IdentifiedMode(NamedTuple):
         return float(phase_collinearity(self.shape[None])[0])
 
 
+def frequency_and_damping(
+    pole: complex, covariance: Float[np.ndarray, "2 2"]
+) -> tuple[float, float, float, float]:
+    """Frequency |p| / 2 pi (Hz) and damping ratio of a pole p = -s + i w (1/s), with deviations.
+
+    `covariance` is that of (s, w). Returned are frequency, its standard deviation, damping ratio,
+    its standard deviation.
+    """
+    rate, angular_frequency, size = -pole.real, pole.imag, abs(pole)
+    by_frequency = np.array([rate, angular_frequency]) / size / (2 * np.pi)
+    by_damping = np.array([angular_frequency**2, -rate * angular_frequency]) / size**3
+    return (
+        float(size / (2 * np.pi)),
+        float(np.sqrt(by_frequency @ covariance @ by_frequency)),
+        float(rate / size),
+        float(np.sqrt(by_damping @ covariance @ by_damping)),
+    )
+
+
 def rejection_reason(mode: IdentifiedMode, duration: float, band: tuple[float, float]) -> str:
     """Reason why a mode found in `duration` seconds is not well identified; empty if it is."""
     half_width = max(mode.damping_ratio, 0.0) * mode.frequency  # where the power is half

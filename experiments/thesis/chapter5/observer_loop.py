@@ -3,7 +3,7 @@
     x(k+1) = A_m(k) x(k) + B_m(k) u(k) + B_f(k) u_f(k),   y(k) = C x(k) + v(k),   u = -K xh
     xh(k+1) = (A - B K - L C) xh(k) + L y(k) + B_f u_f(k)
 
-The plant has the mass at its position in the middle of each period, the observer does not; both
+The plant has the mass at one of 240 positions along the beam, the observer does not; both
 have its weight, the true one. K is the optimal gain of the sampled beam without a load, L that of
 the dual problem. States are amplitudes of sine modes (m), their rates, and the shaker's.
 """
@@ -21,6 +21,7 @@ OBSERVER_WEIGHT = 1e6  # R of the observer, 5.1
 NOISE_VARIANCES = np.array([0.0365, 0.135, 0.0729]) * 1e-10  # m^2, of the three sensors, 5.1
 SENSOR = 1  # at 0.25 m: the one that the observer reads
 SEED = 0
+POSITIONS = 240  # of the load, at which the plant is frozen
 
 
 class ObservedLoop(NamedTuple):
@@ -83,6 +84,9 @@ def simulate_observed(
         case, loads=(jb.MovingForce(mass=case.loads[0].mass, speed=case.loads[0].speed),)
     )
     weight_only = jb.state_space(force, "sine")
+    positions = np.linspace(0.0, crossing, POSITIONS + 1)[:-1] + crossing / POSITIONS / 2
+    loaded = _sampled_at(plant, [*positions, crossing + period], period)
+    weights = _sampled_at(weight_only, [*positions, crossing + period], period)
     state, estimate = np.zeros(len(A)), np.zeros(len(A))
     states, estimates, commands = [], [], []
     for k, t in enumerate(times):
@@ -90,20 +94,21 @@ def simulate_observed(
         states.append(state)
         estimates.append(estimate)
         commands.append(command)
-        if k == count:
-            break
-        middle = t + period / 2
-        loaded, own = plant.at(middle), weight_only.at(middle)
+        segment = min(int((t + period / 2) / crossing * POSITIONS), POSITIONS)
         inputs = np.array([command, weight])
-        advance, forced = sampled(np.asarray(loaded.A), np.asarray(loaded.B), period)
         reading = C[SENSOR] @ state + noise[k, SENSOR]
-        state = advance @ state + forced @ inputs
+        state = loaded[segment][0] @ state + loaded[segment][1] @ inputs
         if gains is not None:
-            free_advance, free_forced = sampled(A, np.asarray(own.B), period)
             estimate = (
-                free_advance @ estimate
-                + free_forced @ inputs
+                weights[segment][0] @ estimate
+                + weights[segment][1] @ inputs
                 + gains.observer * (reading - C[SENSOR] @ estimate)
             )
     states, estimates = np.array(states), np.array(estimates)
     return ObservedLoop(times, states, estimates, np.array(commands), states @ C.T)
+
+
+def _sampled_at(plant, times, period: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Sampled matrices of the plant with its load frozen at some times (s)."""
+    systems = [plant.at(t) for t in times]
+    return [sampled(np.asarray(one.A), np.asarray(one.B), period) for one in systems]

@@ -23,6 +23,7 @@ from jaxbeam.plot.poles import plot_poles
 
 COMMAND_WEIGHT = 9e-8  # R of the example in 5.1
 ACTIVE_STIFFNESS = 3500.0  # N/m
+TWO_MODE_STATES = (0, 1, 3, 4, 6)  # of the seven states of three modes
 OTHER_SHAKER = "4.6 N/V over root two, alpha = beta = 1000, section of 60 mm by 3.3 mm"
 OTHER_SECTION = {"width": 0.06, "height": 3.3e-3, "youngs_modulus": 65e9, "density": 2700.0}
 # Shakers for all of which the printed gain of 0.2 ms is tried: N/V, rad/s, N/m.
@@ -61,7 +62,7 @@ def sampling_findings(rig: jb.Case, weights) -> list[Finding]:
     rig = with_active_shaker(rig)
     moved_shaker = jb.replace(rig, {"actuators.0.position": 0.25})
     moved_shaker = with_modes(moved_shaker, 2)
-    two_mode_weights = [weights[i] for i in (0, 1, 3, 4, 6)]
+    two_mode_weights = [weights[i] for i in TWO_MODE_STATES]
     gains = (
         (published.SAMPLED_GAIN, rig, 5e-3, weights),
         (published.MOVED_SHAKER_GAIN, moved_shaker, 1e-2, two_mode_weights),

@@ -27,7 +27,7 @@ from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 PERIOD, SPEED = 0.01, 1.0  # s, m/s
 LOW_MOVE_WEIGHT, HIGH_MOVE_WEIGHT = 1e-11, 1e-6  # r_w
 TOLERANCE = 1e-4  # relative, of peaks
-CURVE_RESOLUTION = 0.02  # share of a limit within which a drawn curve seems to reach it
+CURVE_RESOLUTION = 0.02  # share of a limit at which a drawn curve seems to reach it: fitted
 # Rigidity (N m^2) and mass per length (kg/m) as printed for beams with patches.
 PRINTED_SECTIONS = ((12.277, 0.7924), (13.211, 0.812), (12.11, 0.5411))
 DAMPING_RATIOS = (0.01, 0.03)
@@ -97,6 +97,7 @@ def _one_span(case):
     one_move = simulate_mpc(case, 6, 1)
     uncontrolled = jb.simulate(case, one_move.times, tolerance=TOLERANCE)
     no_control = "no control", 0.0
+    as_drawn = f"as a curve shows it, to {CURVE_RESOLUTION:.0%}"
     findings = (
         make_finding(
             published.ONE_MOVE_PEAKS,
@@ -109,8 +110,9 @@ def _one_span(case):
         make_finding(
             published.ONE_SPAN_SATURATION,
             exact,
-            {f"as a curve shows it, to {CURVE_RESOLUTION:.0%}": from_curve},
+            {as_drawn: from_curve},
             null=AT_ONCE,
+            fitted={as_drawn: "r_w=1e-6"},
         ),
     )
     return findings, records
@@ -155,12 +157,13 @@ def _reduced_model_finding(case: jb.Case) -> Finding:
 
 
 def _peak_times(record: jb.Record) -> np.ndarray:
-    """Times (s) of the first and the last upward peak of the deflection while loaded, (2,)."""
+    """Times (s) of the first and last upward peak of the deflection while loaded, (2,), or NaN."""
     history = np.asarray(record.deflection)[:, 0]
     inner = history[1:-1]
     peaks = 1 + np.flatnonzero((inner > history[:-2]) & (inner > history[2:]))
     times = np.asarray(record.times)[peaks]
-    return times[times < float(record.case.beam.length) / SPEED][[0, -1]]
+    loaded = times[times < float(record.case.beam.length) / SPEED]
+    return loaded[[0, -1]] if loaded.size else np.full(2, np.nan)
 
 
 def _unattainable_reductions(case: jb.Case) -> str:

@@ -42,7 +42,6 @@ def identify(
     validate: bool = False,
     report: Path | None = None,
     output: Output = None,
-    plot: bool = False,
     pictures: PictureOptions = PictureOptions(),
     resume: Resume = False,
     options: CaseOptions = CaseOptions(),
@@ -51,6 +50,9 @@ def identify(
 
     Parameters of the logs have addresses such as logs.*.loads.0.speed: the speed of the load in
     every log.
+
+    `--plot` draws measured and fitted signals to a PNG beside the output, or named after the
+    log.
 
     Parameters
     ----------
@@ -80,15 +82,13 @@ def identify(
         Write a report with tables and figures to this folder: report.md and report.html.
     output
         Write the fitted case to this file, FIT.toml, and the whole fit beside it, FIT.npz.
-    plot
-        Draw measured and fitted signals to a PNG beside the output, or named after the log.
     """
     case, logs = split_case_and_logs(files, free)
     if case and free:
         refuse_option(
             resume and not output, "--resume goes on with what is kept beside the output: -o"
         )
-        picture = pictures.path(plot, output, logs[0])
+        picture = pictures.path(output, logs[0])
         options.check_outputs(output, _with_suffix(output, ".npz"), picture)
         if report:
             check_report_folder(report, options.overwrite)
@@ -141,7 +141,7 @@ def identify(
         print_message(
             f"nothing is named with --free, so {case} is not used; modes of the free decay:"
         )
-    files_of_logs = [pictures.path(plot, None, log) for log in logs]
+    files_of_logs = [pictures.path(None, log) for log in logs]
     options.check_outputs(*files_of_logs)
     _identify_modes(logs, files_of_logs, pictures, options)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import check_suffix
+from jaxbeam.cli.commands.describe import settlement_words
 from jaxbeam.cli.options import (
     CaseOptions,
     LabelledPictureOptions,
@@ -23,12 +24,13 @@ def simulate(
     /,
     *,
     output: Output = None,
-    plot: bool = False,
     animate: Path | None = None,
     pictures: LabelledPictureOptions = LabelledPictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Simulate a case: peaks at sensors, contact forces, commands; the whole record on request.
+
+    `--plot` draws the record to a PNG beside the output, or named after the case.
 
     Parameters
     ----------
@@ -37,8 +39,6 @@ def simulate(
     output
         Write all of the record to this file, OUT.nc or OUT.zarr, or what sensors measure, contact
         forces and commands to a table: OUT.csv, .xlsx, .mat or .parquet.
-    plot
-        Draw the record to a PNG beside the output, or named after the case.
     animate
         Write an animation of the run to this file, OUT.gif, or OUT.mp4 if ffmpeg is installed.
     """
@@ -47,7 +47,7 @@ def simulate(
         from jaxbeam.plot.traffic.film import check_film
 
         check_film(animate)
-    picture = pictures.path(plot, output, case)
+    picture = pictures.path(output, case)
     options.check_outputs(output, picture, animate)
     parsed_case = options.read(case)
     labels = pictures.sensor_labels(parsed_case)
@@ -75,6 +75,8 @@ def simulate(
     amplification = record_amplification(record)
     content = _to_dict(record, amplification) | {"plausibility": plausibility}
     lines = _lines(record, amplification)
+    for words in settlement_words(parsed_case):
+        lines.append(f"{words}; sensors read changes from there")
     controller = parsed_case.controller
     if controller is not None and not controller.open_loop:
         from jaxbeam.analysis.crossing_margin import stability_margin

@@ -39,11 +39,13 @@ def sweep(
     resume: bool = False,
     scheduler: str | None = None,
     precision: str = "double",
-    plot: bool = False,
     pictures: LabelledPictureOptions = LabelledPictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Simulate a case for many values of some of its parameters.
+
+    `--plot` draws the peaks to a PNG beside the store, or to CASE_sweep.png in this folder:
+    trains over speed with resonance speeds, other parameters as curves or maps.
 
     Parameters
     ----------
@@ -61,9 +63,6 @@ def sweep(
         store must be in a folder that all workers see.
     precision
         double, or single: half the bits, errors of a few parts in a million.
-    plot
-        Draw the peaks to a PNG beside the store, or to CASE_sweep.png in this folder: trains over
-        speed with resonance speeds, other parameters as curves or maps.
     """
     values = parse_sweep_values(over)
     refuse_option(
@@ -79,7 +78,7 @@ def sweep(
             is_given and store is None,
             f"{option} needs a store of blocks: -o OUT.zarr",
         )
-    picture = pictures.path(plot, output, case.with_stem(f"{case.stem}_sweep"))
+    picture = pictures.path(output, case.with_stem(f"{case.stem}_sweep"))
     refuse_option(
         bool(picture) and not 0 < sum(len(given) > 1 for given in values.values()) < 3,
         "--plot draws peaks over one or two parameters with several values; leave it out",

@@ -78,7 +78,8 @@ def force_system(
     length = nodes[-1] - nodes[0]
     count = np.maximum(4, np.ceil(TABLE_POINTS * np.diff(breaks) / length).astype(int) + 1)
     pieces = [
-        np.linspace(*ends, n) for *ends, n in zip(breaks[:-1], breaks[1:], count, strict=True)
+        np.linspace(left, right, n)
+        for left, right, n in zip(breaks[:-1], breaks[1:], count, strict=True)
     ]
     points = np.concatenate(pieces)
     near = np.repeat((breaks[:-1] + breaks[1:]) / 2, count)

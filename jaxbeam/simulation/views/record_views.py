@@ -16,6 +16,7 @@ from jaxbeam.files.netcdf import write_netcdf
 from jaxbeam.files.tables import write_result
 from jaxbeam.model.modes import Modes
 from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.whole_file import whole_file
 from jaxbeam.simulation.extremes import Extremes
 from jaxbeam.simulation.views.dataset import dataset_parts
 from jaxbeam.simulation.views.table import record_columns
@@ -120,6 +121,5 @@ class RecordViews(TableViews, eqx.Module):
 
         Raises FileExistsError if the file exists, without `overwrite`.
         """
-        if not overwrite and os.path.exists(path):
-            raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
-        write_netcdf(path, *self._dataset_parts())
+        with whole_file(path, overwrite) as beside:
+            write_netcdf(beside, *self._dataset_parts())

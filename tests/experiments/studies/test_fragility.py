@@ -14,9 +14,10 @@ from jaxbeam.case.controller import Measurement
 
 @pytest.mark.parametrize("rig", ["B", "C"])
 def test_hand_set_laws_stay_within_the_limits(rig):
-    law = hand_set.trapezium(rig)
+    law, table = hand_set.trapezium(rig), hand_set.drawn_table(rig)
     low, high = COMMAND_LIMITS
-    assert np.all((law.values >= low) & (law.values <= high))
+    for values in (law.values, table.values):
+        assert values.min() >= low and values.max() == high
     assert law.values.shape == (len(rigs.load(rig).actuators), law.shares.shape[0])
 
 

@@ -134,15 +134,9 @@ def ambient_fits():
 def test_ambient_intervals_cover_the_truth(ambient_fits):
     assert all(fit.kind == "ambient" for fit in ambient_fits)
     complete = [fit for fit in ambient_fits if len(fit.modes) == 2]
-    assert len(complete) >= 36
+    assert len(complete) == 40
     share = np.mean([covered(fit, [3.0, 7.0], [0.02, 0.01]) for fit in complete], axis=(0, 1))
     assert np.all((share >= 0.90) & (share <= 0.98)), share
-
-
-@pytest.mark.slow
-@pytest.mark.xfail(reason="the damping of one mode in thirty is not told from none, and refused")
-def test_all_ambient_modes_are_found(ambient_fits):
-    assert all(len(fit.modes) == 2 for fit in ambient_fits)
 
 
 def test_table_json_and_figures_of_a_fit(tmp_path):

@@ -16,7 +16,7 @@ from tuning.modal.decay.poles import (
     pole_parameters,
     refine,
 )
-from tuning.modal.result import IdentifiedMode
+from tuning.modal.result import IdentifiedMode, frequency_and_damping
 
 MIN_BINS = 8  # bins of a spectrum to find poles in
 MAX_POLE_SHIFT_SD = 4.0  # standard deviations by which a pole may differ in a shorter window
@@ -141,16 +141,14 @@ def _identified_modes(
     for k, pole in enumerate(found.poles):
         covariance = found.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
         covariance = covariance + np.diag(scatter[2 * k : 2 * k + 2])
-        rate, angular_frequency, size = -pole.real, pole.imag, abs(pole)
-        by_frequency = np.array([rate, angular_frequency]) / size / (2 * np.pi)
-        by_damping = np.array([angular_frequency**2, -rate * angular_frequency]) / size**3
+        frequency, frequency_sd, damping_ratio, damping_sd = frequency_and_damping(pole, covariance)
         shape, shape_covariance = _shape(found, k, channels)
         modes.append(
             IdentifiedMode(
-                frequency=float(size / (2 * np.pi)),
-                frequency_sd=float(np.sqrt(by_frequency @ covariance @ by_frequency)),
-                damping_ratio=float(rate / size),
-                damping_sd=float(np.sqrt(by_damping @ covariance @ by_damping)),
+                frequency=frequency,
+                frequency_sd=frequency_sd,
+                damping_ratio=damping_ratio,
+                damping_sd=damping_sd,
                 energy_share=math.nan,  # told by `energies`
                 shape=shape,
                 shape_covariance=shape_covariance,

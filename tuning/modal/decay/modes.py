@@ -84,7 +84,9 @@ def free_decay_modes(
     channels = samples.records[0].shape[1]
     pieces = tuple(windows[:, i : i + channels] for i in range(0, windows.shape[1], channels))
     starts = tuple(one.start / samples.rate for one in used)
-    candidates, diagrams = subspace_modes(pieces, starts, samples.rate, band, order=order)
+    candidates, diagrams = subspace_modes(
+        pieces, starts, samples.rate, band, order=order, refine=False
+    )
     poles = np.array([candidate.mode.pole for candidate in candidates], complex)
     fits = [
         (part, fit)
