@@ -112,13 +112,13 @@ def test_noise_has_no_modes(quantity, pole):
         log = make_log(lfilter([1.0], [1.0, -pole], noise, axis=0), 100.0, quantity)
         fit = identify_modes(log)
         assert not fit.modes, str(fit)
-        assert "no mode is well identified" in str(fit)
+        assert "no mode is well identified" in str(fit) and fit.to_dict()["mac"] == []
 
 
 @pytest.mark.slow
 def test_decay_intervals_cover_the_truth():
-    """120 logs of three modes each: 90 % to 98 % of the intervals cover the true values."""
-    fits = [identify_modes(decay(seed), band=BAND, window=(3.0, 9.5)) for seed in range(120)]
+    """60 logs of three modes each: 90 % to 98 % of the intervals cover the true values."""
+    fits = [identify_modes(decay(seed), band=BAND, window=(3.0, 9.5)) for seed in range(60)]
     share = np.mean([covered(fit, FREQUENCIES, DAMPING) for fit in fits], axis=(0, 1))
     assert np.all((share >= 0.90) & (share <= 0.98)), share
 

@@ -21,7 +21,7 @@ from tuning.modal.samples import MIN_SAMPLES, Samples
 from tuning.modal.stabilisation import Diagram
 
 MIN_DECAY_ENERGY = 0.3  # share of the energy of a log in its decays, if they are to stand for it
-LONG_FALL_NEPERS = 2.5  # or fall of the energy; 95 % of that of an exponential falls by 3
+LONG_FALL_NEPERS = 2.0  # or fall of the energy; 95 % of that of an exponential falls by 3
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
 NOT_REPRODUCED = "not the same in parts of the window"
 MAX_RESIDUAL_OF_WINDOW = 0.05  # the same for a window that the user gives and that falls little
