@@ -3,12 +3,13 @@
 import ast
 import graphlib
 import itertools
+import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
 
-from tests.modules import PACKAGES, module_files, parse
+from tests.modules import PACKAGES, ROOT, module_files, parse
 
 # A package imports only those in lines above its own. A name stands for all modules within it that
 # no longer name here covers. One import may point down: methods of results that are called `plot`
@@ -179,3 +180,13 @@ def test_only_the_validation_page_imports_the_tests():
     assert importing_modules and all(
         module.startswith("experiments.validation.") for module in importing_modules
     )
+
+
+def test_shapes_are_checked_in_every_package_but_runtime():
+    """`pyproject.toml` names the packages; `jaxbeam.runtime` is left out for its speed."""
+    options = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["pytest"]["ini_options"]
+    (option,) = [one for one in options["addopts"] if one.startswith("--jaxtyping-packages=")]
+    checked = option.partition("=")[2].split(",")
+    packages = {".".join(module.split(".")[:2]) for module in FILES if module.count(".") > 1}
+    expected = {name for name in packages if name.startswith("jaxbeam.")} - {"jaxbeam.runtime"}
+    assert sorted(checked) == sorted([*expected, "tuning", "beartype.beartype"])

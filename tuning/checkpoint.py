@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxbeam.runtime.whole_file import whole_file
+
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
@@ -50,14 +52,17 @@ def fingerprint(description: dict) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def save(path: Path, digest: str, arrays: dict[str, np.ndarray]) -> None:
-    """Write named arrays to a file in one step: a stopped write leaves the file as it was."""
-    part = path.with_name(path.name + ".part")
-    with open(part, "wb") as file:
+def save(
+    path: str | os.PathLike, digest: str, arrays: dict[str, np.ndarray], overwrite: bool = True
+) -> None:
+    """Write named arrays to a file in one step: a stopped write leaves the file as it was.
+
+    Raises FileExistsError if the file exists, without `overwrite`.
+    """
+    with whole_file(path, overwrite) as beside, open(beside, "wb") as file:
         np.savez(file, fingerprint=np.array(digest), **arrays)
         file.flush()
         os.fsync(file.fileno())
-    os.replace(part, path)
 
 
 def load(path: Path, digest: str) -> dict[str, np.ndarray]:

@@ -11,6 +11,7 @@ from plain_docstrings import as_text
 import jaxbeam
 import jaxbeam.plot
 import tuning
+from jaxbeam.case.display.views import TableViews
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE
 from jaxbeam.cli.app import COMMANDS, app as commands
 from jaxbeam.files.declared_keys import Key, table_classes, table_keys, tables
@@ -99,6 +100,8 @@ def api_page(title: str, names: list[tuple[str, str]]) -> str:
         lines += [f".. {directive}:: {module}.{name}"]
         if inspect.isclass(one):
             lines += ["   :members:", "   :exclude-members: validate"]
+            if issubclass(one, TableViews):  # with what their views have: tables, files, figures
+                lines += ["   :inherited-members: Module"]
         lines += [""]
     return "\n".join(lines)
 

@@ -28,8 +28,8 @@ WEIGHTS = {
     "points": 300,
     "period": 2e-3,
 }
-ENTRY_TIME_ERRORS = np.array([-0.1, -0.05, -0.025, 0.0, 0.025, 0.05, 0.1])  # s
-MASS_ERRORS = np.array([-0.4, -0.2, 0.0, 0.2, 0.4])  # share of the mass
+ENTRY_TIME_ERRORS = np.array([-0.1, -0.05, 0.0, 0.05, 0.1])  # s
+MASS_ERRORS = np.array([-0.4, 0.0, 0.4])  # share of the mass
 SENSOR, TOLERANCE = 1, 1e-4
 
 
@@ -64,7 +64,10 @@ def run(load_rig) -> ExperimentResult:
         )
 
     by_time = {late: simulated(regulator(entry_time_error=late)) for late in ENTRY_TIME_ERRORS}
-    by_mass = {share: simulated(regulator(mass_error=share)) for share in MASS_ERRORS}
+    by_mass = {
+        share: simulated(regulator(mass_error=share)) if share else by_time[0.0]
+        for share in MASS_ERRORS
+    }
     entries = [peak_reduction(record) for record in by_time.values()]
     masses = [peak_reduction(record) for record in by_mass.values()]
     baseline = peak_reduction(without_feedforward)

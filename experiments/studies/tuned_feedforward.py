@@ -4,9 +4,9 @@ One table of commands over the position of the load (`jaxbeam.control.feedforwar
 masses and speeds. It is tuned by `experiments.studies.tune_feedforward` and compared, on held-out
 loads, with the cubic feedback of chapter 6 and the least achievable peak:
 
-- ideal: no delay;
 - bench: 20 ms of delay, compensated by an equal lead; then also 10 ms more, which are not
-  compensated, or a beam that is 10 % stiffer or softer than the design model.
+  compensated, or a beam that is 10 % stiffer or softer than the design model;
+- a trapezium drawn by hand on the same gates, on the same bench.
 
 Commands are sampled every 10 ms in steps of 10 mV (2 V at the patch); loads enter between sampling
 instants.
@@ -21,6 +21,7 @@ import dataclasses
 import numpy as np
 
 import jaxbeam as jb
+from experiments.studies.hand_set import HAND_SET, trapezium
 from experiments.studies.held_out import (
     CUBIC_CUTOFFS,
     CUBIC_FEEDBACK,
@@ -39,14 +40,14 @@ from experiments.thesis.verdicts import Experiment, ExperimentResult
 from tuning.control.run_set import RunSet, make_run_set
 
 DELAY = 0.02  # s
-IDEAL, BENCH = "tuned, ideal", "tuned, bench"
-DRAWN_LAWS = (CUBIC_FEEDBACK, BENCH, EXTRA_DELAY_LAW)
+BENCH = "tuned, bench"
+DRAWN_LAWS = (CUBIC_FEEDBACK, HAND_SET, BENCH, EXTRA_DELAY_LAW)
 
 
 def run(load_rig) -> ExperimentResult:
     """Shares of the achievable reduction on rigs B and C, for held-out loads."""
     studies = [run_study(rig, load_rig(rig)) for rig in ("B", "C")]
-    remarks = [line for one in studies for line in one.remarks((CUBIC_FEEDBACK, IDEAL, BENCH))]
+    remarks = [line for one in studies for line in one.remarks((CUBIC_FEEDBACK, HAND_SET, BENCH))]
     title = "One tuned table of commands for all loads, held-out loads"
     return ExperimentResult((), {"shares": draw(studies, DRAWN_LAWS, title)}, tuple(remarks))
 
@@ -54,20 +55,20 @@ def run(load_rig) -> ExperimentResult:
 def run_study(rig: str, case: jb.Case) -> HeldOutStudy:
     """Run all laws on the held-out loads of a rig."""
     case, loads = with_held_out_duration(rig, case), held_out_loads(rig)
-    ideal = jb.load_case(FOLDER / f"{rig}.toml").controller
+    law = jb.load_case(FOLDER / f"{rig}.toml").controller
     controlled_cases = {
         CUBIC_FEEDBACK: with_feedback(case, 3, CUBIC_CUTOFFS[rig]),
-        IDEAL: dataclasses.replace(case, controller=ideal),
-        BENCH: dataclasses.replace(case, controller=with_bench_delay(ideal)),
-        EXTRA_DELAY_LAW: dataclasses.replace(case, controller=with_bench_delay(ideal, EXTRA_DELAY)),
+        HAND_SET: dataclasses.replace(case, controller=with_bench_delay(trapezium(rig))),
+        BENCH: dataclasses.replace(case, controller=with_bench_delay(law)),
+        EXTRA_DELAY_LAW: dataclasses.replace(case, controller=with_bench_delay(law, EXTRA_DELAY)),
     }
     run_sets = {
-        law: make_run_set(one, loads, least_peaks=law == IDEAL)
-        for law, one in controlled_cases.items()
+        name: make_run_set(one, loads, least_peaks=name == BENCH)
+        for name, one in controlled_cases.items()
     }
-    records = {law: run_set.records({}) for law, run_set in run_sets.items()}
-    uncontrolled = run_sets[IDEAL].uncontrolled
-    reductions = {law: 1 - peaks(found) / uncontrolled["peak"] for law, found in records.items()}
+    records = {name: run_set.records({}) for name, run_set in run_sets.items()}
+    uncontrolled = run_sets[BENCH].uncontrolled
+    reductions = {name: 1 - peaks(found) / uncontrolled["peak"] for name, found in records.items()}
     for name, factor in RIGIDITY_ERRORS.items():
         change = {RIGIDITY: factor * float(case.beam.flexural_rigidity)}
         controlled = peaks(run_sets[BENCH].records(change))
@@ -77,7 +78,7 @@ def run_study(rig: str, case: jb.Case) -> HeldOutStudy:
         loads=loads,
         achievable=1 - uncontrolled["least"] / uncontrolled["peak"],
         reductions=reductions,
-        records={law: found[-1] for law, found in records.items()},
+        records={name: found[-1] for name, found in records.items()},
     )
 
 

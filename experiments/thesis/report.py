@@ -5,7 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from experiments.thesis.verdicts import (
+    FITTED,
     IRREPRODUCIBLE,
+    NOT_COUNTED,
+    REPEATED,
     VERDICTS,
     ExperimentRun,
     Finding,
@@ -14,15 +17,20 @@ from experiments.thesis.verdicts import (
 from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable, text_table
 
 TITLE = "The thesis, reproduced"
-COLUMNS = ("number", "published", "computed", "difference", "tolerance", "verdict")
+ALL_VERDICTS = (*VERDICTS, *NOT_COUNTED)
+COLUMNS = ("number", "published", "computed", "null model", "tolerance", "verdict")
 METHOD = (
     "The thesis's figures and measured curves are not available: comparisons are with printed"
-    " numbers, and figures have the thesis's axes. Tolerances depend on the kind of number and were"
-    " fixed before the runs, except those of Figs 6.4, 7.1, 7.2, Table 5.3 and the sampled gains,"
-    " set after a first look. Verdicts are computed from them."
+    " numbers, and figures have the thesis's axes. A tolerance is a unit of the last printed digit,"
+    " with the rounding of the printed parameters, or the scatter of measurements that the thesis"
+    " shows. One reading serves for all numbers of a group, the likeliest by its misfit: squared"
+    " differences over half the tolerance, cut off at three tolerances, and two for each fitted"
+    " parameter. A number that a null model meets within the same tolerance, that a parameter was"
+    ' fitted to, or that repeats another counts for nothing. No proof, no "cannot be right".'
 )
 VERDICT_STYLE = (
     ".reproduced { color: #00694c } .explained { color: #0072b2 } .not, .cannot { color: #b34700 }"
+    " .met, .fitted, .repeats { color: #777777 }"
 )
 
 
@@ -32,9 +40,9 @@ def as_text(run: ExperimentRun) -> str:
     for finding, assigned in zip(run.outcome.findings, run.verdicts, strict=True):
         lines += ["", f"  {_finding_title(finding)}"]
         lines += [f"    {line}" for line in text_table(COLUMNS, _finding_rows(finding, assigned))]
-        lines += [f"    {sentence}" for sentence in _finding_notes(finding, assigned.verdicts)]
+        lines += [f"    {sentence}" for sentence in _finding_notes(finding, assigned)]
     lines += [f"  {remark}" for remark in run.outcome.remarks]
-    counts = [f"{run.count(word)} {word}" for word in VERDICTS if run.count(word)]
+    counts = [f"{run.count(word)} {word}" for word in ALL_VERDICTS if run.count(word)]
     summary = ", ".join(counts) or "nothing printed to compare with"
     return "\n".join([*lines, "", f"  {summary}; {run.seconds:.0f} s", ""])
 
@@ -47,7 +55,7 @@ def sections(runs: Sequence[ExperimentRun]) -> list[ReportSection]:
         report.append(ReportSection(title, [run.experiment.claim]))
         for finding, assigned in zip(run.outcome.findings, run.verdicts, strict=True):
             table = ReportTable(COLUMNS, _finding_rows(finding, assigned), _verdict_class)
-            notes = _finding_notes(finding, assigned.verdicts)
+            notes = _finding_notes(finding, assigned)
             report.append(ReportSection(_finding_title(finding), [table, *notes], level=3))
         figures = [ReportFigure(figure_name(run, name)) for name in run.outcome.figures]
         report.append(ReportSection("", [*run.outcome.remarks, *figures]))
@@ -66,38 +74,52 @@ def _finding_title(finding: Finding) -> str:
 
 
 def _finding_rows(finding: Finding, assigned: FindingVerdicts) -> list[tuple[str, ...]]:
-    """One row for each number; the computed one is by the interpretation of its verdict."""
+    """One row for each number; the computed one is by the likeliest interpretation."""
     published = finding.published
     columns = (
         published.value_labels,
         published.printed_text.split(),
+        finding.interpretations[assigned.interpretation],
+        finding.null.values,
         assigned.verdicts,
-        assigned.interpretations,
     )
-    rows = []
-    for i, (label, printed, verdict, interpretation) in enumerate(zip(*columns, strict=True)):
-        value = float(finding.interpretations[interpretation][i])
-        computed, difference = f"{value:.6g}", f"{value - float(printed):+.2g}"
-        if np.isnan(value):
-            computed = difference = "\N{EM DASH}"
-        tolerance = str(published.tolerance)
-        rows.append((label.replace(",", ", "), printed, computed, difference, tolerance, verdict))
-    return rows
+    tolerance = str(published.tolerance)
+    return [
+        (label.replace(",", ", "), printed, _number(value), _number(null), tolerance, verdict)
+        for label, printed, value, null, verdict in zip(*columns, strict=True)
+    ]
 
 
-def _finding_notes(finding: Finding, verdicts: Sequence[str]) -> list[str]:
-    """Sentences on the values by each interpretation, and why numbers cannot be reproduced."""
-    published = finding.published
-    sentences = []
+def _number(value: float) -> str:
+    return "\N{EM DASH}" if np.isnan(value) else f"{value:.6g}"
+
+
+def _finding_notes(finding: Finding, assigned: FindingVerdicts) -> list[str]:
+    """Sentences on the null model, on each reading and its misfit, and on what is not met."""
+    published, verdicts = finding.published, assigned.verdicts
+    misfits = assigned.misfits
+    sentences = [f"Null model: {finding.null.name}."]
     if published.interpretation:
         sentences.append(f"Interpretation: {published.interpretation}.")
     if len(finding.interpretations) > 1:
         for name, values in finding.interpretations.items():
-            numbers = " ".join(f"{value:.5g}" for value in np.asarray(values))
+            numbers = " ".join(_number(value) for value in values)
+            taken = ", taken" if name == assigned.interpretation else ""
             hits = int(finding.within_tolerance(name).sum())
-            sentences.append(f"{name}: {numbers} ({hits} of {len(verdicts)} within the tolerance)")
+            sentences.append(
+                f"{name}: {numbers} ({hits} of {len(verdicts)} within the tolerance; misfit"
+                f" {misfits[name]:.3g}{taken})"
+            )
+        sentences.append(f"Misfit of the null model: {misfits[None]:.3g}.")
+    if FITTED in verdicts:
+        labels = finding.fitted[assigned.interpretation].split() or ["it"]
+        sentences.append(f"The reading was fitted to {', '.join(labels)}.")
+    if REPEATED in verdicts:
+        sentences.append(f"Repeats {published.repeats}.")
     if IRREPRODUCIBLE in verdicts:
-        sentences.append(f"Cannot be reproduced because {finding.inconsistency}.")
+        sentences.append(f"Cannot be right because {finding.impossible}.")
+    if finding.remark:
+        sentences.append(f"{finding.remark[0].upper()}{finding.remark[1:]}.")
     return sentences
 
 
@@ -105,15 +127,15 @@ def _summary_table(runs: Sequence[ExperimentRun]) -> ReportTable:
     """Count of numbers by verdict, and wall time, for each experiment and for all."""
 
     def row(name: str, runs: Sequence[ExperimentRun]) -> tuple[str, ...]:
-        counts = [sum(run.count(word) for run in runs) for word in VERDICTS]
+        counts = [sum(run.count(word) for run in runs) for word in ALL_VERDICTS]
         seconds = sum(run.seconds for run in runs)
         return (name, str(sum(counts)), *map(str, counts), f"{seconds:.0f}")
 
     rows = [row(run.experiment.name, [run]) for run in runs]
-    header = ("experiment", "numbers", *VERDICTS, "seconds")
+    header = ("experiment", "numbers", *ALL_VERDICTS, "seconds")
     return ReportTable(header, [*rows, row("all", runs)], _verdict_class)
 
 
 def _verdict_class(cell: str) -> str | None:
     """CSS class of a cell with a verdict."""
-    return cell.split()[0] if cell in VERDICTS else None
+    return cell.split()[0] if cell in ALL_VERDICTS else None

@@ -15,10 +15,10 @@ import jax
 import jaxbeam as jb
 from experiments.thesis import report
 from experiments.thesis.verdicts import (
-    VERDICTS,
     Experiment,
     ExperimentRun,
     Finding,
+    FindingVerdicts,
     assign_verdicts,
 )
 from jaxbeam import rigs
@@ -36,6 +36,7 @@ MODULES = (
     "thesis.chapter7.predictive_control",
     "studies.tuned_feedforward",
     "studies.sensor_feedback",
+    "studies.fragility",
 )
 OUTPUT_FOLDER = "out/reproduce"
 
@@ -134,14 +135,14 @@ def _initialise_process(cache_folder: str | None) -> None:
 def as_dict(runs: Sequence[ExperimentRun]) -> dict:
     """Numbers and verdicts of all runs as lists and strings, for JSON."""
     return {
-        "summary": {word: sum(run.count(word) for run in runs) for word in VERDICTS},
+        "summary": {word: sum(run.count(word) for run in runs) for word in report.ALL_VERDICTS},
         "experiments": {
             run.experiment.name: {
                 "claim": run.experiment.claim,
                 "seconds": run.seconds,
                 "remarks": list(run.outcome.remarks),
                 "findings": [
-                    _finding_as_dict(finding, assigned.verdicts)
+                    _finding_as_dict(finding, assigned)
                     for finding, assigned in zip(run.outcome.findings, run.verdicts, strict=True)
                 ],
             }
@@ -150,7 +151,7 @@ def as_dict(runs: Sequence[ExperimentRun]) -> dict:
     }
 
 
-def _finding_as_dict(finding: Finding, verdicts: list[str]) -> dict:
+def _finding_as_dict(finding: Finding, assigned: FindingVerdicts) -> dict:
     published = finding.published
     return {
         "where": published.location,
@@ -163,6 +164,12 @@ def _finding_as_dict(finding: Finding, verdicts: list[str]) -> dict:
         "readings": {
             name: list(map(float, values)) for name, values in finding.interpretations.items()
         },
-        "verdicts": verdicts,
-        "obstacle": finding.inconsistency,
+        "reading": assigned.interpretation,
+        "misfits": {name or finding.null.name: value for name, value in assigned.misfits.items()},
+        "null model": finding.null.name,
+        "null": list(map(float, finding.null.values)),
+        "verdicts": assigned.verdicts,
+        "impossible because": finding.impossible,
+        "repeats": published.repeats,
+        "remark": finding.remark,
     }

@@ -1,6 +1,9 @@
-"""Published numbers, their tolerances, and the verdict on each: reproduced, explained, or not.
+"""Verdicts on published numbers, computed from readings of the thesis and from null models.
 
-A verdict is computed from the tolerance of the published number.
+The rules are strict. One reading serves for all numbers of a group: the likeliest, by the sum of
+squared differences over tolerances, plus two for each fitted parameter (Akaike). A number that a
+null model (no control, static, one mode) meets within the same tolerance counts for nothing, nor
+does one that a parameter of the reading was fitted to, nor one that repeats another.
 """
 
 import dataclasses
@@ -11,78 +14,23 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
-
-
-@dataclasses.dataclass(frozen=True)
-class Tolerance:
-    """Allowed difference from a published number: the largest of three bounds.
-
-    `relative` is a share of the number, `absolute` is in its unit, `digits` counts units of its
-    last printed digit (zeros at the end of a whole number are not digits). `basis` names the kind
-    of number that the tolerance is for.
-    """
-
-    basis: str
-    relative: float = 0.0
-    absolute: float = 0.0
-    digits: float = 0.0
-
-    def __str__(self) -> str:
-        parts = [f"{self.absolute:g}"] if self.absolute else []
-        parts += [f"{100 * self.relative:g} %"] if self.relative else []
-        parts += [f"{self.digits:g} in the last digit"] if self.digits else []
-        return " or ".join(parts)
-
-
-@dataclasses.dataclass(frozen=True)
-class PublishedNumbers:
-    """Published numbers of one quantity: location, unit, origin, tolerance, and the digits.
-
-    `printed_text` holds the numbers as printed, separated by spaces, and `labels` a name for each.
-    `origin` is "measured" or "computed", as the thesis says. `interpretation` says how an ambiguous
-    statement is read.
-    """
-
-    location: str
-    quantity: str
-    unit: str
-    origin: str
-    tolerance: Tolerance
-    printed_text: str
-    labels: str = ""
-    interpretation: str = ""
-
-    @property
-    def numbers(self) -> np.ndarray:
-        """The values, (number,)."""
-        return np.array([float(word) for word in self.printed_text.split()])
-
-    @property
-    def allowed_error(self) -> np.ndarray:
-        """Allowed absolute difference from each value, (number,)."""
-        last_digits = [_last_digit_unit(word) for word in self.printed_text.split()]
-        by_digits = self.tolerance.digits * np.array(last_digits)
-        by_share = self.tolerance.relative * np.abs(self.numbers)
-        return np.maximum(np.maximum(by_share, by_digits), self.tolerance.absolute)
-
-    @property
-    def value_labels(self) -> list[str]:
-        """One label for each value, empty where none is given."""
-        labels = self.labels.split()
-        return labels or [""] * self.numbers.size
-
-
-def _last_digit_unit(word: str) -> float:
-    """One unit of the last printed digit; zeros at the end of a whole number are not digits."""
-    if "." in word:
-        return 10.0 ** -len(word.partition(".")[2])
-    return 10.0 ** (len(word) - len(word.rstrip("0")))
-
+from experiments.thesis.published_numbers import PublishedNumbers
 
 REPRODUCED, EXPLAINED = "reproduced", "explained"
-IRREPRODUCIBLE, NOT_REPRODUCED = "cannot be reproduced", "not reproduced"
-VERDICTS = (REPRODUCED, EXPLAINED, IRREPRODUCIBLE, NOT_REPRODUCED)
+IRREPRODUCIBLE, NOT_REPRODUCED = "cannot be right", "not reproduced"
+NULL_MET, FITTED, REPEATED = "met by the null model", "fitted to it", "repeats another"
+VERDICTS = (REPRODUCED, EXPLAINED, IRREPRODUCIBLE, NOT_REPRODUCED)  # those that count
+NOT_COUNTED = (NULL_MET, FITTED, REPEATED)
 LITERAL = "as printed"  # name of the interpretation that takes the thesis at its word
+# Differences in tolerances beyond which they are alike, and those that one standard deviation is.
+FARTHEST, STANDARD_DEVIATION = 3.0, 0.5
+
+
+class NullModel(NamedTuple):
+    """A model that leaves out what the thesis studies, and its values (number,)."""
+
+    name: str
+    values: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,92 +38,134 @@ class Finding:
     """Published numbers beside computed ones, under one or more interpretations of the thesis.
 
     `interpretations` maps a name to computed values (number,); the first takes the thesis at its
-    word, the others are what it may have meant. `inconsistency` is a computed proof that no value
-    can be right for the stated rig, or empty.
+    word, the others are what it may have meant. `fitted` maps an interpretation to the labels of
+    the numbers that its parameters were fitted to, one label for each parameter. `impossible` is a
+    computed proof that no value can be right for the stated rig, or empty, `remark` says why a
+    number is not met where that is known.
 
-    Raises ValueError if an interpretation has another count of values than is published.
+    Raises ValueError if a model has another count of values than is published.
     """
 
     published: PublishedNumbers
     interpretations: Mapping[str, np.ndarray]
-    inconsistency: str = ""
+    null: NullModel
+    fitted: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    impossible: str = ""
+    remark: str = ""
 
     def __post_init__(self):
         count = self.published.numbers.size
-        for name, values in self.interpretations.items():
+        for name, values in (self.interpretations | {self.null.name: self.null.values}).items():
             if np.shape(values) != (count,):
                 raise ValueError(f"{self.published.location}, {name}: {count} numbers are printed")
 
     def within_tolerance(self, interpretation: str) -> np.ndarray:
         """Whether each computed number is within the tolerance, (number,)."""
-        computed = np.asarray(self.interpretations[interpretation])
-        # Differences of decimal numbers are off by rounding: 1.1 - 1.0 exceeds 0.1.
-        return np.abs(computed - self.published.numbers) <= self.published.allowed_error * (
-            1 + 1e-9
-        )
+        return self.published.agrees(self.interpretations[interpretation])
+
+    @property
+    def null_within_tolerance(self) -> np.ndarray:
+        """Whether the null model meets each number within its tolerance, (number,)."""
+        return self.published.agrees(self.null.values)
+
+    def misfit(self, interpretation: str | None) -> float:
+        """Minus twice the logarithm of the likelihood, up to a constant; of the null if None.
+
+        Normal with a standard deviation of half the tolerance, differences cut off at three
+        tolerances, over the numbers that repeat no others, and two for each fitted parameter.
+        """
+        by_null = interpretation is None
+        values = self.null.values if by_null else self.interpretations[interpretation]
+        off = np.abs(np.asarray(values) - self.published.numbers) / self.published.allowed_error
+        off = np.minimum(np.where(np.isnan(off), FARTHEST, off), FARTHEST) / STANDARD_DEVIATION
+        parameters = 0 if by_null else len(self.fitted.get(interpretation, "").split())
+        return float(np.sum(off[~self.published.repeated] ** 2)) + 2 * parameters
 
 
 def make_finding(
     published: PublishedNumbers,
     values,
     alternatives: Mapping[str, np.ndarray] | None = None,
-    inconsistency: str = "",
+    *,
+    null: tuple[str, object],
+    fitted: Mapping[str, str] | None = None,
+    impossible: str = "",
+    remark: str = "",
 ) -> Finding:
     """A finding with `values` by the literal interpretation, and `alternatives` by name.
 
-    Values are numbers or arrays (number,). Raises ValueError if their count is not that published.
+    Values are numbers or arrays (number,), and so are those of the `null` model (name, values),
+    where one number stands for all. Raises ValueError if their count is not that published.
     """
     interpretations = {LITERAL: values} | dict(alternatives or {})
-    arrays = {name: np.atleast_1d(np.asarray(v)) for name, v in interpretations.items()}
-    return Finding(published, arrays, inconsistency)
+    arrays = {name: np.atleast_1d(np.asarray(v, float)) for name, v in interpretations.items()}
+    name, null_values = null
+    null_array = np.asarray(null_values, float)
+    if null_array.ndim == 0:
+        null_array = np.full(published.numbers.size, null_array)
+    return Finding(published, arrays, NullModel(name, null_array), fitted or {}, impossible, remark)
 
 
-def best_interpretation(findings: Sequence[Finding]) -> str:
-    """Name of the alternative with most numbers within tolerance over all findings.
+def group_of(finding: Finding, findings: Sequence[Finding]) -> list[Finding]:
+    """The findings that have the same interpretations: one of them must serve for all."""
+    names = list(finding.interpretations)
+    return [one for one in findings if list(one.interpretations) == names]
 
-    The findings have the same alternatives, so that one serves for all numbers. Empty if there are
-    none.
-    """
-    alternatives = list(findings[0].interpretations)[1:]
-    hits = {
-        name: sum(int(one.within_tolerance(name).sum()) for one in findings)
-        for name in alternatives
-    }
-    return max(hits, key=lambda name: hits[name], default="")
+
+def likeliest_interpretation(group: Sequence[Finding]) -> str:
+    """Name of the interpretation with the least misfit over all findings of a group."""
+    names = list(group[0].interpretations)
+    return min(names, key=lambda name: sum(one.misfit(name) for one in group))
 
 
 class FindingVerdicts(NamedTuple):
-    """Verdict on each number of a finding, and the interpretation that it rests on."""
+    """Verdict on each number of a finding, and the interpretation that all of them rest on.
+
+    `misfits` are those of the group by interpretation, that of the null models under None.
+    """
 
     verdicts: list[str]
-    interpretations: list[str]
+    interpretation: str
+    misfits: dict[str | None, float]
 
 
 def assign_verdicts(findings: Sequence[Finding]) -> list[FindingVerdicts]:
-    """Verdicts on the numbers of each finding.
+    """Verdicts on the numbers of each finding, by the likeliest interpretation of its group.
 
-    "reproduced": the literal interpretation is within tolerance. "explained": the best alternative
-    is, which is the same for all findings that have the same alternatives. Otherwise "cannot be
-    reproduced" if the published numbers are inconsistent, else "not reproduced".
+    Numbers that repeat others count for nothing. One that is within tolerance is "met by the null
+    model" if that meets it too, "fitted to it" if a parameter was; else "reproduced", if the thesis
+    taken at its word gives the same, or "explained". One that is not is "cannot be right" if there
+    is a proof, else "not reproduced". No interpretation that is less likely than the null model
+    explains anything.
     """
     assigned = []
     for one in findings:
-        same = [f for f in findings if list(f.interpretations) == list(one.interpretations)]
-        literal, alternative = next(iter(one.interpretations)), best_interpretation(same)
-        explained = (
-            one.within_tolerance(alternative)
-            if alternative
-            else np.zeros(one.published.numbers.size, bool)
+        group = group_of(one, findings)
+        name = likeliest_interpretation(group)
+        misfits = {
+            key: sum(each.misfit(key) for each in group) for key in (*one.interpretations, None)
+        }
+        met, null_met = one.within_tolerance(name), one.null_within_tolerance
+        as_printed = np.isclose(
+            one.interpretations[name], one.interpretations[LITERAL], rtol=1e-9, atol=0
         )
-        otherwise = IRREPRODUCIBLE if one.inconsistency else NOT_REPRODUCED
+        used = one.published.has_label(one.fitted[name]) if name in one.fitted else 0 * met
+        likely = misfits[name] < misfits[None]
         verdicts = [
-            REPRODUCED if by_literal else EXPLAINED if by_alternative else otherwise
-            for by_literal, by_alternative in zip(
-                one.within_tolerance(literal), explained, strict=True
-            )
+            REPEATED
+            if one.published.repeated[i]
+            else (IRREPRODUCIBLE if one.impossible else NOT_REPRODUCED)
+            if not (met[i] and likely)
+            else NULL_MET
+            if null_met[i]
+            else FITTED
+            if used[i]
+            else REPRODUCED
+            if as_printed[i]
+            else EXPLAINED
+            for i in range(met.size)
         ]
-        sources = [alternative if word == EXPLAINED else literal for word in verdicts]
-        assigned.append(FindingVerdicts(verdicts, sources))
+        assigned.append(FindingVerdicts(verdicts, name, misfits))
     return assigned
 
 

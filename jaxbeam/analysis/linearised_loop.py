@@ -217,7 +217,7 @@ def loop_with_mass_at(case: Case, position: float, mass: float) -> LinearisedLoo
     path = FrozenTrajectory(
         xp.asarray(position), zero, zero, one, xp.ones(1, bool), case.beam.length
     )
-    loads = dataclasses.replace(load_set(alone), trajectories=(path,))
+    loads = dataclasses.replace(load_set(alone), trajectories=(path,), profile=None)
     loop = eqx.tree_at(lambda loop: loop.augmented_plant.loads, loop, loads)
     t = xp.asarray(_passage_time(case, position))
     return without_constant_states(linearise(loop, timing, t))

@@ -24,6 +24,7 @@ MOST_SPAN_OVER_DEFLECTION = 1e6  # loads that are too light by a factor of a tho
 MOST_DAMPING = 0.2  # 5 % is a lot for a structure; above, a per cent was meant
 MOST_MASS_RATIO = 10.0
 LOWEST_FREQUENCY, HIGHEST_FREQUENCY = 0.01, 1e4  # Hz
+MOST_SETTLEMENT = 0.01  # of the length: 25 cm of a bridge of 25 m
 CLAMPING_DISTANCE = 0.01  # of the length: two supports so close hold the rotation, too
 CLAMPING_STIFFNESS = 10.0  # E I / L: of two springs that do
 ROAD_SPEED, RAIL_SPEED = 60.0, 120.0  # m/s; 1.2 times 350 km/h is 117 m/s
@@ -114,6 +115,8 @@ def _frequency_warnings(case: Case, found: Modes, numbers: Plausibility) -> Iter
     name = "beam.damping_ratio"
     if case.beam.rayleigh_damping is not None:
         ratios, name = found.damping_ratios[:1], "beam.rayleigh_damping"
+    elif not ratios.any():  # by loss factors, of the beam or of segments, or a material
+        ratios, name = found.damping_ratios, "the loss factor of the beam"
     if ratios.max() > MOST_DAMPING:
         yield (
             f"{name} makes a damping ratio of {ratios.max():.3g}: it is a share of critical"
@@ -171,6 +174,13 @@ def _support_warnings(case: Case) -> Iterator[str]:
         (float(support.position), _stiffness(support), f"supports.{i}")
         for i, support in enumerate(case.supports)
     ]
+    for i, support in enumerate(case.supports):
+        drop = 0.0 if support.settlement is None else float(support.settlement)
+        if abs(drop) > MOST_SETTLEMENT * length:
+            yield (
+                f"supports.{i} settles by {drop:.4g} m, {abs(drop) / length:.2g} times the length"
+                f" of the beam: is supports.{i}.settlement in m, not in mm?"
+            )
     unit = float(beam.bending_stiffness) / length
     for (left, k, first), (right, other_k, second) in itertools.pairwise(sorted(held)):
         apart = right - left

@@ -29,6 +29,7 @@ from jaxbeam.model.sensing.sensor_signals import initial_filter_state
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import known
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
+from jaxbeam.runtime.whole_file import whole_file
 from jaxbeam.simulation.command_limits import command_ranges
 
 MAX_SAMPLES = 2000  # recorded ones, of the start of the run
@@ -99,7 +100,8 @@ def write_c(program: CProgram, folder: str | os.PathLike, overwrite: bool = Fals
         if path.exists() and not overwrite:
             raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
     for path, text in zip(paths, program.files.values(), strict=True):
-        path.write_text(text, encoding="utf-8")
+        with whole_file(path, overwrite) as beside:
+            beside.write_text(text, encoding="utf-8")
     return paths
 
 

@@ -166,7 +166,7 @@ def _plan(case: Case, times: Float[np.ndarray, " sample"]) -> IntegrationPlan:
 @compiled_if_traced
 def _longest_step(case: Case, layout: Layout) -> Array:
     """Longest stable time step (s) of the beam under its loads."""
-    loads = load_set(case)
+    loads = load_set(case, layout)
     stable = max_stable_step(modal_model(case, layout), loads)
     return xp.minimum(stable, longest_force_step(case, loads))
 

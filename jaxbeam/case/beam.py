@@ -45,7 +45,8 @@ class Support(ReprWithUnits, eqx.Module):
     """Support at a position along a beam, rigid or elastic.
 
     Without a `stiffness` it holds the deflection rigidly; with one it is a vertical spring.
-    Supports enter the modes of the beam, except for their dampers, which couple the modes.
+    Supports enter the modes of the beam, except for their dampers, which couple the modes. A run
+    starts at rest on settled supports: see `jaxbeam.model.settlement`.
     """
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
@@ -58,6 +59,9 @@ class Support(ReprWithUnits, eqx.Module):
     )
     mass: Float[Array, ""] | None = number(
         "kg", "mass of an elastic bearing that moves with the beam", NOT_NEGATIVE, default=None
+    )
+    settlement: Float[Array, ""] | None = number(
+        "m", "lowering of its foot before the run, positive downwards", default=None
     )
 
 
@@ -74,8 +78,9 @@ class Beam(ReprWithUnits, eqx.Module):
 
     Damping is modal: one `damping_ratio` for all modes or one for each; or, when
     `rayleigh_damping` is given, proportional to mass and stiffness, D = a M + b K. A `loss_factor`
-    eta of hysteretic damping is taken as the equivalent ratio eta / 2 of every mode. A `material`
-    has the ratio of EN 1991-2, table 6.6, for the longest span of the beam.
+    eta of hysteretic damping is taken as the equivalent ratio eta / 2 of every mode; those of
+    `segments` count by their shares of the strain energy of each mode. A `material` has the ratio
+    of EN 1991-2, table 6.6, for the longest span of the beam.
     """
 
     length: Float[Array, ""] = number("m", "total length", POSITIVE)
@@ -227,6 +232,9 @@ class Beam(ReprWithUnits, eqx.Module):
             value = getattr(self, name)
             if value is not None and not (isinstance(value, str) and not value):
                 given.append(name)
+        lossy = [i for i, one in enumerate(self.segments) if one.loss_factor is not None]
+        if lossy and "loss_factor" not in given:
+            given.append(f"segments.{lossy[0]}.loss_factor")
         if len(given) > 1:
             return f"{address} has both {given[0]} and {given[1]}; leave one out"
         return None

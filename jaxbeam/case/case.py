@@ -16,7 +16,7 @@ from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.aliases import current_address
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.display.parts import ReprWithUnits, case_text
+from jaxbeam.case.display.parts import ReprWithUnits, case_html, case_text
 from jaxbeam.case.fields import (
     NOT_NEGATIVE,
     POSITIVE,
@@ -95,6 +95,9 @@ class Case(eqx.Module):
 
     def __repr__(self) -> str:
         return case_text(self)
+
+    def _repr_html_(self) -> str:  # in notebooks
+        return case_html(self)
 
     @property
     def sensor_positions(self) -> Float[Array, " sensor"]:

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from typing import NoReturn
 
-from cyclopts import App, CycloptsError, Group, Parameter
+from cyclopts import App, CycloptsError, Group, Parameter, UnusedCliTokensError
 
 from jaxbeam.cli.commands.compare import compare
 from jaxbeam.cli.commands.describe import describe
@@ -103,6 +103,10 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         sys.exit(0)
     except MemoryError as error:
         print_message(f"not enough memory: {error}")
+        sys.exit(1)
+    except UnusedCliTokensError as error:
+        words, what = " ".join(error.unused_tokens or ()), " ".join(error.command_chain or ())
+        print_message(f"{what} takes no further {words!r}; see jaxbeam {what} --help")
         sys.exit(1)
     except (ValueError, OSError, RuntimeError, ImportError, CycloptsError) as error:
         print_message(" ".join(str(error).split()))

@@ -182,15 +182,23 @@ def parse_bounds(text: str, option: str = "--free") -> tuple[str, Bounds | None]
     if not equals:
         return address, None
     entries = [entry.strip() for entry in value.split(":")]
-    with_unit = [is_quantity(entry) for entry in entries]
-    if len(entries) == 2 and all(with_unit):
-        return address, (entries[0], entries[1])
-    if any(with_unit):
-        raise ValueError(f"{option} {text}: give both bounds a unit, as in 8 GN m^2:12 GN m^2")
+    with_units = _both_with_units(f"{option} {text}", entries)
+    if with_units is not None:
+        return address, with_units
     bounds = _parse_numbers(option, text, entries)
     if len(bounds) != 2 or bounds[0] >= bounds[1]:
         raise ValueError(f"{option} {text}: bounds are LOW:HIGH, such as 5:20")
     return address, (bounds[0], bounds[1])
+
+
+def _both_with_units(option: str, entries: list[str]) -> tuple[str, str] | None:
+    """Two texts with units, None if none has one. Raises ValueError if only some have."""
+    with_unit = [is_quantity(entry) for entry in entries]
+    if len(entries) == 2 and all(with_unit):
+        return entries[0], entries[1]
+    if any(with_unit):
+        raise ValueError(f"{option}: give both numbers a unit, as in 8 GN m^2:12 GN m^2")
+    return None
 
 
 def bounds_in_si(
@@ -201,19 +209,49 @@ def bounds_in_si(
     Raises ValueError for an address that the case lacks, a unit that does not fit, and bounds that
     do not increase.
     """
-    from jaxbeam.case.case import unit_at, value_at
-    from jaxbeam.case.reading.units import in_si
-
     converted = {}
     for address, pair in bounds.items():
         if pair is not None and isinstance(pair[0], str):
-            value_at(case, address)  # says what is wrong with the address
-            low, high = in_si(list(pair), unit_at(case, address), f"{option} {address}")
-            if low >= high:
+            pair = pair_in_si(case, address, pair, option)
+            if pair[0] >= pair[1]:
                 raise ValueError(f"{option} {address}: bounds are LOW:HIGH, such as 5:20")
-            pair = low, high
         converted[address] = pair
     return converted
+
+
+def pair_in_si(case: "Case", address: str, pair: Bounds, option: str) -> tuple[float, float]:
+    """Two values at an address, numbers or texts with units, in the SI unit that it has in a case.
+
+    Raises ValueError for an address that the case lacks, and a unit that does not fit.
+    """
+    if not any(isinstance(value, str) for value in pair):
+        return float(pair[0]), float(pair[1])
+    from jaxbeam.case.case import unit_at, value_at
+    from jaxbeam.case.reading.units import in_si
+
+    value_at(case, address)  # says what is wrong with the address
+    first, second = in_si(list(pair), unit_at(case, address), f"{option} {address}")
+    return first, second
+
+
+def parse_prior(text: str) -> tuple[str, Bounds]:
+    """Address, mean and deviation of ADDRESS=MEAN:DEVIATION, texts with units as they are.
+
+    Raises ValueError if they are no two numbers, or one alone has a unit.
+    """
+    address, value = parse_assignment("--prior", text)
+    entries = [entry.strip() for entry in value.split(":")]
+    with_units = _both_with_units(f"--prior {text}", entries)
+    if with_units is not None:
+        return address, with_units
+    try:
+        mean, deviation = map(float, entries)
+    except ValueError:
+        raise ValueError(
+            "--prior takes ADDRESS=MEAN:DEVIATION, such as beam.damping_ratio=0.02:0.005, not"
+            f" {text!r}"
+        ) from None
+    return address, (mean, deviation)
 
 
 def parse_range(option: str, text: str, unit_and_example: str) -> tuple[float, float]:

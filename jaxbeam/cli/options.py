@@ -26,6 +26,7 @@ from jaxbeam.cli.arguments import (
     parse_value,
 )
 from jaxbeam.files.report import text_table
+from jaxbeam.runtime.whole_file import whole_file
 
 PICTURES = (".png", ".svg", ".pdf")
 
@@ -179,7 +180,8 @@ class DrawingOptions:
         size = self.inches()
         if size is not None:
             whole.set_size_inches(size)
-        whole.savefig(path, dpi=self.dpi)
+        with whole_file(path, overwrite=True) as beside:  # refused before, where it is not asked
+            whole.savefig(beside, dpi=self.dpi)
 
 
 @Parameter(name="*")
@@ -187,18 +189,44 @@ class DrawingOptions:
 class PictureOptions(DrawingOptions):
     """Options of a command that draws on request."""
 
+    plot: Annotated[
+        bool,
+        Parameter("--plot", help="Draw to a PNG beside the output, or named after the input."),
+    ] = False
     picture: Annotated[
         Path | None, Parameter(help="Draw to this file instead, OUT.png, OUT.svg or OUT.pdf.")
     ] = None
 
-    def path(self, plot: bool, output: Path | None, source: Path) -> Path | None:
+    def path(self, output: Path | None, source: Path) -> Path | None:
         """File of the picture: that of `--picture`, or with `--plot` beside output or source.
 
         Raises ValueError as `check` does.
         """
-        path = self.picture or (figure_path(output, source) if plot else None)
+        path = self.picture or (figure_path(output, source) if self.plot else None)
         self.check(path)
         return path
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class LabelledPictureOptions(PictureOptions):
+    """Options of a command that draws what sensors measure, on request."""
+
+    labels: Annotated[
+        str, Parameter(help="NAME,NAME,...: names of the sensors in pictures, in their order.")
+    ] = ""
+
+    def sensor_labels(self, case: "jb.Case") -> list[str] | None:
+        """Names of the sensors of a case in pictures, None if left out.
+
+        Raises ValueError for another number of names than sensors.
+        """
+        names = [name.strip() for name in self.labels.split(",")] if self.labels else None
+        if names is not None and len(names) != len(case.sensors):
+            raise ValueError(
+                f"--labels names {len(names)} sensors; the case has {len(case.sensors)}"
+            )
+        return names
 
 
 def print_plausibility(

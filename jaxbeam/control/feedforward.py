@@ -6,15 +6,18 @@ heavy load too: the schedule needs the position of the load, not its mass.
 
 from typing import ClassVar
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep
-from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, concrete, is_concrete, number
+from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, POSITIVE, concrete, is_concrete, number
 from jaxbeam.case.loads.base import trajectory
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.runtime.arrays import Array, xp
+
+CONFIRMATION_SHARE = 0.25  # of the crossing, within which a load must show
 
 
 class Feedforward(AbstractController):
@@ -26,6 +29,11 @@ class Feedforward(AbstractController):
     keep the speed that it has between them; commands begin when it has passed the second gate. The
     table is read `lead` seconds ahead of the load, to compensate delay and hold. No sensor of the
     beam and no mass is used, so that no loop is closed that could become unstable.
+
+    Gates that fire without a load would lift the beam. With a `confirmation` (m) commands begin
+    when a deflection sensor has gone down by that much after the second gate, and within the first
+    quarter of the crossing; if none has, there are none for that passage. Commands that have begun
+    depend on time alone, as without it.
     """
 
     kind: ClassVar[str] = "feedforward"
@@ -40,6 +48,9 @@ class Feedforward(AbstractController):
     lead: Float[Array, ""] = number(
         "s", "time by which the table is read ahead of the load", NOT_NEGATIVE, default=0.0
     )
+    confirmation: Float[Array, ""] | None = number(
+        "m", "downward reading of a deflection sensor that shows a load", POSITIVE, default=None
+    )
 
     def validate(self, case):
         if self.period is None:
@@ -51,6 +62,8 @@ class Feedforward(AbstractController):
                 f"values must have for each of {len(case.actuators)} actuators as many entries as"
                 f" shares has, {self.shares.shape[0]}; they are of shape {self.values.shape}"
             )
+        if self.confirmation is not None and not _deflection_sensors(case.sensors):
+            return "confirmation needs a sensor of the deflection: add one, or leave it out"
         if not all(is_concrete(leaf) for leaf in jax.tree.leaves((self.gates, case))):
             return None
         if np.any(~(np.diff(_gate_times(self.gates, case.loads, case.beam.length)) > 0)):
@@ -61,9 +74,12 @@ class Feedforward(AbstractController):
         gate_times = xp.stack(
             [path.passage_times(self.gates)[:2] for path in plant.loads.trajectories]
         )
-        return FeedforwardLaw(
-            self.gates, self.shares, self.values, self.lead, gate_times, plant.case.beam.length
-        )
+        settings = self.gates, self.shares, self.values, self.lead
+        length = plant.case.beam.length
+        if self.confirmation is None:
+            return FeedforwardLaw(*settings, gate_times, length)
+        sensors = _deflection_sensors(plant.case.sensors)
+        return ConfirmedFeedforwardLaw(*settings, gate_times, length, self.confirmation, sensors)
 
 
 class FeedforwardLaw(AbstractSampledLaw):
@@ -77,16 +93,50 @@ class FeedforwardLaw(AbstractSampledLaw):
     length: Float[Array, ""]
 
     def step(self, state, measurement, t):
+        passed = t >= self.gate_times[:, 1]
+        return ControlStep(xp.sum(xp.where(passed, self.table_commands(t), 0.0), axis=1), state)
+
+    def distances(self, t) -> Float[Array, " load"]:
+        """Distance (m) of each load from the end where it enters at t (s), by its two gates."""
         speeds = xp.diff(self.gates) / xp.diff(self.gate_times, axis=1)[:, 0]
         gate_distance = xp.where(speeds < 0, self.length - self.gates[1], self.gates[1])
-        distance = gate_distance + (t + self.lead - self.gate_times[:, 1]) * xp.abs(speeds)
+        return gate_distance + (t - self.gate_times[:, 1]) * xp.abs(speeds)
+
+    def table_commands(self, t) -> Float[Array, "actuator load"]:
+        """Commands of the table for each load at t (s), read ahead by the lead."""
+        shares = self.distances(t + self.lead) / self.length
 
         def interpolate(row):
-            return xp.interp(distance / self.length, self.shares, row, left=0.0, right=0.0)
+            return xp.interp(shares, self.shares, row, left=0.0, right=0.0)
 
-        commands = xp.stack([interpolate(row) for row in self.values])
-        commands = xp.where(t >= self.gate_times[:, 1], commands, 0.0)
-        return ControlStep(xp.sum(commands, axis=1), state)
+        return xp.stack([interpolate(row) for row in self.values])
+
+
+class ConfirmedFeedforwardLaw(FeedforwardLaw):
+    """The law with commands for those loads alone that a sensor has shown.
+
+    Its state says of each load whether a deflection sensor has read less than -`confirmation` (m)
+    since its second gate, within the first CONFIRMATION_SHARE of its crossing.
+    """
+
+    confirmation: Float[Array, ""]
+    sensors: tuple[int, ...] = eqx.field(static=True)
+
+    def initial_state(self):
+        return xp.zeros(self.gate_times.shape[0], bool)
+
+    def step(self, state, measurement, t):
+        lowest = xp.min(measurement.readings[np.array(self.sensors)])
+        passed = t >= self.gate_times[:, 1]
+        early = self.distances(t) <= CONFIRMATION_SHARE * self.length
+        confirmed = state | (passed & early & (lowest <= -self.confirmation))
+        commands = xp.where(confirmed, self.table_commands(t), 0.0)
+        return ControlStep(xp.sum(commands, axis=1), confirmed)
+
+
+def _deflection_sensors(sensors) -> tuple[int, ...]:
+    """Places of the sensors that read a deflection."""
+    return tuple(i for i, sensor in enumerate(sensors) if sensor.quantity == "deflection")
 
 
 def _gate_times(gates, loads, length) -> Float[np.ndarray, "load 2"]:

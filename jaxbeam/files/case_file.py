@@ -26,6 +26,7 @@ from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.kind_changes import change_kind
 from jaxbeam.files.profile_file import with_profile_file
+from jaxbeam.runtime.whole_file import whole_file
 
 for package in ("jaxbeam.case", "jaxbeam.control", "jaxbeam.estimation"):
     import_modules(package)
@@ -114,13 +115,8 @@ def save_case(case: Case, path: str | os.PathLike, overwrite: bool = False) -> N
     length = 25.0  # m
     """
     text = _as_toml(case)
-    try:
-        with open(path, "w" if overwrite else "x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise FileExistsError(
-            f"{path} exists already; choose another name, or ask to overwrite it"
-        ) from None
+    with whole_file(path, overwrite) as beside:
+        beside.write_text(text, encoding="utf-8")
 
 
 def case_from_dict(content: dict[str, Any]) -> Case:

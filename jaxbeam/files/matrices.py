@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxbeam.model.linear_system import StateSpace
+from jaxbeam.runtime.whole_file import whole_file
 
 MATRIX_SUFFIXES = (".mat", ".npz", ".json", ".csv")
 
@@ -39,15 +40,14 @@ def write_state_space(system: StateSpace, path: str | os.PathLike, overwrite: bo
     if path.suffix == ".mat":
         system.to_mat(path, overwrite)
         return
-    if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
     content = matrices_of(system)
-    if path.suffix == ".npz":
-        np.savez(path, **{name: np.asarray(part) for name, part in content.items()})
-    elif path.suffix == ".json":
-        path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    else:
-        _write_csv(system, path)
+    with whole_file(path, overwrite) as beside:
+        if path.suffix == ".npz":
+            np.savez(beside, **{name: np.asarray(part) for name, part in content.items()})
+        elif path.suffix == ".json":
+            beside.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        else:
+            _write_csv(system, beside)
 
 
 def _write_csv(system: StateSpace, path: Path) -> None:

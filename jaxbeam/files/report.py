@@ -9,6 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jaxbeam.runtime.whole_file import whole_file
+
 Row = Sequence[str]
 
 PAGE_STYLE = """
@@ -76,9 +78,12 @@ def write_report(
     for section in sections:
         for part in section.parts:
             if isinstance(part, ReportFigure) and part.figure is not None:
-                part.figure.savefig(folder / f"{part.name}.png")
-    (folder / "report.md").write_text(markdown(title, sections), encoding="utf-8")
-    (folder / "report.html").write_text(html(title, sections, style), encoding="utf-8")
+                with whole_file(folder / f"{part.name}.png", overwrite) as beside:
+                    part.figure.savefig(beside)
+    pages = {"report.md": markdown(title, sections), "report.html": html(title, sections, style)}
+    for name, text in pages.items():
+        with whole_file(folder / name, overwrite) as beside:
+            beside.write_text(text, encoding="utf-8")
 
 
 def markdown(title: str, sections: Sequence[ReportSection]) -> str:

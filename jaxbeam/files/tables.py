@@ -1,10 +1,6 @@
-"""Results as files for other programs, by their ending: tables of columns, and whole datasets.
-
-A file is written beside its place and then moved there, so that none is ever half written.
-"""
+"""Results as files for other programs, by their ending: tables of columns, and whole datasets."""
 
 import os
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxbeam.files.endings import DATASETS, RESULTS, TABLES, check_ending
+from jaxbeam.runtime.whole_file import whole_file
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -65,7 +62,8 @@ def write_dataset(
 ) -> None:
     """Write a labelled dataset to .nc or .zarr; see `save` for what is raised."""
     check_ending(path, "a dataset", DATASETS)
-    _replace(Path(path), overwrite, lambda beside: _write_dataset(beside, dataset))
+    with whole_file(path, overwrite) as beside:
+        _write_dataset(beside, dataset)
 
 
 def write_table(path: str | os.PathLike, columns: Columns, overwrite: bool = False) -> None:
@@ -81,7 +79,8 @@ def write_table(path: str | os.PathLike, columns: Columns, overwrite: bool = Fal
     lengths = {column.size for column in plain.values()}
     if len(lengths) > 1:
         raise ValueError(f"the columns of a table must be equally long, not {sorted(lengths)}")
-    _replace(Path(path), overwrite, lambda beside: WRITERS[beside.suffix](beside, plain))
+    with whole_file(path, overwrite) as beside:
+        WRITERS[beside.suffix](beside, plain)
 
 
 def _plain(column) -> np.ndarray:
@@ -90,28 +89,12 @@ def _plain(column) -> np.ndarray:
     return column.astype(object) if column.dtype.kind in "UO" else column.astype(float)
 
 
-def _replace(path: Path, overwrite: bool, write: Callable[[Path], None]) -> None:
-    """Write a file or folder beside its place, and move it there."""
-    if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
-    beside = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        write(beside)
-        if path.is_dir():
-            shutil.rmtree(path)
-        os.replace(beside, path)
-    finally:
-        if beside.is_dir():
-            shutil.rmtree(beside)
-        beside.unlink(missing_ok=True)
-
-
-def _write_dataset(path: Path, dataset: "xarray.Dataset") -> None:
+def _write_dataset(beside: Path, dataset: "xarray.Dataset") -> None:
     # Empty dimensions would become unlimited ones in a file.
     empty = [name for name in dataset.variables if dataset[name].size == 0]
     dataset = dataset.drop_vars(empty)
-    if path.suffix == ".nc":
-        dataset.to_netcdf(path, engine="scipy")
+    if beside.suffix == ".nc":
+        dataset.to_netcdf(beside, engine="scipy")
         return
     # Zarr specifies strings of variable length, not of fixed length.
     texts = {
@@ -119,13 +102,13 @@ def _write_dataset(path: Path, dataset: "xarray.Dataset") -> None:
         for name, values in dataset.variables.items()
         if values.dtype.kind == "U"
     }
-    dataset.assign(texts).to_zarr(path, mode="w", consolidated=False, zarr_format=3)
+    dataset.assign(texts).to_zarr(beside, mode="w", consolidated=False, zarr_format=3)
 
 
-def _write_csv(path: Path, columns: Columns) -> None:
+def _write_csv(beside: Path, columns: Columns) -> None:
     import csv
 
-    with path.open("w", encoding="utf-8", newline="") as file:
+    with beside.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows(_rows(columns))
@@ -135,7 +118,7 @@ def _rows(columns: Columns) -> Any:
     return zip(*(column.tolist() for column in columns.values()), strict=True)
 
 
-def _write_excel(path: Path, columns: Columns) -> None:
+def _write_excel(beside: Path, columns: Columns) -> None:
     import openpyxl
 
     count = max((column.size for column in columns.values()), default=0)
@@ -148,10 +131,10 @@ def _write_excel(path: Path, columns: Columns) -> None:
     sheet.append(list(columns))
     for row in _rows(columns):
         sheet.append([v if isinstance(v, str) or np.isfinite(v) else None for v in row])
-    book.save(path)
+    book.save(beside)
 
 
-def _write_matlab(path: Path, columns: Columns) -> None:
+def _write_matlab(beside: Path, columns: Columns) -> None:
     import scipy.io
 
     texts = {head: column for head, column in columns.items() if column.dtype == object}
@@ -163,13 +146,13 @@ def _write_matlab(path: Path, columns: Columns) -> None:
     if texts:
         content["text_columns"] = np.array(list(texts), dtype=object)
         content["texts"] = np.stack(list(texts.values()), axis=-1)
-    scipy.io.savemat(path, content)
+    scipy.io.savemat(beside, content)
 
 
-def _write_parquet(path: Path, columns: Columns) -> None:
+def _write_parquet(beside: Path, columns: Columns) -> None:
     import pyarrow.parquet
 
-    pyarrow.parquet.write_table(pyarrow.table(dict(columns)), path)
+    pyarrow.parquet.write_table(pyarrow.table(dict(columns)), beside)
 
 
 WRITERS: dict[str, Callable[[Path, Columns], None]] = {

@@ -1,10 +1,10 @@
 """Peaks of many runs by the C integrator (`integrate_peaks.c`), where there is a C compiler.
 
 XLA splits a step into some forty loops over the runs of a batch; in C it is one, and so are all
-steps of all tasks. It serves sweeps of deflections (not of histories) without a controller, in
-double precision, on CPUs. The first large sweep compiles it, once for a machine: in 2.4 s of
-processor time, of which each new structure regains 1.2 s, as XLA has less to compile, and 4096
-crossings 0.05 (3 modes) to 0.27 s (12 modes), measured in the benchmark `sweep`.
+steps of all tasks. It serves sweeps of peaks of all quantities (not of histories) without a
+controller, in double precision, on CPUs. The first large sweep compiles it, once for a machine: in
+2.4 s of processor time, of which each new structure regains 1.2 s, as XLA has less to compile, and
+4096 crossings 0.05 (3 modes) to 0.27 s (12 modes), measured in the benchmark `sweep`.
 """
 
 import ctypes
@@ -14,11 +14,12 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_peaks as integrate_peaks_in_jax
+from jaxbeam.integrator.monitored_rows import force_weights_at_peaks, largest_per_energy
 from jaxbeam.integrator.propagators import (
     DOUBLINGS,
     GAUSS_NODES,
@@ -29,8 +30,13 @@ from jaxbeam.integrator.propagators import (
 from jaxbeam.integrator.running_peaks import PEAK_MARGIN, Peaks
 from jaxbeam.integrator.step_matrices import CHUNK_STEPS
 from jaxbeam.integrator.time_grid import TimeGrid
+from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.model.sensing.corrected_rows import StaticCorrection
+from jaxbeam.model.sensing.linear_outputs import linear_outputs
+from jaxbeam.model.sensing.output_rows import OutputRows
+from jaxbeam.model.settlement import has_settlement
 from jaxbeam.numerics.gauss import lagrange_coefficients
 from jaxbeam.numerics.peak_search import (
     ESTIMATE_ITERATIONS,
@@ -88,11 +94,16 @@ def supports(case: Case) -> bool:
     plain = (
         case.controller is None
         and case.profile is None
+        and not has_settlement(case)
         and not any(
             load.vehicle(case.run.gravity).names or load.force_histories() for load in case.loads
         )
     )
-    return plain and all(sensor.quantity == "deflection" for sensor in case.sensors)
+    # The static influence is then a polynomial in each step.
+    return plain and (
+        not any(sensor.bends for sensor in case.sensors)
+        or (is_uniform(case) and not case.actuators)
+    )
 
 
 def available() -> bool:
@@ -107,15 +118,16 @@ def integrate_peaks(
     mask: Bool[Array, " task"],
     models: ModalModel,
     grids: TimeGrid,
-    positions: Float[Array, "task position"],
+    outputs: OutputRows,
+    correction: StaticCorrection | None,
     loads: LoadSet,
 ) -> Peaks:
     """Peaks of tasks, each a batch of runs without commands; only where C is `available`.
 
     All arguments but `max_loads`, the largest number of loads on the beam at once, have tasks as
-    their first axis, of length one where models are shared. Deflections are those at `positions`
-    (m). Grids are of one step length a panel (`grid_by_step_length`). Tasks not in the mask stay
-    at rest.
+    their first axis, of length one where models are shared. Peaks are those of the `outputs` with
+    their static `correction`, if it is given. Grids are of one step length a panel
+    (`grid_by_step_length`). Tasks not in the mask stay at rest.
     """
     shapes = models.modes.series
     if models.mode_map is not None:
@@ -125,7 +137,17 @@ def integrate_peaks(
         lagrange_coefficients(NODE_COUNT),
         interpolation_matrix(PEAK_NODES)[: len(PEAK_NODES)].T,
         np.asarray(PEAK_NODES),
+        force_weights_at_peaks(),
     )
+    shared = None if models.state_matrix.shape[0] == 1 else 0
+    own = jax.tree.map(lambda leaf: leaf[0], models) if shared is None else models
+    linear = jax.vmap(linear_outputs, (shared, 0, 0))(own, outputs, correction)
+    corrected = None if correction is None else correction.rows
+    bounds = jax.vmap(largest_per_energy, (shared, 0, 0))(own, outputs, corrected)
+    count = linear.rows.shape[1]
+    influence = np.zeros((1, 1)), np.zeros((1, 1, 0, count))
+    if linear.influence is not None:
+        influence = linear.influence.breaks, linear.influence.series
     arguments = (
         *(mask, models.state_matrix, models.modes.nodes, shapes),
         *(
@@ -135,20 +157,18 @@ def integrate_peaks(
             grids.loads_on_beam,
             grids.on_beam_intervals,
         ),
-        *(*jax.vmap(LoadSet.cubics)(loads), loads.wheels.inertia, loads.wheels.weight, positions),
+        *(*jax.vmap(LoadSet.cubics)(loads), loads.wheels.inertia, loads.wheels.weight),
+        *(linear.rows, bounds, *influence),
         *(part[None] for part in constants),
     )
     tasks, load_count, batch_size = loads.wheels.inertia.shape
-    position_count, modes = positions.shape[1], shapes.shape[-1]
+    modes = shapes.shape[-1]
     blocks, block_size = models.state_matrix.shape[1:3]
     beam = grids.counts.shape[1], blocks, block_size, modes // blocks, *shapes.shape[1:3]
-    sizes = *beam, max_loads, load_count, position_count, batch_size
+    sizes = *beam, max_loads, load_count, count, batch_size
     workspace_size = LIBRARY.load().workspace_size
     workspace_size.restype, workspace_size.argtypes = ctypes.c_int64, [ctypes.c_int64] * len(sizes)
-    results = [
-        (tasks, batch_size, count)
-        for count in (position_count, position_count, load_count, load_count)
-    ]
+    results = [(tasks, batch_size, columns) for columns in (count, count, load_count, load_count)]
     call = jax.ffi.ffi_call(
         LIBRARY.ffi_name("integrate_peaks"),
         [jax.ShapeDtypeStruct(shape, float) for shape in (*results, (workspace_size(*sizes),))],
@@ -162,8 +182,8 @@ def _integrate_peaks_jvp(max_loads, primals, tangents):
     """Derivatives of the same function in JAX."""
 
     def jax_peaks(mask, models, *rest):
-        def task(model, grid, positions, loads):
-            discrete = discrete_model(model, grid, positions)
+        def task(model, grid, outputs, correction, loads):
+            discrete = discrete_model(model, grid, None, None, outputs, correction)
             return integrate_peaks_in_jax(discrete, loads, max_loads=max_loads)[0].peaks()
 
         tasks = mask.shape[0]

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.integrator.monitored_rows import force_weights_at_peaks
 from jaxbeam.integrator.propagators import GAUSS_NODES, PEAK_NODES
 from jaxbeam.integrator.step_matrices import LoadPath, StepMatrices
 from jaxbeam.numerics.peak_search import estimate_peak, max_with_ties, refine_peak
@@ -73,10 +72,6 @@ def update_peaks(
     parts = (states, forces) if commands is None else (states, forces, commands)
     deflections = matrices.monitored @ xp.concatenate(parts, axis=1)
     samples = deflections.reshape(steps, len(PEAK_NODES), -1, batch_size)
-    if path.influence is not None:
-        by_node = forces.reshape(steps, -1, len(GAUSS_NODES), batch_size)
-        at_peaks = xp.einsum("pf,tlfb->tplb", force_weights_at_peaks(), by_node)
-        samples = samples + xp.einsum("tlps,tplb->tpsb", path.influence, at_peaks)
     samples = optimization_barrier(samples)
 
     def updated(best):

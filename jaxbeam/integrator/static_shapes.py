@@ -41,7 +41,7 @@ def static_shapes(case: Case) -> StaticShapes:
 @compiled_if_traced
 def model_limits(case: Case, layout: Layout):
     """Longest stable step (s), whether frequencies repeat, entry and exit times (load, 2) in s."""
-    model, loads = modal_model(case, layout), load_set(case)
+    model, loads = modal_model(case, layout), load_set(case, layout)
     limit = xp.minimum(max_stable_step(model, loads), longest_force_step(case, loads))
     return limit, model.modes.has_repeated, loads.entry_exit_times()
 

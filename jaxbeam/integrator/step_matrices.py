@@ -12,12 +12,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.integrator.discrete_model import DiscreteModel
+from jaxbeam.integrator.monitored_rows import force_weights_at_peaks
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT, PEAK_NODES
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.contact import ModalCompliance, SurfaceRows, surface_rows
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.runtime.arrays import (
     Array,
+    add_at,
     any_jax,
     cond,
     index_in_dim,
@@ -182,7 +184,17 @@ def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
         matrices = _matrices_by_branch(discrete, path)
     else:
         matrices = _matrices_by_length(discrete, path)
+    if path.influence is not None:
+        matrices = (*matrices[:4], _with_influence(discrete, matrices[4], path), *matrices[5:])
     return StepMatrices(*matrices, loaded=xp.any(path.on_beam, axis=1))
+
+
+def _with_influence(discrete: DiscreteModel, monitored, path: LoadPath):
+    """Rows of monitored outputs, with the static influence of the forces at the peak nodes."""
+    of_forces = xp.einsum("pf,tlps->tpslf", force_weights_at_peaks(), path.influence)
+    of_forces = of_forces.reshape(*monitored.shape[:2], -1)
+    first = discrete.model.state_count
+    return add_at(monitored, np.s_[:, :, first : first + of_forces.shape[2]], of_forces)
 
 
 def _matrices_by_length(discrete: DiscreteModel, path: LoadPath):

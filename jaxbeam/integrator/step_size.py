@@ -27,6 +27,7 @@ NO_STEP = (
     " apart: check stiffnesses, masses and damping, or keep fewer modes (beam.modes); or a law in"
     " continuous time switches too often: give it a period, or a larger tolerance"
 )
+ROUNDING = 1e-9  # of the deflection under all loads; below it, deflections are not compared
 TRIAL_POSITIONS = (0.13, 0.29, 0.47, 0.62, 0.88)  # x / length at which errors are measured
 
 
@@ -58,10 +59,10 @@ def choose_step_size(case: Case, shapes: StaticShapes, tolerance: float) -> tupl
     check_step_count(float(concrete(case.run.duration)) / step, step)
     model = modal_model(case, shapes.layout, shapes.coupled)
     case = _without_later_vibration(case, model)
-    halvings = 0
+    halvings, least = 0, rounding_deflection(case, model)
     for _ in range(MAX_TRIALS):
         coarse, fine = (_trial_run(case, model, shapes, step, divided) for divided in (1, 2))
-        error = largest_change(coarse, fine)
+        error = largest_change(coarse, fine, least)
         if error <= tolerance:
             return step, error
         shrink = 0.5
@@ -116,12 +117,29 @@ def run_peaks(
     model = modal_model(case, shapes.layout, shapes.coupled)
     grid = grid_by_step_length(case, model, max_step)
     discrete = discrete_model(model, grid, positions)
-    return integrate_peaks(discrete, load_set(case), max_loads=shapes.max_loads)[0]
+    return integrate_peaks(discrete, load_set(case, shapes.layout), max_loads=shapes.max_loads)[0]
 
 
-def largest_change(coarse: np.ndarray, fine: np.ndarray) -> float:
-    """Largest change of responses (value, batch), relative to the largest value of each run."""
+def rounding_deflection(case: Case, model: ModalModel) -> float:
+    """Deflection (m) that may be all rounding: a share of that of all loads at TRIAL_POSITIONS.
+
+    Loads that stand on supports deflect nothing, and rounding falls with no step.
+    """
+    loads = load_set(case)
+    times = np.linspace(0.0, float(concrete(case.run.duration)), 100)
+    weight = np.max(np.sum(np.abs(loads.varying_weight(times)), axis=1), initial=0.0)
+    rows = model.shapes(case.beam.length * xp.array(TRIAL_POSITIONS), (0,))[0]
+    stiffness = np.where(model.modes.stiffness > 0, model.modes.stiffness, np.inf)
+    return ROUNDING * float(weight * np.max(np.sum(rows**2 / stiffness, axis=1)))
+
+
+def largest_change(coarse: np.ndarray, fine: np.ndarray, least: float = 0.0) -> float:
+    """Largest change of responses (value, batch), relative to the largest value of each run.
+
+    Relative to `least` where no value is larger.
+    """
     if not np.any(fine):
         return 0.0
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return float(np.max(np.abs(coarse - fine) / np.max(np.abs(fine), axis=0), initial=0.0))
+        largest = np.maximum(np.max(np.abs(fine), axis=0), least)
+        return float(np.max(np.abs(coarse - fine) / largest, initial=0.0))

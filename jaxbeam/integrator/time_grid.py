@@ -76,7 +76,9 @@ class TimeGrid(eqx.Module):
 def _load_events(case: Case, model: ModalModel, places=None):
     """Entry and exit of each wheel (wheel, 2), and all load events (event,), in s."""
     own = model.modes.nodes[1:-1]
-    return load_set(case).events(own if places is None else xp.concatenate([own, places]))
+    return load_set(case, model.modes.layout).events(
+        own if places is None else xp.concatenate([own, places])
+    )
 
 
 def _loads_on_beam(positions, panels: int):

@@ -25,6 +25,7 @@ from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.runtime.arrays import Array, add_at, set_at, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
+from jaxbeam.runtime.whole_file import whole_file
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -116,9 +117,8 @@ class FrequencyResponse(TableViews, eqx.Module):
 
         Raises FileExistsError if the file exists and `overwrite` is not set.
         """
-        if not overwrite and os.path.exists(path):
-            raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
-        self.to_xarray().to_netcdf(path, engine="scipy")
+        with whole_file(path, overwrite) as beside:
+            self.to_xarray().to_netcdf(beside, engine="scipy")
 
 
 def frequency_response(

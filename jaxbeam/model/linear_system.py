@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from jaxbeam.numerics.discretisation import c2d
 from jaxbeam.runtime.arrays import Array, solve, xp
+from jaxbeam.runtime.whole_file import whole_file
 
 
 class Signal(NamedTuple):
@@ -87,10 +88,5 @@ class StateSpace(eqx.Module):
             signals = getattr(self, kind)
             content[kind] = np.array([signal.name for signal in signals], dtype=object)
             content[f"{kind}_units"] = np.array([signal.unit for signal in signals], dtype=object)
-        try:
-            with open(path, "wb" if overwrite else "xb") as file:
-                scipy.io.savemat(file, content)
-        except FileExistsError:
-            raise FileExistsError(
-                f"{path} exists already; choose another name, or overwrite it"
-            ) from None
+        with whole_file(path, overwrite) as beside, open(beside, "wb") as file:
+            scipy.io.savemat(file, content)

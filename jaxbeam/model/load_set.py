@@ -14,6 +14,8 @@ from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
 from jaxbeam.case.loads.force_history import ForceHistory
 from jaxbeam.case.loads.vehicle_model import VehicleModel
 from jaxbeam.case.trajectory import AbstractTrajectory
+from jaxbeam.model.layout import Layout
+from jaxbeam.model.settlement import surface
 from jaxbeam.runtime.arrays import Array, add_at, is_jax, xp
 from jaxbeam.runtime.module import Module
 
@@ -256,15 +258,18 @@ class LoadSet(Module):
         return (entry <= times) & (times < leave)
 
 
-def load_set(case: Case) -> LoadSet:
-    """Loads of a case, as a batch of one run."""
+def load_set(case: Case, layout: Layout | None = None) -> LoadSet:
+    """Loads of a case, as a batch of one run, on the surface that settled supports give the beam.
+
+    This needs a `layout` (from `mesh_layout`) where the numbers of the case are traced.
+    """
     trajectories = tuple(trajectory(load, case.beam.length) for load in case.loads)
     vehicles = [load.vehicle(case.run.gravity) for load in case.loads]
     return LoadSet(
         trajectories,
         _wheels(case.loads, vehicles),
         tuple(map(wheel_distances, case.loads, vehicles)),
-        case.profile,
+        surface(case, layout),
     )
 
 

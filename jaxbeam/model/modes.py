@@ -19,12 +19,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.polynomial import legendre
 
-from jaxbeam.case.beam_parts.damping import MATERIALS
 from jaxbeam.case.case import Case
 from jaxbeam.case.display.views import TableViews
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.model.layout import Layout, find_layout, is_uniform, longest_span, node_positions
 from jaxbeam.model.theory.buckling import check_buckling
+from jaxbeam.model.theory.damping import (
+    damping_of_ratios,
+    has_lossy_segments,
+    modal_damping,
+    ratios_of_segments,
+    safe_sqrt,
+)
 from jaxbeam.model.theory.elements import assemble_sections, bending_basis
 from jaxbeam.model.theory.fields import SLOPE, FieldParts, section_fields
 from jaxbeam.model.theory.sections import Sections, sections
@@ -128,7 +134,7 @@ class Modes(TableViews, eqx.Module):
     @property
     def angular_frequencies(self) -> Float[Array, " mode"]:
         """Natural angular frequencies in rad/s, ascending; zero for rigid-body modes."""
-        return _safe_sqrt(self.stiffness)
+        return safe_sqrt(self.stiffness)
 
     @property
     def frequencies(self) -> Float[Array, " mode"]:
@@ -148,7 +154,7 @@ class Modes(TableViews, eqx.Module):
         """Modal damping ratios; zero for rigid-body modes."""
         elastic = self.stiffness > 0
         return xp.where(
-            elastic, self.damping / (2 * xp.where(elastic, _safe_sqrt(self.stiffness), 1)), 0
+            elastic, self.damping / (2 * xp.where(elastic, safe_sqrt(self.stiffness), 1)), 0
         )
 
     def shapes(self, x, derivative: int = 0) -> Float[Array, "*position mode"]:
@@ -189,11 +195,6 @@ def mesh_layout(case: Case) -> Layout:
     return layout
 
 
-def _safe_sqrt(square):
-    """Square root whose derivative at zero is zero."""
-    return xp.where(square > 0, xp.sqrt(xp.where(square > 0, square, 1.0)), 0.0)
-
-
 @jax.named_scope("modes")
 def modes(case: Case, layout: Layout | None = None) -> Modes:
     """Lowest `case.beam.modes` natural modes of the beam on its supports.
@@ -230,9 +231,14 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     rotation = None if to_rotation is None else shapes(to_rotation) / beam.length
     nodes = nodes * beam.length
     span = longest_span(case, layout, nodes)
-    return normalised_modes(
+    undamped = normalised_modes(
         beam, values, coupling, nodes, shapes(to_series), layout, found, rotation, span
     )
+    if found is None or not has_lossy_segments(beam):
+        return undamped
+    ratios = ratios_of_segments(beam, layout, found, undamped.stiffness, undamped.fields)
+    damping = damping_of_ratios(ratios, undamped.stiffness, undamped.coupling)
+    return eqx.tree_at(lambda m: (m.damping, m.damping_coupling), undamped, damping)
 
 
 def _without_rounding(series):
@@ -249,7 +255,7 @@ def normalised_modes(
     beam, values, coupling, nodes, series, layout: Layout, sections=None, rotation=None, span=None
 ) -> Modes:
     """Modes of given stiffness (1/s^2) with the beam's damping, positive near the left end."""
-    damping, damping_coupling = _damping(beam, values, coupling, span)
+    damping, damping_coupling = modal_damping(beam, values, coupling, span)
     left_values = piecewise_chebyshev(nodes, series, beam.length * 1e-3 / beam.modes, (0,))[0]
     signs = stop_gradient(xp.where(left_values < 0, -1.0, 1.0))
     sign_products = signs[:, None] * signs[None, :]
@@ -341,26 +347,3 @@ def supported_matrices(case: Case, layout: Layout):
         for index in node:
             if 2 <= index < 2 + len(case.supports):
                 yield case.supports[index - 2], i
-
-
-def _damping(beam, values, coupling, span):
-    """Modal damping (1/s), and damping between repeated modes (mode, mode).
-
-    Rayleigh damping, a + b K; or modal ratios, D = 2 zeta sqrt(K), whose derivative between
-    repeated modes is that of the matrix square root.
-    """
-    if beam.rayleigh_damping is not None:
-        mass_factor, stiffness_factor = beam.rayleigh_damping
-        return mass_factor + stiffness_factor * values, stiffness_factor * coupling
-    ratio = beam.damping_ratio
-    if beam.loss_factor is not None:
-        ratio = beam.loss_factor / 2
-    if beam.material:
-        ratio = MATERIALS[beam.material].at(beam.length if span is None else span)
-    ratios = xp.broadcast_to(ratio, values.shape)
-    omega = _safe_sqrt(values)
-    sums = omega[:, None] + omega[None, :]
-    coupling_factor = xp.where(
-        sums > 0, (ratios[:, None] + ratios) / xp.where(sums > 0, sums, 1.0), 0.0
-    )
-    return 2 * ratios * omega, coupling_factor * coupling

@@ -1,19 +1,155 @@
-"""Static response of a beam to settlements of its supports, by reciprocity with reactions."""
+"""Static equilibrium of a beam whose supports have settled, and the surface it gives to wheels.
 
-import equinox as eqx
+A run starts at rest in this equilibrium w_s(x). Equations of motion are linear, so that everything
+that moves is measured from it; a wheel at x rolls over the settled surface, the profile r + w_s.
+"""
+
+import dataclasses
+
+import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
+from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.profiles.base import AbstractProfile
 from jaxbeam.case.validation import check_case
-from jaxbeam.model.flexibility import check_supported
-from jaxbeam.model.layout import find_layout
-from jaxbeam.model.theory.fields import SLOPE
-from jaxbeam.model.theory.sections import RIGIDITY
-from jaxbeam.model.theory.statics import section_flexibility
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.model.layout import Layout, find_layout
+from jaxbeam.model.theory.elements import nodal_unknowns
+from jaxbeam.model.theory.statics import LEAST_STIFFNESS, nodal_system
+from jaxbeam.model.theory.transfer import Transfer
+from jaxbeam.numerics.piecewise import piecewise_chebyshev
+from jaxbeam.runtime.arrays import Array, set_at, solve, xp
+from jaxbeam.runtime.module import Module
 
-SIDE = 1e-12  # of the length: distance from a support to the sections beside it
+
+class SettledBeam(Module):
+    """Static fields of a beam on settled supports, between the nodes of its `transfer` matrices.
+
+    `left_states` are the states (w, phi, M, S) at the left of each part, in beam units.
+    """
+
+    transfer: Transfer
+    left_states: Float[Array, "part 4"]
+    length: Float[Array, ""]
+
+    def field(self, x, order: int = 0) -> Float[Array, "*position"]:
+        """Field of an order (see `Modes.fields`) at positions x (m): 0 is the deflection w_s."""
+        y = xp.asarray(x, float) / self.length
+        states = piecewise_chebyshev(self.transfer.nodes, self._series(), y, (0,))[0]
+        field = xp.sum(self.transfer.section(y).rows(order) * states, axis=-1)
+        return field * self.length ** (1 - abs(order))  # SLOPE, of order -1, is w'
+
+    def surface(self, below: AbstractProfile | None) -> "SettledSurface":
+        """Surface of the beam with the profile of the road or track on it."""
+        nodes = self.transfer.nodes * self.length
+        return SettledSurface(below, nodes, self._series()[..., :1] * self.length)
+
+    def _series(self) -> Float[Array, "part degree 4"]:
+        parts, terms, _ = self.transfer.series.shape
+        entries = self.transfer.series.reshape(parts, terms, 4, 4)
+        return xp.einsum("pdij,pj->pdi", entries, self.left_states)
+
+
+class SettledSurface(Module):
+    """Height r + w_s of the surface of a settled beam; level with its ends before and behind it.
+
+    Embankments settle with the ends. A slope w_s' at an end is that of a joint: wheels with mass
+    enter without impact, as they do where the beam vibrates.
+    """
+
+    below: AbstractProfile | None
+    nodes: Float[Array, " node"] | None
+    series: Float[Array, "part degree 1"] | None
+
+    def heights(self, x):
+        """Height (m), slope and curvature (1/m), as those of a profile.
+
+        Raises RuntimeError where the load set was made without the layout of a traced case.
+        """
+        if self.nodes is None:
+            raise RuntimeError("the surface of a settled beam needs the layout: load_set(case, it)")
+        x = xp.asarray(x, float)
+        start, end = self.nodes[0], self.nodes[-1]
+        parts = piecewise_chebyshev(self.nodes, self.series, xp.clip(x, start, end), (0, 1, 2))
+        height, slope, curvature = parts[..., 0]
+        inside = (x >= start) & (x <= end)
+        own = height, xp.where(inside, slope, 0.0), xp.where(inside, curvature, 0.0)
+        if self.below is None:
+            return own
+        return tuple(a + b for a, b in zip(own, self.below.heights(x), strict=True))
+
+    def kinks(self) -> Float[Array, " kink"]:
+        """Positions (m) at which the slope or curvature of the profile jumps; nodes come anyway."""
+        return xp.zeros(0) if self.below is None else self.below.kinks()
+
+
+def has_settlement(case: Case) -> bool:
+    """Whether a support of a case has a settlement."""
+    return any(support.settlement is not None for support in case.supports)
+
+
+def surface(case: Case, layout: Layout | None = None) -> Module | None:
+    """Surface under the wheels of a case: its profile, and the settled beam; None if level."""
+    if not has_settlement(case):
+        return case.profile
+    numbers = case.beam.length, *(support.position for support in case.supports)
+    if layout is None and not all(map(is_concrete, numbers)):
+        return SettledSurface(case.profile, None, None)
+    return settled_beam(case, layout).surface(case.profile)
+
+
+def settled_beam(case: Case, layout: Layout | None = None, settlements=None) -> SettledBeam:
+    """Static equilibrium of a beam from settlements (support,) in m, by default those of the case.
+
+    The foot of an elastic support settles, and its spring pulls. Patches settle with the beam;
+    suspensions of actuators are without force afterwards. Displacements of the nodes that rigid
+    supports prescribe move the others by K_ff d_f = -K_fh d_h + k s. `layout` (from `mesh_layout`)
+    is needed where numbers of the case are traced.
+
+    Raises ValueError for a beam that is not held in place, of known numbers.
+    """
+    layout = find_layout(case) if layout is None else layout
+    if settlements is None:
+        settlements = [0.0 if s.settlement is None else s.settlement for s in case.supports]
+    if not layout.parts:  # of a uniform beam, which needs no parts for its own statics
+        elements = len(layout.degrees)
+        layout = dataclasses.replace(layout, segments=(0,) * elements, parts=(1,) * elements)
+    released = dataclasses.replace(
+        layout, constrained=tuple((False, clamped) for _, clamped in layout.constrained)
+    )
+    system = nodal_system(case, released, suspended=False)
+    unknowns, length = nodal_unknowns(case, released)[0], case.beam.length
+    unit = length**3 / case.beam.bending_stiffness
+    size = system.stiffness.shape[0]
+    displacement, force, held = xp.zeros(size), xp.zeros(size), []
+    for i, (node, (is_held, _)) in enumerate(zip(layout.nodes, layout.constrained, strict=True)):
+        w = unknowns[i][0]
+        here = [index - 2 for index in node if 2 <= index < 2 + len(case.supports)]
+        for n in here:
+            foot, stiffness = -settlements[n] / length, case.supports[n].stiffness
+            if stiffness is None:
+                displacement = set_at(displacement, w, foot)
+            elif not is_held:
+                force = set_at(force, w, force[w] + stiffness * unit * foot)
+        if is_held:
+            held.append(w)
+    free = np.setdiff1d(np.arange(size), held)
+    stiffness = system.stiffness[np.ix_(free, free)]
+    known = free.size > 0 and is_concrete(stiffness)
+    if known and np.linalg.eigvalsh(concrete(stiffness))[0] <= LEAST_STIFFNESS:
+        raise ValueError(
+            "supports settle, but do not hold the beam in place: clamp an end, or add supports"
+        )
+    right = force[free] - system.stiffness[np.ix_(free, held)] @ displacement[np.array(held, int)]
+    displacement = set_at(displacement, free, solve(stiffness, right))
+    padded = xp.concatenate([displacement, xp.zeros(1)])  # -1: no displacement
+    of_parts = padded[system.unknowns]
+    left, over = of_parts[:, :2, None], of_parts[:, 2:, None]
+    across = system.transfer.across()
+    forces = system.force_of_deflection @ (over - across[:, :2, :2] @ left)
+    states = xp.concatenate([left, forces], axis=1)[..., 0]
+    return SettledBeam(system.transfer, states, length)
 
 
 def settlement_response(
@@ -22,11 +158,9 @@ def settlement_response(
     """Static deflection (m, positive upwards) at x (m) from settlements of the supports.
 
     `settlements` (support,) in m, positive downwards, are those of the `supports` of the case,
-    rigid or elastic; an end settles as a rigid support at its position. `derivative` is that of
-    `influence_line`: with 2, times the bending stiffness, it is a bending moment. The response
-    is linear, so it adds to that of a run with forces. Field = sum of R_i s_i, with the
-    reaction R_i of support i under the unit source dual to the field (Betti). Differentiable in
-    settlements and stiffnesses; the positions must be known.
+    rigid or elastic, in place of their own; an end settles as a rigid support at its position.
+    `derivative` is that of `influence_line`: with 2, times the bending stiffness, it is a bending
+    moment. Differentiable in settlements and stiffnesses; the positions of supports must be known.
 
     Raises ValueError as `influence_line` does, and for a number of settlements other than that of
     the supports.
@@ -47,33 +181,4 @@ def settlement_response(
             f"settlements must be one for each of the {len(case.supports)} supports; their shape"
             f" is {settlements.shape}"
         )
-    # A foundation of no stiffness: statics by transfer matrices, of a uniform beam too.
-    if case.beam.foundation_stiffness is None:
-        case = eqx.tree_at(
-            lambda c: c.beam.foundation_stiffness,
-            case,
-            xp.zeros(()),
-            is_leaf=lambda leaf: leaf is None,
-        )
-    layout = find_layout(case)
-    check_supported(case, layout)
-    greens = section_flexibility(case, layout, x.reshape(-1), derivative)
-
-    def vertical_force(y):
-        """V - T w' in beam units, (side..., source)."""
-        sections = greens.transfer.sections
-        shear = sections.at(y)[..., RIGIDITY, None] * greens(y, 3)
-        return shear - sections.axial_force * greens(y, SLOPE)
-
-    total = xp.zeros(x.size)
-    for i, support in enumerate(case.supports):
-        place = support.position / case.beam.length
-        sides = xp.stack([place - SIDE, place + SIDE])
-        left, right = vertical_force(xp.clip(sides, SIDE, 1 - SIDE))
-        left = xp.where(place > SIDE, left, 0.0)
-        right = xp.where(place < 1 - SIDE, right, 0.0)
-        # A source on the support itself is no part of the reaction.
-        own = xp.where(xp.abs(greens.positions - place) <= SIDE, greens.jumps[:, 3], 0.0)
-        total = total + settlements[i] * (right - left - own)
-    # Beam units: a unit source dual to a derivative has the unit of a force over L^derivative.
-    return (total / case.beam.length**derivative).reshape(x.shape)
+    return settled_beam(case, settlements=settlements).field(x, derivative)

@@ -252,7 +252,7 @@ def build_plant(case: Case, model: ModalModel, coordinates: str = "modal") -> Pl
         scale, coordinate = _sine_scale(case, model), Signal("a", "m")
     else:
         raise ValueError(f"coordinates may be 'modal' or 'sine', not {coordinates!r}")
-    return Plant(case, model, load_set(case), scale, coordinate)
+    return Plant(case, model, load_set(case, model.modes.layout), scale, coordinate)
 
 
 def _sine_scale(case: Case, model: ModalModel) -> Float[Array, " mode"]:

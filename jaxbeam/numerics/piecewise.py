@@ -59,7 +59,7 @@ def _sum_series(table, series):
 def _segment_polynomials(series, local, segment):
     """Polynomials of all segments, zero except those of the segment of each position."""
     segments, terms, _ = series.shape
-    table = _chebyshev_polynomials(local, terms)
+    table = chebyshev_polynomials(local, terms)
     masks = (segment[..., None] == s for s in range(segments))
     parts = [xp.where(mask, table, 0.0) for mask in masks] if segments > 1 else [table]
     return xp.concatenate(parts, axis=-1)
@@ -82,7 +82,7 @@ def legendre_to_chebyshev(terms: int) -> np.ndarray:
     return scale * (chebyshev.chebvander(points, terms - 1).T @ values)
 
 
-def _chebyshev_polynomials(t, terms: int):
+def chebyshev_polynomials(t, terms: int):
     """Chebyshev polynomials of degree 0 to terms - 1 at t, along a new last axis.
 
     By doubling, T_(k+j) = 2 T_k T_j - T_(k-j): few steps, and accurate.

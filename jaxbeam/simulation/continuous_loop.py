@@ -41,7 +41,8 @@ class ContinuousLoop(AbstractInputPolicy):
     def inputs(self, memory, state, info: StepInfo, states):
         times = info.start + info.length * GAUSS_NODES
         if not self.implicit:
-            commands = vmap(lambda time: self._commands(state, time))(times)
+            commands = self._open_loop_commands(times)[..., None]
+            commands = xp.broadcast_to(commands, (*commands.shape[:2], state.shape[-1]))
             return commands, commands[-1]
 
         def commands_for(commands):
@@ -62,7 +63,18 @@ class ContinuousLoop(AbstractInputPolicy):
         self, states: Float[Array, "time state"], times: Float[Array, " time"]
     ) -> Float[Array, "time command"]:
         """Commands of a single run at some times (s): those to the actuators, then the rates."""
+        if not self.implicit:
+            return self._open_loop_commands(times)
         return vmap(lambda state, time: self._commands(state[:, None], time)[:, 0])(states, times)
+
+    def _open_loop_commands(self, times):
+        """Commands of a law of time alone, (time, command): limits are applied to all at once."""
+        sensors, no_command = len(self.plant.case.sensors), xp.zeros(len(self.plant.case.actuators))
+        states = self.plant.modal_model.state_count
+        nothing = Measurement(xp.zeros(sensors), xp.zeros(states), no_command)
+        law_state = xp.zeros(0)
+        commands = vmap(lambda time: self.law.command(law_state, nothing, time))(times)
+        return limit_commands(self.plant.case, commands.T).T
 
     def _commands(self, state, time):
         """Commands and rates of the law's states, (command, batch), for states (state, batch)."""

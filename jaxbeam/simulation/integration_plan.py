@@ -29,10 +29,12 @@ from jaxbeam.integrator.step_size import (
     choose_step_size,
     largest_change,
     longest_trial_step,
+    rounding_deflection,
     trial_deflections,
 )
 from jaxbeam.integrator.time_grid import grid_by_schedule
 from jaxbeam.model.load_set import load_set
+from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
@@ -164,7 +166,8 @@ def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, 
     confirming_halvings = 6 if case.controller.period is None else 1
     if np.isnan(response(1)).any() and np.isnan(response(confirming_halvings)).any():
         return 2 * min_substeps, np.nan
-    halvings, error = _halve_until_converged(response, tolerance, 8)
+    least = rounding_deflection(case, modal_model(case, shapes.layout, shapes.coupled))
+    halvings, error = _halve_until_converged(response, tolerance, 8, least)
     return min_substeps * 2**halvings, error
 
 
@@ -174,7 +177,7 @@ def _closed_loop_trial_run(case, shapes, schedule, substeps):
     Peaks would hide errors: where a command saturates, the deflection has its error everywhere but
     at a peak, where it is stationary.
     """
-    loads = load_set(case)
+    loads = load_set(case, shapes.layout)
     policy = closed_loop(case, shapes.layout, loads, schedule)
     grid = grid_by_schedule(case, policy.model, schedule, substeps)
     discrete = discrete_model(policy.model, grid, None, policy)
@@ -187,17 +190,17 @@ _compiled_trial_run = compiled(_closed_loop_trial_run)
 
 
 def _halve_until_converged(
-    response: Callable[[int], np.ndarray], tolerance: float, max_halvings: int
+    response: Callable[[int], np.ndarray], tolerance: float, max_halvings: int, least: float
 ) -> tuple[int, float]:
     """Number of halvings of a step until one more changes the response within the tolerance.
 
-    Returns it with that change, relative to the largest response. Raises RuntimeError if no number
-    up to `max_halvings` suffices.
+    Returns it with that change, relative to the largest response, or to `least` where that is
+    larger. Raises RuntimeError if no number up to `max_halvings` suffices.
     """
     coarse = response(0)
     for halvings in range(max_halvings):
         fine = response(halvings + 1)
-        error = largest_change(coarse, fine)
+        error = largest_change(coarse, fine, least)
         if error <= tolerance:
             return halvings, error
         if halvings >= MAX_DIVERGED_HALVINGS and not np.isfinite(fine).all():

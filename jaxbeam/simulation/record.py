@@ -1,7 +1,6 @@
 """Record of one simulated run: histories, section forces, peaks, error; as xarray and netCDF."""
 
-import os
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
@@ -9,15 +8,11 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.case.aliases import renamed_property
 from jaxbeam.case.case import Case
-from jaxbeam.case.display.views import TableViews
-from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.files.endings import check_ending
-from jaxbeam.files.netcdf import write_netcdf
-from jaxbeam.files.tables import write_result
+from jaxbeam.case.fields import concrete
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.measurement import sensor_readings
-from jaxbeam.model.sensing.output_rows import quantity_history, sensor_history
+from jaxbeam.model.sensing.output_rows import sensor_history
 from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readings
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
@@ -25,16 +20,14 @@ from jaxbeam.simulation import section_forces
 from jaxbeam.simulation.extremes import Extremes
 from jaxbeam.simulation.labels import contact_sentence
 from jaxbeam.simulation.record_envelope import RecordEnvelope, record_envelope
-from jaxbeam.simulation.views.dataset import dataset_parts
-from jaxbeam.simulation.views.table import record_columns
-from jaxbeam.simulation.views.text import record_text
+from jaxbeam.simulation.truncation import MAX_SAMPLES, truncation_errors
+from jaxbeam.simulation.views.record_views import RecordViews
 
 if TYPE_CHECKING:
-    import xarray  # imported where it is used, as it takes as long as all of JAX
-    from matplotlib.figure import Figure, SubFigure
+    pass
 
 
-class Record(TableViews, eqx.Module):
+class Record(RecordViews):
     """Record of one simulated run.
 
     Deflection is positive upwards. Samples at an entry or exit of a load are those just after.
@@ -109,12 +102,13 @@ class Record(TableViews, eqx.Module):
 
         Strain is that of the fibre at `fibre_distance` z (m) above the neutral axis, -z w_xx;
         stress the moment over the `section_modulus` (m^3). Curvature, strain and section forces are
-        statically corrected, hence right with few modes (see `corrected_history`). Raises
-        ValueError for an unknown quantity, strain without a fibre distance, or stress without a
-        section modulus.
+        statically corrected, hence right with few modes (see `corrected_history`). Moments, shear
+        forces and stresses include those of settled supports; sensors and all other quantities are
+        zero at the start of a run. Raises ValueError for an unknown quantity, strain without a
+        fibre distance, or stress without a section modulus.
         """
         parameters = fibre_distance, section_modulus
-        return quantity_history(self.case, self.modes, self.motion, x, quantity, *parameters)
+        return section_forces.history(self.case, self.modes, self.motion, x, quantity, *parameters)
 
     def bending_moment(self, x) -> Float[Array, "time ..."]:
         """Bending moment at positions x (m) in N m, positive where the beam sags: E I w_xx."""
@@ -173,6 +167,18 @@ class Record(TableViews, eqx.Module):
         Those in continuous time, between samples too; zero, at rest, is among the values.
         """
         return Extremes(self.smallest, self.smallest_time, self.largest, self.largest_time)
+
+    @property
+    def truncation_errors(self) -> Float[Array, " sensor"]:
+        """What the modes left out change, relative to the largest value at each sensor, about.
+
+        See `jaxbeam.simulation.truncation`: of deflections the static correction, of others the
+        dynamic part of the three highest modes, from up to 400 samples. `error_estimate` is that of
+        the time steps. NaN where it is not known.
+        """
+        chosen = np.unique(np.linspace(0, self.times.shape[0] - 1, MAX_SAMPLES).astype(int))
+        motion = Motion(*(part[chosen] for part in self.motion))
+        return truncation_errors(self.case, self.modes, motion)
 
     def _at_sensors(self, quantity: str) -> Float[Array, "time sensor"]:
         return self.at(self.case.sensor_positions, quantity)
@@ -269,64 +275,6 @@ class Record(TableViews, eqx.Module):
         failures = int(concrete(self.failures)[-1])
         if failures:
             parts.append(f"the controller found no solution in {failures} of its steps")
-        parts.append(f"estimated error {float(concrete(self.error_estimate)):.1e} of the peak")
+        error = float(concrete(self.error_estimate))
+        parts.append(f"estimated error of the steps {error:.1e} of the largest deflection")
         return "; ".join(parts)
-
-    def __repr__(self) -> str:
-        if not is_concrete(self.coordinates) or self.times.ndim != 1:
-            return f"Record of {self.case.title!r}, traced or of several runs"
-        return record_text(self.case, self.times, self.verdict, self.extremes)
-
-    def _dataset_parts(self) -> tuple[dict, dict, dict]:
-        """Variables, coordinates and attributes of the labelled dataset."""
-        return dataset_parts(
-            self.case, self.modes, self.times, self.bodies, lambda name: getattr(self, name)
-        )
-
-    def to_xarray(self) -> "xarray.Dataset":
-        """Labelled dataset with units; `record_from_xarray` restores the record exactly."""
-        import xarray
-
-        return xarray.Dataset(*self._dataset_parts())
-
-    def plot(self, quantity: str | None = None, **options: Any) -> "Figure | SubFigure":
-        """Figure of the record, or of one quantity of its sensors; see `jaxbeam.plot.plot_record`.
-
-        `options` are its `ax`, `title` and `labels`; it raises as that function does.
-        """
-        from jaxbeam.plot import plot_record
-
-        return plot_record(self, quantity, **options)
-
-    def plot_envelope(self, quantity: str = "moment", **options: Any) -> "Figure | SubFigure":
-        """Figure of the envelope of a quantity; see `jaxbeam.plot.plot_envelope`."""
-        from jaxbeam.plot import plot_envelope
-
-        return plot_envelope(self, quantity, **options)
-
-    @property
-    def columns(self) -> dict[str, Float[np.ndarray, " time"]]:
-        """Histories by head, as "midspan deflection (m)"; `to_dataframe` has them too."""
-        histories = self.sensor_values, self.contact_force, self.command
-        return record_columns(self.case, self.times, *histories)
-
-    def save(self, path: str | os.PathLike, overwrite: bool = False) -> None:
-        """Write all of the record to .nc or .zarr, or its `columns` to .csv, .xlsx, .mat, .parquet.
-
-        Raises FileExistsError if the file exists, without `overwrite`; ValueError for another
-        ending; ImportError, with what to install, if a package is missing (see `jaxbeam.save`).
-        """
-        check_ending(path, "a record")
-        if os.fspath(path).endswith(".nc"):  # without xarray, which takes long to import
-            self.to_netcdf(path, overwrite)
-        else:
-            write_result(path, lambda: self.columns, self.to_xarray, overwrite)
-
-    def to_netcdf(self, path: str | os.PathLike, overwrite: bool = False) -> None:
-        """Write the labelled dataset to a netCDF file.
-
-        Raises FileExistsError if the file exists, without `overwrite`.
-        """
-        if not overwrite and os.path.exists(path):
-            raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
-        write_netcdf(path, *self._dataset_parts())

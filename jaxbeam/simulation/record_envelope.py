@@ -10,10 +10,9 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.display.views import TableViews
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.sensing.output_rows import quantity_history
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, take, xp
-from jaxbeam.simulation.section_forces import SIDES, shear_force
+from jaxbeam.simulation.section_forces import SIDES, history, shear_force
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -102,7 +101,7 @@ def record_envelope(
 ) -> RecordEnvelope:
     """Envelope of a quantity at positions (m), by default equally spaced; see `Record.envelope`.
 
-    Of shear forces on both sides of each position. Raises ValueError as `quantity_history` does.
+    Of shear forces on both sides of each position. Raises ValueError as `history` does.
     """
     if positions is None:
         positions = case.beam.length * np.linspace(0.0, 1.0, DEFAULT_POSITIONS)
@@ -118,7 +117,7 @@ def record_envelope(
             """Histories (side, time, position) at the positions of this part."""
             if name == "shear":
                 return xp.stack([shear_force(case, modes, motion, x, side) for side in SIDES])
-            return quantity_history(case, modes, motion, x, name, *parameters)[None]
+            return history(case, modes, motion, x, name, *parameters)[None]
 
         sides, other = sides_of(quantity), None
         if coincident:

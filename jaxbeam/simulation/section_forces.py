@@ -1,4 +1,4 @@
-"""Shear forces and reactions of a run, statically corrected.
+"""Section forces and reactions of a run, statically corrected, with those of settled supports.
 
 Shear forces jump at the positions of loads, supports and point actuators, so that they have a
 value on either side; reactions are jumps of the shear force, less the other forces there.
@@ -8,8 +8,15 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
+from jaxbeam.case.quantities import quantity_of
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.sensing.output_rows import SIDE_SHARE, beside, quantity_history
+from jaxbeam.model.sensing.output_rows import (
+    SIDE_SHARE,
+    beside,
+    quantity_factor,
+    quantity_history,
+)
+from jaxbeam.model.settlement import has_settlement, settled_beam
 from jaxbeam.model.static_correction import (
     Motion,
     corrected_history,
@@ -20,6 +27,37 @@ from jaxbeam.model.theory.fields import SLOPE
 from jaxbeam.runtime.arrays import Array, xp
 
 SIDES = ("left", "right")
+
+
+def history(
+    case: Case,
+    modes: Modes,
+    motion: Motion,
+    x,
+    name: str,
+    fibre_distance=None,
+    section_modulus=None,
+) -> Float[Array, "time *position"]:
+    """History of a quantity at positions x (m); raises as `quantity_history`.
+
+    Moments, shear forces and stresses have those of settled supports in them. Displacements,
+    strains and curvatures are measured from the settled beam at rest.
+    """
+    parameters = fibre_distance, section_modulus
+    changes = quantity_history(case, modes, motion, x, name, *parameters)
+    if not (quantity_of(name, *parameters).section_force and has_settlement(case)):
+        return changes
+    return changes + locked_in(case, modes, beside(case, x), name, *parameters)
+
+
+def locked_in(
+    case: Case, modes: Modes, x, name: str, fibre_distance=None, section_modulus=None
+) -> Float[Array, "*position"]:
+    """Moment, shear force or stress of settled supports at positions x (m), in its SI unit."""
+    parameters = fibre_distance, section_modulus
+    quantity = quantity_of(name, *parameters)
+    field = settled_beam(case, modes.layout).field(x, quantity.x_derivative)
+    return quantity_factor(case, x, quantity, *parameters) * field
 
 
 def shear_force(
@@ -34,9 +72,10 @@ def shear_force(
     if side not in SIDES:
         raise ValueError(f"side must be 'left' or 'right' of x, not {side!r}")
     if side == "right":
-        return quantity_history(case, modes, motion, x, "shear")
+        return history(case, modes, motion, x, "shear")
     x = beside(case, x, side)
-    return shear_of_third_derivative(case, x, corrected_history(case, modes, motion, x, 3))
+    shear = shear_of_third_derivative(case, x, corrected_history(case, modes, motion, x, 3))
+    return shear + locked_in(case, modes, x, "shear") if has_settlement(case) else shear
 
 
 def support_positions(case: Case, modes: Modes) -> Float[Array, " support"]:
@@ -93,5 +132,8 @@ def _vertical_force(case: Case, modes: Modes, motion: Motion, x, side: str):
     shear = shear_force(case, modes, motion, x, side)
     if case.beam.axial_force is None:
         return shear
-    slope = corrected_history(case, modes, motion, beside(case, x, side), SLOPE)
+    x = beside(case, x, side)
+    slope = corrected_history(case, modes, motion, x, SLOPE)
+    if has_settlement(case):
+        slope = slope + settled_beam(case, modes.layout).field(x, SLOPE)
     return shear - case.beam.axial_force * slope

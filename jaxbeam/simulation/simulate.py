@@ -23,7 +23,7 @@ from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
 from jaxbeam.model.sensing.measurement import sensor_readings
-from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.sensing.output_rows import sensor_history, sensor_rows
 from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readings
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
@@ -151,12 +151,14 @@ def simulate_readings(
 class Histories(NamedTuple):
     """Deflection (m) at given positions, commands and contact forces (N) of a run.
 
-    Forces of wheels off the beam are zero, also those of vehicles on the ground.
+    Forces of wheels off the beam are zero, also those of vehicles on the ground. `measured` are
+    true quantities of sensors, by name.
     """
 
     deflection: Float[Array, "time position"]
     command: Float[Array, "time actuator"]
     contact_force: Float[Array, "time load"]
+    measured: dict[str, Float[Array, "time _"]]
 
 
 def simulate_histories(
@@ -164,14 +166,23 @@ def simulate_histories(
     times: Float[Array, " time"],
     plan: IntegrationPlan,
     positions: Float[Array, " position"],
+    quantities: Sequence[str] = (),
 ) -> Histories:
-    """Histories at ascending times (s) and positions (m); see `simulate_readings`."""
+    """Histories at ascending times (s) and positions (m), and of the sensors of some quantities.
+
+    See `simulate_readings`.
+    """
     _, outputs, modal, _ = _integrate(case, plan, times, None)
     motion = outputs.motion
     deflection = motion.coordinates @ modal.shapes(positions).T
     on_beam = xp.isfinite(motion.load_position)
     contact_force = xp.where(on_beam, motion.contact_force, 0.0)
-    return Histories(deflection, motion.command, contact_force)
+    measured = {
+        name: xp.stack([sensor_history(case, modal, motion, sensor) for sensor in own], axis=1)
+        for name in quantities
+        if (own := [sensor for sensor in case.sensors if sensor.quantity == name])
+    }
+    return Histories(deflection, motion.command, contact_force, measured)
 
 
 class IntegrationSetup(NamedTuple):
@@ -199,7 +210,8 @@ def integration_setup(
 
     Its peaks are those of what the `monitored` sensors measure, upwards, then downwards.
     """
-    loads, layout = load_set(case), plan.shapes.layout
+    layout = plan.shapes.layout
+    loads = load_set(case, layout)
     if case.controller is None:
         model, policy = modal_model(case, layout, plan.shapes.coupled), None
         # From rest at t = 0 to the first sample in steps as those between samples.

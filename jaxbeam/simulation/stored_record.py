@@ -7,11 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxbeam.case.beam_parts.properties import has
 from jaxbeam.case.case import Case
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.files.zarr_codecs import check_codecs
+from jaxbeam.model.layout import Layout, is_uniform
 from jaxbeam.model.load_set import load_set
-from jaxbeam.model.modes import Modes, mesh_layout
+from jaxbeam.model.modes import Modes, mesh_layout, modes
+from jaxbeam.model.theory.sections import sections
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.result_variables import MODE_FIELDS, MODE_VARIABLES, VARIABLES
@@ -51,6 +54,7 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
     if missing:
         raise ValueError(f"not a record of jaxbeam: it lacks {', '.join(missing)}")
     values = {name: xp.asarray(dataset[name].values) for name in _STORED_VARIABLES}
+    layout = mesh_layout(case)
     return Record(
         case=case,
         modes=Modes(
@@ -58,7 +62,9 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
                 MODE_FIELDS.get(name, name): xp.asarray(dataset[label].values)
                 for name, label in mode_variables.items()
             },
-            layout=mesh_layout(case),
+            layout=layout,
+            sections=None if is_uniform(case) else sections(case, layout),
+            rotation_series=_rotation_series(dataset, case, layout),
         ),
         times=xp.asarray(dataset["time"].values),
         error_estimate=xp.asarray(float(dataset.attrs["error_estimate"])),
@@ -66,6 +72,13 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
         controller_readings=xp.asarray(dataset["measured"].values) if _is_sampled(case) else None,
         **values,
     )
+
+
+def _rotation_series(dataset: "xarray.Dataset", case: Case, layout: Layout):
+    """Rotations of the modes; computed again for a file that lacks those of a Timoshenko beam."""
+    if "mode_rotation_series" in dataset.variables:
+        return xp.asarray(dataset["mode_rotation_series"].values)
+    return modes(case, layout).rotation_series if has(case.beam, "shear_stiffness") else None
 
 
 def _with_extremes(dataset: "xarray.Dataset", case: Case) -> "xarray.Dataset":

@@ -5,15 +5,23 @@ depend on the path are computed once for all runs of a batch.
 """
 
 import dataclasses
+import re
 from collections.abc import Collection
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbeam.case.case import Case, unit_at
+from jaxbeam.case.case import Case, replace, unit_at, value_at
+from jaxbeam.model.modes import Layout, mesh_layout
 
 PATH_UNITS = {"m", "m/s", "s", "m/s^2"}  # of numbers of a load on which its path may depend
 MAX_BATCH_SIZE = 256  # runs; more exceed the cache of the processor
+
+# Numbers that decide the order of positions, or the degrees and parts of a beam not uniform.
+POSITION_ADDRESS = re.compile(
+    r"beam\.(length|axial_force|foundation_stiffness|(segments|hinges)\..*)"
+    r"|(supports|actuators)\.(\d+|\*)\.(position|start|end)"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,3 +77,39 @@ def make_batches(
         batched_values[padded_index],
         index,
     )
+
+
+def values_at(case: Case, batches: Batches, address: str) -> Float[np.ndarray, " path"]:
+    """Number at an address in each batch."""
+    if address in batches.shared_addresses:
+        return batches.shared_values[:, batches.shared_addresses.index(address)]
+    return np.full(batches.shared_values.shape[0], float(value_at(case, address)))
+
+
+def common_layout(case: Case, batches: Batches) -> Layout:
+    """Layout of all batches: the common order of positions, with the largest degrees of any.
+
+    Raises ValueError if positions along the beam change their order within the sweep.
+    """
+    varying = [i for i, a in enumerate(batches.shared_addresses) if POSITION_ADDRESS.fullmatch(a)]
+    if not varying:
+        return mesh_layout(case)
+    values = np.unique(batches.shared_values[:, varying], axis=0)
+    names = [batches.shared_addresses[i] for i in varying]
+    layouts = [mesh_layout(replace(case, dict(zip(names, row, strict=True)))) for row in values]
+    largest = {name: _largest(layouts, name) for name in ("degrees", "parts")}
+    common = {dataclasses.replace(layout, **largest) for layout in layouts}
+    if len(common) > 1:
+        raise ValueError(
+            f"positions along the beam change their order over {', '.join(names)}: split the sweep "
+            "where supports or patch ends meet"
+        )
+    return common.pop()
+
+
+def _largest(layouts: list[Layout], name: str) -> tuple[int, ...]:
+    """Largest degrees or parts of each element in any layout, where all have as many elements."""
+    numbers = [getattr(layout, name) for layout in layouts]
+    if len({len(of_layout) for of_layout in numbers}) > 1:
+        return numbers[0]
+    return tuple(map(int, np.max(numbers, axis=0)))

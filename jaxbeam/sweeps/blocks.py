@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.case import Case, value_at
+from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.integrator.events import sample_schedule
 from jaxbeam.integrator.static_shapes import StaticShapes, max_concurrent_loads
 from jaxbeam.model.load_set import load_set
@@ -18,8 +18,7 @@ from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import sample_times, steps_per_interval
 from jaxbeam.sweeps import programs
-from jaxbeam.sweeps.batches import Batches
-from jaxbeam.sweeps.common_layout import common_layout
+from jaxbeam.sweeps.batches import Batches, common_layout, values_at
 from jaxbeam.sweeps.step_size import (
     choose_step_sizes,
     initial_step_sizes,
@@ -60,7 +59,7 @@ class Runner:
             )
         elif histories:
             self.schedule = sample_schedule(sample_times(case), True, end=case.run.duration)
-        # More threads than cores, as some wait for the results of others.
+        # More threads than cores, as some wait for others.
         self.pool = ThreadPoolExecutor(2 * (os.cpu_count() or 1))
         # The variant that measures step sizes is compiled below, others on first use.
         self._compile_lock, self._compiled_variants = threading.Lock(), {(None, False)}
@@ -79,8 +78,13 @@ class Runner:
         self.shapes = StaticShapes(layout, has_coupling(case), max_loads, native)
         # The C library makes its own step matrices.
         self.discretise_separately = case.controller is None and not native
-        entries, exits = self._compile_programs()
-        limits = self._make_models()
+        self.known_outputs = None
+        if self.same_model:
+            limits = self._make_shared_model()
+            entries, exits = self._compile_programs()
+        else:
+            entries, exits = self._compile_programs()
+            limits = self._make_models()
         self._set_step_limits(entries, exits, limits)
 
     def _set_block_size(self):
@@ -105,11 +109,19 @@ class Runner:
         return np.asarray(times), np.asarray(steps)
 
     def _model_groups(self) -> list:
-        """Indices of batches whose models are made in one call: one batch if all share a model."""
-        if self.same_model:
-            return [[0]]
+        """Indices of batches whose models are made in one call."""
         count = self.batches.run_index.shape[0]
         return list(np.resize(np.arange(count), (self.block_count, self.batches_per_block)))
+
+    def _make_shared_model(self) -> Float[np.ndarray, " path"]:
+        """Make model and outputs that all batches share, of known numbers; longest stable steps."""
+        program = programs.Program(concrete_case(self.case), self.shapes, *self.addresses)
+        values = self.batches.shared_values[0]
+        model, limit = programs.model_and_limit(program, values)
+        self.models = jax.tree.map(lambda leaf: np.asarray(leaf)[None], model)
+        if self.case.controller is None:
+            self.known_outputs = jax.tree.map(np.asarray, program.outputs(model, values))
+        return _stable_steps(np.repeat(np.asarray(limit), self.batches.run_index.shape[0]))
 
     def _compile_programs(self) -> tuple[np.ndarray, np.ndarray]:
         """Compile the programs for step sizes; entry and exit times (path, load) in s."""
@@ -132,17 +144,12 @@ class Runner:
             programs.modal_models(program, self.batches.shared_values[group])
             for group in self._model_groups()
         ]
-        if self.same_model:
-            self.models, limit = groups[0]
-            limits = np.repeat(np.asarray(limit), count)
-        else:
-            self.models, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *groups)
-        limits = limits[:count]
-        return np.where(np.isfinite(limits), limits, np.inf)  # such a run fails with any step
+        self.models, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *groups)
+        return _stable_steps(limits[:count])
 
     def _set_step_limits(self, entries, exits, limits):
         """Crossing rates (1/s), longest steps and initial steps (s) of all batches."""
-        duration = _values_at(self.case, self.batches, "run.duration")
+        duration = values_at(self.case, self.batches, "run.duration")
         times_on_beam = np.minimum(exits, duration[:, None]) - entries
         times_on_beam = np.where(times_on_beam > 0, times_on_beam, duration[:, None])
         crossing_time = np.min(times_on_beam, axis=1, initial=np.inf)
@@ -165,10 +172,10 @@ class Runner:
         def peaks(batch_indices, steps, extra_steps=0, single=False):
             calls = batch_indices.size // self.trial_batches
             parts = zip(np.split(batch_indices, calls), np.split(steps, calls), strict=True)
-            results = [self._integrate(*part, None, single, extra_steps) for part in parts]
-            names = "peak_deflection", programs.MODAL_SUM_PEAK
-            columns = ([one.get(name, np.zeros(0)) for one in results] for name in names)
-            return self._compared_by_quantity(*map(np.concatenate, columns))
+            settings = None, single, extra_steps, False
+            results = [self._integrate(*part, *settings) for part in parts]
+            found = [one["peak_deflection"] for one in results]
+            return self._compared_by_quantity(np.concatenate(found))
 
         search = self.crossing_rates, self.initial_steps, self.max_steps, count, self.tolerance
         steps, error = choose_step_sizes(peaks, *search, self.pool.map)
@@ -179,22 +186,12 @@ class Runner:
             )
         return steps, error
 
-    def _compared_by_quantity(self, peaks, modal_sums):
-        """Peaks (path, batch, sensor), those of each quantity as further runs of the batch.
-
-        Small peaks of one quantity then are not judged by large ones of another unit. Of statically
-        corrected quantities the sums of the modes count as well.
-        """
-        sensors = self.case.sensors
-        quantities = np.array([sensor.quantity for sensor in sensors])
-        parts = [peaks * (quantities == quantity) for quantity in np.unique(quantities)]
-        if modal_sums.size:
-            own = np.array([sensor.bends for sensor in sensors])
-            sums = np.zeros_like(peaks)
-            sums[..., own] = modal_sums
-            kinds = np.unique(quantities[own])
-            parts += [sums * (quantities == quantity) for quantity in kinds]
-        return np.concatenate(parts, axis=1)
+    def _compared_by_quantity(self, peaks):
+        """Peaks (path, batch, sensor) of each quantity as further runs: they are not compared."""
+        quantities = np.array([sensor.quantity for sensor in self.case.sensors])
+        return np.concatenate(
+            [peaks * (quantities == one) for one in np.unique(quantities)], axis=1
+        )
 
     def run_count(self, block: int) -> int:
         """Number of runs in a block, without padding."""
@@ -208,17 +205,16 @@ class Runner:
         substeps = None
         if self.histories:
             substeps = steps_per_interval(float(self.schedule.lengths.max()), steps.min())
-        results = self._integrate(batch_indices, steps[batch_indices], substeps, self.single)
-        results.pop(programs.MODAL_SUM_PEAK, None)
-        return results
+        return self._integrate(batch_indices, steps[batch_indices], substeps, self.single)
 
     def _programs_to_compile(self, program, shared_values):
         """Programs that step sizes need, the slowest to compile first, and template arguments."""
-        model_template, _ = programs.modal_models.template(program, shared_values)
         indices = np.zeros(self.batches_per_block, int)
         step_size, mask = (np.ones(self.batches_per_block), indices), indices > 0
-        models = model_template
-        if not self.same_model:
+        if self.same_model:
+            models = self.models
+        else:
+            model_template, _ = programs.modal_models.template(program, shared_values)
             models = jax.tree.map(lambda leaf: leaf[indices], model_template)
         discretise_arguments = program, mask, models, self.batches.shared_values[indices], step_size
         if self.discretise_separately:
@@ -231,10 +227,13 @@ class Runner:
         )
         if self.discretise_separately:
             yield programs.discrete_models, discretise_arguments
-        yield programs.modal_models, (program, shared_values)
+        if not self.same_model:
+            yield programs.modal_models, (program, shared_values)
 
-    def _integrate(self, batch_indices, steps, substeps, single, extra_steps=0):
-        """Results of at most a block of batches by name."""
+    def _integrate(
+        self, batch_indices, steps, substeps, single, extra_steps=0, corrected: bool = True
+    ):
+        """Results of at most a block of batches by name; statically corrected, or not."""
         # Fewer batches are spread over the block, so that each device has its part.
         rows = np.arange(batch_indices.size) * self.batches_per_block // batch_indices.size
         mask = np.zeros(self.batches_per_block, bool)
@@ -242,7 +241,7 @@ class Runner:
         nearest_row = np.cumsum(mask) - 1
         batch_indices, steps = batch_indices[nearest_row], steps[nearest_row]
         step_size = steps, np.full(batch_indices.size, extra_steps)
-        program, models = self.program(substeps), self._models_of(batch_indices)
+        program, models = self.program(substeps, corrected), self._models_of(batch_indices)
         shared_values, batched_values = self._values_of(batch_indices)
         if self.discretise_separately:
             models = programs.discrete_models(program, mask, models, shared_values, step_size)
@@ -274,11 +273,12 @@ class Runner:
         """Shared and batched values of batches."""
         return self.batches.shared_values[batch_indices], self.batches.batched_values[batch_indices]
 
-    def program(self, substeps: int | None = None) -> programs.Program:
-        """Static data of the programs; with `substeps` per sample interval, also for histories."""
+    def program(self, substeps: int | None = None, corrected: bool = True) -> programs.Program:
+        """Data of the programs; with `substeps` per sample interval, also for histories."""
         scheduled = substeps is not None or self.case.controller is not None
         sampling = (self.schedule if scheduled else None), substeps
-        return programs.Program(self.case, self.shapes, *self.addresses, *sampling)
+        outputs = self.known_outputs, np.asarray(float(corrected))
+        return programs.Program(self.case, self.shapes, *self.addresses, *sampling, *outputs)
 
 
 def _round_up(count: int, unit: int) -> int:
@@ -286,11 +286,9 @@ def _round_up(count: int, unit: int) -> int:
     return -(-count // unit) * unit
 
 
-def _values_at(case: Case, batches: Batches, address: str) -> Float[np.ndarray, " path"]:
-    """Number at an address in each batch."""
-    if address in batches.shared_addresses:
-        return batches.shared_values[:, batches.shared_addresses.index(address)]
-    return np.full(batches.shared_values.shape[0], float(value_at(case, address)))
+def _stable_steps(limits) -> Float[np.ndarray, " path"]:
+    """Longest stable steps (s), infinite where there is none: such a run fails with any step."""
+    return np.where(np.isfinite(limits), limits, np.inf)
 
 
 def _to_single_precision(leaf):

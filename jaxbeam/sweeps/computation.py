@@ -18,6 +18,7 @@ from jaxbeam.sweeps import cluster, store as sweep_store
 from jaxbeam.sweeps.batches import Batches
 from jaxbeam.sweeps.block_store import BlockStore, MemoryStore
 from jaxbeam.sweeps.blocks import Runner
+from jaxbeam.sweeps.force_runner import ForceRunner
 from jaxbeam.sweeps.specification import SweepSpecification
 from jaxbeam.sweeps.truncation import estimated_errors, is_corrected
 
@@ -32,12 +33,37 @@ def compute_sweep(
     client: Any,
     progress_bar: tqdm,
 ) -> "xarray.Dataset":
-    """Dataset of a sweep; blocks are written to the store at a path, unless it is None.
+    """Dataset of a sweep with its estimated truncation errors.
+
+    Blocks are written to the store at a path, unless it is None.
 
     `state` of the store is "new" or "resume" (see `Writing`); then the blocks in it are not
     computed again, and count in the progress bar as done before. With a `client` of Dask its
     workers compute all blocks but the first.
     """
+    dataset, block_store = _computed(specification, path, state, client, progress_bar)
+    for quantity, share in estimated_errors(
+        specification.case, _worst_runs(specification, dataset)
+    ).items():
+        dataset[f"peak_{quantity}"].attrs["truncation_error"] = share
+    block_store.finish(dataset)
+    return dataset
+
+
+def peaks_in_memory(specification: SweepSpecification) -> "xarray.Dataset":
+    """Dataset of a sweep that is not stored, without estimated truncation errors."""
+    with tqdm(disable=True) as progress_bar:
+        return _computed(specification, None, "new", None, progress_bar)[0]
+
+
+def _computed(
+    specification: SweepSpecification,
+    path: Path | None,
+    state: str,
+    client: Any,
+    progress_bar: tqdm,
+) -> "tuple[xarray.Dataset, BlockStore]":
+    """Dataset of a sweep, and the store of its blocks (see `compute_sweep`)."""
     fingerprint = specification.fingerprint()
     if path is not None and state == "resume":
         block_store = sweep_store.ZarrStore(path)
@@ -69,12 +95,7 @@ def compute_sweep(
             progress_bar.update(runner.run_count(block))
     dataset = _to_dataset(specification, runner.batches, block_store.collect())
     dataset.attrs |= {"error_estimate": error, sweep_store.FINGERPRINT_ATTRIBUTE: fingerprint}
-    for quantity, share in estimated_errors(
-        specification.case, _worst_runs(specification, dataset)
-    ).items():
-        dataset[f"peak_{quantity}"].attrs["truncation_error"] = share
-    block_store.finish(dataset)
-    return dataset
+    return dataset, block_store
 
 
 def count_as_done(progress_bar: tqdm, runs: int) -> None:
@@ -86,7 +107,9 @@ def count_as_done(progress_bar: tqdm, runs: int) -> None:
     progress_bar.refresh()
 
 
-def _compute(runner: Runner, blocks: list[int], steps, block_store: BlockStore) -> Iterator[int]:
+def _compute(
+    runner: Runner | ForceRunner, blocks: list[int], steps, block_store: BlockStore
+) -> Iterator[int]:
     """Numbers of blocks as they are computed, on all cores, and stored."""
     results = runner.pool.map(lambda block: (block, runner.compute_block(block, steps)), blocks)
     # An error or an interrupt closes the iterator, which cancels blocks not yet started.

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
-from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule
@@ -29,9 +29,13 @@ from jaxbeam.integrator.static_shapes import StaticShapes
 from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
-from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
-from jaxbeam.model.sensing.output_rows import sensor_rows
-from jaxbeam.model.static_correction import is_supported
+from jaxbeam.model.sensing.corrected_rows import (
+    StaticCorrection,
+    corrected_places,
+    static_correction,
+)
+from jaxbeam.model.sensing.output_rows import OutputRows, sensor_rows
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,
     PARALLEL_COMPILATION,
@@ -39,12 +43,18 @@ from jaxbeam.runtime.compiling import (
 )
 from jaxbeam.simulation.closed_loop import closed_loop
 
+# Rows of what the sensors measure, and their static correction.
+Outputs = tuple[OutputRows, StaticCorrection | None]
+
 
 class Program(NamedTuple):
-    """Static data of the programs of a sweep: case, static shapes, addresses of the values.
+    """Data of the programs of a sweep: case, static shapes, addresses of the values.
 
     With a `schedule` steps end at its events; with `substeps` there are so many between events, and
     histories are saved, otherwise the step size of each batch determines their number.
+    `known_outputs` are those of all batches, if they share them. The share of the static correction
+    in the outputs is one, or zero while step sizes are chosen: by the sums of the modes, as peaks
+    of an axle that passes a sensor are nearly exact with any step.
     """
 
     case: Case
@@ -53,6 +63,8 @@ class Program(NamedTuple):
     batched_addresses: tuple[str, ...]
     schedule: EventSchedule | None = None
     substeps: int | None = None
+    known_outputs: Outputs | None = None
+    correction_share: Float[Array, ""] | float = 1.0
 
     def case_with(self, shared_values) -> Case:
         """Case of a batch."""
@@ -64,7 +76,7 @@ class Program(NamedTuple):
 
         def wheels_of_run(values):
             pairs = zip(self.batched_addresses, values, strict=True)
-            loads = load_set(replace(varied, dict(pairs)))
+            loads = load_set(replace(varied, dict(pairs)), self.shapes.layout)
             wheels = loads.wheels
             if loads.massless:  # known to be, which `vmap` would hide: no equations of contact
                 wheels = eqx.tree_at(_inertia, wheels, None)
@@ -74,7 +86,7 @@ class Program(NamedTuple):
         if wheels.inertia is None:
             massless = np.zeros(wheels.weight.shape)
             wheels = eqx.tree_at(_inertia, wheels, massless, is_leaf=lambda leaf: leaf is None)
-        return dataclasses.replace(load_set(varied), wheels=wheels)
+        return dataclasses.replace(load_set(varied, self.shapes.layout), wheels=wheels)
 
     def grid(self, model, shared_values, step_size):
         """Time grid of a batch for a longest step (s) and a number of extra steps per event."""
@@ -85,40 +97,35 @@ class Program(NamedTuple):
         substeps = jnp.ceil(jnp.max(self.schedule.lengths) / max_step).astype(int) + extra_steps
         return grid_by_schedule(varied, model, self.schedule, self.substeps or substeps, places)
 
-    def modal_sums(self, varied: Case) -> list[Sensor]:
-        """Sensors whose peaks are statically corrected, and are followed as sums of the modes."""
-        if not is_supported(varied, self.shapes.layout):
-            return []
-        return [sensor for sensor in varied.sensors if sensor.bends]
-
     def discretise(self, model, shared_values, step_size, policy=None):
-        """Discrete model of a batch, with peaks of what the sensors measure.
+        """Discrete model of a batch, with peaks of what the sensors measure."""
+        grid = self.grid(model, shared_values, step_size)
+        return discrete_model(model, grid, None, policy, *self.outputs(model, shared_values))
 
-        Those that are statically corrected are followed by their sums of the modes, which show the
-        error of a step: peaks as an axle passes a sensor are exact with any step.
-        """
-        varied, grid = self.case_with(shared_values), self.grid(model, shared_values, step_size)
-        sums = self.modal_sums(varied)
-        sensors = *varied.sensors, *sums
-        outputs = sensor_rows(model, varied, sensors)
-        correction = static_correction(model, varied, sensors, outputs, len(sums))
-        return discrete_model(model, grid, None, policy, outputs, correction)
-
-
-# Peaks of the modal sums of corrected quantities among the results: for step sizes only.
-MODAL_SUM_PEAK = "modal_sum_peak"
+    def outputs(self, model, shared_values) -> Outputs:
+        """Outputs of a batch."""
+        if self.known_outputs is None:
+            varied = self.case_with(shared_values)
+            rows = sensor_rows(model, varied, varied.sensors)
+            correction = static_correction(model, varied, varied.sensors, rows)
+        else:
+            rows, correction = self.known_outputs
+        return rows, correction and correction.scaled(self.correction_share)
 
 
 @compiled(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)
 def modal_models(program: Program, shared_values):
     """Models of batches, and their longest stable steps (s)."""
 
-    def model_and_limit(values):
-        varied = program.case_with(values)
-        model = modal_model(varied, program.shapes.layout, program.shapes.coupled)
-        return model, max_stable_step(model, load_set(varied))
+    # `map` is less to trace than `vmap`.
+    return jax.lax.map(lambda values: model_and_limit(program, values), shared_values)
 
-    return jax.lax.map(model_and_limit, shared_values)  # less to trace than vmap
+
+def model_and_limit(program: Program, shared_values):
+    """Model of a batch, and its longest stable step (s)."""
+    varied = program.case_with(shared_values)
+    model = modal_model(varied, program.shapes.layout, program.shapes.coupled)
+    return model, max_stable_step(model, load_set(varied, program.shapes.layout))
 
 
 @compiled
@@ -175,15 +182,17 @@ def integrate_block(
 
 
 def _native_results(program: Program, mask, models, shared_values, batched_values, step_size):
-    """Results of the C library, from time grids, sensor positions and loads of the batches."""
+    """Results of the C library, from time grids, outputs and loads of the batches."""
     shared_model, own_models = _split_shared_model(models)
 
     def integration_inputs(own_model, shared, batched, step):
-        grid = program.grid(shared_model or own_model, shared, step)
-        return grid, program.case_with(shared).sensor_positions, program.loads(shared, batched)
+        model = shared_model or own_model
+        grid, outputs = program.grid(model, shared, step), program.outputs(model, shared)
+        return grid, *outputs, program.loads(shared, batched)
 
     inputs = jax.vmap(integration_inputs)(own_models, shared_values, batched_values, step_size)
-    return native_peaks.integrate_peaks(program.shapes.max_loads, mask, models, *inputs)._asdict()
+    peaks = native_peaks.integrate_peaks(program.shapes.max_loads, mask, models, *inputs)
+    return peaks._asdict()
 
 
 def _compiled_results(program: Program, mask, discrete, shared_values, batched_values, step_size):
@@ -237,10 +246,7 @@ def _results(program: Program, discrete, varied: Case, loads: LoadSet, policy=No
         history["deflection"] = jnp.einsum("sm,tml->lts", rows, modal)
     if policy is not None:
         history["controller_failures"] = policy.failures(memory)
-    peaks, count = running_peaks.peaks(), len(varied.sensors)
-    history[MODAL_SUM_PEAK] = peaks.peak_deflection[:, count:]
-    own = peaks.peak_deflection[:, :count], peaks.peak_time[:, :count]
-    return peaks._replace(peak_deflection=own[0], peak_time=own[1])._asdict() | history
+    return running_peaks.peaks()._asdict() | history
 
 
 def _map_masked(function, mask, values):

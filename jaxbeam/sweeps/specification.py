@@ -25,6 +25,7 @@ from jaxbeam.integrator import native_peaks
 from jaxbeam.sweeps import MAX_RUNS
 from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, Batches, addresses_within_batches, make_batches
 from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner
+from jaxbeam.sweeps.force_runner import ForceRunner, force_runner
 from jaxbeam.sweeps.truncation import is_corrected
 
 # Positions and list entries, whose values are valid only in combination.
@@ -86,15 +87,24 @@ class SweepSpecification:
         within = [] if one_run_each else addresses_within_batches(self.case, self.axes)
         return make_batches(list(self.axes), self.runs(), within)
 
-    def runner(self, native: bool) -> Runner:
-        """Runner of the batches in blocks, whose steps are taken in C if `native`.
+    @functools.cached_property
+    def _force_runner(self) -> ForceRunner | None:
+        """Runner of peaks in closed form; None where there is none."""
+        if self.histories or self.single:
+            return None
+        return force_runner(self.case, self.batches(), self.tolerance)
+
+    def runner(self, native: bool) -> Runner | ForceRunner:
+        """Runner of the batches in blocks: in closed form, or whose steps are in C if `native`.
 
         Raises ValueError if positions along the beam change their order within the sweep.
         """
+        if self._force_runner is not None:
+            return self._force_runner
         settings = self.histories, self.tolerance, self.single
         return Runner(self.case, self.batches(), *settings, native)
 
-    def resumed_runner(self, content: dict[str, Any]) -> Runner:
+    def resumed_runner(self, content: dict[str, Any]) -> Runner | ForceRunner:
         """Runner of the sweep of a store with this content, in C if it was begun so.
 
         So all blocks agree to the bit. Raises ValueError if the C code cannot be compiled here.
@@ -112,6 +122,8 @@ class SweepSpecification:
     def uses_c(self) -> bool:
         """Whether a new sweep takes its steps in C (see `native_peaks.chosen_for`)."""
         peaks_in_double = not (self.histories or self.single)
+        if self._force_runner is not None:
+            return False
         return peaks_in_double and native_peaks.chosen_for(self.case, self.count)
 
     @functools.cached_property

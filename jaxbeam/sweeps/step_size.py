@@ -67,12 +67,12 @@ def step_errors(
     """
     # The finer runs take longer and start first.
     fine, coarse = map_function(peaks, (batches, batches), (steps / REFINEMENT, steps), (1, 0))
-    return _relative_changes(coarse, fine)
+    return relative_changes(coarse, fine)
 
 
 def rounding_error(exact: Float[np.ndarray, "path batch sensor"], rounded: np.ndarray) -> float:
     """Largest relative error of peaks in single precision, over the runs that do not fail."""
-    return float(np.nanmax(_relative_changes(rounded, exact), initial=0.0))
+    return float(np.nanmax(relative_changes(rounded, exact), initial=0.0))
 
 
 def stratified_sample(
@@ -102,7 +102,7 @@ def _interpolate_conservatively(
     return np.minimum(*(smallest[np.clip(side, 0, unique.size - 1)] for side in (below, above)))
 
 
-def _relative_changes(coarse, fine):
+def relative_changes(coarse, fine):
     """Largest relative change of peaks in each batch; NaN where all runs fail."""
     finite = np.isfinite(fine)
     size = np.abs(np.where(finite, fine, 0.0))

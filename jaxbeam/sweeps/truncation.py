@@ -1,29 +1,17 @@
 """What the modes that a sweep leaves out change of its peaks: warning, and estimated errors."""
 
-import dataclasses
 import warnings
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case, replace
 from jaxbeam.case.quantities import QUANTITIES
-from jaxbeam.case.sensors import Sensor
-from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensing.output_rows import sensor_history
-from jaxbeam.model.static_correction import (
-    Motion,
-    corrected_history,
-    is_supported,
-    residual_flexibility,
-)
+from jaxbeam.model.static_correction import is_supported, residual_flexibility
 from jaxbeam.model.statics import influence_line
-from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 
-LEFT_OUT = 2  # highest modes whose dynamic part estimates that of all modes beyond
 SAMPLES = 400  # of the run from which errors of corrected quantities are estimated
 ESTIMATE_TOLERANCE = 1e-3  # of that run
 
@@ -79,78 +67,33 @@ def estimated_errors(case: Case, worst: dict[str, dict[str, float]]) -> dict[str
 
     `worst` has the numbers of the run with the largest peak of each quantity. Of deflections and
     rotations the error is the static one; others are estimated from that run (see
-    `truncation_errors`), without a controller.
+    `Record.truncation_errors`), without a controller.
     """
-    errors = static_shares(case)
+    errors, records = static_shares(case), {}
     quantities = [sensor.quantity for sensor in case.sensors]
     if case.controller is not None:
         return errors
     for quantity, numbers in worst.items():
         if quantity in errors:
             continue
-        of_run = concrete_case(replace(case, numbers))
-        times = np.linspace(0.0, float(of_run.run.duration), SAMPLES)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ContactLossWarning)
-            try:
-                record = simulate(of_run, times, tolerance=ESTIMATE_TOLERANCE)
-            except RuntimeError:  # no step was found: the peaks are kept, their error is not known
-                continue
+        key = tuple(numbers.items())
+        if key not in records:
+            records[key] = _record_for_estimates(concrete_case(replace(case, numbers)))
+        if records[key] is None:
+            continue
         own = np.array(quantities) == quantity
-        found = np.asarray(truncation_errors(record))[own]
+        found = np.asarray(records[key].truncation_errors)[own]
         if np.isfinite(found).any():
             errors[quantity] = float(np.nanmax(found))
     return errors
 
 
-def truncation_errors(record: Record) -> Float[Array, " sensor"]:
-    """Estimated truncation error of the quantity of each sensor, relative to its largest value.
-
-    From the samples of a record. Of a deflection or rotation, the largest part that the static
-    correction would add. Of others, the largest change with the dynamic part of the two highest
-    modes left out, which is more than that of all higher modes where their contributions fall;
-    accelerations under point forces do not converge, and their modes are a convention. NaN for
-    those of a case with one mode, and for slopes of a beam that is not uniform.
-    """
-    errors = []
-    for sensor in record.case.sensors:
-        full = _history(record, sensor)
-        quantity = QUANTITIES[sensor.quantity]
-        if quantity.of_axis and not is_uniform(record.case):
-            other = full * xp.nan
-        elif quantity.time_derivative == 0 and not quantity.bends:
-            parts = record.case, record.modes, record.motion, sensor.position
-            other = corrected_history(*parts, quantity.x_derivative)
-        else:
-            fewer = _with_fewer_modes(record)
-            other = full * xp.nan if fewer is None else _history(fewer, sensor)
-        largest = xp.max(xp.abs(full))
-        change = xp.max(xp.abs(full - other))
-        errors.append(xp.where(largest > 0, change / xp.where(largest > 0, largest, 1.0), 0.0))
-    return xp.array(errors).reshape(-1)
-
-
-def _history(record: Record, sensor: Sensor):
-    return sensor_history(record.case, record.modes, record.motion, sensor)
-
-
-def _with_fewer_modes(record: Record) -> Record | None:
-    """The record without its highest modes; None with one mode."""
-    case, count = record.case, record.case.beam.modes
-    kept = count - min(LEFT_OUT, count - 1)
-    if kept == count:
-        return None
-    beam = dataclasses.replace(case.beam, modes=kept, damping_ratio=_of_lowest(case.beam, kept))
-    amplitudes = {name: getattr(record, name)[:, :kept] for name in Motion._fields[:3]}
-    return dataclasses.replace(
-        record,
-        case=dataclasses.replace(case, beam=beam),
-        modes=record.modes.lowest(kept),
-        **amplitudes,
-    )
-
-
-def _of_lowest(beam, count: int):
-    """Damping ratios of the lowest modes: one for all, or a list."""
-    ratio = beam.damping_ratio
-    return ratio[:count] if np.ndim(ratio) else ratio
+def _record_for_estimates(case: Case) -> Record | None:
+    """Record of a run; None where no step is found: its peaks are kept, their error not known."""
+    times = np.linspace(0.0, float(case.run.duration), SAMPLES)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ContactLossWarning)
+        try:
+            return simulate(case, times, tolerance=ESTIMATE_TOLERANCE)
+        except RuntimeError:
+            return None

@@ -89,6 +89,14 @@ MISTAKES = {
         bridge(beam={"damping_ratio": 0.0, "rayleigh_damping": [20.0, 0.0]}),
         "beam.rayleigh_damping",
     ),
+    "loss factor in per cent": (
+        bridge(beam={"damping_ratio": 0.0, "loss_factor": 2.0}),
+        "the loss factor of the beam makes a damping ratio of 1",
+    ),
+    "settlement in mm": (
+        bridge(supports=[jb.Support(12.5, settlement=20.0)]),
+        "is supports.0.settlement in m, not in mm?",
+    ),
 }
 
 

@@ -95,6 +95,17 @@ CASES = {
         ),
         loads=TWO_LOADS,
     ),
+    "feedforward-confirmed": rig(
+        jb.Feedforward(
+            [-0.05, 0.05],
+            shares=[0.0, 0.3, 1.0],
+            values=[[0.0, 5.0, 0.0], [1.0, 2.0, 3.0]],
+            lead=2e-3,
+            confirmation=5e-5,
+            period=PERIOD,
+        ),
+        loads=TWO_LOADS,
+    ),
     "internal-model": rig(
         jb.InternalModel(
             [-1e-3, 0.0, 1e-3],

@@ -31,6 +31,15 @@ def test_a_case_has_a_line_for_each_part_with_its_address():
     assert lines[-2] == "loads.49: MovingForce(force=49000 N, speed=2 m/s)"
 
 
+def test_a_case_in_a_notebook():
+    """The same parts as in its text, in a table; texts are escaped."""
+    loads = [jb.MovingForce(force=1e3 * i, speed=2.0) for i in range(50)]
+    shown = jb.Case(BEAM, loads=loads, title="a < b")._repr_html_()
+    assert "<b>a &lt; b</b>" in shown and "a < b" not in shown
+    assert ">Beam</td>" in shown and ">length = 0.6 m, flexural_rigidity = 11.68 N m^2," in shown
+    assert shown.count(">MovingForce</td>") == 4 and "... 46 more loads ..." in shown
+
+
 def test_traced_numbers_show_their_shapes():
     texts = []
 

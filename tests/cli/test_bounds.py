@@ -3,7 +3,7 @@
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.cli.arguments import bounds_in_si, parse_bounds
+from jaxbeam.cli.arguments import bounds_in_si, pair_in_si, parse_bounds, parse_prior
 
 CASE = jb.Case(jb.Beam(25.0, 3e10, 1.5e4), loads=[jb.MovingForce(force=1e5, speed=20.0)])
 
@@ -35,3 +35,13 @@ def test_bounds_in_si_units(text, expected):
 def test_bounds_that_are_refused(text, message):
     with pytest.raises(ValueError, match=message):
         bounds_in_si(CASE, dict([parse_bounds(text)]))
+
+
+def test_priors_in_si_units():
+    address, pair = parse_prior("beam.flexural_rigidity=30 GN m^2:500 MN m^2")
+    assert pair_in_si(CASE, address, pair, "--prior") == pytest.approx((3e10, 5e8))
+    assert parse_prior("beam.length=25:0.1") == ("beam.length", (25.0, 0.1))
+    with pytest.raises(ValueError, match="give both numbers a unit, as in"):
+        parse_prior("beam.length=25 m:0.1")
+    with pytest.raises(ValueError, match="--prior beam.length.1 must be in m"):
+        pair_in_si(CASE, "beam.length", ("25 m", "1 kg"), "--prior")

@@ -22,6 +22,7 @@ def frequency(n: int, rigidity: float = 11.68) -> float:
 
 REFUSED = [
     ("simulat case.toml", 'Unknown command "simulat". Did you mean "simulate"?'),
+    ("simulate case.toml more", "simulate takes no further 'more'; see jaxbeam simulate --help"),
     ("simulate", "requires an argument"),
     ("simulate case.toml --plott", "--plott"),
     ("simulate none.toml", "cannot read the case file none.toml: no such file or directory"),
@@ -74,7 +75,7 @@ REFUSED = [
     ("identify log.csv -o fit.toml", "-o and --set are for fitting a case; name what is free"),
     ("identify case.toml log.csv --free beam.length=2:1", "bounds are LOW:HIGH, such as 5:20"),
     ("identify case.toml log.csv --free beam.length=0:b", "'b' is not a number"),
-    ("identify case.toml log.csv --free beam.length=1:2m", "give both bounds a unit, as in 8 GN"),
+    ("identify case.toml log.csv --free beam.length=1:2m", "give both numbers a unit, as in 8 GN"),
     ("identify case.toml log.csv --free beam.length -o case.toml", "case.toml exists; choose"),
     (
         "weigh case.toml old.nc --speeds 5:20 --calibration old.nc",
@@ -126,7 +127,7 @@ def test_simulate_prints_and_writes_the_same(run, folder):
     np.testing.assert_allclose(factors, jb.amplification(record.case, [0.3, 0.15]), rtol=1e-6)
     assert found["largest_contact_force"] == [float(record.contact_force.max())]
     printed = run("simulate case.toml -o out.nc --plot --animate out.gif")
-    assert f"{factors[0]:.4g}" in printed and " steps" not in printed
+    assert f"{factors[0]:.4g}" in printed and f"{found['steps']} steps" not in printed
     assert f"{float(record.peak_deflection[0]):.6g}" in printed
     assert "written: out.nc" in printed
     assert (folder / "out.nc").stat().st_size > 0
@@ -149,8 +150,15 @@ def test_pictures_have_endings_sizes_and_titles(run, folder):
         run(f"{line} --picture out.svg --title Anew --overwrite")
         text = (folder / "out.svg").read_text()
         assert "<!-- Anew -->" in text and "one span, one ball" not in text
+    run("simulate case.toml --picture out.svg --labels near,far --overwrite")
+    assert "<!-- near" in (folder / "out.svg").read_text()
     run("modes case.toml --picture out.pdf")
     assert (folder / "out.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_labels_name_every_sensor(refused):
+    message = refused("simulate case.toml --plot --labels one")
+    assert message == "--labels names 1 sensors; the case has 2"
 
 
 def test_film_needs_ffmpeg(run, refused, folder, monkeypatch):

@@ -35,6 +35,16 @@ def test_case_file(run):
     assert "loads.0: mass" in printed and "weight 4.905 N, mass 0.5 kg" in printed
 
 
+def test_settled_supports(folder, run):
+    """3 E I s / l^2 over the middle support."""
+    text = (folder / "case.toml").read_text()
+    (folder / "case.toml").write_text(text + '[[supports]]\nposition = 0.3\nsettlement = "1 mm"\n')
+    moment = 3 * 11.68 * 1e-3 / 0.3**2
+    expected = f"settled: supports.0 by 1 mm; moments locked in from 0 N m to {moment:.4g} N m"
+    assert expected in run("describe case.toml")
+    assert f"{expected}; sensors read changes from there" in run("simulate case.toml")
+
+
 def test_case_of_a_train_in_words(run, folder):
     """Units with prefixes, when the loads are on the beam, the first and the last of 50 axles."""
     run("new railway-bridge")

@@ -65,6 +65,7 @@ KEYS = {
                 "largest": None,
                 "largest_time": None,
                 "dynamic_amplification": None,
+                "truncation_error": None,
             }
         ],
         "peak_deflection": None,

@@ -74,6 +74,43 @@ def test_load_from_the_right_and_several_loads():
     assert_allclose(commands(beam_case(loads=both), times), first + later, atol=1e-12)
 
 
+CONFIRMED = dataclasses.replace(LAW, confirmation=np.asarray(2e-5))
+
+
+def test_gates_that_fire_without_a_load_leave_the_beam_alone():
+    """A load without weight passes the gates: the table alone lifts the beam by 0.2 mm."""
+    nothing = (jb.MovingMass(mass=1e-9, speed=1.0, entry_time=0.3),)
+    lifted = jb.simulate(beam_case(loads=nothing))
+    assert float(np.max(lifted.deflection)) > 2e-4
+    at_rest = jb.simulate(beam_case(CONFIRMED, nothing))
+    assert not np.any(at_rest.command) and float(np.max(np.abs(at_rest.deflection))) < 1e-9
+
+
+def test_a_load_that_a_sensor_shows_is_answered_by_the_table():
+    """Commands are those of the table from the first sample at which the beam has gone down."""
+    record = jb.simulate(beam_case(CONFIRMED))
+    table = np.asarray(commands(beam_case(), record.times))
+    shown = np.asarray(record.deflection)[:, 0] <= -2e-5
+    first = int(np.argmax(shown))
+    assert 0.3 < record.times[first] < 0.35
+    expected = np.where(np.arange(table.size) < first, 0.0, table)
+    assert_allclose(record.command[:, 0], expected, atol=1e-9)
+
+
+def test_a_load_that_shows_too_late_is_not_confirmed():
+    """The first passage is without a load; the second load shows after its time is out."""
+    loads = (
+        jb.MovingMass(mass=1e-9, speed=1.0, entry_time=0.2),
+        jb.MovingMass(mass=0.4, speed=1.0, entry_time=0.5),
+    )
+    run = jb.simulate(beam_case(CONFIRMED, loads))
+    alone = jb.simulate(beam_case(CONFIRMED, loads[1:]))
+    assert_allclose(run.command, alone.command, atol=1e-9)
+    none = dataclasses.replace(beam_case(CONFIRMED), sensors=())
+    with pytest.raises(ValueError, match="confirmation needs a sensor of the deflection"):
+        jb.simulate(none)
+
+
 def test_case_file_and_errors_of_settings():
     case = beam_case()
     assert jax.tree.all(

@@ -1,4 +1,4 @@
-"""The C integrator: peaks equal to those of XLA, for all kinds of models and load paths."""
+"""The C integrator: peaks equal to those of XLA, for all kinds of models, outputs and paths."""
 
 import ctypes
 import dataclasses
@@ -26,6 +26,8 @@ from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
+from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
+from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.numerics.peak_search import interpolation_matrix, refine_peak
 from jaxbeam.runtime import native_library
 from jaxbeam.simulation.integration_plan import static_shapes
@@ -80,6 +82,17 @@ LONG = jb.Case(
     ],
     run=jb.Run(2.0),
 )
+# Other quantities, on a beam whose modes are coupled by a damper.
+QUANTITIES = ("velocity", "acceleration", "strain", "moment", "shear")
+MEASURED = dataclasses.replace(
+    PLAIN,
+    supports=[jb.Support(0.45, stiffness=2e4, damping=30.0)],
+    sensors=[
+        jb.Sensor(0.2, name, fibre_distance=2e-3 if name == "strain" else None)
+        for name in QUANTITIES
+    ],
+    run=jb.Run(0.7),
+)
 FEW = {"loads.0.mass": [0.1, 0.5], "loads.2.speed": [0.8, 1.2]}
 GRID = {"loads.0.mass": np.linspace(0.05, 1.0, 13), "loads.0.speed": [1.0, 2.0, 7.0]}
 
@@ -125,6 +138,14 @@ def test_results_equal_those_of_xla(case, over):
     assert np.any(native.peak_deflection != plain.peak_deflection)
 
 
+def test_peaks_of_every_quantity_equal_those_of_a_single_run():
+    found = jb.sweep(MEASURED, {"loads.0.mass": [0.5]}, tolerance=1e-8, progress=False)
+    record = jb.simulate(MEASURED, tolerance=1e-9)
+    largest = np.maximum(np.abs(record.smallest), record.largest)
+    for i, name in enumerate(QUANTITIES):
+        assert_allclose(found[f"peak_{name}"][0, i], largest[i], rtol=2e-8, err_msg=name)
+
+
 def test_a_beam_without_loads_stays_at_rest():
     case = dataclasses.replace(PLAIN, loads=[])
     results = jb.sweep(case, {"beam.flexural_rigidity": [9.0, 12.0]}, progress=False)
@@ -165,26 +186,32 @@ def test_contact_is_lost_in_one_of_the_cases():
 
 
 def peaks_of_mass(case, native, max_step=1e-3):
-    """Function of the mass (kg) of a load: peaks at the sensors of a single run."""
+    """Function of the mass (kg) of a load: peaks of the sensors of a single run."""
     shapes = static_shapes(case)
 
     def peaks(mass):
         varied = replace(case, {"loads.0.mass": mass})
         model = modal_model(varied, shapes.layout, shapes.coupled)
-        grid = grid_by_step_length(varied, model, jnp.asarray(max_step))
-        positions, loads = varied.sensor_positions, load_set(varied)
+        places = corrected_places(varied, model, varied.sensors)
+        grid = grid_by_step_length(varied, model, jnp.asarray(max_step), places=places)
+        outputs = sensor_rows(model, varied, varied.sensors)
+        correction = static_correction(model, varied, varied.sensors, outputs)
+        loads = load_set(varied)
         if not native:
-            discrete = discrete_model(model, grid, positions)
+            discrete = discrete_model(model, grid, None, None, outputs, correction)
             running_peaks, _ = integrate_peaks(discrete, loads, max_loads=shapes.max_loads)
             return running_peaks.refined_peak()[0][:, 0]
-        arguments = jnp.ones((), bool), model, grid, positions, loads
+        arguments = jnp.ones((), bool), model, grid, outputs, correction, loads
         one_task = jax.tree.map(lambda leaf: leaf[None], arguments)
         return native_peaks.integrate_peaks(shapes.max_loads, *one_task).peak_deflection[0, 0]
 
     return jax.jit(peaks)
 
 
-@pytest.mark.parametrize("case", [PLAIN, COUPLED], ids=["plain", "coupled"])
+BENT = dataclasses.replace(PLAIN, sensors=[jb.Sensor(0.2, "moment"), jb.Sensor(0.3, "velocity")])
+
+
+@pytest.mark.parametrize("case", [PLAIN, COUPLED, BENT], ids=["plain", "coupled", "moment"])
 def test_derivatives_equal_those_of_xla(case):
     mass = jnp.asarray(0.4)
     value, slope = jax.jvp(peaks_of_mass(case, True), (mass,), (jnp.ones(()),))
@@ -215,7 +242,7 @@ def specification_of(case, histories=False, precision="double"):
     return sweep_specification(case, GRID, False, histories, 1e-7, precision)
 
 
-def test_sweeps_of_deflections_in_double_precision_use_c():
+def test_sweeps_of_peaks_in_double_precision_use_c():
     assert specification_of(PLAIN).uses_c()
     assert not specification_of(PLAIN, histories=True).uses_c()
     assert not specification_of(PLAIN, precision="single").uses_c()
@@ -226,9 +253,10 @@ def test_sweeps_of_deflections_in_double_precision_use_c():
         sensors=SENSORS[:1],
     )
     assert not specification_of(controlled).uses_c()
-    assert not specification_of(
-        dataclasses.replace(PLAIN, sensors=[jb.Sensor(0.2, "moment")])
-    ).uses_c()
+    moments = dataclasses.replace(PLAIN, sensors=[jb.Sensor(0.2, "moment")])
+    assert specification_of(moments).uses_c()
+    sheared = dataclasses.replace(BEAM, shear_stiffness=1e5)
+    assert not specification_of(dataclasses.replace(moments, beam=sheared)).uses_c()
 
 
 @pytest.mark.parametrize("begun_in_c", [True, False])

@@ -1,6 +1,7 @@
 """Data and labels of figures."""
 
 import dataclasses
+import inspect
 import itertools
 
 import jax.numpy as jnp
@@ -325,6 +326,15 @@ def test_figures_take_the_place_of_axes(record):
         record.plot("strain")
     with pytest.raises(ValueError, match="labels names 1 sensors; the case has 2"):
         record.plot(labels=["one"])
+
+
+def test_every_figure_may_take_the_place_of_axes():
+    import jaxbeam.plot
+
+    functions = [name for name in dir(jaxbeam.plot) if name.startswith("plot_")]
+    assert len(functions) > 10
+    for name in functions:
+        assert "ax" in inspect.signature(getattr(jaxbeam.plot, name)).parameters, name
 
 
 def test_envelope_and_modes_on_axes(record):

@@ -217,6 +217,9 @@ def test_text_has_the_extremes_of_each_sensor(record):
     assert lines[4].split()[-4:] == [largest, "m/s²", time, "s"]
     several = jax.tree.map(lambda leaf: np.stack([leaf, leaf]), record)
     assert repr(several) == "Record of 'a run for its record', traced or of several runs"
+    shown = record._repr_html_()
+    assert f"<p>{record.verdict}</p>" in shown and shown.count("<tr>") == 6
+    assert f"{1e3 * found.smallest[0]:.4g} mm" in shown and several._repr_html_() is None
 
 
 def test_text_of_modes(record):

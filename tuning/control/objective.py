@@ -7,18 +7,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.simulation.simulate import Histories
 from tuning.aliases import accepts_old_arguments
 
 METRICS = ("peak", "shortfall", "rms", "after_exit", "effort", "contact")
+# Metrics named by what sensors measure; deflections have the metric `peak`.
+QUANTITY_METRICS = tuple(name for name in QUANTITIES if name != "deflection")
+ALL_METRICS = (*METRICS, *QUANTITY_METRICS)
 AGGREGATIONS = ("mean", "worst", "cvar")
 LIMIT_PENALTY_SLOPE = 10.0  # added to the objective for each unit of a metric beyond its limit
 Sharpness = Float[Array, ""] | float | None  # of smooth maxima; None for true maxima
 
 
 class WeightsAndLimits(NamedTuple):
-    """Weights and limits of all metrics, in the order of `METRICS`."""
+    """Weights and limits of all metrics, in the order of `ALL_METRICS`."""
 
     weights: Float[Array, " metric"]
     limits: Float[Array, " metric"]
@@ -37,7 +41,10 @@ class Objective:
     - `rms`: RMS deflection over that without control;
     - `after_exit`: largest deflection after the last exit over the peak without control;
     - `effort`: RMS command over the largest command within limits;
-    - `contact`: largest change of a contact force over the weight.
+    - `contact`: largest change of a contact force over the weight;
+    - `moment`, `shear`, `strain`, `acceleration` and any other quantity of sensors: largest
+      absolute value of it at the sensors that measure it, statically corrected, over that without
+      control.
 
     The `aggregation` over runs is their "mean", their "worst" value, or "cvar", the mean of the
     worst `tail_share` of them. Metrics with `limits`, aggregated alike, must not exceed these.
@@ -52,10 +59,11 @@ class Objective:
     limits: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
-        unknown = (set(self.weights) | set(self.limits)) - set(METRICS)
+        unknown = (set(self.weights) | set(self.limits)) - set(ALL_METRICS)
         if unknown:
             raise ValueError(
-                f"there is no metric {min(unknown)!r} to tune for; it may be {', '.join(METRICS)}"
+                f"there is no metric {min(unknown)!r} to tune for; it may be"
+                f" {', '.join(ALL_METRICS)}"
             )
         if not self.weights or any(not 0 < value < float("inf") for value in self.weights.values()):
             raise ValueError("an objective needs metrics with positive, finite weights")
@@ -69,12 +77,17 @@ class Objective:
             raise ValueError(f"tail_share must be above 0 and at most 1; it is {self.tail_share:g}")
 
     @property
+    def quantities(self) -> tuple[str, ...]:
+        """Quantities of sensors among its metrics."""
+        named = set(self.weights) | set(self.limits)
+        return tuple(name for name in QUANTITY_METRICS if name in named)
+
+    @property
     def target(self) -> WeightsAndLimits:
         """Weights (0 for metrics that do not count) and limits (infinite where there is none)."""
-        weights = [self.weights.get(name, 0.0) for name in METRICS]
-        return WeightsAndLimits(
-            jnp.array(weights), jnp.array([self.limits.get(name, jnp.inf) for name in METRICS])
-        )
+        weights = [self.weights.get(name, 0.0) for name in ALL_METRICS]
+        limits = [self.limits.get(name, jnp.inf) for name in ALL_METRICS]
+        return WeightsAndLimits(jnp.array(weights), jnp.array(limits))
 
     def penalised(
         self,
@@ -86,7 +99,8 @@ class Objective:
 
         The penalty is so steep that the minimum lies at a limit, not beyond it.
         """
-        rows = jnp.stack([metrics[name] for name in METRICS])
+        none = jnp.zeros_like(metrics[METRICS[0]])  # of quantities that are not tuned for
+        rows = jnp.stack([metrics.get(name, none) for name in ALL_METRICS])
         excess = jnp.stack([self.aggregate(row, sharpness) for row in rows]) - target.limits
         penalty = LIMIT_PENALTY_SLOPE * jnp.sum(jnp.maximum(excess, 0.0))
         return self.aggregate(target.weights @ rows, sharpness) + penalty
@@ -124,17 +138,21 @@ def run_metrics(
 ) -> dict[str, Float[Array, ""]]:
     """Metrics of one run (see `Objective`), by name.
 
-    `uncontrolled` holds "peak" and "rms" (m) without control, and the "least" achievable peak (m,
-    NaN if not computed); `after_exit` is 1 at samples after the last exit and 0 before;
-    `command_ranges` are the largest commands within limits, `weights` those of the loads (N). With
-    a `sharpness` maxima are smooth.
+    `uncontrolled` holds "peak" and "rms" (m) without control, the "least" achievable peak (m, NaN
+    if not computed), and the largest value of each quantity in `found.measured`; `after_exit` is 1
+    at samples after the last exit and 0 before; `command_ranges` are the largest commands within
+    limits, `weights` those of the loads (N). With a `sharpness` maxima are smooth.
     """
     size = jnp.abs(found.deflection)
     change = jnp.abs(found.contact_force - weights) * (found.contact_force != 0)
     nonzero_weights = jnp.where(weights > 0, weights, 1.0)
     peak = smooth_max(size / uncontrolled["peak"], sharpness)
     least = uncontrolled["least"] / uncontrolled["peak"]
-    return {
+    measured = {
+        name: smooth_max(jnp.abs(history) / uncontrolled[name], sharpness)
+        for name, history in found.measured.items()
+    }
+    return measured | {
         "peak": peak,
         "shortfall": (peak - least) / (1 - least),
         "rms": jnp.sqrt(jnp.mean(found.deflection**2)) / uncontrolled["rms"],

@@ -9,7 +9,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.files.report import text_table
 from tuning.aliases import accepts_old_arguments, has_old_attributes
 from tuning.control.load_cases import LoadCases
-from tuning.control.objective import METRICS, Objective
+from tuning.control.objective import ALL_METRICS, Objective
 from tuning.control.stability_constraint import StabilityConstraint
 from tuning.control.tune import ParameterBounds, TuningProblem, check_arguments
 from tuning.control.tuning_result import TuningResult
@@ -112,12 +112,9 @@ def lexicographic(
     """
     if not metrics or len(set(metrics)) < len(metrics):
         raise ValueError("name at least one metric, and each once, the most important first")
-    check_arguments(
-        free, cases, Objective(dict.fromkeys(metrics, 1.0)), method, steps, least_peaks=least_peaks
-    )
-    problem = TuningProblem(
-        case, free, cases, Objective({metrics[0]: 1.0}, aggregation), stable, positions, least_peaks
-    )
+    of_all = Objective(dict.fromkeys(metrics, 1.0), aggregation)
+    check_arguments(free, cases, of_all, method, steps, least_peaks=least_peaks)
+    problem = TuningProblem(case, free, cases, of_all, stable, positions, least_peaks)
     found: list[TuningResult] = []
 
     def objectives() -> Iterator[Objective]:
@@ -149,7 +146,7 @@ def _tune_successively(
 
 
 def _with_limits(objective: Objective, limits: dict[str, float]) -> Objective:
-    unknown = set(limits) - set(METRICS)
+    unknown = set(limits) - set(ALL_METRICS)
     if unknown:
-        raise ValueError(f"there is no metric {min(unknown)!r}; it may be {', '.join(METRICS)}")
+        raise ValueError(f"there is no metric {min(unknown)!r}; it may be {', '.join(ALL_METRICS)}")
     return dataclasses.replace(objective, limits=objective.limits | limits)

@@ -36,9 +36,10 @@ class RunSet(eqx.Module):
 
     `stacked` is the case with the numbers of all runs along a first axis, `error` the relative
     error of their peaks with the `plan`. `uncontrolled` holds, by run, the peak and RMS deflection
-    (m) without control ("peak", "rms"), and the least achievable peak ("least", m; NaN if not
-    computed). `positions` (m) are where deflections count; `nominal` has the parameters of the
-    plant, by address, that controllers are designed for where those of the runs differ.
+    (m) without control ("peak", "rms"), the least achievable peak ("least", m; NaN if not
+    computed), and the largest absolute value of each of the `quantities` of sensors. `positions`
+    (m) are where deflections count; `nominal` has the parameters of the plant, by address, that
+    controllers are designed for where those of the runs differ.
 
     Pass a run set as an argument to compiled functions, never by closure: its arrays would become
     constants that XLA works on for seconds.
@@ -54,6 +55,7 @@ class RunSet(eqx.Module):
     after_exit: Float[np.ndarray, "run time"]
     command_ranges: Float[np.ndarray, " actuator"]
     nominal: dict[str, Float[np.ndarray, ""]]
+    quantities: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def cases(self) -> list[Case]:
@@ -65,9 +67,9 @@ class RunSet(eqx.Module):
         """Histories of all runs, along a first axis, with other values at some addresses."""
 
         def single(case):
-            return simulate_histories(
-                self._case_with_values(case, values), self.times, self.plan, self.positions
-            )
+            varied = self._case_with_values(case, values)
+            wanted = self.times, self.plan, self.positions, self.quantities
+            return simulate_histories(varied, *wanted)
 
         return jax.vmap(single)(self.stacked)
 
@@ -105,15 +107,20 @@ class RunSet(eqx.Module):
 
 
 def make_run_set(
-    case: Case, runs: Sequence[AddressValues], positions=None, least_peaks: bool = False
+    case: Case,
+    runs: Sequence[AddressValues],
+    positions=None,
+    least_peaks: bool = False,
+    quantities: Sequence[str] = (),
 ) -> RunSet:
     """Run set of a case; the runs are simulated once without control.
 
     `positions` (m) are where deflections count, those of the sensors if left out. With
-    `least_peaks` the least achievable peak of each run is computed.
+    `least_peaks` the least achievable peak of each run is computed. `quantities` of sensors are
+    metrics.
 
     Raises ValueError for an unknown address, a faulty run or one that ends too early, and for a
-    case without a controller or without positions.
+    case without a controller, without positions, or without a sensor of one of the quantities.
     """
     if case.controller is None:
         raise ValueError("there is no controller to tune: give the case one")
@@ -122,15 +129,23 @@ def make_run_set(
     positions = jnp.asarray(positions, float).reshape(-1)
     if positions.size == 0:
         raise ValueError("there is no deflection to reduce: add a sensor, or give positions (m)")
+    for name in quantities:
+        if all(sensor.quantity != name for sensor in case.sensors):
+            raise ValueError(
+                f"the metric {name!r} is the largest {name} at the sensors that measure it, and no"
+                f' sensor does: add one with quantity = "{name}"'
+            )
     cases = run_cases(case, runs)
     times = sample_times(case)
     # Most of the time goes into compiling programs that do not depend on each other.
     with ThreadPoolExecutor(3) as pool:
         plan_future = pool.submit(_integration_plan, cases)
-        deflection_future = pool.submit(_uncontrolled_deflections, cases, times, positions)
+        wanted = times, positions, tuple(quantities)
+        uncontrolled_future = pool.submit(_uncontrolled_histories, cases, *wanted)
         least_future = pool.submit(_least_peaks, cases, positions) if least_peaks else None
     plan, error = plan_future.result()
-    deflection = deflection_future.result()
+    uncontrolled = uncontrolled_future.result()
+    deflection = uncontrolled.deflection
     varied = dict.fromkeys(a for run in runs for a in run if a.startswith(PLANT_PREFIXES))
     exit_times = np.array([crossing_times(own)[:, 1].max(initial=0.0) for own in cases])
     command_limits = [actuator.command_limits() for actuator in case.actuators]
@@ -145,12 +160,14 @@ def make_run_set(
             "peak": np.abs(deflection).max(axis=(1, 2)),
             "rms": np.sqrt((deflection**2).mean(axis=(1, 2))),
             "least": np.full(len(runs), np.nan) if least_future is None else least_future.result(),
+            **{name: np.abs(h).max(axis=(1, 2)) for name, h in uncontrolled.measured.items()},
         },
         after_exit=(np.asarray(times) > exit_times[:, None]).astype(float),
         command_ranges=np.array(
             [1.0 if pair is None else np.abs(pair).max() for pair in command_limits]
         ),
         nominal={address: np.asarray(value_at(case, address)) for address in varied},
+        quantities=tuple(quantities),
     )
 
 
@@ -164,20 +181,20 @@ def _integration_plan(cases: list[Case]) -> tuple[IntegrationPlan, float]:
     return dataclasses.replace(plan, error=0.0), plan.error
 
 
-def _uncontrolled_deflections(
-    cases: list[Case], times, positions
-) -> Float[np.ndarray, "run time position"]:
-    """Deflections (m) of runs without their controllers."""
+def _uncontrolled_histories(cases: list[Case], times, positions, quantities) -> Histories:
+    """Histories of runs without their controllers, along a first axis."""
     without_controller = [dataclasses.replace(case, controller=None) for case in cases]
     plan, _ = _integration_plan(without_controller)
-    return np.asarray(_deflections(stack_cases(without_controller), times, plan, positions))
+    stacked = stack_cases(without_controller)
+    return jax.tree.map(np.asarray, _histories(stacked, times, plan, positions, quantities))
 
 
 @compiled
-def _deflections(
-    stacked: Case, times, plan: IntegrationPlan, positions
-) -> Float[Array, "run time position"]:
-    return jax.vmap(lambda own: simulate_histories(own, times, plan, positions).deflection)(stacked)
+def _histories(
+    stacked: Case, times, plan: IntegrationPlan, positions, quantities: tuple[str, ...]
+) -> Histories:
+    wanted = times, plan, positions, quantities
+    return jax.vmap(lambda own: simulate_histories(own, *wanted))(stacked)
 
 
 def _least_peaks(cases: list[Case], positions) -> Float[np.ndarray, " run"]:

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -164,7 +165,9 @@ class TuningProblem:
         self.case, self.cases, self.objective = case, cases, objective
         self.positions, self.least_peaks, self.penalty = positions, least_peaks, penalty
         self.parameters = free_parameters([case], dict(free), 1.0)
-        self.run_set = make_run_set(case, cases.training, positions, least_peaks)
+        self.run_set = make_run_set(
+            case, cases.training, positions, least_peaks, objective.quantities
+        )
         self.violation = None
         if stable is not None:
             self.violation = stable.violation_of_runs(case, self.run_set)
@@ -196,7 +199,8 @@ class TuningProblem:
     @functools.cached_property
     def held_out_runs(self) -> RunSet:
         """Run set of the held-out cases, of which there must be some."""
-        return make_run_set(self.case, self.cases.held_out, self.positions, self.least_peaks)
+        settings = self.positions, self.least_peaks, self.objective.quantities
+        return make_run_set(self.case, self.cases.held_out, *settings)
 
     def tuning_result(
         self, optimisation: Optimisation, state: OptimisationState, objective: Objective
@@ -242,7 +246,7 @@ def _run_set_result(name, run_set: RunSet, objective, before, after) -> RunSetRe
     peaks = [_largest_deflections(run_set, records) for records in pairs]
     # Compiled programs must not depend on the names of the runs.
     unnamed = dataclasses.replace(run_set, runs=())
-    metrics = [_metrics_of(unnamed, _histories(records, run_set.positions)) for records in pairs]
+    metrics = [_metrics_of(unnamed, _histories(records, run_set)) for records in pairs]
     values = [objective.weighted_metrics(found) for found in metrics]
     metrics_before, metrics_after = (
         {name: float(objective.aggregate(part)) for name, part in found.items()}
@@ -262,10 +266,20 @@ def _run_set_result(name, run_set: RunSet, objective, before, after) -> RunSetRe
     )
 
 
-def _histories(records: list[Record], positions) -> Histories:
-    """Histories of all runs, along a first axis, at some positions (m)."""
-    parts = [(record.at(positions), record.command, record.contact_force) for record in records]
-    return Histories(*map(np.stack, zip(*parts, strict=True)))
+def _histories(records: list[Record], run_set: RunSet) -> Histories:
+    """Histories of all runs, along a first axis, at the positions of a run set."""
+    names = [sensor.quantity for sensor in records[0].case.sensors]
+    own = {name: [i for i, one in enumerate(names) if one == name] for name in run_set.quantities}
+    parts = [
+        Histories(
+            record.at(run_set.positions),
+            record.command,
+            record.contact_force,
+            {name: record.sensor_values[:, index] for name, index in own.items()},
+        )
+        for record in records
+    ]
+    return jax.tree.map(lambda *histories: np.stack(histories), *parts)
 
 
 def _largest_deflections(run_set: RunSet, records) -> Float[np.ndarray, " run"]:

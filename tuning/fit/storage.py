@@ -48,9 +48,6 @@ def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None
 
     Raises FileExistsError if the file exists and `overwrite` is not set.
     """
-    path = Path(path)
-    if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
     logs = fit.dataset.logs
     header = {
         "case": case_to_dict(fit.case),
@@ -68,7 +65,7 @@ def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None
         arrays |= {f"log{i}.{name}": getattr(log, name) for name in _LOG_ARRAYS}
     for i, found in enumerate(fit.minima):
         arrays |= {f"minimum{i}.values": found.values, f"minimum{i}.point": found.unbounded}
-    save(path, FORMAT, arrays | {"about": np.array(json.dumps(header))})
+    save(path, FORMAT, arrays | {"about": np.array(json.dumps(header))}, overwrite)
 
 
 def load_fit(path: str | os.PathLike) -> Fit:

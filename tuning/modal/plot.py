@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.plot.style import COLOURS, GREY, INK, use_style
+from jaxbeam.runtime.whole_file import whole_file
 from tuning.modal.shape_plot import draw_shapes
 
 FIT, MODE = COLOURS[:2]
@@ -36,7 +37,8 @@ def plot_modal_fit(fit, path: str | Path | None = None, length: float | None = N
         draw_shapes(rows[-1], fit, length)
     figure.suptitle(f"{Path(fit.log.source).name}: modes from {_kind_text(fit)}")
     if path is not None:
-        figure.savefig(path)
+        with whole_file(path, overwrite=True) as beside:
+            figure.savefig(beside)
     return figure
 
 

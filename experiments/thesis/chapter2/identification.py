@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 import tuning
 from experiments.thesis.cases import with_modes
-from experiments.thesis.chapter2 import published
-from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
+from experiments.thesis.verdicts import Experiment, ExperimentResult
 from jaxbeam.plot.style import colour, set_title, use_style
 
 LOGS = Path(__file__).parent / "logs"
@@ -24,11 +23,6 @@ HAND_FITTED = {
     "A": {DAMPING: 0.03, "actuators.0.stiffness": 3500.0, "actuators.0.damping": 80.0},
     "B": {DAMPING: 0.03, PATCH_FACTORS[0]: 0.32},
     "C": {PATCH_FACTORS[0]: 0.39, PATCH_FACTORS[1]: 0.68},
-}
-PUBLISHED = {
-    "A": published.SHAKER_HAND_FIT,
-    "B": published.PATCH_HAND_FIT,
-    "C": published.RAIL_HAND_FIT,
 }
 
 
@@ -45,16 +39,21 @@ def fit_rig(rig: str, load_rig) -> tuning.Fit:
 
 
 def run(load_rig) -> ExperimentResult:
-    """Fits of rigs A, B and C, with 95 % intervals as remarks."""
-    fits = {rig: fit_rig(rig, load_rig) for rig in HAND_FITTED}
-    findings = [make_finding(PUBLISHED[rig], fit.values) for rig, fit in fits.items()]
-    remarks = ["The measured logs are not available: these come from finite elements."]
+    """Fits of rigs A and B, with 95 % intervals as remarks; that of rig C takes a minute."""
+    fits = {rig: fit_rig(rig, load_rig) for rig in ("A", "B")}
+    remarks = [
+        "A test of the method, not of the thesis: the measured logs are not available, and these"
+        " were made by finite elements with the very numbers that the thesis fitted by hand."
+    ]
     for rig, fit in fits.items():
         for address, value, (low, high) in zip(
             fit.addresses, fit.values, fit.intervals, strict=True
         ):
-            remarks.append(f"rig {rig}, {address}: {value:.4g}, 95 % {low:.4g} to {high:.4g}")
-    return ExperimentResult(tuple(findings), {"logs": _draw(fits)}, tuple(remarks))
+            remarks.append(
+                f"rig {rig}, {address}: {value:.4g}, 95 % {low:.4g} to {high:.4g}; logs made with"
+                f" {HAND_FITTED[rig][address]:g}"
+            )
+    return ExperimentResult((), {"logs": _draw(fits)}, tuple(remarks))
 
 
 @use_style
@@ -72,13 +71,14 @@ def _draw(fits) -> Figure:
     figure.axes[0].set_ylabel("deflection (mm)")
     figure.axes[len(fits)].set_ylabel("residual (µm)")
     figure.axes[0].legend()
-    set_title(figure, "Logs of rigs A, B and C, and models identified from them")
+    set_title(figure, "Logs of rigs A and B, and models identified from them")
     return figure
 
 
 EXPERIMENT = Experiment(
     "identification",
     "hand fits of damping, shaker and patches: 2.1.2, 2.2.4, 2.4.2",
-    "Identification from logs of such rigs finds the numbers that the thesis fitted by hand.",
+    "Identification finds the numbers that logs of such rigs were made with; the thesis is not"
+    " tested by that.",
     run,
 )

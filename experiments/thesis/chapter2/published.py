@@ -1,14 +1,7 @@
 """Chapter 2: modes, critical speeds, moving force and mass, shaker, patches."""
 
-from experiments.thesis.tolerances import (
-    COMPUTED_CURVE,
-    EIGENVALUE_TABLE,
-    FORMULA,
-    HAND_FIT,
-    HZ,
-    SAME_MODEL,
-)
-from experiments.thesis.verdicts import PublishedNumbers, Tolerance
+from experiments.thesis.published_numbers import PublishedNumbers
+from experiments.thesis.tolerances import DIGITS, FORMULA, HZ
 
 MODE_LABELS = "1 2 3 4 5 6 7 8"
 
@@ -18,7 +11,7 @@ FREQUENCY_PARAMETERS = PublishedNumbers(
     "frequency parameters of two equal spans",
     "1",
     "computed",
-    EIGENVALUE_TABLE,
+    DIGITS,
     "3.1416 3.9266 6.2832 7.0686 9.4248 10.2102 12.5664 13.3518",
     MODE_LABELS,
 )
@@ -27,29 +20,35 @@ ANALYTICAL_FREQUENCIES = PublishedNumbers(
     "natural frequencies, analytical",
     HZ,
     "computed",
-    EIGENVALUE_TABLE,
+    FORMULA,
     "20.387 31.849 81.550 103.212 183.488 215.343 326.2 368.249",
     MODE_LABELS,
     "12.11 N m^2 and 0.5411 kg/m, as beside the table",
+    "Table 2.1, squared, times one factor",
+    "2 3 4 5 6 7 8",
 )
 APPROXIMATE_FREQUENCIES = PublishedNumbers(
     "Table 2.2",
     "natural frequencies, approximate",
     HZ,
     "computed",
-    EIGENVALUE_TABLE,
+    FORMULA,
     "20.387 31.951 81.550 104.304 183.487 220.577 326.198 100660",
     MODE_LABELS,
     "a rigid support as a spring in eight sine modes",
+    "the row above it",
+    "1 3 5 7",
 )
 FREQUENCY_ERRORS = PublishedNumbers(
     "Table 2.2",
     "error of the approximate frequencies",
     "%",
     "computed",
-    EIGENVALUE_TABLE,
+    DIGITS,
     "0.322 1.06 2.43 273240",
     "2 4 6 8",
+    repeats="the two rows above it, by division",
+    repeated_labels="2 4 6",
 )
 CRITICAL_SPEEDS = PublishedNumbers(
     "2.3",
@@ -59,16 +58,19 @@ CRITICAL_SPEEDS = PublishedNumbers(
     FORMULA,
     "24.03 48.95 38.24",
     "one-span two-spans,1st two-spans,2nd",
+    repeats="the first frequency of Table 2.2, times twice the span",
+    repeated_labels="two-spans,1st",
 )
 SPEED_RATIOS = PublishedNumbers(
     "2.3",
     "speed over critical speed",
     "1",
     "computed",
-    EIGENVALUE_TABLE,
+    DIGITS,
     "0.04 0.04 0.08",
     "0.9m/s,one-span 1.5m/s,two-spans 3m/s,two-spans",
     "v_cr2 for two spans",
+    "the critical speeds, by division",
 )
 ANGULAR_FREQUENCIES = PublishedNumbers(
     "2.3",
@@ -78,13 +80,14 @@ ANGULAR_FREQUENCIES = PublishedNumbers(
     FORMULA,
     "128 200.22",
     "1 2",
+    repeats="the critical speeds of two spans, by eqs (2.38) and (2.39)",
 )
 MASS_RATIO = PublishedNumbers(
     "Fig. 2.25",
     "mass over mass of the beam",
     "1",
     "computed",
-    EIGENVALUE_TABLE,
+    DIGITS,
     "0.81 1.56",
     "0.26kg 0.5kg",
 )
@@ -93,7 +96,7 @@ SHAKER_MODES = PublishedNumbers(
     "natural frequencies with the shaker",
     HZ,
     "computed",
-    SAME_MODEL,
+    DIGITS,
     "24 72 159",
     "1 2 3",
     "the stiffness of the shaker is not stated there; 3500 N/m as where it is active",
@@ -101,20 +104,17 @@ SHAKER_MODES = PublishedNumbers(
 
 # Patches and sections.
 PATCH_MOMENT = PublishedNumbers(
-    "2.4.2", "C0 of the patch, eq. (2.43)", "N m/V", "computed", FORMULA, "8.292e-4"
+    "2.4.2", "C0 of the patch, eq. (2.43)", "N m/V", "computed", DIGITS, "8.292e-4"
 )
 PATCH_SECTION = PublishedNumbers(
     "2.4.2",
-    "rigidity (N m^2) and mass per length (kg/m)",
-    "",
+    "rigidity of the beam with a patch",
+    "N m^2",
     "computed",
-    FORMULA,
-    "13.211 0.812",
-    "EI rhoA",
-    "h = 2.83 mm as printed beside it; 65 GPa, 2800 kg/m^3",
-)
-SHAKER_CUTOFF = PublishedNumbers(
-    "2.2.3", "cutoff of the first-order shaker", HZ, "computed", FORMULA, "1591.5"
+    DIGITS,
+    "13.211",
+    "",
+    "h = 2.83 mm as printed beside it; 65 GPa",
 )
 
 # Moving force and moving mass.
@@ -123,7 +123,7 @@ FREE_AMPLITUDE_RATIO = PublishedNumbers(
     "free amplitude, moving force over moving mass",
     "1",
     "computed",
-    COMPUTED_CURVE,
+    DIGITS,
     "3",
     "",
     "up to three times",
@@ -133,7 +133,7 @@ FREE_PHASE_DIFFERENCE = PublishedNumbers(
     "phase between both free vibrations",
     "degree",
     "computed",
-    COMPUTED_CURVE,
+    DIGITS,
     "180",
 )
 FORCE_MASS_DIFFERENCE = PublishedNumbers(
@@ -141,7 +141,7 @@ FORCE_MASS_DIFFERENCE = PublishedNumbers(
     "peaks of moving force and mass differ by",
     "mm",
     "computed",
-    Tolerance("a difference read off a curve, to one digit", digits=1),
+    DIGITS,
     "0.04",
     "",
     "the prescribed voltage is not printed",
@@ -151,7 +151,7 @@ ONE_SPAN_AMPLIFICATION = PublishedNumbers(
     "amplification at midspan of one span",
     "1",
     "computed",
-    COMPUTED_CURVE,
+    DIGITS,
     "1.6 2.0 2.2",
     "force,0.7 0.26kg,0.5 0.5kg,0.75",
     "at the speed ratio v / v_cr, without the shaker",
@@ -161,7 +161,7 @@ TWO_SPAN_AMPLIFICATION = PublishedNumbers(
     "amplification on two spans, moving mass of 0.261 kg",
     "1",
     "computed",
-    COMPUTED_CURVE,
+    DIGITS,
     "3.6 4.5 5",
     "1st-midspan,0.45 2nd-midspan,0.45 2nd-midspan,1.75",
     "at the speed ratio v / v_cr1",
@@ -171,7 +171,7 @@ YANG_AMPLIFICATION = PublishedNumbers(
     "amplification of a moving force, after Yang",
     "1",
     "computed",
-    COMPUTED_CURVE,
+    DIGITS,
     "1.5 3.25",
     "1st-midspan 2nd-midspan",
     "largest over the speed, undamped; first span as Yang's simply supported beam",
@@ -183,7 +183,7 @@ FORCE_DROPS = PublishedNumbers(
     "force drops of force per voltage",
     HZ,
     "computed",
-    COMPUTED_CURVE,
+    DIGITS,
     "21 84 189 340",
     "1 2 3 4",
 )
@@ -192,58 +192,27 @@ SHAKER_GAIN = PublishedNumbers(
     "force per voltage below 11 Hz and at its peak",
     "N/V",
     "computed",
-    COMPUTED_CURVE,
+    DIGITS,
     "2.5 10",
     "low peak",
 )
 SHAKER_PEAK_FREQUENCY = PublishedNumbers(
-    "Fig. 2.15", "the peak is at", HZ, "computed", COMPUTED_CURVE, "27"
+    "Fig. 2.15", "the peak is at", HZ, "computed", DIGITS, "27"
 )
 TRANSMITTED_PEAK_FREQUENCY = PublishedNumbers(
     "Fig. 2.18",
     "peak of the force on the beam per coil force",
     HZ,
     "computed",
-    COMPUTED_CURVE,
+    DIGITS,
     "27",
 )
 STATIONARY_MASS_DROP = PublishedNumbers(
-    "Fig. 2.16", "further force drop with 0.5 kg at 0.3 m", HZ, "computed", COMPUTED_CURVE, "13"
+    "Fig. 2.16", "further force drop with 0.5 kg at 0.3 m", HZ, "computed", DIGITS, "13"
 )
 STATIONARY_MASS_PEAK = PublishedNumbers(
-    "Fig. 2.16", "peak with 0.5 kg at 0.3 m", "N/V", "computed", COMPUTED_CURVE, "32.5"
+    "Fig. 2.16", "peak with 0.5 kg at 0.3 m", "N/V", "computed", DIGITS, "32.5"
 )
 STATIONARY_MASS_PEAK_FREQUENCY = PublishedNumbers(
-    "Fig. 2.16", "the peak with 0.5 kg at 0.3 m is at", HZ, "computed", COMPUTED_CURVE, "27"
-)
-
-# Fitted by hand.
-SHAKER_HAND_FIT = PublishedNumbers(
-    "2.1.2, 2.2.4",
-    "damping ratio, and stiffness (N/m) and damping (N s/m) of the active shaker, by hand",
-    "SI",
-    "measured",
-    HAND_FIT,
-    "0.03 3500 80",
-    "damping_ratio stiffness damping",
-)
-PATCH_HAND_FIT = PublishedNumbers(
-    "2.4.2",
-    "damping ratio, and correction factor of the patch on one span, by hand",
-    "1",
-    "measured",
-    HAND_FIT,
-    "0.03 0.32",
-    "damping_ratio c_p",
-    "the damping ratio is that of 2.1.2",
-)
-RAIL_HAND_FIT = PublishedNumbers(
-    "2.4.2",
-    "correction factors of patches on two spans, by hand",
-    "1",
-    "measured",
-    HAND_FIT,
-    "0.39 0.68",
-    "with_rail without",
-    "one patch of each kind, so that one log shows both",
+    "Fig. 2.16", "the peak with 0.5 kg at 0.3 m is at", HZ, "computed", DIGITS, "27"
 )

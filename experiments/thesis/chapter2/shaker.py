@@ -23,6 +23,8 @@ STATIONARY_MASS = ((0.3, 0.5),)  # m, kg: Fig. 2.16
 ALUMINIUM = {"width": 0.06, "height": 3.3e-3, "youngs_modulus": 70e9, "density": 2700.0}
 RIGID = {"flexural_rigidity": 1.022e5, "mass_per_length": 11.016}  # Fig. 2.20
 
+TEXTBOOK = "aluminium of 70 GPa, 2700 kg/m^3, 3.3 mm high"  # chosen for a force drop
+UNDAMPED = f"{TEXTBOOK}, without damping"
 MASS_IN_IMPEDANCE = "the mass in eq. (2.26), but not in (2.33)"
 
 
@@ -33,11 +35,7 @@ def run(load_rig) -> ExperimentResult:
         printed.length, damping_ratio=printed.damping_ratio, modes=4, **ALUMINIUM
     )
     undamped = dataclasses.replace(aluminium_beam, damping_ratio=0.0)
-    beams = {
-        LITERAL: printed,
-        "aluminium of 70 GPa, 2700 kg/m^3, 3.3 mm high": aluminium_beam,
-        "the same without damping": undamped,
-    }
+    beams = {LITERAL: printed, TEXTBOOK: aluminium_beam, UNDAMPED: undamped}
     free = {name: _features(_response(beam)) for name, beam in beams.items()}
     with_mass = {name: _features(_response(beam, STATIONARY_MASS)) for name, beam in beams.items()}
     with_mass[MASS_IN_IMPEDANCE] = _features(_mass_in_impedance_only(printed))
@@ -45,19 +43,45 @@ def run(load_rig) -> ExperimentResult:
         _mass_in_impedance_only(aluminium_beam)
     )
     transmitted = max(_peaks(_response(printed), 2), key=lambda pair: pair[1])
+    one_mode = dataclasses.replace(printed, modes=1)
+    null, null_with_mass = (_features(_response(one_mode, mass)) for mass in ((), STATIONARY_MASS))
+    null_transmitted = max(_peaks(_response(one_mode), 2), key=lambda pair: pair[1])
 
-    def by_beam(published_numbers, features, select):
+    def by_beam(published_numbers, features, null_features, select):
         values = {name: select(one) for name, one in features.items()}
-        return make_finding(published_numbers, values.pop(LITERAL), values)
+        first, drops_only = values.pop(LITERAL), published_numbers is published.FORCE_DROPS
+        return make_finding(
+            published_numbers,
+            first,
+            values,
+            null=("one mode", select(null_features)),
+            fitted=dict.fromkeys((TEXTBOOK, UNDAMPED), "2") if drops_only else None,
+        )
+
+    def drops(features):
+        return np.append(features["drops"], [np.nan] * 4)[:4]
 
     findings = (
-        by_beam(published.FORCE_DROPS, free, lambda one: one["drops"][:4]),
-        by_beam(published.SHAKER_GAIN, free, lambda one: [one["low"], one["peak"][1]]),
-        by_beam(published.SHAKER_PEAK_FREQUENCY, free, lambda one: one["peak"][0]),
-        make_finding(published.TRANSMITTED_PEAK_FREQUENCY, transmitted[0]),
-        by_beam(published.STATIONARY_MASS_DROP, with_mass, lambda one: one["drops"][0]),
-        by_beam(published.STATIONARY_MASS_PEAK_FREQUENCY, with_mass, lambda one: one["peak"][0]),
-        by_beam(published.STATIONARY_MASS_PEAK, with_mass, lambda one: one["peak"][1]),
+        by_beam(published.FORCE_DROPS, free, null, drops),
+        by_beam(published.SHAKER_GAIN, free, null, lambda one: [one["low"], one["peak"][1]]),
+        by_beam(published.SHAKER_PEAK_FREQUENCY, free, null, lambda one: one["peak"][0]),
+        make_finding(
+            published.TRANSMITTED_PEAK_FREQUENCY,
+            transmitted[0],
+            null=("one mode", null_transmitted[0]),
+        ),
+        by_beam(
+            published.STATIONARY_MASS_DROP, with_mass, null_with_mass, lambda one: one["drops"][0]
+        ),
+        by_beam(
+            published.STATIONARY_MASS_PEAK_FREQUENCY,
+            with_mass,
+            null_with_mass,
+            lambda one: one["peak"][0],
+        ),
+        by_beam(
+            published.STATIONARY_MASS_PEAK, with_mass, null_with_mass, lambda one: one["peak"][1]
+        ),
     )
     stiff = dataclasses.replace(printed, **{key: np.asarray(value) for key, value in RIGID.items()})
     return ExperimentResult(findings, {"responses": _draw(printed, stiff)})

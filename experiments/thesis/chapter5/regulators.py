@@ -41,10 +41,11 @@ class RegulatorInterpretation(NamedTuple):
 
 
 WEAK_SHAKER = "2.5 N/V reach the beam"
+OTHER_WEIGHT = "R = 5e-4, 3500 N/m, all states"
 INTERPRETATIONS = {
     LITERAL: RegulatorInterpretation(4.6, COMMAND_WEIGHT, 12000.0, PRINTED_STATES),
     WEAK_SHAKER: RegulatorInterpretation(2.5, COMMAND_WEIGHT, 12000.0, PRINTED_STATES),
-    "R = 5e-4, 3500 N/m, all states": RegulatorInterpretation(4.6, 5e-4, 3500.0, ALL_STATES),
+    OTHER_WEIGHT: RegulatorInterpretation(4.6, 5e-4, 3500.0, ALL_STATES),
 }
 FULL_SHAKER = "full model of the shaker, Table 2.3"
 REFITTED_SHAKER = "full model, 12000 N/m and 80 N s/m with its back-EMF"

@@ -14,20 +14,22 @@ import jaxbeam as jb
 from experiments.thesis.cases import reduction
 from experiments.thesis.chapter6 import published
 from experiments.thesis.chapter6.filter_oscillation import (
-    gain_margin_finding,
+    fitted_correction,
     oscillation_findings,
 )
 from experiments.thesis.chapter6.gain_scheduling import (
     HIGHER_GAINS,
     derived_schedules,
-    static_schedule_remark,
+    schedule_findings,
     switching_masses,
 )
 from experiments.thesis.chapter6.patch_rigs import (
+    GAIN,
     MASSES,
     ONE_SPAN_CUTOFF,
     TWO_SPAN_CUTOFF,
     simulate_changes,
+    static_extremes,
     with_feedback,
 )
 from experiments.thesis.figures import plot_commands, plot_deflections
@@ -35,9 +37,8 @@ from experiments.thesis.verdicts import Experiment, ExperimentResult, Finding, m
 from jaxbeam.plot.style import colour, set_title, use_style
 
 LAWS = {"no control": 0, "linear": 1, "cubic": 3}  # and their powers
-# c_p as in 2.4.2, that of two spans, and one that fits Fig. 6.7
-CORRECTION_FACTORS = (0.32, 0.39, 0.5)
-HEADWAYS = (0.3, 0.6, 0.9, 1.2, 1.5)  # s between two masses
+CORRECTION_FACTORS = (0.32, 0.39)  # c_p as in 2.4.2, and that of two spans
+HEADWAYS = (0.3, 0.9, 1.5)  # s between two masses
 # s and 1: not printed in section 6.2, and possible explanations of the instability
 EXTRA_DELAY, LOW_DAMPING_RATIO = 0.03, 0.01
 
@@ -68,25 +69,35 @@ def _two_spans(case: jb.Case):
     (free, linear, cubic), rise = np.moveaxis(down, 2, 1), up[..., 1]
     amplifier = float(case.actuators[0].amplifier_gain)
     volts = [amplifier * float(records[2][i].command[:, j].max()) for i, j in ((0, 0), (3, 1))]
+    static_down, static_up = static_extremes(case)
+    static = 1e3 * np.outer(static_down, MASSES)  # mm, (sensor, mass)
+    static_rise = 1e3 * static_up[1] * np.array(MASSES)
+    static_volts = [amplifier * GAIN * static[j, i] ** 3 for i, j in ((0, 0), (3, 1))]
+    at_rest_s1, at_rest_s3 = (("static, no control", row) for row in static)
+    no_control = "no control", 0.0
     table = (
-        (published.FREE_S1, free[0]),
-        (published.CUBIC_S1, cubic[0]),
-        (published.CUBIC_REDUCTION_S1, reduction(free, cubic)[0]),
-        (published.LINEAR_S1, linear[0]),
-        (published.LINEAR_REDUCTION_S1, reduction(free, linear)[0]),
-        (published.FREE_S3, free[1]),
-        (published.FREE_S3_COMPUTED, free[1]),
-        (published.CUBIC_S3, cubic[1]),
-        (published.CUBIC_REDUCTION_S3, reduction(free, cubic)[1]),
-        (published.LINEAR_S3, linear[1]),
-        (published.LINEAR_REDUCTION_S3, reduction(free, linear)[1]),
-        (published.FREE_UP, rise[0]),
-        (published.CUBIC_UP, rise[2]),
-        (published.CUBIC_REDUCTION_UP, reduction(rise[0], rise[2])),
-        (published.FEEDBACK_VOLTAGE, volts),
-        (published.SUMMARY_TWO, [reduction(free, law)[0, -1] for law in (linear, cubic)]),
+        (published.FREE_S1, free[0], at_rest_s1),
+        (published.CUBIC_S1, cubic[0], at_rest_s1),
+        (published.CUBIC_REDUCTION_S1, reduction(free, cubic)[0], no_control),
+        (published.LINEAR_S1, linear[0], at_rest_s1),
+        (published.LINEAR_REDUCTION_S1, reduction(free, linear)[0], no_control),
+        (published.FREE_S3, free[1], at_rest_s3),
+        (published.FREE_S3_COMPUTED, free[1], at_rest_s3),
+        (published.CUBIC_S3, cubic[1], at_rest_s3),
+        (published.CUBIC_REDUCTION_S3, reduction(free, cubic)[1], no_control),
+        (published.LINEAR_S3, linear[1], at_rest_s3),
+        (published.LINEAR_REDUCTION_S3, reduction(free, linear)[1], no_control),
+        (published.FREE_UP, rise[0], ("static, no control", static_rise)),
+        (published.CUBIC_UP, rise[2], ("static, no control", static_rise)),
+        (published.CUBIC_REDUCTION_UP, reduction(rise[0], rise[2]), no_control),
+        (published.FEEDBACK_VOLTAGE, volts, ("cube of the static deflection", static_volts)),
+        (
+            published.SUMMARY_TWO,
+            [reduction(free, law)[0, -1] for law in (linear, cubic)],
+            no_control,
+        ),
     )
-    findings = [make_finding(numbers, values) for numbers, values in table]
+    findings = [make_finding(numbers, values, null=null) for numbers, values, null in table]
     findings += [_two_mass_finding(case), _unstable_mass_finding(case)]
     heaviest = {name: row[-1] for name, row in zip(LAWS, records, strict=True)}
     return findings, {"two-spans": _draw(heaviest, "Two spans, 0.509 kg (Figs 6.8, 6.9)")}
@@ -102,30 +113,36 @@ def _unstable_mass_finding(case: jb.Case) -> Finding:
         for damped, damping in dampings.items()
     }
     (_, literal), *others = lightest.items()
-    return make_finding(published.UNSTABLE_MASS, literal, dict(others))
+    fitted = {name: "lightest" for name, _ in others}
+    null = "no control, stable", np.nan
+    return make_finding(published.UNSTABLE_MASS, literal, dict(others), null=null, fitted=fitted)
 
 
 def _lightest_unstable(case: jb.Case, delay: float | None, damping: float) -> float:
     """The lightest mass (kg) with which the cubic law of k = 3 is unstable, or NaN.
 
-    A loop counts as unstable if its commands grow until the actuators' limits hold them.
+    A loop counts as unstable if its commands grow until the actuators' limits hold them. Masses
+    below one that is stable are not tried: the cubic law acts less on them.
     """
-    changes = [{"loads.0.mass": mass, "beam.damping_ratio": damping} for mass in MASSES]
-    records = simulate_changes(with_feedback(case, 3, TWO_SPAN_CUTOFF, 3.0, delay), changes)
-    saturated = [bool(np.any(record.saturated)) for record in records]
-    return MASSES[saturated.index(True)] if any(saturated) else np.nan
+    loop = with_feedback(case, 3, TWO_SPAN_CUTOFF, 3.0, delay)
+    unstable = np.nan
+    for mass in reversed(MASSES):
+        change = {"loads.0.mass": mass, "beam.damping_ratio": damping}
+        (record,) = simulate_changes(loop, [change])
+        if not np.any(record.saturated):
+            break
+        unstable = mass
+    return unstable
 
 
 def _two_mass_finding(case: jb.Case) -> Finding:
-    """Reduction for two masses: inconsistent if it depends on their headway, which is unknown."""
+    """Reduction for two masses, which depends on their headway; that is not printed."""
     reductions = _two_mass_reductions(case)
-    lowest, highest = min(reductions), max(reductions)
-    inside = lowest <= published.TWO_MASSES.numbers[0] <= highest
-    inconsistency = (
+    remark = (
         f"the gap between the masses is not printed; gaps of {HEADWAYS[0]:g} to"
-        f" {HEADWAYS[-1]:g} s give {lowest:.1f} to {highest:.1f} %"
+        f" {HEADWAYS[-1]:g} s give {min(reductions):.1f} to {max(reductions):.1f} %"
     )
-    return make_finding(published.TWO_MASSES, np.nan, inconsistency=inconsistency if inside else "")
+    return make_finding(published.TWO_MASSES, np.nan, null=("no control", 0.0), remark=remark)
 
 
 def _two_mass_reductions(case: jb.Case) -> list[float]:
@@ -150,9 +167,10 @@ def _two_mass_reductions(case: jb.Case) -> list[float]:
 
 def _one_span(case: jb.Case):
     """Findings, figures and remarks of rig B."""
+    corrections = (*CORRECTION_FACTORS, fitted_correction(case))
     changes = [
         {"loads.0.mass": mass, "actuators.0.correction": correction}
-        for correction in CORRECTION_FACTORS
+        for correction in corrections
         for mass in MASSES
     ]
     records = [
@@ -160,7 +178,7 @@ def _one_span(case: jb.Case):
         for power in LAWS.values()
     ]
     peaks = [[float(one.peak_deflection[0]) for one in row] for row in records]
-    shape = len(CORRECTION_FACTORS), len(MASSES)
+    shape = len(corrections), len(MASSES)
     linear, cubic = (reduction(peaks[0], row).reshape(shape) for row in peaks[1:])
     higher_gain_peaks = []
     for gain in HIGHER_GAINS:
@@ -172,27 +190,29 @@ def _one_span(case: jb.Case):
     switches, last = switching_masses(
         MASSES, np.reshape(peaks, (3, *shape)), np.array(higher_gain_peaks)
     )
-    labels = [f"c_p {correction:g}" for correction in CORRECTION_FACTORS]
+    labels = [f"c_p {correction:.3g}" for correction in corrections]
 
     def by_correction(numbers, values):
-        return make_finding(numbers, values[0], dict(zip(labels[1:], values[1:], strict=True)))
+        others = dict(zip(labels[1:], values[1:], strict=True))
+        return make_finding(numbers, values[0], others, null=("no control", 0.0))
 
     def of_each(select):
         """Values of the linear and of the cubic law for each correction factor."""
         return [[select(a), select(b)] for a, b in zip(linear, cubic, strict=True)]
 
+    frequency = jb.modes(case).frequencies[0]
     findings = [
         by_correction(published.ONE_SPAN_LINEAR, [[v.min(), v.max()] for v in linear]),
         by_correction(published.ONE_SPAN_CUBIC, [[v.min(), v.max()] for v in cubic]),
         by_correction(published.SUMMARY_ONE, of_each(lambda row: row[-1])),
-        by_correction(published.SWITCHING_MASSES, switches),
-        by_correction(published.EQUIVALENT_LINEAR_GAIN, last),
         by_correction(published.LIGHTEST_MASS_REDUCTION, of_each(lambda row: row[0])),
-        make_finding(published.FREE_VIBRATION_FREQUENCY, jb.modes(case).frequencies[0]),
-        gain_margin_finding(case, CORRECTION_FACTORS),
+        *schedule_findings(case, corrections, switches, last),
+        make_finding(published.FREE_VIBRATION_FREQUENCY, frequency, null=("one mode", frequency)),
     ]
     oscillating, filters = oscillation_findings(with_feedback(case, 3, ONE_SPAN_CUTOFF))
-    schedule, remark = derived_schedules(with_feedback(case, 1, ONE_SPAN_CUTOFF), MASSES)
+    schedule, remark = derived_schedules(
+        with_feedback(case, 1, ONE_SPAN_CUTOFF), MASSES[:: len(MASSES) - 1]
+    )
     heaviest = {name: row[len(MASSES) - 1] for name, row in zip(LAWS, records, strict=True)}
     figures = {
         "one-span": _draw(heaviest, "One span, 0.509 kg (Figs 6.3, 6.5)"),
@@ -200,7 +220,7 @@ def _one_span(case: jb.Case):
         "reductions": _draw_reductions(linear[0], cubic[0]),
         "schedule": schedule,
     }
-    return [*findings, *oscillating], figures, (static_schedule_remark(case, MASSES[-1]), remark)
+    return [*findings, *oscillating], figures, (remark,)
 
 
 @use_style

@@ -13,7 +13,15 @@ from matplotlib.figure import Figure
 
 import jaxbeam as jb
 from experiments.thesis.cases import reduction
-from experiments.thesis.chapter6.patch_rigs import GAIN, simulate_changes
+from experiments.thesis.chapter6 import published
+from experiments.thesis.chapter6.filter_oscillation import gain_margin
+from experiments.thesis.chapter6.patch_rigs import (
+    GAIN,
+    MASSES,
+    simulate_changes,
+    static_extremes,
+)
+from experiments.thesis.verdicts import Finding, make_finding
 from jaxbeam.analysis.crossing_margin import stability_margin
 from jaxbeam.analysis.derived_gains import (
     BestGain,
@@ -26,7 +34,6 @@ from jaxbeam.plot.style import colour, set_title, use_style
 
 HIGHER_GAINS = (3.0, 4.5)  # V/mm, of the scheduled linear law
 MAX_GAIN = 24.0  # V/mm, the largest gain tried
-LIKELY_CORRECTION = 0.5  # c_p that fits Fig. 6.7
 MASS_GRID = np.linspace(0.2, 0.6, 81)  # kg
 
 
@@ -47,17 +54,48 @@ def switching_masses(
     return switches, equal
 
 
-def static_schedule_remark(case: jb.Case, heaviest: float) -> str:
-    """Switching masses and the equal gain from static deflections alone, as a sentence."""
-    likely = jb.replace(case, {"actuators.0.correction": LIKELY_CORRECTION})
-    gains = equivalent_gains(likely, MASS_GRID, GAIN * 1e9)[0] / 1e3
+def static_schedule(case: jb.Case, heaviest: float, correction: float) -> tuple[float, ...]:
+    """Switching masses (kg) and the equal gain (V/mm) from static deflections alone, for a c_p."""
+    case = jb.replace(case, {"actuators.0.correction": correction})
+    gains = equivalent_gains(case, MASS_GRID, GAIN * 1e9)[0] / 1e3
     light, middle = np.interp([GAIN, HIGHER_GAINS[0]], gains, MASS_GRID)
-    last = np.interp(heaviest, MASS_GRID, gains)
-    return (
-        f"Fig. 6.7 by statics alone, c_p {LIKELY_CORRECTION:g}: the cubic law beats the linear one"
-        f" from {light:.3f} kg on, k = {HIGHER_GAINS[0]:g} from {middle:.3f} kg on; for"
-        f" {heaviest:g} kg it equals a linear gain of {last:.2f} V/mm."
+    return float(light), float(middle), float(np.interp(heaviest, MASS_GRID, gains))
+
+
+def uncontrolled_schedule(case: jb.Case, heaviest: float) -> tuple[float, ...]:
+    """The same by the static deflection without control: k = 2 w^2, w in mm."""
+    deflection = 1e3 * float(static_extremes(case)[0][0])  # mm/kg
+    masses = np.sqrt(np.array([GAIN, HIGHER_GAINS[0]]) / GAIN) / deflection
+    return float(masses[0]), float(masses[1]), GAIN * (deflection * heaviest) ** 2
+
+
+def schedule_findings(case: jb.Case, corrections, switches, equal_gains) -> list[Finding]:
+    """The scheduled gains of Fig. 6.7 and the gain margin, by c_p, by crossings and by statics.
+
+    The last of `corrections` is fitted to the margin. `switches` (kg) and `equal_gains` (V/mm) are
+    those of crossings, by c_p.
+    """
+    by_statics = f"c_p {corrections[-1]:.3g}, by statics"
+    light, middle, last = static_schedule(case, MASSES[-1], corrections[-1])
+    null_light, null_middle, null_last = uncontrolled_schedule(case, MASSES[-1])
+    names = [f"c_p {correction:.3g}, by crossings" for correction in corrections]
+    margins = [gain_margin(case, correction) for correction in corrections]
+    fitted = {names[-1]: "margin", by_statics: "margin"}
+    rows = (
+        (published.SWITCHING_MASSES, switches, [light, middle], [null_light, null_middle]),
+        (published.EQUIVALENT_LINEAR_GAIN, equal_gains, last, null_last),
+        (published.GAIN_MARGIN, margins, margins[-1], np.nan),
     )
+    return [
+        make_finding(
+            numbers,
+            values[0],
+            dict(zip(names[1:], values[1:], strict=True)) | {by_statics: static},
+            null=("static, without control", null),
+            fitted=fitted if numbers is published.GAIN_MARGIN else None,
+        )
+        for numbers, values, static, null in rows
+    ]
 
 
 def derived_schedules(case: jb.Case, masses: Sequence[float]) -> tuple[Figure, str]:

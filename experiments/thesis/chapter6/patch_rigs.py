@@ -5,8 +5,16 @@ import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 import jaxbeam as jb
-from jaxbeam.simulation.integration_plan import integration_plan
+from jaxbeam.simulation.closed_loop import loop_schedule
+from jaxbeam.simulation.integration_plan import (
+    IntegrationPlan,
+    integration_plan,
+    sample_times,
+    static_shapes,
+)
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 MASSES = (0.261, 0.322, 0.371, 0.509)  # kg
@@ -32,10 +40,32 @@ def with_feedback(
 
 
 def simulate_changes(case: jb.Case, changes: Sequence[Mapping[str, Any]]) -> list[jb.Record]:
-    """Records of a case with several changes of its numbers, by one integration plan."""
+    """Records of a case with several changes of its numbers, by one integration plan.
+
+    A sampled loop takes one step in each of its periods: that meets TOLERANCE, as its search finds.
+    """
     cases = [jb.replace(case, change) for change in changes]
-    plan = integration_plan(cases[-1], None, TOLERANCE)
+    last = cases[-1]
+    if last.controller is None:
+        plan = integration_plan(last, None, TOLERANCE)
+    else:
+        schedule = loop_schedule(last, sample_times(last), float(last.run.duration))
+        plan = IntegrationPlan(static_shapes(last), 1, 0, False, TOLERANCE, schedule, True)
     with warnings.catch_warnings():
         # With too high gains the contact force becomes negative; the peaks show it.
         warnings.simplefilter("ignore", ContactLossWarning)
         return [jb.simulate(one, plan=plan) for one in cases]
+
+
+def static_extremes(case: jb.Case) -> tuple[np.ndarray, np.ndarray]:
+    """Largest static deflections down and up (m/kg), (sensor,), as a weight crosses the beam."""
+    model = jb.modes(case)
+    shapes_at_sensors, shapes = (
+        np.asarray(model.shapes(positions, 0))
+        for positions in (
+            np.array([float(sensor.position) for sensor in case.sensors]),
+            np.linspace(0.0, float(case.beam.length), 601),
+        )
+    )
+    lines = float(case.run.gravity) * shapes_at_sensors / np.asarray(model.stiffness) @ shapes.T
+    return lines.max(axis=1), -lines.min(axis=1)

@@ -1,7 +1,11 @@
 """Chapter 7: model predictive control of one and two spans with patches."""
 
-from experiments.thesis.tolerances import COMPUTED_REDUCTION, SAMPLE_INSTANT, YES_OR_NO
-from experiments.thesis.verdicts import PublishedNumbers
+from experiments.thesis.published_numbers import PublishedNumbers
+from experiments.thesis.tolerances import (
+    DIGITS,
+    SAMPLE_INSTANT,
+    YES_OR_NO,
+)
 
 # Model predictive control, 0.509 kg at 1 m/s.
 ONE_SPAN_REDUCTION = PublishedNumbers(
@@ -9,7 +13,7 @@ ONE_SPAN_REDUCTION = PublishedNumbers(
     "one span, reduction by predictive control",
     "%",
     "computed",
-    COMPUTED_REDUCTION,
+    DIGITS,
     "22",
 )
 ONE_SPAN_SATURATION = PublishedNumbers(
@@ -26,7 +30,7 @@ TWO_SPAN_REDUCTION = PublishedNumbers(
     "two spans, reduction by predictive control",
     "%",
     "computed",
-    COMPUTED_REDUCTION,
+    DIGITS,
     "29 46 19",
     "s1,1st-half s2,1st-half s2,2nd-half",
     "r_w as for one span",
@@ -54,7 +58,7 @@ SECOND_HALF_REDUCTION = PublishedNumbers(
     "two spans, s1, reduction in the second half",
     "%",
     "computed",
-    COMPUTED_REDUCTION,
+    DIGITS,
     "64 54",
     "Np=4,Nc=3 Np=6,Nc=4",
 )

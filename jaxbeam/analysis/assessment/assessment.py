@@ -2,10 +2,10 @@
 
 import dataclasses
 import os
-from pathlib import Path
 from typing import Any
 
 from jaxbeam.files.report import text_table
+from jaxbeam.runtime.whole_file import whole_file
 
 SATISFIED, NOT_SATISFIED, INFORMATION = "satisfied", "not satisfied", "information"
 REQUIRED, NOT_REQUIRED = "required", "not required"
@@ -125,10 +125,8 @@ class Assessment:
 
     def save(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write the report as Markdown. Raises FileExistsError unless `overwrite`."""
-        path = Path(path)
-        if path.exists() and not overwrite:
-            raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
-        path.write_text(self.to_markdown(), encoding="utf-8")
+        with whole_file(path, overwrite) as beside:
+            beside.write_text(self.to_markdown(), encoding="utf-8")
 
 
 HEADER = ["check", "value", "limit", "unit", "outcome", "clause"]

@@ -12,7 +12,8 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.axles import Axles
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.modes import modes
-from jaxbeam.sweeps.sweep import sweep
+from jaxbeam.sweeps.computation import peaks_in_memory
+from jaxbeam.sweeps.specification import sweep_specification
 from jaxbeam.vehicles.trains import trains as library
 
 # Ratio of speeds: N axles at a spacing build up resonance of order i over a share 2 / (N i) of the
@@ -55,7 +56,8 @@ def train_response(
 
     def peaks_at(speeds) -> Float[np.ndarray, "speed sensor"]:
         over = {"loads.0.speed": speeds, "run.duration": way / speeds + free}
-        found = sweep(loaded, over, paired=True, progress=False, tolerance=TOLERANCE)
+        plan = sweep_specification(loaded, over, True, False, TOLERANCE, "double")
+        found = peaks_in_memory(plan)
         columns = [found[f"peak_{s.quantity}"].to_numpy()[:, i] for i, s in enumerate(sensors)]
         return np.stack(columns, axis=-1)
 

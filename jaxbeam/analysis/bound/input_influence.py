@@ -132,7 +132,7 @@ def input_influence(
         axis=-1,
     )
     response = coordinates[..., 2 : count * actuators + 2]
-    if case.profile is not None:
+    if load_set(case).profile is not None:
         response = response - coordinates[..., 1:2]
     return InputInfluence(
         _deflection_rows(uncontrolled_case, shapes, positions),
@@ -158,7 +158,7 @@ def _unit_responses(
     actuator_index,
 ):
     """Modal coordinates (time, mode, batch): under weights for hold -1, else a unit command."""
-    model, case_loads = modal_model(case, shapes.layout), load_set(case)
+    model, case_loads = modal_model(case, shapes.layout), load_set(case, shapes.layout)
     size = (case_loads.wheel_count, hold_index.shape[0])
     wheels = jax.tree.map(
         lambda part: xp.broadcast_to(part, (*part.shape[:-1], size[1])), case_loads.wheels

@@ -4,7 +4,11 @@ import numpy as np
 
 from jaxbeam.c_code.source import CSource, interpolation_operations
 from jaxbeam.c_code.writers import write_law
-from jaxbeam.control.feedforward import FeedforwardLaw
+from jaxbeam.control.feedforward import (
+    CONFIRMATION_SHARE,
+    ConfirmedFeedforwardLaw,
+    FeedforwardLaw,
+)
 from jaxbeam.control.prescribed import Prescribed
 
 
@@ -42,12 +46,41 @@ for (i = 0; i < {actuators}; i++) {{
 
 @write_law.register
 def _(law: FeedforwardLaw, code: CSource) -> None:
+    _write_feedforward(law, code)
+
+
+@write_law.register
+def _(law: ConfirmedFeedforwardLaw, code: CSource) -> None:
+    never = np.full(len(law.gate_times), -1e30)
+    states = code.state("confirmed", never, "second gate's times (s) of loads that a sensor showed")
+    shown = " || ".join(
+        f"{code.readings}[{i}] <= (real)-{float(law.confirmation)!r}" for i in law.sensors
+    )
+    limit = CONFIRMATION_SHARE * float(law.length)
+    _write_feedforward(
+        law,
+        code,
+        f"""
+    if (({shown})
+        && {{distance}} + (t - second) * fabs(speed) <= (real){limit!r})
+        {states}[j] = second;
+    if ({states}[j] < second) continue;""",
+        len(law.sensors) + 7,
+    )
+
+
+def _write_feedforward(
+    law: FeedforwardLaw, code: CSource, check: str = "", operations: int = 0
+) -> None:
+    """Commands over the position of each load; `check`, of some operations, may leave one out."""
     actuators, points = np.shape(law.values)
     shares, values = code.constant("shares", law.shares), code.constant("values", law.values)
     near, far = (float(position) for position in law.gates)
     times = code.gates(np.asarray(law.gate_times))
     loads, length = code.gate_loads, float(law.length)
     table = f"{shares}, {values} + {points} * i, {points}"
+    distance = f"(speed < 0 ? (real){length - far!r} : (real){far!r})"
+    check = check.replace("{distance}", distance)
     code.add(
         f"""
 /* Commands over the position of each load, which keeps its speed between the gates */
@@ -56,11 +89,11 @@ for (j = 0; j < {loads}; j++) {{
     const real first = {times}[2 * j], second = {times}[2 * j + 1];
     real speed, share;
     if (t < second) continue;
-    speed = (real){far - near!r} / (second - first);
-    share = ((speed < 0 ? (real){length - far!r} : (real){far!r})
+    speed = (real){far - near!r} / (second - first);{check}
+    share = ({distance}
              + (t + (real){float(law.lead)!r} - second) * fabs(speed)) / (real){length!r};
     for (i = 0; i < {actuators}; i++)
         {code.output}[i] += interpolate_inside(share, {table});
 }}""",
-        loads * (10 + actuators * (interpolation_operations(points) + 1)),
+        loads * (10 + operations + actuators * (interpolation_operations(points) + 1)),
     )

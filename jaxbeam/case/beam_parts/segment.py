@@ -4,7 +4,7 @@ import equinox as eqx
 from jaxtyping import Float
 
 from jaxbeam.case.display.parts import ReprWithUnits
-from jaxbeam.case.fields import POSITIVE, number
+from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, number
 from jaxbeam.runtime.arrays import Array
 
 
@@ -38,4 +38,7 @@ class Segment(ReprWithUnits, eqx.Module):
     )
     foundation_stiffness: Float[Array, " *power"] | None = number(
         "N/m^2", "elastic foundation, force per length and deflection", default=None
+    )
+    loss_factor: Float[Array, ""] | None = number(
+        "1", "loss factor of its material", NOT_NEGATIVE, default=None
     )

@@ -1,6 +1,8 @@
 """Parts of a case as text: numbers with their units, what is left out omitted."""
 
 import dataclasses
+from collections.abc import Iterable, Sequence
+from html import escape
 from typing import Any
 
 import jax
@@ -17,32 +19,66 @@ class ReprWithUnits:
     """
 
     def __repr__(self) -> str:
-        entries = [
-            f"{field.name}={_entry(value, field.metadata.get('unit', ''))}"
-            for field in dataclasses.fields(self)  # type: ignore[arg-type]
-            if not _is_default(value := getattr(self, field.name), field)
-        ]
+        entries = [f"{name}={value}" for name, value in part_entries(self)]
         return f"{type(self).__name__}({', '.join(entries)})"
+
+
+def part_entries(part: Any) -> list[tuple[str, str]]:
+    """Names of the entries of a part that are not left out, and their values with units."""
+    return [
+        (field.name, _entry(value, field.metadata.get("unit", "")))
+        for field in dataclasses.fields(part)
+        if not _is_default(value := getattr(part, field.name), field)
+    ]
 
 
 def case_text(case: Any) -> str:
     """Text of a case: its title, and each part in a line with its address."""
-    lines = []
-    for field in dataclasses.fields(case):
-        value = getattr(case, field.name)
-        if isinstance(value, tuple):
-            lines += _part_lines(field.name, value)
-        elif field.name != "title" and value is not None:
-            lines.append(f"{field.name}: {value!r}")
     head = f"Case {case.title!r}" if case.title else "Case"
+    lines = [address if part is None else f"{address}: {part!r}" for address, part in _parts(case)]
     return "\n  ".join([head, *lines])
 
 
-def _part_lines(key: str, values: tuple) -> list[str]:
-    lines = [f"{key}.{i}: {value!r}" for i, value in enumerate(values)]
-    if len(lines) <= MAX_PARTS:
-        return lines
-    return [*lines[:3], f"... {len(lines) - 4} more {key} ...", lines[-1]]
+def case_html(case: Any) -> str:
+    """A case as a table in HTML: address, class and entries of each part, as in `case_text`."""
+    rows = []
+    for address, part in _parts(case):
+        if part is None:
+            rows.append((address, "", ""))
+        elif isinstance(part, ReprWithUnits):
+            entries = ", ".join(f"{name} = {value}" for name, value in part_entries(part))
+            rows.append((address, type(part).__name__, entries))
+        else:
+            rows.append((address, type(part).__name__, repr(part)))
+    return html_table(case.title or "Case", ("address", "part", "entries"), rows)
+
+
+def html_table(caption: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in HTML, its texts escaped, flush left."""
+
+    def row(tag, cells):
+        texts = (f'<{tag} style="text-align: left">{escape(cell)}</{tag}>' for cell in cells)
+        return f"<tr>{''.join(texts)}</tr>"
+
+    body = "".join(row("td", cells) for cells in rows)
+    head = f'<caption style="text-align: left"><b>{escape(caption)}</b></caption>'
+    return f"<table>{head}<thead>{row('th', header)}</thead><tbody>{body}</tbody></table>"
+
+
+def _parts(case: Any) -> list[tuple[str, Any]]:
+    """Addresses and parts of a case; of a long row of loads, say, the number left out and None."""
+    found = []
+    for field in dataclasses.fields(case):
+        value = getattr(case, field.name)
+        if isinstance(value, tuple):
+            listed = [(f"{field.name}.{i}", part) for i, part in enumerate(value)]
+            if len(listed) > MAX_PARTS:
+                left_out = f"... {len(listed) - 4} more {field.name} ..."
+                listed = [*listed[:3], (left_out, None), listed[-1]]
+            found += listed
+        elif field.name != "title" and value is not None:
+            found.append((field.name, value))
+    return found
 
 
 def _is_default(value: Any, field: dataclasses.Field) -> bool:

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 GRAVITY = 9.81  # m/s^2, of vehicles without a case
 FAST = 5.0  # m/s, from where speeds are in km/h too
+POSITIONS = 401  # of sections at which moments are looked for
 MAX_LOADS = 6  # of a case that are described
 MAX_WHEELS = 12  # of a load of a case with a row each
 
@@ -97,6 +98,7 @@ def _about_case(path: str) -> tuple[dict[str, Any], list[str]]:
             f"largest static deflection under the loads: {with_prefix(found.deflection, 'm')},"
             f" 1/{found.span_over_deflection:.0f} of the span of {found.span:.4g} m"
         )
+    lines += settlement_words(case)
     if found.critical_speed is not None:
         lines.append(f"critical speed: {_speed(found.critical_speed)}")
     lines += [*_load_times(case), *_sensor_words(case), f"plausibility: {found}"]
@@ -115,6 +117,29 @@ def _beam_words(case: "Case") -> str:
         f"beam of {float(beam.length):.6g} m, {beam.ends}{held}: E I = {rigidity},"
         f" {float(beam.linear_density):.6g} kg/m"
     )
+
+
+def settlement_words(case: "Case") -> list[str]:
+    """What settles, and the smallest and largest moment that this locks in."""
+    import numpy as np
+
+    from jaxbeam.case.display.prefixes import with_prefix
+    from jaxbeam.model.settlement import has_settlement, settled_beam
+    from jaxbeam.model.static_correction import bending_moment
+
+    if not has_settlement(case):
+        return []
+    settled = [
+        f"supports.{i} by {with_prefix(float(support.settlement), 'm')}"
+        for i, support in enumerate(case.supports)
+        if support.settlement is not None
+    ]
+    places = [float(support.position) for support in case.supports]
+    x = np.append(np.linspace(0.0, float(case.beam.length), POSITIONS), places)
+    moments = np.array(bending_moment(case, x, settled_beam(case).field(x, 2)))
+    moments[np.abs(moments) < 1e-9 * np.abs(moments).max()] = 0.0  # rounding errors
+    low, high = (with_prefix(float(one), "N m") for one in (moments.min(), moments.max()))
+    return [f"settled: {', '.join(settled)}; moments locked in from {low} to {high}"]
 
 
 def _speed(value: float) -> str:

@@ -24,11 +24,12 @@ def modes(
     /,
     *,
     output: Output = None,
-    plot: bool = False,
     pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Compute natural frequencies and damping ratios.
+
+    `--plot` draws the mode shapes to CASE_modes.png in this folder.
 
     Parameters
     ----------
@@ -37,11 +38,9 @@ def modes(
     output
         Write the table to this file, OUT.csv, .xlsx, .mat or .parquet, or OUT.nc or .zarr with the
         mode shapes.
-    plot
-        Draw the mode shapes to CASE_modes.png in this folder.
     """
     check_suffix(output, TABLES[0], "a table of modes", RESULTS)
-    picture = pictures.path(plot, None, case.with_stem(f"{case.stem}_modes"))
+    picture = pictures.path(None, case.with_stem(f"{case.stem}_modes"))
     options.check_outputs(output, picture)
     parsed_case = options.read(case)
     found = jb.modes(parsed_case)
@@ -77,11 +76,13 @@ def frf(
     to: float = 1000.0,
     points: int = 2000,
     output: Output = None,
-    plot: bool = False,
     pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Compute frequency responses without the loads; print resonances and antiresonances.
+
+    `--plot` draws magnitude and phase to a PNG beside the output, or to CASE_frf.png in this
+    folder.
 
     Parameters
     ----------
@@ -102,11 +103,9 @@ def frf(
         Number of frequencies, logarithmically spaced; 2000 if left out.
     output
         Write the responses to this file: OUT.nc, .zarr, .csv, .xlsx, .mat or .parquet.
-    plot
-        Draw magnitude and phase to a PNG beside the output, or to CASE_frf.png in this folder.
     """
     check_suffix(output, ".nc", "a frequency response", RESULTS)
-    picture = pictures.path(plot, output, case.with_stem(f"{case.stem}_frf"))
+    picture = pictures.path(output, case.with_stem(f"{case.stem}_frf"))
     options.check_outputs(output, picture)
     frequencies = frequency_grid(from_, to, points)
     pairs = [input_output_pair(text) for text in pair] or None

@@ -5,8 +5,10 @@ from pathlib import Path
 from jaxbeam.cli.arguments import (
     bounds_in_si,
     check_exists,
+    pair_in_si,
     parse_assignment,
     parse_bounds,
+    parse_prior,
     refuse_option,
     split_case_and_logs,
 )
@@ -40,7 +42,6 @@ def identify(
     validate: bool = False,
     report: Path | None = None,
     output: Output = None,
-    plot: bool = False,
     pictures: PictureOptions = PictureOptions(),
     resume: Resume = False,
     options: CaseOptions = CaseOptions(),
@@ -50,12 +51,16 @@ def identify(
     Parameters of the logs have addresses such as logs.*.loads.0.speed: the speed of the load in
     every log.
 
+    `--plot` draws measured and fitted signals to a PNG beside the output, or named after the
+    log.
+
     Parameters
     ----------
     files
         [CASE.toml] LOG...: the case to fit, if any, and the logs, with all the runs they hold.
     prior
-        ADDRESS=MEAN:DEVIATION: normal prior of a free parameter; repeat it for more.
+        ADDRESS=MEAN:DEVIATION: normal prior of a free parameter, also with units, as
+        beam.length='25 m:10 cm'; repeat it for more.
     scale
         ADDRESS=log or ADDRESS=logit: scale on which a parameter is searched between its bounds.
     loss
@@ -77,15 +82,13 @@ def identify(
         Write a report with tables and figures to this folder: report.md and report.html.
     output
         Write the fitted case to this file, FIT.toml, and the whole fit beside it, FIT.npz.
-    plot
-        Draw measured and fitted signals to a PNG beside the output, or named after the log.
     """
     case, logs = split_case_and_logs(files, free)
     if case and free:
         refuse_option(
             resume and not output, "--resume goes on with what is kept beside the output: -o"
         )
-        picture = pictures.path(plot, output, logs[0])
+        picture = pictures.path(output, logs[0])
         options.check_outputs(output, _with_suffix(output, ".npz"), picture)
         if report:
             check_report_folder(report, options.overwrite)
@@ -97,6 +100,10 @@ def identify(
 
         parsed_case = options.read(case)
         bounds, normals, scales = arguments
+        normals = {
+            address: pair_in_si(parsed_case, address, pair, "--prior")
+            for address, pair in normals.items()
+        }
         priors = _priors(bounds_in_si(parsed_case, bounds), normals, scales)
         if options.overwrite and not resume:
             _remove_checkpoints(output)
@@ -134,7 +141,7 @@ def identify(
         print_message(
             f"nothing is named with --free, so {case} is not used; modes of the free decay:"
         )
-    files_of_logs = [pictures.path(plot, None, log) for log in logs]
+    files_of_logs = [pictures.path(None, log) for log in logs]
     options.check_outputs(*files_of_logs)
     _identify_modes(logs, files_of_logs, pictures, options)
 
@@ -166,17 +173,7 @@ def _prior_arguments(free, prior, scale) -> tuple[dict, dict, dict]:
     """
     bounds = dict(parse_bounds(text) for text in free)
     scales = dict(parse_assignment("--scale", text) for text in scale)
-    normals = {}
-    for text in prior:
-        address, value = parse_assignment("--prior", text)
-        try:
-            mean, deviation = map(float, value.split(":"))
-        except ValueError:
-            raise ValueError(
-                f"--prior takes ADDRESS=MEAN:DEVIATION, such as beam.damping_ratio=0.02:0.005, not "
-                f"{text!r}"
-            ) from None
-        normals[address] = mean, deviation
+    normals = dict(parse_prior(text) for text in prior)
     for address in (*scales, *normals):
         refuse_option(
             address not in bounds, f"{address} has a prior or a scale, but is not free: --free"

@@ -6,7 +6,14 @@ from pathlib import Path
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import check_suffix
-from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, print_plausibility, table
+from jaxbeam.cli.commands.describe import settlement_words
+from jaxbeam.cli.options import (
+    CaseOptions,
+    LabelledPictureOptions,
+    Output,
+    print_plausibility,
+    table,
+)
 from jaxbeam.files.endings import RESULTS
 
 MAX_WHEELS = 8  # of a load, or bodies, with a row each
@@ -17,12 +24,13 @@ def simulate(
     /,
     *,
     output: Output = None,
-    plot: bool = False,
     animate: Path | None = None,
-    pictures: PictureOptions = PictureOptions(),
+    pictures: LabelledPictureOptions = LabelledPictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Simulate a case: peaks at sensors, contact forces, commands; the whole record on request.
+
+    `--plot` draws the record to a PNG beside the output, or named after the case.
 
     Parameters
     ----------
@@ -31,8 +39,6 @@ def simulate(
     output
         Write all of the record to this file, OUT.nc or OUT.zarr, or what sensors measure, contact
         forces and commands to a table: OUT.csv, .xlsx, .mat or .parquet.
-    plot
-        Draw the record to a PNG beside the output, or named after the case.
     animate
         Write an animation of the run to this file, OUT.gif, or OUT.mp4 if ffmpeg is installed.
     """
@@ -41,9 +47,10 @@ def simulate(
         from jaxbeam.plot.traffic.film import check_film
 
         check_film(animate)
-    picture = pictures.path(plot, output, case)
+    picture = pictures.path(output, case)
     options.check_outputs(output, picture, animate)
     parsed_case = options.read(case)
+    labels = pictures.sensor_labels(parsed_case)
     plausibility = print_plausibility(parsed_case, options)
 
     from jaxbeam.simulation.simulate import ContactLossWarning
@@ -56,7 +63,7 @@ def simulate(
     if picture:
         from jaxbeam.plot import plot_record
 
-        figure = plot_record(record, ax=pictures.page(), title=pictures.title)
+        figure = plot_record(record, ax=pictures.page(), title=pictures.title, labels=labels)
         pictures.save(figure, picture)
     if animate:
         from jaxbeam.plot import animate as write_animation
@@ -68,6 +75,8 @@ def simulate(
     amplification = record_amplification(record)
     content = _to_dict(record, amplification) | {"plausibility": plausibility}
     lines = _lines(record, amplification)
+    for words in settlement_words(parsed_case):
+        lines.append(f"{words}; sensors read changes from there")
     controller = parsed_case.controller
     if controller is not None and not controller.open_loop:
         from jaxbeam.analysis.crossing_margin import stability_margin
@@ -88,12 +97,13 @@ def _to_dict(record: "jb.Record", amplification: "list[float | None]") -> dict:
         "sensors": [
             {"name": label, "quantity": s.quantity, "unit": s.unit, "position": s.position}
             | extremes
-            | {"dynamic_amplification": factor}
-            for label, s, extremes, factor in zip(
+            | {"dynamic_amplification": factor, "truncation_error": error}
+            for label, s, extremes, factor, error in zip(
                 sensor_labels(sensors),
                 sensors,
                 _extremes_of_sensors(record),
                 amplification,
+                _truncation_errors(record),
                 strict=True,
             )
         ],
@@ -121,6 +131,13 @@ def _to_dict(record: "jb.Record", amplification: "list[float | None]") -> dict:
             "saturated": record.saturated.mean(axis=0),
         }
     return content | {"verdict": record.verdict}
+
+
+def _truncation_errors(record: "jb.Record") -> list[float | None]:
+    """What the modes left out change at each sensor; None where it is not known."""
+    if record.case.controller is not None:
+        return [None] * len(record.case.sensors)
+    return [float(error) if error == error else None for error in record.truncation_errors]
 
 
 def _extremes_of_sensors(record: "jb.Record") -> list[dict[str, float]]:
@@ -216,6 +233,11 @@ def _lines(record: "jb.Record", amplification: "list[float | None]") -> list[str
         )
     ]
     header = ("sensor", "position (m)", "quantity", "smallest", "at (s)", "largest", "at (s)")
+    errors = _truncation_errors(record)
+    if any(error is not None for error in errors):
+        header = (*header, "error of truncation")
+        shares = ("-" if error is None else f"{error:.1e}" for error in errors)
+        rows = [(*row, share) for row, share in zip(rows, shares, strict=True)]
     if any(factor is not None for factor in amplification):
         header = (*header, "dynamic amplification")
         factors = ("-" if factor is None else f"{factor:.4g}" for factor in amplification)

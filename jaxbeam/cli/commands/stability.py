@@ -19,11 +19,13 @@ def stability(
     limits: bool = False,
     headway: float | None = None,
     mass_at: tuple[str, ...] = (),
-    plot: bool = False,
     pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Tell whether the loop is stable along the crossing; compute margins, poles and growth.
+
+    `--plot` draws the poles along the crossing to CASE_poles.png in this folder, and Bode and
+    Nyquist plots of the loop, broken at the first command, to CASE_loop.png.
 
     Parameters
     ----------
@@ -38,12 +40,9 @@ def stability(
     mass_at
         POSITION=MASS in m and kg: margins with this stationary mass in place of the loads; repeat
         it for more.
-    plot
-        Draw the poles along the crossing to CASE_poles.png in this folder, and Bode and Nyquist
-        plots of the loop, broken at the first command, to CASE_loop.png.
     """
     places = [stationary_mass(text) for text in mass_at]
-    picture = pictures.path(plot, None, case.with_stem(f"{case.stem}_poles"))
+    picture = pictures.path(None, case.with_stem(f"{case.stem}_poles"))
     loop_picture = picture and picture.with_stem(picture.stem.removesuffix("_poles") + "_loop")
     options.check_outputs(picture, loop_picture)
     parsed_case = options.read(case)

@@ -16,9 +16,9 @@ from jaxbeam.cli.arguments import (
 )
 from jaxbeam.cli.options import (
     CaseOptions,
+    LabelledPictureOptions,
     Output,
     Over,
-    PictureOptions,
     PrintOptions,
     print_plausibility,
     table,
@@ -39,11 +39,13 @@ def sweep(
     resume: bool = False,
     scheduler: str | None = None,
     precision: str = "double",
-    plot: bool = False,
-    pictures: PictureOptions = PictureOptions(),
+    pictures: LabelledPictureOptions = LabelledPictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Simulate a case for many values of some of its parameters.
+
+    `--plot` draws the peaks to a PNG beside the store, or to CASE_sweep.png in this folder:
+    trains over speed with resonance speeds, other parameters as curves or maps.
 
     Parameters
     ----------
@@ -61,9 +63,6 @@ def sweep(
         store must be in a folder that all workers see.
     precision
         double, or single: half the bits, errors of a few parts in a million.
-    plot
-        Draw the peaks to a PNG beside the store, or to CASE_sweep.png in this folder: trains over
-        speed with resonance speeds, other parameters as curves or maps.
     """
     values = parse_sweep_values(over)
     refuse_option(
@@ -79,7 +78,7 @@ def sweep(
             is_given and store is None,
             f"{option} needs a store of blocks: -o OUT.zarr",
         )
-    picture = pictures.path(plot, output, case.with_stem(f"{case.stem}_sweep"))
+    picture = pictures.path(output, case.with_stem(f"{case.stem}_sweep"))
     refuse_option(
         bool(picture) and not 0 < sum(len(given) > 1 for given in values.values()) < 3,
         "--plot draws peaks over one or two parameters with several values; leave it out",
@@ -87,6 +86,7 @@ def sweep(
     if not resume:
         options.check_outputs(output, picture)
     parsed_case = options.read(case)
+    labels = pictures.sensor_labels(parsed_case)
     plausibility = _print_plausibility(parsed_case, values, options)
 
     from jaxbeam.sweeps.cluster import connect
@@ -108,7 +108,8 @@ def sweep(
     if picture:
         from jaxbeam.plot import plot_sweep
 
-        figure = plot_sweep(results, ax=pictures.page(), title=pictures.title)
+        look = {"title": pictures.title, "labels": labels}
+        figure = plot_sweep(results, ax=pictures.page(), **look)
         pictures.save(figure, picture)
     values = {address: results[address].to_numpy().tolist() for address in values}  # in SI units
     peaks = {str(name): results[name] for name in results if str(name).startswith("peak_")}
@@ -158,7 +159,17 @@ def _lines(case: "jb.Case", results: "xarray.Dataset", addresses: Sequence[str])
     header = ("sensor", "quantity", "peak", "size", "time (s)")
     names = [_head(results[address]) for address in addresses]
     lines = [f"{runs}; peaks are largest absolute values:", *table((*header, *names), rows)]
-    return [*lines, *_contact_lines(results, addresses)]
+    return [*lines, *_truncation_lines(results), *_contact_lines(results, addresses)]
+
+
+def _truncation_lines(results: "xarray.Dataset") -> list[str]:
+    """Sentence on what the modes left out change of the peaks of each quantity, where known."""
+    errors = [
+        f"{name.removeprefix('peak_')} {peaks.attrs['truncation_error']:.1e}"
+        for name, peaks in ((str(name), results[name]) for name in results)
+        if "truncation_error" in peaks.attrs
+    ]
+    return [f"modes left out change the largest peaks by about: {', '.join(errors)}"] * bool(errors)
 
 
 def _head(values: "xarray.DataArray") -> str:

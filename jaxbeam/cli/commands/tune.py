@@ -43,7 +43,6 @@ def tune(
     seed: Seed = 0,
     least_peaks: Annotated[bool, Parameter(negative="--no-least-peaks")] = True,
     output: Output = None,
-    plot: bool = False,
     pictures: PictureOptions = PictureOptions(),
     resume: Resume = False,
     options: CaseOptions = CaseOptions(),
@@ -51,6 +50,8 @@ def tune(
     """Tune controller parameters by gradient descent; report performance on held-out runs.
 
     Metrics are peak, shortfall, rms, after_exit, effort and contact.
+
+    `--plot` draws peaks before and after to a PNG beside the output.
 
     Parameters
     ----------
@@ -100,8 +101,6 @@ def tune(
     output
         Write the tuned case to this file, TUNED.toml (those of a Pareto front to TUNED-1.toml,
         TUNED-2.toml, ...), and checkpoints beside it.
-    plot
-        Draw peaks before and after to a PNG beside the output.
     """
     weights = dict(named_number("--objective", text, "peak=1") for text in objective)
     limits = dict(named_number("--limit", text, "effort=0.3") for text in limit)
@@ -128,7 +127,7 @@ def tune(
         bool(lexicographic and (weights or limits)),
         "--lexicographic takes the place of --objective and --limit",
     )
-    picture = pictures.path(plot, output, case.with_suffix(".tuned"))
+    picture = pictures.path(output, case.with_suffix(".tuned"))
     check_suffix(output, ".toml", "a tuned case")
     pareto_limits = _pareto_limits(pareto) if pareto else None
     integer_choices = dict(_integer_choices(text) for text in integers)

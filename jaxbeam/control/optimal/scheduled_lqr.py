@@ -164,6 +164,6 @@ def _with_crossing_load(plant: Plant, mass, speed) -> Plant:
         lambda x: (x.speed, x.deceleration), load, (jnp.sign(load.speed) * speed, jnp.zeros(()))
     )
     case = eqx.tree_at(lambda c: c.loads, plant.case, (changed,))
-    loads = load_set(case)
+    loads = load_set(case, plant.modal_model.modes.layout)
     wheels = loads.wheels.scaled(mass / load.total_mass(gravity))
     return dataclasses.replace(plant, case=case, loads=dataclasses.replace(loads, wheels=wheels))

@@ -17,6 +17,7 @@ import scipy
 
 from jaxbeam.files.export.gains import ARRAYS, Gains
 from jaxbeam.files.export.header import c_header
+from jaxbeam.runtime.whole_file import whole_file
 
 FORMAT = "jaxbeam gains 3"
 SECTION_COEFFICIENTS = ("b0", "b1", "b2", "a0", "a1", "a2")
@@ -32,13 +33,8 @@ def write_gains(gains: Gains, path: str | os.PathLike, overwrite: bool = False) 
     if path.suffix not in WRITERS:
         raise ValueError(f"{path}: gains are written to {', '.join(WRITERS)}")
     content = WRITERS[path.suffix](gains)
-    try:
-        with open(path, "wb" if overwrite else "xb") as file:
-            file.write(content)
-    except FileExistsError:
-        raise FileExistsError(
-            f"{path} exists already; choose another name, or overwrite it"
-        ) from None
+    with whole_file(path, overwrite) as beside:
+        beside.write_bytes(content)
 
 
 def read_gains(path: str | os.PathLike) -> Gains:

@@ -8,19 +8,22 @@ with the exact influence G of a force F_l at x_l on the quantity at x. The last 
 accelerations and commands; the residual of the loads depends on where they are.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
+from numpy.polynomial import chebyshev
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.quantities import quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.flexibility import Flexibility, flexibility
+from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.output_rows import (
-    SIDE_SHARE,
     OutputRows,
     beside,
     quantity_factor,
@@ -31,9 +34,12 @@ from jaxbeam.model.static_correction import (
     residual_port_flexibility,
 )
 from jaxbeam.model.theory.statics import SectionFlexibility
-from jaxbeam.numerics.piecewise import piecewise_chebyshev
-from jaxbeam.runtime.arrays import Array, set_at, solve, xp
+from jaxbeam.numerics.piecewise import chebyshev_polynomials, piecewise_chebyshev
+from jaxbeam.runtime.arrays import Array, set_at, solve, take, xp
 from jaxbeam.runtime.module import Module
+
+SIDE_SHIFT = 0.01  # towards a position nearby, by which the side of a break is found
+PARTS, PART_TERMS = 8, 24  # in which influence functions that are no cubics are interpolated
 
 
 class CorrectionRows(Module):
@@ -49,23 +55,15 @@ class CorrectionRows(Module):
 
 
 class LoadInfluence(Module):
-    """Static influence of a force on outputs, less that of the modes; see `of_forces_at`.
+    """Static influence of a force on outputs, less that of the modes, over its position.
 
-    `greens` are for each order of derivation, with the indices of its outputs in `outputs`, and
-    `factors` from them to the quantities per newton. The influence of the modes has the Chebyshev
-    `series` between the `nodes` (m). At the `places` (m) of the outputs it has kinks or jumps.
-    `mirrored` outputs are those, then their negatives.
+    Chebyshev `series` of the outputs per newton upwards between the `breaks` (m): nodes of the
+    beam, and the outputs, at which moments have kinks and shear forces jump. `mirrored` outputs are
+    those, then their negatives.
     """
 
-    places: Float[Array, " place"]
-
-    nodes: Float[Array, " node"]
-    series: Float[Array, "segment degree output"]
-    length: Float[Array, ""]
-    greens: tuple[Flexibility | SectionFlexibility, ...]
-    factors: tuple[Float[Array, " _"], ...]
-    outputs: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    count: int = eqx.field(static=True)
+    breaks: Float[Array, " break"]
+    series: Float[Array, "piece term output"]
     mirrored: bool = eqx.field(static=True, default=False)
 
     def of_forces_at(
@@ -73,24 +71,64 @@ class LoadInfluence(Module):
     ) -> Float[Array, "*position output"]:
         """Outputs per newton upwards at positions x (m), off the beam as at its nearer end.
 
-        A force is on the side of each place on which `near` (m) is; at the place, its limit there.
+        At a break the limit on the side of it on which `near` (m) is.
         """
-        step = max(2 * SIDE_SHARE, 8 * float(np.finfo(x.dtype).eps)) * self.length
-        passed = self.places <= near[..., None]
-        lower = xp.max(xp.where(passed, self.places + step, 0.0), axis=-1)
-        upper = xp.min(xp.where(passed, self.length, self.places), axis=-1)
-        y = xp.clip(x, lower, xp.maximum(lower, upper)) / self.length
-        parts = [
-            factor * greens(y) for greens, factor in zip(self.greens, self.factors, strict=True)
-        ]
-        given = np.concatenate([np.array(index, int) for index in self.outputs])
-        others = np.setdiff1d(np.arange(self.count), given)
-        zeros = xp.zeros((*x.shape, others.size))
-        as_given = np.argsort(np.concatenate([given, others]))
-        influence = xp.concatenate([*parts, zeros], axis=-1)[..., as_given]
-        of_modes = piecewise_chebyshev(self.nodes, self.series, y * self.length, (0,))[0]
-        influence = influence - of_modes
+        toward = x + SIDE_SHIFT * (near - x)
+        piece = xp.sum(toward[..., None] >= self.breaks[1:-1], axis=-1)
+        left, right = take(self.breaks, piece), take(self.breaks, piece + 1)
+        width = xp.where(right > left, right - left, 1.0)
+        local = xp.clip((2 * x - left - right) / width, -1.0, 1.0)
+        table = chebyshev_polynomials(local, self.series.shape[1])
+        influence = xp.einsum("...k,...ko->...o", table, take(self.series, piece))
         return xp.concatenate([influence, -influence], -1) if self.mirrored else influence
+
+    def plus(self, other: "LoadInfluence") -> "LoadInfluence":
+        """Sum with another, whose breaks are among those of this one."""
+
+        def values(x):
+            return other.of_forces_at(x, x)
+
+        added = _to_series(self.breaks, self.series.shape[1], values)
+        return eqx.tree_at(lambda one: one.series, self, self.series + added)
+
+
+def _to_series(breaks, terms: int, function: Callable) -> Float[Array, "piece term output"]:
+    """Chebyshev series between breaks (m) through the values (..., output) of a function."""
+    points = chebyshev.chebpts1(terms)
+    middle, half = (breaks[1:] + breaks[:-1]) / 2, xp.diff(breaks) / 2
+    values = function(middle[:, None] + half[:, None] * points)
+    scale = np.where(np.arange(terms) == 0, 1.0, 2.0)[:, None] / terms
+    to_series = scale * chebyshev.chebvander(points, terms - 1).T
+    return xp.einsum("kp,spo->sko", to_series, values)
+
+
+def load_influence(
+    case: Case,
+    modes: Modes,
+    on_modes: Float[Array, "mode output"],
+    greens: Sequence[tuple[Flexibility | SectionFlexibility, Float[Array, " _"], Sequence[int]]],
+) -> LoadInfluence:
+    """Influence of forces on outputs, from influence functions less that of the modes.
+
+    `greens` are influence functions, factors from them to the quantities, and the indices of their
+    outputs; the amplitudes of the modes have the influence `on_modes`. Between the breaks both are
+    polynomials on a uniform beam; on others, smooth functions, interpolated in parts.
+    """
+    uniform, terms = is_uniform(case), max(4, modes.series.shape[1])
+    breakpoints = [modes.nodes / case.beam.length, *(one.breakpoints for one, _, _ in greens)]
+    if not uniform:
+        breakpoints.append(np.linspace(0.0, 1.0, PARTS + 1))
+    breaks = case.beam.length * xp.sort(xp.clip(xp.concatenate(breakpoints), 0.0, 1.0))
+    terms = terms if uniform else max(terms, PART_TERMS)
+
+    def influence(x):
+        values = -piecewise_chebyshev(modes.nodes, modes.series @ on_modes, x, (0,))[0]
+        for one, factor, index in greens:
+            at = np.s_[..., np.array(index, int)]
+            values = set_at(values, at, values[at] + factor * one(x / case.beam.length))
+        return values
+
+    return LoadInfluence(breaks, _to_series(breaks, terms, influence))
 
 
 class StaticCorrection(Module):
@@ -99,21 +137,26 @@ class StaticCorrection(Module):
     rows: CorrectionRows
     influence: LoadInfluence
 
+    def scaled(self, share) -> "StaticCorrection":
+        """This share of the correction."""
+        influence = eqx.tree_at(
+            lambda one: one.series, self.influence, share * self.influence.series
+        )
+        return StaticCorrection(jax.tree.map(lambda row: share * row, self.rows), influence)
+
 
 def static_correction(
     model: ModalModel,
     case: Case,
     sensors: Sequence[Sensor],
     outputs: OutputRows,
-    modal_sums: int = 0,
 ) -> StaticCorrection | None:
     """Static correction of the `outputs` of sensors, in the coordinates of their modal model.
 
-    The last `modal_sums` of the sensors are left as sums of the modes. None where no sensor
-    measures a curvature, strain or section force, and for beams that can move as a rigid body.
+    None where no sensor measures a curvature, strain or section force, and for beams that can move
+    as a rigid body.
     """
-    corrected = sensors[: len(sensors) - modal_sums]
-    bending = [i for i, sensor in enumerate(corrected) if sensor.bends]
+    bending = [i for i, sensor in enumerate(sensors) if sensor.bends]
     layout = model.modes.layout
     if not bending or not is_supported(case, layout):
         return None
@@ -157,17 +200,8 @@ def static_correction(
     rows = CorrectionRows(
         rates if is_damped else None, accelerations if has_masses else None, commands
     )
-    outputs_of_groups = tuple(tuple(index) for index in groups.values())
-    influence = LoadInfluence(
-        xp.stack([sensors[i].position for i in bending]),
-        model.modes.nodes,
-        model.modes.series @ of_modes,
-        length,
-        tuple(all_greens),
-        tuple(factors),
-        outputs_of_groups,
-        count,
-    )
+    greens = list(zip(all_greens, factors, groups.values(), strict=True))
+    influence = load_influence(case, model.modes, of_modes, greens)
     return StaticCorrection(rows, influence)
 
 

@@ -66,8 +66,8 @@ class NodalSystem(NamedTuple):
     force_of_deflection: Float[Array, "part 2 2"]
 
 
-def nodal_system(case: Case, layout: Layout) -> NodalSystem:
-    """Stiffness matrix of nodes, supports and suspensions, in beam units.
+def nodal_system(case: Case, layout: Layout, suspended: bool = True) -> NodalSystem:
+    """Stiffness matrix of nodes, supports and, if `suspended`, suspensions, in beam units.
 
     Across a part d_2 = A_11 d_1 + A_12 f_1 with d = (w, phi) and f = (M, S), so that
     f_1 = A_12^-1 (d_2 - A_11 d_1) and f_2 = A_21 d_1 + A_22 f_1.
@@ -91,8 +91,9 @@ def nodal_system(case: Case, layout: Layout) -> NodalSystem:
         )
     main, _ = nodal_unknowns(case, layout)
     stiffness, _ = add_nodal_parts(case, layout, main, stiffness, None)
-    rows, suspensions = suspension_rows(case, layout, size)
-    stiffness = stiffness + rows.T @ (suspensions[:, None] * rows)
+    if suspended:
+        rows, suspensions = suspension_rows(case, layout, size)
+        stiffness = stiffness + rows.T @ (suspensions[:, None] * rows)
     return NodalSystem(across, (stiffness + stiffness.T) / 2, unknowns, inverse)
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from PIL import Image
 
+from jaxbeam.runtime.whole_file import whole_file
+
 PALETTE_SIZE = 96  # colours of the GIF; few keep the file small
 EVEN = "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white"  # sides, as H.264 wants them
 
@@ -31,9 +33,12 @@ def write_film(path: str | os.PathLike, frames: Sequence[Image.Image], rate: int
 
     Raises OSError if ffmpeg fails.
     """
-    if Path(path).suffix == ".mp4":
-        _write_mp4(path, frames, rate)
-        return
+    write = _write_mp4 if Path(path).suffix == ".mp4" else _write_gif
+    with whole_file(path, overwrite=True) as beside:
+        write(beside, frames, rate)
+
+
+def _write_gif(path: Path, frames: Sequence[Image.Image], rate) -> None:
     # One palette for all frames, of the last and fullest: GIF stores only what changes.
     palette = frames[-1].quantize(PALETTE_SIZE)
     first, *others = (one.quantize(palette=palette, dither=Image.Dither.NONE) for one in frames)

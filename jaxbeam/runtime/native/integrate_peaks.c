@@ -1,4 +1,4 @@
-/* Deflection peaks and contact forces of several tasks, each a batch of runs that differ in their
+/* Peaks of outputs and contact forces of several tasks, each a batch of runs that differ in their
  * loads: integrator/integrate.py, `integrate_peaks`, without commands. Steps are advanced in
  * chunks. First the matrices of its steps are computed, which all runs of a task share; then groups
  * of runs, as many as fill a vector register, are advanced through all steps of the chunk, so that
@@ -71,7 +71,6 @@ static double last_exit(const Workspace *w) {
 static void integrate_task(Workspace *w) {
     reset(w);
     shape_series(w);
-    observation_rows(w, (double *)w->product);
     compute_propagators(w);
     const double exit_time = last_exit(w);
     int panel = 0;
@@ -152,7 +151,9 @@ XLA_FFI_Error *integrate_peaks(XLA_FFI_CallFrame *frame) {
                            .pieces = (int)dims[BREAKPOINTS][2],
                            .max_loads = (int)max_loads,
                            .loads = (int)dims[INERTIA][1],
-                           .positions = (int)dims[POSITIONS][1],
+                           .positions = (int)dims[OUTPUT_ROWS][1],
+                           .influence_pieces = (int)dims[INFLUENCE_SERIES][1],
+                           .influence_terms = (int)dims[INFLUENCE_SERIES][2],
                            .batch_size = dims[INERTIA][2]};
     Workspace *w = &workspace;
     derive_sizes(w);

@@ -55,32 +55,6 @@ static void evaluate_shapes(const Workspace *w, Register x) {
     }
 }
 
-/* Mode shapes at the monitored positions, and the static deflection of each under a unit force
- * there, which bounds the deflection at a given energy; infinite without stiffness. */
-static void observation_rows(const Workspace *w, double *stiffness) {
-    const int block_size = w->block_size, modes = w->modes;
-    for (int position = 0; position < w->positions; position++) {
-        double *mode_row = w->mode_rows + position * w->all_modes;
-        evaluate_shapes(w, broadcast(w->inputs[POSITIONS][position]));
-        for (int m = 0; m < w->all_modes; m++) mode_row[m] = w->shape_sums[m][0];
-        w->flexibility[position] = 0;
-        for (int b = 0; b < w->blocks; b++) {
-            const double *matrix = w->inputs[STATE_MATRIX] + (ptrdiff_t)b * block_size * block_size;
-            double *row = stiffness;
-            for (int i = 0; i < modes; i++, row += modes + 1) {
-                for (int j = 0; j < modes; j++) row[j] = -matrix[(2 * i + 1) * block_size + 2 * j];
-                row[modes] = mode_row[b * modes + i];
-                for (int k = 0; k < i; k++) {
-                    const double *above = stiffness + k * (modes + 1), factor = row[k] / above[k];
-                    for (int j = k; j <= modes; j++) row[j] -= factor * above[j];
-                }
-                const double deflection = row[modes] * row[modes] / row[i];
-                w->flexibility[position] += row[i] > 0 ? deflection : INFINITY;
-            }
-        }
-    }
-}
-
 /* Position (m), speed (m/s) and acceleration (m/s^2) of a load. */
 static void evaluate_trajectory(const Workspace *w, int64_t load, double time, double *position,
                                 double *speed, double *acceleration) {
@@ -131,6 +105,38 @@ static void load_path(const Workspace *w, const Step *step) {
                     row += j % 2 ? 2 * v * slope[m] : v * v * curvature[m] + a * slope[m];
                 store(contact_rows + i * PADDED_NODES, row, REGISTER_WIDTH);
             }
+        }
+    }
+}
+
+/* Static influence of a load on the outputs at the peak nodes of a step, added to its sample rows:
+ * model/sensing/corrected_rows.py, `LoadInfluence`. No step contains a break inside. */
+static void add_influence(const Workspace *w, const Step *step, int s) {
+    const double *breaks = w->inputs[INFLUENCE_BREAKS];
+    double position, speed, acceleration;
+    evaluate_trajectory(w, step->load_numbers[s], step->start + step->length / 2, &position, &speed,
+                        &acceleration);
+    int piece = 0;
+    while (piece < w->influence_pieces - 1 && position >= breaks[piece + 1]) piece++;
+    const double left = breaks[piece], width = breaks[piece + 1] - left;
+    const double *series = w->inputs[INFLUENCE_SERIES] +
+                           (ptrdiff_t)piece * w->influence_terms * w->positions;
+    for (int p = 0; p < PEAK_POINTS; p++) {
+        evaluate_trajectory(w, step->load_numbers[s],
+                            step->start + step->length * w->inputs[PEAK_FRACTIONS][p], &position,
+                            &speed, &acceleration);
+        const double x = fmin(fmax(2 * (position - left) / width - 1, -1), 1);
+        const double *weights = w->inputs[PEAK_FORCE_WEIGHTS] + p * NODES;
+        for (int output = 0; output < w->positions; output++) {
+            double sum = 0, above = 0; /* Clenshaw's recurrence */
+            for (int k = w->influence_terms - 1; k > 0; k--) {
+                const double next = series[k * w->positions + output] + 2 * x * sum - above;
+                above = sum, sum = next;
+            }
+            sum = series[output] + x * sum - above;
+            for (int f = 0; f < NODES; f++)
+                step->sample_rows[(ptrdiff_t)(w->states + s * NODES + f) * w->sample_count +
+                                  p * w->positions + output] += weights[f] * sum;
         }
     }
 }

@@ -160,11 +160,11 @@ static void set_force_weights(const Workspace *w, const Fractions *f) {
     }
 }
 
-/* Deflections at the positions, at the peak nodes of a step, by its initial state and by forces on
- * the modes. */
+/* Outputs at the peak nodes of a step, by its initial state and by forces on the modes. */
 static void observe_propagators(const Workspace *w, int panel) {
     const int block_size = w->block_size, modes = w->modes, all_modes = w->all_modes;
     const int sample_count = w->sample_count, padded = padded_size(sample_count);
+    const double *output_rows = w->inputs[OUTPUT_ROWS];
     const double *transition = w->transition + (size_t)panel * transition_size(w);
     const double *force_response = w->force_response + (size_t)panel * force_response_size(w);
     const double *node_transition = w->node_transition + (size_t)panel * node_transition_size(w);
@@ -178,16 +178,15 @@ static void observe_propagators(const Workspace *w, int panel) {
             const int at = point * w->positions + position, node = point - 1;
             for (int state = 0; state < w->states; state++) {
                 const int b = state / block_size, j = state % block_size;
-                const double *mode_row = w->mode_rows + position * all_modes + b * modes;
+                const double *row = output_rows + position * w->states + b * block_size;
                 double sum = 0;
-                for (int m = 0; m < modes; m++) {
-                    const int i = 2 * m;
-                    if (point == 0) sum += mode_row[m] * (i == j);
+                for (int i = 0; i < block_size; i++) {
+                    if (point == 0) sum += row[i] * (i == j);
                     else if (node == NODES)
-                        sum += mode_row[m] * transition[(b * block_size + j) * block_size + i];
+                        sum += row[i] * transition[(b * block_size + j) * block_size + i];
                     else
                         sum +=
-                            mode_row[m] *
+                            row[i] *
                             node_transition[((b * block_size + i) * block_size + j) * PADDED_NODES +
                                             node];
                 }
@@ -199,13 +198,12 @@ static void observe_propagators(const Workspace *w, int panel) {
                               : node_force_response + (size_t)node * force_response_size(w);
             for (int input = 0; input < all_modes; input++) {
                 const int b = input / modes, k = input % modes;
-                const double *mode_row = w->mode_rows + position * all_modes + b * modes;
+                const double *row = output_rows + position * w->states + b * block_size;
                 for (int force = 0; force < NODES; force++) {
                     double sum = 0;
-                    for (int m = 0; m < modes; m++)
-                        sum += mode_row[m] *
-                               responses[((b * block_size + 2 * m) * modes + k) * PADDED_NODES +
-                                         force];
+                    for (int i = 0; i < block_size; i++)
+                        sum += row[i] *
+                               responses[((b * block_size + i) * modes + k) * PADDED_NODES + force];
                     sample_response[(force * all_modes + input) * padded + at] = sum;
                 }
             }

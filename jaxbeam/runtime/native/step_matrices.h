@@ -86,5 +86,6 @@ static void step_matrices(const Workspace *w, const Step *step) {
                 store(stored, sampled,
                       sample_count - l < REGISTER_WIDTH ? sample_count - l : REGISTER_WIDTH);
             }
+        if (w->influence_terms) add_influence(w, step, s);
     }
 }

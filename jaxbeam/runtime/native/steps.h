@@ -162,7 +162,7 @@ static void advance_chunk(const Workspace *w, int steps, Group *groups, int grou
     }
 }
 
-/* Whether the energy left cannot raise any peak, by the bound of `observation_rows`. Diverged runs
+/* Whether the energy left cannot raise any peak, by the bounds of the outputs. Diverged runs
  * cannot. */
 static int peaks_final(const Workspace *w) {
     const int block_size = w->block_size, modes = w->modes;
@@ -183,7 +183,7 @@ static int peaks_final(const Workspace *w) {
         const Mask finite = 0 * energy == 0;
         for (int position = 0; position < w->positions; position++) {
             Register peak = load(w->peak + position * w->batch_size + first, count);
-            Mask above = finite & ~(w->flexibility[position] * energy < peak * peak);
+            Mask above = finite & ~(w->inputs[OUTPUT_BOUNDS][position] * energy < peak * peak);
             for (int l = 0; l < count; l++)
                 if (above[l]) return 0;
         }

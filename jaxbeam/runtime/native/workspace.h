@@ -13,7 +13,7 @@ enum { STEP_FRACTIONS = NODES + 1 }; /* Gauss nodes and end of a step */
 enum { INTERLEAVED_GROUPS = 2 };     /* groups of runs that are advanced together */
 
 /* Arguments of the call, with tasks as the first axis, of length one if shared: modal model, panels
- * of the time grid, trajectories, loads, positions, constants. */
+ * of the time grid, trajectories, loads, outputs, constants. */
 enum {
     MASK,
     STATE_MATRIX,
@@ -28,11 +28,15 @@ enum {
     CUBICS,
     INERTIA,
     WEIGHT,
-    POSITIONS,
+    OUTPUT_ROWS,
+    OUTPUT_BOUNDS,
+    INFLUENCE_BREAKS,
+    INFLUENCE_SERIES,
     GAUSS_NODES,
     LAGRANGE_COEFFICIENTS,
     INTERPOLATION,
     PEAK_FRACTIONS,
+    PEAK_FORCE_WEIGHTS,
     ARGUMENT_COUNT
 };
 enum { PEAK, PEAK_TIME, LOWEST_FORCE, CONTACT_LOSS_TIME, WORKSPACE, RESULT_COUNT };
@@ -61,13 +65,13 @@ typedef struct {
 typedef struct {
     /* Numbers of each; modes are those of a block. */
     int panels, blocks, block_size, modes, segments, terms, pieces, max_loads, loads, positions;
+    int influence_pieces, influence_terms;
     int states, all_modes, sample_count, columns;
     ptrdiff_t batch_size;
     const double *inputs[ARGUMENT_COUNT];
     double *outputs[RESULT_COUNT];
-    /* Of the task: series of mode shapes and their derivatives; mode shapes and static flexibility
-     * at the positions. */
-    double *series, *mode_rows, *flexibility;
+    /* Of the task: series of mode shapes and their derivatives. */
+    double *series;
     /* Of each panel: propagators, with nodes, forces or samples as the last axis. */
     double *node_transition, *node_force_response, *transition, *force_response, *sample_rows,
         *sample_response;
@@ -120,8 +124,6 @@ static size_t partition_workspace(Workspace *w, uintptr_t start) {
     size_t positions = (size_t)w->positions, all_modes = (size_t)w->all_modes,
            modes = (size_t)w->modes;
     w->series = allocate(start, &used, (size_t)w->segments * w->terms * w->columns);
-    w->mode_rows = allocate(start, &used, positions * all_modes);
-    w->flexibility = allocate(start, &used, positions);
     w->node_transition = allocate(start, &used, panels * node_transition_size(w));
     w->node_force_response = allocate(start, &used, panels * node_force_response_size(w));
     w->transition = allocate(start, &used, panels * transition_size(w));

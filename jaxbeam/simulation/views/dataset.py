@@ -13,6 +13,7 @@ from jaxbeam.simulation.labels import wheel_labels
 from jaxbeam.simulation.result_variables import (
     MODE_FIELDS,
     MODE_VARIABLES,
+    ROTATION_SERIES,
     VARIABLES,
     sensor_coordinates,
 )
@@ -30,6 +31,10 @@ def dataset_parts(
         name: (dims, np.asarray(value(name)), {"units": unit, "long_name": words})
         for name, (dims, unit, words) in VARIABLES.items()
     }
+    supports, reactions = np.asarray(value("support_positions")), np.asarray(value("reactions"))
+    if supports.size:
+        labels = {"units": "N", "long_name": "reaction of the support, positive upwards"}
+        variables["reaction"] = (("time", "support"), reactions, labels)
     # Modes of repeated frequencies are not unique, so they are stored.
     variables |= {
         f"mode_{name}": (
@@ -39,11 +44,16 @@ def dataset_parts(
         )
         for name, (dims, unit, words) in MODE_VARIABLES.items()
     }
+    if modes.rotation_series is not None:
+        dims, unit, words = ROTATION_SERIES
+        labels = {"units": unit, "long_name": words}
+        variables["mode_rotation_series"] = (dims, np.asarray(modes.rotation_series), labels)
     coordinates = {
         "time": ("time", np.asarray(times), {"units": "s"}),
         **sensor_coordinates(case),
         "load": ("load", wheel_labels(case)),
         "body": ("body", np.array(bodies, dtype=str)),
+        **({"support": ("support", supports, {"units": "m"})} if supports.size else {}),
         "frequency": ("mode", np.asarray(modes.frequencies), {"units": "Hz"}),
     }
     attributes = {

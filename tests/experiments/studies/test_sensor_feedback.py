@@ -90,11 +90,10 @@ def test_loop_is_stable_as_loads_leave_a_softer_beam():
         assert poles.largest_real_part.max() < 0.0
 
 
-def test_untuned_conditions_have_the_longest_period_and_the_filter_of_the_other_rig():
+def test_untuned_conditions_have_the_longest_period_or_the_filter_of_the_other_rig():
     assert set(sensor_feedback.untuned_conditions("B").values()) == {
         (0.015, 10.0),
         (0.01, 20.0),
-        (0.015, 20.0),
     }
     bench = sensor_feedback.bench_case("C", rigs.load("C"))
     changed = sensor_feedback.with_cutoff(bench, 10.0)

@@ -77,15 +77,26 @@ def test_response_with_the_mass_in_the_impedance_only():
     np.testing.assert_allclose(np.asarray(both.values)[every_97th, 3], expected, rtol=1e-8)
 
 
-def test_sampled_gain_of_the_other_shaker():
-    """3.25 N/V and 1000 1/s: all seven numbers that are printed for 5 ms."""
-    waves, omega = sines(3)
+def matrices_with_shaker(rigidity, density, stiffness, damping, force, bandwidth):
+    """System matrices of the beam with a shaker at 0.5 m, three sine modes, eq. (2.36)."""
+    waves = np.arange(1, 4) * np.pi / LENGTH
+    omega, modal = waves**2 * np.sqrt(rigidity / density), density * LENGTH / 2
     at_shaker = np.sin(0.5 * waves)
     A, B = np.zeros((7, 7)), np.zeros((7, 1))
     A[:3, 3:6] = np.eye(3)
-    A[3:6, :3] = -np.diag(omega**2) - 3500 / MODAL * np.outer(at_shaker, at_shaker)
-    A[3:6, 3:6] = -np.diag(2 * DAMPING * omega) - 80 / MODAL * np.outer(at_shaker, at_shaker)
-    A[3:6, 6], A[6, 6], B[6] = 3.25 * at_shaker / MODAL, -1000, 1000
+    A[3:6, :3] = -np.diag(omega**2) - stiffness / modal * np.outer(at_shaker, at_shaker)
+    A[3:6, 3:6] = -np.diag(2 * DAMPING * omega)
+    A[3:6, 3:6] -= damping / modal * np.outer(at_shaker, at_shaker)
+    A[3:6, 6], A[6, 6], B[6] = force * at_shaker / modal, -bandwidth, bandwidth
+    return A, B
+
+
+def test_sampled_gain_of_the_other_shaker():
+    """4.6 N/V over root two and 1000 1/s: all seven numbers for 5 ms to the last digit."""
+    height, width = 3.3e-3, 0.06
+    A, B = matrices_with_shaker(
+        65e9 * width * height**3 / 12, 2700 * width * height, 3500, 80, 4.6 / np.sqrt(2), 1000
+    )
     exponential = expm(5e-3 * np.vstack([np.hstack([A, B]), np.zeros((1, 8))]))
     A, B = exponential[:7, :7], exponential[:7, 7:]
     cost = solve_discrete_are(A, B, np.diag(STATE_WEIGHTS), [[COMMAND_WEIGHT]])
@@ -94,5 +105,14 @@ def test_sampled_gain_of_the_other_shaker():
         optimal_gain(with_other_shaker(with_active_shaker(rigs.load("A"))), 5e-3, STATE_WEIGHTS)[0]
     )[0]
     np.testing.assert_allclose(computed, expected, rtol=1e-6)
-    printed = published_regulators.SAMPLED_GAIN
-    assert np.all(np.abs(expected - printed.numbers) <= printed.allowed_error)
+    assert np.all(published_regulators.SAMPLED_GAIN.agrees(expected))
+
+
+def test_printed_frequencies_with_the_shaker_are_the_damped_ones():
+    """24, 72 and 159 Hz: a dashpot lowers frequencies, by more than the spring raises them."""
+    A, _ = matrices_with_shaker(RIGIDITY, DENSITY, 3500, 80, 0, 1000)
+    poles = np.linalg.eigvals(A)
+    expected = np.sort(poles.imag[poles.imag > 0]) / (2 * np.pi)
+    computed = frequencies.damped_frequencies(rigs.load("A"), 3500, 80)
+    np.testing.assert_allclose(computed, expected, rtol=1e-9)
+    assert np.all(published.SHAKER_MODES.agrees(expected))

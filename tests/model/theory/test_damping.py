@@ -1,10 +1,14 @@
 """Damping by material, hysteretic and Rayleigh damping."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.model.modes import mesh_layout, modes
+from tests.differences import central
 
 BRIDGE = {"flexural_rigidity": 1e10, "mass_per_length": 1e4, "modes": 4}
 
@@ -40,6 +44,46 @@ def test_loss_factor():
     assert_allclose(ratios(length=20.0, loss_factor=0.03), 0.015, rtol=1e-12)
 
 
+def test_loss_factors_of_segments():
+    """Of a uniform pinned beam the part up to a has the share a/L - sin(2 n pi a/L) / (2 n pi)."""
+    n, share = np.arange(1, 5), 0.3
+    energy = share - np.sin(2 * n * np.pi * share) / (2 * n * np.pi)
+    segments = jb.Segment(6.0, loss_factor=0.1), jb.Segment(loss_factor=0.02)
+    found = ratios(length=20.0, segments=segments)
+    assert_allclose(found, (0.1 * energy + 0.02 * (1 - energy)) / 2, rtol=1e-9)
+    found = ratios(length=20.0, segments=[segments[0], jb.Segment()], loss_factor=0.02)
+    assert_allclose(found, (0.1 * energy + 0.02 * (1 - energy)) / 2, rtol=1e-9)
+    found = ratios(length=20.0, segments=[jb.Segment(6.0), jb.Segment(loss_factor=0.02)])
+    assert_allclose(found, 0.01 * (1 - energy), rtol=1e-9)
+
+
+def test_loss_of_soft_shear_and_springs():
+    """Equal loss in bending and shear is that of the whole; a spring without loss takes its share.
+
+    A stiff beam on two equal springs moves as a rigid body: its strain energy is nearly none.
+    """
+    segments = [jb.Segment(6.0, loss_factor=0.04), jb.Segment(loss_factor=0.04)]
+    found = ratios(length=20.0, segments=segments, shear_stiffness=1e8, rotary_inertia=3e3)
+    assert_allclose(found, 0.02, rtol=1e-9)
+    springs = [jb.Support(x, stiffness=1e4) for x in (0.0, 20.0)]
+    found = ratios(springs, length=20.0, segments=segments, ends="free-free")
+    assert found[0] < 1e-5 and found[1] < 1e-5 and 0.0199 < found[2] < 0.02
+
+
+def test_gradient_of_a_loss():
+    def ratio(values):
+        segments = jb.Segment(values[0], loss_factor=values[1]), jb.Segment()
+        beam = jb.Beam(length=20.0, **BRIDGE, segments=segments, loss_factor=0.01)
+        return modes(jb.Case(beam), layout).damping_ratios
+
+    values = jnp.array([6.0, 0.1])
+    given = [jb.Segment(6.0, loss_factor=0.1), jb.Segment()]
+    layout = mesh_layout(jb.Case(jb.Beam(length=20.0, **BRIDGE, segments=given, loss_factor=0.01)))
+    assert_allclose(
+        jax.jit(jax.jacfwd(ratio))(values), central(ratio, values), rtol=1e-6, atol=1e-9
+    )
+
+
 def test_rayleigh_coefficients():
     """The coefficients give the ratios at the first and the third frequency of a bridge."""
     first, _, third, _ = jb.modes(jb.Case(jb.Beam(20.0, **BRIDGE))).frequencies
@@ -55,6 +99,10 @@ def test_bad_damping():
         ({"material": "wood"}, "beam.material cannot be 'wood'"),
         ({"material": "steel", "damping_ratio": 0.01}, "both damping_ratio and material"),
         ({"loss_factor": 0.1, "rayleigh_damping": [0.1, 0.1]}, "both rayleigh_damping and loss"),
+        (
+            {"material": "steel", "segments": [jb.Segment(loss_factor=0.1)]},
+            "both material and segments.0.loss_factor",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             jb.simulate(jb.Case(jb.Beam(20.0, **BRIDGE, **beam)))

@@ -300,3 +300,17 @@ def test_buckling_with_shear(shear):
     critical = np.pi**2 / (1 + np.pi**2 / shear)
     case = jb.Case(jb.Beam(**UNIT, shear_stiffness=shear, axial_force=-1.0))
     assert_allclose(critical_axial_force(case, find_layout(case)), -critical, rtol=1e-10)
+
+
+def test_impulse_of_a_mass_at_a_hinge_vanishes_with_many_modes():
+    """m v [w'] / (1 + m sum psi^2) falls like 1 / n: the reason why such cases are refused."""
+    impulses = []
+    for count in (10, 20, 40):
+        beam = jb.Beam(**UNIT, modes=count, ends="clamped-clamped", hinges=[jb.Hinge(0.4)])
+        found = jb.modes(jb.Case(beam))
+        shape = found.shapes(0.4)
+        jump = found.shapes(0.4 + 1e-9, 1) - found.shapes(0.4 - 1e-9, 1)
+        sagging = jump @ (-shape / found.stiffness)
+        impulses.append(sagging / (1 + shape @ shape))
+    assert sagging > 0.1
+    assert_allclose(np.divide(impulses[:-1], impulses[1:]), 2.0, rtol=0.06)

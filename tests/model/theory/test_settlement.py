@@ -27,6 +27,25 @@ def test_elastic_support():
     assert_allclose(jb.settlement_response(case, [0.1], 2.0), expected, rtol=1e-11)
 
 
+def test_middle_support_of_a_beam_that_is_soft_in_shear():
+    """It is pulled down with R = s / (L^3 / 48 E I + L / 4 kGA), so that M = R L / 4."""
+    case = jb.Case(jb.Beam(4.0, 6.0, 1.0, shear_stiffness=9.0), [jb.Support(2.0)])
+    force = 0.1 / (4.0**3 / (48 * 6.0) + 4.0 / (4 * 9.0))
+    assert_allclose(6.0 * jb.settlement_response(case, [0.1], 2.0, 2), force, rtol=1e-11)
+    x = np.array([1.0, 3.0])
+    assert_allclose(6.0 * jb.settlement_response(case, [0.1], x, 3), [force / 2, -force / 2])
+
+
+def test_a_clamped_end_settles_with_a_support_on_it():
+    """M = 6 E I s / L^2 at both ends, V = 12 E I s / L^3, and -s/2 midway."""
+    case = jb.Case(jb.Beam(4.0, 6.0, 1.0, ends="clamped-clamped"), [jb.Support(4.0)])
+    moment = 6 * 6.0 * 0.1 / 4.0**2
+    x = np.array([0.0, 4.0])
+    assert_allclose(6.0 * jb.settlement_response(case, [0.1], x, 2), [-moment, moment], rtol=1e-11)
+    assert_allclose(6.0 * jb.settlement_response(case, [0.1], 1.0, 3), 2 * moment / 4.0)
+    assert_allclose(jb.settlement_response(case, [0.1], 2.0), -0.05, rtol=1e-11)
+
+
 @pytest.mark.parametrize("beam", [{}, {"shear_stiffness": 9.0, "axial_force": 4.0}])
 def test_rigid_motion(beam):
     """Supports that settle by the same amount do not bend the beam."""

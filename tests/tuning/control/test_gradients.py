@@ -149,3 +149,28 @@ def test_gradients_through_the_closed_loop(kind):
     expected = central(lambda shares: objective(shares)[0], ones, step=1e-4)
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
     assert np.all(np.abs(expected) > 1e-7)
+
+
+def test_gradients_of_a_bending_moment():
+    """The metric is of the statically corrected moment that records have."""
+    case = rig(jb.Feedback([3000.0], period=0.02))
+    sensors = (jb.Sensor(0.25), jb.Sensor(0.15, "moment"))
+    case = dataclasses.replace(case, sensors=sensors, run=jb.Run(0.42, sample_rate=50.0))
+    run_set = make_run_set(case, RUNS, [0.25], quantities=("moment",))
+
+    @jax.jit
+    @jax.value_and_grad
+    def metric(gain):
+        return run_set.metrics({"controller.gains.0": gain}, 50.0)["moment"][0]
+
+    value, slope = metric(jnp.asarray(3000.0))
+    controlled, uncontrolled = (
+        np.abs(jb.simulate(jb.replace(one, RUNS[0])).sensor_values[:, 1])
+        for one in (case, dataclasses.replace(case, controller=None))
+    )
+    expected = np.log(np.sum(np.exp(50.0 * controlled / uncontrolled.max()))) / 50.0
+    np.testing.assert_allclose(value, expected, rtol=1e-4)
+    above, below = (metric(jnp.asarray(3000.0 + h))[0] for h in (10.0, -10.0))
+    np.testing.assert_allclose(slope, (above - below) / 20, rtol=1e-5)
+    with pytest.raises(ValueError, match="'shear' is the largest shear at the sensors"):
+        make_run_set(case, RUNS, quantities=("shear",))

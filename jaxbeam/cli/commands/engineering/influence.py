@@ -16,11 +16,12 @@ def influence(
     fibre_distance: float | None = None,
     section_modulus: float | None = None,
     output: Output = None,
-    plot: bool = False,
     pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Compute influence lines: values at a section over the position of a load of 1 N.
+
+    `--plot` draws them to CASE_influence.png in this folder, or beside the output.
 
     Parameters
     ----------
@@ -38,11 +39,9 @@ def influence(
         Bending moment over stress in m^3, for stress.
     output
         Write the lines to a table: OUT.csv, .xlsx, .mat or .parquet.
-    plot
-        Draw them to CASE_influence.png in this folder, or beside the output.
     """
     check_suffix(output, TABLES[0], "a table of influence lines", TABLES[1:])
-    picture = pictures.path(plot, output, case.with_stem(f"{case.stem}_influence"))
+    picture = pictures.path(output, case.with_stem(f"{case.stem}_influence"))
     options.check_outputs(output, picture)
     parsed_case = options.read(case)
 

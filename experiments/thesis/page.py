@@ -1,0 +1,139 @@
+"""Counts of verdicts on the pages of the documentation, written from a report of `reproduce`.
+
+    python -m experiments.thesis.page out/reproduce/report.json
+
+writes docs/explanation/thesis.md, and the sentences between the marks of README.md and of
+docs/howto/reproduce.md. Run it after `jaxbeam reproduce --all`.
+"""
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from experiments.thesis.report import ALL_VERDICTS
+from experiments.thesis.verdicts import (
+    EXPLAINED,
+    FITTED,
+    IRREPRODUCIBLE,
+    NOT_COUNTED,
+    NOT_REPRODUCED,
+    NULL_MET,
+    REPEATED,
+    REPRODUCED,
+    VERDICTS,
+)
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "explanation" / "thesis.md"
+BEGIN, END = "<!-- counts of verdicts -->", "<!-- end of counts -->"
+INTRODUCTION = """# What the thesis's numbers bear
+
+Every number that the thesis prints and a computation can be compared with was gone through as by
+somebody who tries to refute it. The rules:
+
+- A computed number is *reproduced* if it follows from printed parameters to a unit of its last
+  digit, the rounding of those parameters included; a measured one within the scatter that the
+  thesis itself shows between its two spans and between series of one case.
+- It is *explained* if a reading of the text other than the literal one gives it, and no parameter
+  was fitted to that very number. One reading serves for all numbers of a group: the likeliest, with
+  all readings in the report.
+- It *cannot be right* only by a proof that the report shows; else it is *not reproduced*.
+- A number that a null model (no control, static, one mode) meets within the same tolerance counts
+  for nothing, nor does one that a parameter was fitted to, nor one that repeats another.
+
+This page is written from the report of `jaxbeam reproduce --all`, by
+`python -m experiments.thesis.page`.
+"""
+
+
+def findings(report: dict) -> Iterator[tuple[str, dict]]:
+    """Name of the experiment and finding, for all findings of a report."""
+    for name, experiment in report["experiments"].items():
+        yield from ((name, one) for one in experiment["findings"])
+
+
+def counts(report: dict) -> Counter:
+    """Published numbers by verdict."""
+    return Counter(verdict for _, one in findings(report) for verdict in one["verdicts"])
+
+
+def sentence(report: dict) -> str:
+    """The counts in a sentence."""
+    found = counts(report)
+    counted = sum(found[word] for word in VERDICTS)
+    return (
+        f"Of {sum(found.values())} numbers that the thesis prints {counted} bear a verdict:"
+        f" {found[REPRODUCED]} are reproduced, {found[EXPLAINED]} explained by a named reading,"
+        f" {found[IRREPRODUCIBLE]} cannot be right and {found[NOT_REPRODUCED]} are not reproduced."
+        f" {found[NULL_MET]} a null model meets as well, to {found[FITTED]} a parameter was"
+        f" fitted, and {found[REPEATED]} repeat others: these count for nothing."
+    )
+
+
+def page(report: dict) -> str:
+    """The page on the thesis: counts by experiment, then each number that is not reproduced."""
+    header = ("experiment", *ALL_VERDICTS)
+    rows = []
+    for name, experiment in report["experiments"].items():
+        own = Counter(word for one in experiment["findings"] for word in one["verdicts"])
+        if own:
+            rows.append((name, *(str(own[word]) for word in ALL_VERDICTS)))
+    rows.append(("all", *(str(counts(report)[word]) for word in ALL_VERDICTS)))
+    parts = [INTRODUCTION, sentence(report), "", _table(header, rows), ""]
+    for verdict in (EXPLAINED, IRREPRODUCIBLE, NOT_REPRODUCED, *NOT_COUNTED):
+        lines = [_line(one, verdict) for _, one in findings(report) if verdict in one["verdicts"]]
+        if lines:
+            parts += [f"## {verdict[0].upper()}{verdict[1:]}", "", *lines, ""]
+    return "\n".join(parts).rstrip() + "\n"
+
+
+def _line(one: dict, verdict: str) -> str:
+    """An item on the numbers of a finding with a verdict: printed, computed, and why."""
+    which = [i for i, word in enumerate(one["verdicts"]) if word == verdict]
+    computed = one["readings"][one["reading"]]
+    pairs = ", ".join(
+        f"{one['published'][i]:g}" + ("" if np.isnan(computed[i]) else f" ({computed[i]:.4g})")
+        for i in which
+    )
+    reasons = {
+        EXPLAINED: one["reading"],
+        IRREPRODUCIBLE: one["impossible because"],
+        NOT_REPRODUCED: one["remark"],
+        NULL_MET: one["null model"],
+        FITTED: one["reading"],
+        REPEATED: one["repeats"],
+    }
+    reason = reasons[verdict]
+    return f"- {one['where']}, {one['what']}: {pairs}" + (f": {reason}." if reason else ".")
+
+
+def _table(header, rows) -> str:
+    lines = [header, ("---", *["---:"] * (len(header) - 1)), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def with_counts(text: str, report: dict) -> str:
+    """The text with the sentence of the counts between its marks.
+
+    Raises ValueError if it has no marks.
+    """
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise ValueError(f"there are no marks {BEGIN} and {END} in the text")
+    return f"{before}{BEGIN}\n{sentence(report)}\n{END}{after}"
+
+
+def write(report: dict) -> None:
+    """Write the page, and the counts in README and on the page about `reproduce`."""
+    PAGE.write_text(page(report), encoding="utf-8")
+    for file in (ROOT / "README.md", ROOT / "docs" / "howto" / "reproduce.md"):
+        file.write_text(with_counts(file.read_text(encoding="utf-8"), report), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")))

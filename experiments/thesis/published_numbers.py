@@ -1,0 +1,97 @@
+"""Numbers that are printed in the thesis, with the tolerance of each."""
+
+import dataclasses
+
+import numpy as np
+
+SHORT_WHOLE_NUMBER = 3  # digits up to which zeros at the end of a whole number are digits
+
+
+@dataclasses.dataclass(frozen=True)
+class Tolerance:
+    """Allowed difference from a published number: the largest of three bounds.
+
+    `relative` is a share of the number, `absolute` is in its unit, `digits` counts units of its
+    last printed digit (zeros at the end of a whole number of four or more digits are not digits).
+    `basis` names what the tolerance rests on.
+    """
+
+    basis: str
+    relative: float = 0.0
+    absolute: float = 0.0
+    digits: float = 0.0
+
+    def __str__(self) -> str:
+        parts = [f"{self.absolute:g}"] if self.absolute else []
+        parts += [f"{100 * self.relative:g} %"] if self.relative else []
+        parts += [f"{self.digits:g} in the last digit"] if self.digits else []
+        return " or ".join(parts)
+
+
+@dataclasses.dataclass(frozen=True)
+class PublishedNumbers:
+    """Published numbers of one quantity: location, unit, origin, tolerance, and the digits.
+
+    `printed_text` holds the numbers as printed, separated by spaces, and `labels` a name for each.
+    `origin` is "measured" or "computed", as the thesis says. `interpretation` says how an ambiguous
+    statement is read. `repeats` says where else the numbers are printed, or from which printed
+    numbers they follow by arithmetic: such numbers are shown and not counted. `repeated_labels` has
+    the labels of those that repeat; all do if it is empty.
+    """
+
+    location: str
+    quantity: str
+    unit: str
+    origin: str
+    tolerance: Tolerance
+    printed_text: str
+    labels: str = ""
+    interpretation: str = ""
+    repeats: str = ""
+    repeated_labels: str = ""
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The values, (number,)."""
+        return np.array([float(word) for word in self.printed_text.split()])
+
+    @property
+    def allowed_error(self) -> np.ndarray:
+        """Allowed absolute difference from each value, (number,)."""
+        last_digits = [_last_digit_unit(word) for word in self.printed_text.split()]
+        by_digits = self.tolerance.digits * np.array(last_digits)
+        by_share = self.tolerance.relative * np.abs(self.numbers)
+        return np.maximum(np.maximum(by_share, by_digits), self.tolerance.absolute)
+
+    @property
+    def value_labels(self) -> list[str]:
+        """One label for each value, empty where none is given."""
+        labels = self.labels.split()
+        return labels or [""] * self.numbers.size
+
+    @property
+    def repeated(self) -> np.ndarray:
+        """Whether each number repeats another, (number,)."""
+        if not self.repeats:
+            return np.zeros(self.numbers.size, bool)
+        return self.has_label(self.repeated_labels or self.labels)
+
+    def has_label(self, labels: str) -> np.ndarray:
+        """Whether the label of each number is among `labels`, (number,)."""
+        return np.isin(self.value_labels, labels.split() or [""])
+
+    def agrees(self, values) -> np.ndarray:
+        """Whether each of `values` (number,) is within the tolerance."""
+        # Differences of decimal numbers are off by rounding: 1.1 - 1.0 exceeds 0.1.
+        return np.abs(np.asarray(values) - self.numbers) <= self.allowed_error * (1 + 1e-9)
+
+
+def _last_digit_unit(word: str) -> float:
+    """One unit of the last printed digit; zeros at the end of long whole numbers are not digits."""
+    digits, _, exponent = word.lower().partition("e")
+    scale = 10.0 ** int(exponent or 0)
+    if "." in digits:
+        return scale * 10.0 ** -len(digits.partition(".")[2])
+    if len(digits.lstrip("+-")) <= SHORT_WHOLE_NUMBER:
+        return scale
+    return scale * 10.0 ** (len(digits) - len(digits.rstrip("0")))

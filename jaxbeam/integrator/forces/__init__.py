@@ -1,0 +1,1 @@
+"""Forces that move at constant speeds, in closed form."""
