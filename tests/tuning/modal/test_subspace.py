@@ -77,7 +77,7 @@ def test_close_modes_are_found_in_a_short_log():
     ("kind", "count"), [("ambient", 2), pytest.param("motor", 8, marks=pytest.mark.slow)]
 )
 def test_modes_and_lines_of_planted_logs_are_found(kind, count):
-    """As `experiments.validation.modal_identification` does with many; intervals cover the truth."""
+    """As `experiments.validation.modal_identification` does it; intervals cover the truth."""
     found = []
     for seed in range(count):
         planted = sampled(small_structure(seed), kind, seed, 200.0)
