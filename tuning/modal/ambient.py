@@ -187,13 +187,13 @@ def _mode(poles: Poles, chain: Chain, found: dict[int, Spread], scale) -> Identi
 
 
 def _with_usual_spread(mode: IdentifiedMode, chain: Chain, found: dict[int, Spread]):
-    """The mode with the uncertainty of the lower quarter of its chain.
+    """The mode with the uncertainty of the lower eighth of its chain.
 
     The pole of least uncertainty decides whether there is a mode; but that it is the least makes it
     too small by chance.
     """
     ranked = sorted((found[k].covariance for k in chain.members.tolist()), key=np.linalg.det)
-    variances = np.maximum(np.diag(ranked[len(ranked) // 4]), np.diag(ranked[0]))
+    variances = np.maximum(np.diag(ranked[len(ranked) // 8]), np.diag(ranked[0]))
     frequency_sd, damping_sd = np.sqrt(variances).tolist()
     return mode._replace(frequency_sd=frequency_sd, damping_sd=damping_sd)
 
