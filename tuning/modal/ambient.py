@@ -114,6 +114,10 @@ def _modes_of_band(prepared: Prepared, whole, variance, data_driven, order, refi
     modes = [_mode(poles, chain, spread_of, scale) for chain in diagram.chains]
     lengths = [chain.members.size for chain in diagram.chains]
     reasons = [rejection_reason(mode, duration, whole) for mode in modes]
+    modes = [
+        mode if reason else _with_usual_spread(mode, chain, spread_of)
+        for mode, reason, chain in zip(modes, reasons, diagram.chains, strict=True)
+    ]
     if refine and any(reasons):
         modes, reasons = _decided(modes, reasons, records, prepared.rate, scale, duration, whole)
     candidates = [Candidate(*found) for found in zip(modes, reasons, lengths, strict=True)]
@@ -180,6 +184,18 @@ def _mode(poles: Poles, chain: Chain, found: dict[int, Spread], scale) -> Identi
         shape_covariance=covariance,
         quantile=float(student.ppf(0.975, own.degrees_of_freedom)),
     )
+
+
+def _with_usual_spread(mode: IdentifiedMode, chain: Chain, found: dict[int, Spread]):
+    """The mode with the uncertainty of the lower eighth of its chain.
+
+    The pole of least uncertainty decides whether there is a mode; but that it is the least makes it
+    too small by chance.
+    """
+    ranked = sorted((found[k].covariance for k in chain.members.tolist()), key=np.linalg.det)
+    variances = np.maximum(np.diag(ranked[len(ranked) // 8]), np.diag(ranked[0]))
+    frequency_sd, damping_sd = np.sqrt(variances).tolist()
+    return mode._replace(frequency_sd=frequency_sd, damping_sd=damping_sd)
 
 
 def _rescaled(shape, covariance, scale, largest):
