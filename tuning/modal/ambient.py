@@ -67,12 +67,11 @@ def subspace_modes(
     found: list[Candidate] = []
     diagrams = []
     parts = divided_band(band)
-    variance = _variance(prepare(records, starts, rate, band).records)
     for low, high in parts:
         if progress:
             progress(f"modes from {low:.3g} Hz to {high:.4g} Hz")
         prepared = prepare(records, starts, rate, overlapping((low, high), band))
-        candidates, diagram = _modes_of_band(prepared, band, variance, data_driven, order, refine)
+        candidates, diagram = _modes_of_band(prepared, band, data_driven, order, refine)
         found += candidates
         diagrams.append(diagram)
     return without_duplicates(found), tuple(diagrams)
@@ -89,11 +88,8 @@ def _variance(records):
     return sum(np.sum(record**2, axis=0) for record in records) / sum(map(len, records))
 
 
-def _modes_of_band(prepared: Prepared, whole, variance, data_driven, order, refine):
-    """Candidates and diagram of records prepared for one part of the band `whole`.
-
-    `variance` is that of the channels in the whole band.
-    """
+def _modes_of_band(prepared: Prepared, whole, data_driven, order, refine):
+    """Candidates and diagram of records prepared for one part of the band `whole`."""
     scale = np.sqrt(_variance(prepared.records))
     scale = np.where(scale > 0, scale, 1.0)
     records = tuple(record / scale for record in prepared.records)
@@ -102,7 +98,6 @@ def _modes_of_band(prepared: Prepared, whole, variance, data_driven, order, refi
     if order is not None:
         rows = max(rows, order // channels + 1)
     subspace = decompose(records, prepared.rate, rows, data_driven)
-    subspace = subspace._replace(total=np.maximum(variance / scale**2, 1e-300))
     highest = order or min(MAX_ORDER, 2 * rows * channels // 3)
     parts = [poles_of_order(subspace, n) for n in range(2, highest + 1, 2)]
     poles = Poles(*(np.concatenate([getattr(p, name) for p in parts]) for name in Poles._fields))

@@ -104,8 +104,7 @@ def free_decay_modes(
     )
     energy = np.sum(measured**2, axis=0)
     limit = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_ENERGY
-    by_channel = energy.reshape(-1, channels).sum(axis=0)
-    found = _candidates(fits, by_channel, len(windows) / samples.rate, band)
+    found = _candidates(fits, channels, len(windows) / samples.rate, band)
     good = any(not one.reason for one in found)
     if kind is None and not (good and np.sum((measured - fitted) ** 2) < limit * energy.sum()):
         return None
@@ -120,12 +119,13 @@ def _within(values, rate, part):
     return np.fft.irfft(transform, len(values), axis=0)
 
 
-def _candidates(fits, energy, duration, band) -> tuple[Candidate, ...]:
-    """Modes of each part of the band, with their shares in the energy of the channels."""
+def _candidates(fits, channels, duration, band) -> tuple[Candidate, ...]:
+    """Modes of each part of the band, with their shares in its energy of the channels."""
     found = []
     for part, fit in fits:
-        decays = fit.energies.shape[1] // energy.size
-        by_channel = fit.energies.reshape(-1, decays, energy.size).sum(axis=1)
+        energy = np.sum(fit.measured**2, axis=0).reshape(-1, channels).sum(axis=0)
+        decays = fit.energies.shape[1] // channels
+        by_channel = fit.energies.reshape(-1, decays, channels).sum(axis=1)
         shares = np.mean(by_channel / np.maximum(energy, 1e-300), axis=1)
         for mode, share, gone in zip(fit.modes, shares.tolist(), fit.gone, strict=True):
             if part[0] <= mode.frequency < part[1] or len(fits) == 1:
