@@ -30,9 +30,9 @@ from experiments.thesis.verdicts import (
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "explanation" / "thesis.md"
 BEGIN, END = "<!-- counts of verdicts -->", "<!-- end of counts -->"
-INTRODUCTION = """# What the thesis's numbers bear
+INTRODUCTION = """# The numbers of the thesis, and which are reproduced
 
-Every number that the thesis prints and a computation can be compared with was gone through as by
+Each number in the thesis that can be computed stands here with a verdict, which was given as by
 somebody who tries to refute it. The rules:
 
 - A computed number is *reproduced* if it follows from printed parameters to a unit of its last
@@ -45,6 +45,7 @@ somebody who tries to refute it. The rules:
 - A number that a null model (no control, static, one mode) meets within the same tolerance counts
   for nothing, nor does one that a parameter was fitted to, nor one that repeats another.
 
+In the lists the number of the thesis comes first, the computed one in brackets, then the reason.
 This page is written from the report of `jaxbeam reproduce --all`, by
 `python -m experiments.thesis.page`. [Verdicts that changed](thesis_changes.md) has each number
 whose verdict was another one before these rules.
@@ -67,11 +68,11 @@ def sentence(report: dict) -> str:
     found = counts(report)
     counted = sum(found[word] for word in VERDICTS)
     return (
-        f"Of {sum(found.values())} numbers that the thesis prints {counted} bear a verdict:"
-        f" {found[REPRODUCED]} are reproduced, {found[EXPLAINED]} explained by a named reading,"
+        f"Of the {sum(found.values())} numbers of the thesis that can be computed {counted} count:"
+        f" {found[REPRODUCED]} are reproduced, {found[EXPLAINED]} are explained by a named reading,"
         f" {found[IRREPRODUCIBLE]} cannot be right and {found[NOT_REPRODUCED]} are not reproduced."
-        f" {found[NULL_MET]} a null model meets as well, to {found[FITTED]} a parameter was"
-        f" fitted, and {found[REPEATED]} repeat others: these count for nothing."
+        f" The others count for nothing: a null model meets {found[NULL_MET]} of them as well,"
+        f" a parameter was fitted to {found[FITTED]}, and {found[REPEATED]} repeat others."
     )
 
 
