@@ -30,23 +30,25 @@ from experiments.thesis.verdicts import (
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "explanation" / "thesis.md"
 BEGIN, END = "<!-- counts of verdicts -->", "<!-- end of counts -->"
-INTRODUCTION = """# Numbers of the thesis: reproduced or not
+INTRODUCTION = """# The numbers of the thesis, and which are reproduced
 
-For each number that the thesis prints and that can be computed, this page says whether jaxbeam
-finds the same. The words:
+Each number in the thesis that can be computed stands here with a verdict, which was given as by
+somebody who tries to refute it. The rules:
 
-- *Reproduced*: the computed number follows from the printed parameters to a unit of its last
-  printed digit, the rounding of these parameters included. For a measured number the tolerance is
-  the scatter that the thesis shows between its two spans and between series of one case.
-- *Explained*: another reading of the text than the literal one gives the number, without a
-  parameter fitted to it. One reading serves for all numbers of a group: the likeliest. The report
-  has all readings.
-- *Cannot be right*: the report shows a proof. *Not reproduced*: all others.
-- Not counted is a number that a null model (no control, static, or one mode) meets within the same
-  tolerance, one to which a parameter was fitted, and one that repeats another.
+- A computed number is *reproduced* if it follows from printed parameters to a unit of its last
+  digit, the rounding of those parameters included; a measured one within the scatter that the
+  thesis itself shows between its two spans and between series of one case.
+- It is *explained* if a reading of the text other than the literal one gives it, and no parameter
+  was fitted to that very number. One reading serves for all numbers of a group: the likeliest, with
+  all readings in the report.
+- It *cannot be right* only by a proof that the report shows; else it is *not reproduced*.
+- A number that a null model (no control, static, one mode) meets within the same tolerance counts
+  for nothing, nor does one that a parameter was fitted to, nor one that repeats another.
 
+In the lists the number of the thesis comes first, the computed one in brackets, then the reason.
 This page is written from the report of `jaxbeam reproduce --all`, by
-`python -m experiments.thesis.page`.
+`python -m experiments.thesis.page`. [Verdicts that changed](thesis_changes.md) has each number
+whose verdict was another one before these rules.
 """
 
 
@@ -66,11 +68,11 @@ def sentence(report: dict) -> str:
     found = counts(report)
     counted = sum(found[word] for word in VERDICTS)
     return (
-        f"The thesis prints {sum(found.values())} numbers that can be computed. {counted} count:"
-        f" {found[REPRODUCED]} are reproduced, {found[EXPLAINED]} explained by a named reading,"
+        f"Of the {sum(found.values())} numbers of the thesis that can be computed {counted} count:"
+        f" {found[REPRODUCED]} are reproduced, {found[EXPLAINED]} are explained by a named reading,"
         f" {found[IRREPRODUCIBLE]} cannot be right and {found[NOT_REPRODUCED]} are not reproduced."
-        f" Not counted are {found[NULL_MET]} that a null model meets as well, {found[FITTED]} to"
-        f" which a parameter was fitted, and {found[REPEATED]} that repeat others."
+        f" The others count for nothing: a null model meets {found[NULL_MET]} of them as well,"
+        f" a parameter was fitted to {found[FITTED]}, and {found[REPEATED]} repeat others."
     )
 
 

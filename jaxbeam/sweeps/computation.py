@@ -32,8 +32,9 @@ def compute_sweep(
     state: str,
     client: Any,
     progress_bar: tqdm,
+    estimates: bool = True,
 ) -> "xarray.Dataset":
-    """Dataset of a sweep with its estimated truncation errors.
+    """Dataset of a sweep, with `estimates` of its truncation errors.
 
     Blocks are written to the store at a path, unless it is None.
 
@@ -42,10 +43,10 @@ def compute_sweep(
     workers compute all blocks but the first.
     """
     dataset, block_store = _computed(specification, path, state, client, progress_bar)
-    for quantity, share in estimated_errors(
-        specification.case, _worst_runs(specification, dataset)
-    ).items():
-        dataset[f"peak_{quantity}"].attrs["truncation_error"] = share
+    if estimates:
+        worst = worst_runs(specification, dataset)
+        for quantity, share in estimated_errors(specification.case, worst).items():
+            dataset[f"peak_{quantity}"].attrs["truncation_error"] = share
     block_store.finish(dataset)
     return dataset
 
@@ -167,7 +168,7 @@ def _to_dataset(
     return xarray.Dataset(variables, coordinates, attributes)
 
 
-def _worst_runs(specification: SweepSpecification, dataset) -> dict[str, dict[str, float]]:
+def worst_runs(specification: SweepSpecification, dataset) -> dict[str, dict[str, float]]:
     """Numbers of the run with the largest peak of each quantity; none where all runs failed."""
     runs, worst = specification.runs(), {}
     for quantity in {sensor.quantity for sensor in specification.case.sensors}:

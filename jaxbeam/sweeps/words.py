@@ -24,8 +24,9 @@ from jaxbeam.case.display.addresses import address_words
 from jaxbeam.case.joint_addresses import ALL
 from jaxbeam.files.case_file import case_to_dict, with_settings
 from jaxbeam.sweeps import MAX_RUNS, store as sweep_store
-from jaxbeam.sweeps.computation import compute_sweep, count_as_done
+from jaxbeam.sweeps.computation import compute_sweep, count_as_done, worst_runs
 from jaxbeam.sweeps.specification import SweepSpecification, sweep_specification
+from jaxbeam.sweeps.truncation import estimated_errors
 from jaxbeam.sweeps.zarr_files import BLOCKS_GROUP, FINGERPRINT_ATTRIBUTE, new_store, replace_blocks
 
 if TYPE_CHECKING:
@@ -177,12 +178,26 @@ def compute_word_sweep(
         part_path = None if path is None else path / BLOCKS_GROUP / str(i)
         datasets.append(_compute_part(part, part_path, client, progress_bar))
     joined = plan.join(datasets)
+    for quantity, share in _estimates(plan, datasets).items():
+        joined[f"peak_{quantity}"].attrs["truncation_error"] = share
     if set(plan.sweeps[0].dims) - set(plan.dims):  # words alone
         joined = joined.isel({dim: 0 for dim in plan.sweeps[0].dims}, drop=True)
     joined.attrs[FINGERPRINT_ATTRIBUTE] = fingerprint
     if path is not None:
         replace_blocks(path, joined)
     return joined
+
+
+def _estimates(plan: WordSweep, datasets: "Sequence[xarray.Dataset]") -> dict[str, float]:
+    """Truncation errors by quantity, each of the words with the largest peak of it."""
+    errors = {}
+    for quantity in {sensor.quantity for sensor in plan.case.sensors}:
+        peaks = [part[f"peak_{quantity}"].max().item() for part in datasets]
+        worst = int(np.argmax(np.nan_to_num(peaks)))
+        part, run = plan.sweeps[worst], worst_runs(plan.sweeps[worst], datasets[worst])
+        found = estimated_errors(part.case, {q: run[q] for q in run if q == quantity})
+        errors |= {q: share for q, share in found.items() if q == quantity}
+    return errors
 
 
 def _compute_part(part, path, client, progress_bar) -> "xarray.Dataset":
@@ -194,4 +209,4 @@ def _compute_part(part, path, client, progress_bar) -> "xarray.Dataset":
     if found and found[1] != part.fingerprint():
         raise ValueError(f"{path} is not the part of its sweep that its place says")
     state = "new" if found is None else "resume"
-    return compute_sweep(part, path, state, client, progress_bar)
+    return compute_sweep(part, path, state, client, progress_bar, estimates=False)

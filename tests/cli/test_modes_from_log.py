@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from jaxbeam.files.case_file import load_case
+
 
 @pytest.fixture
 def decay_log(folder):
@@ -43,6 +45,23 @@ def test_the_rate_of_a_file_without_times(run, decay_log):
     np.testing.assert_allclose(found["frequencies_hz"], [12], rtol=1e-3)
 
 
+def test_a_case_is_fitted_to_the_modes(run, decay_log):
+    """E I = m L^4 (2 pi f)^2 / pi^4 of the pinned beam, within its interval."""
+    (decay_log / "beam.toml").write_text(
+        "[beam]\nlength = 3.0\nflexural_rigidity = 9e4\nmass_per_length = 20.0\nmodes = 2\n"
+    )
+    line = f"modes-from-log node.csv {COLUMNS} --band 5:60 --case beam.toml"
+    printed = run(f"{line} --free beam.flexural_rigidity=5e4:5e5 -o fitted.toml")
+    assert "mode 1 of the case: 12.0" in printed and "written: fitted.toml" in printed
+    expected = 20 * 3**4 * (2 * np.pi * 12) ** 2 / np.pi**4
+    assert load_case(decay_log / "fitted.toml").beam.flexural_rigidity == pytest.approx(
+        expected, rel=2e-3
+    )
+    found = run(f"{line} --free beam.flexural_rigidity --json")["fit"]
+    low, high = found["numbers"]["beam.flexural_rigidity"]["interval_95"]
+    assert low < expected < high < 1.02 * low
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [
@@ -56,6 +75,8 @@ def test_the_rate_of_a_file_without_times(run, decay_log):
         (f"node.csv {COLUMNS} --channels c", "the log has no channel 'c'; it has a, b"),
         (f"node.csv {COLUMNS} --method x", "method must be"),
         (f"node.csv {COLUMNS} --order 2", "the highest order must be at least 4, not 2"),
+        (f"node.csv {COLUMNS} --free beam.length", "--case and --free belong together"),
+        (f"node.csv {COLUMNS} -o out.toml", "-o writes the fitted case: give --case"),
         (f"node.csv {COLUMNS} --rate 100", "the log has a column of times, 't'"),
     ],
 )

@@ -67,12 +67,11 @@ def subspace_modes(
     found: list[Candidate] = []
     diagrams = []
     parts = divided_band(band)
-    variance = _variance(prepare(records, starts, rate, band).records)
     for low, high in parts:
         if progress:
             progress(f"modes from {low:.3g} Hz to {high:.4g} Hz")
         prepared = prepare(records, starts, rate, overlapping((low, high), band))
-        candidates, diagram = _modes_of_band(prepared, band, variance, data_driven, order, refine)
+        candidates, diagram = _modes_of_band(prepared, band, data_driven, order, refine)
         found += candidates
         diagrams.append(diagram)
     return without_duplicates(found), tuple(diagrams)
@@ -89,11 +88,8 @@ def _variance(records):
     return sum(np.sum(record**2, axis=0) for record in records) / sum(map(len, records))
 
 
-def _modes_of_band(prepared: Prepared, whole, variance, data_driven, order, refine):
-    """Candidates and diagram of records prepared for one part of the band `whole`.
-
-    `variance` is that of the channels in the whole band.
-    """
+def _modes_of_band(prepared: Prepared, whole, data_driven, order, refine):
+    """Candidates and diagram of records prepared for one part of the band `whole`."""
     scale = np.sqrt(_variance(prepared.records))
     scale = np.where(scale > 0, scale, 1.0)
     records = tuple(record / scale for record in prepared.records)
@@ -102,7 +98,6 @@ def _modes_of_band(prepared: Prepared, whole, variance, data_driven, order, refi
     if order is not None:
         rows = max(rows, order // channels + 1)
     subspace = decompose(records, prepared.rate, rows, data_driven)
-    subspace = subspace._replace(total=np.maximum(variance / scale**2, 1e-300))
     highest = order or min(MAX_ORDER, 2 * rows * channels // 3)
     parts = [poles_of_order(subspace, n) for n in range(2, highest + 1, 2)]
     poles = Poles(*(np.concatenate([getattr(p, name) for p in parts]) for name in Poles._fields))
@@ -114,6 +109,10 @@ def _modes_of_band(prepared: Prepared, whole, variance, data_driven, order, refi
     modes = [_mode(poles, chain, spread_of, scale) for chain in diagram.chains]
     lengths = [chain.members.size for chain in diagram.chains]
     reasons = [rejection_reason(mode, duration, whole) for mode in modes]
+    modes = [
+        mode if reason else _with_usual_spread(mode, chain, spread_of)
+        for mode, reason, chain in zip(modes, reasons, diagram.chains, strict=True)
+    ]
     if refine and any(reasons):
         modes, reasons = _decided(modes, reasons, records, prepared.rate, scale, duration, whole)
     candidates = [Candidate(*found) for found in zip(modes, reasons, lengths, strict=True)]
@@ -180,6 +179,18 @@ def _mode(poles: Poles, chain: Chain, found: dict[int, Spread], scale) -> Identi
         shape_covariance=covariance,
         quantile=float(student.ppf(0.975, own.degrees_of_freedom)),
     )
+
+
+def _with_usual_spread(mode: IdentifiedMode, chain: Chain, found: dict[int, Spread]):
+    """The mode with the uncertainty of the lower eighth of its chain.
+
+    The pole of least uncertainty decides whether there is a mode; but that it is the least makes it
+    too small by chance.
+    """
+    ranked = sorted((found[k].covariance for k in chain.members.tolist()), key=np.linalg.det)
+    variances = np.maximum(np.diag(ranked[len(ranked) // 8]), np.diag(ranked[0]))
+    frequency_sd, damping_sd = np.sqrt(variances).tolist()
+    return mode._replace(frequency_sd=frequency_sd, damping_sd=damping_sd)
 
 
 def _rescaled(shape, covariance, scale, largest):

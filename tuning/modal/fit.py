@@ -77,7 +77,9 @@ class ModalFit:
     @property
     def shapes(self) -> Complex[np.ndarray, "mode channel"]:
         """Mode shapes, each with a largest component of one."""
-        return np.array([mode.shape for mode in self.modes]).reshape(len(self.modes), -1)
+        return np.array([mode.shape for mode in self.modes], complex).reshape(
+            len(self.modes), len(self.log.names)
+        )
 
     @property
     def mac(self) -> Float[np.ndarray, "mode mode"]:

@@ -17,6 +17,7 @@ BACKGROUND_OCTAVES = 1.0  # width of the running quantile that is the background
 BACKGROUND_PERCENT = 25  # below the peaks of a pair of modes, however much of an octave they fill
 RESONANCE_RATIO = 6.0  # of the spectrum over its background: 8 dB
 BAND_ENERGY_SHARE = 0.99  # of the kinetic energy of resonances, below the upper end of the band
+MAX_RESONANCES = 12  # in the band: the lowest, which a model of the structure has
 BAND_MARGIN = 1.3  # of the ends of the band beyond the outermost resonances
 MIN_CYCLES = 8.0  # cycles of the lowest frequency in the longest record
 
@@ -38,7 +39,9 @@ def kinetic_band(
     rate: float,
     derivatives: tuple[int, ...],
 ) -> tuple[float, float]:
-    """Band (Hz) of the resonances that hold the kinetic energy of a vibration.
+    """Band (Hz) of the lowest resonances of a vibration, MAX_RESONANCES at most.
+
+    It ends earlier where they hold nearly all of its kinetic energy.
 
     Resonances are where the spectrum exceeds its background (lower quartile over an octave) by
     8 dB; their excess is converted to velocities by `derivatives`, the order of each channel as a
@@ -62,6 +65,10 @@ def kinetic_band(
     share = np.cumsum(kinetic) / kinetic.sum()
     low = bins[np.searchsorted(share, 1 - BAND_ENERGY_SHARE)]
     high = bins[min(int(np.searchsorted(share, BAND_ENERGY_SHARE)), bins.size - 1)]
+    stands_out = np.any(excess > 0, axis=1) & (bins >= low)
+    tops = bins[np.flatnonzero(stands_out & ~np.append(stands_out[1:], False))]
+    if tops.size > MAX_RESONANCES:
+        high = min(high, float(tops[MAX_RESONANCES - 1]))
     high = min(high * BAND_MARGIN, 0.4 * rate)
     return float(max(low / BAND_MARGIN**2, lowest)), float(high)
 

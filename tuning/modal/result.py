@@ -10,7 +10,7 @@ from tuning.modal.shapes import phase_collinearity
 MAX_RELATIVE_FREQUENCY_SD = 0.02
 MAX_DAMPING_RATIO = 0.2
 MIN_CYCLES = 4.0  # cycles of a mode in the window
-MIN_ENERGY_SHARE = 0.002  # of the energy of the log in the band
+MIN_ENERGY_SHARE = 0.002  # of the energy of the log in the mode's part of the band
 MIN_COLLINEARITY = 0.5  # modal phase collinearity, of three channels or more
 MAX_BAND_SHARE = 0.98  # of the upper end of the band; a mode above may be the flank of another
 
@@ -18,7 +18,8 @@ MAX_BAND_SHARE = 0.98  # of the upper end of the band; a mode above may be the f
 class IdentifiedMode(NamedTuple):
     """A mode: undamped natural frequency (Hz) and damping ratio, with standard deviations.
 
-    `energy_share` is its share of the energy of a channel in the band, on average over channels.
+    `energy_share` is its share of the energy of a channel in its part of the band, three octaves at
+    most, on average over channels: how strong another part is does not matter.
     `shape` has a largest component of one; `shape_covariance` is that of its real parts, then its
     imaginary parts.
     """

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from tuning.logs.log import Log
 from tuning.logs.quality import find_faults
 from tuning.logs.records import even_records
+from tuning.modal.settling import settled_from
 
 MIN_SAMPLES = 64
 
@@ -39,8 +40,16 @@ def samples_of(logs: Sequence[Log], window: tuple[float, float] | None) -> Sampl
         part = log if (start, stop) == (0, log.times.size) else _part(log, start, stop)
         rate, found, said = even_records(part)
         rates.append(rate)
-        records += [record.values for record in found]
-        starts += [record.start for record in found]
+        settled = settled_from(found[0].values) if window is None else 0
+        if settled:
+            said = (
+                *said,
+                f"the first {settled / rate:.3g} s are left out, while a sensor settles  [--from]",
+            )
+        for i, record in enumerate(found):
+            skipped = 0 if i else settled
+            records.append(record.values[skipped:])
+            starts.append(record.start + skipped / rate)
         faults = (str(fault).removeprefix(f"{log.source}: ") for fault in find_faults(part))
         notes += [*log.notes, *said, *faults]
         if log.names != logs[0].names or abs(rate / rates[0] - 1) > 1e-3:

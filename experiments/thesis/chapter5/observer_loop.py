@@ -34,7 +34,7 @@ class ObservedLoop(NamedTuple):
     deflection: Float[np.ndarray, "sample sensor"]
 
 
-class Gains(NamedTuple):
+class LoopGains(NamedTuple):
     """Gain of the regulator (state,) and of the observer (state,), at one sampling period (s)."""
 
     regulator: Float[np.ndarray, " state"]
@@ -50,8 +50,8 @@ def sampled(A, B, period: float) -> tuple[np.ndarray, np.ndarray]:
     return exponential[:states, :states], exponential[:states, states:]
 
 
-def design(case: jb.Case, period: float, state_weights, command_weight: float) -> Gains:
-    """Gains of the regulator and of the observer of the beam without its load."""
+def design(case: jb.Case, period: float, state_weights, command_weight: float) -> LoopGains:
+    """LoopGains of the regulator and of the observer of the beam without its load."""
     plant = jb.state_space(case, "sine").unloaded
     A, B = sampled(np.asarray(plant.A), np.asarray(plant.B), period)
     C, Q = np.asarray(plant.C)[SENSOR : SENSOR + 1], np.diag(state_weights)
@@ -59,11 +59,15 @@ def design(case: jb.Case, period: float, state_weights, command_weight: float) -
     regulator = np.linalg.solve(command_weight + B.T @ cost @ B, B.T @ cost @ A)[0]
     cost = solve_discrete_are(A.T, C.T, Q, [[OBSERVER_WEIGHT]])
     observer = (A @ cost @ C.T / (OBSERVER_WEIGHT + C @ cost @ C.T))[:, 0]
-    return Gains(regulator, observer)
+    return LoopGains(regulator, observer)
 
 
 def simulate_observed(
-    case: jb.Case, period: float, gains: Gains | None, noisy: bool = True, after_exit: float = 0.0
+    case: jb.Case,
+    period: float,
+    gains: LoopGains | None,
+    noisy: bool = True,
+    after_exit: float = 0.0,
 ) -> ObservedLoop:
     """Run of a case with one mass, until some time (s) after it has left.
 

@@ -75,7 +75,7 @@ def peaks_of_forces(
     panels = _panels(system, row, solutions, duration)
     table = np.concatenate([tables[v] for v in np.unique(speed)])
     first_point = np.searchsorted(np.unique(speed), speed) * len(system.influence)
-    outputs = _Outputs(system, row, panels, table, first_point)
+    outputs = _RowOutputs(system, row, panels, table, first_point)
     rate = max(system.fastest, system.wavenumber * np.abs(speed).max())
     max_step, coarse = max_phase / rate, max(max_phase, COARSE_PHASE) / rate
     steps = _steps(panels.boundaries, coarse)
@@ -145,7 +145,7 @@ def _steps(boundaries, max_step: float):
     return panel, boundaries[panel] + number * length, length
 
 
-class _Outputs(NamedTuple):
+class _RowOutputs(NamedTuple):
     """Outputs at the peak nodes of steps."""
 
     system: ForceSystem

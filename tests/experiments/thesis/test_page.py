@@ -22,7 +22,7 @@ REPORT = {"experiments": {"one": {"findings": [FINDING]}, "none": {"findings": [
 
 def test_numbers_are_counted_and_listed_with_their_reasons():
     assert page.counts(REPORT) == {NULL_MET: 1, EXPLAINED: 1, NOT_REPRODUCED: 1}
-    assert "The thesis prints 3 numbers that can be computed. 2 count:" in page.sentence(REPORT)
+    assert "Of the 3 numbers of the thesis that can be computed 2 count" in page.sentence(REPORT)
     text = page.page(REPORT)
     assert "- Table 9, peaks: 2 (2): else." in text
     assert "- Table 9, peaks: 3: the speed is not printed." in text

@@ -21,7 +21,8 @@ from tuning.modal.samples import MIN_SAMPLES, Samples
 from tuning.modal.stabilisation import Diagram
 
 MIN_DECAY_ENERGY = 0.3  # share of the energy of a log in its decays, if they are to stand for it
-LONG_FALL_NEPERS = 2.5  # or fall of the energy; 95 % of that of an exponential falls by 3
+LONG_FALL_NEPERS = 2.0  # or fall of the energy; 95 % of that of an exponential falls by 3
+MIN_START_LEVEL = 0.2  # energy at the start of such a decay over the mean energy of the log
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
 NOT_REPRODUCED = "not the same in parts of the window"
 MAX_RESIDUAL_OF_WINDOW = 0.05  # the same for a window that the user gives and that falls little
@@ -76,7 +77,9 @@ def free_decay_modes(
     if given:
         decays = tuple(Stretch(i, 0, len(r), 0.0) for i, r in enumerate(samples.records))
     ratio = prepared.rate / samples.rate
-    if not decays or not (kind or given or _dominate(decays, prepared.records, ratio)):
+    if not decays or not (
+        kind or given or _dominate(decays, prepared.records, ratio, prepared.rate / frequency)
+    ):
         return None
     windows, used = stacked(samples.records, decays)
     if len(windows) < MIN_SAMPLES // 2:
@@ -101,8 +104,7 @@ def free_decay_modes(
     )
     energy = np.sum(measured**2, axis=0)
     limit = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_ENERGY
-    by_channel = energy.reshape(-1, channels).sum(axis=0)
-    found = _candidates(fits, by_channel, len(windows) / samples.rate, band)
+    found = _candidates(fits, channels, len(windows) / samples.rate, band)
     good = any(not one.reason for one in found)
     if kind is None and not (good and np.sum((measured - fitted) ** 2) < limit * energy.sum()):
         return None
@@ -117,12 +119,13 @@ def _within(values, rate, part):
     return np.fft.irfft(transform, len(values), axis=0)
 
 
-def _candidates(fits, energy, duration, band) -> tuple[Candidate, ...]:
-    """Modes of each part of the band, with their shares in the energy of the channels."""
+def _candidates(fits, channels, duration, band) -> tuple[Candidate, ...]:
+    """Modes of each part of the band, with their shares in its energy of the channels."""
     found = []
     for part, fit in fits:
-        decays = fit.energies.shape[1] // energy.size
-        by_channel = fit.energies.reshape(-1, decays, energy.size).sum(axis=1)
+        energy = np.sum(fit.measured**2, axis=0).reshape(-1, channels).sum(axis=0)
+        decays = fit.energies.shape[1] // channels
+        by_channel = fit.energies.reshape(-1, decays, channels).sum(axis=1)
         shares = np.mean(by_channel / np.maximum(energy, 1e-300), axis=1)
         for mode, share, gone in zip(fit.modes, shares.tolist(), fit.gone, strict=True):
             if part[0] <= mode.frequency < part[1] or len(fits) == 1:
@@ -132,10 +135,20 @@ def _candidates(fits, energy, duration, band) -> tuple[Candidate, ...]:
     return without_duplicates(found)
 
 
-def _dominate(decays, records, ratio) -> bool:
-    """Whether decays hold much of the energy of a log, or fall farther than chance allows."""
+def _dominate(decays, records, ratio, cycle) -> bool:
+    """Whether decays hold much of the energy of a log, or one falls far from a level like its own.
+
+    `cycle` is that of the strongest vibration in samples. A decay that begins far below the level
+    of the log, long after blows, lacks the modes that were gone by then.
+    """
     inside = sum(
         np.sum(records[d.record][int(d.start * ratio) : int(d.stop * ratio)] ** 2) for d in decays
     )
     whole = sum(np.sum(record**2) for record in records)
-    return bool(inside > MIN_DECAY_ENERGY * whole or max(d.fall for d in decays) > LONG_FALL_NEPERS)
+    level = whole / sum(map(len, records))
+    longest = max(decays, key=lambda d: d.fall)
+    start = int(np.ceil(longest.start * ratio))
+    first = records[longest.record][start : start + int(2 * cycle) + 1]
+    begins = np.sum(first**2) / len(first)
+    falls = longest.fall > LONG_FALL_NEPERS and begins > MIN_START_LEVEL * level
+    return bool(inside > MIN_DECAY_ENERGY * whole or falls)

@@ -2,7 +2,7 @@
 
 Between blows the samples are predicted by the past ones, but for noise. An autoregressive model of
 each channel tells excitation by its prediction errors: a blow is an error far beyond those of the
-quietest parts of the log, and beyond those around it or not small beside the signal itself. The
+quietest parts of the log, and beyond those before it or not small beside the signal itself. The
 model is that of the log at its own rate, whose highest frequencies show a contact best, whatever
 the band in which modes are sought.
 """
@@ -19,7 +19,7 @@ AR_ROWS = 20_000  # equations from which its coefficients are found
 QUIET_QUANTILE = 0.2  # of the blocks, by their prediction errors
 BLOW_SD = 10.0  # prediction errors of quiet blocks, beyond which the structure is struck
 BLOW_SIGNAL_SHARE = 0.25  # of the rms of the signal around, likewise
-BLOW_LOCAL_SD = 8.0  # or of the errors around it; normal errors reach six in a day of samples
+BLOW_LOCAL_SD = 8.0  # or of the errors before it; normal errors reach six in a day of samples
 CONTACT_SAMPLES = 4  # within which past and future fail after a blow
 MIN_ENERGY_RISE = 2.0  # energy in two cycles after a blow over that before it
 MIN_DECAY_CYCLES = 5.0  # of the strongest vibration
@@ -70,11 +70,21 @@ def _is_large(error, around, span):
         return found > BLOW_SIGNAL_SHARE * around
     blocks = found[: error.size // size * size].reshape(-1, size)
     quiet = np.sqrt(np.quantile(np.mean(blocks**2, axis=1), QUIET_QUANTILE))
-    medians = np.median(blocks, axis=1) / 0.6745  # standard deviations of normal errors
-    local = medians[np.minimum(np.arange(error.size) // size, len(medians) - 1)]
+    local = _level_before(error, max(span // 4, 16))
     return (found > BLOW_SD * quiet) & (
         (found > BLOW_SIGNAL_SHARE * around) | (found > BLOW_LOCAL_SD * local)
     )
+
+
+def _level_before(error, size):
+    """Deviation of the errors in the block of half a cycle before that of each sample.
+
+    In a decay, whose errors may fall with the signal, none exceeds those before it.
+    """
+    count = max(error.size // size, 1)
+    blocks = np.abs(error[: count * size]).reshape(count, -1)
+    medians = np.median(blocks, axis=1) / 0.6745  # standard deviations of normal errors
+    return medians[np.clip(np.arange(error.size) // size - 1, 0, count - 1)]
 
 
 def _widened(samples):

@@ -7,8 +7,16 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from jaxbeam.cli.arguments import check_exists, figure_path, parse_range, refuse_option
-from jaxbeam.cli.options import OutputOptions, print_message
+import jaxbeam as jb
+from jaxbeam.cli.arguments import (
+    bounds_in_si,
+    check_exists,
+    figure_path,
+    parse_bounds,
+    parse_range,
+    refuse_option,
+)
+from jaxbeam.cli.options import CaseOptions, Free, Output, print_message
 
 
 def modes_from_log(
@@ -27,12 +35,16 @@ def modes_from_log(
     align: bool = False,
     plot: bool = False,
     length: float | None = None,
-    options: OutputOptions = OutputOptions(),
+    case: Path | None = None,
+    free: Free = (),
+    output: Output = None,
+    options: CaseOptions = CaseOptions(),
 ) -> None:
     """Natural frequencies, damping ratios and mode shapes from logs of unknown excitation.
 
     Free decays after blows, ambient vibration, and the harmonic lines of machines in it are
-    recognised. Every choice is printed with the option that overrides it.
+    recognised. Every choice is printed with the option that overrides it. With `--case`, parameters
+    of a case are fitted to the modes that were found, with 95 % intervals.
 
     Parameters
     ----------
@@ -67,16 +79,27 @@ def modes_from_log(
         after the first log.
     length
         Length (m) of the beam on which the shapes are drawn.
+    case
+        CASE.toml: the case whose parameters (`--free`) are fitted to the modes.
+    output
+        Write the fitted case to this file, FIT.toml.
     """
     refuse_option(not logs, "modes-from-log needs a log: jaxbeam modes-from-log LOG...")
     limits = None if band is None else parse_range("--band", band, "Hz, such as 5:45")
     refuse_option(
         from_ is not None and to is not None and from_ >= to, "--from must be less than --to"
     )
+    refuse_option(
+        (case is None) != (not free), "--case and --free belong together: what is fitted, and where"
+    )
+    refuse_option(output is not None and case is None, "-o writes the fitted case: give --case")
+    bounds = dict(parse_bounds(text) for text in free)
     excluded = _numbers("--exclude", exclude)
     check_exists("log file", *logs)
     picture = figure_path(None, logs[0]) if plot else None
-    options.check_outputs(picture)
+    options.check_outputs(output, picture)
+    if case is not None:
+        options.check_case(case)
 
     import tuning
 
@@ -104,7 +127,14 @@ def modes_from_log(
     )
     if picture:
         fit.plot(picture, length=length)
-    options.report(fit.to_dict(), [str(fit)], picture)
+    answer, lines = fit.to_dict(), [str(fit)]
+    if case is not None:
+        model = options.read(case)
+        updated = tuning.identify_from_modes(model, fit, bounds_in_si(model, bounds))
+        answer, lines = {**answer, "fit": updated.to_dict()}, [*lines, "", str(updated)]
+        if output is not None:
+            jb.save_case(updated.case, output, options.overwrite)
+    options.report(answer, lines, output, picture)
 
 
 def _numbers(option: str, text: str | None) -> tuple[float, ...]:
