@@ -166,7 +166,8 @@ def _make_log(
         raise ValueError(f"{path}: there is no column besides the time, {time_column!r}")
     declared = units if isinstance(units, Mapping) else dict.fromkeys(channels, units)
     column_units = [
-        _unit_of(path, table, name, declared, description) for name in (time_column, *channels)
+        _unit_of(path, table, name, declared, description, "s" if name == time_column else "mm")
+        for name in (time_column, *channels)
     ]
     if column_units[0][1].quantity != "time":
         raise ValueError(
@@ -245,14 +246,15 @@ def _unit_of(
     name: str,
     declared: Mapping[str, str | None],
     description: LogDescription,
+    example: str,
 ):
-    """Unit of a column, as text and as `Unit`."""
+    """Unit of a column, as text and as `Unit`; an error names the `example` of one."""
     in_file = table.units[table.names.index(name)]
     text = declared.get(name) or description.unit(name) or in_file
     if not text:
         raise ValueError(
-            f"{path}, column {name!r}: no unit found; write it in the heading, {name} [mm], "
-            f'pass units={{"{name}": "mm"}}, or put {name} = "mm" under [columns] '
+            f"{path}, column {name!r}: no unit found; write it in the heading, {name} [{example}], "
+            f'pass units={{"{name}": "{example}"}}, or put {name} = "{example}" under [columns] '
             f"in {path.with_suffix('.toml').name}"
         )
     try:
