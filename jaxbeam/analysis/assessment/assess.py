@@ -150,8 +150,8 @@ def _determinant_length(case: Case, given) -> float:
     found = spans(case)
     if len(found) > 1:
         raise ValueError(
-            f"the beam has {len(found)} spans; give their determinant length L_phi by table 6.2 of EN"
-            " 1991-2, as determinant_length or --determinant-length"
+            f"the beam has {len(found)} spans; give their determinant length L_phi by table 6.2 of"
+            " EN 1991-2, as determinant_length or --determinant-length"
         )
     return found[0][1] - found[0][0]
 
