@@ -54,7 +54,8 @@ class MPC(AbstractStateController):
     part of the prediction.
 
     Limits and rate limits of each actuator are kept; a `soft_limit` on deflections is exceeded
-    where that costs less, at `soft_weight` times the square of the excess. With the `terminal` cost
+    where that costs less, at `soft_weight` times the square of the excess. A `hard_limit` is kept in
+    every predicted period; where no commands keep it there is no solution. With the `terminal` cost
     "riccati" the regulator of the unloaded plant is assumed to act after the horizon, eq. (7.31).
     `solver` is the method for the quadratic program; "unconstrained" is the law (7.9), clipped by
     the actuators only. Where no solution is found the last command is held, and the record counts
@@ -82,6 +83,9 @@ class MPC(AbstractStateController):
     )
     soft_weight: Float[Array, ""] = number(
         "1", "weight of the square of the excess over a soft limit", POSITIVE, default=1e4
+    )
+    hard_limit: Float[Array, " *output"] | None = number(
+        "m", "limit of each deflection that predictions must keep", POSITIVE, default=None
     )
     loads: str = choice(
         "weights of the loads in the prediction", "ignored", "known", default="ignored"
@@ -114,6 +118,7 @@ class MPC(AbstractStateController):
             "output_weight": ((), (outputs,)),
             "horizon_weight": ((self.horizon,),),
             "soft_limit": ((), (outputs,)),
+            "hard_limit": ((), (outputs,)),
         }
         if self.period is None:
             return "period must be given: predictive control acts at samples"
@@ -171,6 +176,7 @@ class MPC(AbstractStateController):
             move_weights=xp.broadcast_to(self.move_weight, (len(actuators),)),
             soft_limit=self.soft_limit,
             soft_weight=self.soft_weight,
+            hard_limit=self.hard_limit,
             terminal_cost=self._terminal_cost(sampled, C, weights, vehicles),
             preview=loaded_plant and preview(loaded_plant, self.period, self.delay),
             delayed=self.delay is not None,

@@ -51,6 +51,7 @@ class MPCLaw(AbstractStateLaw):
     move_weights: Float[Array, " actuator"]
     soft_limit: Float[Array, " *output"] | None
     soft_weight: Float[Array, ""]
+    hard_limit: Float[Array, " *output"] | None
     terminal_cost: Float[Array, "augmented augmented"] | None
     preview: Preview | None
     delayed: bool = eqx.field(static=True)
@@ -122,6 +123,9 @@ class MPCLaw(AbstractStateLaw):
         gamma = self.limits.limits - self.limits.command_rows @ previous_command
         if self.solver == "unconstrained":
             return QuadraticProgram(H, f, M[:0], gamma[:0])
+        if self.hard_limit is not None:
+            rows, sides = _rows_within(Phi, free_response, self.hard_limit)
+            M, gamma = xp.concatenate([M, rows]), xp.concatenate([gamma, sides])
         if self.soft_limit is not None:
             return self._with_soft_limits(H, f, M, gamma, Phi, free_response)
         return QuadraticProgram(H, f, M, gamma)
@@ -137,14 +141,22 @@ class MPCLaw(AbstractStateLaw):
 
     def _with_soft_limits(self, H, f, M, gamma, Phi, free_response):
         """Program with the excess over the soft limit of each output as a further variable."""
-        horizon, outputs, variables = Phi.shape
+        horizon, outputs, _ = Phi.shape
         H = block_diag(H, 2 * self.soft_weight * xp.eye(outputs))
-        excess = xp.tile(xp.eye(outputs), (horizon, 1))
-        rows, free_deflections = Phi.reshape(-1, variables), free_response.reshape(-1)
-        limit = xp.tile(xp.broadcast_to(self.soft_limit, (outputs,)), horizon)
-        M = xp.block([[M, xp.zeros((M.shape[0], outputs))], [rows, -excess], [-rows, -excess]])
-        gamma = xp.concatenate([gamma, limit - free_deflections, limit + free_deflections])
+        excess = xp.tile(xp.eye(outputs), (2 * horizon, 1))
+        rows, sides = _rows_within(Phi, free_response, self.soft_limit)
+        M = xp.block([[M, xp.zeros((M.shape[0], outputs))], [rows, -excess]])
+        gamma = xp.concatenate([gamma, sides])
         return QuadraticProgram(H, xp.pad(f, (0, outputs)), M, gamma)
+
+
+def _rows_within(Phi, free_response, limit):
+    """Rows and right sides of |Phi variables + free response| <= limit, of each output."""
+    horizon, outputs, variables = Phi.shape
+    rows, free_deflections = Phi.reshape(-1, variables), free_response.reshape(-1)
+    limit = xp.tile(xp.broadcast_to(limit, (outputs,)), horizon)
+    sides = xp.concatenate([limit - free_deflections, limit + free_deflections])
+    return xp.concatenate([rows, -rows]), sides
 
 
 def output_weights(

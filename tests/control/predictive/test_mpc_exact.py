@@ -38,6 +38,13 @@ SETTINGS = {
         "horizon_weight": [1.0, 0.5, 2.0, 1.0, 3.0],
     },
     "soft limits": {"soft_limit": [2e-4, 4e-4], "soft_weight": 30.0, "move_weight": 1e-9},
+    "hard limits": {"hard_limit": [9e-4, 9.5e-4], "move_weight": 1e-8},
+    "hard and soft limits": {
+        "hard_limit": 9e-4,
+        "soft_limit": 3e-4,
+        "soft_weight": 0.3,
+        "move_weight": 1e-8,
+    },
     "Laguerre functions": {"horizon": 8, "moves": 2, "laguerre_pole": 0.6} | TIME_VARYING,
     "terminal cost": {"terminal": "riccati"},
 }
@@ -151,13 +158,17 @@ class ExplicitProgram:
             best = np.linalg.lstsq(slopes, -residuals)[0]
             return self.future(best)[1][0]
         rows, row_slopes = affine(self.rows, count)
+        outputs, output_slopes = affine(lambda v: 1e6 * self.future(v)[2][1:] @ self.C.T, count)
+        output_slopes = output_slopes.reshape(-1, count)
+        if self.law.hard_limit is not None:  # in um
+            allowed = 1e6 * np.broadcast_to(self.law.hard_limit, outputs.shape)
+            rows = np.concatenate([rows, (outputs - allowed).ravel(), (-outputs - allowed).ravel()])
+            row_slopes = np.vstack([row_slopes, output_slopes, -output_slopes])
         if self.law.soft_limit is not None:  # an excess (um) for each position, and its cost
             extra = 1e6 * np.sqrt(float(self.law.soft_weight)) * 1e-6 * np.eye(2)
             slopes = scipy.linalg.block_diag(slopes, extra)
             residuals = np.append(residuals, np.zeros(2))
-            outputs, output_slopes = affine(lambda v: 1e6 * self.future(v)[2][1:] @ self.C.T, count)
             allowed = 1e6 * np.broadcast_to(self.law.soft_limit, outputs.shape)
-            output_slopes = output_slopes.reshape(-1, count)
             excess = np.tile(np.eye(2), (len(outputs), 1))
             row_slopes = np.vstack(
                 [
@@ -235,3 +246,10 @@ def test_commands_against_an_independent_program(name):
     if law.soft_limit is not None:
         without = commands_of(beam_case(**SETTINGS[name] | {"soft_limit": 1.0}))
         assert np.max(np.abs(found - without)) > 0.05
+    if law.hard_limit is not None:
+        without = commands_of(beam_case(**SETTINGS[name] | {"hard_limit": 1.0}))
+        assert np.max(np.abs(found - without)) > 0.05
+
+
+def test_the_last_command_is_held_where_no_commands_keep_a_hard_limit():
+    assert_allclose(commands_of(beam_case(hard_limit=1e-7)), 0.0, atol=1e-12)
