@@ -54,12 +54,12 @@ class MPC(AbstractStateController):
     part of the prediction.
 
     Limits and rate limits of each actuator are kept; a `soft_limit` on deflections is exceeded
-    where that costs less, at `soft_weight` times the square of the excess. A `hard_limit` is kept in
-    every predicted period; where no commands keep it there is no solution. With the `terminal` cost
-    "riccati" the regulator of the unloaded plant is assumed to act after the horizon, eq. (7.31).
-    `solver` is the method for the quadratic program; "unconstrained" is the law (7.9), clipped by
-    the actuators only. Where no solution is found the last command is held, and the record counts
-    a failure.
+    where that costs less, at `soft_weight` times the square of the excess. A `hard_limit` is kept
+    in every predicted period; where no commands keep it there is no solution. With the `terminal`
+    cost "riccati" the regulator of the unloaded plant is assumed to act after the horizon, eq.
+    (7.31). `solver` is the method for the quadratic program; "unconstrained" is the law (7.9),
+    clipped by the actuators only. Where no solution is found the last command is held, and the
+    record counts a failure.
     """
 
     kind: ClassVar[str] = "mpc"
