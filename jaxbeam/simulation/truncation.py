@@ -17,6 +17,7 @@ LEFT_OUT = 3  # highest modes whose dynamic part estimates that of all modes bey
 MAX_SAMPLES = 400  # of a record from which the errors are estimated
 
 
+@np.errstate(all="ignore")  # of extreme numbers
 def truncation_errors(case: Case, modes: Modes, motion: Motion) -> Float[Array, " sensor"]:
     """Estimated truncation error of the quantity of each sensor, relative to its largest value.
 
