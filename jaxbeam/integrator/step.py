@@ -148,13 +148,25 @@ def _known_forces(step: StepInput):
         no_response = np.zeros((*weight.shape[:-1], matrices.state_count + count))
         return -np.concatenate([no_response, weight], axis=-1)
     parts = [response, *([] if commands is None else [commands.contact_response])]
+    # Runs of the same wheels share the systems; weights are then right sides of one each.
+    batch = weight.shape[1]
+    shared = batch > 1 and not np.ptp(inertia, axis=1).any()
+    if shared:
+        inertia, weight = inertia[:, :1], np.moveaxis(weight, 1, -1)[:, :, 0][:, None]
     right = [inertia * part[:, None] for part in parts]
     right = np.concatenate([*right, weight], axis=-1)
     if isinstance(compliance, ModalCompliance):
         compliance = jax.tree.map(lambda part: part[:, None], compliance)
-        return compliance.solve(inertia, right)
-    system = np.eye(weight.shape[2]) + inertia * compliance[:, None]
-    return -np.linalg.solve(system, right)
+        forces = compliance.solve(inertia, right)
+    else:
+        system = np.eye(weight.shape[2]) + inertia * compliance[:, None]
+        forces = -np.linalg.solve(system, right)
+    if not shared:
+        return forces
+    of_weights = np.swapaxes(forces[..., -batch:], 1, 3)  # step, batch, wheel, 1
+    of_state = forces[..., :-batch]
+    of_state = np.broadcast_to(of_state, (len(forces), batch, *of_state.shape[2:]))
+    return np.concatenate([of_state, of_weights], axis=-1)
 
 
 _advance_with_rule = custom_jvp(_advance_all)
