@@ -192,11 +192,14 @@ def map_elements(function: Callable, inputs) -> Any:
 
 def while_loop(condition: Callable, step: Callable, carry) -> Any:
     """`jax.lax.while_loop`."""
-    start = carry
-    while not any_jax(carry) and not is_jax(going_on := condition(carry)):
+    start, count = carry, 0
+    # Numbers that are known at the start and after one step stay known.
+    while count > 1 or not any_jax(carry):
+        if is_jax(going_on := condition(carry)):
+            break
         if not going_on:
             return carry
-        carry = step(carry)
+        carry, count = step(carry), count + 1
     return jax.lax.while_loop(condition, step, start)
 
 
@@ -313,6 +316,11 @@ def cholesky(matrix) -> Any:
     """Lower triangular factor of a matrix; nan where it is not positive definite."""
     if is_jax(matrix):
         return lapack.cholesky(matrix)
+    if matrix.ndim == 2 and matrix.size:
+        from scipy.linalg import lapack as scipy_lapack
+
+        upper, failure = scipy_lapack.dpotrf(matrix.T, False, True)
+        return np.tril(np.full_like(matrix, np.nan)) if failure else upper.T
     try:
         return np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:

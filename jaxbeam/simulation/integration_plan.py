@@ -17,9 +17,8 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule
-from jaxbeam.integrator.integrate import (
-    integrate_at_events,
-)
+from jaxbeam.integrator.input_policy import AbstractInputPolicy
+from jaxbeam.integrator.integrate import integrate_at_events
 from jaxbeam.integrator.static_shapes import StaticShapes, static_shapes
 from jaxbeam.integrator.step_size import (
     MAX_DIVERGED_HALVINGS,
@@ -41,6 +40,7 @@ from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
 
 TOLERANCE = 1e-7  # relative to the largest deflection
 MAX_STEPS_PER_SAMPLE = 10**5  # time steps between samples of a controlled run
+MAX_KNOWN_EVENTS = 20000  # of a run without compilation, which would take less time beyond
 SPACING_TOLERANCE = 1e-6  # largest deviation of equally spaced samples, relative to the spacing
 
 
@@ -64,14 +64,22 @@ class IntegrationPlan(eqx.Module):
     to_duration: bool = eqx.field(static=True, default=False)
 
 
+# A run by a plan under an input policy: its deflections, as `trial_deflections`, at all events.
+FirstRun = Callable[[IntegrationPlan, AbstractInputPolicy], np.ndarray]
+
+
 def integration_plan(
-    case: Case, times: Float[Array, " time"] | None = None, tolerance: float = TOLERANCE
+    case: Case,
+    times: Float[Array, " time"] | None = None,
+    tolerance: float = TOLERANCE,
+    first_run: FirstRun | None = None,
 ) -> IntegrationPlan:
     """Integration plan of a case with concrete numbers, for samples at `times` (s).
 
     Default times are those of the run, which ends at its duration. `tolerance` is relative to the
-    largest deflection. Raises ValueError for an invalid case, RuntimeError if no time step meets
-    the tolerance.
+    largest deflection. A `first_run` with the longest steps may take the place of the first trial
+    run of a controlled case that is not compiled. Raises ValueError for an invalid case,
+    RuntimeError if no time step meets the tolerance.
     """
     check_case(case)
     case = concrete_case(case)
@@ -81,8 +89,16 @@ def integration_plan(
     if case.controller is not None:
         end = float(case.run.duration) if to_duration else None
         schedule = loop_schedule(case, samples, end)
-        substeps, error = _choose_substeps(case, shapes, schedule, tolerance)
-        return IntegrationPlan(shapes, substeps, 0, False, error, schedule, to_duration)
+
+        def plan(substeps, error):
+            return IntegrationPlan(shapes, substeps, 0, False, error, schedule, to_duration)
+
+        def run_first(substeps, policy):
+            assert first_run is not None
+            return first_run(plan(substeps, 0.0), policy)
+
+        by_first_run = None if first_run is None else run_first
+        return plan(*_choose_substeps(case, shapes, schedule, tolerance, by_first_run))
     step, error = choose_step_size(case, shapes, tolerance)
     intervals = np.diff(samples)
     equally_spaced = bool(
@@ -143,8 +159,17 @@ def sample_times(case: Case) -> Float[Array, " time"]:
     return xp.arange(intervals + 1) / rate if intervals else xp.array([0.0, duration])
 
 
-def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, tolerance: float):
-    """Number of steps between events of a schedule, and the relative error of the deflection."""
+def _choose_substeps(
+    case: Case,
+    shapes: StaticShapes,
+    schedule: EventSchedule,
+    tolerance: float,
+    first_run: Callable[[int, AbstractInputPolicy], np.ndarray] | None,
+) -> tuple[int, float]:
+    """Number of steps between events of a schedule, and the relative error of the deflection.
+
+    A `first_run` takes the smallest number of steps.
+    """
     step, interval = longest_trial_step(case, shapes), float(schedule.lengths.max())
     if interval / step > MAX_STEPS_PER_SAMPLE:
         raise RuntimeError(
@@ -155,11 +180,16 @@ def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, 
     check_step_count(schedule.times.size * interval / step, step)
     min_substeps = steps_per_interval(interval, step)
 
-    trial_run = _compiled_trial_run if case.controller.runs_compiled else _known_trial_run
+    is_compiled = runs_compiled(case, schedule)
+    trial_run = _compiled_trial_run if is_compiled else _known_trial_run
+    policy = None if is_compiled else _known_loop(case, shapes, schedule)
 
     @functools.cache
     def response(halvings):
-        return np.asarray(trial_run(case, shapes, schedule, xp.asarray(min_substeps * 2**halvings)))
+        if halvings == 0 and first_run is not None and policy is not None:
+            return first_run(min_substeps, policy)
+        substeps = xp.asarray(min_substeps * 2**halvings)
+        return np.asarray(trial_run(case, shapes, schedule, substeps, policy))
 
     # A loop that diverges does so with any step, so its error is not defined. A stiff law in
     # continuous time may also overflow because the steps are too long.
@@ -171,18 +201,32 @@ def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, 
     return min_substeps * 2**halvings, error
 
 
-def _closed_loop_trial_run(case, shapes, schedule, substeps):
+def runs_compiled(case: Case, schedule: EventSchedule) -> bool:
+    """Whether runs of a controlled case are compiled although its numbers are known.
+
+    In NumPy each event takes a fraction of a millisecond, in a program a hundredth of that.
+    """
+    return case.controller.runs_compiled or schedule.times.shape[0] > MAX_KNOWN_EVENTS
+
+
+@compiled_if_traced
+def _known_loop(case, shapes, schedule):
+    """Input policy of all trial runs."""
+    return closed_loop(case, shapes.layout, load_set(case, shapes.layout), schedule)
+
+
+def _closed_loop_trial_run(case, shapes, schedule, substeps, policy):
     """Deflections (m) at TRIAL_POSITIONS and all events, as (event and position, batch).
 
-    Peaks would hide errors: where a command saturates, the deflection has its error everywhere but
-    at a peak, where it is stationary.
+    The input `policy` is that of the case if it is None. Peaks would hide errors: where a command
+    saturates, the deflection has its error everywhere but at a peak, where it is stationary.
     """
     loads = load_set(case, shapes.layout)
-    policy = closed_loop(case, shapes.layout, loads, schedule)
+    policy = policy or closed_loop(case, shapes.layout, loads, schedule)
     grid = grid_by_schedule(case, policy.model, schedule, substeps)
     discrete = discrete_model(policy.model, grid, None, policy)
     states = integrate_at_events(discrete, loads, max_loads=shapes.max_loads, policy=policy)
-    return trial_deflections(case, policy.model, states)
+    return trial_deflections(case, policy.model, states[: schedule.times.shape[0]])
 
 
 _known_trial_run = compiled_if_traced(_closed_loop_trial_run)
