@@ -10,10 +10,9 @@ from jaxtyping import Float
 from jaxbeam.case.estimator import AbstractSampledFilter, Estimate
 from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.gains import filter_gain
-from jaxbeam.estimation.sampled_plant import Transition
+from jaxbeam.estimation.sampled_plant import Transition, in_blocks
 from jaxbeam.estimation.sensor_chain import FilteredPlant, SensorChain
 from jaxbeam.estimation.simulated_vehicles import with_loads
-from jaxbeam.numerics.blocks import in_blocks
 from jaxbeam.numerics.matrices import symmetric_part
 from jaxbeam.runtime.arrays import Array, take, xp
 

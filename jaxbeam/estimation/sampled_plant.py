@@ -7,7 +7,9 @@ the one that acts at the end of the period.
 import functools
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
+import jax
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.controller import AbstractController
@@ -15,6 +17,7 @@ from jaxbeam.numerics.discretisation import exponential_and_gramian
 from jaxbeam.runtime.arrays import Array, stop_gradient, xp
 from jaxbeam.runtime.module import Module
 
+BLOCK = 256  # samples, of which the intermediate results fit into a cache
 PERIOD_ROUNDING = 1e-9  # of a period; delays that exceed whole periods by less count as whole
 
 Square = Float[Array, "*sample state state"]
@@ -124,6 +127,17 @@ def sample_timing(controller: AbstractController) -> SampleTiming:
     """Timing of a controller with a sampling period; whole periods of its delay are left out."""
     period, delay = controller.period, controller.delay
     return SampleTiming(period, None if delay is None else split_delay(delay, period)[1])
+
+
+def in_blocks(function: Callable[[int, int], Any], count: int) -> Any:
+    """Arrays that a function of a first sample and a number of samples returns, for `count` ones.
+
+    Computed block by block: intermediate results of all samples at once would need more room. The
+    first axis of the arrays is that of the samples.
+    """
+    starts = range(0, count, BLOCK)
+    parts = [function(first, min(BLOCK, count - first)) for first in starts]
+    return jax.tree.map(lambda *blocks: xp.concatenate(blocks), *parts)
 
 
 def split_delay(delay: Number, period: Number) -> tuple[Number, Number]:

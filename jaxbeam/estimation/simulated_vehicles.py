@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractContinuousFilter, AbstractSampledFilter, Estimate
-from jaxbeam.estimation.sampled_plant import SampleTiming, Transition
+from jaxbeam.estimation.sampled_plant import SampleTiming, Transition, in_blocks
 from jaxbeam.model.state_space import Plant
-from jaxbeam.numerics.blocks import in_blocks
 from jaxbeam.runtime.arrays import Array, take, xp
 
 

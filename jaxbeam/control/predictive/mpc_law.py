@@ -13,7 +13,7 @@ from jaxbeam.control.predictive.prediction import Prediction, SampledPlant, pred
 from jaxbeam.control.predictive.preview import Preview
 from jaxbeam.control.predictive.qp import solve_qp
 from jaxbeam.control.state_law import AbstractStateLaw
-from jaxbeam.numerics.blocks import in_blocks
+from jaxbeam.estimation.sampled_plant import in_blocks
 from jaxbeam.runtime.arrays import Array, block_diag, set_at, solve, take, xp
 
 
