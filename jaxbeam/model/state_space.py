@@ -9,6 +9,7 @@ wheel. Heights and pitch of vehicles are measured from static equilibrium.
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -31,7 +32,7 @@ from jaxbeam.model.vehicles.contact_rows import (
 )
 from jaxbeam.model.vehicles.vehicle_states import initial_vehicle_states, vehicle_signals
 from jaxbeam.numerics.batched_linalg import solve_small
-from jaxbeam.runtime.arrays import Array, collapse, set_at, xp
+from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.module import Module
 
@@ -194,9 +195,9 @@ class Plant(Module):
             force_input = set_at(force_input, np.s_[..., rates, :], shape.mT)
             contact_matrix = xp.eye(wheels) + mass[..., None, :] * (shape @ shape.mT)
             systems = contact_matrix, force_input.mT  # of each time, which solve_small has last
-            systems = (xp.moveaxis(collapse(part, 0, len(times)), 0, -1) for part in systems)
-            solution = xp.moveaxis(solve_small(*systems), -1, 0)
-            force_input = solution.reshape(*times, wheels, -1).mT
+            flat = (part.reshape(math.prod(times), wheels, part.shape[-1]) for part in systems)
+            solution = xp.moveaxis(solve_small(*(xp.moveaxis(x, 0, -1) for x in flat)), -1, 0)
+            force_input = solution.reshape(*times, wheels, matrix.shape[-1]).mT
             matrix = matrix - force_input @ contact.force
             command = command - force_input @ (mass[..., None] * (shape @ command[rates]))
             inputs = xp.concatenate([command, -force_input], axis=-1)
