@@ -26,7 +26,7 @@ from jaxbeam.model.sensing.sensor_signals import (
 )
 from jaxbeam.model.state_space import Plant, build_plant
 from jaxbeam.runtime.arrays import Array, expm, known, scan, xp
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 
 PERIOD_TOLERANCE = 1e-9  # of a period; smaller differences of times count as zero
 
@@ -237,10 +237,10 @@ class LoopDynamics(eqx.Module):
 
 def loop_dynamics(case: Case, layout: Layout) -> LoopDynamics:
     """Loop dynamics of a case that has a controller; may be traced and batched."""
-    return known(_loop_dynamics(case, compiled_modal_model(case, layout)))
+    build = _compiled_dynamics if case.controller.runs_compiled else _known_dynamics
+    return known(build(case, compiled_modal_model(case, layout)))
 
 
-@compiled
 def _loop_dynamics(case, model):
     plant = build_plant(case, model)
     law = case.controller.law(plant)
@@ -248,6 +248,9 @@ def _loop_dynamics(case, model):
     augmented_model, output_rows = with_sensor_filters(plant, filters)
     augmented_plant = eqx.tree_at(lambda m: m.modal_model, plant, augmented_model)
     return LoopDynamics(plant, augmented_plant, output_rows, law)
+
+
+_compiled_dynamics, _known_dynamics = compiled(_loop_dynamics), compiled_if_traced(_loop_dynamics)
 
 
 def propagate(matrix, t, duration, substeps: int, start):

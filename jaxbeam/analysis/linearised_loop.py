@@ -8,7 +8,7 @@ acceleration; stationary ones rest at their positions.
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -31,10 +31,20 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.model.linear_system import Signal, StateSpace
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.runtime.arrays import Array, known, scan, solve, stop_gradient, xp, zeros
+from jaxbeam.runtime.arrays import (
+    Array,
+    any_traced,
+    known,
+    scan,
+    solve,
+    stop_gradient,
+    xp,
+    zeros,
+)
 from jaxbeam.runtime.compiling import LOW_OPTIMISATION, compiled
 
 NEWTON_ITERATIONS = 8  # towards the equilibrium about which the loop is linearised
+NEWTON_ROUNDING = 1e-14  # relative change below which an iterate counts as the last
 EIGENVALUE_OFFSET = 1e-10  # of the shift of inverse iteration from an eigenvalue, relative
 
 
@@ -145,43 +155,79 @@ def loop_timing(case: Case) -> LoopTiming | None:
     return LoopTiming(period, delay, sensor_delays)
 
 
+class _Derivatives(NamedTuple):
+    """Change of a state (per s, or from sample to sample), and its derivatives; see the module."""
+
+    change: Float[Array, " state"]
+    A: Float[Array, "state state"]
+    B: Float[Array, "state actuator"]
+    K: Float[Array, "actuator state"]
+
+
 def linearise(loop: LoopDynamics, timing: LoopTiming | None, t) -> LinearisedLoop:
     """Loop with loads frozen at t (s), linearised about the equilibrium under their weights."""
-    return known(_linearise(loop, timing, t))
+    if not any_traced(loop, t):
+        return _linearise(_derivatives_compiled, loop, timing, t)
+    return _linearise_compiled(_derivatives, loop, timing, t)
 
 
-@compiled(**LOW_OPTIMISATION)
-def _linearise(loop, timing, t):
-    loop, modal_states = loop.freeze_loads(t), 2 * loop.plant.coordinate_scale.shape[0]
+def _derivatives(loop: LoopDynamics, timing: LoopTiming | None, t, state) -> _Derivatives:
+    """Derivatives of the loop with loads frozen at t (s), at a state."""
+    loop = loop.freeze_loads(t)
     if timing is None:
-        A, input_matrix, weight_rates, command = loop.continuous_dynamics(t)
-        equilibrium = _equilibrium(
-            lambda state: A @ state + input_matrix @ command(state) + weight_rates,
-            zeros(A.shape[:1], like=A),
-        )
-        return LinearisedLoop(A, input_matrix, jax.jacfwd(command)(equilibrium), None, modal_states)
-    start, rebuild = loop.rest_state(timing)
+        A, B, weight_rates, command = loop.continuous_dynamics(t)
+        K = jax.jacfwd(command)(state)
+        return _Derivatives(A @ state + B @ command(state) + weight_rates, A, B, K)
+    _, rebuild = loop.rest_state(timing)
 
     def sampling_step(state, given):
         after, command = loop.sampling_step(timing, rebuild(state), t, given)
-        return ravel_pytree(after)[0], command
+        after = ravel_pytree(after)[0]
+        return (after, command), (after, command)
 
-    equilibrium = _equilibrium(lambda state: sampling_step(state, None)[0] - state, start)
-    command_at_equilibrium = sampling_step(equilibrium, None)[1]
-    (A, B), (K, _) = jax.jacfwd(sampling_step, argnums=(0, 1))(equilibrium, command_at_equilibrium)
-    return LinearisedLoop(A, B, K, timing.period, modal_states)
+    command = sampling_step(state, None)[0][1]
+    jacobian = jax.jacfwd(sampling_step, argnums=(0, 1), has_aux=True)
+    ((A, B), (K, _)), (after, _) = jacobian(state, command)
+    return _Derivatives(after - state, A, B, K)
 
 
-def _equilibrium(change, start):
-    """State of zero change, by Newton's method from a start; the start if it does not converge."""
+# The program of one state is shorter than that of the search for the equilibrium.
+_derivatives_compiled = compiled(_derivatives, **LOW_OPTIMISATION)
 
-    def newton_step(state, _):
-        step = xp.linalg.lstsq(jax.jacfwd(change)(state), -change(state))[0]
-        return state + step, None
 
-    state = scan(newton_step, start, length=NEWTON_ITERATIONS)[0]
+def _linearise(derivatives, loop: LoopDynamics, timing, t) -> LinearisedLoop:
+    """Loop linearised about its equilibrium, found by Newton's method; by `derivatives` of states.
+
+    About rest, the start, if it does not converge.
+    """
+    plant = loop.augmented_plant
+    size = plant.modal_model.state_count + plant.vehicle_states
+    if timing is None:
+        start = zeros((size + loop.law.state_count,), like=loop)
+    else:
+        start = loop.rest_state(timing)[0]
+    constant = 0.0 if timing is None else np.eye(start.shape[0])
+
+    def newton_step(state):
+        change, A, B, K = known(derivatives(loop, timing, t, state))
+        return state + xp.linalg.lstsq(A + B @ K - constant, -change)[0]
+
+    if any_traced(loop, t):
+        state = scan(lambda x, _: (newton_step(x), None), start, length=NEWTON_ITERATIONS)[0]
+    else:
+        state = known(start)
+        for _ in range(NEWTON_ITERATIONS):
+            previous, state = state, newton_step(state)
+            if np.max(np.abs(state - previous)) <= NEWTON_ROUNDING * np.max(np.abs(state)):
+                break
     # Derivatives of the poles by the equilibrium, non-zero for a nonlinear law, are left out.
-    return stop_gradient(xp.where(xp.all(xp.isfinite(state)), state, start))
+    state = stop_gradient(xp.where(xp.all(xp.isfinite(state)), state, start))
+    _, A, B, K = known(derivatives(loop, timing, t, state))
+    period = None if timing is None else timing.period
+    return LinearisedLoop(A, B, K, period, 2 * loop.plant.coordinate_scale.shape[0])
+
+
+_linearise_compiled = compiled(_linearise, **LOW_OPTIMISATION)
 
 
 def stationary_loops(case: Case, times) -> list[LinearisedLoop]:

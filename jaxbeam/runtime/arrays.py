@@ -34,6 +34,11 @@ def any_jax(*trees: Any) -> bool:
     return any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(trees))
 
 
+def any_traced(*trees: Any) -> bool:
+    """Whether any leaf of some trees is traced by JAX, so that its number is not known."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
 def _einsum(subscripts: str, *operands: np.ndarray) -> np.ndarray | np.generic:
     """`numpy.einsum`; of two operands as products of matrices, several times as fast."""
     inputs, _, output = subscripts.partition("->")

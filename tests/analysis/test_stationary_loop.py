@@ -1,5 +1,6 @@
 """Loops with a stationary mass against matrices assembled here, and the verdict of all commands."""
 
+import dataclasses
 import json
 
 import control
@@ -113,3 +114,19 @@ def test_commands_have_one_verdict(printed, tmp_path):
     assert sentence in printed("compare case.toml --period 0.05")
     found = json.loads(printed("stability case.toml --json"))
     assert found["verdict"] == "unstable" and found["stable_without_loads"]
+
+
+def test_a_filter_that_follows_the_loads_has_no_verdict():
+    """Its covariance depends on the way here, so that no loop with stationary loads stands for it.
+
+    One that ignores the loads has a constant gain.
+    """
+    weights = {"state_weight": [1.0] * 5, "command_weight": [1.0], "period": PERIOD}
+    margins_found = []
+    for loads in ("ignored", "known"):
+        estimator = jb.Kalman(process_noise=0.1, measurement_noise=1e-5, loads=loads)
+        controller = jb.DiscreteLQR(**weights, estimator=estimator)
+        case = dataclasses.replace(lagging_case(), controller=controller)
+        margins_found.append(stability_margin(case))
+    assert [margin.verdict for margin in margins_found] == ["stable", "undetermined"]
+    assert "gain of the Kalman filter varies" in margins_found[1].obstacle

@@ -17,7 +17,11 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.model.sensing.sensor_signals import noise_samples
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
+from jaxbeam.simulation.integration_plan import (
+    IntegrationPlan,
+    integration_plan,
+    static_shapes,
+)
 from jaxbeam.simulation.simulate import simulate_readings
 from tests.loop_as_oracle import expected, span_of
 
@@ -154,6 +158,21 @@ def test_controller_and_record_have_the_same_noise():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("quantity", ["deflection", "strain"])
+def test_first_trial_run_is_the_run_by_its_plan(quantity):
+    """Steps end at sensors of strain, too, in the trial run whose record is the result."""
+    fibre = 1e-3 if quantity == "strain" else None
+    sensor = jb.Sensor(0.33, quantity, fibre_distance=fibre)
+    case = loop([PATCH], [sensor], jb.Feedback([500.0], period=0.01))
+    record, plan = jb.simulate(case, TIMES), integration_plan(case, TIMES)
+    again = jb.simulate(case, TIMES, plan)
+    assert record.steps == again.steps and 0 < record.error_estimate < 1e-7
+    for ours, theirs in zip(record.extremes, again.extremes, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    np.testing.assert_array_equal(record.deflection, again.deflection)
+    np.testing.assert_array_equal(record.command, again.command)
+
+
 def test_readings_for_fits_have_no_noise():
     """Filters run at the samples of the loop, not at the sample times of the run."""
     noiseless = LOOPS["delay beyond two periods, filter at the sensor's own period"]
