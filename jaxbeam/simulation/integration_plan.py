@@ -25,6 +25,7 @@ from jaxbeam.integrator.step_size import (
     MAX_DIVERGED_HALVINGS,
     MAX_STEPS,
     NO_STEP,
+    StepTrial,
     check_step_count,
     choose_step_size,
     largest_change,
@@ -38,6 +39,7 @@ from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
+from jaxbeam.simulation.errors import step_errors
 
 TOLERANCE = 1e-7  # relative to the largest deflection
 MAX_STEPS_PER_SAMPLE = 10**5  # time steps between samples of a controlled run
@@ -49,7 +51,8 @@ class IntegrationPlan(eqx.Module):
 
     Valid for cases that differ in numbers only, if these keep the order of supports and loads and
     change frequencies little. `substeps` is the number of steps from sample to sample (with a
-    controller from event to event), `error` relative to the largest deflection. `lead_samples` are
+    controller from event to event), `error` relative to the largest deflection, `sensor_errors`
+    to the largest value of what each sensor measures. `lead_samples` are
     added before the first sample, back to the start of the run. The run ends with the last sample,
     or `to_duration` at the duration of the case. With a controller the `schedule` holds its events,
     the samples and the end.
@@ -62,6 +65,7 @@ class IntegrationPlan(eqx.Module):
     error: float = eqx.field(static=True)
     schedule: EventSchedule | None = None
     to_duration: bool = eqx.field(static=True, default=False)
+    sensor_errors: tuple[float, ...] = eqx.field(static=True, default=())
 
 
 def integration_plan(
@@ -81,9 +85,10 @@ def integration_plan(
     if case.controller is not None:
         end = float(case.run.duration) if to_duration else None
         schedule = loop_schedule(case, samples, end)
-        substeps, error = _choose_substeps(case, shapes, schedule, tolerance)
-        return IntegrationPlan(shapes, substeps, 0, False, error, schedule, to_duration)
-    step, error = choose_step_size(case, shapes, tolerance)
+        substeps, error, trial = _choose_substeps(case, shapes, schedule, tolerance)
+        errors = _sensor_errors(case, shapes, trial)
+        return IntegrationPlan(shapes, substeps, 0, False, error, schedule, to_duration, errors)
+    step, error, trial = choose_step_size(case, shapes, tolerance)
     intervals = np.diff(samples)
     equally_spaced = bool(
         np.all(np.abs(intervals - intervals.mean()) < SPACING_TOLERANCE * intervals.mean())
@@ -92,7 +97,13 @@ def integration_plan(
     check_step_count(samples.size * (intervals.max() / step), step)
     substeps = steps_per_interval(intervals.max(), step)
     return IntegrationPlan(
-        shapes, substeps, lead_samples, equally_spaced, error, to_duration=to_duration
+        shapes,
+        substeps,
+        lead_samples,
+        equally_spaced,
+        error,
+        to_duration=to_duration,
+        sensor_errors=_sensor_errors(case, shapes, trial),
     )
 
 
@@ -124,6 +135,7 @@ def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> Integr
         lead_samples=max(plan.lead_samples for plan in plans),
         equally_spaced=all(plan.equally_spaced for plan in plans),
         error=max(plan.error for plan in plans),
+        sensor_errors=tuple(map(max, zip(*(plan.sensor_errors for plan in plans), strict=True))),
     )
 
 
@@ -144,7 +156,7 @@ def sample_times(case: Case) -> Float[Array, " time"]:
 
 
 def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, tolerance: float):
-    """Number of steps between events of a schedule, and the relative error of the deflection."""
+    """Number of steps between events of a schedule, relative error of the deflection, and trial."""
     step, interval = longest_trial_step(case, shapes), float(schedule.lengths.max())
     if interval / step > MAX_STEPS_PER_SAMPLE:
         raise RuntimeError(
@@ -157,22 +169,38 @@ def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, 
 
     trial_run = _compiled_trial_run if case.controller.runs_compiled else _known_trial_run
 
+    model = modal_model(case, shapes.layout, shapes.coupled)
+
     @functools.cache
+    def states(halvings):
+        substeps = xp.asarray(min_substeps * 2**halvings)
+        return np.asarray(trial_run(case, shapes, schedule, substeps))
+
     def response(halvings):
-        return np.asarray(trial_run(case, shapes, schedule, xp.asarray(min_substeps * 2**halvings)))
+        return np.asarray(trial_deflections(case, model, states(halvings)))
 
     # A loop that diverges does so with any step, so its error is not defined. A stiff law in
     # continuous time may also overflow because the steps are too long.
     confirming_halvings = 6 if case.controller.period is None else 1
     if np.isnan(response(1)).any() and np.isnan(response(confirming_halvings)).any():
-        return 2 * min_substeps, np.nan
-    least = rounding_deflection(case, modal_model(case, shapes.layout, shapes.coupled))
+        return 2 * min_substeps, np.nan, None
+    least = rounding_deflection(case, model)
     halvings, error = _halve_until_converged(response, tolerance, 8, least)
-    return min_substeps * 2**halvings, error
+    own = slice(None, -1)  # no step starts at the last event
+    trial = StepTrial(schedule.times[own], states(halvings)[own], states(halvings + 1)[own])
+    return min_substeps * 2**halvings, error, trial
+
+
+def _sensor_errors(case: Case, shapes: StaticShapes, trial: StepTrial | None) -> tuple[float, ...]:
+    """Errors of the steps of a trial at each sensor (see `step_errors`), NaN without one."""
+    if trial is None:
+        return (np.nan,) * len(case.sensors)
+    model = modal_model(case, shapes.layout, shapes.coupled)
+    return tuple(map(float, step_errors(case, model, trial)))
 
 
 def _closed_loop_trial_run(case, shapes, schedule, substeps):
-    """Deflections (m) at TRIAL_POSITIONS and all events, as (event and position, batch).
+    """States at all events, of the beam's modal model and then of vehicles: (event, state, batch).
 
     Peaks would hide errors: where a command saturates, the deflection has its error everywhere but
     at a peak, where it is stationary.
@@ -182,7 +210,8 @@ def _closed_loop_trial_run(case, shapes, schedule, substeps):
     grid = grid_by_schedule(case, policy.model, schedule, substeps)
     discrete = discrete_model(policy.model, grid, None, policy)
     states = integrate_at_events(discrete, loads, max_loads=shapes.max_loads, policy=policy)
-    return trial_deflections(case, policy.model, states)
+    own = modal_model(case, shapes.layout, shapes.coupled).state_count
+    return xp.concatenate([states[:, :own], states[:, policy.model.state_count :]], axis=1)
 
 
 _known_trial_run = compiled_if_traced(_closed_loop_trial_run)
