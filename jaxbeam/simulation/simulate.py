@@ -77,6 +77,7 @@ def simulate(
     if plan is None:
         plan = integration_plan(case, times, tolerance)
     times = sample_times(case) if times is None else xp.asarray(times, float)
+    sensor_errors = plan.sensor_errors or (np.nan,) * len(case.sensors)
     # Plans that differ in their error only share compiled programs.
     is_compiled = case.controller is not None and case.controller.runs_compiled
     simulate_record = _simulate_compiled if is_compiled else _simulate
@@ -84,7 +85,7 @@ def simulate(
         case,
         dataclasses.replace(plan, error=0.0, sensor_errors=()),
         times,
-        (xp.asarray(plan.error), xp.asarray(plan.sensor_errors, float)),
+        (xp.asarray(plan.error), xp.asarray(sensor_errors, float)),
     )
     if is_concrete(record.contact_lost_time):
         lost = np.isfinite(concrete(record.contact_lost_time)) & ~load_set(case).prescribed

@@ -8,7 +8,7 @@ import pytest
 import jaxbeam as jb
 from jaxbeam.case.quantities import QUANTITIES
 
-TIGHT = 1e-11
+TIGHT = 1e-9
 FACTOR = 2.0  # of a stated error: that of the finer of two runs is neglected
 
 
