@@ -1,0 +1,267 @@
+"""Rigid wheels over kinks: hinges, supports and steps of beams with shear, ends of ramps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.case.case import replace
+from jaxbeam.case.loads.oscillator import Oscillator
+from jaxbeam.integrator.adaptive_reference import simulate_adaptive
+from jaxbeam.simulation.simulate import simulate_readings
+from tests.differences import central
+from tests.oracles.kinked_path import PiecewiseShapes, Wheel, crossing
+from tests.runs import plan_of
+
+pytestmark = pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+UNIT = {"length": 1.0, "flexural_rigidity": 1.0, "mass_per_length": 1.0}
+HINGED = jb.Beam(**UNIT, modes=3, ends="clamped-pinned", hinges=[jb.Hinge(0.4, 0.5)])
+SHEARED = jb.Beam(**UNIT, modes=4, shear_stiffness=60.0, rotary_inertia=0.002)
+GRAVITY = 9.81
+
+
+def level(x):
+    return 0.0, 0.0, 0.0
+
+
+def ramp(x):
+    """From 0.2 m to 0.5 m, 0.03 m high."""
+    inside = 0.2 < x < 0.5
+    return 0.1 * np.clip(x - 0.2, 0.0, 0.3), 0.1 * inside, 0.0
+
+
+def constant(speed, start=0.0):
+    return lambda t: (start + speed * t, speed, 0.0)
+
+
+def braking(t):
+    return 0.9 * t - 0.2 * t**2, 0.9 - 0.4 * t, -0.4
+
+
+def arrival(x):
+    """Time at which the braking load arrives."""
+    return (0.9 - np.sqrt(0.81 - 0.8 * x)) / 0.4
+
+
+def mass(m, **motion):
+    return jb.MovingMass(mass=m, **motion)
+
+
+SPRUNG = {"mass": 0.3, "stiffness": 40.0, "damping": 2.0, "wheel_mass": 0.2}
+# Beam, profile, loads, supports; wheels, and times of entry, exit, and passages over kinks.
+CASES = {
+    "hinge": (
+        (HINGED, None, [mass(0.4, speed=0.7)], []),
+        (level, [Wheel(constant(0.7), 0.4, 0.4 * GRAVITY)], [0.4 / 0.7, 1 / 0.7]),
+    ),
+    "leftwards, two masses": (
+        (HINGED, None, [mass(0.4, speed=-0.7), mass(0.3, speed=0.8, entry_time=0.1)], []),
+        (
+            level,
+            [
+                Wheel(constant(-0.7, 1.0), 0.4, 0.4 * GRAVITY),
+                Wheel(constant(0.8, -0.08), 0.3, 0.3 * GRAVITY),
+            ],
+            [0.1, 0.6, 0.6 / 0.7, 1.35, 1 / 0.7],
+        ),
+    ),
+    "braking": (
+        (HINGED, None, [mass(0.4, speed=0.9, deceleration=0.4)], []),
+        (level, [Wheel(braking, 0.4, 0.4 * GRAVITY)], [arrival(0.4), arrival(1.0)]),
+    ),
+    "vehicle": (
+        (HINGED, None, [Oscillator(**SPRUNG, speed=0.7)], []),
+        (
+            level,
+            [Wheel(constant(0.7), 0.2, 0.5 * GRAVITY, 0.3, 40.0, 2.0)],
+            [0.4 / 0.7, 1 / 0.7],
+        ),
+    ),
+    "ramp": (
+        (
+            jb.Beam(**UNIT, modes=3),
+            jb.RampProfile(start=0.2, end=0.5, height=0.03),
+            [mass(0.4, speed=0.7)],
+            [],
+        ),
+        (ramp, [Wheel(constant(0.7), 0.4, 0.4 * GRAVITY)], [0.2 / 0.7, 0.5 / 0.7, 1 / 0.7]),
+    ),
+    "ramp over a hinge": (
+        (
+            HINGED,
+            jb.RampProfile(start=0.2, end=0.5, height=0.03),
+            [Oscillator(**SPRUNG, speed=0.7)],
+            [],
+        ),
+        (
+            ramp,
+            [Wheel(constant(0.7), 0.2, 0.5 * GRAVITY, 0.3, 40.0, 2.0)],
+            [0.2 / 0.7, 0.4 / 0.7, 0.5 / 0.7, 1 / 0.7],
+        ),
+    ),
+    "two spans with shear": (
+        (SHEARED, None, [mass(0.4, speed=0.7)], [jb.Support(0.6)]),
+        (level, [Wheel(constant(0.7), 0.4, 0.4 * GRAVITY)], [0.6 / 0.7, 1 / 0.7]),
+    ),
+    "step of the shear stiffness": (
+        (
+            jb.Beam(
+                length=1.0,
+                modes=3,
+                segments=[
+                    jb.Segment(0.3, 1.0, 1.0, shear_stiffness=20.0),
+                    jb.Segment(None, 1.0, 1.0, shear_stiffness=80.0),
+                ],
+            ),
+            None,
+            [mass(0.4, speed=0.7)],
+            [jb.Support(0.55, stiffness=200.0)],
+        ),
+        (
+            level,
+            [Wheel(constant(0.7), 0.4, 0.4 * GRAVITY)],
+            [0.3 / 0.7, 0.55 / 0.7, 1 / 0.7],
+        ),
+    ),
+}
+TIMES = np.linspace(0, 1.4, 24)
+
+
+def described(name):
+    (beam, profile, loads, supports), wheels = CASES[name]
+    case = jb.Case(
+        beam,
+        supports=supports,
+        loads=loads,
+        profile=profile,
+        run=jb.Run(1 / 0.7, gravity=GRAVITY),
+        sensors=[jb.Sensor(0.47)],
+    )
+    return case, *wheels
+
+
+def oracle(case, profile, wheels, events, impulses=None):
+    modes = jb.modes(case)
+    shapes = PiecewiseShapes(modes.nodes, modes.shapes)
+    frequencies = modes.angular_frequencies
+    return crossing(frequencies, shapes, profile, wheels, events, TIMES, (0.0, 1.0), impulses)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_balance_of_momentum(name):
+    """Against scipy's integration of the modal equations, with momentum kept over each kink."""
+    case, *described_wheels = described(name)
+    impulses = []
+    expected = oracle(case, *described_wheels, impulses)
+    record = jb.simulate(case, times=TIMES, tolerance=1e-9)
+    rows = record.modes.shapes(0.47)
+    found, velocity = record.at(0.47, "deflection"), record.at(0.47, "velocity")
+    count = case.beam.modes
+    deflection, rates = rows @ expected[:count], rows @ expected[count:]
+    assert_allclose(found, deflection, rtol=0, atol=2e-7 * np.abs(deflection).max())
+    assert_allclose(velocity, rates, rtol=0, atol=2e-6 * np.abs(rates).max())
+    largest = max((np.abs(rows @ jump).max() for jump in impulses), default=0.0)
+    if supports_take_all(case):
+        assert largest == 0
+    else:  # without its impulses the result would be another
+        assert largest > 1e-2 * np.abs(rates).max()
+
+
+def supports_take_all(case):
+    return any(support.stiffness is None for support in case.supports)
+
+
+def test_adaptive_reference():
+    case = described("leftwards, two masses")[0]
+    times = jnp.asarray(TIMES)
+    expected = simulate_adaptive(case, times, 1e-9).deflection
+    found = jb.simulate(case, times=times, tolerance=1e-9).deflection
+    assert_allclose(found, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
+
+
+def test_momentum_of_all_wheels():
+    """A passage moves no other wheel off the surface, and keeps the momentum of the modes."""
+    case = described("leftwards, two masses")[0]
+    times = 0.6 / 0.7 + np.array([-1e-9, 1e-9])  # the first mass passes the hinge leftwards
+    record = jb.simulate(case, times=times, tolerance=1e-9)
+    modes = jb.modes(case)
+    before, after = np.asarray(record.rates)
+    places, speeds = [0.4, 0.8 * (0.6 / 0.7 - 0.1)], [-0.7, 0.8]
+    shapes = np.asarray(modes.shapes(np.array(places)))
+    q = np.asarray(record.coordinates)[0]
+    slopes = [modes.shapes(x, 1) @ q for x in (0.4 + 1e-9, 0.4 - 1e-9)]
+    momentum = 0.4 * (shapes[0] @ (after - before) + speeds[0] * (slopes[1] - slopes[0]))
+    other = 0.3 * shapes[1] @ (after - before)
+    change = after - before
+    assert_allclose(change, -shapes.T @ [momentum, other], atol=1e-6 * np.abs(before).max())
+    assert abs(other) > 1e-3 * abs(momentum) > 1e-5
+
+
+def hinge_with(modes, stiffness=0.0):
+    return jb.Case(
+        jb.Beam(**UNIT, modes=modes, ends="clamped-pinned", hinges=[jb.Hinge(0.4, stiffness)]),
+        loads=[mass(0.4, speed=0.7)],
+        run=jb.Run(1 / 0.7),
+        sensors=[jb.Sensor(0.47)],
+    )
+
+
+def test_convergence_in_the_number_of_modes():
+    """The impulse over a hinge falls like 1 / n; deflections converge."""
+    impulses, deflections = [], []
+    at = 0.4 / 0.7
+    times = np.array([at - 1e-7, at + 1e-7, 0.9])
+    counts = (4, 8, 16)
+    for n in counts:
+        record = jb.simulate(hinge_with(n), times=times, tolerance=1e-6)
+        jump = np.diff(np.asarray(record.rates)[:2], axis=0)[0]
+        shape = np.asarray(jb.modes(hinge_with(n)).shapes(0.4))
+        impulses.append(np.abs(jump).max() / np.abs(shape[np.argmax(np.abs(jump))]))
+        deflections.append(record.at(0.47, "deflection")[-1])
+    products = np.array(impulses) * counts
+    print(products, deflections)
+    assert_allclose(products, products[-1], rtol=0.3)
+    changes = np.abs(np.diff(deflections)) / np.abs(deflections[-1])
+    assert changes[1] < changes[0] / 2 and changes[1] < 1e-3
+
+
+def test_stiff_hinge_is_no_hinge():
+    rigid = jb.Case(
+        jb.Beam(**UNIT, modes=3, ends="clamped-pinned"),
+        loads=[mass(0.4, speed=0.7)],
+        run=jb.Run(1 / 0.7),
+        sensors=[jb.Sensor(0.47)],
+    )
+    expected = jb.simulate(rigid, times=TIMES).deflection
+    found = jb.simulate(hinge_with(3, 1e7), times=TIMES).deflection
+    assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+VARIED = ("beam.hinges.0.position", "beam.hinges.0.rotational_stiffness", "loads.0.speed")
+VARIED = (*VARIED, "loads.0.mass", "profile.height", "profile.start")
+
+
+def test_gradients():
+    """Known and traced runs agree, and derivatives are differences, at times not at a passage."""
+    base = described("ramp over a hinge")[0]
+    case = jb.replace(base, {"loads.0": mass(0.4, speed=0.7)})
+    times = np.array([0.35, 0.62, 1.0])
+    point = np.array([0.4, 0.5, 0.7, 0.4, 0.03, 0.2])
+    plan = plan_of(case, 40, even=False)
+
+    def deflections(values):
+        varied = replace(case, dict(zip(VARIED, values, strict=True)))
+        return simulate_readings(varied, times, plan)
+
+    known = deflections(point)
+    traced = jax.jit(deflections)(jnp.asarray(point))
+    assert_allclose(traced, known, rtol=0, atol=1e-11 * np.abs(known).max())
+    found = jax.jit(jax.jacfwd(deflections))(jnp.asarray(point))
+    expected = central(deflections, point, 1e-3)
+    for i in range(point.size):
+        scale = np.abs(expected[..., i]).max()
+        assert_allclose(found[..., i], expected[..., i], rtol=0, atol=1e-6 * scale)
+    gradient = jax.grad(lambda v: jnp.sum(deflections(v)))(jnp.asarray(point))
+    assert_allclose(gradient, found.sum(axis=(0, 1)), rtol=1e-8)
