@@ -1,5 +1,7 @@
 """Rigid wheels over kinks: hinges, supports and steps of beams with shear, ends of ramps."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ import jaxbeam as jb
 from jaxbeam.case.case import replace
 from jaxbeam.case.loads.oscillator import Oscillator
 from jaxbeam.integrator.adaptive_reference import simulate_adaptive
+from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.simulate import simulate_readings
 from tests.differences import central
 from tests.oracles.kinked_path import PiecewiseShapes, Wheel, crossing
@@ -173,6 +176,7 @@ def supports_take_all(case):
     return any(support.stiffness is None for support in case.supports)
 
 
+@pytest.mark.slow
 def test_adaptive_reference():
     case = described("leftwards, two masses")[0]
     times = jnp.asarray(TIMES)
@@ -184,13 +188,14 @@ def test_adaptive_reference():
 def test_momentum_of_all_wheels():
     """A passage moves no other wheel off the surface, and keeps the momentum of the modes."""
     case = described("leftwards, two masses")[0]
-    times = 0.6 / 0.7 + np.array([-1e-9, 1e-9])  # the first mass passes the hinge leftwards
+    at = 0.6 / 0.7  # the first mass passes the hinge leftwards
+    times = np.array([0.0, at - 1e-9, at + 1e-9])
     record = jb.simulate(case, times=times, tolerance=1e-9)
     modes = jb.modes(case)
-    before, after = np.asarray(record.rates)
+    before, after = np.asarray(record.rates)[1:]
     places, speeds = [0.4, 0.8 * (0.6 / 0.7 - 0.1)], [-0.7, 0.8]
     shapes = np.asarray(modes.shapes(np.array(places)))
-    q = np.asarray(record.coordinates)[0]
+    q = np.asarray(record.coordinates)[1]
     slopes = [modes.shapes(x, 1) @ q for x in (0.4 + 1e-9, 0.4 - 1e-9)]
     momentum = 0.4 * (shapes[0] @ (after - before) + speeds[0] * (slopes[1] - slopes[0]))
     other = 0.3 * shapes[1] @ (after - before)
@@ -212,19 +217,18 @@ def test_convergence_in_the_number_of_modes():
     """The impulse over a hinge falls like 1 / n; deflections converge."""
     impulses, deflections = [], []
     at = 0.4 / 0.7
-    times = np.array([at - 1e-7, at + 1e-7, 0.9])
-    counts = (4, 8, 16)
+    times = np.array([0.0, at - 1e-7, at + 1e-7, 0.9])
+    counts = (3, 6, 12)
     for n in counts:
-        record = jb.simulate(hinge_with(n), times=times, tolerance=1e-6)
-        jump = np.diff(np.asarray(record.rates)[:2], axis=0)[0]
+        record = jb.simulate(hinge_with(n), times=times, tolerance=1e-5)
+        jump = np.diff(np.asarray(record.rates)[1:3], axis=0)[0]
         shape = np.asarray(jb.modes(hinge_with(n)).shapes(0.4))
         impulses.append(np.abs(jump).max() / np.abs(shape[np.argmax(np.abs(jump))]))
         deflections.append(record.at(0.47, "deflection")[-1])
     products = np.array(impulses) * counts
-    print(products, deflections)
     assert_allclose(products, products[-1], rtol=0.3)
     changes = np.abs(np.diff(deflections)) / np.abs(deflections[-1])
-    assert changes[1] < changes[0] / 2 and changes[1] < 1e-3
+    assert changes[1] < changes[0] / 2 and changes[1] < 2e-3
 
 
 def test_stiff_hinge_is_no_hinge():
@@ -243,25 +247,17 @@ VARIED = ("beam.hinges.0.position", "beam.hinges.0.rotational_stiffness", "loads
 VARIED = (*VARIED, "loads.0.mass", "profile.height", "profile.start")
 
 
+@pytest.mark.slow
 def test_gradients():
-    """Known and traced runs agree, and derivatives are differences, at times not at a passage."""
-    base = described("ramp over a hinge")[0]
-    case = jb.replace(base, {"loads.0": mass(0.4, speed=0.7)})
-    times = np.array([0.35, 0.62, 1.0])
-    point = np.array([0.4, 0.5, 0.7, 0.4, 0.03, 0.2])
-    plan = plan_of(case, 40, even=False)
+    """Known and traced runs agree; derivatives are differences, at times other than of passages."""
+    case = dataclasses.replace(described("ramp over a hinge")[0], loads=[mass(0.4, speed=0.7)])
+    times = np.linspace(0.0, 1.2, 4)
+    plan, point = plan_of(case, 20), np.array([0.4, 0.5, 0.7, 0.4, 0.03, 0.2])
 
-    def deflections(values):
+    def misfit(values):
         varied = replace(case, dict(zip(VARIED, values, strict=True)))
-        return simulate_readings(varied, times, plan)
+        return xp.sum(xp.cos(xp.arange(4.0))[:, None] * simulate_readings(varied, times, plan))
 
-    known = deflections(point)
-    traced = jax.jit(deflections)(jnp.asarray(point))
-    assert_allclose(traced, known, rtol=0, atol=1e-11 * np.abs(known).max())
-    found = jax.jit(jax.jacfwd(deflections))(jnp.asarray(point))
-    expected = central(deflections, point, 1e-3)
-    for i in range(point.size):
-        scale = np.abs(expected[..., i]).max()
-        assert_allclose(found[..., i], expected[..., i], rtol=0, atol=1e-6 * scale)
-    gradient = jax.grad(lambda v: jnp.sum(deflections(v)))(jnp.asarray(point))
-    assert_allclose(gradient, found.sum(axis=(0, 1)), rtol=1e-8)
+    found = jax.jit(jax.value_and_grad(misfit))(jnp.asarray(point))
+    assert_allclose(found[0], misfit(point), rtol=1e-11)
+    assert_allclose(found[1], central(misfit, point), rtol=1e-6)
