@@ -253,6 +253,13 @@ class LoadSet(Module):
             times.append(passages.reshape(-1, count))
         return xp.concatenate(times)
 
+    def rest_times(self) -> Float[Array, " wheel"]:
+        """Times (s) from which wheels stand for good; for trajectories as those of `cubics`."""
+        rest = [
+            xp.broadcast_to(path.cubics()[0][-1], behind.shape) for path, behind in self._paths()
+        ]
+        return xp.concatenate([xp.zeros(0), *rest])
+
     def passage_times(self, positions: Float[Array, " position"]) -> Float[Array, " time"]:
         """Times (s) at which wheels pass positions (m), and of jumps in speed or acceleration.
 

@@ -9,8 +9,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.case.actuators.point import PointForce
 from jaxbeam.case.case import replace
 from jaxbeam.case.loads.oscillator import Oscillator
+from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.adaptive_reference import simulate_adaptive
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.simulate import simulate_readings
@@ -261,3 +263,73 @@ def test_gradients():
     found = jax.jit(jax.value_and_grad(misfit))(jnp.asarray(point))
     assert_allclose(found[0], misfit(point), rtol=1e-11)
     assert_allclose(found[1], central(misfit, point), rtol=1e-6)
+
+
+def test_kink_of_a_settled_beam():
+    """The part between a hinge and a settled end turns as a rigid body: the surface is a ramp."""
+    beam = jb.Beam(**UNIT, modes=3, ends="clamped-free", hinges=[jb.Hinge(0.4)])
+    common = {"loads": [mass(0.4, speed=0.7)], "run": jb.Run(1 / 0.7), "sensors": [jb.Sensor(0.47)]}
+    settled = jb.Case(beam, supports=[jb.Support(1.0, settlement=0.06)], **common)
+    ramp = jb.RampProfile(start=0.4, end=1.0, height=-0.06)
+    expected = jb.simulate(jb.Case(beam, supports=[jb.Support(1.0)], profile=ramp, **common), TIMES)
+    found = jb.simulate(settled, TIMES)
+    scale = np.abs(expected.deflection).max()
+    assert_allclose(found.deflection, expected.deflection, atol=1e-9 * scale)
+    assert_allclose(found.contact_force, expected.contact_force, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_sweep_is_simulate():
+    case = described("leftwards, two masses")[0]
+    sensors = [jb.Sensor(0.47), jb.Sensor(0.3, "moment"), jb.Sensor(0.2, "acceleration")]
+    case = dataclasses.replace(case, sensors=sensors)
+    assert not native_peaks.supports(case)
+    speeds = [-0.7, -0.5]
+    found = jb.sweep(case, {"loads.0.speed": speeds}, progress=False)
+    for i, speed in enumerate(speeds):
+        record = jb.simulate(replace(case, {"loads.0.speed": speed}))
+        expected = np.maximum(record.largest, -record.smallest)
+        for sensor, quantity in enumerate(("deflection", "moment", "acceleration")):
+            peak = found[f"peak_{quantity}"].values[i, sensor]
+            assert_allclose(peak, expected[sensor], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("period", "tolerance"),
+    [(4e-3, 4e-3), pytest.param(None, 1e-7, marks=pytest.mark.slow)],
+    ids=["sampled", "continuous"],
+)
+def test_loops(period, tolerance):
+    """Feedback of velocity to a force is a damper; at samples nearly so."""
+    case = described("ramp over a hinge")[0]
+    place, gain = 0.6, 0.5
+    case = dataclasses.replace(case, sensors=[jb.Sensor(place, "velocity")])
+    damper = dataclasses.replace(case, actuators=[jb.SpringDamper(place, 0.0, gain)])
+    law = jb.Feedback([gain], period=period)
+    loop = dataclasses.replace(case, actuators=[PointForce(place)], controller=law)
+    found, expected = (jb.simulate(one, TIMES).coordinates for one in (loop, damper))
+    assert_allclose(found, expected, rtol=0, atol=tolerance * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        {"times": [0.0, 0.5, 1.0], "positions": [0.0, 0.2, 0.4]},
+        {"times": [0.1, 0.5, 1.0], "positions": [0.4, 0.2, 0.1]},
+        {"speed": 0.4, "deceleration": 0.2},
+    ],
+    ids=["to a kink", "leftwards from a kink", "braking to a kink"],
+)
+def test_start_and_stop_at_a_kink(motion):
+    """A wheel that does not pass the kink takes no impulse, as one just short of it."""
+    case = dataclasses.replace(hinge_with(3), loads=[mass(0.4, **motion)], run=jb.Run(1.4))
+    short = replace(case, {"beam.hinges.0.position": 0.4 + side(motion) * 1e-6})
+    records = [jb.simulate(one, TIMES) for one in (case, short)]
+    found, expected = (record.coordinates for record in records)
+    assert_allclose(found, expected, rtol=0, atol=2e-4 * np.abs(expected).max())
+
+
+def side(motion):
+    """1 where the load stays to the left of the kink, -1 where to its right."""
+    places = motion.get("positions", [0.0])
+    return 1.0 if min(places) < 0.4 else -1.0

@@ -13,6 +13,7 @@ from jaxbeam.case.beam_parts.properties import has
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.loads.base import AbstractLoad
+from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.layout import kink_nodes
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
@@ -82,8 +83,10 @@ def kink_passages(case: Case, model: ModalModel, loads: LoadSet) -> KinkPassages
         rows = xp.concatenate([rows, xp.zeros((jumps.shape[0], rows.shape[1]))])
     if not (wheels.size and positions.shape[0]):
         return None
+    # A wheel that stops on a kink does not pass it.
+    times, rest = loads.passages(positions)[wheels], loads.rest_times()[wheels][:, None]
     return KinkPassages(
-        loads.passages(positions)[wheels].reshape(-1),
+        xp.where(times < rest, times, NEVER).reshape(-1),
         np.repeat(wheels, positions.shape[0]),
         xp.tile(rows, (wheels.size, 1)),
         xp.tile(profile_jumps, wheels.size),
