@@ -18,7 +18,6 @@ from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.propagators import NODE_COUNT, end_weights
 from jaxbeam.integrator.running_peaks import Peaks
 from jaxbeam.integrator.time_grid import grid_by_schedule
-from jaxbeam.model.contact import contact_at, split_states
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
@@ -37,6 +36,7 @@ from jaxbeam.simulation.integration_plan import (
     integration_plan,
     sample_times,
 )
+from jaxbeam.simulation.motion.at_samples import motion_at
 from jaxbeam.simulation.record import Record
 
 
@@ -262,7 +262,7 @@ def _integrate(case: Case, plan: IntegrationPlan, times, monitored, noisy=True):
             if policy.implicit
             else _commands_at_steps(case, commands, sample_steps)
         )
-    motion, vehicles = _motion(case, model, loads, times, states, commands)
+    motion, vehicles = motion_at(case, model, loads, times, states, commands)
     return running_peaks, Outputs(motion, vehicles, observed, failures), model.modes, steps
 
 
@@ -274,20 +274,6 @@ def _commands_at_steps(case: Case, commands, steps):
     return xp.clip(commands_at_start, low, high)
 
 
-def _vehicle_motion(model: ModalModel, loads: LoadSet, states, accelerations) -> VehicleMotion:
-    """Motion of the bodies at instants, from the states and the accelerations at contact."""
-    _, vehicle_states = split_states(model.state_count, loads, states)
-    none = xp.zeros((states.shape[0], 0))
-    parts = []
-    for state, acceleration in zip(vehicle_states, accelerations, strict=True):
-        dofs = acceleration.shape[-2]
-        motion = state[..., :dofs, 0], state[..., dofs:, 0], acceleration[..., 0]
-        parts.append([part.reshape(part.shape[0], -1) for part in motion])
-    if not parts:
-        return VehicleMotion(none, none, none)
-    return VehicleMotion(*(xp.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
-
-
 class Outputs(NamedTuple):
     """Motion of beam and vehicles at the samples; readings and failures of a controller, if any."""
 
@@ -295,19 +281,3 @@ class Outputs(NamedTuple):
     vehicles: VehicleMotion
     readings: Float[Array, "time sensor"] | None
     failures: Float[Array, " time"] | None
-
-
-def _motion(case: Case, model: ModalModel, loads: LoadSet, times, states, commands):
-    """Motion of the modes with the forces on the beam, and motion of the vehicles."""
-    columns = None if commands is None else commands[..., None]
-    contact = contact_at(model, loads, times, states, columns)
-    vehicles = _vehicle_motion(model, loads, states, contact.vehicle_acceleration)
-    force, accelerations = contact.force[..., 0], contact.modal_acceleration[..., 0]
-    count = 2 * accelerations.shape[1]
-    coordinates = states[:, 0:count:2, 0], states[:, 1:count:2, 0], accelerations
-    if model.mode_map is not None:
-        coordinates = tuple(part @ model.mode_map.T for part in coordinates)
-    position = xp.where(loads.on_beam(times).T, loads.kinematics(times)[0].T, xp.nan)
-    actuators = len(case.actuators)
-    command = xp.zeros((times.shape[0], actuators)) if commands is None else commands[:, :actuators]
-    return Motion(*coordinates, position, -force, command), vehicles

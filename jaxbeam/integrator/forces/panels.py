@@ -29,6 +29,11 @@ class Panels(NamedTuple):
     response: Int[np.ndarray, "panel slot"]
     piece: Int[np.ndarray, "panel slot"]
 
+    def forces_in(self, panel: Int[np.ndarray, " own"]):
+        """Forces in some of the panels: which of these, and indices of panel and slot."""
+        which, slot = np.nonzero(np.arange(self.force.shape[1]) < self.count[panel][:, None])
+        return which, (panel[which], slot)
+
 
 def force_panels(responses: ForceResponses, paths: ForcePaths) -> Panels:
     """Panels of runs that begin at rest, with the free vibration in each."""

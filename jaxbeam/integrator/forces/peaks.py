@@ -27,14 +27,13 @@ def peaks_of_forces(responses: ForceResponses, paths: ForcePaths, phase: float) 
     """
     panels = force_panels(responses, paths)
     search = _Search(responses, panels, paths.duration.size, phase)
-    found = [search.peaks(output) for output in range(responses.table.shape[2])]
-    value, time = (np.stack(part, axis=-1)[:, None] for part in zip(*found, strict=True))
+    value, time = search.peaks()
     nodes = responses.system.nodes
     entry, leave = paths.windows(nodes[0], nodes[-1])
     entered = leave > entry
     lowest = np.where(entered, -paths.force, np.inf)
     lost = np.where(entered & (paths.force > 0), entry, np.nan)
-    return Peaks(value, time, lowest[:, None], lost[:, None])
+    return Peaks(value[:, None], time[:, None], lowest[:, None], lost[:, None])
 
 
 class _Search:
@@ -65,10 +64,12 @@ class _Search:
         self.bend = size @ (largest * np.abs(self.poles[:, None]) ** 2) + forced_bend
         slack = np.einsum("ps,pso->po", np.abs(on_beam), responses.table_error[panels.response])
         self.slack = 2 * slack[self.panel]  # of a value, and of that which is reached
-        forced = np.stack([self._forced_all(share) for share in (0.0, 0.5, 1.0)])
+        forced = np.stack([self._forced(share) for share in (0.0, 0.5, 1.0)])
         half = (self.length / 2)[:, None]
         self.bound = size @ largest + np.abs(forced).max(axis=0) + forced_bend * half**2 / 8
         self.bound += self.slack
+        self.tables = np.ascontiguousarray(np.moveaxis(responses.table, 2, 0))
+        self.tables = self.tables.reshape(self.C.shape[0], -1)
         self.first = np.abs(forced[0] + (self.amplitude @ self.C.T).real)
 
     def _place_forces(self):
@@ -82,95 +83,109 @@ class _Search:
         self.offset = panels.response * points + responses.first[panels.piece]
         self.last = count[panels.piece] - 2
 
-    def _forced_all(self, share: float) -> Float[np.ndarray, "chunk output"]:
+    def _forced(self, share: float) -> Float[np.ndarray, "chunk output"]:
         """All outputs under the forces, at the same share of each chunk, from the tables."""
         table = self.responses.table.reshape(-1, self.C.shape[0])
-        return self._from_table(table, self.panel, self.start + share * self.length)
+        return self._from_table(table, self.panel, (self.start + share * self.length)[:, None])[:, 0]
 
-    def _from_table(self, table, panel, time):
-        """Values of a table under the forces in panels, at times (panel, *time)."""
-        result = np.zeros((*time.shape, *table.shape[1:]))
-        for slot in range(self.place.shape[1]):
-            here = np.flatnonzero(self.panels.count[panel] > slot)
-            at = panel[here], slot
-            own = time[here]
+    def _from_table(self, table, panel, times):
+        """Values of a table under the forces in panels, at times (panel, time)."""
+        which, at = self.panels.forces_in(panel)
+        place = self.place[at][:, None] + self.rate[at][:, None] * times[which]
+        low = np.clip(place.astype(int), 0, self.last[at][:, None])
+        share = np.clip(place - low, 0.0, 1.0)
+        low += self.offset[at][:, None]
+        force = self.panels.force[at].reshape(-1, *(1,) * table.ndim)
+        share = share.reshape(*share.shape, *(1,) * (table.ndim - 1))
+        below = table[low]
+        below += share * (table[low + 1] - below)
+        below *= force
+        return _sums(below, which, panel.size)
 
-            def wide(array, like=own, at=at):
-                return array[at].reshape(-1, *(1,) * (like.ndim - 1))
+    def peaks(self) -> tuple[Float[np.ndarray, "run output"], Float[np.ndarray, "run output"]]:
+        """Peaks of the outputs in all runs, and their times (s)."""
+        steps = [self._steps_of_peak(output) for output in range(self.C.shape[0])]
+        output = np.repeat(np.arange(len(steps)), [step[0].size for step in steps])
+        return self._refined(output, *(np.concatenate(part) for part in zip(*steps, strict=True)))
 
-            place = wide(self.place) + wide(self.rate) * own
-            low = np.clip(place.astype(int), 0, wide(self.last))
-            share = np.clip(place - low, 0.0, 1.0)
-            share = share.reshape(*share.shape, *(1,) * (table.ndim - 1))
-            low += wide(self.offset)
-            below, above = table[low], table[low + 1]
-            force = self.panels.force[at].reshape(-1, *(1,) * (below.ndim - 1))
-            result[here] += force * (below + share * (above - below))
-        return result
+    def _steps_of_peak(self, output: int):
+        """Short steps in one of which each run has the peak of an output.
 
-    def peaks(self, output: int):
-        """Peak of an output in each run, and its time (s)."""
-        reached = np.zeros(self.runs)
-        np.maximum.at(reached, self.run, self.first[:, output])
-        bad = np.isnan(self.bound[:, output])
-        reached[self.run[bad]] = np.nan
-        bound = self.bound[:, output]
+        Their panels, starts and lengths (s), and the amplitudes at the start.
+        """
+        reached, bound = np.zeros(self.runs), self.bound[:, output]
+        _raise_to(reached, self.run, self.first[:, output])
         chunk = np.flatnonzero((bound >= reached[self.run]) & (bound > 0))
         panel, start, amplitude = self.panel[chunk], self.start[chunk], self.amplitude[chunk]
         length, bend, slack = self.length[chunk], self.bend[chunk, output], self.slack[chunk, output]
-        for parts in (CHUNK_STEPS, REFINEMENTS, REFINEMENTS):
+        for parts in (CHUNK_STEPS, REFINEMENTS):
             step = length / parts
             times = start[:, None] + step[:, None] * np.arange(parts + 1)
             values, growth = self._values(output, panel, amplitude, step, times)
-            np.maximum.at(reached, self.panels.run[panel], values.max(axis=1))
-            limit = np.maximum(values[:, 1:], values[:, :-1]) + (bend * step**2 / 8 + slack)[:, None]
+            _raise_to(reached, self.panels.run[panel], values.max(axis=1))
+            above = bend * step**2 / 8 + slack
+            limit = np.maximum(values[:, 1:], values[:, :-1]) + above[:, None]
             which, part = np.nonzero(limit >= reached[self.panels.run[panel], None])
             amplitude = amplitude[which] * growth[which] ** part[:, None]
             start, panel, length = times[which, part], panel[which], step[which]
             bend, slack = bend[which], slack[which]
-        return self._refined(output, panel, start, length, amplitude, reached)
+        return panel, start, length, amplitude
 
     def _values(self, output: int, panel, amplitude, step, times):
         """Magnitudes of an output at equally spaced times, and growth of free vibration in a step.
 
         From one time to the next by the growth.
         """
-        table = np.ascontiguousarray(self.responses.table[..., output]).reshape(-1)
-        values = self._from_table(table, panel, times)
+        values = self._from_table(self.tables[output], panel, times)
         growth = np.exp(step[:, None] * self.poles)
         now = amplitude * self.C[output]
         for i in range(times.shape[1]):
             values[:, i] += now.real.sum(axis=1)
-            now = now * growth
+            now *= growth
         return np.abs(values), growth
 
-    def _refined(self, output: int, panel, start, length, amplitude, reached):
-        """Peaks in short steps by the polynomials through exact values at the peak nodes."""
-        nodes = np.asarray(PEAK_NODES)
-        since = nodes[:, None] * length
-        free = np.einsum("nsk,sk->ns", np.exp(since[..., None] * self.poles), amplitude * self.C[output]).real
-        samples = free + self._exact(output, panel, start + since)
-        run = self.panels.run[panel]
-        estimate = estimate_peak(samples, PEAK_NODES)
-        order = np.lexsort((estimate, run))
-        last = np.flatnonzero(np.diff(run[order], append=-1))
-        best = order[last]
-        value, time = np.full(self.runs, np.nan), np.zeros(self.runs)
-        value[reached == 0] = 0.0
-        refined, position = refine_peak(samples[:, best], PEAK_NODES)
-        value[run[best]] = refined
-        time[run[best]] = start[best] + position * length[best]
+    def _refined(self, output, panel, start, length, amplitude):
+        """Peaks, and times (s), by the polynomials through exact values at nodes of short steps."""
+        since = np.array(PEAK_NODES) * length[:, None]
+        free = np.exp(since[..., None] * self.poles) @ (amplitude * self.C[output])[..., None]
+        samples = (free[..., 0].real + self._exact(output, panel, start[:, None] + since)).T
+        number = self.panels.run[panel] * self.C.shape[0] + output
+        order = np.lexsort((estimate_peak(samples, PEAK_NODES), number))
+        best = order[np.diff(number[order], append=-1) != 0]
+        value, time = np.zeros((2, self.runs * self.C.shape[0]))
+        found, position = refine_peak(samples[:, best], PEAK_NODES)
+        value[number[best]], time[number[best]] = found, start[best] + position * length[best]
+        finite = np.ones(self.runs, bool)
+        finite[self.run[~np.isfinite(self.bound).all(axis=1)]] = False
+        value, time = (
+            np.where(finite[:, None], part.reshape(self.runs, -1), np.nan) for part in (value, time)
+        )
         return value, time
 
-    def _exact(self, output: int, panel, times):
-        """Exact values of an output under the forces at times (node, panel)."""
-        result, panels, breaks = np.zeros(times.shape), self.panels, self.responses.system.breaks
-        for slot in range(panels.force.shape[1]):
-            here = np.flatnonzero(panels.count[panel] > slot)
-            at = panel[here], slot
-            piece = panels.piece[at]
-            x = panels.origin[at] + panels.speed[at] * times[:, here]
-            x = np.clip(x, breaks[piece], breaks[piece + 1])
-            number, pieces = (np.broadcast_to(a, x.shape) for a in (panels.response[at], piece))
-            result[:, here] += panels.force[at] * self.responses.exact(number, pieces, x, output)
-        return result
+    def _exact(self, output, panel, times):
+        """Exact values of outputs under the forces in panels at times (panel, time)."""
+        panels, breaks = self.panels, self.responses.system.breaks
+        which, at = panels.forces_in(panel)
+        piece = np.repeat(panels.piece[at], times.shape[1])
+        x = panels.origin[at][:, None] + panels.speed[at][:, None] * times[which]
+        x = np.clip(x.reshape(-1), breaks[piece], breaks[piece + 1])
+        number, own = (np.repeat(a, times.shape[1]) for a in (panels.response[at], output[which]))
+        r = self.responses.exact(number, piece, x, own).reshape(-1, times.shape[1])
+        return _sums(panels.force[at][:, None] * r, which, panel.size)
+
+
+def _sums(values, which, count: int):
+    """Sums (count, ...) of consecutive values, of which each belongs to one."""
+    result = np.zeros((count, *values.shape[1:]))
+    first = np.flatnonzero(np.diff(which, prepend=-1))
+    if first.size:
+        result[which[first]] = np.add.reduceat(values, first, axis=0)
+    return result
+
+
+def _raise_to(reached, run, values) -> None:
+    """Raise what is reached in each run to the largest of its values; runs are in order."""
+    first = np.flatnonzero(np.diff(run, prepend=-1))
+    if first.size:
+        own = run[first]
+        reached[own] = np.maximum(reached[own], np.maximum.reduceat(values, first))

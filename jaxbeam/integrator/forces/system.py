@@ -55,12 +55,12 @@ class ForceSystem(NamedTuple):
         middle = (self.breaks[:-1] + self.breaks[1:]) / 2
         return np.searchsorted(self.nodes[1:-1], middle)
 
-    def static_part(self, x, piece, output=slice(None)):
+    def static_part(self, x, piece) -> Float[np.ndarray, "force output"]:
         """Static part of r at positions (m) in pieces."""
         if self.static.influence is None:
-            return np.zeros((*np.shape(x), self.on_outputs.shape[0]))[..., output]
+            return np.zeros((x.size, self.on_outputs.shape[0]))
         near = (self.breaks[piece] + self.breaks[piece + 1]) / 2
-        return np.asarray(self.static.influence.of_forces_at(x, near))[..., output]
+        return np.asarray(self.static.influence.of_forces_at(x, near))
 
 
 def force_system(
@@ -148,16 +148,16 @@ class ForceResponses(NamedTuple):
     first: Int[np.ndarray, " piece"]
     count: Int[np.ndarray, " piece"]
 
-    def exact(self, speed, piece, x, output: int) -> Float[np.ndarray, " force"]:
+    def exact(self, speed, piece, x, output) -> Float[np.ndarray, " force"]:
         """r(x) of an output, for forces of numbered speeds at x (m) in pieces of the beam."""
         segment = self.system.segment[piece]
-        series = self.on_outputs[speed, segment, :, output]
+        series = self.on_outputs[speed, segment, :, output].T
         t = _local(self.system.nodes, segment, x)
         lower, value = 0.0, np.zeros(x.shape)
-        for k in range(series.shape[-1] - 1, 0, -1):  # Clenshaw's recurrence
-            lower, value = value, 2 * t * value - lower + series[..., k]
-        value = t * value - lower + series[..., 0]
-        return value + self.system.static_part(x, piece, output)
+        for coefficient in series[:0:-1]:  # Clenshaw's recurrence
+            lower, value = value, 2 * t * value - lower + coefficient
+        static = self.system.static_part(x, piece)[np.arange(x.size), output]
+        return t * value - lower + series[0] + static
 
     def particular(self, speed: int, segment: int, x) -> Complex[np.ndarray, "force pole"]:
         """p(x) at positions (m) in a segment."""
