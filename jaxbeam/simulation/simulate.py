@@ -19,7 +19,7 @@ from jaxbeam.integrator.propagators import NODE_COUNT, end_weights
 from jaxbeam.integrator.running_peaks import Peaks
 from jaxbeam.integrator.time_grid import grid_by_schedule
 from jaxbeam.model.load_set import LoadSet, load_set
-from jaxbeam.model.modal_model import ModalModel, modal_model
+from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
 from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.sensing.output_rows import sensor_history, sensor_rows

@@ -35,9 +35,9 @@ LEAST_TOLERANCE = 1e-8  # above the error of the eigenvectors
 # Numbers on which the model does not depend, and with which forces keep constant speeds.
 ADDRESS = re.compile(r"loads\.(\d+|\*)\.(speed|entry_time|start_position|spacing)|run\.duration")
 OF_BEAM = "beam", "supports", "actuators", "sensors"  # the keys on which the model depends
-BLOCK_RUNS = 64
+BLOCK_RUNS = 32
 TRIAL_RUNS = 4  # in which the error of the peaks is measured
-PHASE = 1.5  # rad of the fastest pole in a step of the search
+PHASE = 1.6  # rad of the fastest pole in a step of the search
 
 
 class ForceRunner:

@@ -10,6 +10,7 @@ from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import is_supported, residual_flexibility
 from jaxbeam.model.statics import influence_line
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.simulation.motion.moving_forces import motion_of_forces
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 from jaxbeam.simulation.truncation import truncation_errors
@@ -89,7 +90,7 @@ def estimated_errors(case: Case, worst: dict[str, dict[str, float]]) -> dict[str
     return errors
 
 
-def _errors_of_run(case: Case) -> Float[np.ndarray, " sensor"] | None:
+def _errors_of_run(case: Case) -> Float[Array, " sensor"] | None:
     """Truncation errors at the sensors; None where no step is found: they are not known."""
     times = np.linspace(0.0, float(case.run.duration), SAMPLES)
     found = motion_of_forces(case, times)

@@ -81,13 +81,15 @@ def _of_forces_at_start(responses: ForceResponses, paths: ForcePaths, response):
     system, nodes = responses.system, responses.system.nodes
     amplitude = np.zeros((paths.duration.size, system.poles.size), complex)
     x, speed = paths.origin, paths.speed
-    # One at an end passes it at t = 0, or has left.
-    inside = np.where(speed > 0, (x > nodes[0]) & (x < nodes[-1]), (x < nodes[-1]) & (x > nodes[0]))
+    # One that enters at t = 0 passes the end then; one that leaves then was inside.
+    inside = np.where(
+        speed > 0, (nodes[0] < x) & (x <= nodes[-1]), (nodes[0] <= x) & (x < nodes[-1])
+    )
     for run, wheel in np.argwhere(inside):
         place = x[run, wheel]
         side = "left" if speed[run, wheel] > 0 else "right"  # a node is passed at t = 0
         segment = int(np.searchsorted(nodes[1:-1], place, side))
-        p = responses.particular(response[run, wheel], segment, np.array([place]))[0]
+        p = responses.particular(int(response[run, wheel]), segment, np.array([place]))[0]
         amplitude[run] -= paths.force[wheel] * p
     return amplitude
 

@@ -57,20 +57,19 @@ def force_paths(
     origins, speeds = [], []
     for i, load in enumerate(case.loads):
 
-        def of_load(name, default, i=i, load=load):
+        def of_load(name, default=0.0, i=i, load=load):
             for address in (f"loads.{i}.{name}", f"loads.{ALL}.{name}"):
                 if address in column:
                     return column[address]
             given = getattr(load, name)
-            return default if given is None else np.full(runs, concrete(given))
+            return np.broadcast_to(default if given is None else concrete(given), runs)
 
-        speed = of_load("speed", None)
-        entry = of_load("entry_time", np.zeros(runs))
+        speed, entry = of_load("speed"), of_load("entry_time")
         start = of_load("start_position", np.where(speed < 0, length, 0.0))
         vehicle = load.vehicle(case.run.gravity)
         spaced = {f"loads.{i}.spacing", f"loads.{ALL}.spacing"} & set(addresses)
         if spaced:
-            spacings, index = np.unique(of_load("spacing", None), return_inverse=True)
+            spacings, index = np.unique(of_load("spacing"), return_inverse=True)
             own = [replace(case, {f"loads.{i}.spacing": one}).loads[i] for one in spacings]
             behind = np.stack([concrete(wheel_distances(one, vehicle)) for one in own])[index]
         else:

@@ -16,7 +16,7 @@ from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.running_peaks import Peaks
 from jaxbeam.numerics.peak_search import estimate_peak, refine_peak
 
-CHUNK_STEPS = 12
+CHUNK_STEPS = 16
 REFINEMENTS = 4  # of a step
 
 
@@ -86,7 +86,8 @@ class _Search:
     def _forced(self, share: float) -> Float[np.ndarray, "chunk output"]:
         """All outputs under the forces, at the same share of each chunk, from the tables."""
         table = self.responses.table.reshape(-1, self.C.shape[0])
-        return self._from_table(table, self.panel, (self.start + share * self.length)[:, None])[:, 0]
+        times = (self.start + share * self.length)[:, None]
+        return self._from_table(table, self.panel, times)[:, 0]
 
     def _from_table(self, table, panel, times):
         """Values of a table under the forces in panels, at times (panel, time)."""
@@ -117,7 +118,11 @@ class _Search:
         _raise_to(reached, self.run, self.first[:, output])
         chunk = np.flatnonzero((bound >= reached[self.run]) & (bound > 0))
         panel, start, amplitude = self.panel[chunk], self.start[chunk], self.amplitude[chunk]
-        length, bend, slack = self.length[chunk], self.bend[chunk, output], self.slack[chunk, output]
+        length, bend, slack = (
+            self.length[chunk],
+            self.bend[chunk, output],
+            self.slack[chunk, output],
+        )
         for parts in (CHUNK_STEPS, REFINEMENTS):
             step = length / parts
             times = start[:, None] + step[:, None] * np.arange(parts + 1)

@@ -22,7 +22,7 @@ def outputs_of_forces(
     x = panels.origin[at] + panels.speed[at] * times[which]
     x = np.clip(x, system.breaks[piece], system.breaks[piece + 1])
     segment = system.segment[piece]
-    for u, s in np.unique(np.stack([number, segment]), axis=1).T:
+    for u, s in np.unique(np.stack([number, segment]), axis=1).T.tolist():
         here = (number == u) & (segment == s)
         p = responses.particular(u, s, x[here])
         np.add.at(eta, which[here], panels.force[at][here, None] * p)

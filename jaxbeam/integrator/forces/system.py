@@ -11,14 +11,14 @@ change where a force enters, passes a node or leaves, so that eta is continuous.
 
     y = sum over the forces of F r(x) + Re(C a exp(lambda t)),    r(x) = Re(C p(x)) + influence(x),
 
-the second term of r being static (`LinearOutputs`). r is found once for a speed; a train is a sum of
-shifted copies of it.
+the second term of r being static (`LinearOutputs`). r is found once for a speed; a train is a sum
+of shifted copies of it.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 from numpy.polynomial import chebyshev
 
 from jaxbeam.model.modal_model import ModalModel
@@ -54,6 +54,13 @@ class ForceSystem(NamedTuple):
         """Segment in which each piece between two breaks is."""
         middle = (self.breaks[:-1] + self.breaks[1:]) / 2
         return np.searchsorted(self.nodes[1:-1], middle)
+
+    @property
+    def has_static(self) -> Bool[np.ndarray, " output"]:
+        """Whether r of each output has a static part."""
+        if self.static.influence is None:
+            return np.zeros(self.on_outputs.shape[0], bool)
+        return np.any(np.asarray(self.static.influence.series), axis=(0, 1))
 
     def static_part(self, x, piece) -> Float[np.ndarray, "force output"]:
         """Static part of r at positions (m) in pieces."""
@@ -156,8 +163,12 @@ class ForceResponses(NamedTuple):
         lower, value = 0.0, np.zeros(x.shape)
         for coefficient in series[:0:-1]:  # Clenshaw's recurrence
             lower, value = value, 2 * t * value - lower + coefficient
-        static = self.system.static_part(x, piece)[np.arange(x.size), output]
-        return t * value - lower + series[0] + static
+        value = t * value - lower + series[0]
+        has_static = np.flatnonzero(self.system.has_static[output])
+        if has_static.size:
+            static = self.system.static_part(x[has_static], piece[has_static])
+            value[has_static] += static[np.arange(has_static.size), output[has_static]]
+        return value
 
     def particular(self, speed: int, segment: int, x) -> Complex[np.ndarray, "force pole"]:
         """p(x) at positions (m) in a segment."""

@@ -18,9 +18,9 @@ def motion_at(
     vehicles = _vehicle_motion(model, loads, states, contact.vehicle_acceleration)
     force, accelerations = contact.force[..., 0], contact.modal_acceleration[..., 0]
     count = 2 * accelerations.shape[1]
-    coordinates = states[:, 0:count:2, 0], states[:, 1:count:2, 0], accelerations
+    coordinates = [states[:, 0:count:2, 0], states[:, 1:count:2, 0], accelerations]
     if model.mode_map is not None:
-        coordinates = tuple(part @ model.mode_map.T for part in coordinates)
+        coordinates = [part @ model.mode_map.T for part in coordinates]
     position = xp.where(loads.on_beam(times).T, loads.kinematics(times)[0].T, xp.nan)
     actuators = len(case.actuators)
     command = xp.zeros((times.shape[0], actuators)) if commands is None else commands[:, :actuators]

@@ -15,9 +15,7 @@ from jaxbeam.model.static_correction import Motion
 from jaxbeam.simulation.motion.at_samples import motion_at
 
 
-def motion_of_forces(
-    case: Case, times: Float[np.ndarray, " time"]
-) -> tuple[Modes, Motion] | None:
+def motion_of_forces(case: Case, times: Float[np.ndarray, " time"]) -> tuple[Modes, Motion] | None:
     """Modes, and motion of a run without controller at times (s); None if it is not of the kind.
 
     All loads have to be forces that move at constant speeds, and the poles of the beam distinct.
