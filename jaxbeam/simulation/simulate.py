@@ -37,6 +37,7 @@ from jaxbeam.simulation.integration_plan import (
     integration_plan,
     sample_times,
 )
+from jaxbeam.simulation.motion.at_samples import motion_at
 from jaxbeam.simulation.record import Record
 
 
