@@ -93,6 +93,7 @@ from .control.receptance import (
     receptances as receptances,
 )
 from .control.scheduled_feedback import ScheduledFeedback as ScheduledFeedback
+from .control.sliding_mode import SlidingMode as SlidingMode
 from .control.state_feedback import StateFeedback as StateFeedback
 from .estimation.inversion import Inversion as Inversion
 from .estimation.kalman import Kalman as Kalman

@@ -133,6 +133,11 @@ CASES = {
             period=PERIOD,
         )
     ),
+    "sliding-mode": rig(
+        jb.SlidingMode(
+            [30.0, 20.0], 10.0, [0.1, 0.2], positions=[0.25, 0.45], estimator=KALMAN, period=PERIOD
+        )
+    ),
     "state": rig(jb.StateFeedback(np.full((2, 5), 2.0), period=PERIOD)),
     "lqr-observer": rig(jb.LQR(**WEIGHTS, estimator=jb.Observer(speed=3.0))),
     "dlqr-kalman": rig(DiscreteLQR(**WEIGHTS, delay=2e-3, estimator=KALMAN), sensors=FILTERED),
