@@ -78,6 +78,7 @@ from .control.optimal.crossing_lqr import (
 )
 from .control.optimal.integral_lqr import IntegralLQR as IntegralLQR
 from .control.optimal.lqr import LQR as LQR
+from .control.optimal.position_lqr import PositionLQR as PositionLQR
 from .control.optimal.sampled_lqr import DiscreteLQR as DiscreteLQR
 from .control.optimal.sampling_loss import sampling_limit as sampling_limit
 from .control.optimal.scheduled_lqr import ScheduledLQR as ScheduledLQR
