@@ -144,6 +144,11 @@ CASES = {
     "dlqr-kalman": rig(DiscreteLQR(**WEIGHTS, delay=2e-3, estimator=KALMAN), sensors=FILTERED),
     "lqr-inversion": rig(jb.LQR(**WEIGHTS, estimator=jb.Inversion(1e-2), delay=2 * PERIOD)),
     "mpc": rig(jb.MPC(8, 3, [1e-10, 1e-10], estimator=KALMAN, period=PERIOD, delay=1e-3)),
+    "gpc": rig(
+        jb.GPC(
+            6, 2, 1e-8, output_weight=[1.0, 1.0, 1e-5], reference=[1e-4, 0.0, 0.0], period=PERIOD
+        )
+    ),
     "mpc-soft": rig(
         jb.MPC(
             6,
