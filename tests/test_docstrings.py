@@ -83,8 +83,8 @@ PUBLIC_CLASSES = {
     for name in package.__all__
     if inspect.isclass(getattr(package, name))
 }
-# Functions that compile for longer than a second, and their results: their examples are the notebooks, the README and
-# the pages of the site.
+# Functions that compile for longer than a second, and their results: their examples are the
+# notebooks, the README and the pages of the site.
 NO_EXAMPLE = {
     "tuning.cross_validate",
     "tuning.design_experiment",
