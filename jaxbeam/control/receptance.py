@@ -141,8 +141,8 @@ def receptance_gains(
 
     `assigned` (pole, sensor) are the receptances at the poles, one of each conjugate pair. The
     modes of the open-loop poles `kept_poles` (1/s) with deflections `kept` (pole, sensor) at the
-    sensors do not change. Each complex pole takes two gains, each real one one; where gains are
-    left, the smallest are taken. Raises ValueError if there are too few sensors, or if the poles
+    sensors do not change. A complex pole takes two gains, a real pole one; where gains are left,
+    the smallest are taken. Raises ValueError if there are too few sensors, or if the poles
     cannot be assigned.
 
     The `actuator` is driven with the `delay` (s) from measurement to command.

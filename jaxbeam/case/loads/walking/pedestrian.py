@@ -1,4 +1,4 @@
-"""Pedestrian: a person who walks or jogs along the beam, or on the spot."""
+"""Pedestrian: a person who walks or jogs along the beam, or in one place."""
 
 from typing import ClassVar
 
