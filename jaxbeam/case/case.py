@@ -37,7 +37,14 @@ from jaxbeam.runtime.arrays import Array, set_at, xp
 
 
 class Run(ReprWithUnits, eqx.Module):
-    """Duration of a run, sampling rate of its record, gravity, and seed of the sensor noise."""
+    """Duration of a run, sampling rate of its record, gravity, and seed of the sensor noise.
+
+    >>> import jaxbeam as jb
+    >>> run = jb.Run(duration=1.5, sample_rate=200.0)
+    >>> case = jb.Case(jb.Beam(0.6, 12.0, 0.5), run=run)
+    >>> print(jb.simulate(case).times.size)
+    301
+    """
 
     duration: Float[Array, ""] = number("s", "simulated time, from 0", POSITIVE)
     sample_rate: Float[Array, ""] = number(
@@ -56,6 +63,11 @@ class Case(eqx.Module):
 
     An immutable tree: `replace(case, {"loads.0.mass": 0.3})` or `equinox.tree_at` return a changed
     copy. Every number has an address, its dotted path. Its fields are the keys of a case file.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(jb.Beam(0.6, 12.0, 0.5), sensors=[jb.Sensor(0.3)], run=jb.Run(1.0))
+    >>> print(jb.replace(case, {"sensors.0.position": 0.2}).sensors[0].position)
+    0.2
     """
 
     beam: Beam

@@ -52,7 +52,7 @@ def truncation_errors(case: Case, modes: Modes, motion: Motion) -> Float[Array, 
 
     From the samples of a run. Of a deflection or rotation, the largest part that the static
     correction would add. Of others, the largest change with the dynamic part of the three highest
-    modes left out, which is more than that of all higher modes where their contributions fall;
+    modes left out, which exceeds that of all higher modes where their contributions fall;
     accelerations under point forces do not converge, and their modes are a convention. NaN for
     those of a case with one mode, and for slopes of a beam that is not uniform.
     """

@@ -43,6 +43,19 @@ class Record(RecordViews):
     so are the peaks. `error_estimate` of the time steps is relative to the largest deflection,
     `step_errors` to the largest value of what each sensor measures. `controller_readings`
     are the readings that a sampled controller has received, None without one.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02),
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=1.0)],
+    ...     run=jb.Run(0.6, sample_rate=100.0),
+    ... )
+    >>> record = jb.simulate(case)
+    >>> print(record.times.size, record.deflection.shape)
+    61 (61, 1)
+    >>> print(record.verdict.split(";")[0])
+    every load presses on the beam throughout
     """
 
     case: Case

@@ -11,6 +11,12 @@ class RampProfile(AbstractTransition):
 
     r' jumps at both ends, by height / (end - start), unless a `contact_length` rounds them: the
     velocity of a wheel with mass that is rigidly on the surface jumps, by an impulse on the beam.
+
+    >>> import jaxbeam as jb
+    >>> profile = jb.RampProfile(start=0.0, end=2.0, height=0.03)
+    >>> heights, slopes, curvatures = profile.heights([0.5, 1.0, 3.0])
+    >>> print(heights.round(4))
+    [0.0075 0.015  0.03  ]
     """
 
     kind: ClassVar[str] = "ramp"
