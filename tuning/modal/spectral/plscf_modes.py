@@ -14,12 +14,12 @@ from tuning.modal.ambient import (
     Candidate,
     divided_band,
     mean_square,
-    mode_of_chain,
     overlapping,
     without_duplicates,
 )
 from tuning.modal.preprocessing import RATE_OVER_BAND, Prepared, prepare
 from tuning.modal.result import IdentifiedMode, rejection_reason
+from tuning.modal.spectral.chains import mode_of_best_half, spread_of_changes
 from tuning.modal.spectral.impulse_responses import (
     FrequencyResponses,
     frequency_responses,
@@ -33,7 +33,7 @@ from tuning.modal.spectral.matrix_fraction import (
     pole_changes,
 )
 from tuning.modal.spectral.residues import shapes_with_covariance
-from tuning.modal.stabilisation import Chain, Diagram, stabilise
+from tuning.modal.stabilisation import Diagram, stabilise
 from tuning.modal.subspace import Poles, Spread
 
 LAG_CYCLES = 15.0  # cycles of the lowest frequency in the lags of correlations
@@ -91,7 +91,7 @@ def _modes_of_band(prepared: Prepared, whole, order):
     )
     diagram = stabilise(poles._replace(shapes=poles.shapes * scale), prepared.band)
     chosen = _Chosen(system, fractions, poles, diagram)
-    modes = [_mode(poles, chain, chosen.spreads, scale) for chain in diagram.chains]
+    modes = [mode_of_best_half(poles, chain, chosen.spreads, scale) for chain in diagram.chains]
     if modes:
         modes = _with_residues(modes, chosen, scale, np.diag(correlations.values[0]))
     duration = sum(map(len, records)) / prepared.rate
@@ -100,24 +100,6 @@ def _modes_of_band(prepared: Prepared, whole, order):
         for mode, chain in zip(modes, diagram.chains, strict=True)
     ]
     return candidates, diagram
-
-
-def _mode(poles: Poles, chain: Chain, spreads: dict[int, Spread], scale) -> IdentifiedMode:
-    """Mode of a chain: the median pole of the half that is determined best.
-
-    The scatter of that half over the degrees adds to its uncertainty, as the choice among them is
-    not free of it.
-    """
-    ranked = sorted(chain.members.tolist(), key=lambda k: np.linalg.det(spreads[k].covariance))
-    half = np.array(ranked[: max(len(ranked) // 2, 1)])
-    values = poles.poles[half]
-    centre = np.median(values.real) + 1j * np.median(values.imag)
-    which = half[[np.argmin(np.abs(values - centre))]]
-    mode = mode_of_chain(poles, Chain(which, int(which[0])), spreads, scale)
-    return mode._replace(
-        frequency_sd=float(np.hypot(mode.frequency_sd, poles.frequencies[half].std())),
-        damping_sd=float(np.hypot(mode.damping_sd, poles.damping_ratios[half].std())),
-    )
 
 
 class _Chosen:
@@ -138,28 +120,13 @@ class _Chosen:
                 for k in inside:
                     self.changes[k] = changes[:, k - first]
                     self.participations[k] = fraction.left[k - first].conj()
-                    self.spreads[k] = _spread(poles.poles[k], self.changes[k], poles.shapes[k])
+                    self.spreads[k] = spread_of_changes(poles.poles[k], self.changes[k], poles.shapes[k])
             first += fraction.poles.size
 
     def member(self, mode: IdentifiedMode) -> int:
         """Index of the pole of a mode."""
         members = np.array(list(self.spreads))
         return int(members[np.argmin(np.abs(self.poles.poles[members] - mode.pole))])
-
-
-def _spread(pole, changes, shape) -> Spread:
-    """Uncertainty of frequency and damping ratio of a pole from its changes by blocks."""
-    size = np.abs(pole)
-    radial = np.real(np.conj(pole) * changes) / size
-    by_damping = -changes.real / size + pole.real * radial / size**2
-    stacked = np.stack([radial / (2 * np.pi), by_damping], axis=-1)
-    parts = 2 * shape.size
-    return Spread(
-        stacked.T @ stacked,
-        shape / shape[np.argmax(np.abs(shape))],
-        np.zeros((parts, parts)),
-        float(max(len(changes) - 1, 1)),
-    )
 
 
 def _with_residues(modes, chosen: _Chosen, scale, variances):
