@@ -12,10 +12,10 @@ from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.sensing.motion import motion_at
 from jaxbeam.model.sensing.output_rows import sensor_history
 from jaxbeam.model.static_correction import Motion, corrected_history
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.simulation.motion.at_samples import motion_at
 
 LEFT_OUT = 3  # highest modes whose dynamic part estimates that of all modes beyond
 MAX_SAMPLES = 400  # of a run from which the errors are estimated

@@ -52,9 +52,9 @@ class IntegrationPlan(eqx.Module):
     Valid for cases that differ in numbers only, if these keep the order of supports and loads and
     change frequencies little. `substeps` is the number of steps from sample to sample (with a
     controller from event to event), `error` relative to the largest deflection, `sensor_errors`
-    to the largest value of what each sensor measures (empty where they are not known). `lead_samples` are
-    added before the first sample, back to the start of the run. The run ends with the last sample,
-    or `to_duration` at the duration of the case. With a controller the `schedule` holds its events,
+    to the largest value of what each sensor measures (empty where they are not known).
+    `lead_samples` are added before the first sample, back to the start of the run. The run ends
+    with the last sample, or `to_duration` at the duration of the case. With a controller the `schedule` holds its events,
     the samples and the end.
     """
 

@@ -22,7 +22,6 @@ from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
 from jaxbeam.model.sensing.measurement import sensor_readings
-from jaxbeam.model.sensing.motion import motion_at
 from jaxbeam.model.sensing.output_rows import sensor_history, sensor_rows
 from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readings
 from jaxbeam.model.static_correction import Motion
