@@ -24,6 +24,7 @@ from jaxbeam.integrator.step_size import (
     MAX_DIVERGED_HALVINGS,
     MAX_STEPS,
     NO_STEP,
+    StepTrial,
     check_step_count,
     choose_step_size,
     largest_change,
@@ -37,6 +38,7 @@ from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
+from jaxbeam.simulation.errors import step_errors
 
 TOLERANCE = 1e-7  # relative to the largest deflection
 MAX_STEPS_PER_SAMPLE = 10**5  # time steps between samples of a controlled run
@@ -49,10 +51,11 @@ class IntegrationPlan(eqx.Module):
 
     Valid for cases that differ in numbers only, if these keep the order of supports and loads and
     change frequencies little. `substeps` is the number of steps from sample to sample (with a
-    controller from event to event), `error` relative to the largest deflection. `lead_samples` are
-    added before the first sample, back to the start of the run. The run ends with the last sample,
-    or `to_duration` at the duration of the case. With a controller the `schedule` holds its events,
-    the samples and the end.
+    controller from event to event), `error` relative to the largest deflection, `sensor_errors`
+    to the largest value of what each sensor measures (empty where they are not known).
+    `lead_samples` are added before the first sample, back to the start of the run. The run ends
+    with the last sample, or `to_duration` at the duration of the case. With a controller the
+    `schedule` holds its events, the samples and the end.
     """
 
     shapes: StaticShapes = eqx.field(static=True)
@@ -62,9 +65,10 @@ class IntegrationPlan(eqx.Module):
     error: float = eqx.field(static=True)
     schedule: EventSchedule | None = None
     to_duration: bool = eqx.field(static=True, default=False)
+    sensor_errors: tuple[float, ...] = eqx.field(static=True, default=())
 
 
-# A run by a plan under an input policy: its deflections, as `trial_deflections`, at all events.
+# A run by a plan under an input policy: its states at all events, as `beam_and_vehicles`.
 FirstRun = Callable[[IntegrationPlan, AbstractInputPolicy], np.ndarray]
 
 
@@ -90,16 +94,18 @@ def integration_plan(
         end = float(case.run.duration) if to_duration else None
         schedule = loop_schedule(case, samples, end)
 
-        def plan(substeps, error):
-            return IntegrationPlan(shapes, substeps, 0, False, error, schedule, to_duration)
+        def plan(substeps, error, errors=()):
+            parts = shapes, substeps, 0, False, error, schedule, to_duration, errors
+            return IntegrationPlan(*parts)
 
         def run_first(substeps, policy):
             assert first_run is not None
             return first_run(plan(substeps, 0.0), policy)
 
         by_first_run = None if first_run is None else run_first
-        return plan(*_choose_substeps(case, shapes, schedule, tolerance, by_first_run))
-    step, error = choose_step_size(case, shapes, tolerance)
+        substeps, error, trial = _choose_substeps(case, shapes, schedule, tolerance, by_first_run)
+        return plan(substeps, error, _sensor_errors(case, shapes, trial))
+    step, error, trial = choose_step_size(case, shapes, tolerance)
     intervals = np.diff(samples)
     equally_spaced = bool(
         np.all(np.abs(intervals - intervals.mean()) < SPACING_TOLERANCE * intervals.mean())
@@ -108,7 +114,13 @@ def integration_plan(
     check_step_count(samples.size * (intervals.max() / step), step)
     substeps = steps_per_interval(intervals.max(), step)
     return IntegrationPlan(
-        shapes, substeps, lead_samples, equally_spaced, error, to_duration=to_duration
+        shapes,
+        substeps,
+        lead_samples,
+        equally_spaced,
+        error,
+        to_duration=to_duration,
+        sensor_errors=_sensor_errors(case, shapes, trial),
     )
 
 
@@ -140,6 +152,7 @@ def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> Integr
         lead_samples=max(plan.lead_samples for plan in plans),
         equally_spaced=all(plan.equally_spaced for plan in plans),
         error=max(plan.error for plan in plans),
+        sensor_errors=tuple(map(max, zip(*(plan.sensor_errors for plan in plans), strict=True))),
     )
 
 
@@ -165,10 +178,10 @@ def _choose_substeps(
     schedule: EventSchedule,
     tolerance: float,
     first_run: Callable[[int, AbstractInputPolicy], np.ndarray] | None,
-) -> tuple[int, float]:
-    """Number of steps between events of a schedule, and the relative error of the deflection.
+) -> tuple[int, float, StepTrial | None]:
+    """Number of steps between events of a schedule, relative error of the deflection, and trial.
 
-    A `first_run` takes the smallest number of steps.
+    A `first_run` takes the smallest number of steps. There is no trial of a run that diverges.
     """
     step, interval = longest_trial_step(case, shapes), float(schedule.lengths.max())
     if interval / step > MAX_STEPS_PER_SAMPLE:
@@ -184,21 +197,36 @@ def _choose_substeps(
     trial_run = _compiled_trial_run if is_compiled else _known_trial_run
     policy = None if is_compiled else _known_loop(case, shapes, schedule)
 
+    model = modal_model(case, shapes.layout, shapes.coupled)
+
     @functools.cache
-    def response(halvings):
+    def states(halvings):
         if halvings == 0 and first_run is not None and policy is not None:
             return first_run(min_substeps, policy)
         substeps = xp.asarray(min_substeps * 2**halvings)
         return np.asarray(trial_run(case, shapes, schedule, substeps, policy))
 
+    def response(halvings):
+        return np.asarray(trial_deflections(case, model, states(halvings)))
+
     # A loop that diverges does so with any step, so its error is not defined. A stiff law in
     # continuous time may also overflow because the steps are too long.
     confirming_halvings = 6 if case.controller.period is None else 1
     if np.isnan(response(1)).any() and np.isnan(response(confirming_halvings)).any():
-        return 2 * min_substeps, np.nan
-    least = rounding_deflection(case, modal_model(case, shapes.layout, shapes.coupled))
+        return 2 * min_substeps, np.nan, None
+    least = rounding_deflection(case, model)
     halvings, error = _halve_until_converged(response, tolerance, 8, least)
-    return min_substeps * 2**halvings, error
+    own = slice(None, -1)  # no step starts at the last event
+    trial = StepTrial(schedule.times[own], states(halvings)[own], states(halvings + 1)[own])
+    return min_substeps * 2**halvings, error, trial
+
+
+def _sensor_errors(case: Case, shapes: StaticShapes, trial: StepTrial | None) -> tuple[float, ...]:
+    """Errors of the steps of a trial at each sensor (see `step_errors`), NaN without one."""
+    if trial is None:
+        return (np.nan,) * len(case.sensors)
+    model = modal_model(case, shapes.layout, shapes.coupled)
+    return tuple(map(float, step_errors(case, model, trial)))
 
 
 def runs_compiled(case: Case, schedule: EventSchedule) -> bool:
@@ -215,8 +243,16 @@ def _known_loop(case, shapes, schedule):
     return closed_loop(case, shapes.layout, load_set(case, shapes.layout), schedule)
 
 
+def beam_and_vehicles(
+    case: Case, shapes: StaticShapes, policy: AbstractInputPolicy, states
+) -> Float[Array, "event state batch"]:
+    """The states of a controlled run without those of filters and of the controller."""
+    own = modal_model(case, shapes.layout, shapes.coupled).state_count
+    return xp.concatenate([states[:, :own], states[:, policy.model.state_count :]], axis=1)
+
+
 def _closed_loop_trial_run(case, shapes, schedule, substeps, policy):
-    """Deflections (m) at TRIAL_POSITIONS and all events, as (event and position, batch).
+    """States at all events, of the beam's modal model and then of vehicles: (event, state, batch).
 
     The input `policy` is that of the case if it is None. Peaks would hide errors: where a command
     saturates, the deflection has its error everywhere but at a peak, where it is stationary.
@@ -226,7 +262,7 @@ def _closed_loop_trial_run(case, shapes, schedule, substeps, policy):
     grid = grid_by_schedule(case, policy.model, schedule, substeps)
     discrete = discrete_model(policy.model, grid, None, policy)
     states = integrate_at_events(discrete, loads, max_loads=shapes.max_loads, policy=policy)
-    return trial_deflections(case, policy.model, states[: schedule.times.shape[0]])
+    return beam_and_vehicles(case, shapes, policy, states[: schedule.times.shape[0]])
 
 
 _known_trial_run = compiled_if_traced(_closed_loop_trial_run)

@@ -17,9 +17,7 @@ from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.propagators import NODE_COUNT, end_weights
 from jaxbeam.integrator.running_peaks import Peaks
-from jaxbeam.integrator.step_size import trial_deflections
 from jaxbeam.integrator.time_grid import TimeGrid, grid_by_schedule
-from jaxbeam.model.contact import contact_at, split_states
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
@@ -36,10 +34,12 @@ from jaxbeam.simulation.integration_plan import (
     TOLERANCE,
     FirstRun,
     IntegrationPlan,
+    beam_and_vehicles,
     integration_plan,
     runs_compiled,
     sample_times,
 )
+from jaxbeam.simulation.motion.at_samples import motion_at
 from jaxbeam.simulation.record import Record
 
 
@@ -81,14 +81,17 @@ def simulate(
     if plan is None:
         plan = integration_plan(case, times, tolerance, _first_run(case, times, first_records))
     times = sample_times(case) if times is None else xp.asarray(times, float)
-    error, record = xp.asarray(plan.error), first_records.get(plan.substeps)
+    sensor_errors = plan.sensor_errors or (np.nan,) * len(case.sensors)
+    errors = xp.asarray(plan.error), xp.asarray(sensor_errors, float)
+    record = first_records.get(plan.substeps)
     if record is not None:
-        record = dataclasses.replace(record, error_estimate=error)
+        record = dataclasses.replace(record, error_estimate=errors[0], step_errors=errors[1])
     else:
-        # Plans that differ in their error only share compiled programs.
+        # Plans that differ in their errors only share compiled programs.
         is_compiled = plan.schedule is not None and runs_compiled(case, plan.schedule)
         simulate_record = _simulate_compiled if is_compiled else _simulate
-        record = simulate_record(case, dataclasses.replace(plan, error=0.0), times, error)
+        without_errors = dataclasses.replace(plan, error=0.0, sensor_errors=())
+        record = simulate_record(case, without_errors, times, errors)
     if is_concrete(record.contact_lost_time):
         lost = np.isfinite(concrete(record.contact_lost_time)) & ~load_set(case).prescribed
         if lost.any() and np.isnan(concrete(record.diverged_time)):
@@ -118,16 +121,16 @@ def _first_run(case: Case, times, records: dict[int, Record]) -> FirstRun | None
 
     def run(plan, policy):
         samples = sample_times(case) if times is None else xp.asarray(times, float)
-        record, deflections = _simulate_first(case, plan, samples, policy)
+        record, states = _simulate_first(case, plan, samples, policy)
         records[plan.substeps] = record
-        return deflections
+        return states
 
     return run
 
 
 @compiled_if_traced
 def _simulate_first(case: Case, plan: IntegrationPlan, times, policy):
-    """Record of a run, and its trial deflections at all events."""
+    """Record of a run without its errors, and its states at all events."""
     monitored = monitored_sensors(case.sensors)
     integration = _integrate(case, plan, times, monitored, policy=policy)
     event = integration.grid.event_at(np.arange(integration.steps))
@@ -137,16 +140,17 @@ def _simulate_first(case: Case, plan: IntegrationPlan, times, policy):
         xp.where(event < 0, plan.schedule.times.shape[0], event),
         states,
     )
-    deflections = trial_deflections(case, integration.model, at_events)
-    return _record(case, integration, times, xp.zeros(())), deflections
+    no_errors = xp.zeros(()), xp.zeros(len(case.sensors))
+    record = _record(case, integration, times, no_errors)
+    return record, beam_and_vehicles(case, plan.shapes, policy, at_events)
 
 
-def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
+def _simulate_record(case: Case, plan: IntegrationPlan, times, errors) -> Record:
     monitored = monitored_sensors(case.sensors)
-    return _record(case, _integrate(case, plan, times, monitored), times, error)
+    return _record(case, _integrate(case, plan, times, monitored), times, errors)
 
 
-def _record(case: Case, integration: "_Integration", times, error) -> Record:
+def _record(case: Case, integration: "_Integration", times, errors) -> Record:
     outputs = integration.outputs
     peaks = Peaks(*(part[0] for part in integration.running_peaks.peaks()))
     extremes, peaks = sensor_extremes(case.sensors, peaks)
@@ -164,7 +168,8 @@ def _record(case: Case, integration: "_Integration", times, error) -> Record:
         **peaks._asdict(),
         **extremes._asdict(),
         contact_lost_position=lost_positions,
-        error_estimate=error,
+        error_estimate=errors[0],
+        step_errors=errors[1],
         steps=integration.steps,
     )
 
@@ -319,7 +324,7 @@ def _integrate(case: Case, plan: IntegrationPlan, times, monitored, noisy=True, 
             if policy.implicit
             else _commands_at_steps(case, commands, sample_steps)
         )
-    motion, vehicles = _motion(case, model, loads, times, states, commands)
+    motion, vehicles = motion_at(case, model, loads, times, states, commands)
     outputs = Outputs(motion, vehicles, observed, failures)
     return _Integration(running_peaks, outputs, model, discrete.grid, all_states, steps)
 
@@ -332,20 +337,6 @@ def _commands_at_steps(case: Case, commands, steps):
     return xp.clip(commands_at_start, low, high)
 
 
-def _vehicle_motion(model: ModalModel, loads: LoadSet, states, accelerations) -> VehicleMotion:
-    """Motion of the bodies at instants, from the states and the accelerations at contact."""
-    _, vehicle_states = split_states(model.state_count, loads, states)
-    none = xp.zeros((states.shape[0], 0))
-    parts = []
-    for state, acceleration in zip(vehicle_states, accelerations, strict=True):
-        dofs = acceleration.shape[-2]
-        motion = state[..., :dofs, 0], state[..., dofs:, 0], acceleration[..., 0]
-        parts.append([part.reshape(part.shape[0], -1) for part in motion])
-    if not parts:
-        return VehicleMotion(none, none, none)
-    return VehicleMotion(*(xp.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
-
-
 class Outputs(NamedTuple):
     """Motion of beam and vehicles at the samples; readings and failures of a controller, if any."""
 
@@ -353,19 +344,3 @@ class Outputs(NamedTuple):
     vehicles: VehicleMotion
     readings: Float[Array, "time sensor"] | None
     failures: Float[Array, " time"] | None
-
-
-def _motion(case: Case, model: ModalModel, loads: LoadSet, times, states, commands):
-    """Motion of the modes with the forces on the beam, and motion of the vehicles."""
-    columns = None if commands is None else commands[..., None]
-    contact = contact_at(model, loads, times, states, columns)
-    vehicles = _vehicle_motion(model, loads, states, contact.vehicle_acceleration)
-    force, accelerations = contact.force[..., 0], contact.modal_acceleration[..., 0]
-    count = 2 * accelerations.shape[1]
-    coordinates = states[:, 0:count:2, 0], states[:, 1:count:2, 0], accelerations
-    if model.mode_map is not None:
-        coordinates = tuple(part @ model.mode_map.T for part in coordinates)
-    position = xp.where(loads.on_beam(times).T, loads.kinematics(times)[0].T, xp.nan)
-    actuators = len(case.actuators)
-    command = xp.zeros((times.shape[0], actuators)) if commands is None else commands[:, :actuators]
-    return Motion(*coordinates, position, -force, command), vehicles
