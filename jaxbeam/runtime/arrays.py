@@ -104,6 +104,11 @@ else:
     Array = jax.Array | np.ndarray | np.generic
 
 
+def array_namespace(*values: Any) -> Any:
+    """The library that `xp` takes for some values, chosen once for a loop of many small calls."""
+    return jnp if any(map(is_jax, values)) else np
+
+
 def take(array, index) -> Any:
     """Entries at an index along the first axis, one that may be traced in a known array."""
     return jnp.asarray(array)[index] if is_jax(index) else array[index]

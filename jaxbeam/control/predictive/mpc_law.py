@@ -137,9 +137,11 @@ class MPCLaw(AbstractStateLaw):
         weight, Phi, maps = self.output_weights, prediction.Phi, self.move_maps
         if self.terminal_cost is not None:
             weight = set_at(weight, -1, 0.0)  # included in P
-        move_cost = xp.einsum("hav,a,haw->vw", maps, self.move_weights, maps)
-        H = xp.einsum("hov,ho,how->vw", Phi, weight, Phi) + move_cost
-        f = xp.einsum("hov,ho,ho->v", Phi, weight, free_response)
+        weighted = (weight[..., None] * Phi).reshape(-1, Phi.shape[2])
+        weighted_moves = (self.move_weights[:, None] * maps).reshape(-1, maps.shape[2])
+        move_cost = weighted_moves.T @ maps.reshape(-1, maps.shape[2])
+        H = weighted.T @ Phi.reshape(-1, Phi.shape[2]) + move_cost
+        f = weighted.T @ free_response.reshape(-1)
         if self.terminal_cost is not None:
             terminal_gradient = prediction.terminal_phi.T @ self.terminal_cost
             H = H + terminal_gradient @ prediction.terminal_phi

@@ -43,8 +43,9 @@ class Prediction(NamedTuple):
         """Prediction under weights (N) from one whose last initial conditions are those weights."""
 
         def combined(columns):
-            own, of_loads = xp.split(columns, [columns.shape[-1] - load_weights.shape[0]], axis=-1)
-            return xp.concatenate([own, of_loads @ load_weights[:, None]], axis=-1)
+            own = columns.shape[-1] - load_weights.shape[0]
+            of_loads = columns[..., own:] @ load_weights
+            return xp.concatenate([columns[..., :own], of_loads[..., None]], axis=-1)
 
         return self._replace(F=combined(self.F), terminal=combined(self.terminal))
 

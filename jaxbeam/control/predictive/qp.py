@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Int
 from jaxbeam.runtime.arrays import (
     Array,
     any_jax,
+    array_namespace,
     cholesky,
     fori_loop,
     set_at,
@@ -170,29 +171,29 @@ def _zero_tangent(value):
     return xp.zeros(xp.shape(value), jax.dtypes.float0)
 
 
-def _status(tolerance, error, z, previous_multipliers, multipliers, h, G):
+def _status(lib, tolerance, error, z, previous_multipliers, multipliers, h, G):
     """Status of an iterate: solved, or infeasible by the growth r of the multipliers.
 
     A ray r >= 0 with G'r = 0 and h'r < 0 proves infeasibility (Farkas); for other r >= 0 every
     feasible point is at least -h'r / |G'r| away from the origin.
     """
     # XLA's maxima may ignore NaN, so that the error alone is no proof.
-    finite = xp.isfinite(z).all() & xp.isfinite(multipliers).all()
+    finite = lib.isfinite(z).all() & lib.isfinite(multipliers).all()
     solved = finite & (error <= tolerance * (1 + abs(z).max()))
-    ray = xp.maximum(multipliers - previous_multipliers, 0.0)
+    ray = lib.maximum(multipliers - previous_multipliers, 0.0)
     min_certificate = MAX_DISTANCE * abs(G.T @ ray).max() + TOLERANCE * ray.sum()
     infeasible = -(h @ ray) > min_certificate
-    return xp.where(solved, SOLVED, xp.where(infeasible, INFEASIBLE, UNFINISHED))
+    return lib.where(solved, SOLVED, lib.where(infeasible, INFEASIBLE, UNFINISHED))
 
 
 def _interior_point(G, h, limits_matter):
     """Mehrotra's predictor-corrector method (SIAM J. Optimization 2, 1992), regularised in l."""
-    rows, variables = G.shape
+    (rows, variables), lib = G.shape, array_namespace(G, h, limits_matter)
 
     def optimality_errors(z, multipliers, slack):
         stationary, limits = z + G.T @ multipliers, G @ z + slack - h
-        worst = xp.maximum(abs(stationary).max(), abs(limits).max())
-        return xp.maximum(worst, xp.minimum(multipliers, slack).max()), stationary, limits
+        worst = lib.maximum(abs(stationary).max(), abs(limits).max())
+        return lib.maximum(worst, lib.minimum(multipliers, slack).max()), stationary, limits
 
     def unfinished(state):
         *_, status, steps = state
@@ -214,18 +215,18 @@ def _interior_point(G, h, limits_matter):
 
         gap = multipliers @ slack
         _, multiplier_change, slack_change = newton(multipliers * slack)
-        length = _step_length(multipliers, multiplier_change, slack, slack_change, 1.0)
+        length = _step_length(lib, multipliers, multiplier_change, slack, slack_change, 1.0)
         affine_gap = (multipliers + length * multiplier_change) @ (slack + length * slack_change)
         centring_step = (steps > STEPS_BEFORE_CENTRING) & (steps % 2 == 0)
-        centring_target = xp.where(centring_step, 0.3, (affine_gap / gap) ** 3) * gap / rows
+        centring_target = lib.where(centring_step, 0.3, (affine_gap / gap) ** 3) * gap / rows
         # The second-order correction is scaled by the step length of the predictor: in full, it
         # makes the method cycle where limits nearly exclude each other. A centring step without it
         # ends the rare cycles that are left.
-        second_order = xp.where(centring_step, 0.0, length) * multiplier_change * slack_change
+        second_order = lib.where(centring_step, 0.0, length) * multiplier_change * slack_change
         z_change, multiplier_change, slack_change = newton(
             multipliers * slack + second_order - centring_target
         )
-        length = _step_length(multipliers, multiplier_change, slack, slack_change, 0.995)
+        length = _step_length(lib, multipliers, multiplier_change, slack, slack_change, 0.995)
         z, slack = z + length * z_change, slack + length * slack_change
         next_multipliers = multipliers + length * multiplier_change
         error, stationary, limits = optimality_errors(z, next_multipliers, slack)
@@ -235,22 +236,22 @@ def _interior_point(G, h, limits_matter):
             slack,
             stationary,
             limits,
-            _status(TOLERANCE, error, z, multipliers, next_multipliers, h, G),
+            _status(lib, TOLERANCE, error, z, multipliers, next_multipliers, h, G),
             steps + 1,
         )
 
-    start = xp.zeros(variables), xp.ones(rows), xp.maximum(h, 0.0) + 1.0
+    start = lib.zeros(variables), lib.ones(rows), lib.maximum(h, 0.0) + 1.0
     _, *residuals = optimality_errors(*start)
-    initial_status = xp.where(limits_matter, UNFINISHED, SOLVED), xp.zeros((), int)
+    initial_status = lib.where(limits_matter, UNFINISHED, SOLVED), lib.zeros((), int)
     start = (*start, *residuals, *initial_status)
     z, multipliers, *_, status, steps = while_loop(unfinished, step, start)
-    return z, xp.where(limits_matter, multipliers, 0.0), status, steps
+    return z, lib.where(limits_matter, multipliers, 0.0), status, steps
 
 
-def _step_length(multipliers, multiplier_change, slack, slack_change, boundary_share):
+def _step_length(lib, multipliers, multiplier_change, slack, slack_change, boundary_share):
     """Step length, at most 1, at which no multiplier or slack decreases by more than this share."""
-    worst = xp.maximum((-multiplier_change / multipliers).max(), (-slack_change / slack).max())
-    return xp.where(worst > boundary_share, boundary_share / worst, 1.0)
+    worst = lib.maximum((-multiplier_change / multipliers).max(), (-slack_change / slack).max())
+    return lib.where(worst > boundary_share, boundary_share / worst, 1.0)
 
 
 def _hildreth(G, h, limits_matter):
@@ -276,7 +277,8 @@ def _hildreth(G, h, limits_matter):
         z = -G.T @ after
         slack = h - G @ z
         error = xp.maximum(xp.max(-slack), xp.max(xp.minimum(after, slack)))
-        return z, after, _status(HILDRETH_TOLERANCE, error, z, multipliers, after, h, G), sweeps + 1
+        status = _status(xp, HILDRETH_TOLERANCE, error, z, multipliers, after, h, G)
+        return z, after, status, sweeps + 1
 
     initial_status = xp.where(limits_matter, UNFINISHED, SOLVED), xp.zeros((), int)
     start = xp.zeros(variables), xp.zeros(rows)
