@@ -42,33 +42,32 @@ def advance_known_with_inputs(policy, vehicles, steps: StepInput, infos, state, 
     Results as of a `scan` of `step_with_inputs`; see `step.known_maps`. None if the policy
     computes with JAX in spite of known numbers, as a law of a user may.
     """
-    forces_map, maps = known_maps(steps, vehicles)
-    count, batch_size, state_count, columns = maps.shape
-    bound = np.full((state_count, 1), np.inf)  # of vehicles none
-    bound[: steps.matrices.state_count, 0] = policy.state_bound
-    # State, commands, and one.
-    sources = np.ones((count + 1, batch_size, columns, 1))
-    sources[0, :, :state_count, 0] = state.T
+    of_forces, of_states = known_maps(steps, vehicles)
+    count, batch_size, state_count = of_states.offset.shape
+    bound = np.full(state_count, np.inf)  # of vehicles none
+    bound[: steps.matrices.state_count] = policy.state_bound
+    # State and commands.
+    sources = np.ones((count + 1, batch_size, of_states.linear.shape[-1]))
+    sources[0, :, :state_count] = state.T
     events, observations, held = infos.event.tolist(), [], None
     for i in range(count):
         state = sources[i, :, :state_count]
         if events[i] >= 0 or i == 0 or not policy.holds_commands:
             info = StepInfo(infos.start[i], infos.length[i], infos.event[i])
-            node_commands, memory = policy.inputs(memory, state[..., 0].T, info, None)
+            node_commands, memory = policy.inputs(memory, state.T, info, None)
             if i == 0 and any_jax(node_commands, memory):
                 return None
-            held = collapse(node_commands, 0, 2).T[..., None]
+            held = collapse(node_commands, 0, 2).T
             observed = policy.observe(memory, info)
-        sources[i, :, state_count:-1] = held
+        sources[i, :, state_count:] = held
         observations.append(observed)
-        next_state = maps[i] @ sources[i]
+        next_state = of_states.at(i, sources[i])
         within = np.abs(next_state) <= bound
         if not within.all():
             next_state = np.where(within.all(axis=1, keepdims=True), next_state, np.nan)
         sources[i + 1, :, :state_count] = next_state
-    forces = forces_map @ sources[:-1]
-    forces, states = (np.swapaxes(part[..., 0], 1, 2) for part in (forces, sources))
-    commands = states[:-1, state_count:-1]
+    forces, states = (np.swapaxes(part, 1, 2) for part in (of_forces(sources[:-1]), sources))
+    commands = states[:-1, state_count:]
     observed = jax.tree.map(lambda *parts: np.stack(parts), *observations)
     states = states[:, :state_count]
     return (states[-1], memory), (states[:-1], forces, commands, observed)

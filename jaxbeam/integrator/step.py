@@ -5,6 +5,8 @@ that of the state before it; all other terms are computed for all steps at once,
 remains to be done step by step, in forward and in reverse mode.
 """
 
+from typing import NamedTuple
+
 import jax
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
@@ -103,50 +105,78 @@ def _advance_known(step: StepInput, state, vehicles: Vehicles | None):
 
     The systems of all steps are solved at once; NumPy takes a tenth of the time of one by one.
     """
-    forces_of_state, maps = known_maps(step, vehicles)
-    states = np.empty((len(maps) + 1, *maps.shape[1:3], 1))
-    states[0] = state.T[..., None]
-    state_maps, offsets = maps[..., :-1], maps[..., -1:]
-    for i in range(len(maps)):
-        states[i + 1] = state_maps[i] @ states[i] + offsets[i]
-    forces = forces_of_state[..., :-1] @ states[:-1] + forces_of_state[..., -1:]
-    states, forces = (np.swapaxes(part[..., 0], 1, 2) for part in (states, forces))
+    of_forces, of_states = known_maps(step, vehicles)
+    states = np.empty((len(of_states.offset) + 1, *of_states.offset.shape[1:]))
+    states[0] = state.T
+    for i in range(len(states) - 1):
+        states[i + 1] = of_states.at(i, states[i])
+    states, forces = (np.swapaxes(part, 1, 2) for part in (states, of_forces(states[:-1])))
     return states[-1], states[:-1], forces
 
 
-def known_maps(step: StepInput, vehicles: Vehicles | None):
+class KnownMap(NamedTuple):
+    """Affine map of each step from the state and the commands: linear @ (z, u) + offset.
+
+    Runs of a batch may share the linear part, whose batch axis then has length one.
+    """
+
+    linear: Float[np.ndarray, "step shared_or_batch row column"]
+    offset: Float[np.ndarray, "step batch row"]
+
+    def at(
+        self, i: int, columns: Float[np.ndarray, "batch column"]
+    ) -> Float[np.ndarray, "batch row"]:
+        """Values of one step."""
+        linear = self.linear[i]
+        if len(linear) == 1:
+            return columns @ linear[0].T + self.offset[i]
+        return (linear @ columns[..., None])[..., 0] + self.offset[i]
+
+    def __call__(
+        self, columns: Float[np.ndarray, "step batch column"]
+    ) -> Float[np.ndarray, "step batch row"]:
+        """Values of all steps."""
+        if self.linear.shape[1] == 1:
+            return columns @ self.linear[:, 0].mT + self.offset
+        return (self.linear @ columns[..., None])[..., 0] + self.offset
+
+
+def known_maps(step: StepInput, vehicles: Vehicles | None) -> tuple[KnownMap, KnownMap]:
     """Maps of steps of known numbers to the contact forces and to the next state.
 
-    z' = Phi z + B u - Gamma S (m (R z + D u) + w) with commands u, if there are any. Both maps are
-    (step, batch, row, column), with the columns of the state, of u, and of one.
+    z' = Phi z + B u - Gamma S (m (R z + D u) + w) with commands u, if there are any.
     """
     matrices, commands = step.matrices, step.matrices.commands
     surface = None
     if vehicles is None:
-        forces_of_state = _known_forces(step)
+        of_columns, of_one = _known_forces(step)
     else:
-        forces_of_state, surface = known_forces(vehicles, step)
-    maps = matrices.force_response[:, None] @ forces_of_state
+        forces, surface = known_forces(vehicles, step)
+        of_columns, of_one = forces[..., :-1], forces[..., -1:]
+    linear, offset = (matrices.force_response[:, None] @ part for part in (of_columns, of_one))
     blocks, side = matrices.transition.shape[1:3]
     state_index = np.arange(matrices.state_count).reshape(blocks, side)
-    maps[:, :, state_index[:, :, None], state_index[:, None, :]] += matrices.transition[:, None]
+    linear[:, :, state_index[:, :, None], state_index[:, None, :]] += matrices.transition[:, None]
     if commands is not None:
-        count = commands.input_matrix.shape[-1]
-        maps[..., -1 - count : -1] += commands.input_matrix[:, None]
+        linear[..., linear.shape[-1] - commands.input_matrix.shape[-1] :] += commands.input_matrix[
+            :, None
+        ]
     if vehicles is not None:
-        maps = np.concatenate([maps, known_state_maps(vehicles, step, surface)], axis=2)
-    return forces_of_state, maps
+        of_vehicles = known_state_maps(vehicles, step, surface)
+        linear = np.concatenate([linear, of_vehicles[..., :-1]], axis=2)
+        offset = np.concatenate([offset, of_vehicles[..., -1:]], axis=2)
+    return KnownMap(of_columns, of_one[..., 0]), KnownMap(linear, offset[..., 0])
 
 
 def _known_forces(step: StepInput):
-    """Map to the contact forces of plain wheels; see `known_maps`."""
+    """Linear part and offset of the map to the contact forces of plain wheels."""
     matrices, commands = step.matrices, step.matrices.commands
     inertia, weight = (np.swapaxes(part, 1, 2)[..., None] for part in (step.inertia, step.weight))
     compliance, response = matrices.contact_compliance, matrices.contact_response
     if response is None:
         count = 0 if commands is None else commands.input_matrix.shape[-1]
-        no_response = np.zeros((*weight.shape[:-1], matrices.state_count + count))
-        return -np.concatenate([no_response, weight], axis=-1)
+        no_response = np.zeros((len(weight), 1, weight.shape[2], matrices.state_count + count))
+        return no_response, -weight
     parts = [response, *([] if commands is None else [commands.contact_response])]
     # Runs of the same wheels share the systems; weights are then right sides of one each.
     batch = weight.shape[1]
@@ -162,11 +192,8 @@ def _known_forces(step: StepInput):
         system = np.eye(weight.shape[2]) + inertia * compliance[:, None]
         forces = -np.linalg.solve(system, right)
     if not shared:
-        return forces
-    of_weights = np.swapaxes(forces[..., -batch:], 1, 3)  # step, batch, wheel, 1
-    of_state = forces[..., :-batch]
-    of_state = np.broadcast_to(of_state, (len(forces), batch, *of_state.shape[2:]))
-    return np.concatenate([of_state, of_weights], axis=-1)
+        return forces[..., :-1], forces[..., -1:]
+    return forces[..., :-batch], np.swapaxes(forces[..., -batch:], 1, 3)  # step, batch, wheel, 1
 
 
 _advance_with_rule = custom_jvp(_advance_all)

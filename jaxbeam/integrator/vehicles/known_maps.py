@@ -17,7 +17,7 @@ from jaxbeam.runtime.arrays import take
 def known_forces(vehicles: Vehicles, step: StepInput):
     """Maps of known steps to contact forces, and to q = k y + c y' of the beam at the rows.
 
-    Both (step, batch, row, column) with columns as in `step.known_maps`; see `advance`.
+    Both (step, batch, row, column), with columns of state, commands, and one; see `advance`.
     """
     matrices, loads, wheels = step.matrices, vehicles.loads, vehicles.loads.wheels
     states = matrices.state_count
