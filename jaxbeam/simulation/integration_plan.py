@@ -69,7 +69,7 @@ class IntegrationPlan(eqx.Module):
 
 
 # A run by a plan under an input policy: its states at all events, as `beam_and_vehicles`.
-FirstRun = Callable[[IntegrationPlan, AbstractInputPolicy], np.ndarray]
+FirstRun = Callable[[IntegrationPlan, AbstractInputPolicy], Array]
 
 
 def integration_plan(
@@ -177,7 +177,7 @@ def _choose_substeps(
     shapes: StaticShapes,
     schedule: EventSchedule,
     tolerance: float,
-    first_run: Callable[[int, AbstractInputPolicy], np.ndarray] | None,
+    first_run: Callable[[int, AbstractInputPolicy], Array] | None,
 ) -> tuple[int, float, StepTrial | None]:
     """Number of steps between events of a schedule, relative error of the deflection, and trial.
 
@@ -202,7 +202,7 @@ def _choose_substeps(
     @functools.cache
     def states(halvings):
         if halvings == 0 and first_run is not None and policy is not None:
-            return first_run(min_substeps, policy)
+            return np.asarray(first_run(min_substeps, policy))
         substeps = xp.asarray(min_substeps * 2**halvings)
         return np.asarray(trial_run(case, shapes, schedule, substeps, policy))
 
