@@ -71,6 +71,22 @@ CASES = {
             [0.1, 0.6, 0.6 / 0.7, 1.35, 1 / 0.7],
         ),
     ),
+    "more masses than modes": (
+        (
+            dataclasses.replace(HINGED, modes=1),
+            None,
+            [mass(0.4, speed=-0.7), mass(0.3, speed=0.8, entry_time=0.1)],
+            [],
+        ),
+        (
+            level,
+            [
+                Wheel(constant(-0.7, 1.0), 0.4, 0.4 * GRAVITY),
+                Wheel(constant(0.8, -0.08), 0.3, 0.3 * GRAVITY),
+            ],
+            [0.1, 0.6, 0.6 / 0.7, 1.35, 1 / 0.7],
+        ),
+    ),
     "braking": (
         (HINGED, None, [mass(0.4, speed=0.9, deceleration=0.4)], []),
         (level, [Wheel(braking, 0.4, 0.4 * GRAVITY)], [arrival(0.4), arrival(1.0)]),
