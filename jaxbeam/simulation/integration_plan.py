@@ -42,7 +42,7 @@ from jaxbeam.simulation.errors import step_errors
 
 TOLERANCE = 1e-7  # relative to the largest deflection
 MAX_STEPS_PER_SAMPLE = 10**5  # time steps between samples of a controlled run
-MAX_KNOWN_EVENTS = 20000  # of a run without compilation, which would take less time beyond
+MAX_KNOWN_EVENTS = 10000  # of a run without compilation, which would take less time beyond
 SPACING_TOLERANCE = 1e-6  # largest deviation of equally spaced samples, relative to the spacing
 
 
