@@ -159,8 +159,11 @@ FUNCTIONS = {
 }
 
 
-def both_ways(function, case: jb.Case):
-    """Arrays that a function of a case returns with its numbers known, and with them traced."""
+def both_ways(function, case: jb.Case, **settings: bool | int):
+    """Arrays that a function of a case returns with its numbers known, and with them traced.
+
+    Programs are compiled with low optimisation, or with other `settings` of the compiler.
+    """
     numbers, rest = eqx.partition(case, eqx.is_array)
 
     def arrays(numbers):
@@ -169,7 +172,7 @@ def both_ways(function, case: jb.Case):
     known = arrays(numbers)
     assert not any_jax(known), "known numbers give arrays of NumPy"
     # Run once each: the full optimisation of the default takes five times as long.
-    options = xla_options(**LOW_OPTIMISATION)
+    options = xla_options(**(settings or LOW_OPTIMISATION))
     return known, jax.jit(arrays, compiler_options=options)(numbers)
 
 
@@ -221,7 +224,8 @@ def test_peaks_of_known_and_traced_numbers_are_the_same(name):
     def peaks(case):
         return run_peaks(case, shapes, np.float64(2e-3), case.sensor_positions).peaks()
 
-    assert_equal(*both_ways(peaks, case))
+    # This long program runs for longer without optimisation.
+    assert_equal(*both_ways(peaks, case, xla_backend_optimization_level=2))
 
 
 @pytest.mark.parametrize(
