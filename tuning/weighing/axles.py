@@ -39,6 +39,21 @@ class AxleWeighing:
     The load of the fit has `forces` (N), `offsets` (m, behind the first axle), speed and entry
     time. `dynamic` has the errors of the parameters of the fit on an unknown road, which are larger
     than the fit's own.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
+    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
+    ...     run=jb.Run(0.4, sample_rate=50.0),
+    ... )
+    >>> record = jb.simulate(case)
+    >>> columns = ("w",), ("deflection",), ("m",), "log", (0,)
+    >>> log = tuning.Log(record.times, record.measured, *columns)
+    >>> found = tuning.weigh_axles(case, log, (1.0, 3.0), axles=1)
+    >>> print(found.fit.addresses)
+    ['loads.0.forces.0', 'loads.0.speed', 'loads.0.entry_time', 'sensors.0.offset']
     """
 
     moses: MosesFit
@@ -140,6 +155,21 @@ def weigh_axles(
 
     Raises ValueError if speeds are not 0 < low < high, there is no axle, or a sensor measures
     velocity or acceleration, and as `identify` does.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
+    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
+    ...     run=jb.Run(0.4, sample_rate=50.0),
+    ... )
+    >>> record = jb.simulate(case)
+    >>> columns = ("w",), ("deflection",), ("m",), "log", (0,)
+    >>> log = tuning.Log(record.times, record.measured, *columns)
+    >>> found = tuning.weigh_axles(case, log, (1.0, 3.0), axles=1)
+    >>> print(f"{found.load.forces[0]:.1f} N at {found.load.speed:.1f} m/s")
+    4.0 N at 2.0 m/s
     """
     low, high = speeds
     if not 0 < low < high:
