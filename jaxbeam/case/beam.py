@@ -59,7 +59,9 @@ class Support(ReprWithUnits, eqx.Module):
     stiffness: Float[Array, ""] | None = number(
         "N/m", "vertical spring; rigid if left out", NOT_NEGATIVE, default=None
     )
-    damping: Float[Array, ""] = number("N s/m", "vertical damper", NOT_NEGATIVE, default=0.0)
+    damping: Float[Array, ""] | None = number(
+        "N s/m", "vertical damper of an elastic support", NOT_NEGATIVE, default=None
+    )
     rotational_stiffness: Float[Array, ""] = number(
         "N m/rad", "spring against rotation", NOT_NEGATIVE, default=0.0
     )

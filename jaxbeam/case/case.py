@@ -192,10 +192,25 @@ def addresses(case: Case) -> dict[str, Float[Array, "..."]]:
 
 def unknown_address_error(case: Case, address: str) -> ValueError:
     """Error for an address that a case does not have, with the nearest one that it has."""
+    if _is_left_out(case, address):
+        return ValueError(
+            f"the case has no number at address {address!r}, as it is left out there: give it a"
+            " value first"
+        )
     names = list(addresses(case))
     nearest = difflib.get_close_matches(address, names, n=1, cutoff=0.5)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; it has {', '.join(names)}"
     return ValueError(f"the case has no number at address {address!r}{hint}")
+
+
+def _is_left_out(case: Case, address: str) -> bool:
+    """Whether the address is that of a number which may be left out, and is."""
+    part: Any = case
+    *parents, name = address.split(".")
+    for key in parents:
+        listed = isinstance(part, tuple) and key.isdecimal() and int(key) < len(part)
+        part = part[int(key)] if listed else getattr(part, key, None)
+    return part is not None and getattr(part, name, part) is None
 
 
 def list_sizes(case: Case) -> dict[str, int]:

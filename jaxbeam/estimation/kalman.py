@@ -89,10 +89,6 @@ class Kalman(AbstractEstimator):
     points: int = count("intervals of the gain from event to event", default=400)
 
     @property
-    def runs_compiled(self) -> bool:
-        return self.loads != "ignored"
-
-    @property
     def has_vehicles(self):
         return self.loads != "ignored"
 

@@ -217,7 +217,7 @@ def _uncontrolled_peak(case: Case, positions) -> float:
     """Largest absolute deflection (m) at the positions (m) without commands, in continuous time."""
     uncontrolled_case = dataclasses.replace(case, controller=None)
     shapes = static_shapes(uncontrolled_case)
-    step, _ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
+    step, *_ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
     running_peaks = _run_peaks(uncontrolled_case, shapes, np.asarray(step), positions)
     return float(np.max(running_peaks.refined_peak()[0]))
 

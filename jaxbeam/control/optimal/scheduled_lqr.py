@@ -79,7 +79,7 @@ class ScheduledLQR(AbstractFiniteHorizonRegulator):
         speeds = jnp.abs(load.speed)[None] if self.speeds is None else self.speeds
 
         def design(mass, speed):
-            return self.gain_schedule(plant, _with_crossing_load(design_plant, mass, speed))
+            return self.gain_schedule(plant, with_crossing_load(design_plant, mass, speed))
 
         schedules = jax.vmap(jax.vmap(design, (None, 0)), (0, None))(
             jnp.asarray(self.masses), jnp.asarray(speeds)
@@ -173,7 +173,7 @@ def _any_not_positive(values) -> bool:
     return is_concrete(values) and bool(np.any(concrete(values) <= 0))
 
 
-def _with_crossing_load(plant: Plant, mass, speed) -> Plant:
+def with_crossing_load(plant: Plant, mass, speed) -> Plant:
     """Plant with another mass (kg) at another constant speed (m/s), in the same direction.
 
     A vehicle of another mass is a similar one, of the same frequencies.

@@ -117,12 +117,6 @@ class MPC(AbstractStateController):
     def design_depends_on_loads(self) -> bool:
         return True
 
-    @property
-    def runs_compiled(self) -> bool:
-        return (self.loads, self.prediction) != ("ignored", "time-invariant") or (
-            super().runs_compiled
-        )
-
     def validate(self, case):
         outputs = len(case.sensors) if self.positions is None else self.positions.shape[0]
         sizes = {
