@@ -4,7 +4,6 @@ import ast
 import doctest
 import importlib
 import inspect
-import os
 import re
 import shutil
 
@@ -15,21 +14,7 @@ import tuning
 from tests.modules import ROOT, module_files, parse
 
 FILES = module_files()
-# Examples that compile for longer than five seconds: `.ci/nightly` runs them.
-LONG_EXAMPLES = {
-    "tuning.control.integer_choices",
-    "tuning.control.pareto",
-    "tuning.control.reduced_order",
-    "tuning.control.tune",
-    "tuning.control.tuning_result",
-    "tuning.fit.experiment_design",
-    "tuning.fit.uncertainty.posterior",
-    "tuning.weighing.axles",
-    "tuning.weighing.weigh",
-}
 EXAMPLES = {name for name, path in FILES.items() if ">>> " in path.read_text(encoding="utf-8")}
-if "JAXBEAM_FUZZ" not in os.environ:
-    EXAMPLES -= LONG_EXAMPLES
 
 
 def public(nodes, *kinds):

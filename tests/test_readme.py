@@ -79,7 +79,14 @@ def test_every_stored_picture_of_the_gallery_has_its_command():
 
 def test_options_exist():
     named = {option for span in spans() for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", span)}
-    modules = {"--quick", "--modes", "--keep", "--extra", "--group", "--with"}  # of benchmarks and of uv
+    modules = {
+        "--quick",
+        "--modes",
+        "--keep",
+        "--extra",
+        "--group",
+        "--with",
+    }  # of benchmarks and of uv
     assert named - modules <= options_of_commands()
 
 
