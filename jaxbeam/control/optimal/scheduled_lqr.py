@@ -35,6 +35,25 @@ class ScheduledLQR(AbstractFiniteHorizonRegulator):
     Mass, speed and entry time are those of the load in the design, or identified by
     `load_identification`: then the command is zero until the speed is identified, and the lightest
     mass is assumed until the mass is.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3)],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.ScheduledLQR(
+    ...         state_weight=[1e7, 10.0],
+    ...         command_weight=[1e-3],
+    ...         period=0.005,
+    ...         masses=[0.2, 0.5],
+    ...         loads="known",
+    ...     ),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> jb.save_case(case, "regulator.toml")
+    >>> print(jb.load_case("regulator.toml").controller.masses)
+    [0.2 0.5]
     """
 
     kind: ClassVar[str] = "lqr-scheduled"
