@@ -187,7 +187,7 @@ FED_BACK_STATES = PublishedNumbers(
     "computed",
     YES_OR_NO,
     "1 1 1",
-    "time-varying,q1,q2,q1'-below-q1 time-varying,q1,q2-below-q1 time-invariant,all-above-no-control",
+    "varying:q1+q2+q1'<q1 varying:q1+q2<q1 constant:all>uncontrolled",
 )
 IDENTICAL_GAINS = PublishedNumbers(
     "3.2",
