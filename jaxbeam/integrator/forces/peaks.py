@@ -16,8 +16,10 @@ from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.running_peaks import Peaks
 from jaxbeam.numerics.peak_search import estimate_peak, refine_peak
 
-CHUNK_STEPS = 16
+CHUNK_STEPS = 16  # of a chunk, or FEW_STEPS of one that is no longer than these
+FEW_STEPS = 2
 REFINEMENTS = 4  # of a step
+MAX_VALUES = 1e6  # of forces at instants at once
 
 
 def peaks_of_forces(responses: ForceResponses, paths: ForcePaths, phase: float) -> Peaks:
@@ -43,7 +45,7 @@ class _Search:
     """
 
     def __init__(self, responses: ForceResponses, panels: Panels, runs: int, phase: float):
-        self.responses, self.panels, self.runs = responses, panels, runs
+        self.responses, self.panels, self.runs, self.phase = responses, panels, runs, phase
         system = responses.system
         self.poles, self.C = system.poles, system.on_outputs
         self._place_forces()
@@ -91,6 +93,10 @@ class _Search:
 
     def _from_table(self, table, panel, times):
         """Values of a table under the forces in panels, at times (panel, time)."""
+        if panel.size > 1 and self.panels.count[panel].sum() * times.shape[1] > MAX_VALUES:
+            half = panel.size // 2
+            halves = (panel[:half], times[:half]), (panel[half:], times[half:])
+            return np.concatenate([self._from_table(table, *one) for one in halves])
         which, at = self.panels.forces_in(panel)
         place = self.place[at][:, None] + self.rate[at][:, None] * times[which]
         low = np.clip(place.astype(int), 0, self.last[at][:, None])
