@@ -11,9 +11,9 @@ from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import is_supported, residual_flexibility
 from jaxbeam.model.statics import influence_line
 from jaxbeam.runtime.arrays import Array
+from jaxbeam.simulation.errors import truncation_errors
 from jaxbeam.simulation.motion.moving_forces import motion_of_forces
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
-from jaxbeam.simulation.truncation import truncation_errors
 
 SAMPLES = 400  # of the run from which errors of corrected quantities are estimated
 ESTIMATE_TOLERANCE = 1e-3  # of that run

@@ -74,6 +74,7 @@ def test_a_case_is_fitted_to_the_modes(run, decay_log):
         (f"node.csv {COLUMNS} --from 3 --to 2", "--from must be less than --to"),
         (f"node.csv {COLUMNS} --channels c", "the log has no channel 'c'; it has a, b"),
         (f"node.csv {COLUMNS} --method x", "method must be"),
+        (f"node.csv {COLUMNS} --method fdd --order 10", "method 'fdd' has no models and no order"),
         (f"node.csv {COLUMNS} --order 2", "the highest order must be at least 4, not 2"),
         (f"node.csv {COLUMNS} --free beam.length", "--case and --free belong together"),
         (f"node.csv {COLUMNS} -o out.toml", "-o writes the fitted case: give --case"),

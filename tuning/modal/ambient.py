@@ -83,14 +83,14 @@ def overlapping(part: tuple[float, float], band: tuple[float, float]) -> tuple[f
     return max(low / BAND_OVERLAP, band[0]), min(high * BAND_OVERLAP, band[1])
 
 
-def _variance(records):
+def mean_square(records):
     """Mean square of each channel of all records together."""
     return sum(np.sum(record**2, axis=0) for record in records) / sum(map(len, records))
 
 
 def _modes_of_band(prepared: Prepared, whole, data_driven, order, refine):
     """Candidates and diagram of records prepared for one part of the band `whole`."""
-    scale = np.sqrt(_variance(prepared.records))
+    scale = np.sqrt(mean_square(prepared.records))
     scale = np.where(scale > 0, scale, 1.0)
     records = tuple(record / scale for record in prepared.records)
     channels, longest = records[0].shape[1], max(map(len, records))
@@ -106,7 +106,7 @@ def _modes_of_band(prepared: Prepared, whole, data_driven, order, refine):
     diagram = stabilise(scaled, prepared.band)
     duration = sum(map(len, records)) / prepared.rate
     spread_of = _all_spreads(subspace, poles, diagram.chains)
-    modes = [_mode(poles, chain, spread_of, scale) for chain in diagram.chains]
+    modes = [mode_of_chain(poles, chain, spread_of, scale) for chain in diagram.chains]
     lengths = [chain.members.size for chain in diagram.chains]
     reasons = [rejection_reason(mode, duration, whole) for mode in modes]
     modes = [
@@ -159,7 +159,7 @@ def _all_spreads(subspace, poles: Poles, chains: tuple[Chain, ...]) -> dict[int,
     return found
 
 
-def _mode(poles: Poles, chain: Chain, found: dict[int, Spread], scale) -> IdentifiedMode:
+def mode_of_chain(poles: Poles, chain: Chain, found: dict[int, Spread], scale) -> IdentifiedMode:
     """Mode of a chain: its pole with the least uncertainty, by the determinant of covariance."""
     which = min(chain.members.tolist(), key=lambda k: np.linalg.det(found[k].covariance))
     own = found[which]

@@ -6,7 +6,8 @@
 
 The excitation is recognised: free decays, after one blow or many or after a load has left the beam,
 are fitted together by poles (`decay.poles`), starting from those of a subspace method; all else is
-a response to ambient excitation (`ambient`). Harmonic lines are subtracted. Modes that the log
+a response to ambient excitation (`ambient`, or from spectra: `spectral`). Harmonic lines are
+subtracted. Modes that the log
 determines well are the result; others are listed with the reason for rejecting them.
 """
 
@@ -23,10 +24,13 @@ from tuning.modal.fit import Choice, ModalFit
 from tuning.modal.harmonics import Line, harmonic_lines, is_steady, without_lines
 from tuning.modal.preprocessing import kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels
+from tuning.modal.spectral.efdd_modes import SingularValues, efdd_modes
+from tuning.modal.spectral.plscf_modes import plscf_modes
 from tuning.modal.stabilisation import Diagram
 
 KINDS = ("free decay", "ambient")
-METHODS = ("covariance", "data")
+SPECTRAL_METHODS = ("fdd", "plscf")
+METHODS = ("covariance", "data", *SPECTRAL_METHODS)
 TRANSIENT_SHARE = 0.01  # struck samples of a log with transients of crossing loads
 
 
@@ -49,12 +53,15 @@ def identify_modes(
     that of the resonances with most kinetic energy; `count` modes are kept, those with most energy;
     `kind` is "free decay" or "ambient", by default decided from the log; `channels` are the names
     of those to use; `order` is the highest order of the stabilisation diagram; `method` is
-    "covariance" or "data" (subspace identification); `exclude` are frequencies (Hz) that are no
-    modes. `progress` is called with a few words on what is being done.
+    "covariance" or "data" (subspace identification), "fdd" (enhanced frequency-domain
+    decomposition) or "plscf" (poly-reference least-squares complex frequency), of which the last
+    two take every log for a response to broadband excitation; `exclude` are frequencies (Hz) that
+    are no modes. `progress` is called with a few words on what is being done.
 
     Raises ValueError for a log without evenly sampled records, or too short, a window outside the
     log, a band above half the sampling rate, an impossible count or order, unknown channels, kinds
-    and methods, and logs that differ in channels or sampling rate.
+    and methods, a kind that the method cannot use, and logs that differ in channels or sampling
+    rate.
 
     >>> import numpy as np
     >>> import tuning
@@ -85,7 +92,7 @@ def identify_modes(
         choices.append(Choice(f"{len(lines)} harmonic lines subtracted", "--exclude FREQUENCY"))
     struck = excited(samples, derivatives, used_band)
     found = None
-    if kind != "ambient":
+    if kind != "ambient" and method not in SPECTRAL_METHODS:
         found = free_decay_modes(
             samples, struck, derivatives, used_band,
             kind=kind, whole=window is not None, order=order,
@@ -95,35 +102,41 @@ def identify_modes(
     used_method = "decay"
     if found is None:
         used_method = method or "covariance"
-        ambient = subspace_modes(
-            cleaned,
-            samples.starts,
-            samples.rate,
-            used_band,
-            data_driven=used_method == "data",
-            order=order,
-            progress=progress,
-        )
-        found = (*ambient, None)
-        lines += _wandering_lines(ambient[0], cleaned, samples, used_band)
-    found = _Found(*found)
+        found = _ambient_modes(cleaned, samples, used_band, used_method, order, progress)
+        lines += _wandering_lines(found.candidates, cleaned, samples, used_band)
+    else:
+        found = _Found(*found)
     if kind is None:
         says = _kind_words(found, struck, lines)
         choices.append(Choice(says, "--kind ambient, --kind 'free decay', --from and --to"))
     if method is None:
         choices.append(Choice(f"method {used_method}", f"--method {', '.join(METHODS)}"))
-    if order is None:
+    if order is None and found.diagrams:
         highest = max((max(d.orders, default=0) for d in found.diagrams), default=0)
         choices.append(Choice(f"models of orders to {highest}", "--order N"))
     return _result(logs, samples, found, used_band, lines, choices, used_method, count, exclude)
 
 
 class _Found(NamedTuple):
-    """Candidates, diagrams, and the decays that were fitted (None: ambient)."""
+    """Candidates, diagrams, decays that were fitted (None: ambient), and singular values."""
 
     candidates: tuple[Candidate, ...]
     diagrams: tuple[Diagram, ...]
     decays: Decays | None
+    singular_values: tuple[SingularValues, ...] = ()
+
+
+def _ambient_modes(cleaned, samples: Samples, band, method, order, progress) -> _Found:
+    """What a method for ambient excitation finds in records without harmonic lines."""
+    arguments = (cleaned, samples.starts, samples.rate, band)
+    if method == "fdd":
+        candidates, values = efdd_modes(*arguments, progress=progress)
+        return _Found(candidates, (), None, values)
+    if method == "plscf":
+        return _Found(*plscf_modes(*arguments, order=order, progress=progress), None)
+    data_driven = method == "data"
+    found = subspace_modes(*arguments, data_driven=data_driven, order=order, progress=progress)
+    return _Found(*found, None)
 
 
 def _kind_words(found: _Found, struck, lines) -> str:
@@ -157,7 +170,8 @@ def _wandering_lines(candidates, cleaned, samples, band) -> tuple[Line, ...]:
     return tuple(
         Line(c.mode.frequency, min(c.mode.energy_share, 1.0), c.mode.pole)
         for c in candidates
-        if is_steady(record, rate, c.mode.frequency, c.mode.damping_ratio)
+        if c.mode.damping_ratio > 0
+        and is_steady(record, rate, c.mode.frequency, c.mode.damping_ratio)
     )
 
 
@@ -209,6 +223,7 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, count, e
         choices=tuple(choices),
         notes=tuple(notes),
         diagrams=found.diagrams,
+        singular_values=found.singular_values,
         log=logs[0],
         times=times,
         measured=measured,
@@ -233,3 +248,10 @@ def _check_arguments(count, kind, order, method) -> None:
         raise ValueError(f"kind must be {' or '.join(map(repr, KINDS))}, not {kind!r}")
     if method not in (None, *METHODS):
         raise ValueError(f"method must be {' or '.join(map(repr, METHODS))}, not {method!r}")
+    if kind == "free decay" and method in SPECTRAL_METHODS:
+        raise ValueError(
+            f"method {method!r} takes a log for the response to broadband excitation; for kind "
+            "'free decay' leave the method out"
+        )
+    if order is not None and method == "fdd":
+        raise ValueError("method 'fdd' has no models and no order; leave the order out")

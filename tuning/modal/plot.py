@@ -89,6 +89,8 @@ def _draw_spectrum(axes, fit, channel, unit):
         axes.axvline(line.frequency, color=GREY, linewidth=1.2, linestyle="--")
     if fit.diagrams:
         _draw_diagram(axes.twinx(), fit)
+    if fit.singular_values:
+        _draw_singular_values(axes.twinx(), fit)
 
 
 def _draw_diagram(axes, fit):
@@ -100,6 +102,16 @@ def _draw_diagram(axes, fit):
         axes.plot(poles.frequencies[noise], poles.orders[noise], ".", color=GREY, markersize=1.5)
         axes.plot(poles.frequencies[modes], poles.orders[modes], "o", color=FIT, markersize=2.5)
     axes.set(ylabel="order of the model", xlim=fit.band)
+
+
+def _draw_singular_values(axes, fit):
+    """Singular values of the cross-spectral matrix, the largest in colour, over the largest."""
+    highest = max(part.values[:, 0].max() for part in fit.singular_values)
+    for part in fit.singular_values:
+        levels = 10 * np.log10(np.maximum(part.values / highest, 1e-12))
+        axes.plot(part.frequencies, levels[:, 1:], color=GREY, linewidth=0.6)
+        axes.plot(part.frequencies, levels[:, 0], color=FIT, linewidth=1.2)
+    axes.set(ylabel="singular values (dB)", xlim=fit.band)
 
 
 def _draw_fit(axes, residual_axes, fit, channel, unit):

@@ -1,18 +1,28 @@
 """Motion of beam and vehicles at samples, from the states there."""
 
+from jaxtyping import Float
+
 from jaxbeam.case.case import Case
 from jaxbeam.model.contact import contact_at, split_states
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.vehicle_readings import VehicleMotion
 from jaxbeam.model.static_correction import Motion
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import Array, xp
 
 
 def motion_at(
-    case: Case, model: ModalModel, loads: LoadSet, times, states, commands
+    case: Case,
+    model: ModalModel,
+    loads: LoadSet,
+    times: Float[Array, " time"],
+    states: Float[Array, "time state 1"],
+    commands: Float[Array, "time command"] | None = None,
 ) -> tuple[Motion, VehicleMotion]:
-    """Motion of the modes with the forces on the beam, and motion of the vehicles."""
+    """Motion of the modes with the forces on the beam, and motion of the vehicles.
+
+    At samples (s) of a run, from the states there and the commands; None are taken as zero.
+    """
     columns = None if commands is None else commands[..., None]
     contact = contact_at(model, loads, times, states, columns)
     vehicles = _vehicle_motion(model, loads, states, contact.vehicle_acceleration)

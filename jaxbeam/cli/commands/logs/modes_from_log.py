@@ -65,7 +65,9 @@ def modes_from_log(
     order
         Highest order of the models of the stabilisation diagram.
     method
-        covariance or data: stochastic subspace identification, covariance- or data-driven.
+        covariance or data: stochastic subspace identification, covariance- or data-driven; fdd:
+        enhanced frequency-domain decomposition; plscf: poly-reference least-squares complex
+        frequency (p-LSCF).
     kind
         ambient or "free decay".
     exclude

@@ -1,0 +1,1 @@
+"""Modal identification from spectra: decomposition of spectra and fits of matrix fractions."""

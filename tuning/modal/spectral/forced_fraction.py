@@ -1,0 +1,120 @@
+"""p-LSCF where forces were measured: spectra of responses over those of forces, without windows.
+
+Transforms of whole records obey
+
+    a(z) Y_o(z) = sum_i b_oi(z) U_i(z) + t_o(z),   z = exp(i w T),
+
+with polynomials of one degree: a is the common denominator, b / a are the frequency responses, and
+t is what the states at the start and the end of a record leave (Pintelon and Schoukens 2012, section
+6.3), so that there is no leakage however lightly the structure is damped. The polynomials are found
+by linear least squares over all lines (Guillaume et al. 2003), first unweighted, then weighted by
+1 / |a|, which makes the error that of the outputs (Sanathanan and Koerner 1963). With a lowest
+coefficient of one, poles that stand for noise are unstable, and fall away.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float, Int
+
+PART_LINES = 4096  # lines whose products are formed at once
+
+
+class Lines(NamedTuple):
+    """Lines of the transforms of all records: spectra (line, output), (line, input), z and record.
+
+    `step` is the sampling step (s).
+    """
+
+    outputs: Complex[np.ndarray, "line output"]
+    inputs: Complex[np.ndarray, "line input"]
+    z: Complex[np.ndarray, " line"]
+    record: Int[np.ndarray, " line"]
+    step: float
+
+    @property
+    def unforced(self) -> Float[np.ndarray, "line record"]:
+        """Columns of one at the lines of each record, for its transient."""
+        return (self.record[:, None] == np.arange(self.record.max() + 1)).astype(float)
+
+
+class Products(NamedTuple):
+    """Products (signal, power, signal, power) of z^j and z^m times signals, summed over lines.
+
+    Signals are outputs, inputs, and one for each record.
+    """
+
+    gram: Float[np.ndarray, "signal power signal power"]
+    outputs: int
+    inputs: int
+    step: float
+
+
+class CommonDenominator(NamedTuple):
+    """Denominator a, lowest power first; poles (1/s) in the upper half plane; unit shapes."""
+
+    denominator: Float[np.ndarray, " power"]
+    poles: Complex[np.ndarray, " pole"]
+    shapes: Complex[np.ndarray, "pole output"]
+
+
+def transforms(
+    records: tuple[Float[np.ndarray, "time output"], ...],
+    forces: tuple[Float[np.ndarray, "time input"], ...],
+    rate: float,
+    band: tuple[float, float],
+) -> Lines:
+    """Discrete Fourier transforms of records and forces at the lines of a band (Hz)."""
+    outputs, inputs, z, numbers = [], [], [], []
+    for number, (record, force) in enumerate(zip(records, forces, strict=True)):
+        bins = np.fft.rfftfreq(len(record), 1 / rate)
+        lines = (bins >= band[0]) & (bins <= band[1])
+        scale = 1 / np.sqrt(len(record))
+        outputs.append(scale * np.fft.rfft(record, axis=0)[lines])
+        inputs.append(scale * np.fft.rfft(force, axis=0)[lines])
+        z.append(np.exp(2j * np.pi * bins[lines] / rate))
+        numbers.append(np.full(lines.sum(), number))
+    return Lines(
+        np.concatenate(outputs), np.concatenate(inputs), np.concatenate(z),
+        np.concatenate(numbers), 1 / rate,
+    )  # fmt: skip
+
+
+def products(
+    lines: Lines, degree: int, weights: Float[np.ndarray, " line"] | None = None
+) -> Products:
+    """Products for all degrees to the highest, by default with equal weights of the lines."""
+    signals = np.concatenate([lines.outputs, lines.inputs, lines.unforced], axis=1)
+    if weights is not None:
+        signals = signals * weights[:, None]
+    count = signals.shape[1]
+    sums = np.zeros((count * count, 2 * degree + 1))
+    for first in range(0, len(signals), PART_LINES):
+        own, z = signals[first : first + PART_LINES], lines.z[first : first + PART_LINES]
+        pairs = (own.conj()[:, :, None] * own[:, None, :]).reshape(len(own), -1)
+        powers = z[:, None] ** np.arange(-degree, degree + 1)
+        sums += pairs.real.T @ powers.real - pairs.imag.T @ powers.imag
+    # Products depend on the difference of the powers only.
+    shift = np.arange(degree + 1) - np.arange(degree + 1)[:, None] + degree
+    gram = sums.reshape(count, count, -1)[:, :, shift].transpose(0, 2, 1, 3)
+    return Products(gram, lines.outputs.shape[1], lines.inputs.shape[1], lines.step)
+
+
+def fit_common_denominator(system: Products, degree: int) -> CommonDenominator:
+    """Polynomials of a degree, at most that of the products."""
+    size, outputs, inputs = degree + 1, system.outputs, system.inputs
+    part = system.gram[:, :size, :, :size]
+    driving = part[outputs:, :, outputs:].reshape(-1, (part.shape[0] - outputs) * size)
+    crossed = part[outputs:, :, :outputs].reshape(len(driving), -1)
+    gains = np.linalg.lstsq(driving, crossed, rcond=1e-14)[0]
+    crossed, gains = (one.reshape(len(driving), outputs, size) for one in (crossed, gains))
+    matrix = np.einsum("ojok->jk", part[:outputs, :, :outputs])
+    matrix = matrix - np.tensordot(crossed, gains, axes=((0, 1), (0, 1)))
+    free = np.linalg.lstsq(matrix[1:, 1:], -matrix[1:, 0], rcond=1e-15)[0]
+    denominator = np.concatenate([[1.0], free])
+    roots = np.roots(denominator[::-1])
+    roots = roots[(roots.imag > 0) & (np.abs(roots) < 1e6)]
+    numerators = (gains @ denominator).reshape(-1, size, outputs)[:inputs]
+    at_roots = roots[:, None] ** np.arange(size)
+    shapes = np.linalg.svd(np.einsum("rp,xpo->rox", at_roots, numerators))[0][:, :, 0]
+    return CommonDenominator(denominator, np.log(roots) / system.step, shapes)
