@@ -39,11 +39,9 @@ class PositionLQR(AbstractFiniteHorizonRegulator):
     to the masses, are added. With none on the beam, `after` holds for those that have left.
 
     >>> import jaxbeam as jb
-    >>> regulator = jb.PositionLQR(
-    ...     state_weight=[1e7, 10.0], command_weight=[1e-3], masses=[0.2, 0.5]
-    ... )
-    >>> print(regulator.masses, regulator.points)
-    [0.2 0.5] 1600
+    >>> weights = {"state_weight": [1e4, 1.0], "command_weight": [1e-3]}
+    >>> print(jb.PositionLQR(**weights, masses=[0.2, 0.4], loads="known").masses)
+    [0.2 0.4]
     """
 
     kind: ClassVar[str] = "lqr-position"
