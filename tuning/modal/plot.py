@@ -43,7 +43,8 @@ def plot_modal_fit(fit, path: str | Path | None = None, length: float | None = N
 
 
 def _kind_text(fit) -> str:
-    return "a free decay" if fit.fitted is not None else "ambient vibration"
+    kinds = {"free decay": "a free decay", "measured force": "responses to a measured force"}
+    return kinds.get(fit.kind, "ambient vibration")
 
 
 def _draw_log(axes, fit, channel, unit):

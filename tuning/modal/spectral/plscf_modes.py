@@ -120,7 +120,9 @@ class _Chosen:
                 for k in inside:
                     self.changes[k] = changes[:, k - first]
                     self.participations[k] = fraction.left[k - first].conj()
-                    self.spreads[k] = spread_of_changes(poles.poles[k], self.changes[k], poles.shapes[k])
+                    self.spreads[k] = spread_of_changes(
+                        poles.poles[k], self.changes[k], poles.shapes[k]
+                    )
             first += fraction.poles.size
 
     def member(self, mode: IdentifiedMode) -> int:
