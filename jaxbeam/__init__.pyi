@@ -78,10 +78,12 @@ from .control.optimal.crossing_lqr import (
 )
 from .control.optimal.integral_lqr import IntegralLQR as IntegralLQR
 from .control.optimal.lqr import LQR as LQR
+from .control.optimal.position_lqr import PositionLQR as PositionLQR
 from .control.optimal.sampled_lqr import DiscreteLQR as DiscreteLQR
 from .control.optimal.sampling_loss import sampling_limit as sampling_limit
 from .control.optimal.scheduled_lqr import ScheduledLQR as ScheduledLQR
 from .control.output_feedback import OutputFeedback as OutputFeedback
+from .control.predictive.gpc import GPC as GPC
 from .control.predictive.mpc import MPC as MPC
 from .control.prescribed import Prescribed as Prescribed
 from .control.receptance import (
@@ -93,6 +95,7 @@ from .control.receptance import (
     receptances as receptances,
 )
 from .control.scheduled_feedback import ScheduledFeedback as ScheduledFeedback
+from .control.sliding_mode import SlidingMode as SlidingMode
 from .control.state_feedback import StateFeedback as StateFeedback
 from .estimation.inversion import Inversion as Inversion
 from .estimation.kalman import Kalman as Kalman

@@ -42,6 +42,7 @@ import hypothesis
 import pytest
 
 from tests.fuzzing import FACTOR
+from tests.layers.selection import layers, matches
 
 # Tracing makes millions of small objects that live long: with Python's own thresholds, garbage
 # collection takes up to a tenth of the time and frees next to nothing.
@@ -60,8 +61,31 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("jaxbeam")
 
 
-def pytest_collection_modifyitems(items):
-    """Order files by their number of slow tests, so that both processes end at about one time."""
+def pytest_addoption(parser):
+    parser.addoption(
+        "--nightly", action="store_true", help="run the tests of tests/layers/nightly.txt too"
+    )
+
+
+@pytest.hookimpl(tryfirst=True)  # before tests are left out by their marks
+def pytest_collection_modifyitems(config, items):
+    """Put tests into layers, and files of many slow tests first, so that processes end together.
+
+    A nightly test runs with `--nightly`, or when it is named on the command line.
+    """
+    named = any("::" in argument for argument in config.args)
+    nightly, slow = layers()
+    late = (
+        []
+        if named or config.getoption("nightly")
+        else [item for item in items if matches(item.nodeid, nightly)]
+    )
+    if late:
+        config.hook.pytest_deselected(items=late)
+        items[:] = [item for item in items if item not in set(late)]
+    for item in items:
+        if matches(item.nodeid, slow) or matches(item.nodeid, nightly):
+            item.add_marker("slow")
     slow = collections.Counter(item.path for item in items if item.get_closest_marker("slow"))
     items.sort(key=lambda item: -slow[item.path])
 

@@ -77,10 +77,15 @@ PUBLIC_FUNCTIONS = {
     for name in package.__all__
     if callable(getattr(package, name)) and not inspect.isclass(getattr(package, name))
 }
-# Functions that compile for longer than a second: their examples are the notebooks, the README and
-# the pages of the site.
+PUBLIC_CLASSES = {
+    f"{package.__name__}.{name}": getattr(package, name)
+    for package in (jaxbeam, tuning)
+    for name in package.__all__
+    if inspect.isclass(getattr(package, name))
+}
+# Functions that compile for longer than a second, and their results: their examples are the
+# notebooks, the README and the pages of the site.
 NO_EXAMPLE = {
-    "jaxbeam.identified_load",
     "tuning.cross_validate",
     "tuning.design_experiment",
     "tuning.identify",
@@ -95,6 +100,8 @@ NO_EXAMPLE = {
     "tuning.tune_reduced",
     "tuning.weigh",
     "tuning.weigh_axles",
+    "tuning.AxleWeighing",
+    "tuning.TuningResult",
 }
 
 
@@ -127,3 +134,8 @@ def test_public_functions_have_types_of_arguments_and_results(name):
 def test_public_functions_have_an_example(name):
     """`test_examples_in_docstrings_print_what_they_show` runs it."""
     assert ">>> " in (inspect.getdoc(PUBLIC_FUNCTIONS[name]) or "")
+
+
+@pytest.mark.parametrize("name", sorted(PUBLIC_CLASSES.keys() - NO_EXAMPLE))
+def test_public_classes_have_an_example(name):
+    assert ">>> " in (PUBLIC_CLASSES[name].__doc__ or "")

@@ -27,6 +27,14 @@ class Plausibility:
     which a force would follow the first mode of a pinned beam: Fryba (1999), Vibration of solids
     and structures under moving loads, chapter 1. Static deflections are sums of the modes of the
     case.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5), loads=[jb.MovingMass(mass=0.1, speed=1.0)], run=jb.Run(1.0)
+    ... )
+    >>> found = jb.check(case)
+    >>> print(f"{found.first_frequency:.1f} Hz, mass ratio {found.mass_ratio:.2f}")
+    21.4 Hz, mass ratio 0.33
     """
 
     first_frequency: float | None

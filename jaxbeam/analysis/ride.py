@@ -197,6 +197,13 @@ class RideMeasures(NamedTuple):
 
     `bodies` are the names of heights, as in `Record.bodies` without the pitches; the measures are
     those at the centre of mass.
+
+    >>> import jaxbeam as jb
+    >>> wagon = jb.VehicleLoad(model="manchester-wagon", speed=50.0)
+    >>> case = jb.Case(jb.Beam(20.0, 1e10, 12e3), loads=[wagon], run=jb.Run(1.5))
+    >>> ride = jb.ride_measures(jb.simulate(case))
+    >>> print(ride.bodies, f"{ride.wheel_unloading.max():.3f}")
+    ['loads.0 body', 'loads.0 front bogie', 'loads.0 rear bogie'] 0.032
     """
 
     bodies: list[str]

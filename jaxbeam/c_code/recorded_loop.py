@@ -61,6 +61,9 @@ class FilteredLaw(AbstractSampledLaw):
         pairs = zip(self.sensors, self.sections, strict=True)
         return self.law.initial_state(), [initial_filter_state(*pair, 0.0) for pair in pairs]
 
+    def tabulated(self, times):
+        return dataclasses.replace(self, law=self.law.tabulated(times))
+
     def step(self, state, measurement, t):
         law_state, filter_states = state
         readings, after = [], []

@@ -47,13 +47,21 @@ class Support(ReprWithUnits, eqx.Module):
     Without a `stiffness` it holds the deflection rigidly; with one it is a vertical spring.
     Supports enter the modes of the beam, except for their dampers, which couple the modes. A run
     starts at rest on settled supports: see `jaxbeam.model.settlement`.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(1.2, 12.0, 0.5)
+    >>> two_spans = jb.Case(beam, supports=[jb.Support(0.6)])
+    >>> print(jb.modes(two_spans).frequencies.round(2)[:2])
+    [21.38 33.39]
     """
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
     stiffness: Float[Array, ""] | None = number(
         "N/m", "vertical spring; rigid if left out", NOT_NEGATIVE, default=None
     )
-    damping: Float[Array, ""] = number("N s/m", "vertical damper", NOT_NEGATIVE, default=0.0)
+    damping: Float[Array, ""] | None = number(
+        "N s/m", "vertical damper of an elastic support", NOT_NEGATIVE, default=None
+    )
     rotational_stiffness: Float[Array, ""] = number(
         "N m/rad", "spring against rotation", NOT_NEGATIVE, default=0.0
     )
@@ -81,6 +89,11 @@ class Beam(ReprWithUnits, eqx.Module):
     eta of hysteretic damping is taken as the equivalent ratio eta / 2 of every mode; those of
     `segments` count by their shares of the strain energy of each mode. A `material` has the ratio
     of EN 1991-2, table 6.6, for the longest span of the beam.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(0.6, width=0.03, height=0.005, youngs_modulus=69e9, density=2700.0)
+    >>> print(f"EI = {beam.bending_stiffness:.2f} N m^2, m = {beam.linear_density:.3f} kg/m")
+    EI = 21.56 N m^2, m = 0.405 kg/m
     """
 
     length: Float[Array, ""] = number("m", "total length", POSITIVE)

@@ -37,7 +37,14 @@ from jaxbeam.runtime.arrays import Array, set_at, xp
 
 
 class Run(ReprWithUnits, eqx.Module):
-    """Duration of a run, sampling rate of its record, gravity, and seed of the sensor noise."""
+    """Duration of a run, sampling rate of its record, gravity, and seed of the sensor noise.
+
+    >>> import jaxbeam as jb
+    >>> run = jb.Run(duration=1.5, sample_rate=200.0)
+    >>> case = jb.Case(jb.Beam(0.6, 12.0, 0.5), run=run)
+    >>> print(jb.simulate(case).times.size)
+    301
+    """
 
     duration: Float[Array, ""] = number("s", "simulated time, from 0", POSITIVE)
     sample_rate: Float[Array, ""] = number(
@@ -56,6 +63,11 @@ class Case(eqx.Module):
 
     An immutable tree: `replace(case, {"loads.0.mass": 0.3})` or `equinox.tree_at` return a changed
     copy. Every number has an address, its dotted path. Its fields are the keys of a case file.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(jb.Beam(0.6, 12.0, 0.5), sensors=[jb.Sensor(0.3)], run=jb.Run(1.0))
+    >>> print(jb.replace(case, {"sensors.0.position": 0.2}).sensors[0].position)
+    0.2
     """
 
     beam: Beam
@@ -180,10 +192,25 @@ def addresses(case: Case) -> dict[str, Float[Array, "..."]]:
 
 def unknown_address_error(case: Case, address: str) -> ValueError:
     """Error for an address that a case does not have, with the nearest one that it has."""
+    if _is_left_out(case, address):
+        return ValueError(
+            f"the case has no number at address {address!r}, as it is left out there: give it a"
+            " value first"
+        )
     names = list(addresses(case))
     nearest = difflib.get_close_matches(address, names, n=1, cutoff=0.5)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; it has {', '.join(names)}"
     return ValueError(f"the case has no number at address {address!r}{hint}")
+
+
+def _is_left_out(case: Case, address: str) -> bool:
+    """Whether the address is that of a number which may be left out, and is."""
+    part: Any = case
+    *parents, name = address.split(".")
+    for key in parents:
+        listed = isinstance(part, tuple) and key.isdecimal() and int(key) < len(part)
+        part = part[int(key)] if listed else getattr(part, key, None)
+    return part is not None and getattr(part, name, part) is None
 
 
 def list_sizes(case: Case) -> dict[str, int]:

@@ -6,7 +6,7 @@ the state. Estimators are in `jaxbeam.estimation`.
 """
 
 import abc
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Float
@@ -18,7 +18,7 @@ from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.module import Module
 
 
-class Estimate(eqx.Module):
+class Estimate(NamedTuple):
     """Estimate of the state of the plant, and of the weights of the loads (N) if estimated too.
 
     The state is that of the beam of the plant for which the filter is designed. `weights` has one
@@ -44,6 +44,10 @@ class AbstractSampledFilter(Module):
     @abc.abstractmethod
     def update(self, state: Any, measurement: Measurement, t: Time) -> tuple[Estimate, Any]:
         """Estimate at a sample at t (s), and the next state of the filter."""
+
+    def tabulated(self, times: Float[Array, " sample"]) -> "AbstractSampledFilter":
+        """As `jaxbeam.case.controller.AbstractSampledLaw.tabulated`."""
+        return self
 
 
 class AbstractContinuousFilter(Module):
@@ -79,11 +83,6 @@ class AbstractEstimator(ReprWithUnits, eqx.Module, metaclass=AcceptsFormerArgume
 
     kind: ClassVar[str]
     continuous_time: ClassVar[bool] = False  # whether it has a filter in continuous time
-
-    @property
-    def runs_compiled(self) -> bool:
-        """As `AbstractController.runs_compiled`, in the steps of the filter."""
-        return False
 
     @property
     def has_vehicles(self) -> bool:

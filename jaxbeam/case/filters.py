@@ -21,6 +21,11 @@ class Filter(ReprWithUnits, eqx.Module):
     """Low-pass filter with gain 1 at low frequency and 1 / sqrt(2) at the cutoff.
 
     An analogue filter acts on the signal before it is sampled, a digital one on the samples.
+
+    >>> import jaxbeam as jb
+    >>> sensor = jb.Sensor(0.3, filter=jb.Filter(cutoff=40.0, order=2))
+    >>> print(sensor.filter.cutoff, sensor.filter.kind)
+    40.0 butterworth
     """
 
     cutoff: Float[Array, ""] = number("Hz", "frequency at which the gain is 1 / sqrt(2)", POSITIVE)

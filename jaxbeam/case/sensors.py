@@ -31,6 +31,11 @@ class Sensor(ReprWithUnits, Module):
     `stress` the moment over the `section_modulus`. `name` is the label in results. `offset` and
     noise are added to the quantity; the reading is limited to the range and rounded to the
     resolution (see `jaxbeam.model.sensing.sensor_signals`). What is left out is ideal.
+
+    >>> import jaxbeam as jb
+    >>> sensor = jb.Sensor(0.3, quantity="strain", fibre_distance=0.0025, name="midspan")
+    >>> print(sensor.name, sensor.unit)
+    midspan 1
     """
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)

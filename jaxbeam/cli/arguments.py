@@ -159,7 +159,7 @@ def split_case_and_logs(
 ) -> tuple[Path | None, list[Path]]:
     """Case file (.toml), if there is one, and logs among the files.
 
-    Raises ValueError without a log, for several cases, and for free parameters without a case.
+    Raises ValueError without a log, for several cases, and for a free parameter without a case.
     """
     cases = [path for path in files if path.suffix == ".toml"]
     logs = [path for path in files if path.suffix != ".toml"]

@@ -34,6 +34,20 @@ class Feedforward(AbstractController):
     when a deflection sensor has gone down by that much after the second gate, and within the first
     quarter of the crossing; if none has, there are none for that passage. Commands that have begun
     depend on time alone, as without it.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=2),
+    ...     actuators=[jb.PointForce(0.3)],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.Feedforward(
+    ...         [-0.1, -0.05], [0.0, 0.5, 1.0], [[0.0, 3.0, 0.0]], period=0.005
+    ...     ),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    0.798 mm
     """
 
     kind: ClassVar[str] = "feedforward"

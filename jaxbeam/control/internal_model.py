@@ -30,6 +30,18 @@ class InternalModel(AbstractController):
     The static lift lacks the vibration of the beam. Where the filters of the sensors pass it,
     `notches` remove it from y - c H u: each is (s^2 + w^2) / (s^2 + 2 zeta w s + w^2), which delays
     slow changes by 2 zeta / w.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=2),
+    ...     actuators=[jb.PointForce(0.3)],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.InternalModel([-2e-3, 0.0, 2e-3], [[3.0, 0.0, -3.0]], period=0.005),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    0.883 mm
     """
 
     kind: ClassVar[str] = "internal-model"

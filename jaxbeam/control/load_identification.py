@@ -37,6 +37,23 @@ class LoadIdentification(ReprWithUnits, eqx.Module):
     first part of the crossing, `until`, its weight is the one whose static deflections fit the
     readings of the deflection sensors best, less the static deflections due to the commands. The
     beam must not be able to move as a rigid body.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=2),
+    ...     actuators=[jb.PointForce(0.3)],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.ScheduledFeedback(
+    ...         masses=[0.2, 0.5],
+    ...         gains=[[1e3, 3e3]],
+    ...         load_identification=jb.LoadIdentification(gates=[-0.1, -0.05]),
+    ...         period=0.005,
+    ...     ),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    1.019 mm
     """
 
     gates: Float[Array, "2"] | None = number(
@@ -126,6 +143,22 @@ def identified_load(record: Any, settings: LoadIdentification) -> IdentifiedLoad
     and commands change at these samples only. Errors refer to the speed at entry.
 
     Raises ValueError for settings that do not suit the case.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=2),
+    ...     actuators=[jb.PointForce(0.3)],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.ScheduledFeedback(
+    ...         masses=[0.2, 0.5], gains=[[1e3, 3e3]], period=0.005
+    ...     ),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> settings = jb.LoadIdentification(gates=[-0.1, -0.05])
+    >>> found = jb.identified_load(jb.simulate(case), settings)
+    >>> print(f"{found.mass:.2f} kg at {found.speed:.2f} m/s")
+    0.41 kg at 4.00 m/s
     """
     case = record.case
     error = settings.validate(case)

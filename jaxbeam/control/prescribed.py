@@ -15,6 +15,20 @@ class Prescribed(AbstractStaticController):
     Each actuator receives its offset + sum of amplitudes sin(2 pi frequency t + phase), plus a
     table of values, interpolated linearly between its times and zero outside them (to hold a
     value, end the table after the run). Parts may be left out.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=2),
+    ...     actuators=[jb.PointForce(0.3)],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.Prescribed(
+    ...         offsets=[2.0], amplitudes=[[0.5]], frequencies=[5.0], period=0.005
+    ...     ),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    1.131 mm
     """
 
     kind: ClassVar[str] = "prescribed"

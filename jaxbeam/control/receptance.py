@@ -36,6 +36,12 @@ class ReceptanceFeedback(eqx.Module):
 
     `displacement` are the gains g (command per m), `velocity` the gains f (command per m/s),
     `delay` is in s. `actuator` is the index of the actuator.
+
+    >>> import numpy as np
+    >>> import jaxbeam as jb
+    >>> law = jb.ReceptanceFeedback(np.array([-200.0]), np.array([-5.0]), delay=np.float64(1e-3))
+    >>> print(law.displacement, law.velocity)
+    [-200.] [-5.]
     """
 
     displacement: Float[Array, " sensor"]
@@ -72,7 +78,9 @@ def receptances(case: Case, s, actuator: int = 0) -> Complex[Array, "pole sensor
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
-    ...     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, damping_ratio=0.03),
+    ...     jb.Beam(
+    ...         length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, damping_ratio=0.03
+    ...     ),
     ...     actuators=[jb.PointForce(0.3, limits=[-1.0, 1.0])],
     ...     sensors=[jb.Sensor(0.3)],
     ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
@@ -133,15 +141,17 @@ def receptance_gains(
 
     `assigned` (pole, sensor) are the receptances at the poles, one of each conjugate pair. The
     modes of the open-loop poles `kept_poles` (1/s) with deflections `kept` (pole, sensor) at the
-    sensors do not change. Each complex pole takes two gains, each real one one; where gains are
-    left, the smallest are taken. Raises ValueError if there are too few sensors, or if the poles
+    sensors do not change. A complex pole takes two gains, a real pole one; where gains are left,
+    the smallest are taken. Raises ValueError if there are too few sensors, or if the poles
     cannot be assigned.
 
     The `actuator` is driven with the `delay` (s) from measurement to command.
 
     >>> import numpy as np
     >>> pole = -1.0 + 5.0j
-    >>> assigned = 1 / (pole**2 + 16) * np.ones((1, 1))  # of a mass of 1 kg on a spring of 16 N/m
+    >>> assigned = (
+    ...     1 / (pole**2 + 16) * np.ones((1, 1))
+    ... )  # of a mass of 1 kg on a spring of 16 N/m
     >>> law = receptance_gains(assigned, [pole])
     >>> closed = pole**2 + 16 - (law.displacement + pole * law.velocity)
     >>> print(np.abs(closed).max() < 1e-9)

@@ -51,11 +51,6 @@ class AbstractStateController(AbstractController):
     def design_depends_on_loads(self) -> bool:
         return self.estimator is not None
 
-    @property
-    def runs_compiled(self) -> bool:
-        is_compiled = self.estimator is not None and self.estimator.runs_compiled
-        return is_compiled or super().runs_compiled
-
     @abc.abstractmethod
     def design_state_law(self, plant: Plant, design_plant: Plant) -> AbstractStateLaw:
         """Law for runs on `plant`, designed for `design_plant`."""

@@ -11,7 +11,20 @@ from jaxbeam.runtime.arrays import Array
 
 
 class StateFeedback(AbstractStateController):
-    """u = -K z with the state z, in the order and units of `state_space(case, coordinates)`."""
+    """u = -K z with the state z, in the order and units of `state_space(case, coordinates)`.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3)],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.StateFeedback(gain=[[3e3, 30.0]], period=0.005),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    1.149 mm
+    """
 
     kind: ClassVar[str] = "state"
 

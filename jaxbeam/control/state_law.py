@@ -43,6 +43,10 @@ class AbstractStateLaw(Module):
     ) -> ControlStep:
         """Command for an estimate at t (s), and the next state of the law."""
 
+    def tabulated(self, times: Float[Array, " sample"]) -> "AbstractStateLaw":
+        """As `AbstractSampledLaw.tabulated`."""
+        return self
+
 
 class GainLaw(AbstractStateLaw):
     """u = -K x with a constant gain K; with `feeds_back_command` x ends with the last command."""
@@ -83,6 +87,9 @@ class SampledStateLaw(AbstractSampledLaw):
 
     def initial_state(self):
         return self.law.initial_state(), self.filter.initial_state()
+
+    def tabulated(self, times):
+        return SampledStateLaw(self.law.tabulated(times), self.filter.tabulated(times))
 
     def step(self, state, measurement, t):
         law_state, filter_state = state

@@ -1,20 +1,28 @@
 """Kalman filter at samples for a plant with its moving loads."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractSampledFilter, Estimate
 from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.gains import filter_gain
-from jaxbeam.estimation.sampled_plant import Transition
+from jaxbeam.estimation.sampled_plant import Transition, in_blocks
 from jaxbeam.estimation.sensor_chain import FilteredPlant, SensorChain
 from jaxbeam.estimation.simulated_vehicles import with_loads
 from jaxbeam.numerics.matrices import symmetric_part
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, take, xp
 
 Square = Float[Array, "state state"]
+
+
+# Transition from the sample before, C and D of the readings; of one sample, or of several.
+SampleModel = tuple[
+    Transition, Float[Array, "*sample sensor state"], Float[Array, "*sample sensor actuator"]
+]
 
 
 class FilterState(NamedTuple):
@@ -41,7 +49,7 @@ class CrossingFilter(AbstractSampledFilter):
     The first `plant_states` states x are those of the plant; those of analogue filters follow, of
     the vehicles, the weights of the loads, and those of the sensors (see `sensor_chain`). `scale`
     is the size of the states before those of the sensors, `noise_intensity` that of the white noise
-    in their rates.
+    in their rates. A `table` has what `model_at` returns at all samples.
     """
 
     filtered: FilteredPlant
@@ -52,15 +60,23 @@ class CrossingFilter(AbstractSampledFilter):
     initial_covariance: Square
     plant_states: int = eqx.field(static=True)
     estimates_weights: bool = eqx.field(static=True)
+    table: SampleModel | None = None
 
     def initial_state(self):
         commands = len(self.filtered.plant.case.actuators)
         return FilterState(self.initial, self.initial_covariance, xp.zeros(commands))
 
-    def model_at(
-        self, t: Float[Array, ""] | float
-    ) -> tuple[Transition, Float[Array, "sensor state"], Float[Array, "sensor actuator"]]:
-        """Transition to the sample at t (s) from the one before, and C and D of its readings."""
+    def tabulated(self, times):
+        def block(first, number):
+            return self.model_at(times[first : first + number])
+
+        return dataclasses.replace(self, table=in_blocks(block, len(times)))
+
+    def model_at(self, t: Float[Array, "*sample"]) -> SampleModel:
+        """Transition to the sample at t (s), or to several, and C and D of its readings."""
+        if self.table is not None:
+            sample = self.sensor_chain.timing.sample_at(t)
+            return jax.tree.map(lambda part: take(part, sample), self.table)
 
         def system_at(time):
             return self.filtered.with_filtered_outputs(self.filtered.plant.augmented(time))

@@ -24,6 +24,23 @@ class Observer(AbstractEstimator):
     times `speed` (eq. 4.4 of the thesis; sampled, a pole p becomes exp(p period)). States of
     actuators follow from the commands, uncorrected. Loads are not modelled and bias the estimate;
     nor are filters and delays of the sensors.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3)],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.LQR(
+    ...         state_weight=[1e6, 1.0],
+    ...         command_weight=[1e-2],
+    ...         period=0.005,
+    ...         estimator=jb.Observer(speed=3.0),
+    ...     ),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    0.690 mm
     """
 
     kind: ClassVar[str] = "observer"

@@ -7,31 +7,36 @@ the one that acts at the end of the period.
 import functools
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
-from jaxtyping import Bool, Float
+import jax
+from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.numerics.discretisation import exponential_and_gramian
-from jaxbeam.runtime.arrays import Array, stop_gradient, vmap, xp
+from jaxbeam.runtime.arrays import Array, stop_gradient, xp
 from jaxbeam.runtime.module import Module
 
+BLOCK = 256  # samples, of which the intermediate results fit into a cache
 PERIOD_ROUNDING = 1e-9  # of a period; delays that exceed whole periods by less count as whole
 
-Square = Float[Array, "state state"]
+Square = Float[Array, "*sample state state"]
+Inputs = Float[Array, "*sample state input"]
 Number = Float[Array, ""]
-# State matrix and input matrix at a time (s).
-StateAndInputMatrices = Callable[[Number], tuple[Float[Array, "..."], Float[Array, "..."]]]
+Times = Float[Array, "*sample"]
+# State matrix and input matrix at times (s), or those of all times.
+StateAndInputMatrices = Callable[[Times], tuple[Float[Array, "..."], Float[Array, "..."]]]
 
 
 class Transition(Module):
     """Transition over a period: x+ = matrix x + previous_input_matrix u- + input_matrix u + w.
 
-    `noise_covariance` is that of w.
+    `noise_covariance` is that of w. Of one sample, or of several along a first axis.
     """
 
     matrix: Square
-    previous_input_matrix: Float[Array, "state input"]
-    input_matrix: Float[Array, "state input"]
+    previous_input_matrix: Inputs
+    input_matrix: Inputs
     noise_covariance: Square
 
     def predict(self, state, previous_input, input) -> Float[Array, " state"]:
@@ -44,7 +49,7 @@ class Transition(Module):
 
     def predict_covariance(self, covariance: Square) -> Square:
         """Covariance of the state at the end of the period, from that at its start."""
-        return self.matrix @ covariance @ self.matrix.T + self.noise_covariance
+        return self.matrix @ covariance @ self.matrix.mT + self.noise_covariance
 
     def compose(self, later: "Transition") -> "Transition":
         """Composition with a later transition in the same period."""
@@ -62,18 +67,22 @@ class SampleTiming(Module):
     period: Number
     input_delay: Number | None
 
+    def sample_at(self, t: Number) -> Int[Array, ""]:
+        """Number of the sample at t (s)."""
+        return xp.floor(t / self.period + 0.5).astype(int)
+
     def transition(
         self,
         matrices_at: StateAndInputMatrices,
-        noise_intensity: Square,
+        noise_intensity: Float[Array, "state state"],
         scale: Float[Array, " state"],
-        t: Number | float = 0.0,
+        t: Times | float = 0.0,
     ) -> Transition:
-        """Transition to the sample at t (s) from the one before, with white noise on x'.
+        """Transition to the sample at t (s), or to several, from the one before.
 
-        Exact for a time-invariant plant; else by Magnus' method of order 4, with one exponential
-        between any two changes of the command. `scale` are the magnitudes of the states, from
-        `numerics.discretisation.balance`.
+        With white noise on x'. Exact for a time-invariant plant; else by Magnus' method of order 4,
+        with one exponential between any two changes of the command. `scale` are the magnitudes of
+        the states, from `numerics.discretisation.balance`.
         """
         parts, _, _ = self.transitions(matrices_at, noise_intensity, scale, t)
         return functools.reduce(Transition.compose, parts)
@@ -81,9 +90,9 @@ class SampleTiming(Module):
     def transitions(
         self,
         matrices_at: StateAndInputMatrices,
-        noise_intensity: Square,
+        noise_intensity: Float[Array, "state state"],
         scale: Float[Array, " state"],
-        t: Number | float = 0.0,
+        t: Times | float = 0.0,
         breaks: Sequence[Number] = (),
     ) -> tuple[list[Transition], Float[Array, " part"], Bool[Array, " part"]]:
         """Transitions of the parts of a period, split at the command change and at `breaks` (s).
@@ -96,18 +105,22 @@ class SampleTiming(Module):
         cuts = [*breaks, *([] if self.input_delay is None else [input_delay])]
         ends = xp.sort(xp.stack([*cuts, self.period]))
         starts = xp.concatenate([xp.zeros(1), ends[:-1]])
-        before_command = (ends <= input_delay)[:, None, None]
-        matrices, input_matrices, noises = vmap(
-            lambda *at: _magnus_step(matrices_at, noise_intensity, scale, *at)
-        )(t - self.period + starts, ends - starts)
-        previous_input_matrices, current_input_matrices = (
-            xp.where(before_command, input_matrices, 0.0),
-            xp.where(before_command, 0.0, input_matrices),
+        before_command = ends <= input_delay
+        steps = _magnus_steps(
+            matrices_at,
+            noise_intensity,
+            scale,
+            xp.asarray(t, float)[..., None] - self.period + starts,
+            ends - starts,
         )
-        columns = zip(
-            matrices, previous_input_matrices, current_input_matrices, noises, strict=True
-        )
-        return [Transition(*column) for column in columns], ends, before_command[:, 0, 0]
+        parts = []
+        for k in range(ends.shape[0]):
+            matrix, inputs, noise = (part[..., k, :, :] for part in steps)
+            previous, present = (
+                xp.where(acts, inputs, 0.0) for acts in (before_command[k], ~before_command[k])
+            )
+            parts.append(Transition(matrix, previous, present, noise))
+        return parts, ends, before_command
 
 
 def sample_timing(controller: AbstractController) -> SampleTiming:
@@ -116,34 +129,50 @@ def sample_timing(controller: AbstractController) -> SampleTiming:
     return SampleTiming(period, None if delay is None else split_delay(delay, period)[1])
 
 
+def in_blocks(function: Callable[[int, int], Any], count: int) -> Any:
+    """Arrays that a function of a first sample and a number of samples returns, for `count` ones.
+
+    Computed block by block: intermediate results of all samples at once would need more room. The
+    first axis of the arrays is that of the samples.
+    """
+    starts = range(0, count, BLOCK)
+    parts = [function(first, min(BLOCK, count - first)) for first in starts]
+    return jax.tree.map(lambda *blocks: xp.concatenate(blocks), *parts)
+
+
 def split_delay(delay: Number, period: Number) -> tuple[Number, Number]:
     """Number of whole periods in a delay (s), and the rest (s); the number has no derivative."""
     whole = stop_gradient(xp.floor(delay / period + PERIOD_ROUNDING))
     return whole, xp.maximum(delay - whole * period, 0.0)
 
 
-def _magnus_step(matrices_at: StateAndInputMatrices, noise_intensity, scale, start, span):
-    """Transition matrix, matrix of a held input, and covariance of the noise over a span (s)."""
-    middle, node_offset = start + span / 2, math.sqrt(3) / 6 * span
+def _magnus_steps(matrices_at: StateAndInputMatrices, noise_intensity, scale, starts, spans):
+    """Transition matrix, matrix of a held input, and covariance of the noise over spans (s).
+
+    The last axis of the starts (s) is that of the spans.
+    """
+    middle, node_offset = starts + spans / 2, math.sqrt(3) / 6 * spans
     nodes = xp.stack([middle - node_offset, middle + node_offset])
-    early, late = vmap(lambda time: _augmented_matrix(matrices_at, time, scale))(nodes)
+    early, late = _augmented_matrices(matrices_at, nodes, scale)
+    span, node_offset = spans[:, None, None], node_offset[:, None, None]
     commutator = late @ early - early @ late
     matrix = span / 2 * (early + late) + span * node_offset / 2 * commutator
     states, covariance_scale = noise_intensity.shape[0], scale * scale[:, None]
-    noise = xp.pad(noise_intensity / covariance_scale, (0, matrix.shape[0] - states))
+    noise = xp.pad(noise_intensity / covariance_scale, (0, matrix.shape[-1] - states))
     noise_commutator = (late - early) @ noise
-    noise = span * noise + span * node_offset / 2 * (noise_commutator + noise_commutator.T)
+    noise = span * noise + span * node_offset / 2 * (noise_commutator + noise_commutator.mT)
     propagator, noise = exponential_and_gramian(matrix, noise)
-    transition = propagator[:states, :states] * scale[:, None] / scale
+    transition = propagator[..., :states, :states] * scale[:, None] / scale
     return (
         transition,
-        propagator[:states, states:] * scale[:, None],
-        noise[:states, :states] * covariance_scale,
+        propagator[..., :states, states:] * scale[:, None],
+        noise[..., :states, :states] * covariance_scale,
     )
 
 
-def _augmented_matrix(matrices_at: StateAndInputMatrices, time, scale):
-    """Matrix of the plant with its inputs as further, constant states; in scaled states."""
-    A, B = matrices_at(time)
-    top = xp.concatenate([A * scale / scale[:, None], B / scale[:, None]], axis=1)
-    return xp.pad(top, ((0, B.shape[1]), (0, 0)))
+def _augmented_matrices(matrices_at: StateAndInputMatrices, times, scale):
+    """Matrices of the plant with its inputs as further, constant states; in scaled states."""
+    A, B = matrices_at(times)
+    top = xp.concatenate([A * scale / scale[:, None], B / scale[:, None]], axis=-1)
+    square = xp.pad(top, [*[(0, 0)] * (top.ndim - 2), (0, B.shape[-1]), (0, 0)])
+    return xp.broadcast_to(square, (*times.shape, *square.shape[-2:]))

@@ -18,7 +18,7 @@ from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensing.sensor_signals import Sections, sensor_sections
 from jaxbeam.model.state_space import Plant
-from jaxbeam.runtime.arrays import Array, block_diag, set_at, xp
+from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.module import Module
 
 # Noise that a digital filter is assumed to add to its output, relative to that of its samples.
@@ -43,7 +43,7 @@ class FilteredPlant(Module):
             return system
         filtered_rows = self.output_rows @ self.plant.to_modal(xp.eye(self.output_rows.shape[1]))
         filtered_rows = xp.pad(
-            filtered_rows, ((0, 0), (0, system.C.shape[1] - filtered_rows.shape[1]))
+            filtered_rows, ((0, 0), (0, system.C.shape[-1] - filtered_rows.shape[1]))
         )
         C = xp.where(analogue[:, None], filtered_rows, system.C)
         D = xp.where(analogue[:, None], 0.0, system.D)
@@ -84,12 +84,12 @@ class SensorChain(Module):
 
     def output_matrices(
         self, C, D
-    ) -> tuple[Float[Array, "sensor all"], Float[Array, "sensor actuator"]]:
-        """C and D of the readings on the states just before a sample and the commands."""
+    ) -> tuple[Float[Array, "*sample sensor all"], Float[Array, "*sample sensor actuator"]]:
+        """C and D of the readings on the states just before samples and the commands."""
         return self._jacobians(C, D, 0)
 
     def transition(self, system_at: SystemAtTime, intensity, scale, t=0.0) -> Transition:
-        """Transition from just before the previous sample to just before that at t (s).
+        """Transition from just before the previous sample to just before that at t (s), or several.
 
         White noise of this intensity acts on the rates of the plant; see `SampleTiming.transition`.
         """
@@ -112,20 +112,19 @@ class SensorChain(Module):
             state_and_input_matrices, intensity, scale, t, list(sampling_offsets.values())
         )
         for k, part in enumerate(parts):
-            padded = block_diag(part.matrix, np.eye(sensor_states))
-            previous_input, present_input = (
-                xp.pad(x, ((0, sensor_states), (0, 0)))
-                for x in (part.previous_input_matrix, part.input_matrix)
+            unchanged = np.diag(np.append(np.zeros(self.plant_states), np.ones(sensor_states)))
+            later = Transition(
+                _padded(part.matrix, sensor_states, sensor_states) + unchanged,
+                _padded(part.previous_input_matrix, sensor_states, 0),
+                _padded(part.input_matrix, sensor_states, 0),
+                _padded(part.noise_covariance, sensor_states, sensor_states),
             )
-            noise = xp.pad(part.noise_covariance, ((0, sensor_states), (0, sensor_states)))
-            transition = transition.compose(
-                Transition(padded, previous_input, present_input, noise)
-            )
+            transition = transition.compose(later)
             for i, offset in sampling_offsets.items():
                 system, is_sampled = system_at(start + ends[k]), ends[k] == offset
                 transition = transition.compose(
                     self._sampling_update(
-                        i, system.C[i], system.D[i], is_sampled, before_command[k]
+                        i, system.C[..., i, :], system.D[..., i, :], is_sampled, before_command[k]
                     )
                 )
         sample_noise = xp.zeros(self.state_count)
@@ -140,12 +139,14 @@ class SensorChain(Module):
     def _sampling_update(self, sensor, row, feedthrough, is_sampled, before_command) -> Transition:
         """Transition at a sample of a sensor, if `is_sampled`: the newest of its samples h."""
         index = self._state_layout()[0][sensor]
-        identity = xp.eye(self.state_count)
-        output_row = xp.pad(row, (0, self.state_count - self.plant_states))
-        matrix = set_at(identity, index, xp.where(is_sampled, output_row, identity[index]))
-        no_input = xp.zeros((self.state_count, feedthrough.shape[0]))
+        samples, own = row.shape[:-1], np.s_[..., index, :]
+        identity = xp.broadcast_to(xp.eye(self.state_count), (*samples, *(self.state_count,) * 2))
+        others = self.state_count - self.plant_states
+        output_row = xp.pad(row, [*[(0, 0)] * len(samples), (0, others)])
+        matrix = set_at(identity, own, xp.where(is_sampled, output_row, identity[own]))
+        no_input = xp.zeros((*samples, self.state_count, feedthrough.shape[-1]))
         previous_inputs, inputs = (
-            set_at(no_input, index, xp.where(is_sampled & acts, feedthrough, 0.0))
+            set_at(no_input, own, xp.where(is_sampled & acts, feedthrough, 0.0))
             for acts in (before_command, ~before_command)
         )
         return Transition(matrix, previous_inputs, inputs, xp.zeros_like(identity))
@@ -153,11 +154,13 @@ class SensorChain(Module):
     def _jacobians(self, C, D, which: int) -> Any:
         """Jacobians by states and commands of the readings (0) or the states after a sample (1).
 
-        A sample is linear, so they are its results for unit vectors.
+        A sample is linear, so they follow from its results for unit vectors.
         """
-        states, commands = np.eye(self.state_count), np.zeros((self.state_count, D.shape[1]))
-        signals = xp.pad(C, ((0, 0), (0, self.state_count - self.plant_states)))
-        return self._sample(states, signals)[which], self._sample(commands, D)[which]
+        states, sensors = self.state_count, len(self.filter_sections)
+        on_states = self._sample(np.eye(states), np.zeros((sensors, states)))[which]
+        on_signals = self._sample(np.zeros((states, sensors)), np.eye(sensors))[which]
+        signals = _padded(C, 0, states - self.plant_states)
+        return on_states + on_signals @ signals, on_signals @ D
 
     def _sample(self, state, signals) -> Any:
         """Readings, and the states just after a sample, from the states just before it.
@@ -204,6 +207,11 @@ class SensorChain(Module):
                 indices.append(end if length else None)
                 end += length
         return *starts, end
+
+
+def _padded(matrix, rows: int, columns: int):
+    """Matrices with further rows and columns of zeros."""
+    return xp.pad(matrix, [*[(0, 0)] * (matrix.ndim - 2), (0, rows), (0, columns)])
 
 
 def sensor_chain(

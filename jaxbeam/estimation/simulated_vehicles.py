@@ -7,13 +7,14 @@ of the beam, so that no sensor in a vehicle is needed.
 import dataclasses
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractContinuousFilter, AbstractSampledFilter, Estimate
-from jaxbeam.estimation.sampled_plant import SampleTiming
+from jaxbeam.estimation.sampled_plant import SampleTiming, Transition, in_blocks
 from jaxbeam.model.state_space import Plant
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, take, xp
 
 
 class VehicleMemory(NamedTuple):
@@ -34,6 +35,27 @@ class SampledWithVehicles(AbstractSampledFilter):
     filter: AbstractSampledFilter
     plant: Plant
     timing: SampleTiming
+    table: Transition | None = None  # at all samples
+
+    def tabulated(self, times):
+        def block(first, number):
+            return self.transition_at(times[first : first + number])
+
+        table = in_blocks(block, len(times))
+        return dataclasses.replace(self, filter=self.filter.tabulated(times), table=table)
+
+    def transition_at(self, t: Float[Array, "*sample"]) -> Transition:
+        """Transition of the coupled plant to the sample at t (s), or to several."""
+        if self.table is not None:
+            sample = self.timing.sample_at(t)
+            return jax.tree.map(lambda part: take(part, sample), self.table)
+
+        def matrices_at(times):
+            system = self.plant.augmented(times)
+            return system.A, system.B
+
+        size = self.plant.modal_model.state_count + self.plant.augmented_start.shape[0]
+        return self.timing.transition(matrices_at, np.zeros((size, size)), xp.ones(size), t)
 
     def initial_state(self):
         commands = xp.zeros(len(self.plant.case.actuators))
@@ -46,19 +68,12 @@ class SampledWithVehicles(AbstractSampledFilter):
         plant = self.plant
         estimate, filter_state = self.filter.update(state.filter_state, measurement, t)
         beam, constants = plant.modal_model.state_count, _constants(plant, estimate)
-
-        def matrices_at(time):
-            system = plant.augmented(time)
-            return system.A, system.B
-
         x = xp.concatenate([state.state, constants])
-        size = x.shape[0]
-        transition = self.timing.transition(matrices_at, np.zeros((size, size)), xp.ones(size), t)
-        predicted = transition.predict(x, state.command, measurement.command)
+        predicted = self.transition_at(t).predict(x, state.command, measurement.command)
         vehicles = predicted[beam : beam + plant.vehicle_states]
         # A run starts at rest: there is no period before it.
         vehicles = xp.where(t > 0, vehicles, state.state[beam:])
-        estimate = dataclasses.replace(estimate, vehicles=vehicles)
+        estimate = estimate._replace(vehicles=vehicles)
         present = xp.concatenate([estimate.state, vehicles])
         return estimate, VehicleMemory(filter_state, present, measurement.command)
 
@@ -80,7 +95,7 @@ class ContinuousWithVehicles(AbstractContinuousFilter):
         own = self.filter.state_count
         estimate = self.filter.estimate(state[:own], measurement, t)
         vehicles = self.plant.augmented_start[: self.plant.vehicle_states] + state[own:]
-        return dataclasses.replace(estimate, vehicles=vehicles)
+        return estimate._replace(vehicles=vehicles)
 
     def rates(self, state, measurement, command, t):
         estimate, own = self.estimate(state, measurement, t), self.filter.state_count

@@ -25,7 +25,9 @@ def sweep_columns(dataset: "xarray.Dataset") -> dict[str, np.ndarray]:
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
-    >>> case = jb.Case(beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingForce(force=5.0, speed=2.0)])
+    >>> case = jb.Case(
+    ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingForce(force=5.0, speed=2.0)]
+    ... )
     >>> runs = jb.sweep(case, {"loads.0.speed": [1.0, 2.0]}, progress=False)
     >>> print(next(iter(sweep_columns(runs))))
     speed of the load (m/s)

@@ -7,6 +7,7 @@ s'', and all loads on the beam summed, the mass-matrix form of the equations of 
 
 eqs (2.11) to (2.16) of the thesis, solved for q'' at every instant. Contact forces are not
 collocated: an embedded Runge-Kutta pair (Dopri8 of diffrax) chooses its steps, event by event.
+Where a load passes a kink of the beam, the momentum (I + sum m s s^T) q' + sum m s x' s'^T q stays.
 """
 
 import itertools
@@ -18,6 +19,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.validation import check_case
+from jaxbeam.integrator.kinks.passages import kink_passages
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.runtime.arrays import Array, set_at, xp
@@ -55,6 +57,7 @@ def simulate_adaptive(
     check_case(case)
     case, times = concrete_case(case), xp.asarray(times, float)
     model, loads = compiled_modal_model(case), load_set(case)
+    kinks = kink_passages(case, model, loads)
     windows, legs = _event_times(model, loads, float(times[-1]))
     absolute_tolerance = tolerance * _state_scales(case, model, loads, float(times[-1]))
     state, histories = xp.zeros(model.state_count), []
@@ -65,6 +68,10 @@ def simulate_adaptive(
         state, leg_histories = _solve_leg(
             model, loads, state, leg, on_beam, times, absolute_tolerance
         )
+        if kinks is not None:
+            at_end = np.abs(kinks.times - stop) <= 10 * EVENT_MARGIN_SHARE * float(times[-1])
+            passed = np.flatnonzero(at_end & kinks.happen(windows, times[0], times[-1]))
+            state = _after_kinks(model, loads, kinks, passed, on_beam, stop, state)
         in_leg = (times >= start)[:, None]
         previous = histories or leg_histories
         histories = [
@@ -87,6 +94,20 @@ def _event_times(model: ModalModel, loads: LoadSet, end: float) -> tuple[np.ndar
         np.concatenate([[0.0, end], event_times[(event_times > 0) & (event_times < end)]])
     )
     return windows, boundaries[np.append(True, np.diff(boundaries) > 10 * EVENT_MARGIN_SHARE * end)]
+
+
+def _after_kinks(model: ModalModel, loads: LoadSet, kinks, passed, on_beam, time, state):
+    """State after the passages of some indices, at one time (s), with the same momentum."""
+    x, speed, _ = loads.kinematics(xp.asarray(time))
+    shape = model.shapes(xp.where(on_beam, x, 0.0), (0,))[0]
+    mass = xp.where(on_beam, loads.inertia[:, 0], 0.0)
+    inertia = xp.eye(model.mode_count) + shape.T @ (mass[:, None] * shape)
+    for i in passed:
+        wheel = kinks.wheels[i]
+        rise = xp.abs(speed[wheel]) * (kinks.slope_jumps[i] @ state[model.coordinate_index])
+        change = xp.linalg.solve(inertia, mass[wheel] * rise * shape[wheel])
+        state = set_at(state, model.rate_index, state[model.rate_index] - change)
+    return state
 
 
 @compiled

@@ -1,7 +1,7 @@
 """Input policy: commands to the actuators, as the integrator asks for them."""
 
 import abc
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Float, Int
@@ -10,7 +10,7 @@ from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.module import Module
 
 
-class StepInfo(eqx.Module):
+class StepInfo(NamedTuple):
     """Start (s) and length (s) of a step or several, and index of the event at the start.
 
     `event` is -1 for a step that starts between two events of the schedule.

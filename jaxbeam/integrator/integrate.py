@@ -19,6 +19,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.input_steps import advance_known_with_inputs, step_with_inputs
+from jaxbeam.integrator.kinks.steps import weights_with_impulses, with_impulses
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
 from jaxbeam.integrator.running_peaks import RunningPeaks, initial_peaks, update_peaks
 from jaxbeam.integrator.step import (
@@ -105,8 +106,11 @@ def _step_inputs(discrete: DiscreteModel, loads: LoadSet, path: LoadPath) -> Ste
         weight = weight + inertia * by_wheel.reshape(*by_wheel.shape[:1], -1, 1)
     vehicle_step = None
     if loads.wheels.vehicles:
-        vehicle_step = VehicleStep(path.length_index, path.loads, path.on_beam, path.surface)
+        vehicle_step = VehicleStep(path.length_index, path.loads, path.pressing, path.surface)
     matrices = step_matrices(discrete, path)
+    if path.kinks is not None:
+        weight = weights_with_impulses(path.kinks, inertia, weight)
+        matrices = with_impulses(path.kinks, matrices, path.rows.shape, discrete.model)
     return StepInput(matrices, inertia, weight, vehicle_step)
 
 

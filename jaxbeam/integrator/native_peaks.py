@@ -19,6 +19,7 @@ from jaxtyping import Bool
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_peaks as integrate_peaks_in_jax
+from jaxbeam.integrator.kinks.passages import may_have_kinks
 from jaxbeam.integrator.monitored_rows import force_weights_at_peaks, largest_per_energy
 from jaxbeam.integrator.propagators import (
     DOUBLINGS,
@@ -95,6 +96,7 @@ def supports(case: Case) -> bool:
         case.controller is None
         and case.profile is None
         and not has_settlement(case)
+        and not may_have_kinks(case)
         and not any(
             load.vehicle(case.run.gravity).names or load.force_histories() for load in case.loads
         )

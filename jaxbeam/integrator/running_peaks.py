@@ -104,10 +104,10 @@ def update_peaks(
         running_peaks,
     )
     least_of_step = xp.min(-forces.reshape(steps, -1, len(GAUSS_NODES), batch_size), axis=2)
-    # Loads off the beam do not count.
+    # Loads off the beam do not count, nor do impulses.
     is_load = (
         path.loads[:, :, None] == np.arange(running_peaks.lowest_contact_force.shape[0])
-    ) & path.on_beam[..., None]
+    ) & path.pressing[..., None]
     least_of_load = xp.where(is_load[..., None], least_of_step[:, :, None], xp.inf)
     lowest_force = xp.minimum(
         running_peaks.lowest_contact_force, xp.min(least_of_load, axis=(0, 1), initial=xp.inf)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.integrator.discrete_model import DiscreteModel
+from jaxbeam.integrator.kinks.passages import KinkSteps
 from jaxbeam.integrator.monitored_rows import force_weights_at_peaks
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT, PEAK_NODES
 from jaxbeam.integrator.time_grid import TimeGrid
@@ -91,7 +92,8 @@ class LoadPath(eqx.Module):
     `length_index` is the index of a step's length among those of the grid; start and length are in
     s. `loads` are the indices of the wheels in the rows. `surface` is the height of the profile (m)
     under all wheels, and its first and second rate, where there is a profile. `influence` is the
-    static one of a force of each wheel at the peak nodes on corrected outputs.
+    static one of a force of each wheel at the peak nodes on corrected outputs; `kinks` tell which
+    steps are passages over kinks, if there are any.
     """
 
     length_index: Int[Array, " step"]
@@ -102,6 +104,12 @@ class LoadPath(eqx.Module):
     rows: SurfaceRows
     surface: Float[Array, "step 3 wheel node"] | None
     influence: Float[Array, "step load sample output"] | None = None
+    kinks: KinkSteps | None = None
+
+    @property
+    def pressing(self) -> Bool[Array, "step load"]:
+        """Which wheels on the beam press on it by forces, not by impulses as in passages."""
+        return self.on_beam if self.kinks is None else self.on_beam & ~self.kinks.here[:, None]
 
 
 def chunk_length(discrete: DiscreteModel, loads: LoadSet, max_loads: int) -> int:
@@ -158,7 +166,13 @@ def load_path(
     influence = None
     if discrete.load_influence is not None:
         influence = _static_influence(discrete, loads, start, length, load_index, on_beam)
-    return LoadPath(length_index, start, length, load_index, on_beam, rows, surface, influence)
+    kinks = None
+    if grid.kinks is not None and not loads.massless:
+        passage = xp.where(grid.starts_panel(index, panel), take(grid.passage, panel), -1)
+        kinks = grid.kinks.of_steps(passage, load_index, on_beam, speed[..., 0])
+    return LoadPath(
+        length_index, start, length, load_index, on_beam, rows, surface, influence, kinks
+    )
 
 
 def _static_influence(discrete: DiscreteModel, loads: LoadSet, start, length, load_index, on_beam):

@@ -4,6 +4,8 @@ A run of the case is compared with one whose steps are half as long. The order o
 least CONVERGENCE_ORDER, so that the next trial is close to the longest step that suffices.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float
 
@@ -31,6 +33,17 @@ ROUNDING = 1e-9  # of the deflection under all loads; below it, deflections are 
 TRIAL_POSITIONS = (0.13, 0.29, 0.47, 0.62, 0.88)  # x / length at which errors are measured
 
 
+class StepTrial(NamedTuple):
+    """States of two trial runs at the same `times` (s): with some steps, and with half of them.
+
+    Those of the beam's modal model, then those of vehicles.
+    """
+
+    times: Float[np.ndarray, " time"]
+    coarse: Float[np.ndarray, "time state batch"]
+    fine: Float[np.ndarray, "time state batch"]
+
+
 def check_step_count(count: float, step: float) -> None:
     """Raises RuntimeError if a run has more than MAX_STEPS time steps, of `step` (s)."""
     if not count <= MAX_STEPS:
@@ -47,8 +60,12 @@ def longest_trial_step(case: Case, shapes: StaticShapes) -> float:
 
 
 @np.errstate(all="ignore")  # of extreme numbers, and of runs that diverge
-def choose_step_size(case: Case, shapes: StaticShapes, tolerance: float) -> tuple[float, float]:
+def choose_step_size(
+    case: Case, shapes: StaticShapes, tolerance: float
+) -> tuple[float, float, StepTrial]:
     """Longest step (s) whose deflections at TRIAL_POSITIONS meet the `tolerance`, and their error.
+
+    The last is the trial from which the error is known.
 
     The step is shortened until dividing it by two changes no deflection at the ends of its steps by
     more than the tolerance, relative to the largest; the error is that change. Peaks alone would
@@ -61,10 +78,13 @@ def choose_step_size(case: Case, shapes: StaticShapes, tolerance: float) -> tupl
     case = _without_later_vibration(case, model)
     halvings, least = 0, rounding_deflection(case, model)
     for _ in range(MAX_TRIALS):
-        coarse, fine = (_trial_run(case, model, shapes, step, divided) for divided in (1, 2))
-        error = largest_change(coarse, fine, least)
+        (times, coarse), (_, fine) = (
+            _trial_run(case, model, shapes, step, divided) for divided in (1, 2)
+        )
+        deflections = (trial_deflections(case, model, states) for states in (coarse, fine))
+        error = largest_change(*deflections, least)
         if error <= tolerance:
-            return step, error
+            return step, error, StepTrial(times, coarse, fine)
         shrink = 0.5
         if np.isfinite(error):
             shrink = np.clip(0.9 * (tolerance / error) ** (1 / CONVERGENCE_ORDER), 0.2, 0.8)
@@ -87,17 +107,18 @@ def _without_later_vibration(case: Case, model: ModalModel) -> Case:
 
 def _trial_run(
     case: Case, model: ModalModel, shapes: StaticShapes, max_step: float, divided: int
-) -> np.ndarray:
-    """Deflections (m) at TRIAL_POSITIONS, (boundary and position, batch), of known numbers.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Boundaries of steps of at most `max_step` (s), and states there (boundary, state, batch).
 
-    The boundaries are those of steps of at most `max_step` (s), each `divided` into so many.
+    Each step is `divided` into so many.
     """
     grid = grid_by_step_length(case, model, np.asarray(max_step), refinement=divided)
     discrete, steps = discrete_model(model, grid, None), int(grid.step_count)
     _, states, *_ = integrate_history(
         discrete, load_set(case), max_loads=shapes.max_loads, steps=steps
     )
-    return np.asarray(trial_deflections(case, model, states[::divided]))
+    _, starts, _ = grid.locate_steps(np.arange(0, steps, divided))
+    return np.append(starts, grid.boundaries[-1]), np.asarray(states[::divided])
 
 
 def trial_deflections(case: Case, model: ModalModel, states):

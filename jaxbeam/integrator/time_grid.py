@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.events import EventSchedule
+from jaxbeam.integrator.kinks.passages import KinkPassages, kink_passages
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import Array, put, searchsorted, stop_gradient, take, xp
@@ -24,6 +25,8 @@ class TimeGrid(eqx.Module):
     zero: that of the steps after the end, which fill the last chunk. `event` is the index of the
     scheduled event at which a panel starts, -1 for a load event; `event_panels` is the panel that
     starts at each scheduled event. `on_beam_intervals` are entry and exit of each load (s).
+    `passage` is the index of the passage over a kink, among the `kinks`, that is the first step of
+    a panel of no length; -1 for none.
     """
 
     boundaries: Float[Array, " boundary"]
@@ -35,6 +38,8 @@ class TimeGrid(eqx.Module):
     on_beam_intervals: Float[Array, "load 2"]
     event: Int[Array, " panel"] | None = None
     event_panels: Int[Array, " event"] | None = None
+    kinks: KinkPassages | None = None
+    passage: Int[Array, " panel"] | None = None
 
     @property
     def last_exit(self) -> Float[Array, ""]:
@@ -65,20 +70,33 @@ class TimeGrid(eqx.Module):
     def event_at(self, index: Int[Array, " step"]) -> Int[Array, " step"]:
         """Index of the scheduled event at which each of some steps starts, -1 for none."""
         panel, _, _ = self.locate_steps(index)
-        starts = (index == self._first_step(panel)) & (index < self.step_count)
-        return xp.where(starts, take(self.event, panel), -1)
+        return xp.where(self.starts_panel(index, panel), take(self.event, panel), -1)
+
+    def starts_panel(self, index: Int[Array, " step"], panel: Int[Array, " step"]):
+        """Whether each of some steps is the first one of its panel."""
+        return (index == self._first_step(panel)) & (index < self.step_count)
 
     def _first_step(self, panel):
         """Index of the first step of a panel."""
         return take(self.cumulative_counts, panel) - take(self.counts, panel)
 
 
-def _load_events(case: Case, model: ModalModel, places=None):
-    """Entry and exit of each wheel (wheel, 2), and all load events (event,), in s."""
-    own = model.modes.nodes[1:-1]
-    return load_set(case, model.modes.layout).events(
-        own if places is None else xp.concatenate([own, places])
-    )
+def _load_events(case: Case, model: ModalModel, places, start, end):
+    """Entry and exit of each wheel (wheel, 2), and times of events between start and end, in s.
+
+    Those of load events (event,), and of passages over kinks, each of them twice: a panel of no
+    length lies in between. Then the passages, and the index of each, -1 for one that does not
+    happen, whose times are the end.
+    """
+    own, loads = model.modes.nodes[1:-1], load_set(case, model.modes.layout)
+    windows, events = loads.events(own if places is None else xp.concatenate([own, places]))
+    events, kinks = xp.clip(events, start, end), kink_passages(case, model, loads)
+    if kinks is None:
+        return windows, events, xp.zeros(0), None, np.zeros(0, int)
+    happen = kinks.happen(windows, start, end)
+    times = xp.where(happen, kinks.times, end)
+    index = xp.where(happen, np.arange(times.shape[0]), -1)
+    return windows, events, xp.repeat(times, 2), kinks, index
 
 
 def _loads_on_beam(positions, panels: int):
@@ -108,24 +126,43 @@ def grid_by_step_length(
     leave the number of steps of a short panel unchanged. Steps also end where a wheel passes one of
     the `places` (m).
     """
-    windows, events = _load_events(case, model, places)
     end = case.run.duration
-    times = xp.concatenate([xp.zeros(1), xp.clip(events, 0.0, end), end[None]])
+    windows, events, twice, kinks, index = _load_events(case, model, places, np.zeros(()), end)
+    times = xp.concatenate([xp.zeros(1), events, twice, end[None]])
     order = xp.argsort(times, stable=True)
-    boundaries = times[order]
+    boundaries, positions = times[order], xp.argsort(order)
     panel_lengths = xp.diff(boundaries)
     counts = xp.ceil(stop_gradient(panel_lengths / max_step)).astype(int) + extra_steps * (
         panel_lengths > 0
     )
+    passage = None
+    if kinks is not None:
+        passage = _passage_of_panels(positions[1 + events.shape[0] : -1 : 2], index, counts)
+        counts = xp.maximum(counts, xp.where(passage >= 0, 1, 0))
     counts = counts * refinement
     lengths = panel_lengths / xp.maximum(counts, 1)
     length_index = xp.arange(panel_lengths.shape[0])
     lengths = xp.append(lengths, 0.0)
-    positions = xp.argsort(order)[1 : 1 + windows.size]
-    loads_on_beam = _loads_on_beam(positions, counts.shape[0])
+    loads_on_beam = _loads_on_beam(positions[1 : 1 + windows.size], counts.shape[0])
     return TimeGrid(
-        boundaries, counts, xp.cumsum(counts), length_index, lengths, loads_on_beam, windows
+        boundaries,
+        counts,
+        xp.cumsum(counts),
+        length_index,
+        lengths,
+        loads_on_beam,
+        windows,
+        kinks=kinks,
+        passage=passage,
     )
+
+
+def _passage_of_panels(positions, index, panels: Int[Array, " panel"]):
+    """Index of the passage that is the first step of each of the panels, -1 for none.
+
+    From the panels that start with the passages of some indices, which are -1 for none.
+    """
+    return put(xp.full_like(panels, -1), xp.where(index < 0, panels.shape[0], positions), index)
 
 
 def grid_by_schedule(
@@ -141,35 +178,43 @@ def grid_by_schedule(
     wheel passes one of the `places` (m).
     """
     times = schedule.times
-    windows, events = _load_events(case, model, places)
+    windows, events, twice, kinks, index = _load_events(case, model, places, times[0], times[-1])
     if schedule.control_sample is not None:
         # A step of zero length after the end: the controller acts at the last event too.
         events = xp.append(events, times[-1])
-    boundary_times = xp.concatenate([times, xp.clip(events, times[0], times[-1])])
+    # Passages over kinks come before an event at the same time.
+    boundary_times = xp.concatenate([twice, times, events])
     order = xp.argsort(boundary_times, stable=True)
     boundaries = boundary_times[order]
     panel_lengths = xp.diff(boundaries)
-    is_scheduled = order < times.shape[0]
-    # The other panels adjoin a load event: at most two each.
+    first = twice.shape[0]
+    is_scheduled = (order >= first) & (order < first + times.shape[0])
+    positions = xp.argsort(order)
+    # The other panels adjoin a load event or a passage: at most two each.
     between_scheduled = is_scheduled[1:] & is_scheduled[:-1]
     length_count = schedule.lengths.shape[0]
+    others = 2 * events.shape[0] + first + 1
+    lengths = xp.concatenate([schedule.lengths, xp.zeros(others)])
+    of_passage = xp.zeros(panel_lengths.shape, bool)
+    if first:
+        of_passage = put(of_passage, positions[:first:2], xp.ones(first // 2, bool))
     length_index = xp.where(
         between_scheduled,
         take(
             schedule.length_index,
             xp.clip(xp.cumsum(is_scheduled)[:-1] - 1, 0, schedule.length_index.shape[0] - 1),
         ),
-        length_count - 1 + xp.cumsum(~between_scheduled),
+        length_count - 1 + xp.cumsum(~between_scheduled & ~of_passage),
     )
-    lengths = xp.concatenate([schedule.lengths, xp.zeros(2 * events.shape[0] + 1)])
-    lengths = put(
-        lengths, xp.where(between_scheduled, lengths.shape[0], length_index), panel_lengths
-    )
+    length_index = xp.where(of_passage, lengths.shape[0] - 1, length_index)
+    shared = between_scheduled | of_passage
+    lengths = put(lengths, xp.where(shared, lengths.shape[0], length_index), panel_lengths)
     counts = xp.full(panel_lengths.shape, substeps)
-    positions = xp.argsort(order)
+    passage = None if kinks is None else _passage_of_panels(positions[:first:2], index, counts)
+    positions = positions[first:]
     event_positions = positions[times.shape[0] : times.shape[0] + windows.size]
     loads_on_beam = _loads_on_beam(event_positions, panel_lengths.shape[0])
-    scheduled_event = xp.where(is_scheduled[:-1], order[:-1], -1)
+    scheduled_event = xp.where(is_scheduled[:-1], order[:-1] - first, -1)
     cumulative_counts, lengths = xp.cumsum(counts), lengths / substeps
     return TimeGrid(
         boundaries,
@@ -181,4 +226,6 @@ def grid_by_schedule(
         windows,
         scheduled_event,
         positions,
+        kinks,
+        passage,
     )

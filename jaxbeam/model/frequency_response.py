@@ -140,7 +140,9 @@ def frequency_response(
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
-    ...     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, damping_ratio=0.03),
+    ...     jb.Beam(
+    ...         length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, damping_ratio=0.03
+    ...     ),
     ...     actuators=[jb.PointForce(0.3, limits=[-1.0, 1.0])],
     ...     sensors=[jb.Sensor(0.3)],
     ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],

@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.beam_parts.properties import (
+    has,
     mass_per_length,
     optional_property,
     rigidity,
@@ -89,6 +90,22 @@ def hinge_nodes(case: Case, layout: Layout) -> dict[int, int]:
         for index in indices
         if first <= index < last
     }
+
+
+def kink_nodes(case: Case, layout: Layout) -> list[int]:
+    """Nodes off rigid supports at which slopes of modes may jump: hinges, with shear also others.
+
+    There w' - phi is V / kGA: it jumps at elastic supports, and at edges between segments. Where
+    a rigid support holds the beam, it takes all of the impulse of a wheel over a kink.
+    """
+    kinks = set(hinge_nodes(case, layout))
+    if has(case.beam, "shear_stiffness"):
+        supports, patch_edges, edges = _counts(case)
+        first = 2 + supports + patch_edges
+        places = {*range(2, 2 + supports), *range(first, first + edges)}
+        kinks |= {i for i, indices in enumerate(layout.nodes) if places & set(indices)}
+    held = {i for i, (deflection, _) in enumerate(layout.constrained) if deflection}
+    return sorted(kinks - held - {0, len(layout.nodes) - 1})
 
 
 def actuator_nodes(case: Case, layout: Layout) -> list[int]:

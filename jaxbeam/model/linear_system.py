@@ -23,13 +23,14 @@ class Signal(NamedTuple):
 class StateSpace(eqx.Module):
     """A linear system z' = A z + B u, y = C z + D u with named signals.
 
-    With a `period` (s) it is one in discrete time, z_(k+1) = A z_k + B u_k.
+    With a `period` (s) it is one in discrete time, z_(k+1) = A z_k + B u_k. Frozen at several
+    times, the matrices of each.
     """
 
-    A: Float[Array, "state state"]
-    B: Float[Array, "state input"]
-    C: Float[Array, "output state"]
-    D: Float[Array, "output input"]
+    A: Float[Array, "*time state state"]
+    B: Float[Array, "*time state input"]
+    C: Float[Array, "*time output state"]
+    D: Float[Array, "*time output input"]
     states: tuple[Signal, ...] = eqx.field(static=True)
     inputs: tuple[Signal, ...] = eqx.field(static=True)
     outputs: tuple[Signal, ...] = eqx.field(static=True)

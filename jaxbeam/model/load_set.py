@@ -243,6 +243,23 @@ class LoadSet(Module):
         windows = self.entry_exit_times()
         return windows, xp.concatenate([windows.reshape(-1), self.passage_times(places)])
 
+    def passages(
+        self, positions: Float[Array, " position"]
+    ) -> Float[Array, "wheel {positions.shape[0]}"]:
+        """Times (s) at which each wheel passes each position (m); `NEVER` if it does not."""
+        count, times = positions.shape[0], [xp.zeros((0, positions.shape[0]))]
+        for path, behind in self._paths():
+            passages = path.passage_times(positions, behind)[: behind.shape[0] * count]
+            times.append(passages.reshape(-1, count))
+        return xp.concatenate(times)
+
+    def rest_times(self) -> Float[Array, " wheel"]:
+        """Times (s) from which wheels stand for good; for trajectories as those of `cubics`."""
+        rest = [
+            xp.broadcast_to(path.cubics()[0][-1], behind.shape) for path, behind in self._paths()
+        ]
+        return xp.concatenate([xp.zeros(0), *rest])
+
     def passage_times(self, positions: Float[Array, " position"]) -> Float[Array, " time"]:
         """Times (s) at which wheels pass positions (m), and of jumps in speed or acceleration.
 

@@ -82,8 +82,12 @@ class ModalModel(Module):
 
 
 def has_coupling(case: Case) -> bool:
-    """Whether a part of the case couples the modes: an actuator, or a damper at a support."""
-    return bool(case.actuators) or any(support.damping is not None for support in case.supports)
+    """Whether a part of the case couples the modes: an actuator, or a damper at a support.
+
+    A damper of zero counts, for its derivatives; one of a rigid support does not act.
+    """
+    damped = any(s.damping is not None and s.stiffness is not None for s in case.supports)
+    return damped or bool(case.actuators)
 
 
 def modal_model(case: Case, layout: Layout | None = None, full_matrix: bool = True) -> ModalModel:

@@ -6,6 +6,7 @@ that moves is measured from it; a wheel at x rolls over the settled surface, the
 
 import dataclasses
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -14,11 +15,11 @@ from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.profiles.base import AbstractProfile
 from jaxbeam.case.validation import check_case
-from jaxbeam.model.layout import Layout, find_layout
+from jaxbeam.model.layout import Layout, find_layout, kink_nodes
 from jaxbeam.model.theory.elements import nodal_unknowns
 from jaxbeam.model.theory.statics import LEAST_STIFFNESS, nodal_system
 from jaxbeam.model.theory.transfer import Transfer
-from jaxbeam.numerics.piecewise import piecewise_chebyshev
+from jaxbeam.numerics.piecewise import piecewise_chebyshev, slope_jumps
 from jaxbeam.runtime.arrays import Array, set_at, solve, xp
 from jaxbeam.runtime.module import Module
 
@@ -40,10 +41,12 @@ class SettledBeam(Module):
         field = xp.sum(self.transfer.section(y).rows(order) * states, axis=-1)
         return field * self.length ** (1 - abs(order))  # SLOPE, of order -1, is w'
 
-    def surface(self, below: AbstractProfile | None) -> "SettledSurface":
-        """Surface of the beam with the profile of the road or track on it."""
+    def surface(
+        self, below: AbstractProfile | None, kinks: tuple[int, ...] = ()
+    ) -> "SettledSurface":
+        """Surface of the beam with the profile of the road or track on it, and its `kinks`."""
         nodes = self.transfer.nodes * self.length
-        return SettledSurface(below, nodes, self._series()[..., :1] * self.length)
+        return SettledSurface(below, nodes, self._series()[..., :1] * self.length, kinks)
 
     def _series(self) -> Float[Array, "part degree 4"]:
         parts, terms, _ = self.transfer.series.shape
@@ -55,12 +58,14 @@ class SettledSurface(Module):
     """Height r + w_s of the surface of a settled beam; level with its ends before and behind it.
 
     Embankments settle with the ends. A slope w_s' at an end is that of a joint: wheels with mass
-    enter without impact, as they do where the beam vibrates.
+    enter without impact, as they do where the beam vibrates. `kink_nodes` are the inner nodes at
+    which w_s' may jump.
     """
 
     below: AbstractProfile | None
     nodes: Float[Array, " node"] | None
     series: Float[Array, "part degree 1"] | None
+    kink_nodes: tuple[int, ...] = eqx.field(static=True, default=())
 
     def heights(self, x):
         """Height (m), slope and curvature (1/m), as those of a profile.
@@ -83,6 +88,18 @@ class SettledSurface(Module):
         """Positions (m) at which the slope or curvature of the profile jumps; nodes come anyway."""
         return xp.zeros(0) if self.below is None else self.below.kinks()
 
+    def slope_kinks(self) -> tuple[Float[Array, " kink"], Float[Array, " kink"]]:
+        """Positions (m) at which the slope jumps, and by how much, as those of a profile."""
+        own = xp.zeros(0), xp.zeros(0)
+        if self.kink_nodes and self.nodes is not None:
+            index = np.array(self.kink_nodes)
+            own = self.nodes[index], slope_jumps(self.nodes, self.series)[index - 1, 0]
+        if self.below is None:
+            return own
+        parts = zip(own, self.below.slope_kinks(), strict=True)
+        positions, jumps = (xp.concatenate(pair) for pair in parts)
+        return positions, jumps
+
 
 def has_settlement(case: Case) -> bool:
     """Whether a support of a case has a settlement."""
@@ -96,7 +113,10 @@ def surface(case: Case, layout: Layout | None = None) -> Module | None:
     numbers = case.beam.length, *(support.position for support in case.supports)
     if layout is None and not all(map(is_concrete, numbers)):
         return SettledSurface(case.profile, None, None)
-    return settled_beam(case, layout).surface(case.profile)
+    layout = find_layout(case) if layout is None else layout
+    parts = layout.parts or (1,) * len(layout.degrees)
+    kinks = tuple(sum(parts[:node]) for node in kink_nodes(case, layout))
+    return settled_beam(case, layout).surface(case.profile, kinks)
 
 
 def settled_beam(case: Case, layout: Layout | None = None, settlements=None) -> SettledBeam:

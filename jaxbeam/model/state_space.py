@@ -9,6 +9,7 @@ wheel. Heights and pitch of vehicles are measured from static equilibrium.
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -99,8 +100,8 @@ class Plant(Module):
         scaled = states / self._state_scales.reshape(-1, *(1,) * (states.ndim - 1))
         return scaled[np.argsort(self._state_order)]
 
-    def at(self, t: Float[Array, ""] | float) -> StateSpace:
-        """System with the loads frozen at a time (s); inputs are the commands, then the weights.
+    def at(self, t: Float[Array, "*time"] | float) -> StateSpace:
+        """System with the loads frozen at times (s); inputs are the commands, then the weights.
 
         Its last states are those of the vehicles, whose wheels travel at their speed. At the
         instant at which a wheel enters or leaves, the system just after it.
@@ -124,7 +125,7 @@ class Plant(Module):
         """Time-invariant system without loads; its inputs are the commands."""
         return _unloaded_plant(self)
 
-    def augmented(self, t: Float[Array, ""] | float) -> StateSpace:
+    def augmented(self, t: Float[Array, "*time"] | float) -> StateSpace:
         """System augmented by the weights as constant states, eq. (5.8) of the thesis.
 
         Its inputs are the commands; the states added to those of the beam start at
@@ -132,24 +133,24 @@ class Plant(Module):
         columns are their effect on the beam and on the vehicles.
         """
         frozen_system, commands = self.at(t), len(self.case.actuators)
-        columns = frozen_system.B[:, commands:], frozen_system.D[:, commands:]
+        columns = frozen_system.B[..., commands:], frozen_system.D[..., commands:]
         constants = frozen_system.inputs[commands:]
         if has_known_disturbance(self.loads):
             weight, surface = known_disturbance(self.loads, xp.asarray(t, float))
-            vehicle_rates = vehicle_system(self.loads)[1] @ surface
-            vehicle_rates = xp.concatenate([xp.zeros(len(self.states)), vehicle_rates])
+            lead, weight = [(0, 0)] * (surface.ndim - 1), weight[..., None]
+            vehicle_rates = surface @ vehicle_system(self.loads)[1].T
+            vehicle_rates = xp.pad(vehicle_rates, [*lead, (len(self.states), 0)])[..., None]
             disturbance = columns[0] @ weight + vehicle_rates, columns[1] @ weight
             columns = tuple(
-                xp.concatenate([old, new[:, None]], axis=1)
-                for old, new in zip(columns, disturbance, strict=True)
+                xp.concatenate(pair, axis=-1) for pair in zip(columns, disturbance, strict=True)
             )
             constants = (*constants, Signal("known_disturbance", "1"))
-        count = len(constants)
+        rows = [*[(0, 0)] * (frozen_system.A.ndim - 2), (0, len(constants)), (0, 0)]
         return StateSpace(
-            A=xp.pad(xp.concatenate([frozen_system.A, columns[0]], axis=1), ((0, count), (0, 0))),
-            B=xp.pad(frozen_system.B[:, :commands], ((0, count), (0, 0))),
-            C=xp.concatenate([frozen_system.C, columns[1]], axis=1),
-            D=frozen_system.D[:, :commands],
+            A=xp.pad(xp.concatenate([frozen_system.A, columns[0]], axis=-1), rows),
+            B=xp.pad(frozen_system.B[..., :commands], rows),
+            C=xp.concatenate([frozen_system.C, columns[1]], axis=-1),
+            D=frozen_system.D[..., :commands],
             states=frozen_system.states + constants,
             inputs=frozen_system.inputs[:commands],
             outputs=frozen_system.outputs,
@@ -169,35 +170,43 @@ class Plant(Module):
         return xp.concatenate([self.coordinate_scale, self.coordinate_scale, actuator_scales])
 
     def _system_with_loads(self, contact: ContactRows | None) -> StateSpace:
-        """System with loads of given contact rows, or without loads."""
+        """System with loads of given contact rows (*time), or without loads."""
         model, states = self.modal_model, self.modal_model.state_count
         rates, matrix, command = model.rate_index, model.A, model.command_matrix
         order, scales, signals, weights = self._state_order, self._state_scales, self.states, ()
         inputs = command
         if contact is not None:
+            times = contact.mass.shape[:-1]
             if contact.surface is not None:
                 A, B, _ = vehicle_system(self.loads)
-                matrix = xp.block([[matrix, xp.zeros((states, len(A)))], [B @ contact.surface, A]])
                 added = len(A)
+                upper = xp.pad(matrix, ((0, 0), (0, added)))
+                upper, below = (xp.broadcast_to(x, (*times, *x.shape)) for x in (upper, A))
+                below = xp.concatenate([B @ contact.surface, below], axis=-1)
+                matrix = xp.concatenate([upper, below], axis=-2)
                 command = xp.pad(command, ((0, added), (0, 0)))
                 order = np.append(order, np.arange(states, states + added))
                 scales = xp.append(scales, xp.ones(added))
                 signals = signals + vehicle_signals(self.loads)
             # The contact forces: (1 + m S S') r = -W - V x - m S (forces of the commands).
             shape, mass = contact.shape, contact.mass
-            force_input = set_at(xp.zeros((len(matrix), len(mass))), rates, shape.T)
-            contact_matrix = xp.eye(len(mass)) + mass * (shape @ shape.T)
-            solution = solve_small(contact_matrix[:, :, None], force_input.T[:, :, None])
-            force_input = solution[:, :, 0].T
+            wheels = mass.shape[-1]
+            force_input = xp.zeros((*times, matrix.shape[-1], wheels))
+            force_input = set_at(force_input, np.s_[..., rates, :], shape.mT)
+            contact_matrix = xp.eye(wheels) + mass[..., None, :] * (shape @ shape.mT)
+            systems = contact_matrix, force_input.mT  # of each time, which solve_small has last
+            flat = (part.reshape(math.prod(times), wheels, part.shape[-1]) for part in systems)
+            solution = xp.moveaxis(solve_small(*(xp.moveaxis(x, 0, -1) for x in flat)), -1, 0)
+            force_input = solution.reshape(*times, wheels, matrix.shape[-1]).mT
             matrix = matrix - force_input @ contact.force
-            command = command - force_input @ (mass[:, None] * (shape @ command[rates]))
-            inputs = xp.concatenate([command, -force_input], axis=1)
-            weights = tuple(Signal(f"load_{i}", "N") for i in range(len(mass)))
+            command = command - force_input @ (mass[..., None] * (shape @ command[rates]))
+            inputs = xp.concatenate([command, -force_input], axis=-1)
+            weights = tuple(Signal(f"load_{i}", "N") for i in range(wheels))
         C, D = sensor_rows(model, self.case, self.case.sensors).of_system(model, matrix, inputs)
         return StateSpace(
-            A=matrix[np.ix_(order, order)] * scales[:, None] / scales,
-            B=inputs[order] * scales[:, None],
-            C=C[:, order] / scales,
+            A=matrix[..., order[:, None], order] * scales[:, None] / scales,
+            B=inputs[..., order, :] * scales[:, None],
+            C=C[..., order] / scales,
             D=D,
             states=signals,
             inputs=_command_signals(self.case) + weights,

@@ -113,6 +113,15 @@ def solve_unpivoted(
     )
 
 
+def solve_each(
+    matrix: Float[Array, "row row batch"], right: Float[Array, "row column batch"]
+) -> Float[Array, "batch row column"]:
+    """`solve_unpivoted` of each system of a batch; the batch axis of the solutions is the first."""
+    if not any_jax(matrix, right):
+        return np.moveaxis(_solve(matrix, right), -1, 0)
+    return jax.vmap(solve_unpivoted, -1)(matrix, right)
+
+
 @jax.custom_batching.custom_vmap
 def _gauss_jordan(matrix, right):
     """Solve systems (row, column, *batch) by Gauss-Jordan elimination."""

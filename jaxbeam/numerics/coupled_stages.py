@@ -20,11 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbeam.numerics.batched_linalg import solve_unpivoted
+from jaxbeam.numerics.batched_linalg import solve_each, solve_unpivoted
 from jaxbeam.numerics.gauss import gauss_weights, lagrange_coefficients
 from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square
 from jaxbeam.numerics.stages import GAUSS_NODES, NODE_COUNT, Stage, command_cost_matrix
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, add_at, any_jax, index_in_dim, scan, xp
 
 TAYLOR_TERMS = 12  # of the series for the shortest intervals
 
@@ -67,7 +67,7 @@ def stage_responses(
     By Taylor series for the shortest interval, and doubling. Inputs are first the polynomials
     sum_p c_p s^p / p! of the fraction s of the interval, then those through values at the nodes.
     """
-    inputs = jnp.concatenate([plant.B, plant.E], axis=1)
+    inputs = xp.concatenate([plant.B, plant.E], axis=1)
     states, count = inputs.shape
     fractions = np.append(GAUSS_NODES, 1.0)
     shortest_length = length / 2**halvings
@@ -77,11 +77,11 @@ def stage_responses(
     state_at_nodes = (
         shortest_length * powers[:NODE_COUNT, :, None, None] * input_responses[:NODE_COUNT]
     )
-    state_at_nodes = jnp.concatenate(
+    state_at_nodes = xp.concatenate(
         [transition[:NODE_COUNT], _flatten_node_columns(state_at_nodes)], axis=2
     )
     quadrature = gauss_weights(NODE_COUNT)[:, None, None]
-    cost = jnp.tensordot(state_at_nodes.mT, quadrature * (Q @ state_at_nodes), ((0, 2), (0, 1)))
+    cost = xp.tensordot(state_at_nodes.mT, quadrature * (Q @ state_at_nodes), ((0, 2), (0, 1)))
 
     def double(carry, _):
         transition, input_responses, cost, length = carry
@@ -90,32 +90,32 @@ def stage_responses(
         return (*doubled, doubled_cost, 2 * length), carry
 
     start = (transition, input_responses, shortest_length * cost, shortest_length)
-    longest, shorter = jax.lax.scan(double, start, length=halvings)
+    longest, shorter = scan(double, start, length=halvings)
     transition, input_responses, cost, lengths = jax.tree.map(
-        lambda some, last: jnp.concatenate([some, last[None]])[::-1], shorter, longest
+        lambda some, last: xp.concatenate([some, last[None]])[::-1], shorter, longest
     )
     # From coefficients to values at the nodes, commands first.
     factorials = np.array([math.factorial(p) for p in range(NODE_COUNT)])
     lagrange = lagrange_coefficients(NODE_COUNT) * factorials  # node, power
     local = lagrange * powers[:, None]  # fraction, node, power: over each fraction of the interval
     node_input_response = (
-        jnp.einsum("cqp,lcpik->lciqk", local, input_responses) * lengths[:, None, None, None, None]
+        xp.einsum("cqp,lcpik->lciqk", local, input_responses) * lengths[:, None, None, None, None]
     )
-    state_response = jnp.concatenate(
+    state_response = xp.concatenate(
         [transition, _commands_before_forces(node_input_response, plant)], axis=3
     )
     cross_cost = cost[:, :states, states:].reshape(-1, states, NODE_COUNT, count)
-    cross_cost = _commands_before_forces(jnp.einsum("qp,lipk->liqk", lagrange, cross_cost), plant)
+    cross_cost = _commands_before_forces(xp.einsum("qp,lipk->liqk", lagrange, cross_cost), plant)
     input_cost = cost[:, states:, states:].reshape(-1, NODE_COUNT, count, NODE_COUNT, count)
-    input_cost = jnp.einsum("qp,lpkxj->lqkxj", lagrange, input_cost)
-    input_cost = _commands_before_forces(jnp.einsum("qx,lpkxj->lpkqj", lagrange, input_cost), plant)
-    input_cost = _commands_before_forces(jnp.moveaxis(input_cost, (1, 2), (-2, -1)), plant)
-    top = jnp.concatenate([cost[:, :states, :states], cross_cost], axis=2)
-    below = jnp.concatenate([cross_cost.mT, input_cost], axis=2)
+    input_cost = xp.einsum("qp,lpkxj->lqkxj", lagrange, input_cost)
+    input_cost = _commands_before_forces(xp.einsum("qx,lpkxj->lpkqj", lagrange, input_cost), plant)
+    input_cost = _commands_before_forces(xp.moveaxis(input_cost, (1, 2), (-2, -1)), plant)
+    top = xp.concatenate([cost[:, :states, :states], cross_cost], axis=2)
+    below = xp.concatenate([cross_cost.mT, input_cost], axis=2)
     return StageResponse(
         state_response[:, :NODE_COUNT].mT,
         state_response[:, -1],
-        jnp.concatenate([top, below], axis=1),
+        xp.concatenate([top, below], axis=1),
     )
 
 
@@ -132,31 +132,28 @@ def node_forces(
     interval_count, forces = coupling.force_state_rows.shape[0], coupling.force_state_rows.shape[2]
     size = NODE_COUNT * forces
     # Rows of V x + S u at the nodes, and of f itself. Intervals are the last axis: sums are short.
-    distribution = jnp.moveaxis(coupling.force_distribution, 0, -1)
-    contact_rows = jnp.einsum("cwi,scri->cwrs", response.state_at_nodes, coupling.force_state_rows)
+    distribution = xp.moveaxis(coupling.force_distribution, 0, -1)
+    contact_rows = xp.einsum("cwi,scri->cwrs", response.state_at_nodes, coupling.force_state_rows)
     # (node, input, force, interval)
-    direct = jnp.moveaxis(coupling.command_feedthrough, 0, -1).swapaxes(1, 2)
+    direct = xp.moveaxis(coupling.command_feedthrough, 0, -1).swapaxes(1, 2)
     direct_part = np.eye(NODE_COUNT)[:, :, None, None, None] * direct[:, None]
-    right = (
-        contact_rows[:, :free_columns]
-        .at[:, states:]
-        .add(direct_part.reshape(NODE_COUNT, -1, forces, interval_count))
-    )
+    direct_part = direct_part.reshape(NODE_COUNT, -1, forces, interval_count)
+    right = add_at(contact_rows[:, :free_columns], np.s_[:, states:], direct_part)
     right = right.swapaxes(1, 2).reshape(size, free_columns, interval_count)
     if explicit:
-        return jnp.moveaxis(right, -1, 0), distribution
+        return xp.moveaxis(right, -1, 0), distribution
     force_on_force = contact_rows[:, free_columns:].reshape(
         NODE_COUNT, NODE_COUNT, -1, forces, interval_count
     )
     force_on_force = _unrolled_sum(
         force_on_force[:, :, :, :, None] * distribution[:, :, None], 2
     ).swapaxes(1, 2)
-    force_feedthrough = np.eye(forces)[:, :, None] + jnp.moveaxis(coupling.force_feedthrough, 0, -1)
+    force_feedthrough = np.eye(forces)[:, :, None] + xp.moveaxis(coupling.force_feedthrough, 0, -1)
     force_system = (
         np.eye(NODE_COUNT)[:, None, :, None, None] * force_feedthrough[:, :, None] - force_on_force
     )
     system = force_system.reshape(size, size, interval_count)
-    return jax.vmap(solve_unpivoted, -1)(system, right), distribution
+    return solve_each(system, right), distribution
 
 
 def coupled_stages(
@@ -172,9 +169,9 @@ def coupled_stages(
     force, distribution = node_forces(plant, response, coupling)
     interval_count, size, _ = force.shape
     # Response of the end to the forces; their cost with x0 and u, and by themselves.
-    force_response = jnp.concatenate([response.state_at_end, response.cost])[:, free_columns:]
+    force_response = xp.concatenate([response.state_at_end, response.cost])[:, free_columns:]
     force_response = force_response.reshape(-1, NODE_COUNT, distribution.shape[1])
-    force_response = jnp.einsum("wqd,qdts->wqts", force_response, distribution).reshape(
+    force_response = xp.einsum("wqd,qdts->wqts", force_response, distribution).reshape(
         -1, size, interval_count
     )
     directed = force_response[states + free_columns :].reshape(NODE_COUNT, -1, size, interval_count)
@@ -182,7 +179,7 @@ def coupled_stages(
         size, size, interval_count
     )
     force_to_end, cross_cost, force_cost = (
-        jnp.moveaxis(part, -1, 0)
+        xp.moveaxis(part, -1, 0)
         for part in (
             force_response[:states],
             force_response[states : states + free_columns],
@@ -190,7 +187,7 @@ def coupled_stages(
         )
     )
     end = response.state_at_end[:, :free_columns] + force_to_end @ force
-    command_cost = jnp.pad(command_cost_matrix(R, length), (states, 0))
+    command_cost = xp.pad(command_cost_matrix(R, length), (states, 0))
     force_part = force.mT @ (cross_cost.mT + force_cost @ force / 2)
     cost = response.cost[:free_columns, :free_columns] + command_cost + force_part + force_part.mT
     return Stage(end[..., :states], end[..., states:], cost)
@@ -205,27 +202,27 @@ def stages_of_length(
     length: Float[Array, ""],
 ) -> Stage:
     """`coupled_stages` for intervals of one of the lengths of `responses`."""
-    response = jax.tree.map(
-        lambda part: jax.lax.dynamic_index_in_dim(part, length_index, 0, False), responses
-    )
+    response = jax.tree.map(lambda part: index_in_dim(part, length_index, 0, False), responses)
     return coupled_stages(plant, response, coupling, R, length)
 
 
 def explicit_force_law(coupling: Coupling) -> Float[Array, "interval node force state_and_input"]:
     """Rows of the explicit law f = (1 + D)^-1 (V x + S u)."""
-    law = jnp.eye(coupling.force_feedthrough.shape[-1]) + coupling.force_feedthrough
-    right_side = jnp.concatenate([coupling.force_state_rows, coupling.command_feedthrough], axis=3)
+    law = xp.eye(coupling.force_feedthrough.shape[-1]) + coupling.force_feedthrough
+    right_side = xp.concatenate([coupling.force_state_rows, coupling.command_feedthrough], axis=3)
     return jax.vmap(jax.vmap(solve_unpivoted))(law, right_side)
 
 
 def _unrolled_sum(terms, axis):
-    """Sum over a short axis, unrolled: shorter to run than a loop."""
+    """Sum over a short axis; where traced unrolled, which is shorter to run than a loop."""
+    if not any_jax(terms):
+        return np.sum(terms, axis=axis)
     return functools.reduce(operator.add, jnp.unstack(terms, axis=axis))
 
 
 def _flatten_node_columns(input_responses):
     """Responses (fraction, power, state, input) as columns (fraction, state, power and input)."""
-    ordered = jnp.moveaxis(input_responses, 1, 2)
+    ordered = xp.moveaxis(input_responses, 1, 2)
     return ordered.reshape(*ordered.shape[:2], -1)
 
 
@@ -234,28 +231,28 @@ def _commands_before_forces(columns, plant: ConstantPlant):
     inputs = plant.B.shape[1]
     commands, forces = columns[..., :inputs], columns[..., inputs:]
     shape = (*columns.shape[:-2], -1)
-    return jnp.concatenate([commands.reshape(shape), forces.reshape(shape)], axis=-1)
+    return xp.concatenate([commands.reshape(shape), forces.reshape(shape)], axis=-1)
 
 
 def _phi_functions(x, inputs, fractions):
     """exp(c x), and phi_1, ... of c x times the inputs, for fractions c of a small matrix x."""
     states = x.shape[0]
-    columns = jnp.concatenate([jnp.eye(states), inputs], axis=1)
+    columns = xp.concatenate([xp.eye(states), inputs], axis=1)
     rows = [columns]
     for _ in range(TAYLOR_TERMS - 1):
         rows.append(x @ rows[-1])
-    powers, terms = jnp.stack(rows), np.arange(TAYLOR_TERMS)
+    powers, terms = xp.stack(rows), np.arange(TAYLOR_TERMS)
     fraction_powers = fractions[:, None] ** terms
     orders = np.arange(NODE_COUNT + 1)[:, None] + terms
     weights = fraction_powers[:, None] / np.vectorize(math.factorial)(orders).astype(float)
-    transition = jnp.tensordot(weights[:, 0], powers[:, :, :states], axes=1)
-    return transition, jnp.tensordot(weights[:, 1:], powers[:, :, states:], axes=1)
+    transition = xp.tensordot(weights[:, 0], powers[:, :, :states], axes=1)
+    return transition, xp.tensordot(weights[:, 1:], powers[:, :, states:], axes=1)
 
 
 def _double_phi(transition, input_responses):
     """Exponentials and phi functions (fraction, phi, state, input) of the doubled argument."""
     halves = 0.5 ** np.arange(1, NODE_COUNT + 1)
-    doubled = transition[:, None] @ input_responses + jnp.einsum(
+    doubled = transition[:, None] @ input_responses + xp.einsum(
         "pq,cqik->cpik", _second_half_matrix().T, input_responses
     )
     return transition @ transition, doubled * halves[:, None, None]
@@ -268,16 +265,16 @@ def _double_cost(transition, input_responses, cost, count):
     first_half_inputs = _flatten_columns(input_responses * first[:, None, None])
     scale = np.append(np.ones(states), np.repeat(first, count))
     # (coefficient over the second, coefficient over both)
-    second_half_weights = jnp.asarray(_second_half_matrix() * first)
+    second_half_weights = _second_half_matrix() * first
 
     def to_second_half(columns):
         """Columns for coefficients over the second interval, as columns for those over both."""
         split = columns.reshape(-1, NODE_COUNT, count)
-        return jnp.einsum("ipk,pq->iqk", split, second_half_weights).reshape(columns.shape)
+        return xp.einsum("ipk,pq->iqk", split, second_half_weights).reshape(columns.shape)
 
     cross_cost, input_cost = cost[:states, states:], cost[states:, states:]
     cross_second_half = to_second_half(cross_cost)
-    cost_of_end_state = cost[:states, :states] @ jnp.concatenate(
+    cost_of_end_state = cost[:states, :states] @ xp.concatenate(
         [transition, first_half_inputs], axis=1
     )
     state_cost = transition.T @ cost_of_end_state[:, :states]
@@ -286,15 +283,15 @@ def _double_cost(transition, input_responses, cost, count):
     new_input_cost = (
         to_second_half(to_second_half(input_cost).T) + end_state_cost + end_state_cost.T
     )
-    top = jnp.concatenate([state_cost, new_cross_cost], axis=1)
-    return cost * scale * scale[:, None] + jnp.concatenate(
-        [top, jnp.concatenate([new_cross_cost.T, new_input_cost], axis=1)]
+    top = xp.concatenate([state_cost, new_cross_cost], axis=1)
+    return cost * scale * scale[:, None] + xp.concatenate(
+        [top, xp.concatenate([new_cross_cost.T, new_input_cost], axis=1)]
     )
 
 
 def _flatten_columns(input_responses):
     """Responses (power, state, input) as columns (state, power and input)."""
-    return jnp.moveaxis(input_responses, 0, 1).reshape(input_responses.shape[1], -1)
+    return xp.moveaxis(input_responses, 0, 1).reshape(input_responses.shape[1], -1)
 
 
 @functools.cache

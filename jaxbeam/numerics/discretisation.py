@@ -40,27 +40,27 @@ def c2d(
 
 
 def exponential_and_gramian(
-    matrix: Float[Array, "state state"], intensity: Float[Array, "state state"]
-) -> tuple[Float[Array, "state state"], Float[Array, "state state"]]:
+    matrix: Float[Array, "*batch state state"], intensity: Float[Array, "*batch state state"]
+) -> tuple[Float[Array, "*batch state state"], Float[Array, "*batch state state"]]:
     """exp(M) and the integral of exp(M s) N exp(M's) over s from 0 to 1; N is the intensity.
 
     By the series of a small fraction of M and doubling: unlike the blocks of one larger exponential
     (Van Loan 1978), this is accurate however fast the plant decays.
     """
     scaled_matrix, scaled_intensity = matrix / 2**DOUBLINGS, intensity / 2**DOUBLINGS
-    identity = xp.eye(matrix.shape[0])
+    identity = xp.broadcast_to(xp.eye(matrix.shape[-1]), matrix.shape)
 
     def horner(sums, k):
         exponential, integral = sums
         product = scaled_matrix @ integral
         return (
             identity + scaled_matrix @ exponential / k,
-            scaled_intensity + (product + product.T) / (k + 1),
+            scaled_intensity + (product + product.mT) / (k + 1),
         ), None
 
     def double(sums, _):
         exponential, integral = sums
-        return (exponential @ exponential, integral + exponential @ integral @ exponential.T), None
+        return (exponential @ exponential, integral + exponential @ integral @ exponential.mT), None
 
     sums, _ = scan(horner, (identity, scaled_intensity), np.arange(SERIES_TERMS, 0.0, -1.0))
     return scan(double, sums, length=DOUBLINGS)[0]

@@ -32,6 +32,20 @@ def piecewise_chebyshev(nodes, series, x, derivatives) -> Float[Array, "order *p
     return xp.moveaxis(values.reshape(*x.shape, len(derivatives), modes), -2, 0)
 
 
+def slope_jumps(nodes, series) -> Float[Array, "inner column"]:
+    """Jumps of the first derivative at the inner nodes, from left to right.
+
+    T_n' is n^2 at 1, and -(-1)^n n^2 at -1.
+    """
+    n = np.arange(series.shape[1])
+    half_length = xp.diff(nodes)[:, None] / 2
+    at_left, at_right = (
+        xp.einsum("d,sdm->sm", sign * n**2.0, series) / half_length
+        for sign in (-((-1.0) ** n), 1.0)
+    )
+    return at_left[1:] - at_right[:-1]
+
+
 @custom_jvp
 def _evaluate_series(series, local, segment):
     """Values of the series at local positions, -1 to 1, in their segments."""

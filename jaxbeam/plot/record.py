@@ -28,7 +28,7 @@ from jaxbeam.plot.style import (
     use_style,
 )
 from jaxbeam.plot.traffic.crossings import label_loads, shade_crossings
-from jaxbeam.plot.traffic.rows import draw_accelerations, draw_forces, has_bodies
+from jaxbeam.plot.traffic.rows import draw_accelerations, draw_forces, forces_vary, has_bodies
 from jaxbeam.simulation.record import Record
 
 
@@ -45,7 +45,8 @@ def plot_record(
 
     Each quantity has axes of its own. Dots mark peaks, shading the times with loads on the beam;
     vehicles have a row for the accelerations of their bodies (see `jaxbeam.plot.traffic.rows`),
-    controllers one for the commands. With a `quantity` of the sensors only its histories are drawn.
+    controllers one for the commands. There is no row for contact forces where all are constant.
+    With a `quantity` of the sensors only its histories are drawn.
 
     The whole takes the place of `ax`, histories are drawn on it. The title is that of the case if
     left out; `labels` name the sensors, in their order, in place of their names. Returns the
@@ -59,6 +60,7 @@ def plot_record(
     crossed = shows_traffic(case)
     quantities = list(dict.fromkeys(sensor.quantity for sensor in case.sensors))
     draw_quantity = functools.partial(_draw_quantity, names=names)
+    shows_forces = forces_vary(record) or not quantities
     panels = [
         (height, draw)
         for height, draw, shown in (
@@ -67,7 +69,7 @@ def plot_record(
                 (3.2 if i == 0 else 2.2, functools.partial(draw_quantity, quantity=name), True)
                 for i, name in enumerate(quantities)
             ),
-            (1.7, _with_crossings(draw_forces), case.loads),
+            (1.7, _with_crossings(draw_forces), case.loads and shows_forces),
             (1.5, _with_crossings(draw_accelerations), has_bodies(record)),
             (1.7, _draw_commands, case.controller is not None),
         )

@@ -17,12 +17,12 @@ import numpy as np
 
 from jaxbeam.runtime import lapack
 
-_KNOWN = (np.ndarray, np.generic, float, int, bool, str, type(None), type, slice)
+_KNOWN = {np.ndarray, np.float64, np.int64, np.bool_, float, int, bool, str, type(None), slice}
 
 
 def is_jax(value: Any) -> bool:
     """Whether a value, or any in a nested list or tuple, is an array of JAX."""
-    if isinstance(value, _KNOWN):
+    if type(value) in _KNOWN:
         return False
     if isinstance(value, list | tuple):
         return any(map(is_jax, value))
@@ -78,7 +78,10 @@ class _Namespace:
 
             @functools.wraps(known)
             def call(*args, **kwargs):
-                if any(map(is_jax, args)) or (kwargs and any(map(is_jax, kwargs.values()))):
+                for value in args:
+                    if type(value) not in _KNOWN and is_jax(value):
+                        return traced(*args, **kwargs)
+                if kwargs and any(map(is_jax, kwargs.values())):
                     return traced(*args, **kwargs)
                 return known(*args, **kwargs)
 
@@ -115,7 +118,11 @@ def add_at(array, index, value) -> Any:
     if is_jax(array) or is_jax(index) or is_jax(value):
         return jnp.asarray(array, jnp.result_type(array, value)).at[index].add(value)
     array = np.array(array, np.result_type(array, value))
-    np.add.at(array, index, value)
+    parts = index if isinstance(index, tuple) else (index,)
+    if all(isinstance(part, slice | int) or part is Ellipsis for part in parts):
+        array[index] += value  # none is repeated; ten times as fast
+    else:
+        np.add.at(array, index, value)
     return array
 
 
@@ -185,11 +192,14 @@ def map_elements(function: Callable, inputs) -> Any:
 
 def while_loop(condition: Callable, step: Callable, carry) -> Any:
     """`jax.lax.while_loop`."""
-    start = carry
-    while not any_jax(carry) and not is_jax(going_on := condition(carry)):
+    start, count = carry, 0
+    # Numbers that are known at the start and after one step stay known.
+    while count > 1 or not any_jax(carry):
+        if is_jax(going_on := condition(carry)):
+            break
         if not going_on:
             return carry
-        carry = step(carry)
+        carry, count = step(carry), count + 1
     return jax.lax.while_loop(condition, step, start)
 
 
@@ -227,25 +237,37 @@ def vmap(function: Callable, in_axes: Any = 0, out_axes: int = 0) -> Callable:
         if any_jax(args):
             return jax.vmap(function, in_axes, out_axes)(*args)
         axes = in_axes if isinstance(in_axes, tuple) else (in_axes,) * len(args)
-        pairs = [(arg, axis) for arg, axis in zip(args, axes, strict=True) if axis is not None]
-        sizes = [np.shape(leaf)[axis] for arg, axis in pairs for leaf in jax.tree.leaves(arg)]
-
-        if sizes[0] == 0:
+        pairs = zip(args, axes, strict=True)
+        leaves = [(leaf, axis) for arg, axis in pairs for leaf in jax.tree.leaves(arg)]
+        size = next(leaf.shape[axis] for leaf, axis in leaves if axis is not None)
+        if size == 0:
             shapes = jax.eval_shape(jax.vmap(function, in_axes, out_axes), *args)
             return jax.tree.map(lambda part: np.zeros(part.shape, part.dtype), shapes)
-
-        def element(arg, axis, i):
-            return jax.tree.map(lambda leaf: leaf if axis is None else np.take(leaf, i, axis), arg)
-
-        results: list[Any] = []
-        for i in range(sizes[0]):
-            pairs = zip(args, axes, strict=True)
-            results.append(function(*(element(arg, axis, i) for arg, axis in pairs)))
-            if any_jax(results[0]):  # from others than its arguments
+        structure, results = jax.tree.structure(args), []
+        for i in range(size):
+            element = structure.unflatten([_at(leaf, axis, i) for leaf, axis in leaves])
+            result, result_structure = jax.tree.flatten(function(*element))
+            if i == 0 and any(map(is_jax, result)):  # from others than its arguments
                 return jax.vmap(function, in_axes, out_axes)(*args)
-        return jax.tree.map(lambda *parts: np.stack(parts, out_axes), *results)
+            results.append(result)
+        parts = zip(*results, strict=True)
+        return result_structure.unflatten([_stack(part, out_axes) for part in parts])
 
     return mapped
+
+
+def _at(leaf, axis, i):
+    """Entry of a leaf at an index along an axis; all of one that has none."""
+    if axis is None:
+        return leaf
+    return leaf[..., i] if axis == -1 else np.take(leaf, i, axis)
+
+
+def _stack(parts, axis):
+    """`numpy.stack`, which for one part takes ten times as long as an index."""
+    if len(parts) == 1 and axis == -1:
+        return np.asarray(parts[0])[..., None]
+    return np.stack(parts, axis)
 
 
 def optimization_barrier(tree) -> Any:
@@ -270,9 +292,14 @@ def solve_triangular(matrix, right, lower: bool, transposed: bool = False) -> An
     """Solution of a triangular system, or of that with the transposed matrix."""
     if is_jax(matrix) or is_jax(right):
         return lapack.solve_triangular(matrix, right, lower, transposed)
-    import scipy.linalg  # 0.1 s, which compiled programs need not wait for
+    from scipy.linalg import lapack as scipy_lapack  # 0.1 s, which compiled programs do not wait
 
-    return scipy.linalg.solve_triangular(matrix, right, transposed, lower=lower, check_finite=False)
+    if not right.size:
+        return np.zeros_like(right)
+    # LAPACK itself: the function of scipy takes ten times as long as a small system. In the order
+    # of Fortran its matrix is the transposed one.
+    solution, singular = scipy_lapack.dtrtrs(matrix.T, right, not lower, not transposed)
+    return np.full_like(solution, np.nan) if singular else solution
 
 
 def solve_tridiagonal(lower, diagonal, upper, right) -> Any:
@@ -289,6 +316,11 @@ def cholesky(matrix) -> Any:
     """Lower triangular factor of a matrix; nan where it is not positive definite."""
     if is_jax(matrix):
         return lapack.cholesky(matrix)
+    if matrix.ndim == 2 and matrix.size:
+        from scipy.linalg import lapack as scipy_lapack
+
+        upper, failure = scipy_lapack.dpotrf(matrix.T, False, True)
+        return np.tril(np.full_like(matrix, np.nan)) if failure else upper.T
     try:
         return np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:

@@ -19,7 +19,8 @@ from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensing.sensor_signals import noise_samples, sensor_sections
 from jaxbeam.model.state_space import state_space
-from jaxbeam.runtime.arrays import Array, block_diag, set_at, xp
+from jaxbeam.runtime.arrays import Array, any_jax, block_diag, set_at, xp
+from jaxbeam.simulation.command_limits import command_ranges
 from jaxbeam.simulation.continuous_loop import ContinuousLoop
 from jaxbeam.simulation.sampled_loop import SampledLoop
 
@@ -82,6 +83,8 @@ def closed_loop(
         return ContinuousLoop(
             plant, law, model, output_rows, bound, not controller.open_loop, states
         )
+    if not any_jax(plant, law, schedule):
+        law = law.tabulated(schedule.times[schedule.control_sample >= 0])
     model, output_rows = with_sensor_filters(plant)
     sections = tuple(sensor_sections(sensor, controller.period) for sensor in case.sensors)
     noise = None
@@ -100,6 +103,7 @@ def closed_loop(
         loads=loads,
         schedule=schedule,
         filter_sections=sections,
+        ranges=command_ranges(case),
         noise=noise,
     )
 

@@ -5,8 +5,10 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.runtime.arrays import Array, stop_gradient, xp
 
+CommandRanges = tuple[Float[Array, " actuator"], ...]
 
-def command_ranges(case: Case) -> tuple[Float[Array, " actuator"], ...]:
+
+def command_ranges(case: Case) -> CommandRanges:
     """Lowest and highest command and rate limit (1/s) of each actuator; infinite without one."""
     limits = [actuator.command_limits() for actuator in case.actuators]
     rates = [actuator.command_rate_limit() for actuator in case.actuators]
@@ -19,18 +21,19 @@ def limit_commands(
     case: Case,
     commands: Float[Array, "actuator *batch"],
     previous: Float[Array, "actuator *batch"] | None = None,
+    ranges: CommandRanges | None = None,
 ) -> Float[Array, "actuator *batch"]:
     """Commands rounded to the resolution of the controller, then limited by each actuator.
 
-    Rate limits apply over a sampling period from the `previous` commands. Derivatives ignore the
-    rounding.
+    Rate limits apply over a sampling period from the `previous` commands. `ranges` are what
+    `command_ranges` returns, computed again if left out. Derivatives ignore the rounding.
     """
     controller = case.controller
     if controller.resolution is not None:
         rounded = controller.resolution * xp.round(commands / controller.resolution)
         commands = commands + stop_gradient(rounded - commands)
     low, high, rate = (
-        part.reshape(-1, *[1] * (commands.ndim - 1)) for part in command_ranges(case)
+        part.reshape(-1, *[1] * (commands.ndim - 1)) for part in ranges or command_ranges(case)
     )
     commands = xp.clip(commands, low, high)
     if previous is not None and any(a.command_rate_limit() is not None for a in case.actuators):

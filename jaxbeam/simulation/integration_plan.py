@@ -17,14 +17,14 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule
-from jaxbeam.integrator.integrate import (
-    integrate_at_events,
-)
+from jaxbeam.integrator.input_policy import AbstractInputPolicy
+from jaxbeam.integrator.integrate import integrate_at_events
 from jaxbeam.integrator.static_shapes import StaticShapes, static_shapes
 from jaxbeam.integrator.step_size import (
     MAX_DIVERGED_HALVINGS,
     MAX_STEPS,
     NO_STEP,
+    StepTrial,
     check_step_count,
     choose_step_size,
     largest_change,
@@ -38,9 +38,11 @@ from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
+from jaxbeam.simulation.errors import step_errors
 
 TOLERANCE = 1e-7  # relative to the largest deflection
 MAX_STEPS_PER_SAMPLE = 10**5  # time steps between samples of a controlled run
+MAX_KNOWN_EVENTS = 20000  # of a run without compilation, which would take less time beyond
 SPACING_TOLERANCE = 1e-6  # largest deviation of equally spaced samples, relative to the spacing
 
 
@@ -49,10 +51,11 @@ class IntegrationPlan(eqx.Module):
 
     Valid for cases that differ in numbers only, if these keep the order of supports and loads and
     change frequencies little. `substeps` is the number of steps from sample to sample (with a
-    controller from event to event), `error` relative to the largest deflection. `lead_samples` are
-    added before the first sample, back to the start of the run. The run ends with the last sample,
-    or `to_duration` at the duration of the case. With a controller the `schedule` holds its events,
-    the samples and the end.
+    controller from event to event), `error` relative to the largest deflection, `sensor_errors`
+    to the largest value of what each sensor measures (empty where they are not known).
+    `lead_samples` are added before the first sample, back to the start of the run. The run ends
+    with the last sample, or `to_duration` at the duration of the case. With a controller the
+    `schedule` holds its events, the samples and the end.
     """
 
     shapes: StaticShapes = eqx.field(static=True)
@@ -62,16 +65,25 @@ class IntegrationPlan(eqx.Module):
     error: float = eqx.field(static=True)
     schedule: EventSchedule | None = None
     to_duration: bool = eqx.field(static=True, default=False)
+    sensor_errors: tuple[float, ...] = eqx.field(static=True, default=())
+
+
+# A run by a plan under an input policy: its states at all events, as `beam_and_vehicles`.
+FirstRun = Callable[[IntegrationPlan, AbstractInputPolicy], np.ndarray]
 
 
 def integration_plan(
-    case: Case, times: Float[Array, " time"] | None = None, tolerance: float = TOLERANCE
+    case: Case,
+    times: Float[Array, " time"] | None = None,
+    tolerance: float = TOLERANCE,
+    first_run: FirstRun | None = None,
 ) -> IntegrationPlan:
     """Integration plan of a case with concrete numbers, for samples at `times` (s).
 
     Default times are those of the run, which ends at its duration. `tolerance` is relative to the
-    largest deflection. Raises ValueError for an invalid case, RuntimeError if no time step meets
-    the tolerance.
+    largest deflection. A `first_run` with the longest steps may take the place of the first trial
+    run of a controlled case that is not compiled. Raises ValueError for an invalid case,
+    RuntimeError if no time step meets the tolerance.
     """
     check_case(case)
     case = concrete_case(case)
@@ -81,9 +93,19 @@ def integration_plan(
     if case.controller is not None:
         end = float(case.run.duration) if to_duration else None
         schedule = loop_schedule(case, samples, end)
-        substeps, error = _choose_substeps(case, shapes, schedule, tolerance)
-        return IntegrationPlan(shapes, substeps, 0, False, error, schedule, to_duration)
-    step, error = choose_step_size(case, shapes, tolerance)
+
+        def plan(substeps, error, errors=()):
+            parts = shapes, substeps, 0, False, error, schedule, to_duration, errors
+            return IntegrationPlan(*parts)
+
+        def run_first(substeps, policy):
+            assert first_run is not None
+            return first_run(plan(substeps, 0.0), policy)
+
+        by_first_run = None if first_run is None else run_first
+        substeps, error, trial = _choose_substeps(case, shapes, schedule, tolerance, by_first_run)
+        return plan(substeps, error, _sensor_errors(case, shapes, trial))
+    step, error, trial = choose_step_size(case, shapes, tolerance)
     intervals = np.diff(samples)
     equally_spaced = bool(
         np.all(np.abs(intervals - intervals.mean()) < SPACING_TOLERANCE * intervals.mean())
@@ -92,7 +114,13 @@ def integration_plan(
     check_step_count(samples.size * (intervals.max() / step), step)
     substeps = steps_per_interval(intervals.max(), step)
     return IntegrationPlan(
-        shapes, substeps, lead_samples, equally_spaced, error, to_duration=to_duration
+        shapes,
+        substeps,
+        lead_samples,
+        equally_spaced,
+        error,
+        to_duration=to_duration,
+        sensor_errors=_sensor_errors(case, shapes, trial),
     )
 
 
@@ -124,6 +152,7 @@ def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> Integr
         lead_samples=max(plan.lead_samples for plan in plans),
         equally_spaced=all(plan.equally_spaced for plan in plans),
         error=max(plan.error for plan in plans),
+        sensor_errors=tuple(map(max, zip(*(plan.sensor_errors for plan in plans), strict=True))),
     )
 
 
@@ -143,8 +172,17 @@ def sample_times(case: Case) -> Float[Array, " time"]:
     return xp.arange(intervals + 1) / rate if intervals else xp.array([0.0, duration])
 
 
-def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, tolerance: float):
-    """Number of steps between events of a schedule, and the relative error of the deflection."""
+def _choose_substeps(
+    case: Case,
+    shapes: StaticShapes,
+    schedule: EventSchedule,
+    tolerance: float,
+    first_run: Callable[[int, AbstractInputPolicy], np.ndarray] | None,
+) -> tuple[int, float, StepTrial | None]:
+    """Number of steps between events of a schedule, relative error of the deflection, and trial.
+
+    A `first_run` takes the smallest number of steps. There is no trial of a run that diverges.
+    """
     step, interval = longest_trial_step(case, shapes), float(schedule.lengths.max())
     if interval / step > MAX_STEPS_PER_SAMPLE:
         raise RuntimeError(
@@ -155,34 +193,76 @@ def _choose_substeps(case: Case, shapes: StaticShapes, schedule: EventSchedule, 
     check_step_count(schedule.times.size * interval / step, step)
     min_substeps = steps_per_interval(interval, step)
 
-    trial_run = _compiled_trial_run if case.controller.runs_compiled else _known_trial_run
+    is_compiled = runs_compiled(case, schedule)
+    trial_run = _compiled_trial_run if is_compiled else _known_trial_run
+    policy = None if is_compiled else _known_loop(case, shapes, schedule)
+
+    model = modal_model(case, shapes.layout, shapes.coupled)
 
     @functools.cache
+    def states(halvings):
+        if halvings == 0 and first_run is not None and policy is not None:
+            return first_run(min_substeps, policy)
+        substeps = xp.asarray(min_substeps * 2**halvings)
+        return np.asarray(trial_run(case, shapes, schedule, substeps, policy))
+
     def response(halvings):
-        return np.asarray(trial_run(case, shapes, schedule, xp.asarray(min_substeps * 2**halvings)))
+        return np.asarray(trial_deflections(case, model, states(halvings)))
 
     # A loop that diverges does so with any step, so its error is not defined. A stiff law in
     # continuous time may also overflow because the steps are too long.
     confirming_halvings = 6 if case.controller.period is None else 1
     if np.isnan(response(1)).any() and np.isnan(response(confirming_halvings)).any():
-        return 2 * min_substeps, np.nan
-    least = rounding_deflection(case, modal_model(case, shapes.layout, shapes.coupled))
+        return 2 * min_substeps, np.nan, None
+    least = rounding_deflection(case, model)
     halvings, error = _halve_until_converged(response, tolerance, 8, least)
-    return min_substeps * 2**halvings, error
+    own = slice(None, -1)  # no step starts at the last event
+    trial = StepTrial(schedule.times[own], states(halvings)[own], states(halvings + 1)[own])
+    return min_substeps * 2**halvings, error, trial
 
 
-def _closed_loop_trial_run(case, shapes, schedule, substeps):
-    """Deflections (m) at TRIAL_POSITIONS and all events, as (event and position, batch).
+def _sensor_errors(case: Case, shapes: StaticShapes, trial: StepTrial | None) -> tuple[float, ...]:
+    """Errors of the steps of a trial at each sensor (see `step_errors`), NaN without one."""
+    if trial is None:
+        return (np.nan,) * len(case.sensors)
+    model = modal_model(case, shapes.layout, shapes.coupled)
+    return tuple(map(float, step_errors(case, model, trial)))
 
-    Peaks would hide errors: where a command saturates, the deflection has its error everywhere but
-    at a peak, where it is stationary.
+
+def runs_compiled(case: Case, schedule: EventSchedule) -> bool:
+    """Whether runs of a controlled case are compiled although its numbers are known.
+
+    In NumPy each event takes a fraction of a millisecond, in a program a hundredth of that.
+    """
+    return case.controller.runs_compiled or schedule.times.shape[0] > MAX_KNOWN_EVENTS
+
+
+@compiled_if_traced
+def _known_loop(case, shapes, schedule):
+    """Input policy of all trial runs."""
+    return closed_loop(case, shapes.layout, load_set(case, shapes.layout), schedule)
+
+
+def beam_and_vehicles(
+    case: Case, shapes: StaticShapes, policy: AbstractInputPolicy, states
+) -> Float[Array, "event state batch"]:
+    """The states of a controlled run without those of filters and of the controller."""
+    own = modal_model(case, shapes.layout, shapes.coupled).state_count
+    return xp.concatenate([states[:, :own], states[:, policy.model.state_count :]], axis=1)
+
+
+def _closed_loop_trial_run(case, shapes, schedule, substeps, policy):
+    """States at all events, of the beam's modal model and then of vehicles: (event, state, batch).
+
+    The input `policy` is that of the case if it is None. Peaks would hide errors: where a command
+    saturates, the deflection has its error everywhere but at a peak, where it is stationary.
     """
     loads = load_set(case, shapes.layout)
-    policy = closed_loop(case, shapes.layout, loads, schedule)
+    policy = policy or closed_loop(case, shapes.layout, loads, schedule)
     grid = grid_by_schedule(case, policy.model, schedule, substeps)
     discrete = discrete_model(policy.model, grid, None, policy)
     states = integrate_at_events(discrete, loads, max_loads=shapes.max_loads, policy=policy)
-    return trial_deflections(case, policy.model, states)
+    return beam_and_vehicles(case, shapes, policy, states[: schedule.times.shape[0]])
 
 
 _known_trial_run = compiled_if_traced(_closed_loop_trial_run)

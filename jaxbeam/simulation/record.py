@@ -17,10 +17,10 @@ from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readin
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation import section_forces
+from jaxbeam.simulation.errors import chosen_samples, truncation_errors
 from jaxbeam.simulation.extremes import Extremes
 from jaxbeam.simulation.labels import contact_sentence
 from jaxbeam.simulation.record_envelope import RecordEnvelope, record_envelope
-from jaxbeam.simulation.truncation import MAX_SAMPLES, truncation_errors
 from jaxbeam.simulation.views.record_views import RecordViews
 
 if TYPE_CHECKING:
@@ -40,8 +40,22 @@ class Record(RecordViews):
     model allows; NaN without one. `command` is that of the actuators, within their limits; at a
     change, the one just after. `failures` counts the steps of the controller so far without a
     solution of its optimisation. If the closed loop diverges the samples are NaN from then on, and
-    so are the peaks. `error_estimate` is relative to the largest deflection. `controller_readings`
+    so are the peaks. `error_estimate` of the time steps is relative to the largest deflection,
+    `step_errors` to the largest value of what each sensor measures. `controller_readings`
     are the readings that a sampled controller has received, None without one.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02),
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=1.0)],
+    ...     run=jb.Run(0.6, sample_rate=100.0),
+    ... )
+    >>> record = jb.simulate(case)
+    >>> print(record.times.size, record.deflection.shape)
+    61 (61, 1)
+    >>> print(record.verdict.split(";")[0])
+    every load presses on the beam throughout
     """
 
     case: Case
@@ -67,6 +81,7 @@ class Record(RecordViews):
     body_velocity: Float[Array, "time body"]
     body_acceleration: Float[Array, "time body"]
     error_estimate: Float[Array, ""]
+    step_errors: Float[Array, " sensor"]
     steps: int = eqx.field(static=True)
     controller_readings: Float[Array, "time sensor"] | None = None
 
@@ -172,11 +187,11 @@ class Record(RecordViews):
     def truncation_errors(self) -> Float[Array, " sensor"]:
         """What the modes left out change, relative to the largest value at each sensor, about.
 
-        See `jaxbeam.simulation.truncation`: of deflections the static correction, of others the
-        dynamic part of the three highest modes, from up to 400 samples. `error_estimate` is that of
-        the time steps. NaN where it is not known.
+        See `jaxbeam.simulation.errors`: of deflections the static correction, of others the
+        dynamic part of the three highest modes, from up to 400 samples. `step_errors` are
+        those of the time steps. NaN where it is not known.
         """
-        chosen = np.unique(np.linspace(0, self.times.shape[0] - 1, MAX_SAMPLES).astype(int))
+        chosen = chosen_samples(self.times.shape[0])
         motion = Motion(*(part[chosen] for part in self.motion))
         return truncation_errors(self.case, self.modes, motion)
 

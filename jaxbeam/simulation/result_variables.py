@@ -23,6 +23,7 @@ VARIABLES = {
     "largest_time": (("sensor",), "s", "time of the largest value"),
     "peak_deflection": (("sensor",), "m", "largest absolute deflection at the sensor"),
     "peak_time": (("sensor",), "s", "time of the largest absolute deflection at the sensor"),
+    "step_errors": (("sensor",), "1", "estimated error of the time steps, of the largest value"),
     "lowest_contact_force": (("load",), "N", "smallest contact force"),
     "contact_lost_time": (("load",), "s", "time of the first negative contact force"),
     "contact_lost_position": (("load",), "m", "position of the first negative contact force"),

@@ -21,7 +21,7 @@ from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.model.sensing.sensor_signals import filtered_reading, initial_filter_state
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, cond, is_jax, take, vmap, xp
-from jaxbeam.simulation.command_limits import limit_commands
+from jaxbeam.simulation.command_limits import CommandRanges, limit_commands
 
 
 class LoopMemory(NamedTuple):
@@ -45,7 +45,7 @@ class SampledLoop(AbstractInputPolicy):
 
     The model includes the analogue filters of the sensors; `filter_sections` are those of the
     digital ones. `measured_rows` are those of the quantities, of which accelerations follow from
-    the forces too; None without accelerations.
+    the forces too; None without accelerations. `ranges` are those of the commands.
     """
 
     plant: Plant
@@ -57,6 +57,7 @@ class SampledLoop(AbstractInputPolicy):
     loads: LoadSet
     schedule: EventSchedule
     filter_sections: tuple
+    ranges: CommandRanges
     noise: Float[Array, "sample sensor"] | None
     implicit: bool = eqx.field(static=True, default=False)
     holds_commands: ClassVar[bool] = True
@@ -108,7 +109,7 @@ class SampledLoop(AbstractInputPolicy):
             command, law_state, solved = self._step_law(
                 law_state, available, state, memory.command, info.start
             )
-            command = limit_commands(self.plant.case, command, queue[0])
+            command = limit_commands(self.plant.case, command, queue[0], self.ranges)
             queue = xp.concatenate([command[None], queue[:-1]])
             return law_state, queue, failures + ~solved
 

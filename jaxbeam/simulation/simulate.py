@@ -3,7 +3,7 @@
 import dataclasses
 import warnings
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -17,8 +17,7 @@ from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.propagators import NODE_COUNT, end_weights
 from jaxbeam.integrator.running_peaks import Peaks
-from jaxbeam.integrator.time_grid import grid_by_schedule
-from jaxbeam.model.contact import contact_at, split_states
+from jaxbeam.integrator.time_grid import TimeGrid, grid_by_schedule
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
@@ -26,17 +25,21 @@ from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.sensing.output_rows import sensor_history, sensor_rows
 from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readings
 from jaxbeam.model.static_correction import Motion
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, any_jax, put, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop
 from jaxbeam.simulation.command_limits import command_ranges
 from jaxbeam.simulation.extremes import monitored_sensors, sensor_extremes
 from jaxbeam.simulation.integration_plan import (
     TOLERANCE,
+    FirstRun,
     IntegrationPlan,
+    beam_and_vehicles,
     integration_plan,
+    runs_compiled,
     sample_times,
 )
+from jaxbeam.simulation.motion.at_samples import motion_at
 from jaxbeam.simulation.record import Record
 
 
@@ -74,15 +77,21 @@ def simulate(
     """
     if times is not None:
         _check_times(times)
+    first_records: dict[int, Record] = {}
     if plan is None:
-        plan = integration_plan(case, times, tolerance)
+        plan = integration_plan(case, times, tolerance, _first_run(case, times, first_records))
     times = sample_times(case) if times is None else xp.asarray(times, float)
-    # Plans that differ in their error only share compiled programs.
-    is_compiled = case.controller is not None and case.controller.runs_compiled
-    simulate_record = _simulate_compiled if is_compiled else _simulate
-    record = simulate_record(
-        case, dataclasses.replace(plan, error=0.0), times, xp.asarray(plan.error)
-    )
+    sensor_errors = plan.sensor_errors or (np.nan,) * len(case.sensors)
+    errors = xp.asarray(plan.error), xp.asarray(sensor_errors, float)
+    record = first_records.get(plan.substeps)
+    if record is not None:
+        record = dataclasses.replace(record, error_estimate=errors[0], step_errors=errors[1])
+    else:
+        # Plans that differ in their errors only share compiled programs.
+        is_compiled = plan.schedule is not None and runs_compiled(case, plan.schedule)
+        simulate_record = _simulate_compiled if is_compiled else _simulate
+        without_errors = dataclasses.replace(plan, error=0.0, sensor_errors=())
+        record = simulate_record(case, without_errors, times, errors)
     if is_concrete(record.contact_lost_time):
         lost = np.isfinite(concrete(record.contact_lost_time)) & ~load_set(case).prescribed
         if lost.any() and np.isnan(concrete(record.diverged_time)):
@@ -102,17 +111,55 @@ def _check_times(times) -> None:
         raise ValueError("times (s from the start of the run) must be finite and ascend")
 
 
-def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
+def _first_run(case: Case, times, records: dict[int, Record]) -> FirstRun | None:
+    """Run that puts its record among the `records`, by its steps between events; None if traced.
+
+    So the last trial run is that of the result, wherever the longest steps suffice.
+    """
+    if any_jax(case, times):
+        return None
+
+    def run(plan, policy):
+        samples = sample_times(case) if times is None else xp.asarray(times, float)
+        record, states = _simulate_first(case, plan, samples, policy)
+        records[plan.substeps] = record
+        return states
+
+    return run
+
+
+@compiled_if_traced
+def _simulate_first(case: Case, plan: IntegrationPlan, times, policy):
+    """Record of a run without its errors, and its states at all events."""
     monitored = monitored_sensors(case.sensors)
-    running_peaks, outputs, modal, steps = _integrate(case, plan, times, monitored)
-    peaks = Peaks(*(part[0] for part in running_peaks.peaks()))
+    integration = _integrate(case, plan, times, monitored, policy=policy)
+    event = integration.grid.event_at(np.arange(integration.steps))
+    states = integration.states[:-1]
+    at_events = put(
+        xp.zeros((plan.schedule.times.shape[0], *states.shape[1:])),
+        xp.where(event < 0, plan.schedule.times.shape[0], event),
+        states,
+    )
+    no_errors = xp.zeros(()), xp.zeros(len(case.sensors))
+    record = _record(case, integration, times, no_errors)
+    return record, beam_and_vehicles(case, plan.shapes, policy, at_events)
+
+
+def _simulate_record(case: Case, plan: IntegrationPlan, times, errors) -> Record:
+    monitored = monitored_sensors(case.sensors)
+    return _record(case, _integrate(case, plan, times, monitored), times, errors)
+
+
+def _record(case: Case, integration: "_Integration", times, errors) -> Record:
+    outputs = integration.outputs
+    peaks = Peaks(*(part[0] for part in integration.running_peaks.peaks()))
     extremes, peaks = sensor_extremes(case.sensors, peaks)
     loads, lost_times = load_set(case), peaks.contact_lost_time
     # Each wheel at its own time.
     lost_positions = xp.diagonal(loads.kinematics(lost_times)[0])
     return Record(
         case=case,
-        modes=modal,
+        modes=integration.model.modes,
         times=times,
         **outputs.motion._asdict(),
         **outputs.vehicles._asdict(),
@@ -121,8 +168,9 @@ def _simulate_record(case: Case, plan: IntegrationPlan, times, error) -> Record:
         **peaks._asdict(),
         **extremes._asdict(),
         contact_lost_position=lost_positions,
-        error_estimate=error,
-        steps=steps,
+        error_estimate=errors[0],
+        step_errors=errors[1],
+        steps=integration.steps,
     )
 
 
@@ -139,10 +187,11 @@ def simulate_readings(
     is unknown. For fits: less to compile and differentiate than `simulate`, without its checks and
     warnings.
     """
-    _, outputs, modal, _ = _integrate(case, plan, times, None, noisy=False)
+    integration = _integrate(case, plan, times, None, noisy=False)
+    outputs = integration.outputs
     readings = outputs.readings
     if readings is None:
-        readings = sensor_readings(case, modal, outputs.motion, times)
+        readings = sensor_readings(case, integration.model.modes, outputs.motion, times)
     if not case.vehicle_sensors:
         return readings
     return xp.concatenate([readings, vehicle_readings(case, outputs.vehicles, times)], axis=1)
@@ -172,8 +221,8 @@ def simulate_histories(
 
     See `simulate_readings`.
     """
-    _, outputs, modal, _ = _integrate(case, plan, times, None)
-    motion = outputs.motion
+    integration = _integrate(case, plan, times, None)
+    motion, modal = integration.outputs.motion, integration.model.modes
     deflection = motion.coordinates @ modal.shapes(positions).T
     on_beam = xp.isfinite(motion.load_position)
     contact_force = xp.where(on_beam, motion.contact_force, 0.0)
@@ -205,10 +254,12 @@ def integration_setup(
     times,
     monitored: Sequence[Sensor] | None,
     noisy: bool = True,
+    policy: AbstractInputPolicy | None = None,
 ) -> IntegrationSetup:
     """Setup of a planned integration; without noise unless `noisy`.
 
-    Its peaks are those of what the `monitored` sensors measure, upwards, then downwards.
+    The input `policy` is that of the case if left out. Peaks are those of what the `monitored`
+    sensors measure, upwards, then downwards.
     """
     layout = plan.shapes.layout
     loads = load_set(case, layout)
@@ -225,7 +276,7 @@ def integration_setup(
         )
     else:
         schedule = plan.schedule
-        policy = closed_loop(case, layout, loads, schedule, noisy)
+        policy = policy or closed_loop(case, layout, loads, schedule, noisy)
         model = policy.model
     places = None if monitored is None else corrected_places(case, model, monitored)
     grid = grid_by_schedule(case, model, schedule, plan.substeps, places)
@@ -242,16 +293,27 @@ def integration_setup(
     )
 
 
-def _integrate(case: Case, plan: IntegrationPlan, times, monitored, noisy=True):
-    """Running peaks, outputs at the sample times, modes, and the number of steps."""
+class _Integration(NamedTuple):
+    """Running peaks, outputs at the sample times, model, grid, states (boundary, state, batch)."""
+
+    running_peaks: Any
+    outputs: "Outputs"
+    model: ModalModel
+    grid: TimeGrid
+    states: Array
+    steps: int
+
+
+def _integrate(case: Case, plan: IntegrationPlan, times, monitored, noisy=True, policy=None):
+    """An integration as planned, under the input policy of the case unless one is given."""
     discrete, loads, policy, sample_steps, steps = integration_setup(
-        case, plan, times, monitored, noisy
+        case, plan, times, monitored, noisy, policy
     )
     model = discrete.model
-    running_peaks, states, commands, observed, _ = integrate_history(
+    running_peaks, all_states, commands, observed, _ = integrate_history(
         discrete, loads, max_loads=plan.shapes.max_loads, steps=steps, policy=policy
     )
-    states = states[sample_steps]
+    states = all_states[sample_steps]
     observed, failures = (
         (None, None) if observed is None else (part[sample_steps, ..., 0] for part in observed)
     )
@@ -262,8 +324,9 @@ def _integrate(case: Case, plan: IntegrationPlan, times, monitored, noisy=True):
             if policy.implicit
             else _commands_at_steps(case, commands, sample_steps)
         )
-    motion, vehicles = _motion(case, model, loads, times, states, commands)
-    return running_peaks, Outputs(motion, vehicles, observed, failures), model.modes, steps
+    motion, vehicles = motion_at(case, model, loads, times, states, commands)
+    outputs = Outputs(motion, vehicles, observed, failures)
+    return _Integration(running_peaks, outputs, model, discrete.grid, all_states, steps)
 
 
 def _commands_at_steps(case: Case, commands, steps):
@@ -274,20 +337,6 @@ def _commands_at_steps(case: Case, commands, steps):
     return xp.clip(commands_at_start, low, high)
 
 
-def _vehicle_motion(model: ModalModel, loads: LoadSet, states, accelerations) -> VehicleMotion:
-    """Motion of the bodies at instants, from the states and the accelerations at contact."""
-    _, vehicle_states = split_states(model.state_count, loads, states)
-    none = xp.zeros((states.shape[0], 0))
-    parts = []
-    for state, acceleration in zip(vehicle_states, accelerations, strict=True):
-        dofs = acceleration.shape[-2]
-        motion = state[..., :dofs, 0], state[..., dofs:, 0], acceleration[..., 0]
-        parts.append([part.reshape(part.shape[0], -1) for part in motion])
-    if not parts:
-        return VehicleMotion(none, none, none)
-    return VehicleMotion(*(xp.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
-
-
 class Outputs(NamedTuple):
     """Motion of beam and vehicles at the samples; readings and failures of a controller, if any."""
 
@@ -295,19 +344,3 @@ class Outputs(NamedTuple):
     vehicles: VehicleMotion
     readings: Float[Array, "time sensor"] | None
     failures: Float[Array, " time"] | None
-
-
-def _motion(case: Case, model: ModalModel, loads: LoadSet, times, states, commands):
-    """Motion of the modes with the forces on the beam, and motion of the vehicles."""
-    columns = None if commands is None else commands[..., None]
-    contact = contact_at(model, loads, times, states, columns)
-    vehicles = _vehicle_motion(model, loads, states, contact.vehicle_acceleration)
-    force, accelerations = contact.force[..., 0], contact.modal_acceleration[..., 0]
-    count = 2 * accelerations.shape[1]
-    coordinates = states[:, 0:count:2, 0], states[:, 1:count:2, 0], accelerations
-    if model.mode_map is not None:
-        coordinates = tuple(part @ model.mode_map.T for part in coordinates)
-    position = xp.where(loads.on_beam(times).T, loads.kinematics(times)[0].T, xp.nan)
-    actuators = len(case.actuators)
-    command = xp.zeros((times.shape[0], actuators)) if commands is None else commands[:, :actuators]
-    return Motion(*coordinates, position, -force, command), vehicles

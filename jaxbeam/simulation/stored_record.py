@@ -48,6 +48,8 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
         if 0 in shape and name not in dataset.variables
     }
     dataset = _with_extremes(dataset.assign(empty), case)
+    if "step_errors" not in dataset.variables:  # of release 0.1.0
+        dataset = dataset.assign(step_errors=("sensor", np.full(len(case.sensors), np.nan)))
     mode_variables = {name: f"mode_{name}" for name in MODE_VARIABLES}
     required = (*_STORED_VARIABLES, *mode_variables.values(), "time")
     missing = [name for name in required if name not in dataset.variables]

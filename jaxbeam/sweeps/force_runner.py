@@ -1,5 +1,7 @@
 """Runner of a sweep of trains of forces, whose peaks are known in closed form."""
 
+import functools
+import json
 import os
 import re
 from concurrent.futures import ThreadPoolExecutor
@@ -7,9 +9,17 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.case import Case, concrete_case, replace
-from jaxbeam.integrator.forces.peaks import constant_speeds, peaks_of_forces
-from jaxbeam.integrator.forces.system import ForceSystem, force_system
+from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
+from jaxbeam.integrator.forces.paths import constant_speeds, force_paths
+from jaxbeam.integrator.forces.peaks import peaks_of_forces
+from jaxbeam.integrator.forces.system import (
+    ForceResponses,
+    ForceSystem,
+    force_responses,
+    force_system,
+)
+from jaxbeam.integrator.running_peaks import Peaks
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
@@ -18,64 +28,61 @@ from jaxbeam.model.sensing.linear_outputs import linear_outputs
 from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.static_correction import is_supported
 from jaxbeam.sweeps.batches import Batches
-from jaxbeam.sweeps.step_size import REFINEMENT, SAFETY_FACTOR, relative_changes, stratified_sample
+from jaxbeam.sweeps.step_size import REFINEMENT, relative_changes, stratified_sample
 
 MIN_WHEELS = 8  # of a row; below, integration in batches takes less time
-LEAST_TOLERANCE = 1e-8  # that tables of the response to a force meet
+LEAST_TOLERANCE = 1e-8  # above the error of the eigenvectors
 # Numbers on which the model does not depend, and with which forces keep constant speeds.
 ADDRESS = re.compile(r"loads\.(\d+|\*)\.(speed|entry_time|start_position|spacing)|run\.duration")
+OF_BEAM = "beam", "supports", "actuators", "sensors"  # the keys on which the model depends
 BLOCK_RUNS = 32
 TRIAL_RUNS = 4  # in which the error of the peaks is measured
-# Through eight samples a polynomial follows a turn by phi rad to (phi / 2)^8 / (8! 2^7).
-SAMPLE_ORDER, SAMPLE_DIVISOR = 8, 40320 * 2**7
-LEAST_PHASE, LARGEST_PHASE = 0.5, 3.5  # rad in a step
+PHASE = 1.6  # rad of the fastest pole in a step of the search
 
 
 class ForceRunner:
     """Runner of batches of one run each (see `blocks.Runner`)."""
 
-    def __init__(self, case: Case, batches: Batches, tolerance: float, system: ForceSystem):
-        self.case, self.batches, self.tolerance, self.system = case, batches, tolerance, system
+    def __init__(self, case: Case, batches: Batches, system: str):
+        self.case, self.batches, self.system = case, batches, system
         self.pool = ThreadPoolExecutor(os.cpu_count())
         self.block_count = -(-len(batches.run_index) // BLOCK_RUNS)
 
     def choose_step_sizes(self) -> tuple[Float[np.ndarray, " path"], float]:
         """Phases (rad) of the fastest pole in a step, and the relative error of peaks with them."""
-        allowed = self.tolerance / SAFETY_FACTOR
-        phase = 2 * (SAMPLE_DIVISOR * allowed) ** (1 / SAMPLE_ORDER)
         count = len(self.batches.run_index)
-        phase = float(np.clip(phase, LEAST_PHASE, LARGEST_PHASE))
-        sample = stratified_sample(np.arange(1.0, count + 1), min(TRIAL_RUNS, count)).tolist()
-
-        def peaks(phase):
-            return np.stack([self._peaks(run, phase).peak_deflection for run in sample])
-
-        coarse, fine = peaks(phase), peaks(phase / REFINEMENT)
+        sample = stratified_sample(np.arange(1.0, count + 1), min(TRIAL_RUNS, count))
+        coarse, fine = (
+            self._peaks(sample, phase).peak_deflection for phase in (PHASE, PHASE / REFINEMENT)
+        )
         error = float(np.nanmax(relative_changes(coarse, fine), initial=0.0))
-        return np.full(count, phase), error
+        return np.full(count, PHASE), error
 
     def run_count(self, block: int) -> int:
         """Number of runs in a block."""
-        return len(self._runs(block))
+        return self._runs(block).size
 
     def compute_block(self, block: int, steps) -> dict[str, np.ndarray]:
         """Results (path, batch, ...) of a block by name; the last run repeated in a short block.
 
         Blocks are of equal size, as those of `blocks.Runner`: stores find a block by its size.
         """
-        found = [self._peaks(run, steps[run])._asdict() for run in self._runs(block)]
-        found += [found[-1]] * (len(self._runs(0)) - len(found))
-        return {name: np.stack([one[name] for one in found]) for name in found[0]}
+        runs = self._runs(block)
+        found = self._peaks(runs, steps[runs[0]])._asdict()
+        more = self._runs(0).size - runs.size
+        return {
+            name: np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
+            for name, values in found.items()
+        }
 
-    def _runs(self, block: int) -> range:
-        return range(len(self.batches.run_index))[block * BLOCK_RUNS : (block + 1) * BLOCK_RUNS]
+    def _runs(self, block: int) -> np.ndarray:
+        return np.arange(len(self.batches.run_index))[block * BLOCK_RUNS : (block + 1) * BLOCK_RUNS]
 
-    def _peaks(self, run: int, phase: float):
-        values = dict(
-            zip(self.batches.shared_addresses, self.batches.shared_values[run], strict=True)
-        )
-        varied = replace(self.case, values)
-        return peaks_of_forces(self.system, load_set(varied), float(varied.run.duration), phase)
+    def _peaks(self, runs: np.ndarray, phase: float) -> Peaks:
+        batches = self.batches
+        paths = force_paths(self.case, batches.shared_addresses, batches.shared_values[runs])
+        speeds = tuple(np.unique(paths.speed).tolist())
+        return peaks_of_forces(_responses(self.system, speeds), paths, phase)
 
 
 def force_runner(case: Case, batches: Batches, tolerance: float) -> ForceRunner | None:
@@ -87,6 +94,15 @@ def force_runner(case: Case, batches: Batches, tolerance: float) -> ForceRunner 
         return None
     if loads.wheel_count < MIN_WHEELS or not constant_speeds(loads):
         return None
+    content = case_to_dict(case)
+    system = json.dumps({key: content[key] for key in OF_BEAM if key in content})
+    return None if _system(system) is None else ForceRunner(case, batches, system)
+
+
+@functools.lru_cache(maxsize=4)
+def _system(content: str) -> ForceSystem | None:
+    """System of the beam and the sensors of a case, from those of its file as JSON."""
+    case = case_from_dict(json.loads(content))
     layout = mesh_layout(case)
     if not is_supported(case, layout):
         return None
@@ -94,9 +110,16 @@ def force_runner(case: Case, batches: Batches, tolerance: float) -> ForceRunner 
     rows = sensor_rows(model, case, case.sensors)
     correction = static_correction(model, case, case.sensors, rows)
     places = corrected_places(case, model, case.sensors)
-    system = force_system(
+    return force_system(
         model,
         linear_outputs(model, rows, correction),
         np.zeros(0) if places is None else np.asarray(places),
     )
-    return None if system is None else ForceRunner(case, batches, tolerance, system)
+
+
+@functools.lru_cache(maxsize=64)
+def _responses(system: str, speeds: tuple[float, ...]) -> ForceResponses:
+    """Responses to forces of some speeds (m/s), which the trains of a sweep share."""
+    found = _system(system)
+    assert found is not None
+    return force_responses(found, np.array(speeds))

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.aliases import current_address
-from jaxbeam.case.case import Case, list_sizes, own_addresses, replace, unit_at, value_at
+from jaxbeam.case.case import Case, addresses, list_sizes, own_addresses, replace, unit_at
 from jaxbeam.case.declared_checks import describe_value
-from jaxbeam.case.joint_addresses import overlap
+from jaxbeam.case.joint_addresses import each_address, overlap
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.reading.units import in_si
 from jaxbeam.case.validation import check_case
@@ -198,7 +198,10 @@ def sweep_specification(
     twice = overlap(over, list_sizes(case))
     if twice:
         raise ValueError(f"{twice} is swept twice: leave one of {', '.join(over)} out")
-    axes = {address: _checked_values(case, address, given) for address, given in over.items()}
+    numbers = addresses(case)
+    axes = {
+        address: _checked_values(case, address, given, numbers) for address, given in over.items()
+    }
     for address in axes:
         if histories and address in ("run.duration", "run.sample_rate"):
             raise ValueError(
@@ -213,30 +216,49 @@ def sweep_specification(
             f"{specification.count:.1e} combinations of values are more than the"
             f" {MAX_RUNS:.0e} runs of a sweep: split it"
         )
-    jointly_checked = [name for name in axes if JOINTLY_CHECKED.fullmatch(name)]
-    # The valid values of one number are a range, so its smallest and largest value are checked: in
-    # a grid with those of the other addresses, in paired values, where these may not meet, alone.
-    ranges = {
-        name: (axes[name].min(), axes[name].max()) for name in axes if name not in jointly_checked
-    }
-    if paired:
-        rows = [{name: value} for name, values in ranges.items() for value in values]
-    else:
-        rows = [dict(zip(ranges, row, strict=True)) for row in zip(*ranges.values(), strict=True)]
-    columns = [list(axes).index(name) for name in jointly_checked]
-    if jointly_checked:
-        rows += [
-            dict(zip(jointly_checked, row, strict=True))
-            for row in np.unique(specification.runs()[:, columns], axis=0)
-        ]
-    for row in rows:
+    for row in _rows_to_check(specification):
         check_case(replace(case, row))
     return specification
 
 
-def _checked_values(case: Case, address: str, values_given: Any) -> Float[np.ndarray, " value"]:
-    """Values of one address as an array, with the checks that need no other address."""
-    if any(np.ndim(value_at(case, one)) for one in own_addresses(case, address)):
+def _rows_to_check(specification: SweepSpecification) -> list[dict[str, float]]:
+    """Values by address of runs that are valid only if all are.
+
+    The valid values of one number are a range, so those runs are enough that have its smallest and
+    its largest value. Of numbers that are valid only in combination, all combinations.
+    """
+    axes, runs = specification.axes, specification.runs()
+    jointly_checked = [name for name in axes if JOINTLY_CHECKED.fullmatch(name)]
+    if specification.paired:
+        extremes = np.unique([runs.argmin(axis=0), runs.argmax(axis=0)])
+        rows = [dict(zip(axes, row, strict=True)) for row in runs[extremes]]
+    else:
+        ranges = {
+            name: (values.min(), values.max())
+            for name, values in axes.items()
+            if name not in jointly_checked
+        }
+        rows = [dict(zip(ranges, row, strict=True)) for row in zip(*ranges.values(), strict=True)]
+    if jointly_checked:
+        columns = [list(axes).index(name) for name in jointly_checked]
+        rows += [
+            dict(zip(jointly_checked, row, strict=True))
+            for row in np.unique(runs[:, columns], axis=0)
+        ]
+    return rows
+
+
+def _checked_values(
+    case: Case, address: str, values_given: Any, numbers: dict[str, Any]
+) -> Float[np.ndarray, " value"]:
+    """Values of one address as an array, with the checks that need no other address.
+
+    `numbers` are those of the case by address.
+    """
+    each = each_address(address, list_sizes(case))
+    if not set(each) <= set(numbers):
+        each = own_addresses(case, address)  # raises its error
+    if any(np.ndim(numbers[one]) for one in each):
         raise ValueError(f"{address} is a list; sweep over one of its entries, {address}.0")
     if isinstance(values_given, list | tuple):
         values_given = in_si(values_given, unit_at(case, address), address)

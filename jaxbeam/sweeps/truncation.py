@@ -3,13 +3,16 @@
 import warnings
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case, replace
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import is_supported, residual_flexibility
 from jaxbeam.model.statics import influence_line
-from jaxbeam.simulation.record import Record
+from jaxbeam.runtime.arrays import Array
+from jaxbeam.simulation.errors import truncation_errors
+from jaxbeam.simulation.motion.moving_forces import motion_of_forces
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 
 SAMPLES = 400  # of the run from which errors of corrected quantities are estimated
@@ -69,7 +72,7 @@ def estimated_errors(case: Case, worst: dict[str, dict[str, float]]) -> dict[str
     rotations the error is the static one; others are estimated from that run (see
     `Record.truncation_errors`), without a controller.
     """
-    errors, records = static_shares(case), {}
+    errors, found_before = static_shares(case), {}
     quantities = [sensor.quantity for sensor in case.sensors]
     if case.controller is not None:
         return errors
@@ -77,23 +80,25 @@ def estimated_errors(case: Case, worst: dict[str, dict[str, float]]) -> dict[str
         if quantity in errors:
             continue
         key = tuple(numbers.items())
-        if key not in records:
-            records[key] = _record_for_estimates(concrete_case(replace(case, numbers)))
-        if records[key] is None:
+        if key not in found_before:
+            found_before[key] = _errors_of_run(concrete_case(replace(case, numbers)))
+        if found_before[key] is None:
             continue
-        own = np.array(quantities) == quantity
-        found = np.asarray(records[key].truncation_errors)[own]
+        found = np.asarray(found_before[key])[np.array(quantities) == quantity]
         if np.isfinite(found).any():
             errors[quantity] = float(np.nanmax(found))
     return errors
 
 
-def _record_for_estimates(case: Case) -> Record | None:
-    """Record of a run; None where no step is found: its peaks are kept, their error not known."""
+def _errors_of_run(case: Case) -> Float[Array, " sensor"] | None:
+    """Truncation errors at the sensors; None where no step is found: they are not known."""
     times = np.linspace(0.0, float(case.run.duration), SAMPLES)
+    found = motion_of_forces(case, times)
+    if found is not None:
+        return truncation_errors(case, *found)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)
         try:
-            return simulate(case, times, tolerance=ESTIMATE_TOLERANCE)
+            return simulate(case, times, tolerance=ESTIMATE_TOLERANCE).truncation_errors
         except RuntimeError:
             return None

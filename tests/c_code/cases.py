@@ -13,6 +13,7 @@ from jaxbeam.control.feedback import Feedback
 from jaxbeam.control.load_identification import LoadIdentification
 from jaxbeam.control.optimal.crossing_lqr import FiniteLQR
 from jaxbeam.control.optimal.gain_schedules import GainSchedule
+from jaxbeam.control.optimal.position_lqr import PositionGainLaw
 from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
 from jaxbeam.control.optimal.scheduled_lqr import ScheduledGainLaw, ScheduledLQR
 from jaxbeam.control.output_feedback import OutputFeedback
@@ -133,11 +134,21 @@ CASES = {
             period=PERIOD,
         )
     ),
+    "sliding-mode": rig(
+        jb.SlidingMode(
+            [30.0, 20.0], 10.0, [0.1, 0.2], positions=[0.25, 0.45], estimator=KALMAN, period=PERIOD
+        )
+    ),
     "state": rig(jb.StateFeedback(np.full((2, 5), 2.0), period=PERIOD)),
     "lqr-observer": rig(jb.LQR(**WEIGHTS, estimator=jb.Observer(speed=3.0))),
     "dlqr-kalman": rig(DiscreteLQR(**WEIGHTS, delay=2e-3, estimator=KALMAN), sensors=FILTERED),
     "lqr-inversion": rig(jb.LQR(**WEIGHTS, estimator=jb.Inversion(1e-2), delay=2 * PERIOD)),
     "mpc": rig(jb.MPC(8, 3, [1e-10, 1e-10], estimator=KALMAN, period=PERIOD, delay=1e-3)),
+    "gpc": rig(
+        jb.GPC(
+            6, 2, 1e-8, output_weight=[1.0, 1.0, 1e-5], reference=[1e-4, 0.0, 0.0], period=PERIOD
+        )
+    ),
     "mpc-soft": rig(
         jb.MPC(
             6,
@@ -170,6 +181,10 @@ class GivenTables(AbstractController):
         schedules = [self.random_schedule() for _ in range(6)]
         grid = jax.tree.map(lambda *x: np.reshape(np.stack(x), (2, 3, *x[0].shape)), *schedules)
         grids = np.array([0.3, 0.5]), np.array([1.0, 2.0, 3.0])
+        if self.identification is None:
+            weights = plant.weights
+            law = PositionGainLaw(grid, *grids, weights / 9.81, weights, plant.loads)
+            return SampledStateLaw(law, TrueState(np.eye(5)))
         numbers = plant.case.beam.length, np.array(2.4)
         source = self.identification.identifier(plant, plant)
         law = ScheduledGainLaw(grid, *grids, *numbers, source, self.nearest, 1)
@@ -218,6 +233,7 @@ RANDOM = np.random.default_rng(0)
 GATES = LoadIdentification(gates=[-0.05, 0.05])
 CASES["table"] = rig(GivenTables(period=PERIOD))
 CASES["family"] = rig(GivenTables(family=True, identification=GATES, period=3 * PERIOD))
+CASES["position"] = rig(GivenTables(family=True, period=3 * PERIOD), loads=TWO_LOADS)
 CASES["nearest"] = rig(
     GivenTables(family=True, nearest=True, identification=GATES, period=3 * PERIOD)
 )

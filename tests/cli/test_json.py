@@ -65,6 +65,7 @@ KEYS = {
                 "largest": None,
                 "largest_time": None,
                 "dynamic_amplification": None,
+                "step_error": None,
                 "truncation_error": None,
             }
         ],

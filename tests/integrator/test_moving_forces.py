@@ -7,13 +7,18 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.integrator.forces.system import force_system, particular_solution
+from jaxbeam.integrator.forces.paths import ForcePaths, force_paths
+from jaxbeam.integrator.forces.peaks import peaks_of_forces
+from jaxbeam.integrator.forces.states import outputs_of_forces
+from jaxbeam.integrator.forces.system import force_responses, force_system, particular_solutions
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.sensing.linear_outputs import linear_outputs
 from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.numerics.piecewise import piecewise_chebyshev
 from jaxbeam.sweeps.force_runner import force_runner
 from jaxbeam.sweeps.specification import sweep_specification
+from jaxbeam.sweeps.truncation import estimated_errors
 
 BEAM = jb.Beam(12.0, 4e8, 2000.0, 0.02, modes=3)
 QUANTITIES = ("deflection", "velocity", "acceleration", "slope", "moment", "shear")
@@ -30,7 +35,11 @@ TIMOSHENKO = dataclasses.replace(
     TWO_SPANS,
     beam=dataclasses.replace(BEAM, shear_stiffness=1e8),
     supports=(),
-    loads=[dataclasses.replace(ROW, start_position=-4.0), BACK],
+    # At t = 0 some are on the beam, and one enters it.
+    loads=[
+        dataclasses.replace(ROW, entry_time=-0.47),
+        dataclasses.replace(BACK, entry_time=0.0),
+    ],
 )
 
 
@@ -49,7 +58,7 @@ def test_peaks_equal_those_of_the_integrator(case):
     for i, quantity in enumerate(QUANTITIES):
         assert_allclose(found["peak_deflection"][i], largest[i], rtol=1e-8, err_msg=quantity)
     assert error < 1e-8
-    assert_allclose(found["lowest_contact_force"], [1e5, 1e5, 9e4, 9e4, 1.2e5, 7e4, 7e4, 7e4])
+    assert_allclose(found["lowest_contact_force"], record.lowest_contact_force)
     assert np.isnan(found["contact_lost_time"]).all()
 
 
@@ -62,23 +71,77 @@ def test_stored_sweeps_whose_last_block_is_short_have_every_run_in_its_place(tmp
     assert_allclose(stored.peak_deflection, in_memory.peak_deflection, rtol=1e-12)
 
 
-@pytest.mark.parametrize("speed", [5.0, 60.0, -300.0])
-def test_particular_solutions_satisfy_their_equation(speed):
-    model = modal_model(TWO_SPANS)
-    outputs = linear_outputs(model, sensor_rows(model, TWO_SPANS, TWO_SPANS.sensors), None)
-    system = force_system(model, outputs, np.zeros(0))
-    solution = particular_solution(system, speed)
+def system_of(case):
+    """System of a case whose outputs have no static part."""
+    model = modal_model(case)
+    outputs = linear_outputs(model, sensor_rows(model, case, case.sensors), None)
+    return force_system(model, outputs, np.zeros(0))
+
+
+def test_particular_solutions_satisfy_their_equation():
+    system, speeds = system_of(TWO_SPANS), np.array([-300.0, 5.0, 60.0])
     x = np.linspace(0.1, 11.9, 40)
-    parts = np.concatenate([solution.real, solution.imag], axis=-1)
-    p, slope = (
-        whole[:, : system.poles.size] + 1j * whole[:, system.poles.size :]
-        for whole in piecewise_chebyshev(system.nodes, parts, x, (0, 1))
-    )
     forces = np.concatenate([system.forces.real, system.forces.imag], axis=-1)
     b = piecewise_chebyshev(system.nodes, forces, x, (0,))[0]
     b = b[:, : system.poles.size] + 1j * b[:, system.poles.size :]
-    residual = speed * slope - system.poles * p - b
-    assert np.abs(residual).max() < 1e-9 * np.abs(b).max()
+    for speed, solution in zip(speeds, particular_solutions(system, speeds), strict=True):
+        parts = np.concatenate([solution.real, solution.imag], axis=-1)
+        p, slope = (
+            whole[:, : system.poles.size] + 1j * whole[:, system.poles.size :]
+            for whole in piecewise_chebyshev(system.nodes, parts, x, (0, 1))
+        )
+        residual = speed * slope - system.poles * p - b
+        assert np.abs(residual).max() < 1e-9 * np.abs(b).max()
+
+
+def test_no_peak_is_missed_among_random_forces():
+    """Against dense samples of the same motion: they are below the peaks, and close to them."""
+    rng, runs, wheels = np.random.default_rng(5), 12, 9
+    sensors = [jb.Sensor(x, name) for name in ("deflection", "velocity", "slope") for x in (2.5, 8)]
+    system = system_of(dataclasses.replace(TWO_SPANS, sensors=sensors))
+    speed = rng.choice([-40.0, -9.0, 7.0, 25.0, 110.0], (runs, wheels))
+    origin = rng.uniform(-6, 18, (runs, wheels)) - speed * rng.uniform(0, 1, (runs, 1))
+    paths = ForcePaths(origin, speed, rng.normal(0, 1e5, wheels), rng.uniform(0.8, 1.4, runs))
+    found = peaks_of_forces(force_responses(system, np.unique(speed)), paths, 1.6)
+    for run in range(runs):
+        own = ForcePaths(origin[run : run + 1], speed[run : run + 1], paths.force, paths.duration)
+        own = own._replace(duration=paths.duration[run : run + 1])
+        times = np.linspace(0, own.duration[0], 8001)
+        sampled = np.abs(outputs_of_forces(system, own, times))
+        peak = found.peak_deflection[run, 0]
+        assert np.all(peak >= sampled.max(axis=0) * (1 - 1e-12))
+        assert_allclose(peak, sampled.max(axis=0), rtol=1e-4)
+        at_peak = np.abs(outputs_of_forces(system, own, found.peak_time[run, 0]))
+        assert_allclose(np.diag(at_peak), peak, rtol=1e-9)
+
+
+def test_paths_are_those_of_the_loads():
+    """Runs that differ in speed, entry, start, spacing and duration, against each as a case."""
+    wagon = jb.Axles(
+        speed=20.0, offsets=[0.0, 2.0], forces=[1e5] * 2, count=3, spacing=7.0, start_position=0.0
+    )
+    case = dataclasses.replace(TWO_SPANS, loads=[wagon, BACK])
+    names = "loads.*.speed", "loads.0.spacing", "loads.1.entry_time", "loads.0.start_position"
+    names += ("run.duration",)
+    values = np.array([[12.0, 5.0, 0.1, -3.0, 2.0], [-30.0, 8.0, 0.0, 4.0, 1.5]])
+    paths = force_paths(case, names, values)
+    for run, row in enumerate(values):
+        one = jb.replace(case, dict(zip(names, row, strict=True)))
+        loads, times = load_set(one), np.array([0.2, 0.9])
+        x = paths.origin[run, :, None] + paths.speed[run, :, None] * times
+        assert_allclose(x, loads.kinematics(times)[0], atol=1e-12)
+        windows = np.clip(loads.entry_exit_times(), 0, row[-1])
+        assert_allclose(np.transpose(paths.windows(0.0, 12.0))[:, run], windows, atol=1e-12)
+        assert_allclose(paths.force, -loads.weight[:, 0])
+
+
+def test_truncation_errors_are_those_of_the_integrated_run():
+    worst = {quantity: {"loads.0.speed": 25.0} for quantity in QUANTITIES}
+    closed_form = estimated_errors(TWO_SPANS, worst)
+    record = jb.simulate(TWO_SPANS, np.linspace(0, 2, 400), tolerance=1e-9)
+    for quantity in ("velocity", "acceleration", "moment", "shear"):
+        error = record.truncation_errors[QUANTITIES.index(quantity)]
+        assert_allclose(closed_form[quantity], error, rtol=1e-6)
 
 
 def test_other_sweeps_are_integrated():

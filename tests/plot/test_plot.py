@@ -295,10 +295,11 @@ def shown_boxes(figure):
 
 def test_many_loads_and_sensors_are_readable():
     """Fifty loads and thirty sensors: no text lies on another."""
+    wave = {"force": 2e5, "frequencies": [3.0], "amplitudes": [2e4], "speed": 50.0}
     case = jb.Case(
         jb.Beam(25.0, 3e10, 1.5e4, modes=2),
         sensors=[jb.Sensor(x) for x in np.linspace(1.0, 24.0, 30)],
-        loads=[jb.MovingForce(force=2e5, speed=50.0, entry_time=0.05 * i) for i in range(50)],
+        loads=[jb.VaryingForce(**wave, entry_time=0.05 * i) for i in range(50)],
         run=jb.Run(3.0, sample_rate=20.0),
     )
     figure = plot_record(jb.simulate(case))

@@ -120,6 +120,20 @@ def test_forces_of_many_wheels_are_an_envelope():
     assert f"wheel {wheel + 1}, lowest" in words(forces.figure)
 
 
+def test_constant_forces_have_no_panel():
+    """Those of moving forces; of a mass, a varying force, or without a sensor they are drawn."""
+    force = jb.MovingForce(force=200e3, speed=25.0)
+    wave = jb.VaryingForce(force=200e3, frequencies=[4.0], amplitudes=[20e3], speed=25.0)
+    case = dataclasses.replace(ROAD, loads=[force, force], profile=None)
+    for loads, count in (([force, force], 2), ([wave], 3), ([jb.MovingMass(20e3, 25.0)], 3)):
+        record = jb.simulate(dataclasses.replace(case, loads=loads))
+        labels = [axes.get_ylabel() for axes in plot_record(record).axes]
+        assert len(labels) == count
+        assert any("contact force" in label for label in labels) == (count == 3)
+    alone = jb.simulate(dataclasses.replace(case, sensors=()))
+    assert "contact force" in plot_record(alone).axes[1].get_ylabel()
+
+
 def test_lost_contact_names_the_wheel():
     record = jb.simulate(WAGONS)
     lost = jnp.full(8, jnp.nan).at[2].set(0.5)

@@ -39,6 +39,14 @@ class LoadCases:
     its result only.
 
     Raises ValueError without training runs, and for a held-out run that is a training run.
+
+    >>> import tuning
+    >>> loads = tuning.LoadCases(
+    ...     ({"loads.0.mass": 0.2}, {"loads.0.mass": 0.5}), ({"loads.0.mass": 0.4},)
+    ... )
+    >>> stiff = [{"beam.flexural_rigidity": 12.0}, {"beam.flexural_rigidity": 13.0}]
+    >>> print(len(loads.across(stiff).training), "training runs")
+    4 training runs
     """
 
     training: tuple[AddressValues, ...]

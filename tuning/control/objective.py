@@ -51,6 +51,11 @@ class Objective:
 
     Raises ValueError for unknown metrics, weights or limits that are not positive and finite, an
     unknown aggregation and a tail share outside 0 to 1.
+
+    >>> import tuning
+    >>> objective = tuning.Objective({"shortfall": 1.0, "effort": 0.1}, limits={"rms": 0.8})
+    >>> print(objective.aggregation, "of", *objective.weights)
+    worst of shortfall effort
     """
 
     weights: dict[str, float] = dataclasses.field(default_factory=lambda: {"peak": 1.0})

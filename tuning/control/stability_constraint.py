@@ -37,6 +37,11 @@ class StabilityConstraint:
     more than runs, `crossings` (values by address, like load cases) may replace the training runs.
 
     Raises ValueError for a negative delay, less than one instant and shares outside 0 to 1.
+
+    >>> import tuning
+    >>> stable = tuning.StabilityConstraint(max_real_part=-1.0, extra_delay=0.001)
+    >>> print(f"{stable.max_real_part:g} 1/s at {stable.instants} instants")
+    -1 1/s at 7 instants
     """
 
     max_real_part: float = 0.0

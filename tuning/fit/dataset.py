@@ -127,8 +127,8 @@ class Dataset:
     def validity_warning(self, values: dict[str, float]) -> str:
         """Warning that the integration plan does not hold at the fitted values; "" if it does.
 
-        The plan was made for the starts: far from them loads may enter in another order, or steps
-        be too long; and without bounds a parameter may end at a value that no beam can have.
+        The plan was made for the starts: far from them the loads may change their order, or
+        steps be too long; and without bounds a parameter may end at a value that no beam can have.
         """
         for i, (case, times) in enumerate(zip(self.cases, self.times, strict=True)):
             try:

@@ -40,6 +40,16 @@ class Responses:
 
     Raises ValueError if shapes disagree, frequencies do not ascend from above zero, or a value is
     zero or not finite.
+
+    >>> import numpy as np
+    >>> import tuning
+    >>> frequencies = np.array([10.0, 20.0, 40.0])
+    >>> values = 1 / (20.0**2 - frequencies**2 + 0.8j * frequencies)
+    >>> measured = tuning.Responses(
+    ...     frequencies, values[:, None], (("actuators.0", "sensors.0"),)
+    ... )
+    >>> print(measured.values.shape)
+    (3, 1)
     """
 
     frequencies: Float[np.ndarray, " frequency"]
@@ -80,11 +90,15 @@ def responses_of(log: Log, segment: float | None = None, min_coherence: float = 
 
     >>> import numpy as np
     >>> import tuning
-    >>> u = np.random.default_rng(0).normal(size=4000)  # commands; readings follow a sample later
+    >>> u = np.random.default_rng(0).normal(
+    ...     size=4000
+    ... )  # commands; readings follow a sample later
     >>> values = np.column_stack([u, 2e-3 * np.roll(u, 1)])
     >>> columns = ("u", "w1"), ("voltage", "deflection"), ("V", "m")
     >>> index = {"sensors": (None, 0), "actuators": (0, None)}
-    >>> found = tuning.responses_of(tuning.Log(0.001 * np.arange(4000), values, *columns, **index))
+    >>> found = tuning.responses_of(
+    ...     tuning.Log(0.001 * np.arange(4000), values, *columns, **index)
+    ... )
     >>> print(f"{abs(found.values).mean():.1e} m/V")
     2.0e-03 m/V
     """

@@ -41,6 +41,19 @@ class ModalParameterFit:
     criterion (1 without shapes); `frequencies` those of the fitted case (Hz) for each pair.
     `misfit` is the root mean square of the residuals in standard deviations; beyond one, the errors
     are widened by it.
+
+    >>> import numpy as np
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> times = 0.005 * np.arange(1600)
+    >>> decay = np.exp(-0.3 * times) * np.cos(2 * np.pi * 3.2 * times)
+    >>> noise = 1e-3 * np.random.default_rng(1).normal(size=times.size)
+    >>> columns = ("a1",), ("acceleration",), ("m/s^2",)
+    >>> fit = tuning.identify_modes(tuning.Log(times, (decay + noise)[:, None], *columns))
+    >>> case = jb.Case(jb.Beam(20.0, 8e9, 12e3, modes=1), sensors=[jb.Sensor(10.0)])
+    >>> found = tuning.identify_from_modes(case, fit, ["beam.flexural_rigidity"])
+    >>> print(found.addresses, f"{found.values[0]:.2e} N m^2")
+    ['beam.flexural_rigidity'] 7.97e+09 N m^2
     """
 
     parameters: list[FreeParameter]

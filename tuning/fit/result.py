@@ -39,6 +39,13 @@ class Fit:
     factor by which autocorrelation of the residuals raises variances and has widened the
     intervals; `degrees_of_freedom` the number of independent samples left. `minima` are those
     found from several starts, lowest first.
+
+    >>> import tuning
+    >>> fit = tuning.load_fit("fit.npz")
+    >>> print(
+    ...     fit.addresses[0], f"{fit.values[0]:.0f} +- {fit.errors[0]:.1f} N m^2,", fit.verdict
+    ... )
+    beam.flexural_rigidity 11 +- 0.2 N m^2, converged
     """
 
     parameters: list[FreeParameter]

@@ -25,6 +25,15 @@ class Log:
     log was read.
 
     Raises ValueError if lengths disagree, a value is not finite or times do not increase.
+
+    >>> import numpy as np
+    >>> import tuning
+    >>> times = np.linspace(0.0, 2.0, 401)
+    >>> log = tuning.Log(
+    ...     times, np.sin(times)[:, None], ("w1",), ("deflection",), ("m",), sensors=(0,)
+    ... )
+    >>> print(log.duration, "s at", log.sample_rate, "Hz")
+    2.0 s at 200.0 Hz
     """
 
     times: Float[np.ndarray, " time"]

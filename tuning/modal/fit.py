@@ -32,6 +32,16 @@ class ModalFit:
     of the band. `times` and `measured` are the log in the first window and the band, `fitted` is
     the response of the modes to it for a free decay, else None. `singular_values` are those of
     frequency-domain decomposition, for each part of the band, else none.
+
+    >>> import numpy as np
+    >>> import tuning
+    >>> times = 0.005 * np.arange(1600)
+    >>> decay = np.exp(-0.3 * times) * np.cos(2 * np.pi * 3.2 * times)
+    >>> noise = 1e-3 * np.random.default_rng(1).normal(size=times.size)
+    >>> columns = ("a1",), ("acceleration",), ("m/s^2",)
+    >>> fit = tuning.identify_modes(tuning.Log(times, (decay + noise)[:, None], *columns))
+    >>> print(f"{fit.frequencies[0]:.2f} Hz, damping ratio {fit.damping_ratios[0]:.4f}")
+    3.20 Hz, damping ratio 0.0149
     """
 
     modes: tuple[IdentifiedMode, ...]

@@ -25,6 +25,11 @@ class Prior:
 
     Raises ValueError for an unknown scale, a prior without mean or deviation, a deviation that is
     not positive, and a scale or prior that does not fit the bounds.
+
+    >>> import tuning
+    >>> prior = tuning.Prior(low=5.0, high=20.0, mean=12.0, deviation=1.0)
+    >>> print(prior)
+    Prior(low=5.0, high=20.0, mean=12.0, deviation=1.0, scale='linear')
     """
 
     low: float | None = None

@@ -19,7 +19,16 @@ SMOOTHNESS = np.logspace(-8, 4, 49)  # tried weights of second differences
 
 
 class InfluenceLines(NamedTuple):
-    """Readings of sensors (SI unit per newton downwards) with a force at positions (m)."""
+    """Readings of sensors (SI unit per newton downwards) with a force at positions (m).
+
+    >>> import numpy as np
+    >>> import tuning
+    >>> lines = tuning.InfluenceLines(
+    ...     np.array([0.0, 5.0, 10.0]), np.array([[0.0], [-2e-8], [0.0]])
+    ... )
+    >>> print(lines.at(np.array([2.5])))
+    [[-1.e-08]]
+    """
 
     positions: Float[np.ndarray, " point"]
     values: Float[np.ndarray, "point sensor"]

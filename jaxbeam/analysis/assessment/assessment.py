@@ -16,6 +16,12 @@ class CodeCheck:
     """One check: what is compared with which limit, by which clause, and the outcome.
 
     `value` and `limit` are in `unit` (None where there is none); `remark` has the other numbers.
+
+    >>> import jaxbeam as jb
+    >>> bridge = jb.Case(jb.Beam(25.0, 3e10, 15000.0, damping_ratio=0.01))
+    >>> check = jb.assess(bridge, "160 km/h").checks[0]
+    >>> print(check.subject, f"{check.value:.2f} {check.unit},", check.outcome)
+    first natural frequency n0 3.55 Hz, information
     """
 
     subject: str
@@ -32,6 +38,12 @@ class Assessment:
     """Checks of a bridge by a code, its inputs, and what is not checked and not in the model.
 
     `sources` are the open sources of the numbers of the code by clause.
+
+    >>> import jaxbeam as jb
+    >>> bridge = jb.Case(jb.Beam(25.0, 3e10, 15000.0, damping_ratio=0.01))
+    >>> found = jb.assess(bridge, "160 km/h")
+    >>> print(len(found.checks), "checks,", len(found.failed), "not satisfied")
+    5 checks, 0 not satisfied
     """
 
     title: str

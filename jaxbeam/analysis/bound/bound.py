@@ -127,7 +127,9 @@ def bound(
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
-    ...     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, damping_ratio=0.03),
+    ...     jb.Beam(
+    ...         length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, damping_ratio=0.03
+    ...     ),
     ...     actuators=[jb.PointForce(0.3, limits=[-1.0, 1.0])],
     ...     sensors=[jb.Sensor(0.3)],
     ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
@@ -215,7 +217,7 @@ def _uncontrolled_peak(case: Case, positions) -> float:
     """Largest absolute deflection (m) at the positions (m) without commands, in continuous time."""
     uncontrolled_case = dataclasses.replace(case, controller=None)
     shapes = static_shapes(uncontrolled_case)
-    step, _ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
+    step, *_ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
     running_peaks = _run_peaks(uncontrolled_case, shapes, np.asarray(step), positions)
     return float(np.max(running_peaks.refined_peak()[0]))
 

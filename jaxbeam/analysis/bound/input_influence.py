@@ -107,7 +107,7 @@ def input_influence(
         )
     uncontrolled_case = dataclasses.replace(case, controller=None)
     shapes = static_shapes(uncontrolled_case)
-    step, _ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
+    step, *_ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
     schedule = controller_schedule(times, hold_times, 0.0, [], [], np.zeros(0))
     substeps = steps_per_interval(np.diff(times).max(), step)
     # Runs with hold -1 (the unforced one) or a hold after the end (padding) have no command; those

@@ -28,6 +28,12 @@ class Envelope(NamedTuple):
     """Lowest and highest value of a quantity at given positions: at most zero, and at least zero.
 
     In m for deflections.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(jb.Beam(0.6, 12.0, 0.5), loads=[jb.MovingMass(mass=0.1, speed=1.0)])
+    >>> found = jb.envelope(case, x=[0.15, 0.3])
+    >>> print((1e3 * found.lowest).round(3), "mm")
+    [-0.267 -0.38 ] mm
     """
 
     lowest: Float[Array, " position"]

@@ -7,6 +7,7 @@ from jaxbeam.c_code.writers import write_law, write_load_source
 from jaxbeam.control.compensators import SampledCompensator
 from jaxbeam.control.feedback import Feedback
 from jaxbeam.control.output_feedback import OutputFeedback
+from jaxbeam.control.predictive.gpc import GPCLaw
 from jaxbeam.control.scheduled_feedback import ScheduledFeedbackLaw
 
 
@@ -48,6 +49,28 @@ for (i = 0; i < {loops}; i++)
         filter_sample({sections} + 6 * i, 1, {states} + 2 * i, {code.readings}[i]);""",
         9 * loops,
     )
+
+
+@write_law.register
+def _(law: GPCLaw, code: CSource) -> None:
+    past, actuators, outputs = np.shape(law.reading_gains)
+    powers = np.shape(law.command_gains)[0]
+    code.add("/* u = r - H (past readings) - K (past commands), the latest ones first */")
+    reference = code.constant("reference_command", law.reference_command)
+    parts = (
+        ("readings", law.reading_gains, code.readings, past, outputs),
+        ("commands", law.command_gains, code.command, powers, actuators),
+    )
+    code.add(f"copy({code.output}, {reference}, {actuators});")
+    for name, gains, latest, count, width in parts:
+        size = count * width
+        kept = code.state(f"past_{name}", np.zeros(size), f"last {name}, the latest first")
+        gain = code.constant(f"{name}_gain", np.moveaxis(np.asarray(gains), 0, 1))
+        code.add(
+            f"for (i = {size - 1}; i >= {width}; i--) {kept}[i] = {kept}[i - {width}];\n"
+            f"copy({kept}, {latest}, {width});"
+        )
+        code.multiply_add(code.output, gain, kept, actuators, size, -1)
 
 
 @write_law.register

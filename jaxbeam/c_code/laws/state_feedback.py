@@ -5,6 +5,7 @@ from textwrap import indent
 import numpy as np
 
 from jaxbeam.c_code.source import CSource, search_operations
+from jaxbeam.c_code.tables import at_samples
 from jaxbeam.c_code.writers import (
     EstimateCode,
     write_filter,
@@ -13,7 +14,9 @@ from jaxbeam.c_code.writers import (
     write_state_law,
 )
 from jaxbeam.control.optimal.gain_schedules import GainSchedule
+from jaxbeam.control.optimal.position_lqr import PositionGainLaw
 from jaxbeam.control.optimal.scheduled_lqr import ScheduledGainLaw
+from jaxbeam.control.sliding_mode import SlidingModeLaw
 from jaxbeam.control.state_law import GainLaw, SampledStateLaw
 
 
@@ -32,6 +35,32 @@ def _(law: GainLaw, code: CSource, estimate: EstimateCode) -> None:
     if law.feeds_back_command:
         matrix = code.constant("command_gain", gain[:, states:])
         code.multiply_add(code.output, matrix, code.command, actuators, actuators, -1)
+
+
+@write_state_law.register
+def _(law: SlidingModeLaw, code: CSource, estimate: EstimateCode) -> None:
+    outputs, states = np.shape(law.surface)
+    s = code.work("surface", outputs, "distance from each surface, in layers")
+    code.add("/* u = -(equivalent control) - gain sat(s) */")
+    code.multiply(s, code.constant("surface", law.surface), estimate.state, outputs, states)
+    code.add(
+        f"for (i = 0; i < {outputs}; i++) {s}[i] = clamp({s}[i], -1, 1);\n"
+        f"for (i = 0; i < {code.actuators}; i++) {code.output}[i] = 0;",
+        2 * outputs,
+    )
+    gain = code.constant("equivalent_gain", law.equivalent_gain)
+    code.multiply_add(code.output, gain, estimate.state, code.actuators, states, -1)
+    gain = code.constant("reaching_gain", law.reaching_gain)
+    code.multiply_add(code.output, gain, s, code.actuators, outputs, -1)
+
+
+@write_state_law.register
+def _(law: PositionGainLaw, code: CSource, estimate: EstimateCode) -> None:
+    gains, forward = (np.asarray(part) for part in at_samples(law.combined, code))
+    code.add("/* u = f - K x, with K and f along the known ways of the loads */")
+    code.add(f"copy({code.output}, {code.per_sample('forward', forward)}, {code.actuators});")
+    gain = code.per_sample("gain", gains)
+    code.multiply_add(code.output, gain, estimate.state, code.actuators, gains.shape[2], -1)
 
 
 def _fed_back(code: CSource, schedule: GainSchedule, estimate: EstimateCode, weights: int) -> str:

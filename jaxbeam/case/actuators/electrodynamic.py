@@ -15,6 +15,20 @@ class Electrodynamic(AbstractActuator):
     L I' = u - R I - K_v w',   force = K_f I - m w'' - c w' - k w: eqs (2.26) to (2.34) of the
     thesis in the time domain. Its state is the current I. A positive voltage lifts the beam. A
     command of zero shorts the coil; its back-EMF then damps the beam.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=2),
+    ...     actuators=[
+    ...         jb.Electrodynamic(0.3, resistance=3.0, inductance=1e-3, force_constant=8.0)
+    ...     ],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.Feedback(gains=[1e3], period=0.005),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    0.769 mm
     """
 
     kind: ClassVar[str] = "electrodynamic"

@@ -38,6 +38,22 @@ class Patch(AbstractActuator):
 
     Commands stay within `limits` and within the voltages `depolarisation`, beyond which the patch
     loses its polarisation; `rate_limit` is that of the amplifier.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=2),
+    ...     actuators=[
+    ...         jb.Patch(
+    ...             0.25, 0.35, moment_per_volt=8e-4, amplifier_gain=200.0, limits=(-2.5, 7.5)
+    ...         )
+    ...     ],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.Feedback(gains=[2e3], period=0.005),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    1.154 mm
     """
 
     kind: ClassVar[str] = "patch"

@@ -13,6 +13,11 @@ class Hinge(ReprWithUnits, eqx.Module):
 
     The deflection is continuous, the rotation jumps. A moment M = k (phi_right - phi_left) is that
     of a semi-rigid joint of `rotational_stiffness` k.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(10.0, 2e7, 400.0, ends="clamped-pinned", hinges=[jb.Hinge(6.0)])
+    >>> print(jb.modes(jb.Case(beam)).frequencies.round(2)[:2])
+    [ 2.52 16.91]
     """
 
     position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)

@@ -19,6 +19,13 @@ class Segment(ReprWithUnits, eqx.Module):
     `width` and `height` (in the bending direction) are those of a rectangular section of the
     beam's `youngs_modulus` and `density`. The last segment may leave out its `length`: it ends
     where the beam does.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(
+    ...     10.0, segments=[jb.Segment(6.0, 2e7, 400.0), jb.Segment(4.0, 1e7, 300.0)]
+    ... )
+    >>> print(jb.modes(jb.Case(beam)).frequencies.round(2)[:2])
+    [ 3.22 12.83]
     """
 
     length: Float[Array, ""] | None = number("m", "length", POSITIVE, default=None)

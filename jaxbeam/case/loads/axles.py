@@ -29,6 +29,16 @@ class Axles(AbstractRowLoad):
     `positions`. One entry of `forces` or `masses` may stand for all axles. With `masses` alone they
     are moving masses, whose weights are the forces; with both, the masses follow the surface and
     the forces are the static loads. `count` repeats wagons; those of the library know their length.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[jb.Axles(offsets=[0.0, 3.0, 4.2], forces=[60e3, 110e3, 110e3], speed=20.0)],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    4.864 mm
     """
 
     kind: ClassVar[str] = "axles"

@@ -16,6 +16,16 @@ class MovingForce(AbstractLoad):
 
     Give the `force` in N (positive downwards), or the `mass` whose weight it is; its trajectory is
     given as for `MovingMass`.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[jb.MovingForce(force=200e3, speed=30.0)],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    3.651 mm
     """
 
     kind: ClassVar[str] = "force"

@@ -29,6 +29,28 @@ class HalfCar(AbstractVehicleLoad):
     """Body with bounce and pitch, on a suspension, an axle and a tyre at each of two or more axles.
 
     Lists are over the axles, front first; positions are forward of the body's centre of mass.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[
+    ...         jb.HalfCar(
+    ...             speed=20.0,
+    ...             body_mass=16600.0,
+    ...             body_inertia=95765.0,
+    ...             axle_positions=[2.4, -2.4],
+    ...             axle_masses=[700.0, 1100.0],
+    ...             suspension_stiffness=[4e5, 1e6],
+    ...             suspension_damping=[1e4, 1e4],
+    ...             tyre_stiffness=[1.75e6, 3.5e6],
+    ...             tyre_damping=[0.0, 0.0],
+    ...         )
+    ...     ],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    3.000 mm
     """
 
     kind: ClassVar[str] = "half-car"

@@ -24,6 +24,16 @@ class LineLoad(AbstractVehicleLoad):
     as the square of their length h; a travelling load excites the beam at the frequency v / h too.
     The front is at the position of the load; with a `position` it stands there, and parts beyond
     the ends of the beam do not count.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[jb.LineLoad(force_per_length=[80e3], lengths=[5.0], points=4, speed=20.0)],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    6.708 mm
     """
 
     kind: ClassVar[str] = "line-load"

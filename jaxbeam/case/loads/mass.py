@@ -16,6 +16,16 @@ class MovingMass(AbstractLoad):
     Its vertical acceleration has all convective terms, w_tt + 2 v w_xt + v^2 w_xx + a w_x
     (corrected eq. (2.3) of the thesis). Give `speed` (negative: it enters at the right end and
     travels left), `entry_time` and `deceleration`; or a table of `times` and `positions`.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[jb.MovingMass(mass=20e3, speed=30.0)],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    3.647 mm
     """
 
     kind: ClassVar[str] = "mass"

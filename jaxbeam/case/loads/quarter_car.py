@@ -16,6 +16,25 @@ class QuarterCar(AbstractVehicleLoad):
     """Body on a suspension above an axle, which stands on a tyre; heights only.
 
     The tyre has no mass: the mass of the wheel belongs to the axle. P = (m_body + m_axle) g.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[
+    ...         jb.QuarterCar(
+    ...             speed=20.0,
+    ...             body_mass=17000.0,
+    ...             axle_mass=600.0,
+    ...             suspension_stiffness=4e5,
+    ...             suspension_damping=1e4,
+    ...             tyre_stiffness=1.75e6,
+    ...         )
+    ...     ],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    3.277 mm
     """
 
     kind: ClassVar[str] = "quarter-car"

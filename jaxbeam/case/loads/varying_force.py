@@ -20,6 +20,18 @@ class VaryingForce(AbstractVehicleLoad):
     t is in s from the start of the run. The table has `forces` at `force_times`, straight lines
     between them and constant before and after. The force travels as other loads do, or stays at
     `position`, as a machine does.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[
+    ...         jb.VaryingForce(force=200e3, frequencies=[4.0], amplitudes=[20e3], speed=30.0)
+    ...     ],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    3.934 mm
     """
 
     kind: ClassVar[str] = "varying-force"

@@ -26,6 +26,16 @@ class VehicleLoad(AbstractRowLoad):
     `model` is a name of the library or the path of a vehicle file (see `planar.files`), whose
     numbers become those of the load: `loads.0.bodies.0.mass`. Tables beside a model replace those
     of the model. The load of a file keeps the numbers, not the path.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[jb.VehicleLoad(model="half-truck", speed=20.0)],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    1.936 mm
     """
 
     kind: ClassVar[str] = "vehicle"

@@ -18,6 +18,31 @@ class Wagon(AbstractRowLoad):
     Wheelsets stay on the rail, where their height is that of the rail. The secondary suspension is
     between body and bogie, the primary one between bogie and wheelset; numbers are those of a whole
     bogie and of a whole wheelset, of both rails. The centre of mass is midway between the bogies.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[
+    ...         jb.Wagon(
+    ...             speed=50.0,
+    ...             body_mass=32e3,
+    ...             body_inertia=2e6,
+    ...             bogie_mass=2600.0,
+    ...             bogie_inertia=1400.0,
+    ...             wheelset_mass=1800.0,
+    ...             primary_stiffness=2.4e6,
+    ...             primary_damping=8e3,
+    ...             secondary_stiffness=8.6e5,
+    ...             secondary_damping=4e4,
+    ...             bogie_distance=19.0,
+    ...             wheelset_distance=2.5,
+    ...         )
+    ...     ],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    5.678 mm
     """
 
     kind: ClassVar[str] = "wagon"

@@ -28,6 +28,10 @@ class AbstractAveragedProfile(AbstractProfile):
         """Positions (m) at which s' jumps."""
         return xp.zeros(0)
 
+    def sizes_of_slope_jumps(self) -> Float[Array, " kink"]:
+        """Jumps of s' (1) at these positions, from left to right."""
+        return xp.zeros(0)
+
     def curvature_jumps(self) -> Float[Array, " kink"]:
         """Positions (m) at which s'' jumps, though s' does not."""
         return xp.zeros(0)
@@ -49,6 +53,7 @@ class AbstractAveragedProfile(AbstractProfile):
         half = self.contact_length / 2
         return xp.concatenate([jumps - half, jumps + half])
 
-    @property
-    def has_slope_jumps(self) -> bool:
-        return self.contact_length is None and self.slope_jumps().shape[0] > 0
+    def slope_kinks(self):
+        if self.contact_length is not None:
+            return super().slope_kinks()
+        return self.slope_jumps(), self.sizes_of_slope_jumps()

@@ -42,10 +42,12 @@ class AbstractProfile(ReprWithUnits, Module):
         """Positions (m) at which r' or r'' jumps; their number depends on no number of the case."""
         return xp.zeros(0)
 
-    @property
-    def has_slope_jumps(self) -> bool:
-        """Whether r' jumps somewhere: an infinite acceleration of a wheel with mass and no tyre."""
-        return False
+    def slope_kinks(self) -> tuple[Float[Array, " kink"], Float[Array, " kink"]]:
+        """Those of the `kinks` (m) at which r' jumps, and by how much (1), from left to right.
+
+        There the velocity of a wheel with mass and no tyre jumps, and the beam takes an impulse.
+        """
+        return xp.zeros(0), xp.zeros(0)
 
     def validate(self, address: str) -> str | None:
         """First inconsistency between its fields as an error message, or None."""

@@ -13,6 +13,12 @@ class BumpProfile(AbstractTransition):
 
     A versine: r = height / 2 (1 - cos(2 pi u)), u = (x - start) / (end - start). r'' jumps at both
     ends, r' does not.
+
+    >>> import jaxbeam as jb
+    >>> profile = jb.BumpProfile(start=0.0, end=2.0, height=0.03)
+    >>> heights, slopes, curvatures = profile.heights([0.5, 1.0])
+    >>> print(heights.round(4))
+    [0.015 0.03 ]
     """
 
     kind: ClassVar[str] = "bump"

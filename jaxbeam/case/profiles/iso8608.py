@@ -19,6 +19,11 @@ class ISO8608Profile(AbstractRandomProfile):
     good, and four times as much for each class after it. VBI-2D, for one, takes the middle of the
     limits, 20e-6 m^3 for A: `scale` = sqrt(20 / 16) is that. The default range, waves of 0.25 to
     100 m, is VBI-2D's. `class` is `road_class` in Python, where it is a reserved word.
+
+    >>> import jaxbeam as jb
+    >>> profile = jb.ISO8608Profile("A", seed=1)
+    >>> print(f"{profile.density(0.1):.2g} m^3")
+    1.6e-05 m^3
     """
 
     kind: ClassVar[str] = "iso8608"

@@ -16,6 +16,11 @@ class RailProfile(AbstractRandomProfile):
     "fra-1" (worst) to "fra-6" (best) of the Federal Railroad Administration, "german-low" and
     "german-high" disturbance, "sncf" (good track) and "sncf-poor". The wavelengths are those for
     which the spectrum was published, where none are given.
+
+    >>> import jaxbeam as jb
+    >>> profile = jb.RailProfile("fra-6", seed=1)
+    >>> print(f"{profile.density(0.1):.2g} m^3")
+    6.5e-07 m^3
     """
 
     kind: ClassVar[str] = "rail"

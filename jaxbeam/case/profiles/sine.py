@@ -15,6 +15,12 @@ class SineProfile(AbstractProfile):
 
     The mean over a contact patch of a length l has sin(pi l / wavelength) / (pi l / wavelength)
     times the amplitude.
+
+    >>> import jaxbeam as jb
+    >>> profile = jb.SineProfile(amplitude=0.002, wavelength=4.0)
+    >>> heights, slopes, curvatures = profile.heights([0.5, 1.0])
+    >>> print(heights.round(4))
+    [0.0014 0.002 ]
     """
 
     kind: ClassVar[str] = "sine"

@@ -13,6 +13,14 @@ class SpectrumProfile(AbstractSpectralProfile):
     """Sum r = sum_i A_i cos(2 pi n_i x + phase_i) of given waves, everywhere.
 
     With `switch_on` it grows from 0 between two positions.
+
+    >>> import jaxbeam as jb
+    >>> profile = jb.SpectrumProfile(
+    ...     wavenumbers=[0.1, 0.5], amplitudes=[0.01, 0.002], phases=[0.0, 1.0]
+    ... )
+    >>> heights, slopes, curvatures = profile.heights([0.0, 5.0])
+    >>> print(heights.round(4))
+    [ 0.0111 -0.0111]
     """
 
     kind: ClassVar[str] = "spectrum"

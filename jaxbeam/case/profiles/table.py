@@ -17,6 +17,12 @@ class TableProfile(AbstractAveragedProfile):
     spline) or follow the nearest points (not-a-knot); r'' jumps there. The ends bend only what is
     within a few points of them: let the table begin before the first wheel and end behind the
     last. Its points should be close enough to show the shortest wave.
+
+    >>> import jaxbeam as jb
+    >>> profile = jb.TableProfile(positions=[0.0, 1.0, 2.0], point_heights=[0.0, 0.01, 0.0])
+    >>> heights, slopes, curvatures = profile.heights([0.5, 1.0])
+    >>> print(heights.round(4))
+    [0.005 0.01 ]
     """
 
     kind: ClassVar[str] = "table"

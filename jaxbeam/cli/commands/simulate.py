@@ -97,12 +97,13 @@ def _to_dict(record: "jb.Record", amplification: "list[float | None]") -> dict:
         "sensors": [
             {"name": label, "quantity": s.quantity, "unit": s.unit, "position": s.position}
             | extremes
-            | {"dynamic_amplification": factor, "truncation_error": error}
-            for label, s, extremes, factor, error in zip(
+            | {"dynamic_amplification": factor, "step_error": steps, "truncation_error": modes}
+            for label, s, extremes, factor, steps, modes in zip(
                 sensor_labels(sensors),
                 sensors,
                 _extremes_of_sensors(record),
                 amplification,
+                _known(record.step_errors),
                 _truncation_errors(record),
                 strict=True,
             )
@@ -137,7 +138,12 @@ def _truncation_errors(record: "jb.Record") -> list[float | None]:
     """What the modes left out change at each sensor; None where it is not known."""
     if record.case.controller is not None:
         return [None] * len(record.case.sensors)
-    return [float(error) if error == error else None for error in record.truncation_errors]
+    return _known(record.truncation_errors)
+
+
+def _known(errors) -> list[float | None]:
+    """Errors, None for those that are not known."""
+    return [float(error) if error == error else None for error in errors]
 
 
 def _extremes_of_sensors(record: "jb.Record") -> list[dict[str, float]]:
@@ -233,11 +239,15 @@ def _lines(record: "jb.Record", amplification: "list[float | None]") -> list[str
         )
     ]
     header = ("sensor", "position (m)", "quantity", "smallest", "at (s)", "largest", "at (s)")
-    errors = _truncation_errors(record)
-    if any(error is not None for error in errors):
-        header = (*header, "error of truncation")
-        shares = ("-" if error is None else f"{error:.1e}" for error in errors)
-        rows = [(*row, share) for row, share in zip(rows, shares, strict=True)]
+    errors = {
+        "error of steps": _known(record.step_errors),
+        "error of truncation": _truncation_errors(record),
+    }
+    for name, shares in errors.items():
+        if any(share is not None for share in shares):
+            header = (*header, name)
+            words = ("-" if share is None else f"{share:.1e}" for share in shares)
+            rows = [(*row, word) for row, word in zip(rows, words, strict=True)]
     if any(factor is not None for factor in amplification):
         header = (*header, "dynamic amplification")
         factors = ("-" if factor is None else f"{factor:.4g}" for factor in amplification)

@@ -164,6 +164,11 @@ class StepLQR(AbstractCrossingRegulator):
 
     States of vehicles, about static equilibrium, are fed back too, with no weight of their own;
     the vehicles need damping, for a stationary regulator to exist while they are off the beam.
+
+    >>> import jaxbeam as jb
+    >>> regulator = jb.StepLQR(state_weight=[1e7, 10.0], command_weight=[1e-3], points=40)
+    >>> print(regulator.points, regulator.open_loop)
+    40 False
     """
 
     kind: ClassVar[str] = "lqr-step"
@@ -207,6 +212,11 @@ class FiniteLQR(AbstractFiniteHorizonRegulator):
     """Optimal regulator over the crossing, eqs (3.3) to (3.9) of the thesis.
 
     States of vehicles, about static equilibrium, are fed back too, with no weight of their own.
+
+    >>> import jaxbeam as jb
+    >>> regulator = jb.FiniteLQR(state_weight=[1e7, 10.0], command_weight=[1e-3], points=40)
+    >>> print(regulator.points, regulator.open_loop)
+    40 False
     """
 
     kind: ClassVar[str] = "lqr-finite"
@@ -218,6 +228,11 @@ class AugmentedLQR(AbstractFiniteHorizonRegulator):
     The weights of all loads are constant states of the plant: the command responds to loads on the
     beam, and, as their entry times are known or predicted, to later ones. With a profile or forces
     that vary in time, which are known too, a further constant state is 1.
+
+    >>> import jaxbeam as jb
+    >>> regulator = jb.AugmentedLQR(state_weight=[1e7, 10.0], command_weight=[1e-3], points=40)
+    >>> print(regulator.points, regulator.open_loop)
+    40 False
     """
 
     kind: ClassVar[str] = "lqr-augmented"

@@ -27,6 +27,24 @@ class IntegralLQR(AbstractRegulator):
     where h is the period. The cost is that of `DiscreteLQR` plus `integral_weight` times h e^2 at
     each sample. At rest y is the reference, whatever constant load acts, while the commands are
     within their limits; beyond them e stands still. The last command is fed back with a delay.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3)],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.IntegralLQR(
+    ...         state_weight=[1e7, 10.0],
+    ...         command_weight=[1e-3],
+    ...         integral_weight=[1e6],
+    ...         reference=[0.0],
+    ...         period=0.005,
+    ...     ),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    0.518 mm
     """
 
     kind: ClassVar[str] = "lqr-integral"

@@ -81,7 +81,20 @@ class AbstractRegulator(AbstractStateController):
 
 
 class LQR(AbstractRegulator):
-    """Time-invariant regulator for the plant without loads, eq. (5.7) of the thesis."""
+    """Time-invariant regulator for the plant without loads, eq. (5.7) of the thesis.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3)],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.LQR(state_weight=[1e6, 1.0], command_weight=[1e-2], period=0.005),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    0.914 mm
+    """
 
     kind: ClassVar[str] = "lqr"
 

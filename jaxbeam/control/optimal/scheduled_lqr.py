@@ -35,6 +35,25 @@ class ScheduledLQR(AbstractFiniteHorizonRegulator):
     Mass, speed and entry time are those of the load in the design, or identified by
     `load_identification`: then the command is zero until the speed is identified, and the lightest
     mass is assumed until the mass is.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3)],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.ScheduledLQR(
+    ...         state_weight=[1e7, 10.0],
+    ...         command_weight=[1e-3],
+    ...         period=0.005,
+    ...         masses=[0.2, 0.5],
+    ...         loads="known",
+    ...     ),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> jb.save_case(case, "regulator.toml")
+    >>> print(jb.load_case("regulator.toml").controller.masses)
+    [0.2 0.5]
     """
 
     kind: ClassVar[str] = "lqr-scheduled"
@@ -60,7 +79,7 @@ class ScheduledLQR(AbstractFiniteHorizonRegulator):
         speeds = jnp.abs(load.speed)[None] if self.speeds is None else self.speeds
 
         def design(mass, speed):
-            return self.gain_schedule(plant, _with_crossing_load(design_plant, mass, speed))
+            return self.gain_schedule(plant, with_crossing_load(design_plant, mass, speed))
 
         schedules = jax.vmap(jax.vmap(design, (None, 0)), (0, None))(
             jnp.asarray(self.masses), jnp.asarray(speeds)
@@ -154,7 +173,7 @@ def _any_not_positive(values) -> bool:
     return is_concrete(values) and bool(np.any(concrete(values) <= 0))
 
 
-def _with_crossing_load(plant: Plant, mass, speed) -> Plant:
+def with_crossing_load(plant: Plant, mass, speed) -> Plant:
     """Plant with another mass (kg) at another constant speed (m/s), in the same direction.
 
     A vehicle of another mass is a similar one, of the same frequencies.

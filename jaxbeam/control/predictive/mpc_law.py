@@ -1,5 +1,6 @@
 """Law of model predictive control: the quadratic program of a sample, and its first move."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,7 +13,8 @@ from jaxbeam.control.predictive.prediction import Prediction, SampledPlant, pred
 from jaxbeam.control.predictive.preview import Preview
 from jaxbeam.control.predictive.qp import solve_qp
 from jaxbeam.control.state_law import AbstractStateLaw
-from jaxbeam.runtime.arrays import Array, block_diag, set_at, solve, xp
+from jaxbeam.estimation.sampled_plant import in_blocks
+from jaxbeam.runtime.arrays import Array, block_diag, set_at, solve, take, xp
 
 
 class CommandLimits(NamedTuple):
@@ -37,9 +39,10 @@ class MPCLaw(AbstractStateLaw):
 
     `sampled_plant` and `prediction` are those of the unloaded plant; with a `preview` both are
     computed at each sample, with the loads on their way, without their weights if not
-    `known_weights`. The states are those of the beam, then those of the vehicles of the preview,
-    and with a delay the last commands. `output_weights` are those of
-    squared deflections in each period, `move_weights` those of squared moves.
+    `known_weights`; or a `table` has both for all samples, the predictions with the known inputs as
+    the last initial conditions. The states are those of the beam, then those of the vehicles of the
+    preview, and with a delay the last commands. `output_weights` are those of squared deflections
+    in each period, `move_weights` those of squared moves.
     """
 
     sampled_plant: SampledPlant
@@ -57,6 +60,7 @@ class MPCLaw(AbstractStateLaw):
     delayed: bool = eqx.field(static=True)
     known_weights: bool = eqx.field(static=True)
     solver: str = eqx.field(static=True)
+    table: tuple[SampledPlant, Prediction] | None = None
 
     @property
     def vehicle_states(self) -> int:
@@ -98,9 +102,30 @@ class MPCLaw(AbstractStateLaw):
         elif estimate.weights is not None:
             known = weights[estimate.weights.shape[0] :]
             weights = xp.concatenate([estimate.weights, known])
+        if self.table is not None:
+            sample = self.preview.sample_at(t)
+            past, prediction = jax.tree.map(lambda part: take(part, sample), self.table)
+            return past, prediction.under(weights), weights
         plants = self.preview.sampled_plants(t, -1, self.move_maps.shape[0] + 1)
         past, future = (jax.tree.map(lambda p, s=s: p[s], plants) for s in (0, slice(1, None)))
         return past, predict(future, self.C, self.move_maps, weights), weights
+
+    def tabulated(self, times):
+        preview, horizon = self.preview, self.move_maps.shape[0]
+        if preview is None:
+            return self
+        inputs = preview.plant.augmented_start.shape[0] - self.vehicle_states
+
+        def block(first, number):
+            plants = preview.sampled_plants(first * preview.period, -1, number + horizon)
+            periods = 1 + np.arange(horizon)[:, None] + np.arange(number)
+            past, future = (
+                jax.tree.map(lambda part, index=index: part[index], plants)
+                for index in (slice(number), periods)
+            )
+            return past, predict(future, self.C, self.move_maps, xp.eye(inputs))
+
+        return dataclasses.replace(self, table=in_blocks(block, len(times)))
 
     def quadratic_program(self, prediction: Prediction, initial, previous_command):
         """Quadratic program of a sample, in the moves, and in the excesses over soft limits.

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.numerics.discretisation import c2d
-from jaxbeam.runtime.arrays import Array, add_at, scan, xp
+from jaxbeam.runtime.arrays import Array, scan, xp
 
 
 class SampledPlant(NamedTuple):
@@ -31,13 +31,22 @@ class Prediction(NamedTuple):
 
     `initial` are the initial conditions (x(k), w, u(k-1), 1), with a column of F for each; that of
     1 is the response to the loads. `terminal` and `terminal_phi` give x(k+N) - x(k+N-1), then
-    y(k+N), N the horizon.
+    y(k+N), N the horizon. Of one sample, or of several along a first axis.
     """
 
-    F: Float[Array, "horizon output initial"]
-    Phi: Float[Array, "horizon output variable"]
-    terminal: Float[Array, "augmented initial"]
-    terminal_phi: Float[Array, "augmented variable"]
+    F: Float[Array, "*sample horizon output initial"]
+    Phi: Float[Array, "*sample horizon output variable"]
+    terminal: Float[Array, "*sample augmented initial"]
+    terminal_phi: Float[Array, "*sample augmented variable"]
+
+    def under(self, load_weights: Float[Array, " load"]) -> "Prediction":
+        """Prediction under weights (N) from one whose last initial conditions are those weights."""
+
+        def combined(columns):
+            own, of_loads = xp.split(columns, [columns.shape[-1] - load_weights.shape[0]], axis=-1)
+            return xp.concatenate([own, of_loads @ load_weights[:, None]], axis=-1)
+
+        return self._replace(F=combined(self.F), terminal=combined(self.terminal))
 
 
 def sampled_plant(
@@ -120,15 +129,19 @@ def predict(
     plants: SampledPlant,
     C: Float[Array, "output state"],
     move_maps: Float[Array, "horizon actuator variable"],
-    load_weights: Float[Array, " load"],
+    load_weights: Float[Array, "load *constant"],
 ) -> Prediction:
     """F and Phi of a plant given over each period of the horizon, eqs (7.5) and (7.10).
 
     `move_maps` map the variables to moves; `load_weights` are in N. For a time-invariant plant F
-    initial equals F (x(k) - x(k-1), y(k)) of the thesis.
+    initial equals F (x(k) - x(k-1), y(k)) of the thesis. Plants (horizon, sample) give predictions
+    at several samples. With a matrix of `load_weights` further initial conditions take the place of
+    the last, 1: the weights are the matrix times these.
     """
     states, actuators = plants.B.shape[-2:]
-    initial_count = 2 * states + actuators + 1
+    if load_weights.ndim == 1:
+        load_weights = load_weights[:, None]
+    initial_count = 2 * states + actuators + load_weights.shape[1]
     columns = initial_count + move_maps.shape[2]
     previous_command = xp.eye(actuators, columns, k=2 * states)
     commands = previous_command + xp.pad(
@@ -136,22 +149,26 @@ def predict(
     )
     unexplained = xp.eye(states, columns, k=states)
 
+    samples = plants.A.shape[1:-2]
+    others = [*[(0, 0)] * (len(samples) + 1), (2 * states + actuators, move_maps.shape[2])]
+
     def advance(state, period):
         plant, command = period
-        next_state = plant.A @ state + plant.B @ command + unexplained
-        next_state = add_at(next_state, np.s_[:, initial_count - 1], plant.E @ load_weights)
+        of_loads = xp.pad(plant.E @ load_weights, others)
+        next_state = plant.A @ state + plant.B @ command + unexplained + of_loads
         return next_state, next_state
 
-    initial_state = xp.eye(states, columns)
+    initial_state = xp.broadcast_to(xp.eye(states, columns), (*samples, states, columns))
     _, trajectory = scan(advance, initial_state, (plants, commands))
     outputs = C @ trajectory
     trajectory = xp.concatenate([initial_state[None], trajectory])
-    terminal = xp.concatenate([trajectory[-1] - trajectory[-2], outputs[-1]])
+    terminal = xp.concatenate([trajectory[-1] - trajectory[-2], outputs[-1]], axis=-2)
+    outputs = xp.moveaxis(outputs, 0, -3)
     return Prediction(
         outputs[..., :initial_count],
         outputs[..., initial_count:],
-        terminal[:, :initial_count],
-        terminal[:, initial_count:],
+        terminal[..., :initial_count],
+        terminal[..., initial_count:],
     )
 
 

@@ -55,8 +55,7 @@ class Preview(Module):
         """
         constant_plant, coupling_at = crossing_plant(self.plant, with_weights=True)
         explicit, cells = self.plant.loads.massless, self.edges.shape[0] - 1
-        sample = xp.floor(t / self.period + 0.5).astype(int) + first
-        periods = sample + np.arange(count)
+        periods = self.sample_at(t) + first + np.arange(count)
         starts = (periods * self.period)[:, None] + self.edges[:-1]
         lengths = xp.diff(self.edges)
         parts = []
@@ -74,6 +73,10 @@ class Preview(Module):
             divided = take(self.event_cells, event) == index
             maps = xp.where(divided[..., None, None], take(self.event_maps, event), maps)
         return self._compose(maps)
+
+    def sample_at(self, t: Float[Array, ""]) -> Int[Array, ""]:
+        """Number of the sample at t (s)."""
+        return xp.floor(t / self.period + 0.5).astype(int)
 
     def _compose(self, maps: Float[Array, "period cell all all_and_command"]) -> SampledPlant:
         """Plants over periods from the maps of their cells."""

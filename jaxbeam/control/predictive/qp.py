@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.runtime.arrays import (
@@ -176,10 +177,10 @@ def _status(tolerance, error, z, previous_multipliers, multipliers, h, G):
     feasible point is at least -h'r / |G'r| away from the origin.
     """
     # XLA's maxima may ignore NaN, so that the error alone is no proof.
-    finite = xp.all(xp.isfinite(z)) & xp.all(xp.isfinite(multipliers))
-    solved = finite & (error <= tolerance * (1 + xp.max(xp.abs(z))))
+    finite = xp.isfinite(z).all() & xp.isfinite(multipliers).all()
+    solved = finite & (error <= tolerance * (1 + abs(z).max()))
     ray = xp.maximum(multipliers - previous_multipliers, 0.0)
-    min_certificate = MAX_DISTANCE * xp.max(xp.abs(G.T @ ray)) + TOLERANCE * xp.sum(ray)
+    min_certificate = MAX_DISTANCE * abs(G.T @ ray).max() + TOLERANCE * ray.sum()
     infeasible = -(h @ ray) > min_certificate
     return xp.where(solved, SOLVED, xp.where(infeasible, INFEASIBLE, UNFINISHED))
 
@@ -190,18 +191,19 @@ def _interior_point(G, h, limits_matter):
 
     def optimality_errors(z, multipliers, slack):
         stationary, limits = z + G.T @ multipliers, G @ z + slack - h
-        worst = xp.maximum(xp.max(xp.abs(stationary)), xp.max(xp.abs(limits)))
-        return xp.maximum(worst, xp.max(xp.minimum(multipliers, slack))), stationary, limits
+        worst = xp.maximum(abs(stationary).max(), abs(limits).max())
+        return xp.maximum(worst, xp.minimum(multipliers, slack).max()), stationary, limits
 
     def unfinished(state):
         *_, status, steps = state
         return (status == UNFINISHED) & (steps < MAX_STEPS)
 
+    identity = np.eye(variables)
+
     def step(state):
-        z, multipliers, slack, _, steps = state
-        _, stationary, limits = optimality_errors(z, multipliers, slack)
+        z, multipliers, slack, stationary, limits, _, steps = state
         scaling = 1 / (slack / multipliers + DUAL_REGULARISATION)
-        factor = cholesky(xp.eye(variables) + (G.T * scaling) @ G)
+        factor = cholesky(identity + (G.T * scaling) @ G)
 
         def newton(product):
             rest = scaling * (limits - product / multipliers)
@@ -226,24 +228,28 @@ def _interior_point(G, h, limits_matter):
         length = _step_length(multipliers, multiplier_change, slack, slack_change, 0.995)
         z, slack = z + length * z_change, slack + length * slack_change
         next_multipliers = multipliers + length * multiplier_change
-        error, *_ = optimality_errors(z, next_multipliers, slack)
+        error, stationary, limits = optimality_errors(z, next_multipliers, slack)
         return (
             z,
             next_multipliers,
             slack,
+            stationary,
+            limits,
             _status(TOLERANCE, error, z, multipliers, next_multipliers, h, G),
             steps + 1,
         )
 
     start = xp.zeros(variables), xp.ones(rows), xp.maximum(h, 0.0) + 1.0
+    _, *residuals = optimality_errors(*start)
     initial_status = xp.where(limits_matter, UNFINISHED, SOLVED), xp.zeros((), int)
-    z, multipliers, _, status, steps = while_loop(unfinished, step, (*start, *initial_status))
+    start = (*start, *residuals, *initial_status)
+    z, multipliers, *_, status, steps = while_loop(unfinished, step, start)
     return z, xp.where(limits_matter, multipliers, 0.0), status, steps
 
 
 def _step_length(multipliers, multiplier_change, slack, slack_change, boundary_share):
     """Step length, at most 1, at which no multiplier or slack decreases by more than this share."""
-    worst = xp.maximum(xp.max(-multiplier_change / multipliers), xp.max(-slack_change / slack))
+    worst = xp.maximum((-multiplier_change / multipliers).max(), (-slack_change / slack).max())
     return xp.where(worst > boundary_share, boundary_share / worst, 1.0)
 
 

@@ -1,198 +1,196 @@
-"""Peaks of a run under forces at constant speeds, from its events (see `system`)."""
+"""Peaks of runs under forces at constant speeds: search where bounds allow one.
 
-from typing import NamedTuple
+Between two instants a time h apart an output y is at most h^2 / 8 max |y''| above the larger of its
+values there. Of free vibration y'' is bounded by the amplitudes of its poles, of the forces by the
+tables (see `ForceResponses`). So most of a run is left out without a look, and no peak is missed:
+what is left out is below a value that is reached.
+"""
 
 import numpy as np
-from jaxtyping import Complex, Float
-from numpy.polynomial import chebyshev
+from jaxtyping import Float
 
-from jaxbeam.case.trajectory import NEVER
-from jaxbeam.integrator.forces.system import (
-    ForceSystem,
-    local_position,
-    particular_solution,
-    tabulated,
-)
+from jaxbeam.integrator.forces.panels import Panels, force_panels
+from jaxbeam.integrator.forces.paths import ForcePaths
+from jaxbeam.integrator.forces.system import ForceResponses
 from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.running_peaks import Peaks
-from jaxbeam.model.load_set import LoadSet
 from jaxbeam.numerics.peak_search import estimate_peak, refine_peak
 
-# Steps that can hold the peak are found from samples between which the fastest pole turns by 4/3
-# rad: without faster parts, a peak is at most 1 / cos(2/3) times a sample (Duffin and Schaeffer).
-COARSE_PHASE, COARSE_NODES = 4.0, (0.0, 1 / 3, 2 / 3, 1.0)
-COARSE_MARGIN = 1.3
-SAME_TIME_SHARE = 1e-12  # of the duration: closer times are one event
+CHUNK_STEPS = 16
+REFINEMENTS = 4  # of a step
 
 
-class _Row(NamedTuple):
-    """Forces of one run or batch: positions x0 + v t (m), times on the beam (s), forces (N)."""
+def peaks_of_forces(responses: ForceResponses, paths: ForcePaths, phase: float) -> Peaks:
+    """Peaks of runs from rest, one to a batch; the fastest pole turns by `phase` (rad) in a step.
 
-    origin: Float[np.ndarray, " wheel"]
-    speed: Float[np.ndarray, " wheel"]
-    windows: Float[np.ndarray, "wheel 2"]
-    force: Float[np.ndarray, "wheel batch"]
+    `responses` are those to forces of all speeds of the paths. A run that is not finite has NaN.
+    """
+    panels = force_panels(responses, paths)
+    search = _Search(responses, panels, paths.duration.size, phase)
+    value, time = search.peaks()
+    nodes = responses.system.nodes
+    entry, leave = paths.windows(nodes[0], nodes[-1])
+    entered = leave > entry
+    lowest = np.where(entered, -paths.force, np.inf)
+    lost = np.where(entered & (paths.force > 0), entry, np.nan)
+    return Peaks(value[:, None], time[:, None], lowest[:, None], lost[:, None])
 
 
-class _Panels(NamedTuple):
-    """Panels between events: boundaries (s), amplitudes at their start, wheels on the beam.
+class _Search:
+    """Chunks of a few steps, within panels, with bounds of the outputs in each.
 
-    `piece` is that of the beam on which each of the wheels is.
+    `bound` is one of the output, `bend` one of its second derivative (1/s^2), both (chunk, output).
     """
 
-    boundaries: Float[np.ndarray, " boundary"]
-    amplitude: Complex[np.ndarray, "panel pole batch"]
-    wheels: np.ndarray
-    on_beam: np.ndarray
-    piece: np.ndarray
+    def __init__(self, responses: ForceResponses, panels: Panels, runs: int, phase: float):
+        self.responses, self.panels, self.runs = responses, panels, runs
+        system = responses.system
+        self.poles, self.C = system.poles, system.on_outputs
+        self._place_forces()
+        parts = np.ceil(panels.length * (system.fastest / phase / CHUNK_STEPS)).astype(int)
+        parts = np.maximum(parts, 1)
+        self.panel = np.repeat(np.arange(parts.size), parts)
+        self.run, self.length = panels.run[self.panel], (panels.length / parts)[self.panel]
+        number = np.arange(self.panel.size) - np.repeat(np.cumsum(parts) - parts, parts)
+        since = number * self.length
+        self.start = panels.start[self.panel] + since
+        self.amplitude = panels.amplitude[self.panel] * np.exp(since[:, None] * self.poles)
+        growth = np.exp(np.maximum(self.poles.real, 0.0) * self.length.max(initial=0.0))
+        size, largest = np.abs(self.amplitude) * growth, np.abs(self.C.T)
+        on_beam = panels.force * (np.arange(panels.force.shape[1]) < panels.count[:, None])
+        forced_bend = np.einsum(
+            "ps,pso->po", np.abs(on_beam), responses.curvature[panels.response]
+        )[self.panel]
+        self.bend = size @ (largest * np.abs(self.poles[:, None]) ** 2) + forced_bend
+        slack = np.einsum("ps,pso->po", np.abs(on_beam), responses.table_error[panels.response])
+        self.slack = 2 * slack[self.panel]  # of a value, and of that which is reached
+        forced = np.stack([self._forced(share) for share in (0.0, 0.5, 1.0)])
+        half = (self.length / 2)[:, None]
+        self.bound = size @ largest + np.abs(forced).max(axis=0) + forced_bend * half**2 / 8
+        self.bound += self.slack
+        self.tables = np.ascontiguousarray(np.moveaxis(responses.table, 2, 0))
+        self.tables = self.tables.reshape(self.C.shape[0], -1)
+        self.first = np.abs(forced[0] + (self.amplitude @ self.C.T).real)
+
+    def _place_forces(self):
+        """Where forces are in the tables: index of the point before it at t = 0, and points/s."""
+        panels, responses = self.panels, self.responses
+        breaks, count = responses.system.breaks, responses.count
+        density = ((count - 1) / np.diff(breaks))[panels.piece]
+        self.place = (panels.origin - breaks[panels.piece]) * density
+        self.rate = panels.speed * density
+        points = responses.table.shape[1]
+        self.offset = panels.response * points + responses.first[panels.piece]
+        self.last = count[panels.piece] - 2
+
+    def _forced(self, share: float) -> Float[np.ndarray, "chunk output"]:
+        """All outputs under the forces, at the same share of each chunk, from the tables."""
+        table = self.responses.table.reshape(-1, self.C.shape[0])
+        times = (self.start + share * self.length)[:, None]
+        return self._from_table(table, self.panel, times)[:, 0]
+
+    def _from_table(self, table, panel, times):
+        """Values of a table under the forces in panels, at times (panel, time)."""
+        which, at = self.panels.forces_in(panel)
+        place = self.place[at][:, None] + self.rate[at][:, None] * times[which]
+        low = np.clip(place.astype(int), 0, self.last[at][:, None])
+        share = np.clip(place - low, 0.0, 1.0)
+        low += self.offset[at][:, None]
+        force = self.panels.force[at].reshape(-1, *(1,) * table.ndim)
+        share = share.reshape(*share.shape, *(1,) * (table.ndim - 1))
+        below = table[low]
+        below += share * (table[low + 1] - below)
+        below *= force
+        return _sums(below, which, panel.size)
+
+    def peaks(self) -> tuple[Float[np.ndarray, "run output"], Float[np.ndarray, "run output"]]:
+        """Peaks of the outputs in all runs, and their times (s)."""
+        steps = [self._steps_of_peak(output) for output in range(self.C.shape[0])]
+        output = np.repeat(np.arange(len(steps)), [step[0].size for step in steps])
+        return self._refined(output, *(np.concatenate(part) for part in zip(*steps, strict=True)))
+
+    def _steps_of_peak(self, output: int):
+        """Short steps in one of which each run has the peak of an output.
+
+        Their panels, starts and lengths (s), and the amplitudes at the start.
+        """
+        reached, bound = np.zeros(self.runs), self.bound[:, output]
+        _raise_to(reached, self.run, self.first[:, output])
+        chunk = np.flatnonzero((bound >= reached[self.run]) & (bound > 0))
+        panel, start, amplitude = self.panel[chunk], self.start[chunk], self.amplitude[chunk]
+        length, bend, slack = (
+            self.length[chunk],
+            self.bend[chunk, output],
+            self.slack[chunk, output],
+        )
+        for parts in (CHUNK_STEPS, REFINEMENTS):
+            step = length / parts
+            times = start[:, None] + step[:, None] * np.arange(parts + 1)
+            values, growth = self._values(output, panel, amplitude, step, times)
+            _raise_to(reached, self.panels.run[panel], values.max(axis=1))
+            above = bend * step**2 / 8 + slack
+            limit = np.maximum(values[:, 1:], values[:, :-1]) + above[:, None]
+            which, part = np.nonzero(limit >= reached[self.panels.run[panel], None])
+            amplitude = amplitude[which] * growth[which] ** part[:, None]
+            start, panel, length = times[which, part], panel[which], step[which]
+            bend, slack = bend[which], slack[which]
+        return panel, start, length, amplitude
+
+    def _values(self, output: int, panel, amplitude, step, times):
+        """Magnitudes of an output at equally spaced times, and growth of free vibration in a step.
+
+        From one time to the next by the growth.
+        """
+        values = self._from_table(self.tables[output], panel, times)
+        growth = np.exp(step[:, None] * self.poles)
+        now = amplitude * self.C[output]
+        for i in range(times.shape[1]):
+            values[:, i] += now.real.sum(axis=1)
+            now *= growth
+        return np.abs(values), growth
+
+    def _refined(self, output, panel, start, length, amplitude):
+        """Peaks, and times (s), by the polynomials through exact values at nodes of short steps."""
+        since = np.array(PEAK_NODES) * length[:, None]
+        free = np.exp(since[..., None] * self.poles) @ (amplitude * self.C[output])[..., None]
+        samples = (free[..., 0].real + self._exact(output, panel, start[:, None] + since)).T
+        number = self.panels.run[panel] * self.C.shape[0] + output
+        order = np.lexsort((estimate_peak(samples, PEAK_NODES), number))
+        best = order[np.diff(number[order], append=-1) != 0]
+        value, time = np.zeros((2, self.runs * self.C.shape[0]))
+        found, position = refine_peak(samples[:, best], PEAK_NODES)
+        value[number[best]], time[number[best]] = found, start[best] + position * length[best]
+        finite = np.ones(self.runs, bool)
+        finite[self.run[~np.isfinite(self.bound).all(axis=1)]] = False
+        value, time = (
+            np.where(finite[:, None], part.reshape(self.runs, -1), np.nan) for part in (value, time)
+        )
+        return value, time
+
+    def _exact(self, output, panel, times):
+        """Exact values of outputs under the forces in panels at times (panel, time)."""
+        panels, breaks = self.panels, self.responses.system.breaks
+        which, at = panels.forces_in(panel)
+        piece = np.repeat(panels.piece[at], times.shape[1])
+        x = panels.origin[at][:, None] + panels.speed[at][:, None] * times[which]
+        x = np.clip(x.reshape(-1), breaks[piece], breaks[piece + 1])
+        number, own = (np.repeat(a, times.shape[1]) for a in (panels.response[at], output[which]))
+        r = self.responses.exact(number, piece, x, own).reshape(-1, times.shape[1])
+        return _sums(panels.force[at][:, None] * r, which, panel.size)
 
 
-def constant_speeds(loads: LoadSet) -> bool:
-    """Whether all loads are forces that move at constant speeds."""
-    if not loads.massless or loads.wheels.histories or not loads.trajectories:
-        return False
-    times, cubics = (np.asarray(part) for part in loads.cubics())
-    straight = not np.any(cubics[:, 0, 2:]) and np.all(cubics[:, 0, 1])
-    return bool(straight and np.all(times[:, 1:] >= NEVER))
+def _sums(values, which, count: int):
+    """Sums (count, ...) of consecutive values, of which each belongs to one."""
+    result = np.zeros((count, *values.shape[1:]))
+    first = np.flatnonzero(np.diff(which, prepend=-1))
+    if first.size:
+        result[which[first]] = np.add.reduceat(values, first, axis=0)
+    return result
 
 
-def peaks_of_forces(
-    system: ForceSystem, loads: LoadSet, duration: float, max_phase: float
-) -> Peaks:
-    """Peaks of a run of `duration` (s) under forces at constant speeds, from rest.
-
-    Polynomials find the peaks between samples, in steps in which the fastest pole turns by at most
-    `max_phase` (rad), and so does the highest of the mode shapes under a force.
-    """
-    starts, cubics = (np.asarray(part) for part in loads.cubics())
-    speed = cubics[:, 0, 1]
-    windows = np.clip(np.asarray(loads.entry_exit_times()), 0.0, duration)
-    row = _Row(cubics[:, 0, 0] - speed * starts[:, 0], speed, windows, -np.asarray(loads.weight))
-    tables, solutions = {}, {}
-    for v in np.unique(speed):
-        solutions[v] = particular_solution(system, v)
-        tables[v] = tabulated(system, solutions[v])
-    panels = _panels(system, row, solutions, duration)
-    table = np.concatenate([tables[v] for v in np.unique(speed)])
-    first_point = np.searchsorted(np.unique(speed), speed) * len(system.influence)
-    outputs = _RowOutputs(system, row, panels, table, first_point)
-    rate = max(system.fastest, system.wavenumber * np.abs(speed).max())
-    max_step, coarse = max_phase / rate, max(max_phase, COARSE_PHASE) / rate
-    steps = _steps(panels.boundaries, coarse)
-    largest = np.abs(outputs.at(*steps, COARSE_NODES)).max(axis=0)
-    reached = largest.max(axis=0)
-    chosen = np.flatnonzero((largest * COARSE_MARGIN >= reached).any(axis=(1, 2)))
-    parts = int(np.ceil(coarse / max_step * (1 - 1e-9)))
-    panel, start, length = (np.repeat(part[chosen], parts) for part in steps)
-    length = length / parts
-    start = start + length * np.tile(np.arange(parts), chosen.size)
-    samples = outputs.at(panel, start, length, PEAK_NODES)
-    estimate = estimate_peak(samples, PEAK_NODES)
-    best = np.argmax(estimate, axis=0)  # output, batch
-    of_best = np.take_along_axis(samples, best[None, None], axis=1)[:, 0]
-    value, position = refine_peak(of_best, PEAK_NODES)
-    time = start[best] + position * length[best]
-    entered = (windows[:, 1] > windows[:, 0])[:, None]
-    lowest = np.where(entered, -row.force, np.inf)
-    lost = np.where(entered & (row.force > 0), windows[:, :1], np.nan)
-    return Peaks(value.T, time.T, lowest.T, lost.T)
-
-
-def _panels(system: ForceSystem, row: _Row, solutions, duration: float) -> _Panels:
-    """Panels between the events of a run, and the free vibration in each."""
-    entry, leave = row.windows.T
-    passages = (system.breaks - row.origin[:, None]) / row.speed[:, None]
-    passages = np.clip(passages, entry[:, None], leave[:, None])
-    times = np.sort(np.concatenate([[0.0], row.windows.ravel(), passages.ravel()]))
-    same = SAME_TIME_SHARE * duration
-    times = times[(np.diff(times, prepend=-np.inf) > same) & (times < duration - same)]
-    boundaries = np.append(times, duration)
-    jumps = np.zeros((boundaries.size, system.poles.size, row.force.shape[1]), complex)
-    at_nodes = (system.nodes - row.origin[:, None]) / row.speed[:, None]
-    at_nodes = np.clip(at_nodes, entry[:, None], leave[:, None])
-    for s in range(system.nodes.size - 1):
-        times = np.sort(at_nodes[:, s : s + 2], axis=1)
-        inside = times[:, 1] > times[:, 0]
-        for end, sign in ((0, -1.0), (1, 1.0)):
-            local = local_position(system.nodes, s, row.origin + row.speed * times[:, end])
-            for v, solution in solutions.items():
-                wheels = np.flatnonzero(inside & (row.speed == v))
-                p = chebyshev.chebval(local[wheels], solution[s]).T.reshape(wheels.size, -1)
-                index = np.searchsorted(boundaries, times[wheels, end] - same)
-                np.add.at(jumps, index, sign * p[:, :, None] * row.force[wheels, None])
-    decay = np.exp(system.poles * np.diff(boundaries, prepend=0.0)[:, None])[..., None]
-    amplitude, now = np.zeros((boundaries.size - 1, *jumps.shape[1:]), complex), 0.0
-    for i in range(boundaries.size - 1):
-        now = now * decay[i] + jumps[i]
-        amplitude[i] = now
-    middle = (boundaries[1:] + boundaries[:-1]) / 2
-    on_beam = (entry < middle[:, None]) & (middle[:, None] < leave)
-    most = max(1, int(on_beam.sum(axis=1).max()))
-    wheels = np.argsort(~on_beam, axis=1, kind="stable")[:, :most]
-    on_beam = np.take_along_axis(on_beam, wheels, axis=1)
-    x = row.origin[wheels] + row.speed[wheels] * middle[:, None]
-    piece = np.clip(np.searchsorted(system.breaks, x) - 1, 0, system.count.size - 1)
-    return _Panels(boundaries, amplitude, wheels, on_beam, piece)
-
-
-def _steps(boundaries, max_step: float):
-    """Panel, start (s) and length (s) of equal steps within panels."""
-    lengths = np.diff(boundaries)
-    counts = np.ceil(lengths / max_step).astype(int)
-    panel = np.repeat(np.arange(counts.size), counts)
-    length = (lengths / np.maximum(counts, 1))[panel]
-    number = np.arange(panel.size) - np.repeat(np.cumsum(counts) - counts, counts)
-    return panel, boundaries[panel] + number * length, length
-
-
-class _RowOutputs(NamedTuple):
-    """Outputs at the peak nodes of steps."""
-
-    system: ForceSystem
-    row: _Row
-    panels: _Panels
-    table: Float[np.ndarray, "point four output"]
-    first_point: np.ndarray
-
-    def at(self, panel, start, length, nodes) -> Float[np.ndarray, "node step output batch"]:
-        """Outputs at nodes (shares of the length) of steps: panel, start and length (s)."""
-        nodes = np.asarray(nodes)
-        return self._free(panel, start, length, nodes) + self._forced(panel, start, length, nodes)
-
-    def _free(self, panel, start, length, nodes):
-        """Free vibration: growth from the start of the panel to that of the step, and within it."""
-        poles, C = self.system.poles, self.system.on_outputs
-        since = start - self.panels.boundaries[panel]
-        amplitude = self.panels.amplitude[panel] * np.exp(since[:, None] * poles)[..., None]
-        lengths, kind = np.unique(length, return_inverse=True)
-        growth = np.exp(np.multiply.outer(lengths[:, None] * nodes, poles))
-        growth = np.concatenate([growth.real, -growth.imag], axis=-1)[kind]
-        vibration = C[:, :, None] * amplitude[:, None]  # step, output, pole, batch
-        vibration = np.concatenate([vibration.real, vibration.imag], axis=2)
-        return np.einsum("snk,sokb->nsob", growth, vibration)
-
-    def _forced(self, panel, start, length, nodes):
-        """Forces on the beam: r(x) by cubics through four points of its table."""
-        outputs, batch = self.table.shape[2], self.row.force.shape[1]
-        result = np.zeros((nodes.size, panel.size, outputs, batch))
-        breaks, count, first = self.system.breaks, self.system.count, self.system.first
-        for on_beam, wheels, pieces in zip(
-            self.panels.on_beam.T, self.panels.wheels.T, self.panels.piece.T, strict=True
-        ):
-            here = np.flatnonzero(on_beam[panel])
-            wheel, piece = wheels[panel[here]], pieces[panel[here]]
-            x = self.row.origin[wheel] + self.row.speed[wheel] * start[here]
-            x = x + np.multiply.outer(nodes, self.row.speed[wheel] * length[here])
-            place = (x - breaks[piece]) * ((count - 1) / np.diff(breaks))[piece]
-            low = np.clip(place.astype(int) - 1, 0, count[piece] - 4)
-            s = place - low
-            weights = (
-                -(s - 1) * (s - 2) * (s - 3) / 6,
-                s * (s - 2) * (s - 3) / 2,
-                -s * (s - 1) * (s - 3) / 2,
-                s * (s - 1) * (s - 2) / 6,
-            )
-            around = self.table[low + self.first_point[wheel] + first[piece]]
-            values = np.einsum("ins,nsio->nso", np.stack(weights), around)
-            result[:, here] += values[..., None] * self.row.force[wheel][:, None]
-        return result
+def _raise_to(reached, run, values) -> None:
+    """Raise what is reached in each run to the largest of its values; runs are in order."""
+    first = np.flatnonzero(np.diff(run, prepend=-1))
+    if first.size:
+        own = run[first]
+        reached[own] = np.maximum(reached[own], np.maximum.reduceat(values, first))

@@ -11,30 +11,30 @@ change where a force enters, passes a node or leaves, so that eta is continuous.
 
     y = sum over the forces of F r(x) + Re(C a exp(lambda t)),    r(x) = Re(C p(x)) + influence(x),
 
-the second term of r being static (`LinearOutputs`). r is tabulated once for a speed; a train is a
-sum of shifted tables. Between samples the peaks are those of polynomials (`peak_search`).
+the second term of r being static (`LinearOutputs`). r is found once for a speed; a train is a sum
+of shifted copies of it.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float, Int
+from numpy.polynomial import chebyshev
 
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.linear_outputs import LinearOutputs
-from jaxbeam.numerics.piecewise import chebyshev_polynomials
 
 MAX_CONDITION = 1e6  # of the eigenvectors; beyond, poles are nearly repeated
-TABLE_POINTS = 3000  # of the beam, at least; cubics between them are exact to 1e-9
+TABLE_POINTS = 600  # of the beam, at least; peaks are searched on lines between them
+POINTS_PER_MODE = 40
+CURVATURE_MARGIN = 1.2  # of the curvature over second differences of the table
 
 
 class ForceSystem(NamedTuple):
     """A model and its outputs in coordinates of its poles (1/s), one of each conjugate pair.
 
-    `forces` are the series (segment, term, pole) of b(x), `on_outputs` is C. Between the `breaks`
-    (m) r(x) is smooth; it is tabulated at points in equal distances, a `count` of them from the
-    `first` on in each piece: `influence` is its static part there, and `polynomials` are those of
-    the series of all segments.
+    `forces` are the series (segment, term, pole) of b(x), `on_outputs` is C, `static` the static
+    part of r(x). Between the `breaks` (m), nodes among them, r(x) is smooth.
     """
 
     poles: Complex[np.ndarray, " pole"]
@@ -42,20 +42,32 @@ class ForceSystem(NamedTuple):
     on_outputs: Complex[np.ndarray, "output pole"]
     nodes: Float[np.ndarray, " node"]
     breaks: Float[np.ndarray, " break"]
-    influence: Float[np.ndarray, "point output"]
-    polynomials: tuple[Float[np.ndarray, "_ term"], ...]
-    first: np.ndarray
-    count: np.ndarray
-
-    @property
-    def wavenumber(self) -> float:
-        """Bound of those of the mode shapes of a beam of one span (rad/m)."""
-        return (self.poles.size + 1) * np.pi / float(self.nodes[-1] - self.nodes[0])
+    static: LinearOutputs
 
     @property
     def fastest(self) -> float:
         """Largest magnitude of a pole (1/s)."""
         return float(np.abs(self.poles).max())
+
+    @property
+    def segment(self) -> Int[np.ndarray, " piece"]:
+        """Segment in which each piece between two breaks is."""
+        middle = (self.breaks[:-1] + self.breaks[1:]) / 2
+        return np.searchsorted(self.nodes[1:-1], middle)
+
+    @property
+    def has_static(self) -> Bool[np.ndarray, " output"]:
+        """Whether r of each output has a static part."""
+        if self.static.influence is None:
+            return np.zeros(self.on_outputs.shape[0], bool)
+        return np.any(np.asarray(self.static.influence.series), axis=(0, 1))
+
+    def static_part(self, x, piece) -> Float[np.ndarray, "force output"]:
+        """Static part of r at positions (m) in pieces."""
+        if self.static.influence is None:
+            return np.zeros((x.size, self.on_outputs.shape[0]))
+        near = (self.breaks[piece] + self.breaks[piece + 1]) / 2
+        return np.asarray(self.static.influence.of_forces_at(x, near))
 
 
 def force_system(
@@ -75,26 +87,8 @@ def force_system(
     on_outputs = outputs.rows @ vectors[:, own] * np.where(poles[own].imag > 0, 2.0, 1.0)
     nodes = np.asarray(model.modes.nodes)
     breaks = np.unique(np.concatenate([nodes, np.clip(places, nodes[0], nodes[-1])]))
-    length = nodes[-1] - nodes[0]
-    count = np.maximum(4, np.ceil(TABLE_POINTS * np.diff(breaks) / length).astype(int) + 1)
-    pieces = [
-        np.linspace(left, right, n)
-        for left, right, n in zip(breaks[:-1], breaks[1:], count, strict=True)
-    ]
-    points = np.concatenate(pieces)
-    near = np.repeat((breaks[:-1] + breaks[1:]) / 2, count)
-    influence = np.zeros((points.size, on_outputs.shape[0]))
-    if outputs.influence is not None:
-        influence = np.asarray(outputs.influence.of_forces_at(points, near))
-    first = np.cumsum(count) - count
     series = np.asarray(model.modes.series) @ into.T
-    size, segment = _solution_size(series.shape[1]), np.searchsorted(nodes[1:-1], near)
-    polynomials = tuple(
-        chebyshev_polynomials(local_position(nodes, s, points[segment == s]), size)
-        for s in range(nodes.size - 1)
-    )
-    parts = poles[own], series, on_outputs, nodes, breaks, influence, polynomials
-    return ForceSystem(*parts, first, count)
+    return ForceSystem(poles[own], series, on_outputs, nodes, breaks, outputs)
 
 
 def _solution_size(terms: int) -> int:
@@ -102,8 +96,10 @@ def _solution_size(terms: int) -> int:
     return terms + 6 * int(np.ceil(np.cbrt(terms))) + 12
 
 
-def particular_solution(system: ForceSystem, speed: float) -> Complex[np.ndarray, "segment n pole"]:
-    """Chebyshev series of p(x), with v p' - lambda p = b(x), in each segment at a speed v (m/s).
+def particular_solutions(
+    system: ForceSystem, speeds: Float[np.ndarray, " speed"]
+) -> Complex[np.ndarray, "speed segment n pole"]:
+    """Chebyshev series of p(x), with v p' - lambda p = b(x), in each segment at speeds v (m/s).
 
     By the recurrence 2 n p_n = c_(n-1) p'_(n-1) - p'_(n+1) of the coefficients of a derivative. Of
     a pole that turns far within a segment the polynomial of the degree of b; of others, the
@@ -117,35 +113,107 @@ def particular_solution(system: ForceSystem, speed: float) -> Complex[np.ndarray
     b[:, :terms] = system.forces
     right = np.zeros((segments, size, poles), complex)
     right[:, 1:] = c[:-1, None] * b[:, : size - 1] - b[:, 2:]
-    result = np.zeros((segments, size, poles), complex)
+    result = np.zeros((speeds.size, segments, size, poles), complex)
     for s, half in enumerate(np.diff(system.nodes) / 2):
-        rate = speed / half
-        turns = np.abs(system.poles / rate)
-        far = turns >= terms
-        p = np.zeros((size + 1, poles), complex)
+        rates = (speeds / half)[:, None]
+        far = np.abs(system.poles / rates) >= terms
+        p = np.zeros((size + 1, speeds.size, poles), complex)
         for k in range(terms, 0, -1):  # from the highest coefficient down
-            known = 2 * k * rate * p[k] + system.poles * p[k + 1] - right[s, k]
-            p[k - 1] = known / (system.poles * c[k - 1])
-        result[s] = np.where(far, p[:size], 0.0)
-        near = np.flatnonzero(~far)
+            known = 2 * k * rates * p[k] + system.poles * p[k + 1] - right[s, k]
+            p[k - 1] = np.where(far, known / (system.poles * c[k - 1]), 0.0)
+        result[:, s] = np.moveaxis(p[:size], 0, 1)
+        at_speed, near = np.nonzero(~far)
         if near.size:
             matrix = np.zeros((near.size, size, size), complex)
-            matrix[:, n, n] = 2 * n * rate
+            matrix[:, n, n] = 2 * n * rates[at_speed]
             matrix[:, n[1:], n[:-1]] -= system.poles[near, None] * c[:-1]
             matrix[:, n[1:-1], n[2:]] += system.poles[near, None]
             matrix[:, 0] = (-1.0) ** n
-            result[s][:, near] = np.linalg.solve(matrix, right[s][:, near].T[..., None])[..., 0].T
+            found = np.linalg.solve(matrix, right[s][:, near].T[..., None])[..., 0]
+            result[at_speed, s, :, near] = found
     return result
 
 
-def tabulated(system: ForceSystem, solution) -> Float[np.ndarray, "point four output"]:
-    """r(x) at the points of the beam for one speed, each with the three next points."""
-    on_outputs = solution @ system.on_outputs.T
-    parts = [T @ own.real for T, own in zip(system.polynomials, on_outputs, strict=True)]
-    table = np.concatenate(parts) + system.influence
-    return np.stack([np.roll(table, -i, axis=0) for i in range(4)], axis=1)
+class ForceResponses(NamedTuple):
+    """Responses to a unit force at each of some `speeds` (m/s): p(x) and r(x).
+
+    `before` and `after` are p at the left and at the right side of the nodes, zero off the beam.
+    `on_outputs` are the series of Re(C p). r is tabulated in equal distances, at `count` points
+    from the `first` on in each piece; on lines between them it has errors up to `table_error`.
+    `curvature` bounds d2r/dt2 (1/s^2) under the moving force.
+    """
+
+    system: ForceSystem
+    speeds: Float[np.ndarray, " speed"]
+    solutions: Complex[np.ndarray, "speed segment n pole"]
+    before: Complex[np.ndarray, "speed node pole"]
+    after: Complex[np.ndarray, "speed node pole"]
+    on_outputs: Float[np.ndarray, "speed segment n output"]
+    table: Float[np.ndarray, "speed point output"]
+    table_error: Float[np.ndarray, "speed output"]
+    curvature: Float[np.ndarray, "speed output"]
+    first: Int[np.ndarray, " piece"]
+    count: Int[np.ndarray, " piece"]
+
+    def exact(self, speed, piece, x, output) -> Float[np.ndarray, " force"]:
+        """r(x) of an output, for forces of numbered speeds at x (m) in pieces of the beam."""
+        segment = self.system.segment[piece]
+        series = self.on_outputs[speed, segment, :, output].T
+        t = _local(self.system.nodes, segment, x)
+        lower, value = 0.0, np.zeros(x.shape)
+        for coefficient in series[:0:-1]:  # Clenshaw's recurrence
+            lower, value = value, 2 * t * value - lower + coefficient
+        value = t * value - lower + series[0]
+        has_static = np.flatnonzero(self.system.has_static[output])
+        if has_static.size:
+            static = self.system.static_part(x[has_static], piece[has_static])
+            value[has_static] += static[np.arange(has_static.size), output[has_static]]
+        return value
+
+    def particular(self, speed: int, segment: int, x) -> Complex[np.ndarray, "force pole"]:
+        """p(x) at positions (m) in a segment."""
+        local = _local(self.system.nodes, segment, x)
+        return chebyshev.chebval(local, self.solutions[speed, segment]).T
 
 
-def local_position(nodes, segment: int, x):
-    """Positions within a segment, -1 to 1."""
+def _local(nodes, segment, x):
+    """Positions within segments, -1 to 1."""
     return np.clip(2 * (x - nodes[segment]) / (nodes[segment + 1] - nodes[segment]) - 1, -1, 1)
+
+
+def force_responses(system: ForceSystem, speeds: Float[np.ndarray, " speed"]) -> ForceResponses:
+    """Responses of a system to forces of some speeds (m/s)."""
+    solutions = particular_solutions(system, speeds)
+    signs = (-1.0) ** np.arange(solutions.shape[2])
+    outside = np.zeros((speeds.size, 1, system.poles.size))
+    after = np.concatenate([np.einsum("usnk,n->usk", solutions, signs), outside], axis=1)
+    before = np.concatenate([outside, solutions.sum(axis=2)], axis=1)
+    on_outputs = (solutions @ system.on_outputs.T).real
+    points, piece, first, count = _points(system)
+    table = np.empty((speeds.size, points.size, system.on_outputs.shape[0]))
+    for s in range(system.nodes.size - 1):
+        own = system.segment[piece] == s
+        local = _local(system.nodes, s, points[own])
+        table[:, own] = chebyshev.chebvander(local, solutions.shape[2] - 1) @ on_outputs[:, s]
+    table += system.static_part(points, piece)
+    bends = np.abs(np.diff(table, 2, axis=1))
+    bends = np.where((piece[2:] == piece[:-2])[:, None], bends, 0.0)
+    distance = np.diff(system.breaks) / (count - 1)
+    error = CURVATURE_MARGIN / 8 * bends.max(axis=1)
+    bends = bends / distance[piece[2:], None] ** 2
+    curvature = CURVATURE_MARGIN * speeds[:, None] ** 2 * bends.max(axis=1)
+    parts = solutions, before, after, on_outputs, table, error, curvature
+    return ForceResponses(system, speeds, *parts, first, count)
+
+
+def _points(system: ForceSystem):
+    """Points of the tables (m), their pieces, and first point and number of points of each."""
+    lengths = np.diff(system.breaks)
+    most = max(TABLE_POINTS, POINTS_PER_MODE * system.poles.size)
+    count = np.maximum(8, np.ceil(most * lengths / lengths.sum()).astype(int) + 1)
+    pieces = [
+        np.linspace(left, right, n)
+        for left, right, n in zip(system.breaks[:-1], system.breaks[1:], count, strict=True)
+    ]
+    piece = np.repeat(np.arange(count.size), count)
+    return np.concatenate(pieces), piece, np.cumsum(count) - count, count

@@ -87,19 +87,24 @@ class OutputRows(Module):
         return C, on_rates
 
     def of_system(
-        self, model: ModalModel, A: Float[Array, "state state"], B: Float[Array, "state input"]
-    ) -> tuple[Float[Array, "output state"], Float[Array, "output input"]]:
+        self,
+        model: ModalModel,
+        A: Float[Array, "*time state state"],
+        B: Float[Array, "*time state input"],
+    ) -> tuple[Float[Array, "*time output state"], Float[Array, "*time output input"]]:
         """C and D of y = C z + D u where z' = A z + B u; the first states are those of the model.
 
         Commands are the first of the inputs.
         """
         C, _ = self.on_states(model)
-        C = xp.pad(C, ((0, 0), (0, A.shape[1] - C.shape[1])))
-        D = xp.zeros((C.shape[0], B.shape[1]))
-        D = set_at(D, np.s_[:, : self.on_commands.shape[1]], self.on_commands)
+        C = xp.pad(C, ((0, 0), (0, A.shape[-1] - C.shape[1])))
+        C = xp.broadcast_to(C, (*A.shape[:-2], *C.shape))
+        D = xp.zeros((*C.shape[:-1], B.shape[-1]))
+        D = set_at(D, np.s_[..., : self.on_commands.shape[1]], self.on_commands)
         rates = model.rate_index
         for i in np.flatnonzero(self.has_feedthrough):
-            C, D = set_at(C, i, self.rows[i] @ A[rates]), set_at(D, i, self.rows[i] @ B[rates])
+            C = set_at(C, np.s_[..., i, :], self.rows[i] @ A[..., rates, :])
+            D = set_at(D, np.s_[..., i, :], self.rows[i] @ B[..., rates, :])
         return C, D
 
     def with_accelerations(

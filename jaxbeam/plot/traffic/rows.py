@@ -20,7 +20,19 @@ from jaxbeam.simulation.labels import wheel_labels
 from jaxbeam.simulation.record import Record
 
 MAX_CURVES = 5  # wheels or bodies of a load with a curve each; those of more are an envelope
+SAME_FORCE = 1e-6  # share of the static load by which a contact force may differ from it
 MAX_WEIGHTS = 4  # static loads with a line and a label each
+
+
+def forces_vary(record: Record) -> bool:
+    """Whether the contact force of a wheel on the beam differs from its static load.
+
+    It does where a mass or a vehicle is on the beam, or a force is a function of time.
+    """
+    on = np.isfinite(np.asarray(record.load_position))
+    static = np.asarray(concrete(load_set(record.case).weight))[:, 0]
+    deviation = np.where(on, np.abs(np.asarray(record.contact_force) - static), 0.0)
+    return bool(np.any(deviation > SAME_FORCE * np.abs(static)))
 
 
 def draw_forces(axes, record: Record) -> None:

@@ -78,13 +78,15 @@ def test_slope_and_curvature_jump_at_kinks_only(name):
         height, slope, curvature = jumps(kinks)
         assert height.max() < 1e-6
         assert (np.maximum(slope, curvature) > 1e-2).all()
-        assert profile.has_slope_jumps == bool((slope > 1e-2).any())
-    else:
-        assert not profile.has_slope_jumps
+    places, sizes = profile.slope_kinks()
+    assert places.size == (np.sum(slope > 1e-2) if kinks.size else 0)
+    for x, size in zip(places, sizes, strict=True):
+        right, left = (profile.heights(x + s)[1] for s in (side, -side))
+        assert_allclose(size, right - left, rtol=1e-6)
 
 
 def test_only_a_ramp_without_a_contact_patch_has_jumps_of_slope():
-    assert [name for name, profile in PROFILES.items() if profile.has_slope_jumps] == ["ramp"]
+    assert [name for name, profile in PROFILES.items() if profile.slope_kinks()[0].size] == ["ramp"]
     assert_allclose(PROFILES["ramp"].kinks(), [1.0, 3.0])
     assert_allclose(np.sort(AVERAGED["ramp"].kinks()), [0.65, 1.35, 2.65, 3.35])
     assert_allclose(PROFILES["bump"].kinks(), [1.0, 3.0])

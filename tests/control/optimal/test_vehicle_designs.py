@@ -12,7 +12,7 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.estimator import Estimate
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.optimal.scheduled_lqr import _with_crossing_load
+from jaxbeam.control.optimal.scheduled_lqr import with_crossing_load
 from tests.control.optimal import test_crossing_vehicles as crossing
 
 MODES, STATES = crossing.MODES, 2 * crossing.MODES + 4
@@ -47,7 +47,7 @@ def test_a_scheduled_vehicle_is_similar():
     heavy = jb.QuarterCar(**{name: factor * value for name, value in car.items()}, speed=speed)
     expected = jb.state_space(crossing.beam_case(heavy))
     mass = factor * (crossing.CAR.body_mass + crossing.CAR.axle_mass)
-    found = _with_crossing_load(jb.state_space(crossing.beam_case()), mass, speed)
+    found = with_crossing_load(jb.state_space(crossing.beam_case()), mass, speed)
     for system, other in (
         (found.at(0.2), expected.at(0.2)),
         (found.augmented(0.3), expected.augmented(0.3)),

@@ -21,6 +21,7 @@ from experiments.benchmarks import (
     tuning_methods,
 )
 from experiments.benchmarks.common import import_optional
+from experiments.benchmarks.trains import __main__ as trains
 
 
 def test_one_command_runs_all_benchmarks(capsys, monkeypatch):
@@ -105,6 +106,12 @@ def test_osqp_solves_the_same_programs(programs):
     atol = quadratic_programs.SOLUTION_TOLERANCE * np.max(np.abs(by_jaxbeam))
     np.testing.assert_allclose(x, by_jaxbeam, atol=atol)
     assert 0 < reported < called
+
+
+def test_trains_have_the_peaks_of_the_script():
+    found = trains.measure(np.array([45.0, 70.0]))
+    assert found["difference"] < 2e-3
+    assert 0 < found["processor"] < found["script"]
 
 
 def test_growth_measures_times_and_memory():

@@ -12,7 +12,31 @@ from jaxbeam.runtime.arrays import Array
 
 
 class VehicleBody(ReprWithUnits, eqx.Module):
-    """Rigid body; without `inertia` it has a height only, like the lumped mass of an axle."""
+    """Rigid body; without `inertia` it has a height only, like the lumped mass of an axle.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[
+    ...         jb.VehicleLoad(
+    ...             speed=20.0,
+    ...             bodies=[jb.VehicleBody("car", mass=1500.0, inertia=2500.0)],
+    ...             axles=[
+    ...                 jb.VehicleAxle(
+    ...                     "car", 1.2, suspension_stiffness=4e4, suspension_damping=3e3
+    ...                 ),
+    ...                 jb.VehicleAxle(
+    ...                     "car", -1.5, suspension_stiffness=4e4, suspension_damping=3e3
+    ...                 ),
+    ...             ],
+    ...         )
+    ...     ],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    0.246 mm
+    """
 
     name: str = choice("name of the body")
     mass: Float[Array, ""] = number("kg", "mass", POSITIVE)
@@ -26,6 +50,30 @@ class VehicleSpring(ReprWithUnits, eqx.Module):
     """Vertical spring and damper between two bodies at a position, and those between their pitches.
 
     A vertical force acts on both bodies along one line, so that they share the position.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[
+    ...         jb.VehicleLoad(
+    ...             speed=20.0,
+    ...             bodies=[
+    ...                 jb.VehicleBody("body", mass=8000.0),
+    ...                 jb.VehicleBody("frame", mass=2000.0),
+    ...             ],
+    ...             springs=[
+    ...                 jb.VehicleSpring(
+    ...                     "body", "frame", position=0.0, stiffness=4e5, damping=1e4
+    ...                 )
+    ...             ],
+    ...             axles=[jb.VehicleAxle("frame", 0.0, suspension_stiffness=1e6)],
+    ...         )
+    ...     ],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    1.857 mm
     """
 
     first: str = choice("name of a body")
@@ -42,7 +90,38 @@ class VehicleSpring(ReprWithUnits, eqx.Module):
 
 
 class VehicleHinge(ReprWithUnits, eqx.Module):
-    """Point at which two bodies have the same height, exactly, such as a fifth wheel."""
+    """Point at which two bodies have the same height, exactly, such as a fifth wheel.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[
+    ...         jb.VehicleLoad(
+    ...             speed=20.0,
+    ...             bodies=[
+    ...                 jb.VehicleBody("tractor", mass=5000.0, inertia=2e4, position=0.0),
+    ...                 jb.VehicleBody("trailer", mass=15000.0, inertia=8e4, position=-6.0),
+    ...             ],
+    ...             hinges=[jb.VehicleHinge("tractor", "trailer", position=-1.5)],
+    ...             axles=[
+    ...                 jb.VehicleAxle(
+    ...                     "tractor", 2.0, suspension_stiffness=4e5, suspension_damping=1e4
+    ...                 ),
+    ...                 jb.VehicleAxle(
+    ...                     "tractor", -2.0, suspension_stiffness=4e5, suspension_damping=1e4
+    ...                 ),
+    ...                 jb.VehicleAxle(
+    ...                     "trailer", -9.0, suspension_stiffness=1e6, suspension_damping=2e4
+    ...                 ),
+    ...             ],
+    ...         )
+    ...     ],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    2.753 mm
+    """
 
     first: str = choice("name of a body")
     second: str = choice("name of another body")
@@ -54,6 +133,29 @@ class VehicleAxle(ReprWithUnits, eqx.Module):
 
     Without a tyre it stays on the surface, where its mass is unsprung, as that of a wheelset;
     without a suspension it is part of the body, which has its mass.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[
+    ...         jb.VehicleLoad(
+    ...             speed=20.0,
+    ...             bodies=[jb.VehicleBody("car", mass=1500.0, inertia=2500.0)],
+    ...             axles=[
+    ...                 jb.VehicleAxle(
+    ...                     "car", 1.2, suspension_stiffness=4e4, suspension_damping=3e3
+    ...                 ),
+    ...                 jb.VehicleAxle(
+    ...                     "car", -1.5, suspension_stiffness=4e4, suspension_damping=3e3
+    ...                 ),
+    ...             ],
+    ...         )
+    ...     ],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    0.246 mm
     """
 
     body: str = choice("name of the body that it carries")

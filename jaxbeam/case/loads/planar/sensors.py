@@ -20,6 +20,16 @@ class VehicleSensor(ReprWithUnits, Module):
     a name of `Record.bodies` without the load, as "body" or "axle 1". At `position` (m) forward of
     the centre of mass it feels the pitch as well. Displacements are from static equilibrium. The
     other entries are those of `Sensor`.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3),
+    ...     loads=[jb.VehicleLoad(model="half-truck", speed=20.0)],
+    ...     vehicle_sensors=[jb.VehicleSensor(body="axle 1", quantity="acceleration")],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(case.vehicle_sensors[0].unit)
+    m/s^2
     """
 
     # What a sensor on the beam may have and this one has not.

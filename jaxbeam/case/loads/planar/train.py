@@ -22,6 +22,11 @@ class Coach(eqx.Module):
 
     `length` over couplers is that of the vehicle file if it is left out; the wheels are in the
     middle of it.
+
+    >>> import jaxbeam as jb
+    >>> coach = jb.Coach("manchester-wagon", count=4)
+    >>> print(coach.count, "coaches of", coach.coupler_length(), "m")
+    4 coaches of 25.0 m
     """
 
     model: str = choice("name of a vehicle of the library, or path of a vehicle file")
@@ -41,6 +46,16 @@ class TrainLoad(AbstractVehicleLoad):
     """Vehicles of several kinds, `coaches` from the front on, coupled without forces between them.
 
     They are one load with one trajectory, that of the first wheel of the train.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[jb.TrainLoad(speed=50.0, coaches=[jb.Coach("manchester-wagon", count=2)])],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    7.645 mm
     """
 
     kind: ClassVar[str] = "train"

@@ -20,6 +20,11 @@ class Crowd(AbstractWalkingLoad):
     mean `pace` and the deviation `pace_deviation`, at most three deviations off, and they step at
     any time. All numbers drawn are those of the `seed`. Streams of different speeds, or in opposite
     directions, are several loads.
+
+    >>> import jaxbeam as jb
+    >>> load = jb.Crowd(pace=1.9, people=5, length=10.0, speed=1.4)
+    >>> print(load.vehicle(9.81).offsets.size, "people")
+    5 people
     """
 
     kind: ClassVar[str] = "crowd"

@@ -1,4 +1,4 @@
-"""Pedestrian: a person who walks or jogs along the beam, or on the spot."""
+"""Pedestrian: a person who walks or jogs along the beam, or in one place."""
 
 from typing import ClassVar
 
@@ -16,6 +16,16 @@ class Pedestrian(AbstractWalkingLoad):
 
     One step is at `step_time`, by default the `entry_time`. With a `position` the person stays
     there; with a speed or a table the force travels as other loads do.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 4e8, 1000.0, damping_ratio=0.01, modes=2),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[jb.Pedestrian(pace=2.0, weight=700.0, speed=10.0)],
+    ...     run=jb.Run(2.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    0.839 mm
     """
 
     kind: ClassVar[str] = "pedestrian"

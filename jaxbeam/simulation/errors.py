@@ -1,20 +1,49 @@
-"""What the modes that a run leaves out change of what its sensors measure."""
+"""Errors of what the sensors of a run measure: of its time steps, and of the modes left out."""
 
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.integrator.step_size import StepTrial
 from jaxbeam.model.layout import is_uniform
+from jaxbeam.model.load_set import load_set
+from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.output_rows import sensor_history
 from jaxbeam.model.static_correction import Motion, corrected_history
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.simulation.motion.at_samples import motion_at
 
 LEFT_OUT = 3  # highest modes whose dynamic part estimates that of all modes beyond
-MAX_SAMPLES = 400  # of a record from which the errors are estimated
+MAX_SAMPLES = 400  # of a run from which the errors are estimated
+
+
+def chosen_samples(count: int) -> Int[np.ndarray, " sample"]:
+    """Indices of at most MAX_SAMPLES of some samples, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, MAX_SAMPLES).astype(int))
+
+
+@np.errstate(all="ignore")  # of extreme numbers, and of runs that diverge
+def step_errors(case: Case, model: ModalModel, trial: StepTrial) -> Float[Array, " sensor"]:
+    """Estimated error of the time steps in the quantity of each sensor, relative to its largest.
+
+    Largest change of the quantity as the steps of a trial are halved, under the same commands. NaN
+    for a run that diverges.
+    """
+    chosen, loads = chosen_samples(trial.times.size), load_set(case, model.modes.layout)
+    times = trial.times[chosen]
+    coarse, fine = (
+        motion_at(case, model, loads, times, states[chosen])[0]
+        for states in (trial.coarse, trial.fine)
+    )
+    errors = []
+    for sensor in case.sensors:
+        known, better = (sensor_history(case, model.modes, m, sensor) for m in (coarse, fine))
+        errors.append(_relative_change(better, known))
+    return xp.array(errors).reshape(-1)
 
 
 @np.errstate(all="ignore")  # of extreme numbers
@@ -23,7 +52,7 @@ def truncation_errors(case: Case, modes: Modes, motion: Motion) -> Float[Array, 
 
     From the samples of a run. Of a deflection or rotation, the largest part that the static
     correction would add. Of others, the largest change with the dynamic part of the three highest
-    modes left out, which is more than that of all higher modes where their contributions fall;
+    modes left out, which exceeds that of all higher modes where their contributions fall;
     accelerations under point forces do not converge, and their modes are a convention. NaN for
     those of a case with one mode, and for slopes of a beam that is not uniform.
     """
@@ -38,10 +67,14 @@ def truncation_errors(case: Case, modes: Modes, motion: Motion) -> Float[Array, 
             other = corrected_history(case, modes, motion, sensor.position, quantity.x_derivative)
         else:
             other = full * xp.nan if fewer is None else sensor_history(*fewer, sensor)
-        largest = xp.max(xp.abs(full))
-        change = xp.max(xp.abs(full - other))
-        errors.append(xp.where(largest > 0, change / xp.where(largest > 0, largest, 1.0), 0.0))
+        errors.append(_relative_change(full, other))
     return xp.array(errors).reshape(-1)
+
+
+def _relative_change(values, others):
+    """Largest difference of others, relative to the largest value; zero where all are zero."""
+    largest, change = xp.max(xp.abs(values)), xp.max(xp.abs(values - others))
+    return xp.where(largest == 0, 0.0, change / xp.where(largest == 0, 1.0, largest))
 
 
 def _with_fewer_modes(

@@ -1,0 +1,1 @@
+"""Sweeps of high-speed trains over their speeds."""

@@ -1,0 +1,233 @@
+"""Generalised predictive control: predictions from past readings and commands, without a state.
+
+Source: Clarke, Mohtadi and Tuffs, Automatica 23, 1987. The sampled plant is the CARIMA model
+
+    A(q) y(k) = B(q) u(k - 1) + e(k) / (1 - q),     q the delay of one sample,
+
+and the moves du of the commands minimise
+
+    sum from N1 to N2 of weight (w - y(k + j))^2 + sum of move_weight du(k + j - 1)^2, j = 1 ... Nu.
+"""
+
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep
+from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, concrete, count, is_concrete, number, part
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.control.design_model import DesignModel
+from jaxbeam.control.predictive.prediction import sampled_plant
+from jaxbeam.runtime.arrays import Array, add_at, solve, xp
+
+
+class PolynomialModel(NamedTuple):
+    """Plant y(k) + a_1 y(k - 1) + ... = B_1 u(k - 1) + B_2 u(k - 2) + ..., all outputs with one a.
+
+    `denominator` are a_1 ... a_n, `numerators` B_1 ... B_n.
+    """
+
+    denominator: Float[Array, " power"]
+    numerators: Float[Array, "power output actuator"]
+
+
+class PredictiveGains(NamedTuple):
+    """u(k) = reference_command - sum of H_i y(k - i) - sum of K_i u(k - 1 - i), i = 0, 1, ..."""
+
+    reading_gains: Float[Array, "past actuator output"]
+    command_gains: Float[Array, "power actuator actuator"]
+    reference_command: Float[Array, " actuator"]
+
+
+def polynomial_model(
+    A: Float[Array, "state state"],
+    B: Float[Array, "state actuator"],
+    C: Float[Array, "output state"],
+) -> PolynomialModel:
+    """Polynomials of x(k+1) = A x(k) + B u(k), y = C x, by the recursion of Faddeev and LeVerrier.
+
+    With M_1 = 1, the numerators are C M_i B, a_i = -tr(A M_i) / i, and M_(i+1) = A M_i + a_i.
+    """
+    identity = xp.eye(A.shape[0])
+    M, denominator, numerators = identity, [], []
+    for i in range(1, A.shape[0] + 1):
+        numerators.append(C @ M @ B)
+        product = A @ M
+        denominator.append(-xp.trace(product) / i)
+        M = product + denominator[-1] * identity
+    return PolynomialModel(xp.stack(denominator), xp.stack(numerators))
+
+
+def predicted_outputs(
+    model: PolynomialModel, horizon: int, moves: int
+) -> tuple[
+    Float[Array, "horizon output past output"],
+    Float[Array, "horizon output before actuator"],
+    Float[Array, "horizon output move actuator"],
+]:
+    """Outputs y(k+1) ... y(k+horizon) as sums over what is known and the moves to come.
+
+    The first factor is that of the readings y(k), y(k-1), ..., the second that of the last moves
+    du(k-1), du(k-2), ..., the third that of du(k), du(k+1), ...: the step response.
+    """
+    a = xp.concatenate([xp.ones(1), model.denominator])
+    powers, outputs, actuators = model.numerators.shape
+    one = xp.concatenate([a, xp.zeros(1)]) - xp.concatenate([xp.zeros(1), a])  # A (1 - q)
+    past, before = powers + 1, powers - 1
+    columns = past * outputs + (before + moves) * actuators
+    # Rows of the known and unknown numbers themselves: readings back from k, moves from k - before.
+    identity = xp.eye(columns)
+    known = [identity[i * outputs : (i + 1) * outputs] for i in range(past)][::-1]
+    steps = [
+        identity[past * outputs + i * actuators : past * outputs + (i + 1) * actuators]
+        for i in [*range(before)[::-1], *range(before, before + moves)]
+    ]
+    predictions = []
+    for j in range(1, horizon + 1):
+        row = xp.zeros((outputs, columns))
+        for i in range(1, past + 1):
+            row = row - one[i] * known[-i]
+        for i in range(1, powers + 1):
+            index = before + j - i  # of du(k + j - i)
+            if 0 <= index < before + moves:
+                row = row + model.numerators[i - 1] @ steps[index]
+        known.append(row)
+        predictions.append(row)
+    stacked = xp.stack(predictions)
+    shapes = (past, outputs), (before, actuators), (moves, actuators)
+    ends = np.cumsum([past * outputs, before * actuators])
+    parts = xp.split(stacked, ends, axis=-1)
+    readings, last, future = (
+        block.reshape(horizon, outputs, *shape) for block, shape in zip(parts, shapes, strict=True)
+    )
+    return readings, last, future
+
+
+def predictive_gains(
+    model: PolynomialModel,
+    horizons: tuple[int, int, int],
+    output_weights: Float[Array, " output"],
+    move_weights: Float[Array, " actuator"],
+    reference: Float[Array, " output"],
+) -> PredictiveGains:
+    """Gains of the first move without limits, for the horizons (N1, N2, Nu)."""
+    first, horizon, moves = horizons
+    past, before, future = (
+        block[first - 1 :] for block in predicted_outputs(model, horizon, moves)
+    )
+    actuators = move_weights.shape[0]
+    G = future.reshape(-1, moves * actuators)
+    weights = xp.tile(output_weights, horizon - first + 1)
+    hessian = G.T @ (weights[:, None] * G) + xp.diag(xp.tile(move_weights, moves))
+    first_move = solve(hessian, G.T * weights)[:actuators]
+    on_outputs = first_move.reshape(actuators, horizon - first + 1, -1)
+    reading_gains = xp.einsum("aho,hopr->par", on_outputs, past)
+    move_gains = xp.einsum("aho,hopb->pab", on_outputs, before)
+    # Moves are differences of commands, and the last command is what the move is added to.
+    none = xp.zeros((1, actuators, actuators))
+    command_gains = xp.concatenate([move_gains, none]) - xp.concatenate([none, move_gains])
+    command_gains = add_at(command_gains, 0, -xp.eye(actuators))
+    return PredictiveGains(
+        reading_gains, command_gains, xp.einsum("aho,o->a", on_outputs, reference)
+    )
+
+
+class GPC(AbstractController):
+    """Generalised predictive control of the readings, by past readings and past commands.
+
+    From `first` to `horizon` periods ahead the readings of all sensors are led to the `reference`,
+    by `moves` moves of each actuator; after these the command stays. The moves are found without
+    limits, then clipped by the actuators; the next sample goes on from the clipped command. A
+    steady load leaves no error at rest, where the readings are as many as the actuators. The plant
+    is that of the case without loads, or of the `design` model: 2 `modes` past readings and
+    commands are fed back, with those of actuator lags and of a delay. Filters of the sensors are no
+    part of it.
+    """
+
+    kind: ClassVar[str] = "gpc"
+
+    horizon: int = count("last period of the prediction, N2")
+    moves: int = count("moves of each actuator, Nu")
+    move_weight: Float[Array, " *actuator"] = number(
+        "unit of a reading^2/unit of a command^2", "weight of the square of each move", POSITIVE
+    )
+    first: int = count("first period of the prediction, N1", default=1)
+    output_weight: Float[Array, " *output"] | None = number(
+        "1", "weight of the square of each reading; 1 if left out", NOT_NEGATIVE, default=None
+    )
+    reference: Float[Array, " output"] | None = number(
+        "unit of a reading", "reference of each reading; 0 if left out", default=None
+    )
+    design: DesignModel | None = part("design model of the plant", DesignModel)
+
+    @property
+    def design_depends_on_loads(self) -> bool:
+        return False
+
+    def validate(self, case):
+        outputs, actuators = len(case.sensors), len(case.actuators)
+        if self.period is None:
+            return "period must be given: kind 'gpc' acts at samples"
+        excess_delay = None if self.delay is None else self.delay - self.period
+        if excess_delay is not None and is_concrete(excess_delay) and concrete(excess_delay) >= 0:
+            return "delay must be less than the period: one pending command is allowed for"
+        for name in ("moves", "first"):
+            if getattr(self, name) > self.horizon:
+                return f"{name} must be at most the horizon, {self.horizon}"
+        if outputs == 0:
+            return "kind needs a sensor: its readings are predicted"
+        for i, sensor in enumerate(case.sensors):
+            quantity = QUANTITIES[sensor.quantity]
+            if quantity.time_derivative > 1 or quantity.x_derivative > 1:
+                return (
+                    "kind needs sensors of deflection, slope or velocity, which commands do not"
+                    f" move at once; sensors.{i} measures {sensor.quantity}"
+                )
+        sizes = {"move_weight": actuators, "output_weight": outputs, "reference": outputs}
+        for name, size in sizes.items():
+            value = getattr(self, name)
+            allowed = [(size,)] if name == "reference" else [(), (size,)]
+            if value is not None and value.shape not in allowed:
+                return f"{name} must have {size} entries, not {value.size}"
+        error = None if self.design is None else self.design.validate(case)
+        return None if error is None else f"design.{error}"
+
+    def design_law(self, plant):
+        design = plant if self.design is None else self.design.design_plant(plant, "modal")
+        system, actuators = design.unloaded, len(plant.case.actuators)
+        outputs = len(design.case.sensors)
+        none = xp.zeros((system.A.shape[0], 0))
+        sampled = sampled_plant(system.A, system.B, none, self.period, self.delay)
+        C = system.C[:outputs]
+        C = xp.pad(C, ((0, 0), (0, sampled.A.shape[0] - C.shape[1])))
+        weight = 1.0 if self.output_weight is None else self.output_weight
+        gains = predictive_gains(
+            polynomial_model(sampled.A, sampled.B, C),
+            (self.first, self.horizon, self.moves),
+            xp.broadcast_to(xp.asarray(weight), outputs),
+            xp.broadcast_to(self.move_weight, actuators),
+            xp.zeros(outputs) if self.reference is None else self.reference,
+        )
+        return GPCLaw(*gains)
+
+
+class GPCLaw(AbstractSampledLaw):
+    """Law of `PredictiveGains`; its state are the readings and commands before the last ones."""
+
+    reading_gains: Float[Array, "past actuator output"]
+    command_gains: Float[Array, "power actuator actuator"]
+    reference_command: Float[Array, " actuator"]
+
+    def initial_state(self):
+        past, _, outputs = self.reading_gains.shape
+        powers, actuators, _ = self.command_gains.shape
+        return xp.zeros((past - 1, outputs)), xp.zeros((powers - 1, actuators))
+
+    def step(self, state, measurement, t):
+        outputs = self.reading_gains.shape[2]
+        readings = xp.concatenate([measurement.readings[None, :outputs], state[0]])
+        commands = xp.concatenate([measurement.command[None], state[1]])
+        command = self.reference_command - xp.einsum("pao,po->a", self.reading_gains, readings)
+        command = command - xp.einsum("pab,pb->a", self.command_gains, commands)
+        return ControlStep(command, (readings[:-1], commands[:-1]))

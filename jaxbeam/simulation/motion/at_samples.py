@@ -1,0 +1,51 @@
+"""Motion of beam and vehicles at samples, from the states there."""
+
+from jaxtyping import Float
+
+from jaxbeam.case.case import Case
+from jaxbeam.model.contact import contact_at, split_states
+from jaxbeam.model.load_set import LoadSet
+from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.model.sensing.vehicle_readings import VehicleMotion
+from jaxbeam.model.static_correction import Motion
+from jaxbeam.runtime.arrays import Array, xp
+
+
+def motion_at(
+    case: Case,
+    model: ModalModel,
+    loads: LoadSet,
+    times: Float[Array, " time"],
+    states: Float[Array, "time state 1"],
+    commands: Float[Array, "time command"] | None = None,
+) -> tuple[Motion, VehicleMotion]:
+    """Motion of the modes with the forces on the beam, and motion of the vehicles.
+
+    At samples (s) of a run, from the states there and the commands; None are taken as zero.
+    """
+    columns = None if commands is None else commands[..., None]
+    contact = contact_at(model, loads, times, states, columns)
+    vehicles = _vehicle_motion(model, loads, states, contact.vehicle_acceleration)
+    force, accelerations = contact.force[..., 0], contact.modal_acceleration[..., 0]
+    count = 2 * accelerations.shape[1]
+    coordinates = [states[:, 0:count:2, 0], states[:, 1:count:2, 0], accelerations]
+    if model.mode_map is not None:
+        coordinates = [part @ model.mode_map.T for part in coordinates]
+    position = xp.where(loads.on_beam(times).T, loads.kinematics(times)[0].T, xp.nan)
+    actuators = len(case.actuators)
+    command = xp.zeros((times.shape[0], actuators)) if commands is None else commands[:, :actuators]
+    return Motion(*coordinates, position, -force, command), vehicles
+
+
+def _vehicle_motion(model: ModalModel, loads: LoadSet, states, accelerations) -> VehicleMotion:
+    """Motion of the bodies at instants, from the states and the accelerations at contact."""
+    _, vehicle_states = split_states(model.state_count, loads, states)
+    none = xp.zeros((states.shape[0], 0))
+    parts = []
+    for state, acceleration in zip(vehicle_states, accelerations, strict=True):
+        dofs = acceleration.shape[-2]
+        motion = state[..., :dofs, 0], state[..., dofs:, 0], acceleration[..., 0]
+        parts.append([part.reshape(part.shape[0], -1) for part in motion])
+    if not parts:
+        return VehicleMotion(none, none, none)
+    return VehicleMotion(*(xp.concatenate(part, axis=1) for part in zip(*parts, strict=True)))

@@ -1,0 +1,1 @@
+"""Layers of the tests: quick, daily, nightly; see `selection`."""

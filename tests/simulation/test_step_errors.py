@@ -1,0 +1,110 @@
+"""Stated errors of time steps against runs of much shorter steps, for every quantity."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+from jaxbeam.case.quantities import QUANTITIES
+
+TIGHT = 1e-9
+FACTOR = 2.0  # of a stated error: that of the finer of two runs is neglected
+
+
+def sensors(length: float) -> list[jb.Sensor]:
+    return [
+        jb.Sensor(
+            (0.21 + 0.06 * i) * length,
+            name,
+            fibre_distance=1e-3 if entry.at_fibre else None,
+            section_modulus=1e-6 if entry.over_modulus else None,
+        )
+        for i, (name, entry) in enumerate(QUANTITIES.items())
+    ]
+
+
+def random_case(seed: int) -> jb.Case:
+    """Masses, and a vehicle, on one or two spans; few samples, so that errors decide the steps."""
+    rng = np.random.default_rng(seed)
+    length = rng.uniform(0.8, 1.5)
+    beam = jb.Beam(
+        length,
+        flexural_rigidity=12.0,
+        mass_per_length=0.5,
+        damping_ratio=rng.uniform(0.0, 0.05),
+        modes=3,
+    )
+    car = jb.QuarterCar(
+        body_mass=0.3,
+        axle_mass=0.05,
+        suspension_stiffness=60.0,
+        suspension_damping=0.4,
+        tyre_stiffness=900.0,
+        tyre_damping=0.1,
+        speed=-rng.uniform(2.0, 6.0),
+    )
+    mass = jb.MovingMass(mass=rng.uniform(0.1, 0.6), speed=rng.uniform(2.0, 6.0))
+    return jb.Case(
+        beam,
+        supports=[jb.Support(0.45 * length)] if seed % 2 else [],
+        sensors=sensors(length),
+        loads=[mass, car],
+        run=jb.Run(0.4, sample_rate=20.0),
+    )
+
+
+def with_feedback(case: jb.Case) -> jb.Case:
+    gain = np.zeros((1, len(case.sensors)))
+    gain[0, 0] = 30.0
+    shaker = jb.Shaker(0.4, stiffness=0.0, damping=0.0, bandwidth=500.0)
+    law = jb.OutputFeedback(gains=gain, period=0.005)
+    return dataclasses.replace(case, actuators=(shaker,), controller=law)
+
+
+def true_errors(coarse: jb.Record, fine: jb.Record) -> np.ndarray:
+    """Errors of the samples of each sensor, relative to its largest value."""
+    errors = []
+    for sensor in coarse.case.sensors:
+        own = sensor.position, sensor.quantity, sensor.fibre_distance, sensor.section_modulus
+        exact = fine.at(*own)
+        errors.append(np.max(np.abs(coarse.at(*own) - exact)) / np.max(np.abs(exact)))
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+def test_stated_errors_are_no_smaller_than_the_true_ones(seed):
+    case = random_case(seed)
+    coarse, fine = jb.simulate(case, tolerance=1e-4), jb.simulate(case, tolerance=TIGHT)
+    found, stated = true_errors(coarse, fine), np.asarray(coarse.step_errors)
+    assert np.all(found <= FACTOR * stated + 100 * TIGHT)
+    # No bound so wide that it says nothing: the steps are those of the trial or shorter.
+    assert np.all(stated < 0.05)
+    assert np.median(stated / np.maximum(found, TIGHT)) < 1e3
+
+
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+def test_accelerations_have_larger_errors_than_deflections():
+    errors = dict(
+        zip(QUANTITIES, jb.simulate(random_case(0), tolerance=1e-5).step_errors, strict=True)
+    )
+    assert errors["acceleration"] > 3 * errors["deflection"]
+
+
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+def test_errors_of_a_sampled_loop():
+    case = with_feedback(random_case(2))
+    coarse, fine = jb.simulate(case, tolerance=1e-4), jb.simulate(case, tolerance=TIGHT)
+    assert np.abs(coarse.command).max() > 0
+    found, stated = true_errors(coarse, fine), np.asarray(coarse.step_errors)
+    assert np.all(found <= FACTOR * stated + 100 * TIGHT)
+
+
+def test_errors_are_stored(tmp_path):
+    case = dataclasses.replace(random_case(1), loads=(jb.MovingForce(force=1.0, speed=3.0),))
+    record = jb.simulate(case)
+    record.save(tmp_path / "run.nc")
+    np.testing.assert_array_equal(
+        jb.read_record(tmp_path / "run.nc").step_errors, record.step_errors
+    )
