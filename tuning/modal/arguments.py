@@ -10,7 +10,10 @@ METHODS = ("covariance", "data", *SPECTRAL_METHODS)
 
 
 def check_band(log: Log, rate: float, band: tuple[float, float] | None) -> None:
-    """Raise ValueError for a band (Hz) not within 0 and half the sampling rate (Hz) of a log."""
+    """Check a band (Hz) for a log of some sampling rate (Hz).
+
+    Raises ValueError for a band not within 0 and half the sampling rate.
+    """
     if band is not None and not 0 < band[0] < band[1] <= rate / 2:
         raise ValueError(
             f"{log.source}: the band from {band[0]:g} Hz to {band[1]:g} Hz is not within 0 and "
@@ -19,7 +22,10 @@ def check_band(log: Log, rate: float, band: tuple[float, float] | None) -> None:
 
 
 def check_force(force: Sequence[str] | None, kind: str | None, method: str | None) -> None:
-    """Raise ValueError for a measured force beside a kind, or a method that does not use it."""
+    """Check a measured force beside the kind of excitation and the method.
+
+    Raises ValueError for a force beside a kind, or with a method that does not use it.
+    """
     if force is None:
         return
     if method not in (None, "plscf"):
@@ -31,9 +37,10 @@ def check_force(force: Sequence[str] | None, kind: str | None, method: str | Non
 def check_arguments(
     count: int | None, kind: str | None, order: int | None, method: str | None
 ) -> None:
-    """Raise ValueError for a count or order that is too small, an unknown kind or method.
+    """Check arguments that need no log.
 
-    And for a kind or an order that the method cannot use.
+    Raises ValueError for a count or order that is too small, an unknown kind or method, and a kind
+    or an order that the method cannot use.
     """
     if count is not None and count < 1:
         raise ValueError(f"count must be at least 1, not {count}")

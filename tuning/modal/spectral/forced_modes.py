@@ -25,7 +25,7 @@ from tuning.modal.spectral.forced_fraction import (
     products,
     transforms,
 )
-from tuning.modal.spectral.modal_model import refine_modal_model
+from tuning.modal.spectral.forced_likelihood import refine_modal_model
 from tuning.modal.stabilisation import Diagram, stabilise
 from tuning.modal.subspace import Poles
 

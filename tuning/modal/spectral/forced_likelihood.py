@@ -25,7 +25,7 @@ CONVERGED = 1e-6  # step over the decay rate
 MAX_SHIFT = 3.0  # from the start, over the decay rate; beyond, a pole is none of the data
 
 
-class ModalModel(NamedTuple):
+class ForcedModel(NamedTuple):
     """Modes, one for each pole at the start, and what they leave: lines of the band with errors.
 
     `power` is that of the responses in the band.
@@ -41,7 +41,7 @@ def refine_modal_model(
     starts: Complex[np.ndarray, " mode"],
     scale: Float[np.ndarray, " output"],
     band: tuple[float, float],
-) -> ModalModel:
+) -> ForcedModel:
     """Modal model at the lines within a band (Hz), from poles (1/s) to start from.
 
     Only poles in the band are refined. Outputs are in units of `scale`, shapes in those of the log.
@@ -87,7 +87,7 @@ def _normal(slopes, errors):
     return weight, np.einsum("rko,rlo,o->kl", slopes, slopes, weight, optimize=True)
 
 
-class _Fit(NamedTuple):
+class _LinearFit(NamedTuple):
     """Columns of the linear least squares, their pseudo-inverse, coefficients and errors."""
 
     columns: Float[np.ndarray, "row column"]
@@ -117,11 +117,11 @@ def _refined(lines, target, starts, moving, powers=REST_POWERS):
     return poles
 
 
-def _linear_fit(lines, target, poles, powers=REST_POWERS) -> _Fit:
+def _linear_fit(lines, target, poles, powers=REST_POWERS) -> _LinearFit:
     columns = _columns(lines, poles, powers)
     inverse = np.linalg.pinv(columns)
     found = inverse @ target
-    return _Fit(columns, inverse, found, target - columns @ found)
+    return _LinearFit(columns, inverse, found, target - columns @ found)
 
 
 def _columns(lines: Lines, poles, powers):
@@ -166,7 +166,7 @@ def _coefficients(found, lines: Lines, modes: int):
     return parts
 
 
-def _slopes(lines: Lines, fit: _Fit, poles, moving):
+def _slopes(lines: Lines, fit: _LinearFit, poles, moving):
     """Derivatives by real and imaginary parts of moving poles: of the responses, and residues.
 
     Those of the responses (row, part, output) are with residues eliminated; those of the
@@ -193,7 +193,9 @@ def _along(terms, signals, coefficients):
     return terms.T[:, :, None] * np.einsum("ls,mso->mlo", signals, coefficients)
 
 
-def _model(lines, target, poles, moving, fit: _Fit, steps, model_errors, scale) -> ModalModel:
+def _model(
+    lines, target, poles, moving, fit: _LinearFit, steps, model_errors, scale
+) -> ForcedModel:
     """Modes with uncertainties; those of poles that were not refined have none."""
     pole_steps, coefficient_steps = steps
     residues = _coefficients(fit.found, lines, poles.size)[0]
@@ -233,4 +235,4 @@ def _model(lines, target, poles, moving, fit: _Fit, steps, model_errors, scale) 
             )
         )
     errors = fit.errors[: len(lines.z)] + 1j * fit.errors[len(lines.z) :]
-    return ModalModel(tuple(modes), lines._replace(outputs=errors), float(np.sum(target**2)))
+    return ForcedModel(tuple(modes), lines._replace(outputs=errors), float(np.sum(target**2)))
