@@ -19,6 +19,7 @@ from tuning.fit.identify import identify
 from tuning.fit.result import Fit
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
+from tuning.weighing.axle_count import AxleCount, count_axles
 from tuning.weighing.dynamic_forces import (
     DynamicErrors,
     dynamic_errors,
@@ -38,12 +39,13 @@ class AxleWeighing:
 
     The load of the fit has `forces` (N), `offsets` (m, behind the first axle), speed and entry
     time. `dynamic` has the errors of the parameters of the fit on an unknown road, which are larger
-    than the fit's own.
+    than the fit's own. `count` says how the number of axles was chosen; None if it was given.
     """
 
     moses: MosesFit
     fit: Fit
     dynamic: DynamicErrors
+    count: AxleCount | None = None
 
     @property
     def intervals(self) -> Float[np.ndarray, "parameter 2"]:
@@ -89,6 +91,7 @@ class AxleWeighing:
                 "speed": geometry.speed,
             },
             "dynamic_share": self.dynamic.share,
+            "bic": {} if self.count is None else {str(n): b for n, b in self.count.bic.items()},
             "verdict": self.fit.verdict,
         }
 
@@ -111,7 +114,8 @@ class AxleWeighing:
         gross, gross_error = self.moses.gross_weight
         header = ("axle", "at (m)", "fitted (kN)", "95 % interval", "Moses (kN)", "95 % interval")
         lines = [
-            f"{count} axles found",
+            f"{count} axle{'s' * (count > 1)} found",
+            *([] if self.count is None else [str(self.count)]),
             *text_table(header, rows, ">>><><"),
             f"gross weight by Moses' method {gross / 1e3:.5g} kN, standard error"
             f" {gross_error / 1e3:.3g} kN, at {geometry.speed:.4g} m/s",
@@ -125,7 +129,7 @@ def weigh_axles(
     case: Case,
     log: Log,
     speeds: tuple[float, float],
-    axles: int,
+    axles: int | None = None,
     *,
     both_ways: bool = False,
     influence_lines: InfluenceLines | None = None,
@@ -133,10 +137,10 @@ def weigh_axles(
     """Forces and distances of the axles of one vehicle or train that crossed a known beam in a log.
 
     `speeds` (m/s) are the lowest and highest possible ones, from the left or, with `both_ways`, in
-    both directions; `axles` is their number. Moses' method has the influence lines of the case, or
-    the `influence_lines` given (see `calibrate_influence_lines`). The fit has moving forces, the
-    vibration of the beam, and offsets of the sensors; loads and profile of case and log are not
-    used.
+    both directions; `axles` is their number, by default that of `count_axles`. Moses' method has
+    the influence lines of the case, or the `influence_lines` given (see
+    `calibrate_influence_lines`). The fit has moving forces, the vibration of the beam, and offsets
+    of the sensors; loads and profile of case and log are not used.
 
     Raises ValueError if speeds are not 0 < low < high, there is no axle, or a sensor measures
     velocity or acceleration, and as `identify` does.
@@ -144,12 +148,16 @@ def weigh_axles(
     low, high = speeds
     if not 0 < low < high:
         raise ValueError(f"speeds must be 0 < low < high in m/s; they are {low:g} and {high:g}")
-    if axles < 1:
+    if axles is not None and axles < 1:
         raise ValueError(f"the number of axles must be 1 or more, not {axles}")
     check_static(case)
     case = dataclasses.replace(case, loads=(), vehicle_sensors=(), profile=None)
     lines = model_influence_lines(case) if influence_lines is None else influence_lines
     readings, valid = sensor_readings(case, log)
+    count = None
+    if axles is None:
+        count = count_axles(case, log.times, readings, (low, high), both_ways)
+        axles = count.chosen
     geometry = find_geometry(lines, log.times, readings, (low, high), axles, both_ways)
     static = moses(lines, geometry, log.times, readings, valid, found=True)
     fit = identify(case, *axle_problem(case, log, static))
@@ -157,7 +165,7 @@ def weigh_axles(
     jacobian = problem.linearised(fit.values)[1][0]
     errors = errors_of_fit(lines, fit.addresses, fit.values, jacobian, fit.noise[0], log.times,
                            readings, readings - fit.fitted[0], valid)  # fmt: skip
-    return AxleWeighing(static, fit, errors)
+    return AxleWeighing(static, fit, errors, count)
 
 
 def errors_of_fit(
