@@ -71,7 +71,7 @@ def ours(planted: Planted, method: str) -> Estimates:
 def pyoma(planted: Planted) -> Estimates:
     """Estimates by the stable poles of pyOMA-2. Raises ImportError where it is not installed."""
     from pyoma2.algorithms.ssi import SSI
-    from pyoma2.setup import SingleSetup
+    from pyoma2.setup.single import SingleSetup
 
     start = time.process_time()
     with warnings.catch_warnings():
