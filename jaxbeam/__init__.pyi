@@ -1,6 +1,8 @@
 from .analysis.assessment.assess import assess as assess
 from .analysis.assessment.assessment import Assessment as Assessment, CodeCheck as CodeCheck
 from .analysis.bound.bound import bound as bound
+from .analysis.bound.least_integral import least_integral as least_integral
+from .analysis.control_systems import to_control as to_control
 from .analysis.plausibility import check as check
 from .analysis.plausible_numbers import Plausibility as Plausibility
 from .analysis.ride import (

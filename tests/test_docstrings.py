@@ -14,6 +14,7 @@ import tuning
 from tests.modules import ROOT, module_files, parse
 
 FILES = module_files()
+EXAMPLES = {name for name, path in FILES.items() if ">>> " in path.read_text(encoding="utf-8")}
 
 
 def public(nodes, *kinds):
@@ -58,9 +59,7 @@ def test_docstrings_say_what_is_raised(name):
             )
 
 
-@pytest.mark.parametrize(
-    "name", [name for name, path in FILES.items() if ">>> " in path.read_text(encoding="utf-8")]
-)
+@pytest.mark.parametrize("name", sorted(EXAMPLES))
 def test_examples_in_docstrings_print_what_they_show(name, tmp_path, monkeypatch):
     """In a folder with the fit that examples read."""
     shutil.copy(ROOT / "tests" / "data" / "release_0_1_0" / "fit.npz", tmp_path)
@@ -82,26 +81,6 @@ PUBLIC_CLASSES = {
     for package in (jaxbeam, tuning)
     for name in package.__all__
     if inspect.isclass(getattr(package, name))
-}
-# Functions that compile for longer than a second, and their results: their examples are the
-# notebooks, the README and the pages of the site.
-NO_EXAMPLE = {
-    "tuning.cross_validate",
-    "tuning.design_experiment",
-    "tuning.identify",
-    "tuning.identify_responses",
-    "tuning.lexicographic",
-    "tuning.pareto",
-    "tuning.predict_held_out",
-    "tuning.profile",
-    "tuning.sample",
-    "tuning.tune",
-    "tuning.tune_integers",
-    "tuning.tune_reduced",
-    "tuning.weigh",
-    "tuning.weigh_axles",
-    "tuning.AxleWeighing",
-    "tuning.TuningResult",
 }
 
 
@@ -130,12 +109,12 @@ def test_public_functions_have_types_of_arguments_and_results(name):
     assert signature.return_annotation is not inspect.Signature.empty
 
 
-@pytest.mark.parametrize("name", sorted(PUBLIC_FUNCTIONS.keys() - NO_EXAMPLE))
+@pytest.mark.parametrize("name", sorted(PUBLIC_FUNCTIONS))
 def test_public_functions_have_an_example(name):
     """`test_examples_in_docstrings_print_what_they_show` runs it."""
     assert ">>> " in (inspect.getdoc(PUBLIC_FUNCTIONS[name]) or "")
 
 
-@pytest.mark.parametrize("name", sorted(PUBLIC_CLASSES.keys() - NO_EXAMPLE))
+@pytest.mark.parametrize("name", sorted(PUBLIC_CLASSES))
 def test_public_classes_have_an_example(name):
     assert ">>> " in (PUBLIC_CLASSES[name].__doc__ or "")

@@ -6,6 +6,7 @@ import shlex
 
 import pytest
 
+from experiments.thesis.reproduction import experiments
 from jaxbeam.cli.app import COMMANDS, app, current_words
 from tests.modules import ROOT
 
@@ -54,9 +55,38 @@ def test_commands_are_accepted(capsys, line):
     assert capsys.readouterr().err == "", "no old words"
 
 
+def captions() -> list[str]:
+    """Commands below the pictures of the gallery that are stored with the site."""
+    found = re.findall(r"^`(jaxbeam [^`]+)`", TEXT["docs/gallery.md"], re.M)
+    return [" ".join(command.split()) for command in found]
+
+
+@pytest.mark.parametrize("command", captions())
+def test_stored_pictures_are_drawn_by_a_command(command):
+    """It is accepted, its files are in the repository, its experiment exists."""
+    name, *words = shlex.split(command)[1:]
+    app.parse_args([name, *words], exit_on_error=False, print_error=False)
+    if name == "reproduce":
+        assert words[0] in experiments()
+    files = [word for word in words if "/" in word]
+    assert all(list(ROOT.glob(file)) for file in files)
+
+
+def test_every_stored_picture_of_the_gallery_has_its_command():
+    pictures = re.findall(r"\(?figures/\w+\.(?:png|gif)", TEXT["docs/gallery.md"])
+    assert len(pictures) == len(captions()) > 3
+
+
 def test_options_exist():
     named = {option for span in spans() for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", span)}
-    modules = {"--quick", "--modes", "--keep", "--extra", "--group"}  # of benchmarks and of uv
+    modules = {
+        "--quick",
+        "--modes",
+        "--keep",
+        "--extra",
+        "--group",
+        "--with",
+    }  # of benchmarks and of uv
     assert named - modules <= options_of_commands()
 
 

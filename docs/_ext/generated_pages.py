@@ -142,12 +142,12 @@ def default(key: Key) -> str:
 
 def key_table(part_class: type) -> list[str]:
     """Table of the keys of a table of a case file, in Markdown."""
-    lines = ["| key | value | unit | default | bounds | meaning |", "|---|---|---|---|---|---|"]
+    lines = ["| key | meaning | value | unit | default | bounds |", "|---|---|---|---|---|---|"]
     for key in table_keys(part_class):
         unit = "" if key.unit in ("", "1") else key.unit
         value = "one number" if key.is_number and key.values == "one number" else key.values
         value = "a word" if key.words else value
-        cells = [f"`{key.name}`", value, unit, default(key), bounds(key), key.meaning]
+        cells = [f"`{key.name}`", key.meaning, value, unit, default(key), bounds(key)]
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return lines if len(lines) > 2 else ["It has no keys."]
 

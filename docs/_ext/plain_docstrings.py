@@ -62,11 +62,11 @@ def field_table(one: type) -> list[str]:
     if not rows:
         return []
     lines = [".. list-table::", "   :header-rows: 1", "   :class: fields", ""]
-    header = ("field", "type and shape", "unit", "default", "meaning")
-    used = [i for i in range(5) if i < 2 or any(row[i] for row in rows)]
+    header = ("field", "meaning", "unit", "type and shape", "default")
+    used = [i for i in range(5) if i in (0, 3) or any(row[i] for row in rows)]
     for row in (header, *rows):
         for k, i in enumerate(used):
-            cell = f"``{row[i]}``" if row is not header and i in (0, 1, 3) and row[i] else row[i]
+            cell = f"``{row[i]}``" if row is not header and i in (0, 3, 4) and row[i] else row[i]
             lines.append(("   * - " if k == 0 else "     - ") + cell)
     return lines
 
@@ -96,7 +96,7 @@ def class_body(one: type) -> list[ast.stmt]:
 
 
 def field_row(one: type, name: str, node: ast.AnnAssign) -> tuple[str, ...]:
-    """Name, type, unit, default and meaning of a field."""
+    """Name, meaning, unit, type and default of a field."""
     declared = (
         {field.name: field for field in dataclasses.fields(one)}
         if (dataclasses.is_dataclass(one))
@@ -109,7 +109,7 @@ def field_row(one: type, name: str, node: ast.AnnAssign) -> tuple[str, ...]:
     shown = "" if default in (dataclasses.MISSING, None, "", ()) else str(default)
     unit = metadata.get("unit", "")
     meaning = as_text(metadata.get("meaning", ""))
-    return name, shape(ast.unparse(node.annotation)), "" if unit == "1" else unit, shown, meaning
+    return name, meaning, "" if unit == "1" else unit, shape(ast.unparse(node.annotation)), shown
 
 
 def source_of(function) -> ast.FunctionDef | None:

@@ -31,6 +31,7 @@ MODULES = (
     "thesis.chapter2.shaker",
     "thesis.chapter2.identification",
     "thesis.chapter5.optimal_control",
+    "thesis.chapter5.fed_back_states",
     "studies.load_streams",
     "thesis.chapter6.feedback",
     "thesis.chapter7.predictive_control",

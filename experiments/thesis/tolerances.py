@@ -26,6 +26,7 @@ MEASURED_RATIO = Tolerance(
 )
 MEASURED_VOLTAGE = Tolerance("measured: the cube of deflections that scatter", relative=0.1)
 APPROXIMATE_FREQUENCY = Tolerance("measured, and called approximate", absolute=1.0)
+SAME_CURVE = Tolerance("called identical: the width of a line in a figure", absolute=1.0)
 YES_OR_NO = Tolerance("yes (1) or no (0)", absolute=0.5)
 
 HZ = "Hz"

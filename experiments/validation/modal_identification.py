@@ -38,7 +38,8 @@ class PlantedComparison(NamedTuple):
 
     `covered` tells, for each identified mode that is one of the structure, whether its intervals of
     frequency and damping ratio hold the truth; `errors` are relative errors of both, and `found`
-    tells of each planted mode with 5 % of the energy whether it was identified.
+    tells of each planted mode with 5 % of the energy whether it was identified. `planted` are the
+    indices of the planted modes that the errors are of.
     """
 
     covered: Float[np.ndarray, "mode 2"]
@@ -46,6 +47,7 @@ class PlantedComparison(NamedTuple):
     false_modes: tuple[float, ...]
     found: tuple[bool, ...]
     missed: tuple[float, ...]
+    planted: tuple[int, ...] = ()
 
 
 def log_of(planted: Planted) -> Log:
@@ -87,6 +89,7 @@ def compare(fit: ModalFit, planted: Planted) -> PlantedComparison:
         tuple(f for i, f in enumerate(fit.frequencies.tolist()) if i not in pairs),
         tuple(seen),
         tuple(float(structure.frequencies[k]) for k, s in zip(strong, seen, strict=True) if not s),
+        tuple(pairs[mine] for mine in sorted(pairs)),
     )
 
 

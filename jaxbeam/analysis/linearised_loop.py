@@ -29,7 +29,7 @@ from jaxbeam.case.loads.mass import MovingMass
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.linear_system import Signal, StateSpace
-from jaxbeam.model.load_set import load_set
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.arrays import (
     Array,
@@ -74,13 +74,24 @@ class LinearisedLoop(eqx.Module):
         `control.feedback(loop, sign=1)` the loop is closed. Raises ImportError, saying what to
         install, if that package is missing.
         """
+        return self._system(self.A).to_control()
+
+    def closed_to_control(self) -> Any:
+        """A `control.StateSpace` of python-control: the closed loop, with the same signals.
+
+        From commands that are added to those of the law. Raises ImportError as `to_control`.
+        """
+        return self._system(self.closed_matrix).to_control()
+
+    def _system(self, matrix) -> StateSpace:
+        """System of a state matrix, from the commands to those of the law."""
         commands = tuple(Signal(f"command_{i}", "") for i in range(self.B.shape[1]))
         states = tuple(Signal(f"x_{i}", "") for i in range(self.A.shape[0]))
         returned = tuple(Signal(f"law_{i}", "") for i in range(self.B.shape[1]))
         D, period = xp.zeros((len(returned), len(commands))), self.period
         period = None if period is None else xp.asarray(period)
         signals = states, commands, returned
-        return StateSpace(self.A, self.B, self.K, D, *signals, period).to_control()
+        return StateSpace(matrix, self.B, self.K, D, *signals, period)
 
     def growth_rate(self) -> Float[Array, ""]:
         """Largest real part of the poles in 1/s; differentiable to first order, on a CPU.
@@ -251,22 +262,30 @@ def loop_with_mass_at(case: Case, position: float, mass: float) -> LinearisedLoo
     schedule has the gains of that time. It is linearised about the equilibrium under the mass.
     Raises ValueError for a position off the beam, a negative mass, and as `linearised_loop`.
     """
+    loads = standing_mass(case, position, mass)
+    timing = loop_timing(case)
+    loop = loop_dynamics(case, mesh_layout(concrete_case(case)))
+    loop = eqx.tree_at(lambda loop: loop.augmented_plant.loads, loop, loads)
+    t = xp.asarray(_passage_time(case, position))
+    return without_constant_states(linearise(loop, timing, t))
+
+
+def standing_mass(case: Case, position: float, mass: float) -> LoadSet:
+    """A stationary mass (kg) at a position (m) in place of the loads of a case.
+
+    Raises ValueError for a position off the beam, and a mass that is negative or not finite.
+    """
     length = float(concrete(case.beam.length))
     if not 0 <= position <= length:
         raise ValueError(f"the mass at {position:g} m is off the beam, 0 to {length:g} m")
     if not 0 <= mass < np.inf:
         raise ValueError(f"the mass at {position:g} m must be positive, in kg; it is {mass:g}")
-    timing = loop_timing(case)
-    loop = loop_dynamics(case, mesh_layout(concrete_case(case)))
     alone = dataclasses.replace(case, loads=(MovingMass(mass=mass, speed=1.0),), profile=None)
     zero, one = xp.zeros(()), xp.ones(())
     path = FrozenTrajectory(
         xp.asarray(position), zero, zero, one, xp.ones(1, bool), case.beam.length
     )
-    loads = dataclasses.replace(load_set(alone), trajectories=(path,), profile=None)
-    loop = eqx.tree_at(lambda loop: loop.augmented_plant.loads, loop, loads)
-    t = xp.asarray(_passage_time(case, position))
-    return without_constant_states(linearise(loop, timing, t))
+    return dataclasses.replace(load_set(alone), trajectories=(path,), profile=None)
 
 
 def without_constant_states(loop: LinearisedLoop) -> LinearisedLoop:

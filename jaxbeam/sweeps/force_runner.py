@@ -35,7 +35,7 @@ LEAST_TOLERANCE = 1e-8  # above the error of the eigenvectors
 # Numbers on which the model does not depend, and with which forces keep constant speeds.
 ADDRESS = re.compile(r"loads\.(\d+|\*)\.(speed|entry_time|start_position|spacing)|run\.duration")
 OF_BEAM = "beam", "supports", "actuators", "sensors"  # the keys on which the model depends
-BLOCK_RUNS = 32
+BLOCK_RUNS, BLOCK_PAIRS = 32, 4e6  # runs of a block at most; and pairs of its wheels at most
 TRIAL_RUNS = 4  # in which the error of the peaks is measured
 PHASE = 1.6  # rad of the fastest pole in a step of the search
 
@@ -46,7 +46,9 @@ class ForceRunner:
     def __init__(self, case: Case, batches: Batches, system: str):
         self.case, self.batches, self.system = case, batches, system
         self.pool = ThreadPoolExecutor(os.cpu_count())
-        self.block_count = -(-len(batches.run_index) // BLOCK_RUNS)
+        wheels = load_set(case).wheel_count
+        self.block_runs = max(1, min(BLOCK_RUNS, int(BLOCK_PAIRS / wheels**2)))
+        self.block_count = -(-len(batches.run_index) // self.block_runs)
 
     def choose_step_sizes(self) -> tuple[Float[np.ndarray, " path"], float]:
         """Phases (rad) of the fastest pole in a step, and the relative error of peaks with them."""
@@ -76,9 +78,14 @@ class ForceRunner:
         }
 
     def _runs(self, block: int) -> np.ndarray:
-        return np.arange(len(self.batches.run_index))[block * BLOCK_RUNS : (block + 1) * BLOCK_RUNS]
+        count = len(self.batches.run_index)
+        return np.arange(block * self.block_runs, min((block + 1) * self.block_runs, count))
 
     def _peaks(self, runs: np.ndarray, phase: float) -> Peaks:
+        """Peaks of runs, no more at once than in a block."""
+        if runs.size > self.block_runs:
+            found = [self._peaks(np.array([run]), phase) for run in runs]
+            return Peaks(*map(np.concatenate, zip(*found, strict=True)))
         batches = self.batches
         paths = force_paths(self.case, batches.shared_addresses, batches.shared_values[runs])
         speeds = tuple(np.unique(paths.speed).tolist())

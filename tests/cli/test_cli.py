@@ -81,6 +81,10 @@ REFUSED = [
         "weigh case.toml old.nc --speeds 5:20 --calibration old.nc",
         "--calibration is for Moses' method: say how many --axles",
     ),
+    (
+        "weigh case.toml old.nc --speeds 5:20 --axles many",
+        "--axles takes a whole number, or auto, not 'many'",
+    ),
 ]
 
 

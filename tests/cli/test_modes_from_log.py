@@ -38,6 +38,19 @@ def test_modes_of_a_file_without_headings(run, decay_log):
     np.testing.assert_allclose(part["frequencies_hz"], [12], rtol=2e-3)
 
 
+def test_a_measured_force(run, decay_log):
+    """The first column is a blow of a hammer, in N by the unit given to it."""
+    rows = np.loadtxt(decay_log / "node.csv", delimiter=",")
+    rows[:, 1] = np.arange(1500) == 0
+    np.savetxt(decay_log / "hammer.csv", rows, delimiter=",", fmt="%.6f")
+    line = "modes-from-log hammer.csv --columns t[s],f[N],b[g] --band 5:40"
+    found = run(f"{line} --force f --json")
+    assert (found["kind"], found["method"]) == ("measured force", "plscf")
+    np.testing.assert_allclose(found["frequencies_hz"], [12], rtol=1e-3)
+    np.testing.assert_allclose(found["damping_ratios"], [0.01], rtol=0.05)
+    assert found == run(f"{line} --json"), "a channel in N is a force"
+
+
 def test_the_rate_of_a_file_without_times(run, decay_log):
     rows = np.loadtxt(decay_log / "node.csv", delimiter=",")[:, 1:]
     np.savetxt(decay_log / "untimed.csv", rows, delimiter=";", fmt="%.6f")
@@ -75,6 +88,8 @@ def test_a_case_is_fitted_to_the_modes(run, decay_log):
         (f"node.csv {COLUMNS} --channels c", "the log has no channel 'c'; it has a, b"),
         (f"node.csv {COLUMNS} --method x", "method must be"),
         (f"node.csv {COLUMNS} --method fdd --order 10", "method 'fdd' has no models and no order"),
+        (f"node.csv {COLUMNS} --force b", "channel 'b' is in g, which is no force"),
+        (f"node.csv {COLUMNS} --force a --method data", "used by method 'plscf', not by 'data'"),
         (f"node.csv {COLUMNS} --order 2", "the highest order must be at least 4, not 2"),
         (f"node.csv {COLUMNS} --free beam.length", "--case and --free belong together"),
         (f"node.csv {COLUMNS} -o out.toml", "-o writes the fitted case: give --case"),

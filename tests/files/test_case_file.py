@@ -37,7 +37,7 @@ modes = 3
 [[supports]]
 position = 0.6
 stiffness = 2.0e6
-damping = 0.0
+damping = 30.0
 [[actuators]]
 kind = "shaker"
 position = 0.5
@@ -86,7 +86,7 @@ def full(tmp_path):
 def test_case_file_equals_the_case_built_in_python(full):
     written = Case(
         Beam(0.6, 11.68, 0.535, 0.03, modes=3),
-        supports=[Support(0.6, 2e6)],
+        supports=[Support(0.6, 2e6, 30.0)],
         actuators=[
             Shaker(
                 position=0.5,

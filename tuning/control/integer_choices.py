@@ -57,6 +57,25 @@ def tune_integers(
     those of `tune`.
 
     Raises ValueError for an address without an integer, and as `tune` does.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3, limits=(-2.0, 2.0))],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
+    ...     controller=jb.MPC(horizon=4, moves=2, move_weight=1e-9, period=0.01),
+    ...     run=jb.Run(0.3),
+    ... )
+    >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
+    >>> options = {"steps": 1, "least_peaks": False, "progress": False}
+    >>> free = {"controller.move_weight": (1e-10, 1e-8)}
+    >>> found = tuning.tune_integers(
+    ...     case, {"controller.horizon": [2, 4]}, free, loads, **options
+    ... )
+    >>> print(found.choices)
+    ({'controller.horizon': 2}, {'controller.horizon': 4})
     """
     rows = [dict(zip(choices, row, strict=True)) for row in itertools.product(*choices.values())]
     if not choices or not rows:

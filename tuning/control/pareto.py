@@ -72,6 +72,24 @@ def pareto(
     than Adam.
 
     Raises ValueError as `tune` does, and for an unknown metric or a limit that is not positive.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3, limits=(-2.0, 2.0))],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
+    ...     controller=jb.Feedback(gains=[500.0], period=0.01),
+    ...     run=jb.Run(0.3),
+    ... )
+    >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
+    >>> free = {"controller.gains.0": (100.0, 5000.0)}
+    >>> options = {"steps": 3, "least_peaks": False, "progress": False}
+    >>> peak = tuning.Objective({"peak": 1.0})
+    >>> front = tuning.pareto(case, free, loads, peak, "effort", [0.1, 0.5], **options)
+    >>> print(front.limits)
+    (0.5, 0.1)
     """
     limits = tuple(sorted(map(float, limits), reverse=True))
     objectives = [_with_limits(objective, {metric: limit}) for limit in limits]
@@ -109,6 +127,23 @@ def lexicographic(
     `Objective`, over the runs. Other arguments are those of `tune`.
 
     Raises ValueError as `tune` does, for an unknown metric and one that is named twice.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3, limits=(-2.0, 2.0))],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
+    ...     controller=jb.Feedback(gains=[500.0], period=0.01),
+    ...     run=jb.Run(0.3),
+    ... )
+    >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
+    >>> free = {"controller.gains.0": (100.0, 5000.0)}
+    >>> options = {"steps": 3, "least_peaks": False, "progress": False}
+    >>> results = tuning.lexicographic(case, free, loads, ["peak", "effort"], **options)
+    >>> print(len(results), "results")
+    2 results
     """
     if not metrics or len(set(metrics)) < len(metrics):
         raise ValueError("name at least one metric, and each once, the most important first")

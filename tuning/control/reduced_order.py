@@ -69,6 +69,23 @@ def tune_reduced(
 
     Raises ValueError for a controller that is no regulator, for more states than it has, and as
     `tune` does.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3, limits=(-2.0, 2.0))],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
+    ...     controller=jb.LQR(state_weight=[1e6, 1.0], command_weight=[1e-2], period=0.01),
+    ...     run=jb.Run(0.3),
+    ... )
+    >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
+    >>> free = {"controller.command_weight.0": (1e-4, 1.0)}
+    >>> options = {"steps": 2, "least_peaks": False, "progress": False}
+    >>> found = tuning.tune_reduced(case, 1, free, loads, **options)
+    >>> print(len(found.fed_back), "of", len(found.shares), "states")
+    1 of 2 states
     """
     controller = case.controller
     if not isinstance(controller, AbstractRegulator):

@@ -83,6 +83,23 @@ def tune(
     Raises ValueError for a faulty case, address, run or checkpoint, and if the closed loop is
     unstable with the start values; FileExistsError if the checkpoint exists and `resume` is not
     set.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3, limits=(-2.0, 2.0))],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
+    ...     controller=jb.Feedback(gains=[500.0], period=0.01),
+    ...     run=jb.Run(0.3),
+    ... )
+    >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
+    >>> free = {"controller.gains.0": (100.0, 5000.0)}
+    >>> options = {"steps": 3, "least_peaks": False, "progress": False}
+    >>> result = tuning.tune(case, free, loads, **options)
+    >>> print(f"gain {result.values[0]:.0f}")
+    gain 767
     """
     objective = Objective() if objective is None else objective
     if plant is not None:

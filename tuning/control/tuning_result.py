@@ -75,6 +75,25 @@ class TuningResult:
     happened in `rejected_steps`. `stability_violation` (1/s) is the excess of the real part of a
     pole over the stability constraint, 0 if that is met or not given. `start_results` are the best
     points of all starts, lowest objective first.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3, limits=(-2.0, 2.0))],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
+    ...     controller=jb.Feedback(gains=[500.0], period=0.01),
+    ...     run=jb.Run(0.3),
+    ... )
+    >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
+    >>> free = {"controller.gains.0": (100.0, 5000.0)}
+    >>> options = {"steps": 3, "least_peaks": False, "progress": False}
+    >>> result = tuning.tune(case, free, loads, **options)
+    >>> print(result.history.shape, len(result.run_sets))
+    (3, 1) 2
+    >>> print(result.case.controller.gains.round())
+    [767.]
     """
 
     case: Case

@@ -82,6 +82,19 @@ def design_experiment(
 
     Raises ValueError for unknown addresses, a choice that is free as well, and bounds that exclude
     the value in the case.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
+    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
+    ...     run=jb.Run(0.4, sample_rate=50.0),
+    ... )
+    >>> over = {"loads.0.speed": (1.0, 4.0)}
+    >>> found = tuning.design_experiment(case, ["beam.flexural_rigidity"], over)
+    >>> print(str(found).splitlines()[0])
+    loads.0.speed: 2 -> 4 m/s
     """
     free = list(free)
     check_case(case)

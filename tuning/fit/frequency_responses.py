@@ -228,6 +228,22 @@ def identify_responses(
     whatever the excitation was. Loads of the case are left out.
 
     Raises ValueError for faulty input.
+
+    >>> import numpy as np
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3)],
+    ...     sensors=[jb.Sensor(0.3)],
+    ... )
+    >>> frequencies = np.array([10.0, 20.0, 40.0])
+    >>> values = jb.frequency_response(case, frequencies).values
+    >>> measured = tuning.Responses(frequencies, values, (("actuators.0", "sensors.0"),))
+    >>> start = jb.replace(case, {"beam.flexural_rigidity": 11.0})
+    >>> fit = tuning.identify_responses(start, measured, ["beam.flexural_rigidity"])
+    >>> print(f"{fit.values[0]:.2f} N m^2")
+    12.00 N m^2
     """
     bounds = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free)
     parameters = free_parameters([case], bounds, 1.0)

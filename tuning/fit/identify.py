@@ -51,6 +51,26 @@ def identify(
 
     Raises ValueError for faulty input or a checkpoint of another search, FileExistsError if the
     checkpoint exists and `resume` is not set, RuntimeError if the simulation fails.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
+    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
+    ...     run=jb.Run(0.4, sample_rate=50.0),
+    ... )
+    >>> logs = []
+    >>> for speed in (2.0, 2.5):
+    ...     record = jb.simulate(jb.replace(case, {"loads.0.speed": speed}))
+    ...     columns = ("w",), ("deflection",), ("m",), f"{speed} m/s", (0,)
+    ...     logs.append(
+    ...         tuning.Log(record.times, record.measured, *columns, loads=record.case.loads)
+    ...     )
+    >>> start = jb.replace(case, {"beam.flexural_rigidity": 10.0})
+    >>> fit = tuning.identify(start, logs, "beam.flexural_rigidity")
+    >>> print(fit.verdict, f"{fit.values[0]:.2f} N m^2")
+    converged 12.02 N m^2
     """
     logs = [logs] if isinstance(logs, Log) else list(logs)
     addresses = [free] if isinstance(free, str) else free

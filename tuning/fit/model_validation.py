@@ -124,6 +124,28 @@ def cross_validate(fit: Fit) -> list[HeldOutPrediction]:
     prediction is as good as these are known. Nothing is compiled anew.
 
     Raises ValueError for a single log.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
+    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
+    ...     run=jb.Run(0.4, sample_rate=50.0),
+    ... )
+    >>> logs = []
+    >>> for speed in (2.0, 2.5):
+    ...     record = jb.simulate(jb.replace(case, {"loads.0.speed": speed}))
+    ...     columns = ("w",), ("deflection",), ("m",), f"{speed} m/s", (0,)
+    ...     logs.append(
+    ...         tuning.Log(record.times, record.measured, *columns, loads=record.case.loads)
+    ...     )
+    >>> start = jb.replace(case, {"beam.flexural_rigidity": 10.0})
+    >>> fit = tuning.identify(start, logs, "beam.flexural_rigidity")
+    >>> for held_out in tuning.cross_validate(fit):
+    ...     print(held_out.log, held_out.residual_ratio.round(1))
+    2.0 m/s [1.]
+    2.5 m/s [1.]
     """
     dataset = fit.dataset
     count = len(dataset.logs)
@@ -143,6 +165,27 @@ def predict_held_out(fit: Fit, logs: Sequence[Log]) -> list[HeldOutPrediction]:
     """Logs that the fit did not use, predicted by the fitted case with the loads of each log.
 
     Raises ValueError as `identify` does for logs that do not match the case.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
+    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
+    ...     run=jb.Run(0.4, sample_rate=50.0),
+    ... )
+    >>> logs = []
+    >>> for speed in (2.0, 2.5):
+    ...     record = jb.simulate(jb.replace(case, {"loads.0.speed": speed}))
+    ...     columns = ("w",), ("deflection",), ("m",), f"{speed} m/s", (0,)
+    ...     logs.append(
+    ...         tuning.Log(record.times, record.measured, *columns, loads=record.case.loads)
+    ...     )
+    >>> start = jb.replace(case, {"beam.flexural_rigidity": 10.0})
+    >>> fit = tuning.identify(start, logs, "beam.flexural_rigidity")
+    >>> for held_out in tuning.predict_held_out(fit, logs[:1]):
+    ...     print(held_out.log, held_out.residual_ratio.round(1))
+    2.0 m/s [1.]
     """
     dataset = make_dataset(fit.case, list(logs))
     predict = compiled(dataset.predictor(["run.gravity"]))

@@ -169,8 +169,9 @@ def _spikes(values: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
 def _constant_runs(values: Float[np.ndarray, " time"], min_length: int):
     """Ranges (start, stop) of at least so many equal samples."""
     run_starts = np.flatnonzero(np.diff(values) != 0) + 1
-    run_starts = np.concatenate([[0], run_starts, [values.size]])
-    return [(a, b) for a, b in zip(run_starts, run_starts[1:], strict=False) if b - a >= min_length]
+    edges = np.concatenate([[0], run_starts, [values.size]])
+    long = np.flatnonzero(np.diff(edges) >= min_length)
+    return list(zip(edges[long].tolist(), edges[long + 1].tolist(), strict=True))
 
 
 def _clipped(values: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:

@@ -217,11 +217,18 @@ def without_duplicates(found: list[Candidate]) -> tuple[Candidate, ...]:
 
 
 def _is_same(a: IdentifiedMode, b: IdentifiedMode) -> bool:
-    """Whether two poles agree in frequency, damping and shape within their uncertainties."""
-    frequency_sd = np.hypot(a.frequency_sd, b.frequency_sd)
-    damping_sd = np.hypot(a.damping_sd, b.damping_sd)
-    return bool(
-        abs(a.frequency - b.frequency) < DUPLICATE_SDS * frequency_sd
-        and abs(a.damping_ratio - b.damping_ratio) < DUPLICATE_SDS * damping_sd
-        and mac_matrix(a.shape[None], b.shape[None])[0, 0] > DUPLICATE_MAC
-    )
+    """Whether two poles stand for one mode: alike in shape, and not told apart in frequency.
+
+    They agree in frequency and damping within two standard deviations of the difference; or their
+    95 % intervals of frequency overlap and the frequencies differ by less than half of the smaller
+    half-power bandwidth, z f, however the damping ratios differ: no spectrum shows two peaks then.
+    """
+    if mac_matrix(a.shape[None], b.shape[None])[0, 0] < DUPLICATE_MAC:
+        return False
+    shift = abs(a.frequency - b.frequency)
+    alike = shift < DUPLICATE_SDS * np.hypot(a.frequency_sd, b.frequency_sd) and abs(
+        a.damping_ratio - b.damping_ratio
+    ) < DUPLICATE_SDS * np.hypot(a.damping_sd, b.damping_sd)
+    overlap = shift < a.quantile * a.frequency_sd + b.quantile * b.frequency_sd
+    width = min(a.damping_ratio * a.frequency, b.damping_ratio * b.frequency)
+    return bool(alike or (overlap and shift < width))

@@ -26,11 +26,11 @@ class ModalFit:
     """Modes identified from a log, ascending in frequency.
 
     `modes` are those well identified, `rejected` the others with the reason. `kind` is "free
-    decay" or "ambient"; `windows` (s) are the parts of the log used, `band` (Hz) that of the
-    search; `lines` are harmonic lines that were subtracted. `choices` are the automatic choices,
-    `notes` sentences on the log. `diagrams` are stabilisation diagrams, one for each part of the
-    band. `times` and `measured` are the log in the first window and the band, `fitted` is the
-    response of the modes to it for a free decay, else None. `singular_values` are those of
+    decay", "ambient" or "measured force"; `windows` (s) are the parts of the log used, `band` (Hz)
+    that of the search; `lines` are harmonic lines that were subtracted. `choices` are the automatic
+    choices, `notes` sentences on the log. `diagrams` are stabilisation diagrams, one for each part
+    of the band. `times` and `measured` are the log in the first window and the band, `fitted` is
+    the response of the modes to it for a free decay, else None. `singular_values` are those of
     frequency-domain decomposition, for each part of the band, else none.
 
     >>> import numpy as np

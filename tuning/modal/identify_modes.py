@@ -19,18 +19,25 @@ import numpy as np
 from tuning.logs.log import Log
 from tuning.logs.units import time_derivative
 from tuning.modal.ambient import Candidate, subspace_modes
+from tuning.modal.arguments import (
+    METHODS,
+    SPECTRAL_METHODS,
+    check_arguments,
+    check_band,
+    check_force,
+)
 from tuning.modal.decay.modes import Decays, excited, free_decay_modes
 from tuning.modal.fit import Choice, ModalFit
 from tuning.modal.harmonics import Line, harmonic_lines, is_steady, without_lines
 from tuning.modal.preprocessing import kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels
 from tuning.modal.spectral.efdd_modes import SingularValues, efdd_modes
+from tuning.modal.spectral.forced_modes import forced_modes
+from tuning.modal.spectral.forces import force_names, force_records, without_forces
 from tuning.modal.spectral.plscf_modes import plscf_modes
 from tuning.modal.stabilisation import Diagram
 
-KINDS = ("free decay", "ambient")
-SPECTRAL_METHODS = ("fdd", "plscf")
-METHODS = ("covariance", "data", *SPECTRAL_METHODS)
+FORCED = "measured force"
 TRANSIENT_SHARE = 0.01  # struck samples of a log with transients of crossing loads
 
 
@@ -44,6 +51,7 @@ def identify_modes(
     channels: Sequence[str] | None = None,
     order: int | None = None,
     method: str | None = None,
+    force: Sequence[str] | None = None,
     exclude: Sequence[float] = (),
     progress: Callable[[str], None] | None = None,
 ) -> ModalFit:
@@ -55,13 +63,15 @@ def identify_modes(
     of those to use; `order` is the highest order of the stabilisation diagram; `method` is
     "covariance" or "data" (subspace identification), "fdd" (enhanced frequency-domain
     decomposition) or "plscf" (poly-reference least-squares complex frequency), of which the last
-    two take every log for a response to broadband excitation; `exclude` are frequencies (Hz) that
-    are no modes. `progress` is called with a few words on what is being done.
+    two take every log for a response to broadband excitation; `force` are the names of the channels
+    of forces that were measured, of a hammer or shaker, by default all in N: method "plscf", then
+    the default, fits the responses to them. `exclude` are frequencies (Hz) that are no modes.
+    `progress` is called with a few words on what is being done.
 
     Raises ValueError for a log without evenly sampled records, or too short, a window outside the
     log, a band above half the sampling rate, an impossible count or order, unknown channels, kinds
-    and methods, a kind that the method cannot use, and logs that differ in channels or sampling
-    rate.
+    and methods, a kind or forces that the method cannot use, channels that are no forces, and logs
+    that differ in channels or sampling rate.
 
     >>> import numpy as np
     >>> import tuning
@@ -74,10 +84,13 @@ def identify_modes(
     ['3.20 Hz']
     """
     logs = [log] if isinstance(log, Log) else list(log)
-    _check_arguments(count, kind, order, method)
-    logs = [with_channels(one, channels) for one in logs]
+    check_arguments(count, kind, order, method)
+    check_force(force, kind, method)
+    measured = logs
+    forces = () if kind or method not in (None, "plscf") else force_names(logs[0], force)
+    logs = [without_forces(with_channels(one, channels)) for one in logs]
     samples = samples_of(logs, window)
-    _check_band(logs[0], samples.rate, band)
+    check_band(logs[0], samples.rate, band)
     choices = []
     derivatives = tuple(time_derivative(name) for name in logs[0].quantities)
     used_band = band or kinetic_band(samples.records, samples.rate, derivatives)
@@ -85,6 +98,20 @@ def identify_modes(
         choices.append(
             Choice(f"band {used_band[0]:.3g} Hz to {used_band[1]:.4g} Hz", "--band LOW:HIGH")
         )
+    if forces:
+        driving = force_records(measured, forces, window, samples)
+        if progress:
+            progress("responses to the measured forces")
+        found, explained = _forced(samples, driving, used_band, order, progress)
+        choices.append(
+            Choice(
+                f"excitation: measured force {' and '.join(forces)}, which explains "
+                f"{100 * explained:.1f} % of the responses in the band",
+                "--force CHANNEL, or --method covariance without it",
+            )
+        )
+        _add_order(choices, order, found)
+        return _result(logs, samples, found, used_band, (), choices, "plscf", count, exclude)
     if progress:
         progress("harmonic lines and excitation")
     lines, cleaned = _subtract_lines(samples, used_band, exclude)
@@ -111,19 +138,31 @@ def identify_modes(
         choices.append(Choice(says, "--kind ambient, --kind 'free decay', --from and --to"))
     if method is None:
         choices.append(Choice(f"method {used_method}", f"--method {', '.join(METHODS)}"))
-    if order is None and found.diagrams:
-        highest = max((max(d.orders, default=0) for d in found.diagrams), default=0)
-        choices.append(Choice(f"models of orders to {highest}", "--order N"))
+    _add_order(choices, order, found)
     return _result(logs, samples, found, used_band, lines, choices, used_method, count, exclude)
 
 
 class _Found(NamedTuple):
-    """Candidates, diagrams, decays that were fitted (None: ambient), and singular values."""
+    """Candidates, diagrams, decays that were fitted if any, singular values if any, and kind."""
 
     candidates: tuple[Candidate, ...]
     diagrams: tuple[Diagram, ...]
     decays: Decays | None
     singular_values: tuple[SingularValues, ...] = ()
+    kind: str = "ambient"
+
+
+def _add_order(choices, order, found: _Found) -> None:
+    if order is None and found.diagrams:
+        highest = max((max(d.orders, default=0) for d in found.diagrams), default=0)
+        choices.append(Choice(f"models of orders to {highest}", "--order N"))
+
+
+def _forced(samples: Samples, driving, band, order, progress) -> tuple[_Found, float]:
+    """Modes of the responses to forces, and the share of the responses that these explain."""
+    arguments = (samples.records, driving, samples.starts, samples.rate, band)
+    found = forced_modes(*arguments, order=order, progress=progress)
+    return _Found(found.candidates, found.diagrams, None, kind=FORCED), found.explained
 
 
 def _ambient_modes(cleaned, samples: Samples, band, method, order, progress) -> _Found:
@@ -215,7 +254,7 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, count, e
     return ModalFit(
         modes=tuple(sorted((mode for mode, _ in modes), key=lambda mode: mode.frequency)),
         rejected=tuple(sorted(rejected, key=lambda pair: pair[0].frequency)),
-        kind="ambient" if found.decays is None else "free decay",
+        kind=found.kind if found.decays is None else "free decay",
         method=method,
         windows=windows,
         band=band,
@@ -229,29 +268,3 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, count, e
         measured=measured,
         fitted=fitted,
     )
-
-
-def _check_band(log: Log, rate: float, band) -> None:
-    if band is not None and not 0 < band[0] < band[1] <= rate / 2:
-        raise ValueError(
-            f"{log.source}: the band from {band[0]:g} Hz to {band[1]:g} Hz is not within 0 and "
-            f"half the sampling rate, {rate / 2:g} Hz"
-        )
-
-
-def _check_arguments(count, kind, order, method) -> None:
-    if count is not None and count < 1:
-        raise ValueError(f"count must be at least 1, not {count}")
-    if order is not None and order < 4:
-        raise ValueError(f"the highest order must be at least 4, not {order}")
-    if kind not in (None, *KINDS):
-        raise ValueError(f"kind must be {' or '.join(map(repr, KINDS))}, not {kind!r}")
-    if method not in (None, *METHODS):
-        raise ValueError(f"method must be {' or '.join(map(repr, METHODS))}, not {method!r}")
-    if kind == "free decay" and method in SPECTRAL_METHODS:
-        raise ValueError(
-            f"method {method!r} takes a log for the response to broadband excitation; for kind "
-            "'free decay' leave the method out"
-        )
-    if order is not None and method == "fdd":
-        raise ValueError("method 'fdd' has no models and no order; leave the order out")

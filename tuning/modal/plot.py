@@ -43,7 +43,8 @@ def plot_modal_fit(fit, path: str | Path | None = None, length: float | None = N
 
 
 def _kind_text(fit) -> str:
-    return "a free decay" if fit.fitted is not None else "ambient vibration"
+    kinds = {"free decay": "a free decay", "measured force": "responses to a measured force"}
+    return kinds.get(fit.kind, "ambient vibration")
 
 
 def _draw_log(axes, fit, channel, unit):
@@ -102,6 +103,7 @@ def _draw_diagram(axes, fit):
         axes.plot(poles.frequencies[noise], poles.orders[noise], ".", color=GREY, markersize=1.5)
         axes.plot(poles.frequencies[modes], poles.orders[modes], "o", color=FIT, markersize=2.5)
     axes.set(ylabel="order of the model", xlim=fit.band)
+    axes.grid(False)
 
 
 def _draw_singular_values(axes, fit):
@@ -112,6 +114,7 @@ def _draw_singular_values(axes, fit):
         axes.plot(part.frequencies, levels[:, 1:], color=GREY, linewidth=0.6)
         axes.plot(part.frequencies, levels[:, 0], color=FIT, linewidth=1.2)
     axes.set(ylabel="singular values (dB)", xlim=fit.band)
+    axes.grid(False)
 
 
 def _draw_fit(axes, residual_axes, fit, channel, unit):

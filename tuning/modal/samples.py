@@ -31,13 +31,7 @@ def samples_of(logs: Sequence[Log], window: tuple[float, float] | None) -> Sampl
     """
     records, starts, rates, notes = [], [], [], []
     for log in logs:
-        start, stop = _sample_range(log, window)
-        if stop - start < MIN_SAMPLES:
-            raise ValueError(
-                f"{log.source}: {stop - start} samples are too few to identify modes from; "
-                f"at least {MIN_SAMPLES} are needed"
-            )
-        part = log if (start, stop) == (0, log.times.size) else _part(log, start, stop)
+        part = part_of_window(log, window)
         rate, found, said = even_records(part)
         rates.append(rate)
         settled = settled_from(found[0].values) if window is None else 0
@@ -61,8 +55,19 @@ def samples_of(logs: Sequence[Log], window: tuple[float, float] | None) -> Sampl
     return Samples(tuple(records), tuple(starts), rates[0], tuple(dict.fromkeys(notes)))
 
 
-def _part(log: Log, start: int, stop: int) -> Log:
-    """Part of a log."""
+def part_of_window(log: Log, window: tuple[float, float] | None) -> Log:
+    """The part of a log in a window (s), by default all.
+
+    Raises ValueError for a window outside the log, and for too few samples.
+    """
+    start, stop = _sample_range(log, window)
+    if stop - start < MIN_SAMPLES:
+        raise ValueError(
+            f"{log.source}: {stop - start} samples are too few to identify modes from; "
+            f"at least {MIN_SAMPLES} are needed"
+        )
+    if (start, stop) == (0, log.times.size):
+        return log
     return Log(
         log.times[start:stop], log.values[start:stop], log.names, log.quantities, log.units,
         log.source, valid=log.valid[start:stop],

@@ -19,6 +19,7 @@ from tuning.fit.identify import identify
 from tuning.fit.result import Fit
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
+from tuning.weighing.axle_count import AxleCount, count_axles
 from tuning.weighing.dynamic_forces import (
     DynamicErrors,
     dynamic_errors,
@@ -38,12 +39,28 @@ class AxleWeighing:
 
     The load of the fit has `forces` (N), `offsets` (m, behind the first axle), speed and entry
     time. `dynamic` has the errors of the parameters of the fit on an unknown road, which are larger
-    than the fit's own.
+    than the fit's own. `count` says how the number of axles was chosen; None if it was given.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
+    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
+    ...     run=jb.Run(0.4, sample_rate=50.0),
+    ... )
+    >>> record = jb.simulate(case)
+    >>> columns = ("w",), ("deflection",), ("m",), "log", (0,)
+    >>> log = tuning.Log(record.times, record.measured, *columns)
+    >>> found = tuning.weigh_axles(case, log, (1.0, 3.0), axles=1)
+    >>> print(found.fit.addresses)
+    ['loads.0.forces.0', 'loads.0.speed', 'loads.0.entry_time', 'sensors.0.offset']
     """
 
     moses: MosesFit
     fit: Fit
     dynamic: DynamicErrors
+    count: AxleCount | None = None
 
     @property
     def intervals(self) -> Float[np.ndarray, "parameter 2"]:
@@ -89,6 +106,7 @@ class AxleWeighing:
                 "speed": geometry.speed,
             },
             "dynamic_share": self.dynamic.share,
+            "bic": {} if self.count is None else {str(n): b for n, b in self.count.bic.items()},
             "verdict": self.fit.verdict,
         }
 
@@ -111,7 +129,8 @@ class AxleWeighing:
         gross, gross_error = self.moses.gross_weight
         header = ("axle", "at (m)", "fitted (kN)", "95 % interval", "Moses (kN)", "95 % interval")
         lines = [
-            f"{count} axles found",
+            f"{count} axle{'s' * (count > 1)} found",
+            *([] if self.count is None else [str(self.count)]),
             *text_table(header, rows, ">>><><"),
             f"gross weight by Moses' method {gross / 1e3:.5g} kN, standard error"
             f" {gross_error / 1e3:.3g} kN, at {geometry.speed:.4g} m/s",
@@ -125,7 +144,7 @@ def weigh_axles(
     case: Case,
     log: Log,
     speeds: tuple[float, float],
-    axles: int,
+    axles: int | None = None,
     *,
     both_ways: bool = False,
     influence_lines: InfluenceLines | None = None,
@@ -133,23 +152,42 @@ def weigh_axles(
     """Forces and distances of the axles of one vehicle or train that crossed a known beam in a log.
 
     `speeds` (m/s) are the lowest and highest possible ones, from the left or, with `both_ways`, in
-    both directions; `axles` is their number. Moses' method has the influence lines of the case, or
-    the `influence_lines` given (see `calibrate_influence_lines`). The fit has moving forces, the
-    vibration of the beam, and offsets of the sensors; loads and profile of case and log are not
-    used.
+    both directions; `axles` is their number, by default that of `count_axles`. Moses' method has
+    the influence lines of the case, or the `influence_lines` given (see
+    `calibrate_influence_lines`). The fit has moving forces, the vibration of the beam, and offsets
+    of the sensors; loads and profile of case and log are not used.
 
     Raises ValueError if speeds are not 0 < low < high, there is no axle, or a sensor measures
     velocity or acceleration, and as `identify` does.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
+    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
+    ...     run=jb.Run(0.4, sample_rate=50.0),
+    ... )
+    >>> record = jb.simulate(case)
+    >>> columns = ("w",), ("deflection",), ("m",), "log", (0,)
+    >>> log = tuning.Log(record.times, record.measured, *columns)
+    >>> found = tuning.weigh_axles(case, log, (1.0, 3.0), axles=1)
+    >>> print(f"{found.load.forces[0]:.1f} N at {found.load.speed:.1f} m/s")
+    4.0 N at 2.0 m/s
     """
     low, high = speeds
     if not 0 < low < high:
         raise ValueError(f"speeds must be 0 < low < high in m/s; they are {low:g} and {high:g}")
-    if axles < 1:
+    if axles is not None and axles < 1:
         raise ValueError(f"the number of axles must be 1 or more, not {axles}")
     check_static(case)
     case = dataclasses.replace(case, loads=(), vehicle_sensors=(), profile=None)
     lines = model_influence_lines(case) if influence_lines is None else influence_lines
     readings, valid = sensor_readings(case, log)
+    count = None
+    if axles is None:
+        count = count_axles(case, log.times, readings, (low, high), both_ways)
+        axles = count.chosen
     geometry = find_geometry(lines, log.times, readings, (low, high), axles, both_ways)
     static = moses(lines, geometry, log.times, readings, valid, found=True)
     fit = identify(case, *axle_problem(case, log, static))
@@ -157,7 +195,7 @@ def weigh_axles(
     jacobian = problem.linearised(fit.values)[1][0]
     errors = errors_of_fit(lines, fit.addresses, fit.values, jacobian, fit.noise[0], log.times,
                            readings, readings - fit.fitted[0], valid)  # fmt: skip
-    return AxleWeighing(static, fit, errors)
+    return AxleWeighing(static, fit, errors, count)
 
 
 def errors_of_fit(

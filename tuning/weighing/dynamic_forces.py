@@ -89,6 +89,14 @@ def dynamic_errors(
     )
 
 
+def degrees_of_freedom(waves: Float[np.ndarray, "time wave sensor"]) -> float:
+    """Degrees of freedom of dynamic wheel forces with these waves: their share of equal ones."""
+    scale = np.maximum(waves.std(axis=(0, 1)), 1e-300)
+    rows = (waves / scale).transpose(1, 0, 2).reshape(waves.shape[1], -1)
+    power = np.linalg.svd(rows, compute_uv=False) ** 2
+    return float(power.sum() ** 2 / max(np.sum(power**2), 1e-300))
+
+
 def white_noise(
     readings: Float[np.ndarray, "time sensor"], valid: np.ndarray
 ) -> Float[np.ndarray, " sensor"]:

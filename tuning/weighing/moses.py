@@ -9,6 +9,7 @@ of bridge and vehicle, is residual.
 """
 
 import dataclasses
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.optimize
@@ -152,21 +153,41 @@ def find_geometry(
     axles: int,
     both_ways: bool = False,
 ) -> AxleGeometry:
-    """Speed, entry time and distances of axles that explain readings best by static forces.
+    """Speed, entry time and distances of axles that explain readings best by static forces."""
+    length = float(lines.positions[-1])
 
-    For each of many speeds (m/s, between two) the readings are explained by non-negative forces
-    that enter at many times; those of the best speeds, gathered to the number of axles, are the
-    starts of a search by least squares in speed, entry time and distances, with the forces of each
-    point by Moses' method (variable projection).
+    def by_lines(geometry, times):
+        return lines.at(geometry.positions(times))
+
+    return search_geometry(by_lines, length, times, readings, speeds, axles, both_ways)[0]
+
+
+def search_geometry(
+    unit_readings: Callable[[AxleGeometry, np.ndarray], Float[np.ndarray, "time axle sensor"]],
+    length: float,
+    times: Float[np.ndarray, " time"],
+    readings: Float[np.ndarray, "time sensor"],
+    speeds: tuple[float, float],
+    axles: int,
+    both_ways: bool = False,
+    more_starts: Sequence[AxleGeometry] = (),
+) -> tuple[AxleGeometry, float, Float[np.ndarray, " axle"]]:
+    """Speed, entry time and distances of axles on a beam of a length (m), from `unit_readings`.
+
+    These are the readings of a force of one newton at each axle. For each of many speeds (m/s,
+    between two) the readings are explained by non-negative forces that enter at many times; those
+    of the best speeds, gathered to the number of axles, and `more_starts` are the starts of a
+    search by least squares in speed, entry time and distances, with the forces of each point by
+    Moses' method (variable projection). Also the mean square of what remains, relative to the
+    variance of each sensor, and the forces (N).
     """
     stride = max(times.size * readings.shape[1] // MAX_ROWS, 1)
     times, readings = times[::stride], readings[::stride]
     scale = np.maximum(readings.std(axis=0), 1e-300)
     target = ((readings - readings.mean(axis=0)) / scale).T.ravel()
-    length = float(lines.positions[-1])
 
     def columns(geometry):
-        table = lines.at(geometry.positions(times)) / scale
+        table = unit_readings(geometry, times) / scale
         return (table - table.mean(axis=0)).transpose(2, 0, 1).reshape(target.size, -1)
 
     starts = []
@@ -186,7 +207,7 @@ def find_geometry(
         return AxleGeometry(sign * np.exp(x[0]), x[1], np.append(0.0, np.cumsum(gaps)), length)
 
     best = None
-    for _, start in starts[:REFINED_COUNT]:
+    for start in [*(start for _, start in starts[:REFINED_COUNT]), *more_starts]:
         sign = np.sign(start.speed)
 
         def residual(x, sign=sign):
@@ -206,7 +227,8 @@ def find_geometry(
         if best is None or found.cost < best[0]:
             best = found.cost, geometry_at(found.x, sign)
     assert best is not None
-    return best[1]
+    forces = scipy.optimize.nnls(columns(best[1]), target)[0]
+    return best[1], float(2 * best[0] / target.size), forces
 
 
 def _gathered(places, weights, axles) -> Float[np.ndarray, " axle"]:

@@ -33,12 +33,12 @@ class UnitForce:
     """Response of the sensors of a case, without its loads, for `duration` (s) after an entry.
 
     Sensors are ideal but for their analogue filters and delays. `frequencies` (Hz) are those of the
-    modes.
+    modes. With `vibrating` all readings are dynamic, as those of velocities and accelerations.
 
     Raises ValueError for a beam that can move as a rigid body.
     """
 
-    def __init__(self, case: Case, duration: float):
+    def __init__(self, case: Case, duration: float, vibrating: bool = False):
         empty = {"loads": (), "vehicle_sensors": (), "controller": None, "profile": None}
         bare = dataclasses.replace(case, **empty)
         model = modal_model(bare)
@@ -57,7 +57,7 @@ class UnitForce:
         self.poles, vectors = np.linalg.eig(model.A)
         self.inputs = np.linalg.solve(vectors, inputs[:, commands:])
         self.outputs, self.feedthrough = C @ vectors, D[:, commands:]
-        self.vibrates = np.array([order > 0 for order in outputs.time_derivatives])
+        self.vibrates = np.array([vibrating or order > 0 for order in outputs.time_derivatives])
 
     def readings(
         self, speed: float, since_entry: Float[np.ndarray, " time"]

@@ -71,6 +71,21 @@ def weigh(
 
     Raises ValueError if there is no sensor, speeds are not 0 < low < high, or no load is found in
     the log, and as `identify` does.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
+    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
+    ...     run=jb.Run(0.4, sample_rate=50.0),
+    ... )
+    >>> record = jb.simulate(case)
+    >>> columns = ("w",), ("deflection",), ("m",), "log", (0,)
+    >>> log = tuning.Log(record.times, record.measured, *columns)
+    >>> found = tuning.weigh(case, log, (1.0, 3.0), max_count=1, both_ways=False)
+    >>> print(f"{found.loads[0].mass:.1f} kg at {found.loads[0].speed:.1f} m/s")
+    0.4 kg at 2.0 m/s
     """
     low, high = speeds
     if not 0 < low < high:

@@ -105,6 +105,36 @@ def over_speeds() -> tuple[str, ...]:
     return (*options, "--paired")
 
 
+# A wagon of 10 degrees of freedom on the bridge, without a profile.
+WAGON = f"""
+[beam]
+length = {SPAN}
+flexural_rigidity = 3.05e10
+mass_per_length = 15000.0
+damping_ratio = 0.01
+modes = 5
+[[sensors]]
+position = {SPAN / 2}
+[[loads]]
+kind = "wagon"
+speed = 50.0
+body_mass = 32000.0
+body_inertia = 1.97e6
+bogie_mass = 2615.0
+bogie_inertia = 1476.0
+wheelset_mass = 1813.0
+primary_stiffness = 2.4e6
+primary_damping = 8.0e3
+secondary_stiffness = 8.6e5
+secondary_damping = 4.0e4
+bogie_distance = 19.0
+wheelset_distance = 2.56
+[run]
+duration = 2.0
+sample_rate = 1000
+"""
+
+
 class Row(NamedTuple):
     """A row of the table.
 
@@ -182,6 +212,7 @@ ROWS = (
         code="jb.simulate(case)",
         case=train(50, 'mass"\nmass = 17000.0'),
     ),
+    Row("a wagon", 1.0, code="jb.simulate(case)", case=WAGON),
     Row(
         "HSLM-A1, 50 forces x 101 speeds, command",
         10.0,

@@ -4,6 +4,7 @@ from experiments.thesis.published_numbers import PublishedNumbers
 from experiments.thesis.tolerances import (
     DIGITS,
     MEASURED_RATIO,
+    SAME_CURVE,
     YES_OR_NO,
 )
 
@@ -178,4 +179,23 @@ FROZEN_POLE_LIMITS = PublishedNumbers(
     "5.6 6.5",
     "speed,0.509kg mass,0.55m/s",
     "the speed shown is taken as the limit",
+)
+FED_BACK_STATES = PublishedNumbers(
+    "Figs 5.14, 5.15",
+    "0.261 kg at 0.55 m/s, statements on the states fed back: holds 1, does not 0",
+    "1",
+    "computed",
+    YES_OR_NO,
+    "1 1 1",
+    "varying:q1+q2+q1'<q1 varying:q1+q2<q1 constant:all>uncontrolled",
+)
+IDENTICAL_GAINS = PublishedNumbers(
+    "3.2",
+    "largest difference of step-by-step from finite-time gains, of the largest of each state",
+    "%",
+    "computed",
+    SAME_CURVE,
+    "0",
+    "",
+    "the gains are called identical",
 )

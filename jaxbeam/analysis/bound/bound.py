@@ -19,7 +19,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxbeam.analysis.bound.input_influence import TOLERANCE, input_influence
+from jaxbeam.analysis.bound.input_influence import (
+    TOLERANCE,
+    InputInfluence,
+    input_influence,
+)
 from jaxbeam.analysis.bound.linear_program import least_peak
 from jaxbeam.case.aliases import renamed_property, warn_renamed
 from jaxbeam.case.case import Case
@@ -154,6 +158,30 @@ def least_achievable_peak(case: Case, positions: ArrayLike | None, period: float
 
 def _bound_without_baseline(case: Case, positions, period, spacing) -> Bound:
     """Bound of a case, with NaN for the uncontrolled peak."""
+    influence, positions, period, spacing = checked_influence(case, positions, period, spacing)
+    peak, commands, weights = least_peak(influence, *held_command_limits(case, period))
+    when, where = np.nonzero(weights)
+    return Bound(
+        peak=float(peak),
+        uncontrolled=np.nan,
+        positions=positions,
+        times=influence.hold_times,
+        commands=commands,
+        period=period,
+        spacing=spacing,
+        active_constraints=ActiveConstraints(
+            positions[where], influence.times[when], weights[when, where]
+        ),
+    )
+
+
+def checked_influence(
+    case: Case, positions: ArrayLike | None, period: float | None, spacing: float | None
+) -> tuple[InputInfluence, Float[np.ndarray, " position"], float, float]:
+    """Influence of held commands, positions (m), period and spacing (s), with the defaults filled.
+
+    Raises ValueError as `bound`.
+    """
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(case)):
         raise ValueError(
             "a bound can be neither differentiated nor compiled: call it outside jit and grad"
@@ -186,20 +214,7 @@ def _bound_without_baseline(case: Case, positions, period, spacing) -> Bound:
         raise ValueError(
             "no actuator deflects the beam at these positions; move one off supports and nodes"
         )
-    peak, commands, weights = least_peak(influence, *_command_limits(case, period))
-    when, where = np.nonzero(weights)
-    return Bound(
-        peak=float(peak),
-        uncontrolled=np.nan,
-        positions=positions,
-        times=influence.hold_times,
-        commands=commands,
-        period=period,
-        spacing=spacing,
-        active_constraints=ActiveConstraints(
-            positions[where], influence.times[when], weights[when, where]
-        ),
-    )
+    return influence, positions, period, spacing
 
 
 def _checked_positions(case: Case, positions) -> Float[np.ndarray, " position"]:
@@ -222,7 +237,7 @@ def _uncontrolled_peak(case: Case, positions) -> float:
     return float(np.max(running_peaks.refined_peak()[0]))
 
 
-def _command_limits(case: Case, period: float):
+def held_command_limits(case: Case, period: float) -> tuple[Float[np.ndarray, " actuator"], ...]:
     """Lowest and highest command of each actuator, and its largest change from hold to hold."""
     low, high, rate = (np.asarray(part) for part in command_ranges(case))
     return low, high, rate * period

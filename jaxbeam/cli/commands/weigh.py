@@ -20,7 +20,7 @@ def weigh(
     speeds: str,
     max_loads: int = 3,
     one_way: bool = False,
-    axles: int | None = None,
+    axles: str | None = None,
     calibration: Path | None = None,
     output: Output = None,
     options: CaseOptions = CaseOptions(),
@@ -40,7 +40,8 @@ def weigh(
     one_way
         Search loads from the left only.
     axles
-        Weigh one vehicle or train of so many axles: their forces and spacings.
+        Weigh one vehicle or train of so many axles, or of as many as are found with `auto`: their
+        forces and spacings.
     calibration
         Log of a vehicle of known axle loads (in the TOML file beside it), for the influence lines.
     output
@@ -48,10 +49,14 @@ def weigh(
     """
     options.check_outputs(output)
     speed_range = parse_range("--speeds", speeds, "m/s, such as 0.5:3")
+    number = None if axles in (None, "auto") else _axle_count(axles)
     check_exists("log file", log)
     if calibration is not None:
         check_exists("log file", calibration)
-        refuse_option(axles is None, "--calibration is for Moses' method: say how many --axles")
+        refuse_option(
+            axles is None,
+            "--calibration is for Moses' method: say how many --axles, or --axles auto",
+        )
     options.check_case(case)
 
     import tuning  # sets XLA's threads, therefore before the case is read
@@ -65,11 +70,18 @@ def weigh(
         if calibration is not None:
             lines = tuning.calibrate_influence_lines(parsed_case, tuning.read_log(calibration))
         weighing = tuning.weigh_axles(
-            parsed_case, read, speed_range, axles, both_ways=not one_way, influence_lines=lines
+            parsed_case, read, speed_range, number, both_ways=not one_way, influence_lines=lines
         )
     if output:
         save_case(weighing.fit.case, output, overwrite=True)  # checked before the work
     options.report(weighing.to_dict(), [str(weighing)], output)
+
+
+def _axle_count(text: str) -> int:
+    """The number of axles that an option gives. Raises ValueError if it is none."""
+    if not text.isdecimal():
+        raise ValueError(f"--axles takes a whole number, or auto, not {text!r}")
+    return int(text)
 
 
 def identify_responses(

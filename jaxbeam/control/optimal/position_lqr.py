@@ -37,6 +37,11 @@ class PositionLQR(AbstractFiniteHorizonRegulator):
     change, rather than at a time. Of several loads on the beam the gains of the state are averaged
     with their masses as weights; with loads "known" the commands for their weights, in proportion
     to the masses, are added. With none on the beam, `after` holds for those that have left.
+
+    >>> import jaxbeam as jb
+    >>> weights = {"state_weight": [1e4, 1.0], "command_weight": [1e-3]}
+    >>> print(jb.PositionLQR(**weights, masses=[0.2, 0.4], loads="known").masses)
+    [0.2 0.4]
     """
 
     kind: ClassVar[str] = "lqr-position"

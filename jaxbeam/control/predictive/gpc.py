@@ -143,6 +143,18 @@ class GPC(AbstractController):
     is that of the case without loads, or of the `design` model: 2 `modes` past readings and
     commands are fed back, with those of actuator lags and of a delay. Filters of the sensors are no
     part of it.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=2),
+    ...     actuators=[jb.PointForce(0.3, limits=[-4.0, 4.0])],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.GPC(horizon=8, moves=2, move_weight=1e-9, period=0.005),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    0.883 mm
     """
 
     kind: ClassVar[str] = "gpc"

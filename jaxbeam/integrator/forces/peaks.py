@@ -16,8 +16,12 @@ from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.running_peaks import Peaks
 from jaxbeam.numerics.peak_search import estimate_peak, refine_peak
 
-CHUNK_STEPS = 16
-REFINEMENTS = 4  # of a step
+CHUNK_STEPS = 16  # of a chunk, or FEW_STEPS of one that is no longer than these
+FEW_STEPS = 2
+REFINEMENTS = 4  # of a step,
+MAX_REFINEMENTS = 4  # at most so often,
+ENOUGH_STEPS = 8  # until no more steps than these are left in a run
+MAX_VALUES = 1e6  # of forces at instants at once
 
 
 def peaks_of_forces(responses: ForceResponses, paths: ForcePaths, phase: float) -> Peaks:
@@ -43,7 +47,7 @@ class _Search:
     """
 
     def __init__(self, responses: ForceResponses, panels: Panels, runs: int, phase: float):
-        self.responses, self.panels, self.runs = responses, panels, runs
+        self.responses, self.panels, self.runs, self.phase = responses, panels, runs, phase
         system = responses.system
         self.poles, self.C = system.poles, system.on_outputs
         self._place_forces()
@@ -62,8 +66,11 @@ class _Search:
             "ps,pso->po", np.abs(on_beam), responses.curvature[panels.response]
         )[self.panel]
         self.bend = size @ (largest * np.abs(self.poles[:, None]) ** 2) + forced_bend
-        slack = np.einsum("ps,pso->po", np.abs(on_beam), responses.table_error[panels.response])
-        self.slack = 2 * slack[self.panel]  # of a value, and of that which is reached
+        lines, self.cubic_slack = (
+            2 * np.einsum("ps,pso->po", np.abs(on_beam), error[panels.response])
+            for error in (responses.table_error, responses.cubic_error)
+        )  # of a value, and of that which is reached
+        self.slack = lines[self.panel]
         forced = np.stack([self._forced(share) for share in (0.0, 0.5, 1.0)])
         half = (self.length / 2)[:, None]
         self.bound = size @ largest + np.abs(forced).max(axis=0) + forced_bend * half**2 / 8
@@ -89,13 +96,24 @@ class _Search:
         times = (self.start + share * self.length)[:, None]
         return self._from_table(table, self.panel, times)[:, 0]
 
-    def _from_table(self, table, panel, times):
-        """Values of a table under the forces in panels, at times (panel, time)."""
+    def _from_table(self, table, panel, times, cubic: bool = False):
+        """Values of a table under the forces in panels, at times (panel, time).
+
+        On lines between its points, or on cubics.
+        """
+        if panel.size > 1 and self.panels.count[panel].sum() * times.shape[1] > MAX_VALUES:
+            half = panel.size // 2
+            halves = (panel[:half], times[:half]), (panel[half:], times[half:])
+            return np.concatenate([self._from_table(table, *one, cubic) for one in halves])
         which, at = self.panels.forces_in(panel)
         place = self.place[at][:, None] + self.rate[at][:, None] * times[which]
-        low = np.clip(place.astype(int), 0, self.last[at][:, None])
-        share = np.clip(place - low, 0.0, 1.0)
+        last = self.last[at][:, None]
+        low = np.clip(place.astype(int), int(cubic), last - int(cubic))
+        share = np.clip(place, 0.0, last + 1) - low
         low += self.offset[at][:, None]
+        if cubic:
+            r = sum(w * table[low + i] for i, w in enumerate(_cubic_weights(share), start=-1))
+            return _sums(self.panels.force[at][:, None] * r, which, panel.size)
         force = self.panels.force[at].reshape(-1, *(1,) * table.ndim)
         share = share.reshape(*share.shape, *(1,) * (table.ndim - 1))
         below = table[low]
@@ -116,32 +134,49 @@ class _Search:
         """
         reached, bound = np.zeros(self.runs), self.bound[:, output]
         _raise_to(reached, self.run, self.first[:, output])
-        chunk = np.flatnonzero((bound >= reached[self.run]) & (bound > 0))
-        panel, start, amplitude = self.panel[chunk], self.start[chunk], self.amplitude[chunk]
-        length, bend, slack = (
-            self.length[chunk],
-            self.bend[chunk, output],
-            self.slack[chunk, output],
-        )
-        for parts in (CHUNK_STEPS, REFINEMENTS):
-            step = length / parts
-            times = start[:, None] + step[:, None] * np.arange(parts + 1)
-            values, growth = self._values(output, panel, amplitude, step, times)
-            _raise_to(reached, self.panels.run[panel], values.max(axis=1))
-            above = bend * step**2 / 8 + slack
-            limit = np.maximum(values[:, 1:], values[:, :-1]) + above[:, None]
-            which, part = np.nonzero(limit >= reached[self.panels.run[panel], None])
-            amplitude = amplitude[which] * growth[which] ** part[:, None]
-            start, panel, length = times[which, part], panel[which], step[which]
-            bend, slack = bend[which], slack[which]
-        return panel, start, length, amplitude
+        few = self.length * self.responses.system.fastest <= FEW_STEPS * self.phase
+        found = []
+        for chunks, parts in ((~few, CHUNK_STEPS), (few, FEW_STEPS)):
+            chunk = np.flatnonzero(chunks & (bound >= reached[self.run]) & (bound > 0))
+            own = self.panel[chunk], self.start[chunk], self.length[chunk], self.amplitude[chunk]
+            bounds = self.bend[chunk, output], self.slack[chunk, output]
+            found.append(self._parts_of_steps(output, parts, reached, *own, *bounds))
+        steps = [np.concatenate(part) for part in zip(*found, strict=True)]
+        order = np.argsort(self.panels.run[steps[0]], kind="stable")
+        steps = [part[order] for part in steps]
+        for _ in range(MAX_REFINEMENTS):
+            steps[-1] = self.cubic_slack[steps[0], output]
+            reached = np.zeros(self.runs)  # what lines reach may be too high
+            steps = list(self._parts_of_steps(output, REFINEMENTS, reached, *steps, cubic=True))
+            if steps[0].size <= ENOUGH_STEPS * self.runs:
+                break
+        return steps[:4]
 
-    def _values(self, output: int, panel, amplitude, step, times):
+    def _parts_of_steps(
+        self, output, parts, reached, panel, start, length, amplitude, bend, slack, cubic=False
+    ):
+        """Parts of steps in which an output may be above what is reached, which is raised.
+
+        Panel, start, length, amplitude, and bounds of each.
+        """
+        step = length / parts
+        times = start[:, None] + step[:, None] * np.arange(parts + 1)
+        values, growth = self._values(output, panel, amplitude, step, times, cubic)
+        run = self.panels.run[panel]
+        _raise_to(reached, run, values.max(axis=1))
+        above = bend * step**2 / 8 + slack
+        limit = np.maximum(values[:, 1:], values[:, :-1]) + above[:, None]
+        which, part = np.nonzero(limit >= reached[run, None])
+        amplitude = amplitude[which] * growth[which] ** part[:, None]
+        parts_of = panel[which], times[which, part], step[which], amplitude
+        return *parts_of, bend[which], slack[which]
+
+    def _values(self, output: int, panel, amplitude, step, times, cubic: bool):
         """Magnitudes of an output at equally spaced times, and growth of free vibration in a step.
 
         From one time to the next by the growth.
         """
-        values = self._from_table(self.tables[output], panel, times)
+        values = self._from_table(self.tables[output], panel, times, cubic)
         growth = np.exp(step[:, None] * self.poles)
         now = amplitude * self.C[output]
         for i in range(times.shape[1]):
@@ -177,6 +212,16 @@ class _Search:
         number, own = (np.repeat(a, times.shape[1]) for a in (panels.response[at], output[which]))
         r = self.responses.exact(number, piece, x, own).reshape(-1, times.shape[1])
         return _sums(panels.force[at][:, None] * r, which, panel.size)
+
+
+def _cubic_weights(s):
+    """Weights of values at -1, 0, 1 and 2 in the cubic through them, at s."""
+    return (
+        -s * (s - 1) * (s - 2) / 6,
+        (s + 1) * (s - 1) * (s - 2) / 2,
+        -(s + 1) * s * (s - 2) / 2,
+        (s + 1) * s * (s - 1) / 6,
+    )
 
 
 def _sums(values, which, count: int):

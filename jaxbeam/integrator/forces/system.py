@@ -139,8 +139,8 @@ class ForceResponses(NamedTuple):
 
     `before` and `after` are p at the left and at the right side of the nodes, zero off the beam.
     `on_outputs` are the series of Re(C p). r is tabulated in equal distances, at `count` points
-    from the `first` on in each piece; on lines between them it has errors up to `table_error`.
-    `curvature` bounds d2r/dt2 (1/s^2) under the moving force.
+    from the `first` on in each piece; on lines between them it has errors up to `table_error`,
+    on cubics up to `cubic_error`. `curvature` bounds d2r/dt2 (1/s^2) under the moving force.
     """
 
     system: ForceSystem
@@ -151,6 +151,7 @@ class ForceResponses(NamedTuple):
     on_outputs: Float[np.ndarray, "speed segment n output"]
     table: Float[np.ndarray, "speed point output"]
     table_error: Float[np.ndarray, "speed output"]
+    cubic_error: Float[np.ndarray, "speed output"]
     curvature: Float[np.ndarray, "speed output"]
     first: Int[np.ndarray, " piece"]
     count: Int[np.ndarray, " piece"]
@@ -196,14 +197,21 @@ def force_responses(system: ForceSystem, speeds: Float[np.ndarray, " speed"]) ->
         local = _local(system.nodes, s, points[own])
         table[:, own] = chebyshev.chebvander(local, solutions.shape[2] - 1) @ on_outputs[:, s]
     table += system.static_part(points, piece)
-    bends = np.abs(np.diff(table, 2, axis=1))
-    bends = np.where((piece[2:] == piece[:-2])[:, None], bends, 0.0)
+    bends, fourth = (_differences(table, piece, order) for order in (2, 4))
     distance = np.diff(system.breaks) / (count - 1)
     error = CURVATURE_MARGIN / 8 * bends.max(axis=1)
+    # At the ends of a piece a cubic holds in the outer interval, where its error is the largest.
+    cubic_error = CURVATURE_MARGIN / 24 * fourth.max(axis=1)
     bends = bends / distance[piece[2:], None] ** 2
     curvature = CURVATURE_MARGIN * speeds[:, None] ** 2 * bends.max(axis=1)
-    parts = solutions, before, after, on_outputs, table, error, curvature
+    parts = solutions, before, after, on_outputs, table, error, cubic_error, curvature
     return ForceResponses(system, speeds, *parts, first, count)
+
+
+def _differences(table, piece, order: int):
+    """Magnitudes of the differences (speed, point, output) of an order within pieces."""
+    same = piece[order:] == piece[:-order]
+    return np.where(same[:, None], np.abs(np.diff(table, order, axis=1)), 0.0)
 
 
 def _points(system: ForceSystem):

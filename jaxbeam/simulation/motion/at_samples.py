@@ -28,13 +28,15 @@ def motion_at(
     vehicles = _vehicle_motion(model, loads, states, contact.vehicle_acceleration)
     force, accelerations = contact.force[..., 0], contact.modal_acceleration[..., 0]
     count = 2 * accelerations.shape[1]
-    coordinates = [states[:, 0:count:2, 0], states[:, 1:count:2, 0], accelerations]
+    coordinates, rates = states[:, 0:count:2, 0], states[:, 1:count:2, 0]
     if model.mode_map is not None:
-        coordinates = [part @ model.mode_map.T for part in coordinates]
+        coordinates, rates, accelerations = (
+            part @ model.mode_map.T for part in (coordinates, rates, accelerations)
+        )
     position = xp.where(loads.on_beam(times).T, loads.kinematics(times)[0].T, xp.nan)
     actuators = len(case.actuators)
     command = xp.zeros((times.shape[0], actuators)) if commands is None else commands[:, :actuators]
-    return Motion(*coordinates, position, -force, command), vehicles
+    return Motion(coordinates, rates, accelerations, position, -force, command), vehicles
 
 
 def _vehicle_motion(model: ModalModel, loads: LoadSet, states, accelerations) -> VehicleMotion:

@@ -1,4 +1,4 @@
-"""The bound is below feedback, predictive, feedforward and internal-model control."""
+"""The bound is below feedback, predictive, feedforward, internal-model and sliding-mode control."""
 
 import dataclasses
 
@@ -27,6 +27,8 @@ LAWS = {
     "mpc": jb.MPC(4, 2, 1e-10, period=PERIOD, loads="known"),
     "feedforward": jb.Feedforward([-0.2, -0.1], SHARES, np.ones((1, 5)), period=PERIOD),
     "internal-model": jb.InternalModel(DEPTHS, np.ones((1, 4)), period=PERIOD),
+    "sliding-mode": jb.SlidingMode(30.0, reaching_rate=20.0, layer=1.0, period=PERIOD),
+    "gpc": jb.GPC(4, 2, 1e-10, period=PERIOD),
 }
 CASES = {name: dataclasses.replace(CASE, controller=law) for name, law in LAWS.items()}
 
@@ -58,6 +60,8 @@ def test_no_controller_is_below_the_bound(plans, mass, speed, strength, weight, 
         "mpc": {"controller.move_weight": 10**weight},
         "feedforward": {"controller.values": np.array([commands])},
         "internal-model": {"controller.values": np.array([commands[:4]])},
+        "sliding-mode": {"controller.layer": strength / 4},
+        "gpc": {"controller.move_weight": 10**weight},
     }
     reached = []
     for name, case in CASES.items():

@@ -6,7 +6,7 @@ import pytest
 from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import Structure, random_structure, response, sampled
 from tuning import identify_modes
-from tuning.modal.decay.stretches import excited_samples, free_decays
+from tuning.modal.decay.stretches import Stretch, excited_samples, free_decays, stacked
 from tuning.modal.harmonics import harmonic_lines
 from tuning.modal.preprocessing import kinetic_band
 
@@ -89,3 +89,20 @@ def test_band_of_a_pair_that_fills_an_octave_and_of_a_short_decay():
     )
     low, high = kinetic_band((values[:, None],), 100.0, (1,))
     assert low < 2.4 and 21.0 < high < 40.0
+
+
+def test_all_of_many_decays_are_used():
+    """Principal combinations of ten decays in eight channels: 24 columns of the same poles."""
+    random = np.random.default_rng(0)
+    modes = np.exp(np.multiply.outer(np.arange(200) / 50.0, np.array([-0.3 + 20j, -0.5 + 33j])))
+    shapes = random.normal(size=(2, 8))
+    records = tuple(
+        np.real((modes * np.exp(1j * random.normal(size=2))) @ shapes) for _ in range(10)
+    )
+    columns, used = stacked(records, tuple(Stretch(i, 0, 200, 2.0) for i in range(10)))
+    assert len(used) == 10 and columns.shape == (200, 24)
+    basis = np.concatenate([modes.real, modes.imag], axis=1)
+    fitted = basis @ np.linalg.lstsq(basis, columns, rcond=None)[0]
+    np.testing.assert_allclose(columns, fitted, atol=1e-9)
+    energy, whole = np.sum(columns**2), sum(np.sum(record**2) for record in records)
+    assert 0.95 * whole < energy <= 1.001 * whole

@@ -8,7 +8,9 @@ from scipy.signal import lfilter
 from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import Structure, random_structure, sampled
 from tuning import identify_modes
+from tuning.modal.ambient import Candidate, without_duplicates
 from tuning.modal.harmonics import harmonic_lines, is_steady, without_lines
+from tuning.modal.result import IdentifiedMode
 from tuning.modal.shapes import mac_matrix, normalised, phase_collinearity
 from tuning.modal.subspace import decompose, poles_of_order, spreads
 
@@ -153,3 +155,30 @@ def test_an_envelope_tells_a_line_that_wanders_from_a_resonance():
     driven = lfilter([1.0], [1, -2 * pole.real, abs(pole) ** 2], random.normal(size=(count, 1)), 0)
     assert not is_steady(driven, rate, 4.0, 0.01)
     assert not is_steady(driven[:300], rate, 4.0, 0.01)
+
+
+def identified(frequency, frequency_sd, damping_ratio, damping_sd):
+    """A mode of two channels, whose shape is that of all."""
+    shape, covariance = np.array([1.0, 0.4 + 0j]), np.zeros((4, 4))
+    return IdentifiedMode(
+        frequency, frequency_sd, damping_ratio, damping_sd, 0.2, shape, covariance, 2.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "kept"),
+    [
+        # Intervals overlap, 0.3 % apart and within half of the half-power bandwidth: one mode.
+        ((154.44, 0.22, 0.0109, 0.0010), (154.92, 0.14, 0.0165, 0.0008), 1),
+        # One per cent apart, and told apart by their intervals.
+        ((4.0, 0.004, 0.02, 0.002), (4.04, 0.004, 0.01, 0.001), 2),
+        # One per cent apart, lightly damped: two peaks, though the intervals overlap.
+        ((4.0, 0.015, 0.004, 0.0004), (4.04, 0.015, 0.008, 0.0004), 2),
+    ],
+)
+def test_poles_that_are_not_told_apart_are_one_mode(first, second, kept):
+    candidates = [Candidate(identified(*numbers), "", 10) for numbers in (first, second)]
+    found = without_duplicates(candidates)
+    assert len(found) == kept
+    if kept == 1:
+        assert found[0].mode.frequency == 154.92, "that of the smaller uncertainty of damping"

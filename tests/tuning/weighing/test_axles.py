@@ -15,6 +15,7 @@ from tuning import Log, calibrate_influence_lines, model_influence_lines, weigh_
 from tuning.fit.dataset import make_dataset
 from tuning.fit.least_squares import LeastSquares
 from tuning.parameters.free import free_parameters, to_unbounded
+from tuning.weighing.axle_count import count_axles
 from tuning.weighing.axles import AxleWeighing, axle_problem, errors_of_fit
 from tuning.weighing.moses import AxleGeometry, find_geometry, moses
 
@@ -156,16 +157,25 @@ def test_the_fit_is_closer_than_moses_and_its_intervals_cover(crossings, found):
 
 @pytest.mark.slow
 def test_axles_of_a_log_are_weighed_and_reported(crossings):
-    weighed = weigh_axles(case(), crossings[0], SPEEDS, 2)
+    weighed = weigh_axles(case(), crossings[0], SPEEDS)
     assert isinstance(weighed, AxleWeighing)
     forces = np.asarray(weighed.load.forces)
     np.testing.assert_allclose(forces, TRUCK.static_loads, rtol=0.1)
-    assert str(weighed).startswith("2 axles found\naxle ")
+    assert str(weighed).startswith("2 axles found\nBIC by number of axles")
     content = weighed.to_dict()
+    assert content["bic"].keys() == {"1", "2", "3", "4", "5"}
     assert content["axles"][0]["value"] == forces[0]
     low, high = content["moses"]["axles"][1]["interval_95"]
     assert low < TRUCK.static_loads[1] < high
     assert content["offsets"][0]["value"] == pytest.approx(SPACING, abs=0.6)
+
+
+def test_axles_are_counted():
+    forces, few = vehicle_elements.forces([0.0, 3.2, 5.6], [60e3, 95e3, 80e3]), slice(None, None, 6)
+    log = log_of(forces, speed=10.0, duration=4.0, step=2.5e-3)
+    found = count_axles(case(), log.times[few], log.values[few], (5.0, 20.0))
+    assert found.chosen == 3 and found.bic.keys() == {1, 2, 3, 4, 5}
+    assert str(found).endswith("the option `axles` sets another")
 
 
 def test_what_cannot_be_weighed(crossings):

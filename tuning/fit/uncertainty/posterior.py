@@ -141,6 +141,27 @@ def sample(
     checkpoint exists and `resume` is not set; ImportError without blackjax.
 
     The No-U-Turn sampler runs `chains` at once, and adapts in `warmup` steps that are dropped.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
+    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
+    ...     run=jb.Run(0.4, sample_rate=50.0),
+    ... )
+    >>> logs = []
+    >>> for speed in (2.0, 2.5):
+    ...     record = jb.simulate(jb.replace(case, {"loads.0.speed": speed}))
+    ...     columns = ("w",), ("deflection",), ("m",), f"{speed} m/s", (0,)
+    ...     logs.append(
+    ...         tuning.Log(record.times, record.measured, *columns, loads=record.case.loads)
+    ...     )
+    >>> start = jb.replace(case, {"beam.flexural_rigidity": 10.0})
+    >>> fit = tuning.identify(start, logs, "beam.flexural_rigidity")
+    >>> posterior = tuning.sample(fit, draws=20, chains=2, warmup=20)
+    >>> print(posterior.addresses, f"{posterior.means[0]:.1f}")
+    ['beam.flexural_rigidity'] 12.0
     """
     if fit.unidentifiable:
         raise ValueError(

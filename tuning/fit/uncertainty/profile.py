@@ -60,6 +60,27 @@ def profile(fit: Fit, address: str, points: int = 4) -> Profile:
     Raises ValueError if the parameter is not free.
 
     The `address` is one of those that were free in the fit.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
+    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
+    ...     run=jb.Run(0.4, sample_rate=50.0),
+    ... )
+    >>> logs = []
+    >>> for speed in (2.0, 2.5):
+    ...     record = jb.simulate(jb.replace(case, {"loads.0.speed": speed}))
+    ...     columns = ("w",), ("deflection",), ("m",), f"{speed} m/s", (0,)
+    ...     logs.append(
+    ...         tuning.Log(record.times, record.measured, *columns, loads=record.case.loads)
+    ...     )
+    >>> start = jb.replace(case, {"beam.flexural_rigidity": 10.0})
+    >>> fit = tuning.identify(start, logs, "beam.flexural_rigidity")
+    >>> found = tuning.profile(fit, "beam.flexural_rigidity", points=1)
+    >>> print(f"{found.interval[0]:.1f} to {found.interval[1]:.1f} {found.unit}")
+    12.0 to 12.1 N m^2
     """
     if address not in fit.addresses:
         raise ValueError(f"{address} is not free in this fit; free are {', '.join(fit.addresses)}")

@@ -184,16 +184,20 @@ def stacked(
     """Decays of one length side by side, channels of the first before those of the second ...
 
     The common length is the median; decays of less than half of it are left out, and those between
-    shorten it. Of more than 24 columns in all, the decays with most energy are kept.
+    shorten it. Of more than 24 columns in all, the principal combinations of the decays are
+    returned: weighted sums, of orthonormal weights, that hold most energy. They have the poles and
+    shapes of the decays, and as much noise as one of them.
     """
     lengths = np.array([one.stop - one.start for one in decays])
     used = tuple(
         one for one, length in zip(decays, lengths, strict=True) if 2 * length >= np.median(lengths)
     )
-    most = max(MAX_COLUMNS // records[0].shape[1], 1)
-    energies = [np.sum(records[one.record][one.start : one.stop] ** 2) for one in used]
-    kept = np.sort(np.argsort(energies)[::-1][:most])
-    used = tuple(used[i] for i in kept)
     length = min(int(np.median(lengths)), min(one.stop - one.start for one in used))
-    parts = [records[one.record][one.start : one.start + length] for one in used]
-    return np.hstack(parts), used
+    parts = np.stack([records[one.record][one.start : one.start + length] for one in used])
+    most = max(MAX_COLUMNS // records[0].shape[1], 1)
+    if len(used) > most:
+        flat = parts.reshape(len(used), -1)
+        weights = np.linalg.svd(flat, full_matrices=False)[0].T[:most]
+        weights = weights * np.where(weights.sum(axis=1) < 0, -1.0, 1.0)[:, None]
+        parts = (weights @ flat).reshape(-1, *parts.shape[1:])
+    return np.hstack(list(parts)), used

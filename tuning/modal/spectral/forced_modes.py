@@ -25,11 +25,12 @@ from tuning.modal.spectral.forced_fraction import (
     products,
     transforms,
 )
-from tuning.modal.spectral.modal_model import refine_modal_model
+from tuning.modal.spectral.forced_likelihood import refine_modal_model
 from tuning.modal.stabilisation import Diagram, stabilise
 from tuning.modal.subspace import Poles
 
 MAX_ORDER = 60
+PASSES = 2  # of the search for modes
 WEIGHT_DEGREE_SHARE = 0.5  # degree of the denominator that weights lines, over the highest
 MIN_WEIGHT = 1e-3  # size of the denominator, over its median, below which weights are equal
 SAME_POLE = 0.5  # distance of two poles over the smaller decay rate, below which they are one
@@ -84,7 +85,31 @@ def forced_modes(
 
 
 def _modes_of_lines(lines: Lines, scale, part, band, duration, order):
-    """Candidates and diagram of a part of a band, and the powers of errors and responses."""
+    """Candidates and diagram of a part of a band, and the powers of errors and responses.
+
+    What the modes found leave is searched again, for modes that stood in the shade of others.
+    """
+    drawn, used, rest, dropped = None, np.zeros(0, complex), lines, []
+    for _ in range(PASSES):
+        diagram = _diagram(rest, scale, part, order)
+        drawn = drawn or diagram
+        before = used.size
+        used = _distinct(used, diagram)
+        if used.size == before and drawn is not diagram:
+            break
+        model, gone = _refined(lines, used, scale, part)
+        dropped += gone
+        used = np.array([mode.pole for mode in model.modes], complex)
+        rest = model.rest
+    modes = [mode for mode in model.modes if part[0] <= mode.frequency <= part[1]]
+    candidates = [
+        Candidate(mode, rejection_reason(mode, duration, band), 1) for mode in (*modes, *dropped)
+    ]
+    return candidates, drawn, (np.sum(np.abs(rest.outputs) ** 2), model.power)
+
+
+def _diagram(lines: Lines, scale, part, order) -> Diagram:
+    """Stabilisation diagram of common denominators of rising degree."""
     highest = min(order or MAX_ORDER, len(lines.z) // (4 * lines.inputs.shape[1] + 4))
     degrees = range(2, max(highest, 3) + 1)
     first = fit_common_denominator(
@@ -98,25 +123,34 @@ def _modes_of_lines(lines: Lines, scale, part, band, duration, order):
     poles = Poles(
         np.repeat(np.array(degrees), sizes),
         np.concatenate([fit.poles for fit in fits]),
-        np.concatenate([fit.shapes for fit in fits]),
+        np.concatenate([fit.shapes for fit in fits]) * scale,
         np.zeros(sum(sizes)),
     )
-    wide = part[0] / 4, 0.5 / lines.step  # modes beside the band leave their flanks in it
-    diagram = stabilise(poles._replace(shapes=poles.shapes * scale), wide)
-    starts = _distinct(poles.poles, diagram.chains)
-    model = refine_modal_model(lines, starts, scale, part)
-    candidates = []
-    for mode, start in zip(model.modes, starts, strict=True):
-        if part[0] <= abs(start) / (2 * np.pi) <= part[1]:
-            candidates.append(Candidate(mode, rejection_reason(mode, duration, band), 1))
-    return candidates, diagram, (model.error_power, model.power)
+    # Modes beside the band leave their flanks in it.
+    return stabilise(poles, (part[0] / 4, 0.5 / lines.step))
 
 
-def _distinct(poles, chains) -> Complex[np.ndarray, " mode"]:
-    """Representative poles of chains, the longer of two that are nearer than a half-power width."""
-    kept: list[complex] = []
-    for chain in sorted(chains, key=lambda chain: -chain.members.size):
-        pole = complex(poles[chain.best])
+def _refined(lines, poles, scale, part):
+    """Modal model of those poles that are determined, and the modes of the others.
+
+    Two poles for one resonance, or one for none, make others uncertain, so that one goes at a time.
+    """
+    dropped = []
+    while True:
+        model = refine_modal_model(lines, poles, scale, part)
+        doubts = [mode.damping_sd / mode.damping_ratio for mode in model.modes]
+        if not doubts or model.modes[0].quantile * max(doubts) < 1:
+            return model, dropped
+        worst = int(np.argmax(doubts))
+        dropped.append(model.modes[worst])
+        poles = np.delete(np.array([mode.pole for mode in model.modes], complex), worst)
+
+
+def _distinct(known, diagram: Diagram) -> Complex[np.ndarray, " mode"]:
+    """Known poles, and those of the chains of a diagram, the longer first, that are others."""
+    kept = [complex(pole) for pole in known]
+    for chain in sorted(diagram.chains, key=lambda chain: -chain.members.size):
+        pole = complex(diagram.poles.poles[chain.best])
         if all(abs(pole - one) > SAME_POLE * min(-pole.real, -one.real) for one in kept):
             kept.append(pole)
     return np.array(sorted(kept, key=abs), complex)

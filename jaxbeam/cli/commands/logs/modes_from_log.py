@@ -29,6 +29,7 @@ def modes_from_log(
     rate: float | None = None,
     order: int | None = None,
     method: str | None = None,
+    force: str | None = None,
     kind: str | None = None,
     exclude: str | None = None,
     count: int | None = None,
@@ -68,6 +69,9 @@ def modes_from_log(
         covariance or data: stochastic subspace identification, covariance- or data-driven; fdd:
         enhanced frequency-domain decomposition; plscf: poly-reference least-squares complex
         frequency (p-LSCF).
+    force
+        NAME,NAME,...: channels of measured forces (N), of a hammer or shaker; by default all in N.
+        The responses to them are fitted by p-LSCF.
     kind
         ambient or "free decay".
     exclude
@@ -121,9 +125,10 @@ def modes_from_log(
         band=limits,
         count=count,
         kind=kind,
-        channels=None if channels is None else [name.strip() for name in channels.split(",")],
+        channels=_names(channels),
         order=order,
         method=method,
+        force=_names(force),
         exclude=excluded,
         progress=None if options.json_ or not sys.stderr.isatty() else print_message,
     )
@@ -137,6 +142,11 @@ def modes_from_log(
         if output is not None:
             jb.save_case(updated.case, output, options.overwrite)
     options.report(answer, lines, output, picture)
+
+
+def _names(text: str | None) -> list[str] | None:
+    """Names separated by commas."""
+    return None if text is None else [name.strip() for name in text.split(",")]
 
 
 def _numbers(option: str, text: str | None) -> tuple[float, ...]:

@@ -1,10 +1,10 @@
 """Modal model of responses to measured forces, refined by maximum likelihood.
 
-Responses Y = sum_r (R_r U + x_r) / (z - z_r) + conjugates + rest are linear in the residues R_r and
-transients x_r, and are minimised over the poles by Gauss-Newton steps with the residues eliminated:
-the likelihood of output errors of one variance for each output (El-Kafafy, De Troyer, Peeters and
-Guillaume 2013). Shapes are the residues by least squares (LSFD), of rank one: shape times
-participation.
+Responses Y = sum_r R_r U / (i w - p_r) + x_r / (z - z_r) + conjugates + rest are linear in the
+residues R_r and the transients x_r of the samples, z_r = exp(p_r T). Their errors are minimised
+over the poles p_r by Gauss-Newton steps with the residues eliminated: the likelihood of output
+errors of one variance for each output (El-Kafafy, De Troyer, Peeters and Guillaume 2013). Shapes
+are the residues by least squares (LSFD), of rank one: shape times participation.
 """
 
 from typing import NamedTuple
@@ -17,18 +17,22 @@ from tuning.modal.result import IdentifiedMode, frequency_and_damping
 from tuning.modal.spectral.forced_fraction import Lines
 
 BLOCKS = 48  # of lines, every 48th in one, whose errors tell the uncertainty
-REST_POWERS = -4, -3, -2, -1, 0, 1, 2, 3, 4  # of z, for modes outside of the band and for sampling
+REST_POWERS = (-2, -1, 0, 1, 2)  # of z, for modes outside of the band and those not found
+FEWER_REST_POWERS = (0, 1)  # with which poles are compared
 STEPS = 12
 MAX_STEP = 0.5  # of a pole, over its decay rate
 CONVERGED = 1e-6  # step over the decay rate
 MAX_SHIFT = 3.0  # from the start, over the decay rate; beyond, a pole is none of the data
 
 
-class ModalModel(NamedTuple):
-    """Modes, one for each pole at the start; powers of errors and of the responses in the band."""
+class ForcedModel(NamedTuple):
+    """Modes, one for each pole at the start, and what they leave: lines of the band with errors.
+
+    `power` is that of the responses in the band.
+    """
 
     modes: tuple[IdentifiedMode, ...]
-    error_power: float
+    rest: Lines
     power: float
 
 
@@ -37,12 +41,13 @@ def refine_modal_model(
     starts: Complex[np.ndarray, " mode"],
     scale: Float[np.ndarray, " output"],
     band: tuple[float, float],
-) -> ModalModel:
+) -> ForcedModel:
     """Modal model at the lines within a band (Hz), from poles (1/s) to start from.
 
     Only poles in the band are refined. Outputs are in units of `scale`, shapes in those of the log.
     Uncertainties are those of the errors of each block of lines, carried through the step of
-    Gauss-Newton (a sandwich, so that the errors may have any spectrum).
+    Gauss-Newton (a sandwich, so that the errors may have any spectrum); the change of a pole with
+    fewer terms for the modes that are not in the model adds to them.
     """
     frequencies = np.angle(lines.z) / (2 * np.pi * lines.step)
     inside = (frequencies >= band[0]) & (frequencies <= band[1])
@@ -54,6 +59,8 @@ def refine_modal_model(
     natural = np.abs(starts) / (2 * np.pi)
     moving = np.flatnonzero((natural >= band[0]) & (natural <= band[1]))
     poles = _refined(lines, target, starts, moving)
+    others = _refined(lines, target, poles, moving, FEWER_REST_POWERS)[moving]
+    model_errors = np.concatenate([(others - poles[moving]).real, (others - poles[moving]).imag])
     fit = _linear_fit(lines, target, poles)
     slopes, by_poles = _slopes(lines, fit, poles, moving)
     blocks = np.tile(np.arange(len(lines.z)) % BLOCKS, 2)
@@ -71,7 +78,7 @@ def refine_modal_model(
             fit.inverse[:, rows] @ errors - np.einsum("cko,k->co", by_poles, step)
         )
     steps = np.array(pole_steps), np.array(coefficient_steps)
-    return _model(lines, target, poles, moving, fit, steps, scale)
+    return _model(lines, target, poles, moving, fit, steps, model_errors, scale)
 
 
 def _normal(slopes, errors):
@@ -80,7 +87,7 @@ def _normal(slopes, errors):
     return weight, np.einsum("rko,rlo,o->kl", slopes, slopes, weight, optimize=True)
 
 
-class _Fit(NamedTuple):
+class _LinearFit(NamedTuple):
     """Columns of the linear least squares, their pseudo-inverse, coefficients and errors."""
 
     columns: Float[np.ndarray, "row column"]
@@ -89,11 +96,11 @@ class _Fit(NamedTuple):
     errors: Float[np.ndarray, "row output"]
 
 
-def _refined(lines, target, starts, moving):
+def _refined(lines, target, starts, moving, powers=REST_POWERS):
     """Poles after Gauss-Newton steps; those that leave their surroundings return to the start."""
     poles = starts.astype(complex)
     for _ in range(STEPS):
-        fit = _linear_fit(lines, target, poles)
+        fit = _linear_fit(lines, target, poles, powers)
         slopes, _ = _slopes(lines, fit, poles, moving)
         weight, normal = _normal(slopes, fit.errors)
         right = np.einsum("rko,ro,o->k", slopes, fit.errors, weight, optimize=True)
@@ -110,22 +117,37 @@ def _refined(lines, target, starts, moving):
     return poles
 
 
-def _linear_fit(lines, target, poles) -> _Fit:
-    columns = _columns(lines, poles)
+def _linear_fit(lines, target, poles, powers=REST_POWERS) -> _LinearFit:
+    columns = _columns(lines, poles, powers)
     inverse = np.linalg.pinv(columns)
     found = inverse @ target
-    return _Fit(columns, inverse, found, target - columns @ found)
+    return _LinearFit(columns, inverse, found, target - columns @ found)
 
 
-def _columns(lines: Lines, poles):
+def _columns(lines: Lines, poles, powers):
     """Real parts above imaginary parts of the columns: residues, transients, rest."""
-    roots = np.exp(poles * lines.step)
+    columns = []
+    for signals, first, second in (
+        (lines.inputs, *_resonances(lines, poles)),
+        (lines.unforced, *_transients(lines, poles)),
+    ):
+        columns += [_times(first + second, signals), _times(1j * (first - second), signals)]
+    rest = lines.z[:, None] ** np.array(powers)
     signals = np.concatenate([lines.inputs, lines.unforced], axis=1)
-    one, other = 1 / (lines.z[:, None] - roots), 1 / (lines.z[:, None] - roots.conj())
-    columns = [_times(one + other, signals), _times(1j * (one - other), signals)]
-    powers = lines.z[:, None] ** np.array(REST_POWERS)
-    columns = np.concatenate([*columns, _times(powers, signals)], axis=1)
+    columns = np.concatenate([*columns, _times(rest, signals)], axis=1)
     return np.concatenate([columns.real, columns.imag])
+
+
+def _resonances(lines: Lines, poles):
+    """1 / (i w - p) and the same of the conjugate poles (line, mode)."""
+    s = 1j * np.angle(lines.z)[:, None] / lines.step
+    return 1 / (s - poles), 1 / (s - poles.conj())
+
+
+def _transients(lines: Lines, poles):
+    """1 / (z - exp(p T)) and the same of the conjugate poles (line, mode)."""
+    roots = np.exp(poles * lines.step)
+    return 1 / (lines.z[:, None] - roots), 1 / (lines.z[:, None] - roots.conj())
 
 
 def _times(terms, signals):
@@ -134,28 +156,30 @@ def _times(terms, signals):
 
 
 def _coefficients(found, lines: Lines, modes: int):
-    """Complex coefficients (mode, signal, output): residues of inputs, then transients."""
-    signals = lines.inputs.shape[1] + lines.unforced.shape[1]
-    half = modes * signals
-    both = found[:half] + 1j * found[half : 2 * half]
-    return both.reshape(modes, signals, -1)
+    """Complex residues (mode, input, output) and transients (mode, record, output)."""
+    parts, first = [], 0
+    for signals in (lines.inputs.shape[1], lines.unforced.shape[1]):
+        half = modes * signals
+        both = found[first : first + half] + 1j * found[first + half : first + 2 * half]
+        parts.append(both.reshape(modes, signals, -1))
+        first += 2 * half
+    return parts
 
 
-def _slopes(lines: Lines, fit: _Fit, poles, moving):
+def _slopes(lines: Lines, fit: _LinearFit, poles, moving):
     """Derivatives by real and imaginary parts of moving poles: of the responses, and residues.
 
     Those of the responses (row, part, output) are with residues eliminated; those of the
     coefficients (column, part, output) are by which they are so.
     """
-    roots = np.exp(poles * lines.step)
-    coefficients = _coefficients(fit.found, lines, poles.size)[moving]
-    signals = np.concatenate([lines.inputs, lines.unforced], axis=1)
-    driven = np.einsum("ls,mso->mlo", signals, coefficients)
-    mirrored = np.einsum("ls,mso->mlo", signals, coefficients.conj())
-    own = (roots[moving] * lines.step)[:, None] / (lines.z - roots[moving][:, None]) ** 2
-    conjugate = roots[moving].conj()[:, None]
-    other = conjugate * lines.step / (lines.z - conjugate) ** 2
-    first, second = own[:, :, None] * driven, other[:, :, None] * mirrored
+    residues, transients = _coefficients(fit.found, lines, poles.size)
+    own, other = _resonances(lines, poles[moving])
+    first = _along(own**2, lines.inputs, residues[moving])
+    second = _along(other**2, lines.inputs, residues[moving].conj())
+    own, other = _transients(lines, poles[moving])
+    factor = lines.step * np.exp(poles[moving] * lines.step)
+    first += _along(factor * own**2, lines.unforced, transients[moving])
+    second += _along(factor.conj() * other**2, lines.unforced, transients[moving].conj())
     both = np.concatenate([first + second, 1j * (first - second)])  # part, line, output
     rows = np.concatenate([both.real, both.imag], axis=1).transpose(1, 0, 2)
     flat = rows.reshape(len(rows), -1)
@@ -164,14 +188,19 @@ def _slopes(lines: Lines, fit: _Fit, poles, moving):
     return projected, by_poles.reshape(len(by_poles), *rows.shape[1:])
 
 
-def _model(lines, target, poles, moving, fit: _Fit, steps, scale) -> ModalModel:
+def _along(terms, signals, coefficients):
+    """Terms (line, mode) times the signals with their coefficients: (mode, line, output)."""
+    return terms.T[:, :, None] * np.einsum("ls,mso->mlo", signals, coefficients)
+
+
+def _model(
+    lines, target, poles, moving, fit: _LinearFit, steps, model_errors, scale
+) -> ForcedModel:
     """Modes with uncertainties; those of poles that were not refined have none."""
-    inputs = lines.inputs.shape[1]
     pole_steps, coefficient_steps = steps
-    residues = _coefficients(fit.found, lines, poles.size)[:, :inputs]
-    changes = np.array([
-        _coefficients(one, lines, poles.size)[:, :inputs] for one in coefficient_steps
-    ])  # fmt: skip
+    residues = _coefficients(fit.found, lines, poles.size)[0]
+    changes = np.array([_coefficients(one, lines, poles.size)[0] for one in coefficient_steps])
+    resonances, mirrored = _resonances(lines, poles)
     power = np.maximum(np.sum(target**2, axis=0), 1e-300)
     quantile = float(student.ppf(0.975, BLOCKS - 1))
     modes = []
@@ -187,12 +216,12 @@ def _model(lines, target, poles, moving, fit: _Fit, steps, scale) -> ModalModel:
         place = np.flatnonzero(moving == k)
         covariance = np.zeros((2, 2))
         if place.size:
-            own = pole_steps[:, [place[0], place[0] + moving.size]] * [-1.0, 1.0]
-            covariance = own.T @ own
+            pair = [place[0], place[0] + moving.size]
+            own = pole_steps[:, pair] * [-1.0, 1.0]
+            covariance = own.T @ own + np.diag(model_errors[pair] ** 2)
         frequency, frequency_sd, damping, damping_sd = frequency_and_damping(pole, covariance)
-        one = _times(1 / (lines.z[:, None] - np.exp(pole * lines.step)), lines.inputs)
-        other = _times(1 / (lines.z[:, None] - np.exp(np.conj(pole) * lines.step)), lines.inputs)
-        part = one @ residues[k] + other @ residues[k].conj()
+        part = resonances[:, [k]] * (lines.inputs @ residues[k])
+        part = part + mirrored[:, [k]] * (lines.inputs @ residues[k].conj())
         modes.append(
             IdentifiedMode(
                 frequency=frequency,
@@ -205,4 +234,5 @@ def _model(lines, target, poles, moving, fit: _Fit, steps, scale) -> ModalModel:
                 quantile=quantile,
             )
         )
-    return ModalModel(tuple(modes), float(np.sum(fit.errors**2)), float(np.sum(target**2)))
+    errors = fit.errors[: len(lines.z)] + 1j * fit.errors[len(lines.z) :]
+    return ForcedModel(tuple(modes), lines._replace(outputs=errors), float(np.sum(target**2)))
