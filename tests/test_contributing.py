@@ -59,7 +59,6 @@ def test_commands_exist(command):
     assert all(Path(ROOT / word).exists() for word in options if "/" in word and word != "out/site")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "command", [c for c in COMMANDS if c[1:3] == ["run", "pytest"] and len(c) > 3], ids=" ".join
 )

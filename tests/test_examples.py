@@ -35,7 +35,6 @@ def test_footbridge_is_worst_at_its_natural_frequency(tmp_path):
     assert abs(max(peaks, key=peaks.get) - 2.002) < 0.06
 
 
-@pytest.mark.slow
 def test_railway_bridge_is_worst_at_the_resonance_of_coaches(tmp_path):
     worst = run("railway_bridge", tmp_path, count=26)
     first = np.pi / (2 * 25.0**2) * np.sqrt(3e10 / 15e3)
@@ -59,17 +58,14 @@ def test_laboratory_rig_is_almost_static(tmp_path):
     assert 0 < run("laboratory_rig", tmp_path) < 0.02
 
 
-@pytest.mark.slow
 def test_controlled_rig_attains_a_share(tmp_path):
     assert 0.3 < run("controlled_rig", tmp_path) < 1.0
 
 
-@pytest.mark.slow
 def test_haunched_bridge_hogs_over_the_pier(tmp_path):
     assert run("haunched_bridge", tmp_path) < -1e6
 
 
-@pytest.mark.slow
 def test_a_rougher_road_adds_to_the_moment(tmp_path):
     increments = run("road_bridge", tmp_path)
     moments = [increments[road][1] for road in ("smooth", "A", "B", "C")]

@@ -132,7 +132,6 @@ def same_words(shown: str, printed: str) -> bool:
     return len(shown.split()) == len(printed.split()) and all(agree(*pair) for pair in pairs)
 
 
-@pytest.mark.slow
 def test_the_three_jobs_print_what_readme_shows(capsys, monkeypatch):
     """Lines are shown in their order; dots stand for those left out."""
     monkeypatch.chdir(ROOT)

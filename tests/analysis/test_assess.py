@@ -106,7 +106,6 @@ def test_characteristic_points():
     ]
 
 
-@pytest.mark.slow
 def test_peaks_over_speed_are_found_and_refined():
     """Three modes around the resonance of HSLM-A1 at 230 km/h; the reference samples 2.5 km/h."""
     beam = dataclasses.replace(BRIDGE.beam, modes=3)

@@ -196,7 +196,6 @@ def run(line: str, folder, monkeypatch, capsys) -> tuple[int, str, str]:
     return ended.value.code, printed.out, printed.err
 
 
-@pytest.mark.slow
 def test_command_prints_and_draws(comparison, folder, monkeypatch, capsys):
     line = "compare weak.toml --controllers wild.toml constant.toml"
     code, printed, errors = run(f"{line} -o out.png", folder, monkeypatch, capsys)
@@ -217,7 +216,6 @@ def test_command_prints_and_draws(comparison, folder, monkeypatch, capsys):
     assert answer["controllers"]["wild"]["stability_margin"]["gain"] is None  # infinite
 
 
-@pytest.mark.slow
 def test_metrics_over_several_load_cases(comparison, folder, monkeypatch, capsys):
     line = "compare weak.toml --over loads.0.mass=0.3,0.509"
     code, printed, errors = run(f"{line} --json", folder, monkeypatch, capsys)

@@ -61,7 +61,6 @@ def test_growth_rate_with_stationary_load_against_reference():
     assert_allclose(2 * np.pi * unstable.frequency, 62.83126204745206, rtol=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 def test_high_gain_has_published_limit_cycle():
     """k = 3, 30 ms of delay and low damping: unstable from 0.322 kg, not at 0.261 kg.

@@ -17,7 +17,7 @@ needs_compiler = pytest.mark.skipif(COMPILER is None, reason="needs a C compiler
 STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic"]
 SANITIZED = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 ALL = CASES | DESIGNED_TABLES
-KINDS = [*CASES, *(pytest.param(kind, marks=pytest.mark.slow) for kind in DESIGNED_TABLES)]
+KINDS = [*CASES, *DESIGNED_TABLES]
 ROUNDING, SINGLE_ROUNDING = 1e-12, 1e-2  # of the largest command
 MIN_OPERATIONS_SHARE = 0.3  # of the stated operations that a loop without a quadratic program takes
 

@@ -91,7 +91,6 @@ def test_power_balance_of_a_coil(back_emf):
     assert_allclose(volts * current + mismatch_power, stored_power + dissipated, rtol=1e-10)
 
 
-@pytest.mark.slow
 def test_crossing_mass_on_a_beam_with_a_shorted_coil():
     """Against the coupled electromechanical equations of sine modes, integrated by scipy."""
     beam = {"length": 0.6, "rigidity": 11.68, "density": 0.535, "ratio": 0.03}

@@ -107,7 +107,6 @@ def sweep_and_compilations():
     return dataset, [message for message in messages if "Compiling jit(integrate_block" in message]
 
 
-@pytest.mark.slow
 def test_only_diverging_runs_of_a_sweep_fail(sweep_and_compilations):
     dataset, compilations = sweep_and_compilations
     assert_array_equal(dataset.failed, [[False, False], [True, True], [False, False]])
@@ -121,7 +120,6 @@ def test_only_diverging_runs_of_a_sweep_fail(sweep_and_compilations):
             assert_allclose(dataset.peak_deflection[i, j], single_run.peak_deflection, rtol=1e-7)
 
 
-@pytest.mark.slow
 def test_batch_of_gains_equals_single_runs():
     plan = plan_for(UNBOUNDED)
 
@@ -151,7 +149,6 @@ FREE = {
 }
 
 
-@pytest.mark.slow
 def test_gradients_through_filter_hold_delay_and_saturation(plan, record):
     sizes = np.array(list(FREE.values()))
     data = record.deflection + 2e-4 * jnp.cos(jnp.arange(31.0))[:, None]
@@ -180,7 +177,6 @@ LAW = dataclasses.replace(
 )
 
 
-@pytest.mark.slow
 def test_gradients_of_a_law_in_continuous_time():
     names = ("controller.gains.0", "sensors.0.filter.cutoff", "actuators.0.damping", "loads.0.mass")
     sizes = np.array([float(jb.addresses(LAW)[name]) for name in names])

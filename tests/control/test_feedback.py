@@ -130,7 +130,6 @@ def test_sampled_compensator_tends_to_its_transfer_function():
         assert_allclose(errors[0] / errors[1], 100.0, rtol=0.02)
 
 
-@pytest.mark.slow
 def test_loop_with_compensators_against_the_oracle():
     times = np.linspace(0.0, 0.2, 41)
     case = dataclasses.replace(CASE, controller=COMPENSATORS["ppf"][0])
@@ -204,7 +203,6 @@ def test_poles_in_continuous_time_against_python_control(name):
     assert_allclose(found[order], truth[expected_order], rtol=1e-7)
 
 
-@pytest.mark.slow
 def test_run_in_continuous_time_against_scipy():
     """A crossing force, point forces, an analogue filter before the second compensator."""
     times, cutoff = np.linspace(0.0, 0.2, 21), 2 * np.pi * 40.0

@@ -172,7 +172,6 @@ def loop():
     return beam_case(jb.Feedback([1000.0], period=0.01))
 
 
-@pytest.mark.slow
 def test_best_gain_has_the_lowest_peak_by_the_oracle(loop):
     """The peak at the samples, by scipy, is higher with a seventh less gain and with more."""
     light, heavy = best_gains(loop, [0.05, 0.2], 1e5)
@@ -193,7 +192,6 @@ def test_best_gain_has_the_lowest_peak_by_the_oracle(loop):
     check_case(dataclasses.replace(loop, controller=made))
 
 
-@pytest.mark.slow
 def test_best_gain_with_a_margin(loop):
     """Against the critical gain with the mass at rest, by scipy."""
     case = jb.replace(loop, {"loads.0.mass": 0.509})

@@ -73,7 +73,6 @@ def test_modes_of_the_oracle():
         assert_allclose(left, right, atol=1e-6 * np.max(np.abs(exact.shapes(0.3, order))))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["open loop", "filtered cubic law"])
 def test_oracle_against_the_reference(name):
     reference = REFERENCE[name]
@@ -88,7 +87,6 @@ def filtered():
     return jb.simulate(beam_case(CUBIC, 20.0), tolerance=1e-6)
 
 
-@pytest.mark.slow
 def test_runs_against_the_reference(filtered):
     """To 4e-3: modes are exact, those of the reference projected sines, up to 5e-3 stiffer."""
     reference, uncontrolled_reference = REFERENCE["filtered cubic law"], REFERENCE["open loop"]
@@ -112,7 +110,6 @@ def test_runs_against_the_reference(filtered):
     assert_allclose(reduction, reference_reduction, atol=2e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sampled", [False, True])
 def test_loops_of_two_spans_against_the_oracle(sampled):
     """Each sensor to its patch, with filters; if sampled, with delay and active limits."""

@@ -128,9 +128,7 @@ class ExplicitLoop:
         return states[:, :3] @ rows.T, -states[:, n : n + 5] @ self.gain.T
 
 
-@pytest.mark.parametrize(
-    "name", ["time-invariant", "estimated", pytest.param("known", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("name", ["time-invariant", "estimated", "known"])
 def test_loops_with_a_filter_in_continuous_time(name):
     deflection, command = ExplicitLoop(name).solve()
     record = jb.simulate(loop(ESTIMATORS[name]), jnp.asarray(TIMES))
@@ -172,7 +170,6 @@ def test_poles_of_a_loop_with_an_observer():
     assert_allclose(np.sort_complex(found), np.sort_complex(expected), rtol=1e-6)
 
 
-@pytest.mark.slow
 def test_gradients():
     case = loop(ESTIMATORS["estimated"], modes=2)
     names = ("process_noise", "measurement_intensity", "weight_deviation")

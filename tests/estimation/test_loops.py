@@ -94,7 +94,6 @@ def run(case):
     return jb.simulate(case, jnp.asarray(TIMES), plan)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kalman", "tolerance"),
     [
@@ -135,7 +134,6 @@ def sampled_loop(case, modes):
     )
 
 
-@pytest.mark.slow
 def test_spillover():
     """A loop of high gain is stable on the beam of the design, unstable on that of more modes."""
     radius = {}  # spectral radius on both beams, for two weights of the command
@@ -151,7 +149,6 @@ def test_spillover():
     assert radius[1e-4][0] < 1 < radius[1e-4][1]
 
 
-@pytest.mark.slow
 def test_gradients_through_loop_and_estimator():
     case = loop(Kalman(FORCE, NOISE), modes=2)
     names = ("controller.estimator.process_noise", "controller.command_weight.0", "loads.0.mass")

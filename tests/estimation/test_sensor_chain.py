@@ -114,7 +114,6 @@ def filter_readings(commands, readings):
     return jax.lax.scan(update, filter.initial_state(), samples)
 
 
-@pytest.mark.slow
 def test_innovations_are_white_with_the_stated_covariance():
     """With analogue and digital Butterworth filters, delays, and an unknown weight."""
     states, readings, commands = SimulatedPlant().runs(np.random.default_rng(0))
@@ -160,7 +159,6 @@ def simulated(case):
     return jb.simulate(case, jnp.asarray(times), plan)
 
 
-@pytest.mark.slow
 def test_estimate_without_noise_is_the_state(crossing):
     """Delayed and filtered readings of a known load equal their predictions."""
     case, truth = crossing

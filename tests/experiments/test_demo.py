@@ -15,7 +15,6 @@ WRITTEN = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
 def test_identification_sweep_and_tuning(tmp_path, capsys, monkeypatch):
     identify = tuning.identify
 

@@ -205,7 +205,6 @@ def test_command_line_exports_the_designed_gains(sampled, tmp_path, capsys):
     assert_allclose(found, expected, rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_table_has_the_gains_of_the_design():
     case = shaker_case(FiniteLQR(**WEIGHTS, points=210, after="hold"))
     gains, layout = export_gains(case, 51), mesh_layout(case)
@@ -220,7 +219,6 @@ def test_table_has_the_gains_of_the_design():
     assert gains.crossing_time == pytest.approx(0.6)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("between", ["interpolated", "nearest"])
 def test_gain_family_gives_the_commands_of_the_controller(between, tmp_path):
     """Between masses of the grid, along the crossing, and during the decay after it."""

@@ -36,7 +36,6 @@ def test_c_header_gives_the_same_estimate(tmp_path):
     assert_allclose(ESTIMATED.test_estimate, expected, rtol=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("estimator", [jb.Kalman(0.02, 1e-5), jb.Observer(speed=2.0)])
 def test_exported_estimator_gives_the_commands_of_a_simulation(estimator, tmp_path):
     """From the readings of a run alone, with a digital filter and a delay in the loop."""

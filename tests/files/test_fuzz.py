@@ -192,7 +192,6 @@ SETTINGS = (
 )
 
 
-@pytest.mark.slow
 def test_extreme_numbers_run_or_are_refused(folder, capsys):
     """Each ends within seconds, with a result or an error message."""
     (folder / "case.toml").write_text(SMALL)

@@ -56,7 +56,6 @@ def plans():
 _STRUCTURES = [TWO_SPANS_AND_A_STREAM, SHAKER_SUSPENSION]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [TWO_SPANS_AND_A_STREAM, TWO_SPANS_AND_BRAKING, DAMPED_SUPPORT, SHAKER_SUSPENSION]
 )

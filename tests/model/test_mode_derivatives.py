@@ -53,7 +53,6 @@ def assert_derivatives(function, size: int, jacobians=REVERSE, floor: float = 0.
         assert_allclose(found / scale, expected / scale, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "numbers", "jacobians"),
     [
@@ -139,7 +138,6 @@ def response(case: Case, numbers: list[str]):
     return function
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", REPEATED)
 def test_responses_have_derivatives_where_frequencies_are_repeated(name):
     case, numbers = REPEATED[name]
@@ -148,7 +146,6 @@ def test_responses_have_derivatives_where_frequencies_are_repeated(name):
     assert_derivatives(response(case, numbers), len(numbers), floor=1e-4)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", [crossing(), decoupled()], ids=["crossing", "decoupled"])
 def test_second_derivatives_where_frequencies_are_repeated(case):
     """Undamped: a damping ratio goes with the root of the stiffness, right to first order only."""

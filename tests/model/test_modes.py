@@ -126,7 +126,6 @@ def random_beams(draw) -> Case:
     )
 
 
-@pytest.mark.slow
 @given(random_beams())
 @hypothesis.settings(max_examples=6)
 def test_random_beams_have_exact_frequencies(case):

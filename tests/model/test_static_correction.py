@@ -197,7 +197,6 @@ def test_moments_and_shear_of_a_clamped_beam(x):
     assert_allclose(shear_force(case, x, influence_line(case, x, 0.15, 3)), forces[x], rtol=1e-11)
 
 
-@pytest.mark.slow
 def test_moment_under_a_slow_load_and_a_patch():
     """Three modes and the correction: P a b / L, within the dynamics of a slow crossing."""
     case = jb.Case(

@@ -189,7 +189,6 @@ NUMBERS = [
 ]  # fmt: skip
 
 
-@pytest.mark.slow
 def test_gradients_of_lines_and_peaks():
     """Relative changes of every number, against central differences.
 

@@ -39,7 +39,6 @@ def two_spans():
     return case, FiniteLQR([1e6] * 2 + [10.0] * 2, [1e-3, 1e-3], terminal_weight=[1e4] * 4)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("rig", [one_span, two_spans])
 def test_gains_are_accurate_to_1e_8(rig):
     """dP/dt = -P A - A'P - Q + P B R^-1 B'P backward in time, by scipy's Radau at 1e-10."""

@@ -15,7 +15,6 @@ def test_a_demo_log_is_small_and_has_units(name):
     assert first == "time [s],d1 [mm],d2 [mm],d3 [mm]"
 
 
-@pytest.mark.slow
 def test_making_the_demo_logs_again_gives_the_committed_numbers():
     for name, table in make_demo_log.make().items():
         committed = np.loadtxt(DEMO / f"{name}.csv", delimiter=",", skiprows=1)
@@ -23,7 +22,6 @@ def test_making_the_demo_logs_again_gives_the_committed_numbers():
         np.testing.assert_allclose(table, committed, rtol=0, atol=0.51e-4)
 
 
-@pytest.mark.slow
 def test_the_nominal_number_of_modes_is_enough_for_the_noise():
     """The error of the modes that the model neglects is far below the noise of a reading."""
     rig, logs = truth()

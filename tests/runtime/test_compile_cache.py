@@ -471,7 +471,6 @@ CASES = [
 ]
 
 
-@pytest.mark.slow
 def test_sweeps_of_the_next_process_compile_nothing_and_are_the_same(tmp_path):
     changed = {"JAXBEAM_CACHE_SIZE": "512", "XDG_CACHE_HOME": str(tmp_path)}
     compiled_names = []

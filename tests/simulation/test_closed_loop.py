@@ -124,13 +124,9 @@ LOOPS = {
         [jb.PointForce(0.3)], [jb.Sensor(0.3, "velocity")], jb.Feedback([200.0])
     ),
 }
-QUICK = ("saturation and quantisation", "linear law in continuous time")
 
 
-@pytest.mark.parametrize(
-    "name",
-    [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in LOOPS],
-)
+@pytest.mark.parametrize("name", LOOPS)
 def test_loops_agree_with_the_oracle(name):
     case = LOOPS[name]
     record = run(case, substeps=4 if case.controller.period is None else 2)
@@ -144,7 +140,6 @@ def test_loops_agree_with_the_oracle(name):
         assert np.all(np.abs(found - true) <= 1e-9 * size)
 
 
-@pytest.mark.slow
 def test_controller_and_record_have_the_same_noise():
     """One sample of noise per reading; without loads it is the only excitation."""
     sensor = jb.Sensor(0.25, noise=1e-4, sampling_period=4e-3)
@@ -157,7 +152,6 @@ def test_controller_and_record_have_the_same_noise():
     assert_allclose(record.command, -1000.0 * record.measured, rtol=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("quantity", ["deflection", "strain"])
 def test_first_trial_run_is_the_run_by_its_plan(quantity):
     """Steps end at sensors of strain, too, in the trial run whose record is the result."""
@@ -184,7 +178,6 @@ def test_readings_for_fits_have_no_noise():
     assert_allclose(found, truth, rtol=0, atol=1e-9 * np.max(np.abs(truth)))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("actuator", "gain"),
     [
@@ -204,7 +197,6 @@ def test_law_that_saturates_within_a_step_meets_the_tolerance(actuator, gain):
     assert 0 < np.sum(record.saturated) < TIMES.size
 
 
-@pytest.mark.slow
 def test_sampled_law_converges_to_continuous_time():
     """At first order: a hold delays by half a period on average."""
     case = loop([PATCH], [SENSOR], jb.Feedback([1000.0]))
@@ -236,7 +228,6 @@ def plant_with_mass() -> control.StateSpace:
     return control.ss(a, b, c, np.zeros((1, 2)), inputs=["u", "weight"], outputs=["w"])
 
 
-@pytest.mark.slow
 def test_time_invariant_sampled_loop_agrees_with_python_control():
     """Zero-order hold of the plant, filter and delay of one period in the feedback path."""
     period, gain = 2e-3, 800.0
@@ -262,7 +253,6 @@ def test_time_invariant_sampled_loop_agrees_with_python_control():
     assert_allclose(record.command[:, 0], response[1], rtol=0, atol=1e-9 * size[1])
 
 
-@pytest.mark.slow
 def test_poles_in_continuous_time_agree_with_python_control():
     """From the free motion after the load has left."""
     case = LOOPS["strong damping in continuous time"]
@@ -284,7 +274,6 @@ def test_poles_in_continuous_time_agree_with_python_control():
     assert_allclose(states, free_motion, rtol=0, atol=1e-9 * np.abs(states).max(axis=1).max())
 
 
-@pytest.mark.slow
 def test_energy_is_conserved():
     """Work of actuators and load = change of the energy of the beam + dissipation.
 

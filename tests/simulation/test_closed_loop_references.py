@@ -37,7 +37,6 @@ def reference_case(name: str) -> jb.Case:
     return loop([patch], [jb.Sensor(0.3, filter=filter)], law, beam, [load], 1.21)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", REFERENCE)
 def test_reference_numbers(name):
     reference = REFERENCE[name]

@@ -24,7 +24,6 @@ def reference_case(modes: int, mass: float, speed: float, **run) -> jb.Case:
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("mass", "speed"), [(100 * MASS, 0.5), (0.05, 5 * CRITICAL)])
 def test_heavy_and_fast_masses_agree_with_scipy(mass, speed):
     with pytest.warns(ContactLossWarning):
@@ -34,7 +33,6 @@ def test_heavy_and_fast_masses_agree_with_scipy(mass, speed):
     assert "loses contact" in record.verdict
 
 
-@pytest.mark.slow
 def test_slow_load_on_two_hundred_modes_is_near_statics():
     """The peak is at most that of a load applied suddenly, twice the static one."""
     case = jb.Case(

@@ -10,10 +10,7 @@ import jaxbeam as jb
 from jaxbeam.simulation.integration_plan import integration_plan
 
 # A load loses contact on entry at the free end; the bilateral model is smooth there.
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning"),
-]
+pytestmark = pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 
 TIMES = jnp.linspace(0.0, 0.4, 101)  # s; loads enter and leave in between
 

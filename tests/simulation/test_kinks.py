@@ -193,7 +193,6 @@ def supports_take_all(case):
     return any(support.stiffness is None for support in case.supports)
 
 
-@pytest.mark.slow
 def test_adaptive_reference():
     case = described("leftwards, two masses")[0]
     times = jnp.asarray(TIMES)
@@ -264,7 +263,6 @@ VARIED = ("beam.hinges.0.position", "beam.hinges.0.rotational_stiffness", "loads
 VARIED = (*VARIED, "loads.0.mass", "profile.height", "profile.start")
 
 
-@pytest.mark.slow
 def test_gradients():
     """Known and traced runs agree; derivatives are differences, at times other than of passages."""
     case = dataclasses.replace(described("ramp over a hinge")[0], loads=[mass(0.4, speed=0.7)])
@@ -295,7 +293,7 @@ def test_kink_of_a_settled_beam():
 
 @pytest.mark.parametrize(
     ("period", "tolerance"),
-    [(4e-3, 4e-3), pytest.param(None, 1e-5, marks=pytest.mark.slow)],
+    [(4e-3, 4e-3), None, 1e-5],
     ids=["sampled", "continuous"],
 )
 def test_loops(period, tolerance):

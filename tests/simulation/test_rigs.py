@@ -16,12 +16,9 @@ from tests.oracles import crossing, finite_elements
 from tests.oracles.loads import GRAVITY, Load
 from tests.runs import assert_close, load_of, plan_of
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.filterwarnings(  # the model is bilateral, the oracles too
-        "ignore::jaxbeam.simulation.simulate.ContactLossWarning"
-    ),
-]
+pytestmark = pytest.mark.filterwarnings(  # the model is bilateral, the oracles too
+    "ignore::jaxbeam.simulation.simulate.ContactLossWarning"
+)
 
 REFERENCE = json.loads((DATA / "reference_cases.json").read_text("utf-8"))
 

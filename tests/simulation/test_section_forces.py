@@ -265,7 +265,6 @@ def moving_force_moment(x, y, ratio: float, modes: int, derivative: int) -> np.n
     return dynamic + static
 
 
-@pytest.mark.slow
 def test_order_of_truncation():
     """Away from the load sums of n modes have errors like n^-2 (M) and n^-1 (V).
 

@@ -52,7 +52,6 @@ def kill_one(client, store: Path) -> None:
     os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # of Dask, about the worker that is killed
 def test_killed_worker_does_not_change_the_store(workers, local_store, tmp_path):
     store = tmp_path / "runs.zarr"

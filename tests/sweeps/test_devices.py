@@ -64,7 +64,6 @@ np.savez(sys.argv[1], peaks=peaks, lines=lines)
 """
 
 
-@pytest.mark.slow
 def test_several_devices_share_a_block(tmp_path):
     """Three devices and eight batches, which three does not divide."""
     flags = os.environ["XLA_FLAGS"] + " --xla_force_host_platform_device_count=3"

@@ -57,7 +57,6 @@ CASES = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_peaks_of_each_quantity(name):
     """Samples at 20 kHz miss a peak by less than 1e-4 of it."""
@@ -101,7 +100,6 @@ def test_moments_of_a_high_speed_train_converge_to_those_of_an_independent_progr
     assert_allclose(found["peak_moment"][0, 0], 8497709.91, rtol=2e-4)
 
 
-@pytest.mark.slow
 def test_moments_of_a_moving_mass_against_an_independent_program():
     """Case 4a of `sections.json`: 80 modes, extrapolated; ten modes with the static correction.
 

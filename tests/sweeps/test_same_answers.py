@@ -69,7 +69,6 @@ def single(case, run, rate: float = 150.0) -> np.ndarray:
     return jb.simulate(jb.replace(case, {**run, "run.sample_rate": rate})).peak_deflection
 
 
-@pytest.mark.slow
 @settings(max_examples=2, phases=[Phase.generate])
 @given(runs=RANDOM_RUNS, rate=numbers(30.0, 1000.0))
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
@@ -83,7 +82,6 @@ def test_single_runs_envelopes_and_sweeps_of_known_numbers(runs, rate):
         assert_allclose(np.maximum(-low, high), peaks, rtol=TOLERANCE)
 
 
-@pytest.mark.slow
 @settings(max_examples=1, phases=[Phase.generate])
 @given(runs=RANDOM_RUNS)
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")

@@ -54,7 +54,6 @@ def test_grid_is_labelled_by_address_and_agrees_with_single_runs(grid_dataset):
             assert_allclose(found, expected, rtol=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [1e-7, 9e-7])
 @pytest.mark.parametrize(
     ("modes", "supports", "speeds"),
@@ -134,7 +133,6 @@ jb.sweep(t.CASE, over, store=sys.argv[1], resume=True, progress=False)
 """
 
 
-@pytest.mark.slow
 def test_killed_sweep_resumes_bit_identically(tmp_path):
     def start(path):
         return subprocess.Popen([sys.executable, "-c", KILLED, str(path)])
@@ -221,7 +219,6 @@ def test_progress_bar_is_on_standard_error(capfd):
     assert captured.out == "" and "run" in captured.err
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("modes", "damping"), [(3, 0.03), (6, 0.0), (12, 0.005)])
 def test_longest_steps_are_stable(modes, damping):
     """They resolve the highest mode, which longer steps excite under a heavy load."""

@@ -157,7 +157,6 @@ t.sweep(sys.argv[1], overwrite=True)
 """
 
 
-@pytest.mark.slow
 def test_killed_overwriting_leaves_the_old_sweep_and_no_lock_that_counts(tmp_path, expected):
     path = tmp_path / "runs.zarr"
     other = jb.sweep(OTHER, OVER, store=path, progress=False)

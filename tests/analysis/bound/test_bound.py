@@ -65,7 +65,6 @@ def sensor_influence(influence):
     return influence.unforced @ influence.deflection_rows[0], response
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "modes"), [("one span, one mass", 5), ("one span, one mass, eight modes", 8)]
 )
@@ -78,7 +77,6 @@ def test_reference_numbers(name, modes):
     assert_allclose(bound(case, spacing=0.01).peak, expected["least_peak_m"], rtol=0, atol=1.1e-7)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("row", DATA["attainable_reduction_percent"])
 def test_published_reductions(row):
     if row["rig"] == "patch":
@@ -161,7 +159,6 @@ def feedback_plan():
     return integration_plan(jb.replace(FEEDBACK_CASE, {"controller.gain": np.ones((1, 10))}))
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 @settings(max_examples=8)
 @given(
@@ -222,7 +219,6 @@ def test_without_limits_one_position_is_held_at_zero_once_a_hold(influence):
     )
 
 
-@pytest.mark.slow
 def test_shorter_holds_lower_the_bound():
     case = patched(mass=0.2, speed=3.0, duration=0.2, controller=jb.Feedback([0.0], period=0.01))
     long, short = bound(case, period=0.02), bound(case)
@@ -231,7 +227,6 @@ def test_shorter_holds_lower_the_bound():
     assert short.peak < long.peak * 0.999
 
 
-@pytest.mark.slow
 def test_two_actuators_and_a_shorter_last_hold():
     """The last hold ends with the run; every actuator has its own commands."""
     force = jb.PointForce(0.2, [0.0, 1.0])

@@ -35,7 +35,6 @@ def plan():
     return integration_plan(CASE)
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 @settings(max_examples=6)
 @given(
@@ -63,7 +62,6 @@ def test_no_state_feedback_is_below_the_bound(plan, masses, speed, gap, strength
     assert 0 < least.reduction < 1
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 def test_commands_attain_the_bound_on_the_whole_beam():
     """To 1e-3: the change of the deflection between the times of the bound."""

@@ -44,7 +44,6 @@ def test_its_commands_attain_it_on_a_rough_surface():
     assert controlled.peak_deflection[0] > found.peak * (1 - 1e-5)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, {"prediction": "time-varying"}])
 def test_no_predictive_law_beats_it_on_a_rough_surface(settings):
     law = jb.MPC(horizon=10, moves=5, move_weight=1e-7, loads="known", period=0.05, **settings)

@@ -38,7 +38,6 @@ def plans():
     return {name: integration_plan(case, None, 1e-6) for name, case in CASES.items()}
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 @settings(max_examples=12)
 @given(
@@ -73,7 +72,6 @@ def test_no_controller_is_below_the_bound(plans, mass, speed, strength, weight, 
     assert reached and max(reached) <= 1 + 1e-6
 
 
-@pytest.mark.slow
 def test_predictive_control_comes_near_the_bound(plans):
     """The inequality above is not met by poor controllers only."""
     case = jb.replace(CASES["mpc"], {"controller.move_weight": 1e-12})

@@ -3,7 +3,6 @@
 import json
 
 import numpy as np
-import pytest
 import scipy.linalg
 from numpy.testing import assert_allclose
 
@@ -84,7 +83,6 @@ def test_linear_program_has_the_bound_of_the_reference():
     assert_allclose(np.max(np.abs(influence.deflection(commands))), peak, rtol=1e-5)
 
 
-@pytest.mark.slow
 def test_bound_with_exact_modes_is_near_the_reference():
     """Seven exact modes, for eight sines and the spring of the support."""
     patches = [

@@ -149,7 +149,6 @@ def _table_of_the_general_method(law, plant):
     )[0]
 
 
-@pytest.mark.slow
 def test_the_simulated_cost_is_the_optimal_one():
     weights = WEIGHTS | {"state_weight": [0.0] * 4}
     expected = START @ riccati(DEFLECTION)(0.0) @ START
@@ -172,7 +171,6 @@ def simulated_cost(law) -> float:
     return simpson(running, x=record.times) + 4e3 * deflection[-1] ** 2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stiffness", "damping", "limit"), [(2e5, 40.0, jb.MovingMass), (1e-4, 0.0, jb.MovingForce)]
 )
@@ -187,7 +185,6 @@ def test_stiff_vehicles_are_masses_and_soft_ones_forces(stiffness, damping, limi
     assert_allclose(commands[0], commands[1], atol=5e-3 * np.max(np.abs(commands[1])))
 
 
-@pytest.mark.slow
 def test_a_sampled_law_with_an_estimator_has_the_vehicle():
     law = jb.AugmentedLQR(**WEIGHTS, points=200, period=0.005)
     case = beam_case(controller=law)
@@ -219,7 +216,6 @@ def test_simulated_vehicles_follow_the_true_beam():
         assert_allclose(column, expected, atol=1e-4 * np.max(np.abs(expected)))
 
 
-@pytest.mark.slow
 def test_gradient_of_the_cost_by_the_suspension():
     law, layout = jb.AugmentedLQR(**WEIGHTS, points=60), mesh_layout(beam_case())
 

@@ -6,7 +6,6 @@ import subprocess
 import sys
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import solve_continuous_are
 
@@ -38,7 +37,6 @@ def loop():
     )
 
 
-@pytest.mark.slow
 def test_a_run_with_the_default_number_of_points_ends():
     environment = os.environ | {"PJRT_NPROC": "2"}
     line = [sys.executable, "-c", DESIGN]

@@ -66,8 +66,8 @@ def test_time_invariant_gain(model):
     ("kind", "points", "name"),
     [
         (StepLQR, 200, "step_by_step_gains"),
-        pytest.param(FiniteLQR, 1200, "finite_time_gains", marks=pytest.mark.slow),
-        pytest.param(AugmentedLQR, 1200, "augmented_finite_time_gains", marks=pytest.mark.slow),
+        (FiniteLQR, 1200, "finite_time_gains"),
+        (AugmentedLQR, 1200, "augmented_finite_time_gains"),
     ],
 )
 def test_gains_over_the_crossing(model, kind, points, name):
@@ -75,7 +75,6 @@ def test_gains_over_the_crossing(model, kind, points, name):
     assert_allclose(gains, REFERENCE[name], rtol=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("controller", "name"),
     [
@@ -101,7 +100,6 @@ def test_closed_loops(controller, name):
     assert_allclose(command, expected["voltage"][:last], rtol=0, atol=1e-6 * largest_voltage)
 
 
-@pytest.mark.slow
 def test_cost_of_the_optimal_gain(model):
     """z0' P z0 is the cost of the run from z0, and no change of the gains lowers it."""
     regulator = FiniteLQR(**WEIGHTS, points=400)

@@ -113,7 +113,6 @@ def regulators():
     return single, jb.PositionLQR(**WEIGHTS, masses=[0.3], loads="ignored")
 
 
-@pytest.mark.slow
 def test_one_load_of_the_design_at_constant_speed():
     """The commands are those of the optimal regulator, by time."""
     steady = (eqx.tree_at(lambda load: load.deceleration, BRAKING, np.zeros(())),)

@@ -256,7 +256,6 @@ def test_errors_of_settings(options, message):
         check_case(beam_case(DiscreteLQR(**WEIGHTS, **options)))
 
 
-@pytest.mark.slow
 def test_poles_of_the_loop_are_those_of_the_design(model):
     """Eigenvalues of the transition over a period, delay and rate weight included."""
     law = DiscreteLQR(**WEIGHTS, period=2e-3, delay=5e-4, input_rate_weight=[1e-8])

@@ -62,7 +62,6 @@ def commands(controller, shares, mass=0.4, speed=1.0):
     return np.asarray(_commands(case, mesh_layout(case), STATES, times)[:, 0])
 
 
-@pytest.mark.slow
 def test_commands_are_interpolated_between_designs():
     """On the grid those of a single design; between, the mean; outside, the nearest, stretched.
 
@@ -102,7 +101,6 @@ def test_gain_before_during_and_after_the_crossing(fade, left):
     assert_allclose(schedule.gain(at(3.0)), 3 * left, rtol=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.8, -0.8])
 def test_load_is_identified_from_gates_in_the_loop(speed):
     """Zero command before the second gate; speed exact, mass to five percent."""
@@ -123,7 +121,6 @@ def test_load_is_identified_from_gates_in_the_loop(speed):
     assert found.mass_error == pytest.approx(found.mass / 0.5 - 1)
 
 
-@pytest.mark.slow
 def test_commands_follow_the_identified_load():
     """With the static readings of a mass, commands tend to those for the given mass."""
     grid = {"masses": [0.2, 0.6], "speeds": [0.5, 1.0]}
@@ -202,7 +199,6 @@ def test_speed_and_mass_from_deflections_without_gates():
     assert_allclose(mass[at:], 0.3, rtol=0.01)
 
 
-@pytest.mark.slow
 def test_load_is_identified_without_gates_in_the_loop():
     identification = jb.LoadIdentification(threshold=2e-5, until=0.4)
     gentle = WEIGHTS | {"command_weight": [1e-2], "period": 2e-3}

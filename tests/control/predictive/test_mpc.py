@@ -60,7 +60,6 @@ def one_span():
     return run(beam_case(mpc(), modes=5), 16)
 
 
-@pytest.mark.slow
 def test_one_span_rig(one_span):
     expected = REFERENCE["one span"]
     deflection, command = 1e3 * one_span.deflection[:, 0], one_span.command[:, 0]
@@ -74,7 +73,6 @@ def test_one_span_rig(one_span):
     assert_allclose(-np.min(deflection), peak, rtol=1e-6)
 
 
-@pytest.mark.slow
 def test_limits_and_reduction_as_published(one_span):
     """7.5 V from 0.05 s on; the peak is reduced by 21.5 %, between 20.8 and 21.7 %."""
     command = np.asarray(one_span.command[:, 0])
@@ -86,7 +84,6 @@ def test_limits_and_reduction_as_published(one_span):
     assert_array_equal(one_span.failures, 0.0)
 
 
-@pytest.mark.slow
 def test_two_span_rig():
     """Within the difference of exact modes from the projected sines of the reference."""
     expected = REFERENCE["two spans"]
@@ -195,7 +192,6 @@ def test_hildreth_in_the_loop(controlled, crossing):
     assert failures == 0
 
 
-@pytest.mark.slow
 def test_known_loads_reduce_the_deflection():
     """A light mass, for which the patch is strong enough: less than half of the deflection."""
     light = jb.replace(beam_case(mpc()), {"loads.0.mass": 0.1})
@@ -235,7 +231,6 @@ def test_no_steady_deflection_under_an_unknown_constant_load(crossing):
     assert_allclose(command[-1], 3.0, rtol=1e-5)
 
 
-@pytest.mark.slow
 def test_records_count_steps_without_a_solution():
     infeasible = dataclasses.replace(
         PATCH, limits=jnp.array([1.0, 2.0]), rate_limit=jnp.array(10.0)
@@ -247,7 +242,6 @@ def test_records_count_steps_without_a_solution():
     assert record.to_xarray().failures.dims == ("time",)
 
 
-@pytest.mark.slow
 def test_sweeps_count_steps_without_a_solution():
     """At 1000 V/s the limits are reached within a period, at 10 V/s never."""
     infeasible = dataclasses.replace(
@@ -259,7 +253,6 @@ def test_sweeps_count_steps_without_a_solution():
     assert not runs.failed.any()
 
 
-@pytest.mark.slow
 def test_derivatives_of_a_closed_loop(crossing):
     """By r_w and the weights of the horizon, forward and reverse; limits are active throughout."""
 

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 import scipy.linalg
 from numpy.testing import assert_allclose
 from scipy.optimize import lsq_linear
@@ -44,7 +43,6 @@ def estimates(readings, commands):
     return np.array(found)
 
 
-@pytest.mark.slow
 def test_filter_of_three_modes_on_twelve():
     """Commands equal those of the law behind a filter in numpy; the peak is reduced by a sixth."""
     settings = {"design": DesignModel(modes=3), "estimator": Kalman(INTENSITY, NOISE)}
@@ -101,7 +99,6 @@ def test_filter_of_three_modes_on_twelve():
     assert np.min(readings) > 0.83 * np.min(uncontrolled)
 
 
-@pytest.mark.slow
 def test_known_loads_within_limits():
     """Each command against bounded least squares over the future commands, by scipy."""
     controller = mpc(loads="known")

@@ -25,7 +25,6 @@ CASE = jb.Case(
 FREE = ("controller.move_weight", "controller.output_weight", "controller.horizon_weight")
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 def test_derivatives_of_a_closed_loop_of_two_spans():
     """Reverse mode, by r_w of each patch and weights of sensors and periods; limits are active.

@@ -6,7 +6,6 @@ Plant by scipy's integration of the matrices in `test_crossing_vehicles`; moves 
 import functools
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
@@ -63,7 +62,6 @@ def test_moves_foresee_the_vehicle_and_the_profile():
     assert_allclose(step.command, [expected], rtol=1e-7)
 
 
-@pytest.mark.slow
 def test_foresight_of_the_vehicle_beats_that_of_its_weight():
     """On a rough surface the static load is a poor prediction of the contact force."""
     foresight = jb.MPC(**SETTINGS, loads="known", prediction="time-varying")

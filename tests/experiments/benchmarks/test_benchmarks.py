@@ -66,7 +66,7 @@ def test_packages_that_are_not_installed_are_none():
     "kind",
     [
         (2, "open", "peaks"),
-        pytest.param((1, "sampled", "histories"), marks=pytest.mark.slow),
+        (1, "sampled", "histories"),
     ],
 )
 @pytest.mark.filterwarnings("ignore::jaxbeam.control.optimal.sampling_loss.SamplingWarning")
@@ -131,7 +131,6 @@ def test_designs_are_timed():
         assert times.compiling > 0 and times.run > 0
 
 
-@pytest.mark.slow
 def test_scipy_identifies_the_same_optimum(monkeypatch):
     monkeypatch.setattr(identification, "SPEEDS", np.array([2.0, 4.0]))
     results = identification.time_fits()
@@ -139,7 +138,6 @@ def test_scipy_identifies_the_same_optimum(monkeypatch):
     assert results["ratio"] > 1
 
 
-@pytest.mark.slow
 def test_evolution_does_not_end_above_its_start():
     case, free = tuning_methods.tuning_problem()
     result = tuning_methods.run_evolution(case, free, evaluations=1)
@@ -147,7 +145,6 @@ def test_evolution_does_not_end_above_its_start():
     assert result.evaluations == 2 * 4 * len(free)
 
 
-@pytest.mark.slow
 def test_a_profile_divides_the_time_between_stages():
     command = [sys.executable, "-m", "experiments.benchmarks.profile"]
     printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout

@@ -44,7 +44,6 @@ def test_worst_step_differs_from_the_median():
     assert times.median < times.batched <= times.batched_worst
 
 
-@pytest.mark.slow
 def test_steps_of_a_run_are_timed():
     record = jb.simulate(patch_case(jb.Feedback(gains=[2e3], period=0.01)), tolerance=1e-4)
     times = computing_times(record)

@@ -7,7 +7,6 @@ from experiments.benchmarks import kernel
 from experiments.benchmarks.sweep import sweep_peaks
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(kernel.compiler() is None, reason="there is no C compiler")
 def test_the_kernel_finds_the_peaks_of_jaxbeam(tmp_path):
     library = kernel.build(3, tmp_path)

@@ -45,7 +45,6 @@ def test_held_out_noise_has_another_seed(rig):
     assert bench.run.seed != tune_sensor_feedback.with_noise_and_filters(rig, bench).run.seed
 
 
-@pytest.mark.slow
 def test_peak_of_a_held_out_load_is_near_the_least_achievable():
     """From sensors alone, with 10 ms more delay than designed for, against the linear program."""
     bench = sensor_feedback.bench_case("B", rigs.load("B"))
@@ -80,7 +79,6 @@ def test_loop_without_a_load_is_stable_with_more_delay_and_another_rigidity(rig)
             assert poles.largest_real_part[0] < 0.0
 
 
-@pytest.mark.slow
 def test_loop_is_stable_as_loads_leave_a_softer_beam():
     """On two spans, 10 ms late, near the far end, where the law is steep and the beam vibrates."""
     run = {"loads.0.mass": 0.322, "loads.0.speed": 0.95, "loads.0.entry_time": 0.0}

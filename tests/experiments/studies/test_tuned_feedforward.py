@@ -31,7 +31,6 @@ def test_held_out_loads_are_not_among_the_training_loads(rig, number):
     assert training.isdisjoint({load[address] for load in held_out_loads(rig)})
 
 
-@pytest.mark.slow
 def test_peak_of_a_held_out_load_is_near_the_least_achievable():
     """On the bench, with the rig's own beam, against the linear program."""
     stored = jb.load_case(tune_feedforward.FOLDER / "B.toml").controller

@@ -1,14 +1,12 @@
 """Identification of the numbers fitted by hand, from logs made by finite elements."""
 
 import numpy as np
-import pytest
 
 from experiments.thesis.chapter2.identification import HAND_FITTED, LOGS, fit_rig
 from jaxbeam import rigs
 from tests.tuning import make_rig_logs
 
 
-@pytest.mark.slow
 def test_intervals_of_rig_b_contain_the_true_values():
     """The log in the repository is the one that `make_rig_logs` makes."""
     stored = np.loadtxt(LOGS / "B.csv", delimiter=",", skiprows=1)

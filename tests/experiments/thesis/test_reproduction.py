@@ -101,7 +101,6 @@ def test_list(capsys):
     assert "--list" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_experiments_in_two_processes(tmp_path):
     """Results come in order and equal those of one process; figures and report are written."""
     names = ["patches", "frequencies"]

@@ -53,7 +53,6 @@ def test_one_case_equals_itself_and_a_change_is_found(tmp_path, capsys):
     assert not comparison.compare(tmp_path / "first.npz", tmp_path / "missing.npz")
 
 
-@pytest.mark.slow
 def test_results_of_another_checkout(tmp_path):
     """A copy of the packages, in which the gravity of a run has another default."""
     checkout = tmp_path / "other"

@@ -17,7 +17,6 @@ def test_page_marks_errors_above_their_tolerance(error, mark, count):
     assert f"| peaks | closed form | {error:.1e} | 1e-06 | {mark} |" in text
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("group", check_groups(), ids=lambda group: group.__name__)
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 def test_errors_are_within_their_tolerances(group):

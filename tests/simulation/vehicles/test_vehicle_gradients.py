@@ -60,7 +60,6 @@ def of_factors(case, numbers, plan):
     return function
 
 
-@pytest.mark.slow
 def test_gradients_by_every_number():
     """Forward against differences, whose runs are of known numbers; reverse against forward."""
     plan = plan_of(CASE, substeps=6)

@@ -26,16 +26,9 @@ SAMPLES = {
     "2h-isoA-quarter-ss": 1301,
     "1p-train-4-manchester-ss50": 601,
 }  # axles on a rough road
-SLOW = (
-    "1d-oscillator-two-span",
-    "1l-artic-5-axle-ss-vbi2d-default",
-    "1p-train-4-manchester-ss50",
-    "2k-fra6-wagon-ss25",
-)
-NAMES = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in RUNS]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", RUNS)
 def test_runs_are_those_of_the_reference(name):
     run = RUNS[name]
     record, at = simulated(run, MODES.get(name, 16), SAMPLES.get(name, 301))

@@ -127,7 +127,6 @@ def test_gradients_of_all_kinds_of_controllers_are_tested():
     assert not untested, f"compare with `central` in tests/control, or add to LOOPS: {untested}"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", LOOPS)
 def test_gradients_through_the_closed_loop(kind):
     controller, start = LOOPS[kind]

@@ -57,7 +57,6 @@ def tuned(file, **options):
     )  # fmt: skip
 
 
-@pytest.mark.slow
 def test_a_killed_tuning_is_resumed(tmp_path):
     killed(TUNE, tmp_path / "search.npz")
     resumed, whole = tuned(tmp_path / "search.npz", resume=True), tuned(None)

@@ -31,7 +31,6 @@ def swept():
     return {name: np.array([float(np.max(row[name])) for row in rows]) for name in METRICS}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("method", ["adam", "lbfgs", "bfgs"])
 def test_every_method_finds_what_a_sweep_finds(swept, method):
     tuned = tuning.tune(rig(), FREE, CASES, method=method, starts=2, seed=3, **OPTIONS)
@@ -43,7 +42,6 @@ def test_every_method_finds_what_a_sweep_finds(swept, method):
     assert "minima by start:" in str(tuned)
 
 
-@pytest.mark.slow
 def test_a_pareto_front(swept):
     limits = [0.15, 0.3, 0.22]
     front = tuning.pareto(
@@ -59,7 +57,6 @@ def test_a_pareto_front(swept):
     front.plot()
 
 
-@pytest.mark.slow
 def test_lexicographic_order(swept):
     first, second = tuning.lexicographic(
         rig(), FREE, CASES, ["peak", "effort"], slack=0.03, **OPTIONS
@@ -72,7 +69,6 @@ def test_lexicographic_order(swept):
     assert 0.99 * least <= second.run_sets[0].metrics["effort"] <= 1.02 * most
 
 
-@pytest.mark.slow
 def test_mini_batches(swept):
     """Steps on two of four runs reach the same objective, and repeat with the same seed."""
     options = OPTIONS | {"batch": 2}
@@ -109,7 +105,6 @@ def test_integers():
         tuning.tune_integers(rig(), {}, FREE, CASES)
 
 
-@pytest.mark.slow
 def test_the_best_integer_is_selected():
     """A power of 1 or 3 of the reading: with such gains a cubic law hardly acts."""
     search = tuning.tune_integers(

@@ -119,7 +119,6 @@ def test_controllers_are_designed_for_the_nominal_plant():
     assert with_fixed_design(case, {}, run_set.plan.shapes.layout) is case
 
 
-@pytest.mark.slow
 def test_tuning_for_the_worst_of_several_plants():
     """Peaks in the result are those of a simulation of each plant."""
     identified = Posterior(

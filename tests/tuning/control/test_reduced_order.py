@@ -24,7 +24,6 @@ def regulated():
     return dataclasses.replace(case, beam=dataclasses.replace(case.beam, modes=2))
 
 
-@pytest.mark.slow
 def test_the_states_selected_are_the_best_of_all_choices(regulated):
     reduced = tuning.tune_reduced(regulated, FED_BACK_COUNT, FREE, CASES, **OPTIONS)
     objectives = {}

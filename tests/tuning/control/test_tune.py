@@ -57,7 +57,6 @@ def metrics(run_set):
     return lambda gain, *sharp: program({GAIN: jnp.asarray(gain)}, *map(jnp.asarray, sharp))
 
 
-@pytest.mark.slow
 def test_metrics_are_those_of_the_simulated_runs(metrics):
     metrics = metrics(5000.0)
     for i, run in enumerate(RUNS):
@@ -84,7 +83,6 @@ def test_metrics_are_those_of_the_simulated_runs(metrics):
         assert metrics["contact"][i] == pytest.approx(change, rel=1e-3)
 
 
-@pytest.mark.slow
 def test_gradients_of_the_objectives(run_set):
     """Gradient of a sum of all, so that they share a compiled program."""
     weights = {"peak": 1.0, "rms": 0.3, "effort": 0.1, "contact": 0.2}
@@ -174,7 +172,6 @@ def test_another_seed_reaches_the_same_objective(tuned):
     assert "nothing was held out" in again.verdict
 
 
-@pytest.mark.slow
 def test_a_stopped_search_is_resumed_to_the_same_result(tuned, tmp_path, monkeypatch):
     file = tmp_path / "search.npz"
 
@@ -209,7 +206,6 @@ def test_the_start_is_the_result_if_nothing_is_better():
 PLAIN = jb.Case(rig().beam, loads=rig().loads, sensors=rig().sensors)
 
 
-@pytest.mark.slow
 def test_tuning_with_a_stability_constraint():
     # With a heavy load frozen poles are unstable on the far half even without control.
     light = {"loads.0.mass": 0.05}

@@ -34,7 +34,6 @@ def call(tmp_path, monkeypatch, capsys):
     return call
 
 
-@pytest.mark.slow
 def test_from_a_fit_to_a_tuned_case(call, tmp_path, monkeypatch):
     """From the file written by identify to a tuned case that can be simulated."""
     monkeypatch.setattr(storage, "make_dataset", lambda case, logs: dataset())

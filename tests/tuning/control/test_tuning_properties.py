@@ -50,7 +50,6 @@ def relative_peak(case: jb.Case, position: float) -> float:
     return peak(case, position) / peak(dataclasses.replace(case, controller=None), position)
 
 
-@pytest.mark.slow
 @settings(max_examples=4)
 @given(st.fixed_dictionaries(PROBLEMS))
 def test_the_objective_never_rises_and_is_that_of_the_saved_case(problem):

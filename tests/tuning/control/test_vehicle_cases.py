@@ -77,7 +77,6 @@ def test_contact_forces_of_a_run_are_those_on_the_beam():
     np.testing.assert_array_equal(found, np.where(on_beam, record.contact_force[:, 0], 0.0))
 
 
-@pytest.mark.slow
 def test_a_gain_is_tuned_on_vehicles_and_checked_on_others():
     cases = tuning.LoadCases(TRAINING[::2], HELD_OUT)
     stable = tuning.StabilityConstraint(max_real_part=0.5, instants=2)

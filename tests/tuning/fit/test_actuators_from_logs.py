@@ -83,7 +83,6 @@ def log(shaker_volts, patch_volts, noise=2e-7, seed=0, **about):
     )
 
 
-@pytest.mark.slow
 def test_shaker_and_patch_together():
     free = [
         "actuators.0.force_per_volt",
@@ -101,7 +100,6 @@ def test_shaker_and_patch_together():
     np.testing.assert_allclose(fit.noise, 2e-7, rtol=0.1)
 
 
-@pytest.mark.slow
 def test_a_patch_alone_from_a_file(tmp_path):
     steps = log(0 * SWEPT, STEPS)
     table = np.column_stack([steps.times, steps.values[:, [0, 1, 3]]])

@@ -70,7 +70,6 @@ def autocorrelated(white, memory: float):
     return noise
 
 
-@pytest.mark.slow
 def test_intervals_cover_the_truth(repeated_fits):
     noises = NOISE * np.random.default_rng(5).normal(size=(500, *repeated_fits.clean.shape))
     errors, _ = repeated_fits.deviations(noises)
@@ -79,7 +78,6 @@ def test_intervals_cover_the_truth(repeated_fits):
     assert np.all(np.abs(np.mean(errors, axis=0)) < 3 / 1.96 / np.sqrt(500))
 
 
-@pytest.mark.slow
 def test_autocorrelated_residuals_widen_intervals(repeated_fits):
     white = NOISE * np.random.default_rng(6).normal(size=(100, *repeated_fits.clean.shape))
     _, narrow = repeated_fits.deviations(white[:10])
@@ -90,7 +88,6 @@ def test_autocorrelated_residuals_widen_intervals(repeated_fits):
     assert np.all(covered >= 0.90), dict(zip(SMALL, covered, strict=True))
 
 
-@pytest.mark.slow
 def test_a_common_factor_is_reported_as_unidentifiable(repeated_fits):
     """Rigidity, mass per length and load mass times a factor lead to the same deflection."""
     scaled = ["beam.flexural_rigidity", "beam.mass_per_length", "loads.0.mass"]

@@ -39,7 +39,6 @@ def errors_by_differences(positions, noise):
     return np.sqrt(np.diagonal(np.linalg.inv(information), axis1=1, axis2=2))
 
 
-@pytest.mark.slow
 def test_the_best_sensor_position_for_the_mass():
     bounds = (0.05, 0.55)
     design = design_experiment(

@@ -105,7 +105,6 @@ def two_logs() -> Fit:
     return identify(replace(one_span(), start), logs, free)
 
 
-@pytest.mark.slow
 def test_true_values_are_recovered(two_logs):
     assert two_logs.addresses == list(TRUTH)
     assert np.all(np.abs(deviations(two_logs, TRUTH)) < 3)
@@ -117,7 +116,6 @@ def test_true_values_are_recovered(two_logs):
     assert not two_logs.at_bound and not two_logs.unidentifiable
 
 
-@pytest.mark.slow
 def test_fitted_cases(two_logs):
     value = dict(zip(two_logs.addresses, two_logs.values, strict=True))
     assert float(two_logs.case.beam.flexural_rigidity) == value["beam.flexural_rigidity"]
@@ -126,7 +124,6 @@ def test_fitted_cases(two_logs):
     assert float(two_logs.case.run.duration) == 0.8
 
 
-@pytest.mark.slow
 def test_correlation(two_logs):
     correlation = two_logs.correlation
     np.testing.assert_allclose(np.diag(correlation), 1, rtol=1e-12)
@@ -135,7 +132,6 @@ def test_correlation(two_logs):
     assert correlation[i, j] > 0.5  # later and faster: the same time at midspan
 
 
-@pytest.mark.slow
 def test_summary_and_figure(two_logs):
     summary = str(two_logs)
     first = summary.splitlines()[1]
@@ -152,7 +148,6 @@ def test_summary_and_figure(two_logs):
 NOISE = 2e-5
 
 
-@pytest.mark.slow
 def test_damping_is_not_identifiable_from_a_log_that_ends_at_the_exit():
     """At 0.5 m/s the deflection is quasi-static: it depends on rigidity, hardly on damping."""
     case = replace(small(duration=1.26), {"loads.0.speed": 0.5})
@@ -167,7 +162,6 @@ def test_damping_is_not_identifiable_from_a_log_that_ends_at_the_exit():
     assert "beam.damping_ratio is not identifiable from the data: give it a value" in str(fit)
 
 
-@pytest.mark.slow
 def test_bounds_hold_and_are_reported_when_reached():
     case = replace(small(duration=0.6), {"beam.flexural_rigidity": 9.0})
     log = simulated_log(small(duration=0.6), NOISE)
@@ -178,7 +172,6 @@ def test_bounds_hold_and_are_reported_when_reached():
     assert fit.to_dict()["numbers"]["beam.flexural_rigidity"]["at_bound"]
 
 
-@pytest.mark.slow
 def test_stiffness_of_an_elastic_support():
     """From a log simulated by jaxbeam; finite elements are used in test_recovery."""
     case = dataclasses.replace(

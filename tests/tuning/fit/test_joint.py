@@ -46,7 +46,6 @@ def crossing_and_shaking(rig: Plant) -> list[Log]:
     ]
 
 
-@pytest.mark.slow
 def test_one_rig_fitted_to_both_logs(rig):
     start = {address: 1.06 * value for address, value in rig.truth.items()}
     fit = identify(replace(rig.case, start), crossing_and_shaking(rig), list(start))

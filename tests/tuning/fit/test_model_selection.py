@@ -41,7 +41,6 @@ def identification() -> SimulatedIdentification:
     )
 
 
-@pytest.mark.slow
 def test_criteria_select_elastic_supports_and_delayed_actuators(identification):
     noise = np.random.default_rng(0).normal(size=identification.clean.shape)
     names = list(identification.truth)

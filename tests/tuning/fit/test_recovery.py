@@ -62,7 +62,6 @@ def identification(request) -> SimulatedIdentification:
     return SimulatedIdentification(PLANTS[request.param])
 
 
-@pytest.mark.slow
 def test_all_parameters_together_lie_within_their_intervals(identification):
     """None is off by more than three standard errors; together, by the 99.9 % quantile."""
     free = np.ones(len(identification.truth), bool)
@@ -75,7 +74,6 @@ def test_all_parameters_together_lie_within_their_intervals(identification):
     assert distance < scipy.stats.chi2.ppf(0.999, errors.size), errors_by_address
 
 
-@pytest.mark.slow
 def test_each_parameter_alone_lies_within_its_interval(identification):
     """Parameters of the beam, which all rigs have, on the rig with one patch only."""
     names = list(identification.truth)
@@ -89,7 +87,6 @@ def test_each_parameter_alone_lies_within_its_interval(identification):
         assert abs(error) < THREE_ERRORS, (name, error)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("identification", ["one span, patch"], indirect=True)
 def test_intervals_of_a_wrong_model_are_called_unreliable(identification):
     """A rigidity fixed 10 % too high biases the other parameters; the fit warns of it."""

@@ -119,7 +119,6 @@ def noisy(crossing, seed):
     return log_of(crossing, noise).values[None]
 
 
-@pytest.mark.slow
 def test_intervals_cover_suspension_and_profile(problem, crossing):
     free = np.arange(len(TRUTH) + 2) < len(TRUTH)
     truth, errors = np.array(list(TRUTH.values())), []
@@ -134,7 +133,6 @@ def test_intervals_cover_suspension_and_profile(problem, crossing):
     assert np.max(np.abs(errors)) < 4 / 1.96
 
 
-@pytest.mark.slow
 def test_without_the_bridge_a_common_factor_of_the_vehicle_is_named(problem, crossing, tmp_path):
     """On the approach, masses, springs and dampers times a factor feel the same."""
     approach = copy.copy(problem)

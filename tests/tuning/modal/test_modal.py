@@ -118,7 +118,6 @@ def test_noise_has_no_modes(quantity, pole):
         assert "no mode is well identified" in str(fit) and fit.to_dict()["mac"] == []
 
 
-@pytest.mark.slow
 def test_decay_intervals_cover_the_truth():
     """60 logs of three modes each: 90 % to 98 % of the intervals cover the true values."""
     fits = [identify_modes(decay(seed), band=BAND, window=(3.0, 9.5)) for seed in range(60)]
@@ -133,7 +132,6 @@ def ambient_fits():
     return [identify_modes(ambient(seed), kind=kind) for seed, kind in enumerate(kinds)]
 
 
-@pytest.mark.slow
 def test_ambient_intervals_cover_the_truth(ambient_fits):
     """By the binomial distribution, so many or few of 80 do with a probability above 2 %."""
     assert all(fit.kind == "ambient" for fit in ambient_fits)

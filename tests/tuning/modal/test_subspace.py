@@ -75,9 +75,7 @@ def test_close_modes_are_found_in_a_short_log():
     assert not any(one.false_modes for one in found)
 
 
-@pytest.mark.parametrize(
-    ("kind", "count"), [("ambient", 2), pytest.param("motor", 8, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("kind", "count"), [("ambient", 2), ("motor", 8)])
 def test_modes_and_lines_of_planted_logs_are_found(kind, count):
     """As `experiments.validation.modal_identification` does it; intervals cover the truth."""
     found = []

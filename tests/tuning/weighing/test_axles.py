@@ -124,7 +124,6 @@ def test_intervals_of_moses_cover_on_rough_roads(found):
     assert np.all(widths < 0.25)
 
 
-@pytest.mark.slow
 def test_the_fit_is_closer_than_moses_and_its_intervals_cover(crossings, found):
     with well_compiled():
         given, free = axle_problem(case(), crossings[0], found[0])
@@ -155,7 +154,6 @@ def test_the_fit_is_closer_than_moses_and_its_intervals_cover(crossings, found):
     assert share < 0.06
 
 
-@pytest.mark.slow
 def test_axles_of_a_log_are_weighed_and_reported(crossings):
     weighed = weigh_axles(case(), crossings[0], SPEEDS)
     assert isinstance(weighed, AxleWeighing)

@@ -97,7 +97,6 @@ def test_readings_of_a_unit_force_are_those_of_a_simulation():
         assert np.all(error < 0.02), error
 
 
-@pytest.mark.slow
 def test_strain_gauge_and_accelerometer_weigh(readings):
     names = "strain", "acceleration"
     weighed = weigh(case(*names), log_of(readings, *names), (6.0, 25.0), 1, both_ways=False)
@@ -112,7 +111,6 @@ def test_strain_gauge_and_accelerometer_weigh(readings):
     assert weighed.to_dict()["loads"][0]["mass"]["value"] == pytest.approx(MASS, rel=0.02)
 
 
-@pytest.mark.slow
 def test_a_fit_of_strain_has_the_cusp_under_the_axle(readings):
     """With two modes, whose sums are 10 % low at the peak, the rigidity is right."""
     own = case("strain", modes=2)

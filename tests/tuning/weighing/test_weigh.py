@@ -32,7 +32,6 @@ def test_matching_pursuit_is_close_without_dynamics():
     assert match.residual_rms < 0.2 < 0.5 * pursuit.find(1).residual_rms
 
 
-@pytest.mark.slow
 def test_two_loads_that_meet_on_the_beam():
     weighed = weigh(CASE, crossing(TWO), (0.8, 2.5))
     truth = {
