@@ -221,6 +221,7 @@ def _choose_substeps(
     return min_substeps * 2**halvings, error, trial
 
 
+@np.errstate(all="ignore")  # of extreme numbers
 def _sensor_errors(case: Case, shapes: StaticShapes, trial: StepTrial | None) -> tuple[float, ...]:
     """Errors of the steps of a trial at each sensor (see `step_errors`), NaN without one."""
     if trial is None:
