@@ -22,6 +22,7 @@ FUNCTIONS = {
     "xp of arrays in a list": (lambda a: xp.stack([a, 2 * a], axis=-1), VECTOR),
     "xp of a named array": (lambda a: xp.clip(VECTOR, max=a), VECTOR[::-1].copy()),
     "xp.linalg": (lambda a: xp.linalg.solve(FACTOR, a), MATRIX),
+    "array_namespace": (lambda a: arrays.array_namespace(VECTOR, a).tanh(a), MATRIX),
     "take": (lambda i: arrays.take(MATRIX, i), 2),
     "take of several": (lambda a, i: arrays.take(a, i), MATRIX, REPEATED),
     "set_at": (lambda a, v: arrays.set_at(a, np.s_[1:3, 0], v), MATRIX, np.array([9.0, 8.0])),
@@ -109,7 +110,7 @@ def test_known_and_traced_arrays_give_the_same(name):
 
 
 def test_every_function_of_the_module_has_its_case():
-    others = {"is_jax", "any_jax", "custom_jvp"}  # tested below
+    others = {"is_jax", "any_jax", "any_traced", "custom_jvp"}  # tested below
     functions = {
         name
         for name, value in vars(arrays).items()
@@ -117,6 +118,13 @@ def test_every_function_of_the_module_has_its_case():
     }
     tested = {name.replace(",", "").split()[0] for name in FUNCTIONS}
     assert functions - tested - others - {"xp"} == set()
+
+
+def test_numbers_are_traced_in_jit_only():
+    found = []
+    jax.jit(lambda a: found.append(arrays.any_traced({"a": a}, VECTOR)) or a)(VECTOR)
+    assert found == [True]
+    assert not arrays.any_traced({"a": jnp.ones(2)}, VECTOR)
 
 
 @pytest.mark.parametrize(
