@@ -21,6 +21,7 @@ from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.batches import Batches, common_layout, values_at
 from jaxbeam.sweeps.step_size import (
     choose_step_sizes,
+    initial_share,
     initial_step_sizes,
     rounding_error,
     stratified_sample,
@@ -160,7 +161,8 @@ class Runner:
         if self.schedule is not None and self.case.controller is not None:  # steps end at events
             self.max_steps = np.minimum(self.max_steps, self.schedule.lengths.max())
         modes = self.case.beam.modes
-        self.initial_steps = initial_step_sizes(crossing_time, limits, modes, self.tolerance)
+        initial = initial_step_sizes(crossing_time, limits, modes, self.tolerance)
+        self.initial_steps = initial * initial_share(s.quantity for s in self.case.sensors)
 
     def choose_step_sizes(self) -> tuple[Float[np.ndarray, " path"], float]:
         """Step sizes (s) of all batches, and the relative error of peaks measured with them.

@@ -7,10 +7,12 @@ sample may have larger errors where the response changes sharply from run to run
 mass near its critical speed is ten times that of a slightly slower one.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from jaxtyping import Float, Int
+
+from jaxbeam.case.quantities import QUANTITIES
 
 CONVERGENCE_ORDER = 9  # assumed order of the error in the step; the true order is higher
 REFINEMENT = 1.25  # ratio of a step to the finer step with which its error is measured
@@ -39,6 +41,18 @@ def initial_step_sizes(
     """
     steps = crossing_times / (20 * modes + 1.84 * crossing_times / max_steps / np.sqrt(modes))
     return steps * (tolerance / 1e-7) ** (1 / CONVERGENCE_ORDER)
+
+
+def initial_share(quantities: Iterable[str]) -> float:
+    """Share of initial steps with which a search for those of some quantities begins.
+
+    Their errors are those of higher modes. Median steps of beams of one and two spans with 2 to 12
+    modes are 0.9 of the initial ones for moments, 0.65 for shear forces, and 0.25 for
+    accelerations: a trial with somewhat shorter steps is useful, one with longer steps is not.
+    """
+    in_x, in_time = (1.0, 0.9, 0.75, 0.55), (1.0, 0.45, 0.22)
+    found = (QUANTITIES[name] for name in quantities)
+    return min((in_x[q.x_derivative] * in_time[q.time_derivative] for q in found), default=1.0)
 
 
 def log_spaced_sample(
