@@ -49,7 +49,7 @@ def _rewrite(app, what, name, obj, options, lines):
 
 def field_table(one: type) -> list[str]:
     """Table of the fields of a class, with shapes, units, defaults and meanings."""
-    rows = []
+    by_name = {}  # a class may declare again what its interface leaves open
     for owner in reversed(one.__mro__):
         if owner.__module__.split(".")[0] not in ("jaxbeam", "tuning"):
             continue
@@ -57,8 +57,9 @@ def field_table(one: type) -> list[str]:
             if isinstance(node, ast.AnnAssign) and not ast.unparse(node.annotation).startswith(
                 ("ClassVar", "typing.ClassVar")
             ):
-                rows.append(field_row(one, ast.unparse(node.target), node))
-    rows = [row for row in rows if not row[0].startswith("_")]
+                name = ast.unparse(node.target)
+                by_name[name] = field_row(one, name, node)
+    rows = [row for row in by_name.values() if not row[0].startswith("_")]
     if not rows:
         return []
     lines = [".. list-table::", "   :header-rows: 1", "   :class: fields", ""]
@@ -82,6 +83,7 @@ def shape(annotation: str) -> str:
             return f"number or ({axes[0][1:]},)"
         return f"({', '.join(axes)}{',' * (len(axes) == 1)})"
 
+    annotation = re.sub(r"^eqx\.AbstractVar\[(.*)\]$", r"\1", annotation)
     text = re.sub(r"(?:Float|Int|Bool|Complex)\[[\w.]+, '([^']*)'\]", of_array, annotation)
     return text.replace(" | None", " or none")
 
