@@ -58,14 +58,15 @@ def beams(draw) -> Beam:
 def supports(draw, length: float) -> tuple[Support, ...]:
     """Up to three supports, rigid or elastic, at different positions."""
     shares = draw(st.lists(st.integers(0, 20), max_size=3, unique=True))
+    stiffnesses = [draw(maybe(numbers(0.0, 1e8))) for _ in shares]
     return tuple(
         Support(
             position=length * share / 20,
-            stiffness=draw(maybe(numbers(0.0, 1e8))),
-            damping=draw(numbers(0.0, 100.0)),
+            stiffness=stiffness,
+            damping=None if stiffness is None else draw(maybe(numbers(0.0, 100.0))),
             rotational_stiffness=draw(numbers(0.0, 1e4)),
         )
-        for share in shares
+        for share, stiffness in zip(shares, stiffnesses, strict=True)
     )
 
 

@@ -88,11 +88,14 @@ def _position_fields(part_class: type) -> list[str]:
 
 def _check_supports(supports: tuple[Support, ...], length: Float[Array, ""]) -> None:
     for i, support in enumerate(supports):
-        if support.mass is not None and support.stiffness is None:
-            raise ValueError(
-                f"supports.{i}.mass would have no effect, since the support is rigid: give"
-                f" supports.{i}.stiffness too, or leave the mass out"
-            )
+        damping = support.damping
+        damped = damping is not None and is_concrete(damping) and float(concrete(damping)) > 0
+        for name, given in (("mass", support.mass is not None), ("damping", damped)):
+            if given and support.stiffness is None:
+                raise ValueError(
+                    f"supports.{i}.{name} would have no effect, since the support is rigid: give"
+                    f" supports.{i}.stiffness too, or leave the {name} out"
+                )
     rigid = [
         (float(concrete(support.position)), i)
         for i, support in enumerate(supports)

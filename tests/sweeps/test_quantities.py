@@ -77,6 +77,19 @@ def test_peaks_of_each_quantity(name):
         assert np.isnan(peaks[:, others]).all()
 
 
+def test_stated_truncation_is_that_of_a_run_with_short_steps():
+    """Sweeps estimate it with the longest stable step."""
+    sensors = (jb.Sensor(0.5, "moment"), jb.Sensor(0.3, "acceleration"))
+    case = dataclasses.replace(CASES["masses"], sensors=sensors)
+    speed = float(case.loads[0].speed)
+    found = jb.sweep(case, {"loads.0.speed": [speed]}, progress=False)
+    times = np.linspace(0.0, float(case.run.duration), 400)
+    expected = jb.simulate(case, times, tolerance=1e-8).truncation_errors
+    for i, name in enumerate(("moment", "acceleration")):
+        stated = found[f"peak_{name}"].attrs["truncation_error"]
+        assert_allclose(stated, expected[i], rtol=1e-2)
+
+
 def test_peaks_under_a_slow_axle_are_the_static_ones():
     """P L / 4 at midspan and P x / L left of x; three modes miss 9.9 % of the moment."""
     assert round(100 * (1 - 8 / np.pi**2 * (1 + 1 / 9)), 1) == 9.9
