@@ -175,7 +175,10 @@ def integrate_peaks(
     results = [(tasks, batch_size, columns) for columns in (count, count, load_count, load_count)]
     call = jax.ffi.ffi_call(
         LIBRARY.ffi_name("integrate_peaks"),
-        [jax.ShapeDtypeStruct(shape, float) for shape in (*results, (workspace_size(*sizes, groups),))],
+        [
+            jax.ShapeDtypeStruct(shape, float)
+            for shape in (*results, (workspace_size(*sizes, groups),))
+        ],
         vmap_method="sequential",
     )
     return Peaks(*call(*arguments, max_loads=np.int64(max_loads))[:-1])
@@ -183,9 +186,7 @@ def integrate_peaks(
 
 def vehicle_numbers(wheels: WheelSet) -> Int[np.ndarray, "group 4"]:
     """First wheel, wheels and states of one vehicle, and number of vehicles, of loads with them."""
-    numbers = [
-        (group.first_wheel, *group.H.shape[-3:-1], group.count) for group in wheels.vehicles
-    ]
+    numbers = [(group.first_wheel, *group.H.shape[-3:-1], group.count) for group in wheels.vehicles]
     return np.array(numbers, np.int64).reshape(-1, 4)
 
 
