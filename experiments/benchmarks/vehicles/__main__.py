@@ -28,7 +28,7 @@ SAMPLES = 800  # of the script, with a parabola through the highest three
 REPEATS = 5
 
 
-def bridge(load: jb.AbstractLoad) -> jb.Case:
+def bridge(load: jb.MovingMass | jb.QuarterCar) -> jb.Case:
     """The bridge under a load."""
     beam = jb.Beam(LENGTH, RIGIDITY, MASS, DAMPING, modes=MODES)
     return jb.Case(beam, sensors=[jb.Sensor(LENGTH / 2)], loads=[load], run=jb.Run(DURATION))
