@@ -25,6 +25,7 @@ BENCHMARKS = {
     "cases": Benchmark("one and two spans, loops, histories: scipy and diffrax", "--quick"),
     "kernel": Benchmark("sweeps: the same method by hand in C", "--modes 3"),
     "first_answer": Benchmark("first answers of fresh processes: a script with scipy", "--quick"),
+    "quantities": Benchmark("sweeps of every quantity, beside deflections", "--modes 3"),
     "trains": Benchmark("ten trains at many speeds: a script with numpy", "--speeds 5"),
     "growth": Benchmark("time and peak memory of growing sweeps; compiling", "--runs 4096 40000"),
     "identification": Benchmark("identification: scipy's least squares"),
