@@ -27,6 +27,7 @@ BENCHMARKS = {
     "first_answer": Benchmark("first answers of fresh processes: a script with scipy", "--quick"),
     "quantities": Benchmark("sweeps of every quantity, beside deflections", "--modes 3"),
     "trains": Benchmark("ten trains at many speeds: a script with numpy", "--speeds 5"),
+    "vehicles": Benchmark("quarter cars: moving masses, and a script with scipy", "--runs 20"),
     "growth": Benchmark("time and peak memory of growing sweeps; compiling", "--runs 4096 40000"),
     "identification": Benchmark("identification: scipy's least squares"),
     "regulator_designs": Benchmark("designs of regulators, many at once"),
