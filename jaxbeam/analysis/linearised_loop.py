@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
+from jaxbeam.analysis.affine_loop import linear_loop, sampled_matrices
 from jaxbeam.analysis.frozen_loop import (
     PERIOD_TOLERANCE,
     FrozenTrajectory,
@@ -31,10 +31,12 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.model.linear_system import Signal, StateSpace
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.numerics.affine import NotAffineError, affine_jacobian
 from jaxbeam.runtime.arrays import (
     Array,
     any_traced,
     known,
+    ravel_pytree,
     scan,
     solve,
     stop_gradient,
@@ -177,9 +179,45 @@ class _Derivatives(NamedTuple):
 
 def linearise(loop: LoopDynamics, timing: LoopTiming | None, t) -> LinearisedLoop:
     """Loop with loads frozen at t (s), linearised about the equilibrium under their weights."""
-    if not any_traced(loop, t):
+    if any_traced(loop, t):
+        return _linearise_compiled(_derivatives, loop, timing, t)
+    try:
+        return affine_linearisations(loop, timing, [t])[0]
+    except NotAffineError:
         return _linearise(_derivatives_compiled, loop, timing, t)
-    return _linearise_compiled(_derivatives, loop, timing, t)
+
+
+def affine_linearisations(
+    loop: LoopDynamics, timing: LoopTiming | None, times
+) -> list[LinearisedLoop]:
+    """Loops of known numbers with loads frozen at times (s), each the same about all its states.
+
+    Raises NotAffineError if they are not.
+    """
+    times, parts = np.asarray(times, float), []
+    if timing is None:
+        for t in times:
+            A, B, _, command = loop.continuous_dynamics(t)
+            parts.append((A, B, affine_jacobian(command, np.zeros(A.shape[0]))))
+    else:
+        linear, plant = (
+            linear_loop(loop, times[0]),
+            loop.plant_transitions(timing, times, weights=False),
+        )
+        for i, t in enumerate(times):
+            linear = linear_loop(loop, t, linear)
+            parts.append(sampled_matrices(linear, timing, t, [part[i] for part in plant]))
+    period = None if timing is None else timing.period
+    modal_states = 2 * loop.plant.coordinate_scale.shape[0]
+    return [LinearisedLoop(*matrices, period, modal_states) for matrices in parts]
+
+
+def linearise_each(loop: LoopDynamics, timing: LoopTiming | None, times) -> list[LinearisedLoop]:
+    """Loops with loads frozen at each of some known times (s); see `linearise`."""
+    try:
+        return affine_linearisations(loop, timing, times)
+    except NotAffineError:
+        return [linearise(loop, timing, t) for t in times]
 
 
 def _derivatives(loop: LoopDynamics, timing: LoopTiming | None, t, state) -> _Derivatives:
@@ -190,9 +228,10 @@ def _derivatives(loop: LoopDynamics, timing: LoopTiming | None, t, state) -> _De
         K = jax.jacfwd(command)(state)
         return _Derivatives(A @ state + B @ command(state) + weight_rates, A, B, K)
     _, rebuild = loop.rest_state(timing)
+    transitions = loop.plant_transitions(timing, t)
 
     def sampling_step(state, given):
-        after, command = loop.sampling_step(timing, rebuild(state), t, given)
+        after, command = loop.sampling_step(timing, rebuild(state), t, transitions, given)
         after = ravel_pytree(after)[0]
         return (after, command), (after, command)
 
