@@ -16,9 +16,9 @@ import numpy as np
 import scipy
 from jaxtyping import Complex, Float
 
-from jaxbeam.analysis.affine_loop import linear_loop, ravel_columns
 from jaxbeam.analysis.frozen_loop import LoopDynamics, LoopTiming, loop_dynamics
 from jaxbeam.analysis.linearised_loop import linearise_each, loop_timing
+from jaxbeam.analysis.loops.affine_loop import linear_loop, ravel_columns
 from jaxbeam.case.case import Case, concrete_case, crossing_times
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.trajectory import NEVER

@@ -1,6 +1,7 @@
 """Derivatives of functions that are affine, by their values: known numbers need no compiler."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -32,8 +33,8 @@ def affine_jacobian(
         raise NotAffineError
     size = point.shape[0]
     with np.errstate(all="ignore"):
-        columns = [(function(STEP * unit) - start) / STEP for unit in np.eye(size)]
-        matrix = np.stack(columns, axis=1) if size else np.zeros((start.shape[0], 0))
+        columns: list[Any] = [(function(STEP * unit) - start) / STEP for unit in np.eye(size)]
+        matrix: Any = np.stack(columns, axis=1) if size else np.zeros((start.shape[0], 0))
         if not all(is_affine(function, matrix, start, scale) for scale in TRIAL_SIZES):
             raise NotAffineError
     return matrix

@@ -170,7 +170,7 @@ class LeastSquares:
 
     def values_at(self, y) -> Float[np.ndarray, " parameter"]:
         """Values of the parameters at search variables."""
-        return self.from_unbounded(np.asarray(y))
+        return np.asarray(self.from_unbounded(np.asarray(y)))
 
     def _slopes(self, y) -> Float[np.ndarray, " parameter"]:
         """Derivatives of the values by the search variables."""

@@ -60,9 +60,7 @@ def linear_loop(loop: LoopDynamics, t: float, earlier: LoopDynamics | None = Non
 def sampled_matrices(
     loop: LoopDynamics, timing: LoopTiming, t, transitions
 ) -> tuple[
-    Float[np.ndarray, "state state"],
-    Float[np.ndarray, "state actuator"],
-    Float[np.ndarray, "actuator state"],
+    Float[Array, "state state"], Float[Array, "state actuator"], Float[Array, "actuator state"]
 ]:
     """Matrices A, B and K of a `linear_loop` over the period from t (s), opened at the commands.
 
@@ -78,7 +76,7 @@ def sampled_matrices(
     return change[:, :size], change[:, size:], command[:, :size]
 
 
-def ravel_columns(tree) -> Float[np.ndarray, "entry column"]:
+def ravel_columns(tree) -> Float[Array, "entry column"]:
     """Leaves (..., column) of known numbers as one matrix; see `ravel_pytree`."""
     leaves = jax.tree.leaves(tree)
     return np.concatenate([leaf.reshape(-1, leaf.shape[-1]) for leaf in leaves])
