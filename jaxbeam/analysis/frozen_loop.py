@@ -12,6 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.analysis.loops.affine import affine_jacobian
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw, Measurement
 from jaxbeam.case.filters import filter_step
@@ -24,7 +25,6 @@ from jaxbeam.model.sensing.sensor_signals import (
     sensor_sections,
 )
 from jaxbeam.model.state_space import Plant, build_plant
-from jaxbeam.numerics.affine import affine_jacobian
 from jaxbeam.numerics.discretisation import propagate
 from jaxbeam.runtime.arrays import Array, known, ravel_pytree, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced

@@ -20,13 +20,13 @@ from jaxbeam.analysis.frozen_loop import (
     LoopTiming,
     loop_dynamics,
 )
+from jaxbeam.analysis.loops.affine import NotAffineError, affine_jacobian
 from jaxbeam.analysis.loops.affine_loop import linear_loop, sampled_matrices
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.linear_system import Signal, StateSpace
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.numerics.affine import NotAffineError, affine_jacobian
 from jaxbeam.runtime.arrays import (
     Array,
     any_traced,

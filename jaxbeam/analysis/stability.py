@@ -18,12 +18,12 @@ from jaxtyping import Complex, Float
 
 from jaxbeam.analysis.frozen_loop import LoopDynamics, LoopTiming, loop_dynamics
 from jaxbeam.analysis.linearised_loop import linearise_each, loop_timing
+from jaxbeam.analysis.loops.affine import NotAffineError
 from jaxbeam.analysis.loops.affine_loop import linear_loop, ravel_columns
 from jaxbeam.case.case import Case, concrete_case, crossing_times
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.numerics.affine import NotAffineError
 from jaxbeam.numerics.discretisation import propagate
 from jaxbeam.runtime.arrays import known, ravel_pytree, scan, xp
 from jaxbeam.runtime.compiling import compiled

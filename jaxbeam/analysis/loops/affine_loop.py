@@ -1,13 +1,15 @@
 """Loops whose law is affine: their matrices from known numbers, without a compiler."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.analysis.frozen_loop import LoopDynamics, LoopTiming
+from jaxbeam.analysis.loops.affine import affine_jacobian, is_affine
 from jaxbeam.case.controller import AbstractSampledLaw, ControlStep, Measurement
-from jaxbeam.numerics.affine import affine_jacobian, is_affine
 from jaxbeam.runtime.arrays import Array, ravel_pytree, xp
 
 
@@ -76,7 +78,7 @@ def sampled_matrices(
     return change[:, :size], change[:, size:], command[:, :size]
 
 
-def ravel_columns(tree) -> Float[Array, "entry column"]:
+def ravel_columns(tree) -> Any:
     """Leaves (..., column) of known numbers as one matrix; see `ravel_pytree`."""
     leaves = jax.tree.leaves(tree)
     return np.concatenate([leaf.reshape(-1, leaf.shape[-1]) for leaf in leaves])
