@@ -28,12 +28,12 @@ from tuning.modal.arguments import (
 )
 from tuning.modal.decay.modes import Decays, excited, free_decay_modes
 from tuning.modal.fit import Choice, ModalFit
+from tuning.modal.forced.forces import force_names, force_records, without_forces
+from tuning.modal.forced.modes import forced_modes
 from tuning.modal.harmonics import Line, harmonic_lines, is_steady, without_lines
 from tuning.modal.preprocessing import kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels
 from tuning.modal.spectral.efdd_modes import SingularValues, efdd_modes
-from tuning.modal.spectral.forced_modes import forced_modes
-from tuning.modal.spectral.forces import force_names, force_records, without_forces
 from tuning.modal.spectral.plscf_modes import plscf_modes
 from tuning.modal.stabilisation import Diagram
 

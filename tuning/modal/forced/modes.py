@@ -1,7 +1,8 @@
 """Modes from responses to measured forces, of a hammer or a shaker.
 
-Poles of p-LSCF (`forced_fraction`) that are stable are refined by the likelihood of a modal model.
-A wide band is divided into bands of three octaves, each decimated to a rate of its own.
+Poles of p-LSCF (`common_denominator`) that are stable are refined by the likelihood of a modal
+model, to which poles are added where errors are more than noise. A wide band is divided into bands
+of three octaves.
 """
 
 from collections.abc import Callable
@@ -9,30 +10,40 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy.signal import detrend
 
 from tuning.modal.ambient import (
     Candidate,
     divided_band,
-    mean_square,
     overlapping,
     without_duplicates,
 )
-from tuning.modal.preprocessing import RATE_OVER_BAND, prepare
-from tuning.modal.result import rejection_reason
-from tuning.modal.spectral.forced_fraction import (
+from tuning.modal.forced.common_denominator import (
     Lines,
     fit_common_denominator,
     products,
     transforms,
 )
-from tuning.modal.spectral.forced_likelihood import refine_modal_model
+from tuning.modal.forced.likelihood import fit_modal_model
+from tuning.modal.forced.modal_model import modes_of_model
+from tuning.modal.forced.significance import (
+    criterion,
+    missing_pole,
+    residue_chances,
+    single_pole_chances,
+    split_pole,
+)
+from tuning.modal.result import rejection_reason
 from tuning.modal.stabilisation import Diagram, stabilise
 from tuning.modal.subspace import Poles
 
 MAX_ORDER = 60
+MAX_ADDED = 12  # poles, one at a time
+HIGHEST_LINE = 1.15  # over the upper end of a band
 PASSES = 2  # of the search for modes
 WEIGHT_DEGREE_SHARE = 0.5  # degree of the denominator that weights lines, over the highest
 MIN_WEIGHT = 1e-3  # size of the denominator, over its median, below which weights are equal
+CHANCE = 1e-3  # probability below which noise is no explanation
 SAME_POLE = 0.5  # distance of two poles over the smaller decay rate, below which they are one
 
 
@@ -58,38 +69,43 @@ def forced_modes(
 
     Raises ValueError if a force is zero throughout.
     """
+    duration = sum(map(len, records)) / rate
+    records, forces = (tuple(detrend(r, axis=0) for r in some) for some in (records, forces))
     found: list[Candidate] = []
     diagrams, rest, whole = [], 0.0, 0.0
     for low, high in divided_band(band):
         if progress:
             progress(f"modes from {low:.3g} Hz to {high:.4g} Hz")
         part = overlapping((low, high), band)
-        prepared = prepare(records, starts, rate, part)
-        driving = prepare(forces, starts, rate, part).records
-        scale, force_scale = (np.sqrt(mean_square(one)) for one in (prepared.records, driving))
+        lines = transforms(records, forces, rate, (part[0] / 2, HIGHEST_LINE * part[1]))
+        scale, force_scale = (
+            np.sqrt(np.mean(np.abs(one) ** 2, axis=0)) for one in (lines.outputs, lines.inputs)
+        )
         if not np.all(force_scale > 0):
             raise ValueError("a measured force is zero throughout; leave it out")
         scale = np.where(scale > 0, scale, 1.0)
-        lines = transforms(
-            tuple(record / scale for record in prepared.records),
-            tuple(force / force_scale for force in driving),
-            prepared.rate,
-            (part[0] / 2, 0.45 * RATE_OVER_BAND * part[1]),
+        lines = lines._replace(outputs=lines.outputs / scale, inputs=lines.inputs / force_scale)
+        candidates, diagram, shares = _modes_of_lines(
+            lines, scale, part, band, duration, order, _poles(found)
         )
-        duration = sum(map(len, prepared.records)) / prepared.rate
-        candidates, diagram, shares = _modes_of_lines(lines, scale, part, band, duration, order)
         found += candidates
         diagrams.append(diagram)
         rest, whole = rest + shares[0], whole + shares[1]
     return ForcedModes(without_duplicates(found), tuple(diagrams), 1 - rest / max(whole, 1e-300))
 
 
-def _modes_of_lines(lines: Lines, scale, part, band, duration, order):
+def _poles(found):
+    """Poles of candidates that are well identified."""
+    return np.array([one.mode.pole for one in found if not one.reason], complex)
+
+
+def _modes_of_lines(lines: Lines, scale, part, band, duration, order, known):
     """Candidates and diagram of a part of a band, and the powers of errors and responses.
 
     What the modes found leave is searched again, for modes that stood in the shade of others.
+    Poles `known` from other parts of the band reach into this one by their flanks.
     """
-    drawn, used, rest, dropped = None, np.zeros(0, complex), lines, []
+    drawn, used, rest, dropped = None, known, lines, []
     for _ in range(PASSES):
         diagram = _diagram(rest, scale, part, order)
         drawn = drawn or diagram
@@ -97,13 +113,17 @@ def _modes_of_lines(lines: Lines, scale, part, band, duration, order):
         used = _distinct(used, diagram)
         if used.size == before and drawn is not diagram:
             break
-        model, gone = _refined(lines, used, scale, part)
+        fitted, model, gone = _refined(lines, used, scale, part)
+        fitted, model = _completed(lines, fitted, model, scale, part)
         dropped += gone
         used = np.array([mode.pole for mode in model.modes], complex)
         rest = model.rest
     modes = [mode for mode in model.modes if part[0] <= mode.frequency <= part[1]]
-    candidates = [
-        Candidate(mode, rejection_reason(mode, duration, band), 1) for mode in (*modes, *dropped)
+    candidates = [Candidate(mode, rejection_reason(mode, duration, band), 1) for mode in modes]
+    candidates += [
+        Candidate(mode, rejection_reason(mode, duration, band) or reason, 1)
+        for mode, reason in dropped
+        if part[0] <= mode.frequency <= part[1]
     ]
     return candidates, drawn, (np.sum(np.abs(rest.outputs) ** 2), model.power)
 
@@ -131,19 +151,53 @@ def _diagram(lines: Lines, scale, part, order) -> Diagram:
 
 
 def _refined(lines, poles, scale, part):
-    """Modal model of those poles that are determined, and the modes of the others.
+    """Modal model of those poles that are determined, and the modes of the others with reasons.
 
     Two poles for one resonance, or one for none, make others uncertain, so that one goes at a time.
     """
     dropped = []
     while True:
-        model = refine_modal_model(lines, poles, scale, part)
-        doubts = [mode.damping_sd / mode.damping_ratio for mode in model.modes]
-        if not doubts or model.modes[0].quantile * max(doubts) < 1:
-            return model, dropped
-        worst = int(np.argmax(doubts))
-        dropped.append(model.modes[worst])
-        poles = np.delete(np.array([mode.pole for mode in model.modes], complex), worst)
+        fitted = fit_modal_model(lines, poles, part)
+        model = modes_of_model(fitted, scale)
+        doubts = np.array(
+            [mode.quantile * mode.damping_sd / mode.damping_ratio for mode in model.modes]
+        )
+        chances = residue_chances(fitted)
+        if np.any(doubts >= 1):
+            worst = int(np.argmax(doubts))
+            reason = ""
+        elif np.any(chances > CHANCE):
+            worst = int(np.argmax(chances))
+            reason = "no response to the force beyond what noise explains"
+        else:
+            return fitted, model, dropped
+        dropped.append((model.modes[worst], reason))
+        poles = np.delete(fitted.poles, worst)
+
+
+def _completed(lines, fitted, model, scale, part):
+    """Models with poles added where errors are more than noise, if that is the better model."""
+    tried: list[complex] = []
+    for _ in range(MAX_ADDED):
+        missing, chance = missing_pole(fitted, part)
+        chances = [chance, *single_pole_chances(fitted)]
+        places = [missing, *fitted.poles[fitted.moving]]
+        new = [
+            k
+            for k in np.argsort(chances)
+            if chances[k] < CHANCE
+            and all(abs(places[k] - one) > SAME_POLE * -one.real for one in tried)
+        ]
+        if not new:
+            break
+        tried.append(complex(places[new[0]]))
+        poles = np.append(fitted.poles, missing)
+        if new[0] > 0:
+            poles = split_pole(fitted, int(fitted.moving[new[0] - 1]))
+        others, better, _ = _refined(lines, poles, scale, part)
+        if criterion(fitted.lines, others.poles) < criterion(fitted.lines, fitted.poles):
+            fitted, model = others, better
+    return fitted, model
 
 
 def _distinct(known, diagram: Diagram) -> Complex[np.ndarray, " mode"]:
