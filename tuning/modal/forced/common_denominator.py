@@ -25,7 +25,8 @@ class Lines(NamedTuple):
     """Lines of the transforms of all records: spectra (line, output), (line, input), z and record.
 
     `step` is the sampling step (s); `level`, if any, is what spectra of each line were multiplied
-    by, so that errors of all lines have one variance.
+    by, so that errors of all lines have one variance; `window_rate` (1/s) is what an exponential
+    window of the records added to each decay rate.
     """
 
     outputs: Complex[np.ndarray, "line output"]
@@ -34,6 +35,7 @@ class Lines(NamedTuple):
     record: Int[np.ndarray, " line"]
     step: float
     level: Float[np.ndarray, " line"] | None = None
+    window_rate: float = 0.0
 
     @property
     def spacing(self) -> float:
@@ -68,8 +70,8 @@ class CommonDenominator(NamedTuple):
 
 
 def transforms(
-    records: tuple[Float[np.ndarray, "time output"], ...],
-    forces: tuple[Float[np.ndarray, "time input"], ...],
+    records: tuple[Float[np.ndarray, "_ output"], ...],
+    forces: tuple[Float[np.ndarray, "_ input"], ...],
     rate: float,
     band: tuple[float, float],
 ) -> Lines:

@@ -25,7 +25,7 @@ from tuning.modal.forced.common_denominator import (
     transforms,
 )
 from tuning.modal.forced.likelihood import fit_modal_model
-from tuning.modal.forced.modal_model import modes_of_model
+from tuning.modal.forced.modal_model import damping_doubts, modes_of_model, unexplained
 from tuning.modal.forced.significance import (
     criterion,
     missing_pole,
@@ -56,16 +56,19 @@ class ForcedModes(NamedTuple):
 
 
 def forced_modes(
-    records: tuple[Float[np.ndarray, "time channel"], ...],
-    forces: tuple[Float[np.ndarray, "time force"], ...],
-    starts: tuple[float, ...],
+    records: tuple[Float[np.ndarray, "_ channel"], ...],
+    forces: tuple[Float[np.ndarray, "_ force"], ...],
     rate: float,
     band: tuple[float, float],
     *,
     order: int | None = None,
+    window_rate: float = 0.0,
     progress: Callable[[str], None] | None = None,
 ) -> ForcedModes:
     """Modes of a band (Hz) from records and the forces measured with them.
+
+    `window_rate` (1/s) is that of an exponential window of records and forces; it is subtracted
+    from the decay rates.
 
     Raises ValueError if a force is zero throughout.
     """
@@ -84,9 +87,13 @@ def forced_modes(
         if not np.all(force_scale > 0):
             raise ValueError("a measured force is zero throughout; leave it out")
         scale = np.where(scale > 0, scale, 1.0)
-        lines = lines._replace(outputs=lines.outputs / scale, inputs=lines.inputs / force_scale)
+        lines = lines._replace(
+            outputs=lines.outputs / scale,
+            inputs=lines.inputs / force_scale,
+            window_rate=window_rate,
+        )
         candidates, diagram, shares = _modes_of_lines(
-            lines, scale, part, band, duration, order, _poles(found)
+            lines, scale, part, band, duration, order, _poles(found, window_rate)
         )
         found += candidates
         diagrams.append(diagram)
@@ -94,9 +101,9 @@ def forced_modes(
     return ForcedModes(without_duplicates(found), tuple(diagrams), 1 - rest / max(whole, 1e-300))
 
 
-def _poles(found):
-    """Poles of candidates that are well identified."""
-    return np.array([one.mode.pole for one in found if not one.reason], complex)
+def _poles(found, window_rate):
+    """Poles of candidates that are well identified, with the damping of the window."""
+    return np.array([one.mode.pole - window_rate for one in found if not one.reason], complex)
 
 
 def _modes_of_lines(lines: Lines, scale, part, band, duration, order, known):
@@ -113,19 +120,22 @@ def _modes_of_lines(lines: Lines, scale, part, band, duration, order, known):
         used = _distinct(used, diagram)
         if used.size == before and drawn is not diagram:
             break
-        fitted, model, gone = _refined(lines, used, scale, part)
-        fitted, model = _completed(lines, fitted, model, scale, part)
+        model, gone = _refined(lines, used, scale, part)
+        model = _completed(lines, model, scale, part)
         dropped += gone
-        used = np.array([mode.pole for mode in model.modes], complex)
-        rest = model.rest
-    modes = [mode for mode in model.modes if part[0] <= mode.frequency <= part[1]]
+        used, rest = model.poles, unexplained(model)
+    modes = [mode for mode in modes_of_model(model, scale) if part[0] <= mode.frequency <= part[1]]
     candidates = [Candidate(mode, rejection_reason(mode, duration, band), 1) for mode in modes]
     candidates += [
         Candidate(mode, rejection_reason(mode, duration, band) or reason, 1)
         for mode, reason in dropped
         if part[0] <= mode.frequency <= part[1]
     ]
-    return candidates, drawn, (np.sum(np.abs(rest.outputs) ** 2), model.power)
+    return (
+        candidates,
+        drawn,
+        (np.sum(np.abs(rest.outputs) ** 2), np.sum(np.abs(model.plain.outputs) ** 2)),
+    )
 
 
 def _diagram(lines: Lines, scale, part, order) -> Diagram:
@@ -151,37 +161,32 @@ def _diagram(lines: Lines, scale, part, order) -> Diagram:
 
 
 def _refined(lines, poles, scale, part):
-    """Modal model of those poles that are determined, and the modes of the others with reasons.
+    """Model of those poles that are determined, and the modes of the others with reasons.
 
     Two poles for one resonance, or one for none, make others uncertain, so that one goes at a time.
     """
     dropped = []
     while True:
-        fitted = fit_modal_model(lines, poles, part)
-        model = modes_of_model(fitted, scale)
-        doubts = np.array(
-            [mode.quantile * mode.damping_sd / mode.damping_ratio for mode in model.modes]
-        )
-        chances = residue_chances(fitted)
+        model = fit_modal_model(lines, poles, part)
+        doubts, chances, reason = damping_doubts(model), residue_chances(model), ""
         if np.any(doubts >= 1):
             worst = int(np.argmax(doubts))
-            reason = ""
         elif np.any(chances > CHANCE):
             worst = int(np.argmax(chances))
             reason = "no response to the force beyond what noise explains"
         else:
-            return fitted, model, dropped
-        dropped.append((model.modes[worst], reason))
-        poles = np.delete(fitted.poles, worst)
+            return model, dropped
+        dropped.append((modes_of_model(model, scale)[worst], reason))
+        poles = np.delete(model.poles, worst)
 
 
-def _completed(lines, fitted, model, scale, part):
-    """Models with poles added where errors are more than noise, if that is the better model."""
+def _completed(lines, model, scale, part):
+    """Model with poles added where errors are more than noise, if that is the better one."""
     tried: list[complex] = []
     for _ in range(MAX_ADDED):
-        missing, chance = missing_pole(fitted, part)
-        chances = [chance, *single_pole_chances(fitted)]
-        places = [missing, *fitted.poles[fitted.moving]]
+        missing, chance = missing_pole(model, part)
+        chances = [chance, *single_pole_chances(model)]
+        places = [missing, *model.poles[model.moving]]
         new = [
             k
             for k in np.argsort(chances)
@@ -191,13 +196,13 @@ def _completed(lines, fitted, model, scale, part):
         if not new:
             break
         tried.append(complex(places[new[0]]))
-        poles = np.append(fitted.poles, missing)
+        poles = np.append(model.poles, missing)
         if new[0] > 0:
-            poles = split_pole(fitted, int(fitted.moving[new[0] - 1]))
-        others, better, _ = _refined(lines, poles, scale, part)
-        if criterion(fitted.lines, others.poles) < criterion(fitted.lines, fitted.poles):
-            fitted, model = others, better
-    return fitted, model
+            poles = split_pole(model, int(model.moving[new[0] - 1]))
+        other, _ = _refined(lines, poles, scale, part)
+        if criterion(model.lines, other.poles) < criterion(model.lines, model.poles):
+            model = other
+    return model
 
 
 def _distinct(known, diagram: Diagram) -> Complex[np.ndarray, " mode"]:
