@@ -1,4 +1,4 @@
-"""TOML that pages show without running it is read without an error, completed by what it leaves out."""
+"""TOML that pages show without running it is read without an error, completed where it is short."""
 
 import re
 import tomllib

@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 from experiments.benchmarks.common import parser
 
-
 PAGES = Path(__file__).parents[2] / "docs" / "_static" / "benchmarks"
 
 
