@@ -99,6 +99,7 @@ from .control.receptance import (
 from .control.scheduled_feedback import ScheduledFeedback as ScheduledFeedback
 from .control.sliding_mode import SlidingMode as SlidingMode
 from .control.state_feedback import StateFeedback as StateFeedback
+from .estimation.extended_kalman import ExtendedKalman as ExtendedKalman
 from .estimation.inversion import Inversion as Inversion
 from .estimation.kalman import Kalman as Kalman
 from .estimation.observer import Observer as Observer
