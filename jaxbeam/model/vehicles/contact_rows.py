@@ -65,8 +65,8 @@ def mass_contact_rows(
 
 def _mass_rows(model, motion, inertia, springs) -> tuple[ContactRows, SurfaceRows]:
     """Contact law of the masses (kg) alone, and the rows of the surface under the wheels."""
-    position, active = motion[0], motion[3]
-    rows = surface_rows(model, *motion, springs)
+    position, speed, acceleration, active = motion
+    rows = surface_rows(model, position, speed, acceleration, active, springs)
     shape = rows.shape.reshape(*position.shape, model.mode_count)
     of_acceleration = rows.acceleration.reshape(*position.shape, model.state_count)
     mass = xp.where(active, inertia, 0.0)
