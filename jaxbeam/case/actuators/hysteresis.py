@@ -11,7 +11,7 @@ Proceedings - Control Theory and Applications 148, 2001).
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Float
 
 from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import INCREASING, concrete, is_concrete, number
@@ -38,11 +38,6 @@ class Hysteresis(ReprWithUnits, eqx.Module):
     )
     weights: Float[Array, " play"] = number("1", "weights of the plays")
 
-    @property
-    def start(self) -> Float[Array, " play"]:
-        """Plays at rest."""
-        return xp.zeros_like(self.thresholds)
-
     def follow(self, plays: Plays, command: Float[Array, "*batch"]) -> Plays:
         """Plays after a command."""
         r = self.thresholds.reshape(-1, *[1] * xp.ndim(command))
@@ -52,9 +47,9 @@ class Hysteresis(ReprWithUnits, eqx.Module):
         """Command that acts."""
         return xp.tensordot(self.weights, plays, axes=1)
 
-    def outputs(self, commands: Float[Array, " time"]) -> Float[np.ndarray, " time"]:
-        """Commands that act, of commands in turn, from rest."""
-        plays, found = self.start, []
+    def outputs(self, commands: ArrayLike) -> Float[np.ndarray, " time"]:
+        """Commands that act for commands (time,) in turn, from rest."""
+        plays, found = xp.zeros_like(self.thresholds), []
         for command in np.asarray(commands, float):
             plays = self.follow(plays, command)
             found.append(self.output(plays))
