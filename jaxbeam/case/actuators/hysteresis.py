@@ -11,7 +11,8 @@ Proceedings - Control Theory and Applications 148, 2001).
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import INCREASING, concrete, is_concrete, number
