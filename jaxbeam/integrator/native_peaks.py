@@ -20,7 +20,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_peaks as integrate_peaks_in_jax
 from jaxbeam.integrator.kinks.passages import may_have_kinks
-from jaxbeam.integrator.monitored_rows import force_weights_at_peaks, largest_per_energy
+from jaxbeam.integrator.monitored_rows import bounds_by_energy, force_weights_at_peaks
 from jaxbeam.integrator.propagators import (
     DOUBLINGS,
     GAUSS_NODES,
@@ -143,7 +143,7 @@ def integrate_peaks(
     own = jax.tree.map(lambda leaf: leaf[0], models) if shared is None else models
     linear = jax.vmap(linear_outputs, (shared, 0, 0))(own, outputs, correction)
     corrected = None if correction is None else correction.rows
-    bounds = jax.vmap(largest_per_energy, (shared, 0, 0))(own, outputs, corrected)
+    bounds = jax.vmap(bounds_by_energy, (shared, 0, 0))(own, outputs, corrected)
     count = linear.rows.shape[1]
     influence = np.zeros((1, 1)), np.zeros((1, 1, 0, count))
     if linear.influence is not None:

@@ -132,22 +132,30 @@ static void add_influence(const Workspace *w, const Step *step, int s) {
     const double left = breaks[piece], width = breaks[piece + 1] - left;
     const double *series = w->inputs[INFLUENCE_SERIES] +
                            (ptrdiff_t)piece * w->influence_terms * w->positions;
-    for (int p = 0; p < PEAK_POINTS; p++) {
-        evaluate_trajectory(w, step->load_numbers[s],
-                            step->start + step->length * w->inputs[PEAK_FRACTIONS][p], &position,
-                            &speed, &acceleration);
-        const double x = fmin(fmax(2 * (position - left) / width - 1, -1), 1);
-        const double *weights = w->inputs[PEAK_FORCE_WEIGHTS] + p * NODES;
+    /* Peak nodes side by side in a register, since each term of the series waits for the last. */
+    for (int first = 0; first < PEAK_POINTS; first += REGISTER_WIDTH) {
+        const int left_over = PEAK_POINTS - first;
+        const int count = left_over < REGISTER_WIDTH ? left_over : REGISTER_WIDTH;
+        Register x = {0};
+        for (int p = 0; p < count; p++) {
+            const double fraction = w->inputs[PEAK_FRACTIONS][first + p];
+            evaluate_trajectory(w, step->load_numbers[s], step->start + step->length * fraction,
+                                &position, &speed, &acceleration);
+            x[p] = fmin(fmax(2 * (position - left) / width - 1, -1), 1);
+        }
+        const Register twice = 2 * x;
         for (int output = 0; output < w->positions; output++) {
-            double sum = 0, above = 0; /* Clenshaw's recurrence */
+            Register sum = {0}, above = {0}; /* Clenshaw's recurrence */
             for (int k = w->influence_terms - 1; k > 0; k--) {
-                const double next = series[k * w->positions + output] + 2 * x * sum - above;
+                const Register next = series[k * w->positions + output] - above + twice * sum;
                 above = sum, sum = next;
             }
-            sum = series[output] + x * sum - above;
-            for (int f = 0; f < NODES; f++)
-                step->sample_rows[(ptrdiff_t)(w->states + s * NODES + f) * w->sample_count +
-                                  p * w->positions + output] += weights[f] * sum;
+            sum = series[output] - above + x * sum;
+            for (int p = 0; p < count; p++)
+                for (int f = 0; f < NODES; f++)
+                    step->sample_rows[(ptrdiff_t)(w->states + s * NODES + f) * w->sample_count +
+                                      (first + p) * w->positions + output] +=
+                        w->inputs[PEAK_FORCE_WEIGHTS][(first + p) * NODES + f] * sum[p];
         }
     }
 }

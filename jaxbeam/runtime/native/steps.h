@@ -179,16 +179,18 @@ static void advance_chunk(Workspace *w, int steps, Group *groups, int group_coun
     }
 }
 
-/* Whether the energy left cannot raise any peak, by the bounds of the outputs. Diverged runs
- * cannot. */
+/* Whether the energies left in the blocks cannot raise any peak, by the bounds of the outputs.
+ * Diverged runs cannot. */
 static int peaks_final(const Workspace *w) {
     const int block_size = w->block_size, modes = w->modes;
+    Register *root = w->root_energy;
     for (ptrdiff_t first = 0; first < w->batch_size; first += REGISTER_WIDTH) {
         const int count = runs_from(w, first);
-        Register energy = {0};
+        Register sum = {0}; /* NaN or infinite in a diverged run */
         for (int b = 0; b < w->blocks; b++) {
             const double *state = w->state + b * block_size * w->batch_size + first;
             const double *matrix = w->inputs[STATE_MATRIX] + b * block_size * block_size;
+            Register energy = {0};
             for (int i = 0; i < 2 * modes; i += 2) {
                 Register rate = load(state + (i + 1) * w->batch_size, count), pull = {0};
                 for (int j = 0; j < 2 * modes; j += 2)
@@ -196,11 +198,15 @@ static int peaks_final(const Workspace *w) {
                         matrix[(i + 1) * block_size + j] * load(state + j * w->batch_size, count);
                 energy += rate * rate + load(state + i * w->batch_size, count) * pull;
             }
+            for (int l = 0; l < REGISTER_WIDTH; l++) root[b][l] = sqrt(energy[l]);
+            sum += root[b];
         }
-        const Mask finite = 0 * energy == 0;
+        const Mask finite = 0 * sum == 0;
         for (int position = 0; position < w->positions; position++) {
-            Register peak = load(w->peak + position * w->batch_size + first, count);
-            Mask above = finite & ~(w->inputs[OUTPUT_BOUNDS][position] * energy < peak * peak);
+            const double *bounds = w->inputs[OUTPUT_BOUNDS] + position * w->blocks;
+            Register reach = {0};
+            for (int b = 0; b < w->blocks; b++) reach += bounds[b] * root[b];
+            Mask above = finite & ~(reach < load(w->peak + position * w->batch_size + first, count));
             for (int l = 0; l < count; l++)
                 if (above[l]) return 0;
         }

@@ -100,6 +100,8 @@ typedef struct {
     /* Of a step: mode shapes and contact rows at the Gauss nodes. */
     double *shape, *contact_rows;
     Register *acceleration, *shape_sums, *chebyshev;
+    /* Of a group of runs: roots of the energies of the blocks. */
+    Register *root_energy;
     /* Of each run: state, running peaks, smallest contact forces; whether it is finite. */
     double *state, *peak, *peak_samples, *peak_step_start, *peak_step_length, *lowest_force,
         *contact_loss_time, *finite, *vehicle_state;
@@ -171,6 +173,7 @@ static size_t partition_workspace(Workspace *w, uintptr_t start) {
     w->acceleration = allocate(start, &used, all_modes * REGISTER_WIDTH);
     w->shape_sums = allocate(start, &used, (size_t)2 * w->columns * REGISTER_WIDTH);
     w->chebyshev = allocate(start, &used, (size_t)w->terms * REGISTER_WIDTH);
+    w->root_energy = allocate(start, &used, (size_t)w->blocks * REGISTER_WIDTH);
     w->state = allocate(start, &used, states * batch_size);
     w->peak = allocate(start, &used, positions * batch_size);
     w->peak_samples = allocate(start, &used, PEAK_POINTS * positions * batch_size);
