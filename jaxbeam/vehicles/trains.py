@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-
 # Known trains that the library lacks, and why.
 LEFT_OUT = {
     "HSLM-B": "its axles and spacings by span are curves of EN 1991-2 without open numbers",
