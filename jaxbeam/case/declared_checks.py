@@ -197,6 +197,7 @@ def _unit_suffix(field: dataclasses.Field) -> str:
 
 
 def in_unit(field: dataclasses.Field) -> str:
+    """Words " in N/m" behind the meaning of a number, none where it has no unit."""
     return f" in{_unit_suffix(field)}" if _unit_suffix(field) else ""
 
 

@@ -31,7 +31,8 @@ def _explanation(part_class: type, args: tuple, arguments: dict) -> str | None:
     for name in arguments:
         if name not in fields:
             return f"{part_class.__name__} has no {name}; {suggestion(name, fields)}"
-    given = {*list(fields)[: len(args)], *arguments}
+    positional = [name for name, field in fields.items() if not field.kw_only]
+    given = {*positional[: len(args)], *arguments}
     missing = [
         f"{name}, the {field.metadata['meaning']}{in_unit(field)}"
         for name, field in fields.items()

@@ -125,6 +125,7 @@ def test_what_is_left_out_is_named():
             lambda: jb.QuarterCar(speed=1.0, body_mass=1.0, axle_mass=1.0, tyre_stiffness=1.0),
             "suspension_stiffness, the spring of the body in N/m; suspension_damping, .*give them",
         ),
+        (lambda: jb.Oscillator(2.0), "^Oscillator lacks stiffness"),
         (lambda: jb.MovingMass(mas=1.0), "MovingMass has no mas; did you mean 'mass'?"),
         (lambda: jb.PD(), "PD lacks gains, the"),
     ],
