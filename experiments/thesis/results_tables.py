@@ -51,7 +51,7 @@ def shares_table(remarks: Sequence[str], rows: Mapping[str, tuple[str, ...]]) ->
             worst, mean = float(found[2]), float(found[3])
             rigs[-1][found[1]] = f"{worst:.1f} % ({mean:.1f} %)" if worst >= 0 else NO_GAIN
     lines = ["| share of the attainable reduction, held out: worst (mean) | one span | two spans |"]
-    lines += ["|---|---|---|"]
+    lines += ["|---|---:|---:|"]
     for words, labels in rows.items():
         cells = [rig[label] for rig, label in zip(rigs, (labels[0], labels[-1]), strict=True)]
         lines.append(f"| {words} | {' | '.join(cells)} |")
