@@ -103,7 +103,7 @@ def measured_responses(
     >>> log = tuning.Log(0.01 * np.arange(1000), np.stack([force, 3.0 * force], axis=1), *columns)
     >>> found = tuning.measured_responses(log, estimator="H2", segment=1.0)
     >>> print(found.frequencies[:3].round(2), f"{abs(found.values).mean():.2f} m/s/N")
-    [0. 1. 2.] 3.00 m/s/N
+    [1. 2. 3.] 3.00 m/s/N
     """
     if estimator not in ESTIMATORS:
         raise ValueError(f"estimator must be {', '.join(ESTIMATORS)}, not {estimator!r}")
