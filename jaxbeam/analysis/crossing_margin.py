@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxbeam.analysis.linearised_loop import stationary_loops
+from jaxbeam.analysis.loops.stationary_loop import stationary_loops
 from jaxbeam.analysis.margins import margins
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.fields import concrete

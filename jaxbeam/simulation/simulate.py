@@ -20,7 +20,6 @@ from jaxbeam.integrator.running_peaks import Peaks
 from jaxbeam.integrator.time_grid import TimeGrid, grid_by_schedule
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
-from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
 from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.sensing.output_rows import sensor_history, sensor_rows
@@ -204,14 +203,6 @@ def simulate_readings(
     if not case.vehicle_sensors:
         return readings
     return xp.concatenate([readings, vehicle_readings(case, outputs.vehicles, times)], axis=1)
-
-
-def motion_of_run(
-    case: Case, times: Float[Array, " time"], plan: IntegrationPlan
-) -> tuple[Modes, Motion]:
-    """Modes, and motion at ascending times (s), of a case without a controller."""
-    integration = _integrate(case, plan, times, None)
-    return integration.model.modes, integration.outputs.motion
 
 
 class Histories(NamedTuple):
