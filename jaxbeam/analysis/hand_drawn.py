@@ -1,0 +1,56 @@
+"""A feedforward drawn by hand: the baseline beside which other laws are judged."""
+
+import numpy as np
+
+from jaxbeam.case.case import Case
+from jaxbeam.case.controller import commanded
+from jaxbeam.case.fields import concrete
+from jaxbeam.control.feedforward import Feedforward
+from jaxbeam.model.statics import influence_line, static_deflection_per_command
+
+POINTS = 21  # shares of the crossing at which the table is drawn
+RAMP_UP, RAMP_DOWN = 0.2, 0.1  # shares of the crossing, at entry and exit
+GATE_SHARES = -0.25, -0.08  # gates before the beam, in lengths of it, where none are given
+
+
+def hand_drawn_law(
+    case: Case, period: float = 0.01, delay: float = 0.0, gates: tuple[float, float] | None = None
+) -> Feedforward:
+    """Trapezium over the position of the load, drawn with nothing but signs and limits.
+
+    Each actuator goes to the limit that lifts the beam where the load is, with ramps over the
+    first fifth and the last tenth of the crossing, and is read ahead by the delay and half a
+    period. Without limits the command is the one that lifts that place by what the heaviest load
+    deflects it statically. `gates` (m) are by default a quarter and a twelfth of the length before
+    the beam.
+
+    Raises ValueError for a case without loads or without actuators that take commands, and as
+    `influence_line` does.
+    """
+    active = commanded(case.actuators)
+    if not case.loads or not active:
+        raise ValueError("a law by hand needs a load and an actuator that takes commands")
+    length = float(concrete(case.beam.length))
+    shares = np.linspace(0.0, 1.0, POINTS)
+    leftwards = np.asarray(concrete(case.loads[0].trajectory(case.beam.length).direction())) < 0
+    places = length * (1.0 - shares if leftwards else shares)
+    lift = np.asarray(static_deflection_per_command(case, places))
+    deflection = np.diagonal(np.asarray(influence_line(case, places, places)))
+    gravity = case.run.gravity
+    weights = [np.sum(concrete(load.vehicle(gravity).static_loads)) for load in case.loads]
+    ramp = np.minimum(1.0, np.minimum(shares / RAMP_UP, (1.0 - shares) / RAMP_DOWN))
+    rows = []
+    for i in active:
+        limits = case.actuators[i].command_limits()
+        if limits is None:
+            largest = np.where(np.abs(lift[i]) > 0.1 * np.abs(lift[i]).max(), lift[i], np.inf)
+            command = -max(weights) * deflection / largest / len(active)
+        else:
+            low, high = concrete(limits)
+            command = np.where(lift[i] >= 0, high, low)
+        rows.append(ramp * command)
+    if gates is None:
+        gates = tuple(length * (1 - x if leftwards else x) for x in GATE_SHARES)
+    return Feedforward(
+        list(gates), shares, np.array(rows), lead=delay + period / 2, period=period, delay=delay
+    )
