@@ -4,18 +4,23 @@ The laws are designed for the case as it is; what a run changes of the plant the
 """
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbeam.analysis.compare import Comparison, compare
 from jaxbeam.analysis.hand_drawn import hand_drawn_law
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 from tuning.control.fixed_design import with_fixed_design
 from tuning.control.load_cases import PLANT_PREFIXES, AddressValues, run_case
+from tuning.control.tuning_result import RunSetResult, beside_no_control
 
 HAND_DRAWN = "drawn by hand"
 OF_CONTROLLER = "controller."
@@ -56,8 +61,50 @@ def with_hand_drawn(
     return dict(controllers) | {HAND_DRAWN: hand_drawn_law(case, **numbers)}
 
 
+def hand_drawn_peaks(case: Case, runs: Sequence[AddressValues]) -> Float[np.ndarray, " run"] | None:
+    """Largest deflections (m) at the sensors under the law drawn by hand, by run.
+
+    None for a case that allows no such law: without loads, say, or with ones that stand.
+    """
+    laws = {} if case.controller is None else {"its own": case.controller}
+    free = dataclasses.replace(case, controller=None)
+    try:
+        law = with_hand_drawn(case, laws)[HAND_DRAWN]
+        cases = [_changed(free, {HAND_DRAWN: law}, run) for run in runs]
+        for one, controllers in cases:
+            check_case(dataclasses.replace(one, controller=controllers[HAND_DRAWN]))
+    except ValueError:
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ContactLossWarning)
+        records = [
+            simulate(dataclasses.replace(one, controller=controllers[HAND_DRAWN]))
+            for one, controllers in cases
+        ]
+    return np.array([float(np.max(record.peak_deflection)) for record in records])
+
+
+def beside_hand_drawn(outcome: RunSetResult, peaks: Float[np.ndarray, " run"]) -> str:
+    """Sentence on the peaks (m) under the law drawn by hand in the runs of a tuning."""
+    reductions = 1 - peaks / outcome.uncontrolled_peaks
+    words = (
+        f"drawn by hand, with no number tuned: worst {outcome.name} run: peak"
+        f" {beside_no_control(reductions.min())}"
+    )
+    if np.isfinite(outcome.least_peaks).all():
+        shares = outcome.attained_shares(peaks)
+        words += f"; of the attainable reduction at least {shares.min():.1%}, {shares.mean():.1%}"
+        words += " in the mean"
+    return words
+
+
 def _compare_run(case: Case, laws, run: AddressValues, period) -> Comparison:
     """Comparison on one run."""
+    return compare(*_changed(case, laws, run), period)
+
+
+def _changed(case: Case, laws, run: AddressValues) -> tuple[Case, dict[str, AbstractController]]:
+    """Case of a run, and the laws designed for the case as it is, with the settings of the run."""
     settings = {a.removeprefix(OF_CONTROLLER): v for a, v in run.items() if _is_setting(a)}
     others = {address: value for address, value in run.items() if not _is_setting(address)}
     changed = run_case(case, others)
@@ -67,7 +114,7 @@ def _compare_run(case: Case, laws, run: AddressValues, period) -> Comparison:
     for name, law in laws.items():
         one = _with_settings(dataclasses.replace(changed, controller=law), settings)
         controllers[name] = with_fixed_design(one, nominal, layout).controller
-    return compare(changed, controllers, period)
+    return changed, controllers
 
 
 def _is_setting(address: str) -> bool:

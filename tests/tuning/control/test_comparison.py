@@ -10,7 +10,13 @@ import jaxbeam as jb
 from jaxbeam.analysis.hand_drawn import hand_drawn_law
 from jaxbeam.case.controller import Measurement
 from jaxbeam.model.statics import influence_line
-from tuning.control.comparison import HAND_DRAWN, compare_runs
+from tuning.control.comparison import (
+    HAND_DRAWN,
+    beside_hand_drawn,
+    compare_runs,
+    hand_drawn_peaks,
+)
+from tuning.control.tuning_result import RunSetResult
 
 CASE = jb.Case(
     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.03, modes=1),
@@ -71,6 +77,25 @@ def test_runs_change_loads_plant_delay_and_gates_but_not_the_design():
     assert all(case.controller.nominal_plant.case.beam.flexural_rigidity == 12.0 for case in cases)
     assert_allclose(cases[1].controller.gate_errors, [0.01, 0.0])
     assert all(metrics.share < 1.001 for metrics in found.metrics.values())
+
+
+def test_law_by_hand_beside_a_tuning():
+    """Its peaks are those of simulations, and shares those of the runs of the tuning."""
+    runs = {"loads.0.mass": 0.3}, {"loads.0.mass": 0.4}
+    peaks = hand_drawn_peaks(CASE, runs)
+    law = hand_drawn_law(dataclasses.replace(CASE, controller=None))
+    found = [
+        jb.simulate(jb.replace(dataclasses.replace(CASE, controller=law), run)).peak_deflection[0]
+        for run in runs
+    ]
+    assert_allclose(peaks, found, rtol=1e-9)
+    none = np.full(2, np.nan)
+    outcome = RunSetResult("held-out", runs, 2 * peaks, none, none, peaks / 2, none, [1.0, 1.0])
+    assert beside_hand_drawn(outcome, peaks) == (
+        "drawn by hand, with no number tuned: worst held-out run: peak 50.0% below no control; of the"
+        " attainable reduction at least 66.7%, 66.7% in the mean"
+    )
+    assert hand_drawn_peaks(dataclasses.replace(CASE, actuators=()), runs) is None
 
 
 @pytest.mark.parametrize("case", [dataclasses.replace(CASE, loads=())])
