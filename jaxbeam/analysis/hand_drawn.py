@@ -10,19 +10,19 @@ from jaxbeam.model.statics import influence_line, static_deflection_per_command
 
 POINTS = 21  # shares of the crossing at which the table is drawn
 RAMP_UP, RAMP_DOWN = 0.2, 0.1  # shares of the crossing, at entry and exit
+MIN_LIFT = 0.1  # of the largest lift of an actuator, below which it does not act
 GATE_SHARES = -0.25, -0.08  # gates before the beam, in lengths of it, where none are given
 
 
 def hand_drawn_law(
     case: Case, period: float = 0.01, delay: float = 0.0, gates: tuple[float, float] | None = None
 ) -> Feedforward:
-    """Trapezium over the position of the load, drawn with nothing but signs and limits.
+    """Table over the position of the load, drawn from statics and limits alone.
 
-    Each actuator goes to the limit that lifts the beam where the load is, with ramps over the
-    first fifth and the last tenth of the crossing, and is read ahead by the delay and half a
-    period. Without limits the command is the one that lifts that place by what the heaviest load
-    deflects it statically. `gates` (m) are by default a quarter and a twelfth of the length before
-    the beam.
+    Each actuator lifts the beam where the load is by its part of what the heaviest load of the case
+    deflects it statically, within its limits, which makes a trapezium of a weak one; with ramps
+    over the first fifth and the last tenth of the crossing, read ahead by the delay and half a
+    period. `gates` (m) are by default a quarter and a twelfth of the length before the beam.
 
     Raises ValueError for a case without loads or without actuators that take commands, and as
     `influence_line` does.
@@ -41,14 +41,10 @@ def hand_drawn_law(
     ramp = np.minimum(1.0, np.minimum(shares / RAMP_UP, (1.0 - shares) / RAMP_DOWN))
     rows = []
     for i in active:
+        able = np.abs(lift[i]) > MIN_LIFT * np.abs(lift[i]).max()
+        command = -max(weights) * deflection / np.where(able, lift[i], np.inf) / len(active)
         limits = case.actuators[i].command_limits()
-        if limits is None:
-            largest = np.where(np.abs(lift[i]) > 0.1 * np.abs(lift[i]).max(), lift[i], np.inf)
-            command = -max(weights) * deflection / largest / len(active)
-        else:
-            low, high = concrete(limits)
-            command = np.where(lift[i] >= 0, high, low)
-        rows.append(ramp * command)
+        rows.append(ramp * (command if limits is None else np.clip(command, *concrete(limits))))
     if gates is None:
         gates = tuple(length * (1 - x if leftwards else x) for x in GATE_SHARES)
     return Feedforward(

@@ -2,6 +2,8 @@
 
 import json
 
+import pytest
+
 from jaxbeam.cli import main
 
 CASE = """
@@ -42,12 +44,14 @@ def test_compare_over_the_runs_of_a_file(tmp_path, capsys):
     case, runs = tmp_path / "weak.toml", tmp_path / "runs.toml"
     case.write_text(CASE)
     runs.write_text(RUNS)
-    assert main(["compare", str(case), "--cases", str(runs), "--json"]) == 0
+    with pytest.raises(SystemExit, match="0"):
+        main(["compare", str(case), "--cases", str(runs), "--json"])
     found = json.loads(capsys.readouterr().out)
     assert list(found["over_all"]) == ["weak", "drawn by hand"]
     assert len(found["cases"]) == 2
     assert all(11 < one["values"]["beam.flexural_rigidity"] < 13 for one in found["cases"])
     shares = [one["controllers"]["weak"]["share"] for one in found["cases"]]
     assert found["over_all"]["weak"]["worst_share"] == min(shares)
-    assert main(["compare", str(case), "--cases", str(runs), "--over", "loads.0.mass=1,2"]) == 2
+    with pytest.raises(SystemExit, match="1"):
+        main(["compare", str(case), "--cases", str(runs), "--over", "loads.0.mass=1,2"])
     assert "--cases has runs of its own" in capsys.readouterr().err
