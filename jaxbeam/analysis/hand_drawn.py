@@ -46,7 +46,13 @@ def hand_drawn_law(
         limits = case.actuators[i].command_limits()
         rows.append(ramp * (command if limits is None else np.clip(command, *concrete(limits))))
     if gates is None:
-        gates = tuple(length * (1 - x if leftwards else x) for x in GATE_SHARES)
+        first, second = (length * (1 - x if leftwards else x) for x in GATE_SHARES)
+        gates = first, second
     return Feedforward(
-        list(gates), shares, np.array(rows), lead=delay + period / 2, period=period, delay=delay
+        gates=list(gates),
+        shares=shares,
+        values=np.array(rows),
+        lead=delay + period / 2,
+        period=period,
+        delay=delay,
     )

@@ -42,8 +42,9 @@ def plant_by_scipy(rigidity, delay):
     stiffness, mass = rigidity * (np.pi / 0.6) ** 4, 0.5
     omega = np.sqrt(stiffness / mass)
     continuous = [2 / (mass * 0.6)], [1.0, 0.04 * omega, omega**2]
-    numerator, denominator, _ = scipy.signal.cont2discrete(continuous, PERIOD)
-    return denominator[1:], np.append(np.zeros(delay), numerator.ravel()[1:])
+    system = scipy.signal.cont2discrete(continuous, PERIOD)
+    numerator, denominator = np.ravel(system[0]), np.ravel(system[1])
+    return denominator[1:], np.append(np.zeros(delay), numerator[1:])
 
 
 def probed(law, commands, readings, state=None):
