@@ -12,7 +12,6 @@ from jaxbeam.analysis.margins import margins
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.fields import concrete
 from jaxbeam.control.predictive.mpc import MPC
-from jaxbeam.estimation.kalman import Kalman
 
 LOAD_POSITIONS = 13  # load positions along a crossing at which margins are computed
 MIN_RATE = 1e-6  # 1/s; a pole whose real part is smaller counts as marginally stable
@@ -75,8 +74,6 @@ def stability_margin(case: Case) -> StabilityMargin:
         return _no_margin("commands that do not depend on readings close no loop")
     if isinstance(controller, MPC) and controller.solver != "unconstrained":
         return _no_margin("a constrained MPC law is not linear at its limits")
-    if controller.period is not None and _has_varying_filter(controller):
-        return _no_margin("the gain of the Kalman filter varies as the loads cross")
     try:
         times = _crossing_times(case)
         found = stationary_loops(case, times)
@@ -102,12 +99,6 @@ def stability_margin(case: Case) -> StabilityMargin:
     return StabilityMargin(
         min(one.gain for one in margins_found), min(one.delay for one in margins_found)
     )
-
-
-def _has_varying_filter(controller) -> bool:
-    """Whether a Kalman filter propagates its covariance, which has no equilibrium of its own."""
-    estimator = getattr(controller, "estimator", None)
-    return isinstance(estimator, Kalman) and estimator.loads != "ignored"
 
 
 def _no_margin(obstacle: str) -> StabilityMargin:
