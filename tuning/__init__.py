@@ -32,6 +32,7 @@ from tuning.logs.log import Log
 from tuning.logs.quality import find_faults, mask
 from tuning.logs.reading import read_log, read_logs
 from tuning.modal.fit import ModalFit
+from tuning.modal.forced.estimates.measured_responses import MeasuredResponses, measured_responses
 from tuning.modal.identify_modes import identify_modes
 from tuning.parameters.prior import Prior
 from tuning.weighing.axles import AxleWeighing, weigh_axles
@@ -48,6 +49,7 @@ __all__ = [
     "InfluenceLines",
     "LoadCases",
     "Log",
+    "MeasuredResponses",
     "ModalFit",
     "ModalParameterFit",
     "Objective",
@@ -71,6 +73,7 @@ __all__ = [
     "lexicographic",
     "load_fit",
     "mask",
+    "measured_responses",
     "model_influence_lines",
     "pareto",
     "predict_held_out",

@@ -8,7 +8,7 @@ import equinox as eqx
 from jaxtyping import Float
 
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
-from jaxbeam.integrator.monitored_rows import largest_per_energy, monitored_rows
+from jaxbeam.integrator.monitored_rows import bounds_by_energy, monitored_rows
 from jaxbeam.integrator.propagators import PEAK_NODES, Propagators, propagators
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.modal_model import ModalModel
@@ -20,11 +20,10 @@ from jaxbeam.runtime.arrays import Array, xp
 class DiscreteModel(eqx.Module):
     """Modal model on a time grid: propagators of each step length, rows of monitored outputs.
 
-    Outputs are deflections, or other quantities of sensors. `flexibility` bounds each of them by
-    the energy: output^2 <= flexibility (q'^2 + q K q), for a deflection the static deflection (m/N)
-    under a unit force there. With `with_node_states`, step matrices include
-    the states at the nodes. `load_influence` is that of statically corrected outputs. Peaks are
-    those of the `magnitude` of an output, by default its absolute value.
+    Outputs are deflections, or other quantities of sensors. `energy_bounds` bound each of them by
+    the energies of the blocks (see `bounds_by_energy`). With `with_node_states`, step matrices
+    include the states at the nodes. `load_influence` is that of statically corrected outputs. Peaks
+    are those of the `magnitude` of an output, by default its absolute value.
     """
 
     model: ModalModel
@@ -32,7 +31,7 @@ class DiscreteModel(eqx.Module):
     propagators: Propagators
     monitored_transition: Float[Array, "length sample block side"] | None
     monitored_input: Float[Array, "length sample force block input"] | None
-    flexibility: Float[Array, " position"] | None
+    energy_bounds: Float[Array, "position block"] | None
     modal_command_matrix: Float[Array, "mode actuator"] | None
     with_node_states: bool = eqx.field(static=True)
     load_influence: LoadInfluence | None = None
@@ -41,7 +40,7 @@ class DiscreteModel(eqx.Module):
     @property
     def position_count(self) -> int:
         """Number of monitored positions."""
-        return 0 if self.flexibility is None else self.flexibility.shape[0]
+        return 0 if self.energy_bounds is None else self.energy_bounds.shape[0]
 
 
 def discrete_model(
@@ -80,7 +79,7 @@ def discrete_model(
         step_propagators,
         transition,
         force_response,
-        largest_per_energy(model, outputs, rows),
+        bounds_by_energy(model, outputs, rows),
         commands,
         with_node_states,
         influence,
@@ -103,6 +102,6 @@ def signed_both_ways(discrete: DiscreteModel) -> DiscreteModel:
         load_influence=influence and dataclasses.replace(influence, mirrored=True),
         monitored_transition=both_signs(discrete.monitored_transition),
         monitored_input=both_signs(discrete.monitored_input),
-        flexibility=xp.tile(discrete.flexibility, 2),
+        energy_bounds=xp.tile(discrete.energy_bounds, (2, 1)),
         magnitude=operator.pos,
     )

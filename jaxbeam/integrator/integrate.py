@@ -20,6 +20,7 @@ from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.input_steps import advance_known_with_inputs, step_with_inputs
 from jaxbeam.integrator.kinks.steps import weights_with_impulses, with_impulses
+from jaxbeam.integrator.monitored_rows import energies
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
 from jaxbeam.integrator.running_peaks import RunningPeaks, initial_peaks, update_peaks
 from jaxbeam.integrator.step import (
@@ -220,7 +221,7 @@ def integrate_peaks(
     beam at once. Forward mode only.
     """
     chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy)
-    grid, stiffness = discrete.grid, discrete.model.stiffness()
+    grid = discrete.grid
 
     def unfinished(carry):
         *_, first_step, continues = carry
@@ -228,14 +229,11 @@ def integrate_peaks(
 
     def can_raise_peak(state, running_peaks, time):
         all_loads_left = time >= grid.last_exit
-        coordinates, rates = (
-            state[discrete.model.coordinate_index],
-            state[discrete.model.rate_index],
-        )
-        energy = xp.sum(rates**2, axis=0) + xp.sum(coordinates * (stiffness @ coordinates), axis=0)
-        deflection_bound = xp.sqrt(discrete.flexibility[:, None] * energy)
+        roots = xp.sqrt(energies(discrete.model, state[: discrete.model.state_count]))
+        bound = discrete.energy_bounds @ roots
         # A run that has diverged cannot raise its peak further.
-        settled = xp.all((deflection_bound < running_peaks.estimate) | ~xp.isfinite(energy))
+        diverged = ~xp.all(xp.isfinite(roots), axis=0)
+        settled = xp.all((bound < running_peaks.estimate) | diverged)
         return ~(all_loads_left & settled)
 
     def next_chunk(carry):

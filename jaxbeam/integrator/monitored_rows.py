@@ -120,48 +120,62 @@ def _feedthrough(
     return direct
 
 
-def largest_per_energy(
+def bounds_by_energy(
     model: ModalModel, outputs: OutputRows, corrected: CorrectionRows | None = None
-) -> Float[Array, " output"]:
-    """Bound of the square of each free output per q'^2 + q K q; infinite with rigid-body modes.
+) -> Float[Array, "output block"]:
+    """Bounds of free outputs by the energies E = q'^2 + q K q of the blocks of a model.
 
-    For a row s on q it is s K^-1 s; on q', s s; on q'' = -K q - D q', (sqrt(s K s) + |D s|)^2; of
-    an output with more than one row, the square of the sum of their roots.
+    An output is at most the sum over the blocks of its bound times sqrt(E). Blocks do not couple,
+    so that no E grows. Infinite with rigid-body modes. For a row s on the q of a block it is
+    sqrt(s K^-1 s); on q', sqrt(s s); on q'' = -K q - D q', sqrt(s K s) + |D s|; of an output with
+    more than one row, the sum.
     """
-    orders = np.array(outputs.time_derivatives, int)
-    bounds = xp.zeros(orders.shape)
+    blocks, orders = model.state_matrix.shape[0], np.array(outputs.time_derivatives, int)
+    bounds = xp.zeros((orders.size, blocks))
     deflections, rates, accelerations = (np.flatnonzero(orders == order) for order in range(3))
     if deflections.size:
-        bounds = add_at(bounds, deflections, _static_flexibility(model, outputs.rows[deflections]))
+        bound = _root_of_static_flexibility(model, outputs.rows[deflections])
+        bounds = add_at(bounds, deflections, bound)
     if rates.size:
-        bounds = add_at(bounds, rates, xp.sum(outputs.rows[rates] ** 2, axis=1))
+        bounds = add_at(bounds, rates, _norms_by_block(outputs.rows[rates], blocks))
     if accelerations.size:
         bound = _of_accelerations(model, outputs.rows[accelerations])
         bounds = add_at(bounds, accelerations, bound)
-    if corrected is None or corrected.rates is None:
-        return bounds
-    roots = xp.sqrt(bounds) + xp.sqrt(xp.sum(corrected.rates**2, axis=1))
-    if corrected.accelerations is not None:
-        roots = roots + xp.sqrt(_of_accelerations(model, corrected.accelerations))
-    return roots**2
+    if corrected is not None and corrected.rates is not None:
+        bounds = bounds + _norms_by_block(corrected.rates, blocks)
+    if corrected is not None and corrected.accelerations is not None:
+        bounds = bounds + _of_accelerations(model, corrected.accelerations)
+    return bounds
 
 
-def _of_accelerations(model: ModalModel, rows) -> Float[Array, " output"]:
+def energies(model: ModalModel, states: Float[Array, "state batch"]) -> Float[Array, "block batch"]:
+    """Energies q'^2 + q K q of the blocks of a model."""
+    q, rates = states[model.coordinate_index], states[model.rate_index]
+    parts = rates**2 + q * (model.stiffness() @ q)
+    return xp.sum(parts.reshape(-1, model.modes_per_block, parts.shape[-1]), axis=1)
+
+
+def _norms_by_block(rows, blocks: int):
+    return xp.sqrt(xp.sum(rows.reshape(rows.shape[0], blocks, -1) ** 2, axis=2))
+
+
+def _of_accelerations(model: ModalModel, rows) -> Float[Array, "output block"]:
+    blocks = model.state_matrix.shape[0]
     damping = -model.A[model.rate_index, model.rate_index]
-    elastic = xp.sum(rows * (rows @ model.stiffness()), axis=1)
-    damped = xp.sum((rows @ damping) ** 2, axis=1)
-    return (xp.sqrt(elastic) + xp.sqrt(damped)) ** 2
+    elastic = (rows * (rows @ model.stiffness())).reshape(rows.shape[0], blocks, -1)
+    return xp.sqrt(xp.sum(elastic, axis=2)) + _norms_by_block(rows @ damping, blocks)
 
 
-def _static_flexibility(
+def _root_of_static_flexibility(
     model: ModalModel, shapes: Float[Array, "position mode"]
-) -> Float[Array, " position"]:
-    """Static deflection (m/N) at positions under a unit force; infinite with rigid-body modes.
+) -> Float[Array, "position block"]:
+    """Root of the static deflection (m/N) of each block at positions under a unit force there.
 
-    Uncoupled modes need no factorisation, which would dominate the time.
+    Infinite with rigid-body modes. Uncoupled modes need no factorisation, which would dominate the
+    time.
     """
     if model.modes_per_block == 1:
-        return xp.sum(shapes**2 / -model.state_matrix[:, 1, 0], axis=1)
+        return xp.abs(shapes) / xp.sqrt(-model.state_matrix[:, 1, 0])
     half_solved = solve_triangular(cholesky(model.stiffness()), shapes.T, lower=True)
-    flexibility = xp.sum(half_solved**2, axis=0)
-    return xp.where(xp.isfinite(flexibility), flexibility, xp.inf)
+    root = _norms_by_block(half_solved.T, model.state_matrix.shape[0])
+    return xp.where(xp.isfinite(root), root, xp.inf)

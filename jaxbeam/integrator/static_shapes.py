@@ -7,10 +7,10 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.integrator.integrate import longest_force_step, max_stable_step
-from jaxbeam.model.load_set import load_set
-from jaxbeam.model.modal_model import has_coupling, modal_model
+from jaxbeam.model.load_set import LoadSet, load_set
+from jaxbeam.model.modal_model import ModalModel, has_coupling, modal_model
 from jaxbeam.model.modes import Layout, mesh_layout
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 
 
@@ -42,8 +42,13 @@ def static_shapes(case: Case) -> StaticShapes:
 def model_limits(case: Case, layout: Layout):
     """Longest stable step (s), whether frequencies repeat, entry and exit times (load, 2) in s."""
     model, loads = modal_model(case, layout), load_set(case, layout)
-    limit = xp.minimum(max_stable_step(model, loads), longest_force_step(case, loads))
+    limit = longest_stable_step(case, model, loads)
     return limit, model.modes.has_repeated, loads.entry_exit_times()
+
+
+def longest_stable_step(case: Case, model: ModalModel, loads: LoadSet) -> Float[Array, ""]:
+    """Longest step (s) that is stable, and resolves the passages of forces."""
+    return xp.minimum(max_stable_step(model, loads), longest_force_step(case, loads))
 
 
 def max_concurrent_loads(entry_exit_times: Float[np.ndarray, "load 2"]) -> int:

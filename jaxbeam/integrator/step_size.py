@@ -16,7 +16,7 @@ from jaxbeam.integrator.integrate import integrate_history, integrate_peaks
 from jaxbeam.integrator.running_peaks import RunningPeaks
 from jaxbeam.integrator.static_shapes import StaticShapes, model_limits
 from jaxbeam.integrator.time_grid import grid_by_step_length
-from jaxbeam.model.load_set import load_set
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.runtime.arrays import Array, xp
 
@@ -75,11 +75,11 @@ def choose_step_size(
     step = longest_trial_step(case, shapes)
     check_step_count(float(concrete(case.run.duration)) / step, step)
     model = modal_model(case, shapes.layout, shapes.coupled)
-    case = _without_later_vibration(case, model)
+    case, loads = without_later_vibration(case, model), load_set(case, shapes.layout)
     halvings, least = 0, rounding_deflection(case, model)
     for _ in range(MAX_TRIALS):
         (times, coarse), (_, fine) = (
-            _trial_run(case, model, shapes, step, divided) for divided in (1, 2)
+            trial_run(case, model, loads, shapes.max_loads, step, divided) for divided in (1, 2)
         )
         deflections = (trial_deflections(case, model, states) for states in (coarse, fine))
         error = largest_change(*deflections, least)
@@ -94,7 +94,7 @@ def choose_step_size(
     raise RuntimeError(NO_STEP.format(tolerance))
 
 
-def _without_later_vibration(case: Case, model: ModalModel) -> Case:
+def without_later_vibration(case: Case, model: ModalModel) -> Case:
     """The case until one period of the lowest mode after the last exit.
 
     Free vibration is exact with any step, and no error grows in it.
@@ -105,18 +105,22 @@ def _without_later_vibration(case: Case, model: ModalModel) -> Case:
     return replace(case, {"run.duration": min(end, float(concrete(case.run.duration)))})
 
 
-def _trial_run(
-    case: Case, model: ModalModel, shapes: StaticShapes, max_step: float, divided: int
+def trial_run(
+    case: Case,
+    model: ModalModel,
+    loads: LoadSet,
+    max_loads: int,
+    max_step: float,
+    divided: int = 1,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Boundaries of steps of at most `max_step` (s), and states there (boundary, state, batch).
 
-    Each step is `divided` into so many.
+    Of a run without controller, with at most `max_loads` on the beam at once. Each step is
+    `divided` into so many.
     """
     grid = grid_by_step_length(case, model, np.asarray(max_step), refinement=divided)
     discrete, steps = discrete_model(model, grid, None), int(grid.step_count)
-    _, states, *_ = integrate_history(
-        discrete, load_set(case), max_loads=shapes.max_loads, steps=steps
-    )
+    _, states, *_ = integrate_history(discrete, loads, max_loads=max_loads, steps=steps)
     _, starts, _ = grid.locate_steps(np.arange(0, steps, divided))
     return np.append(starts, grid.boundaries[-1]), np.asarray(states[::divided])
 

@@ -16,7 +16,11 @@ from jaxbeam.case.fields import is_concrete
 from jaxbeam.model.flexibility import check_supported
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import Layout, Modes, mesh_layout
-from jaxbeam.model.statics import influence_line, static_deflection_per_port_force
+from jaxbeam.model.statics import (
+    static_deflection_per_port_force,
+    unchecked_influence_line,
+    validated_layout,
+)
 from jaxbeam.model.theory.sections import rigidity_at
 from jaxbeam.runtime.arrays import Array, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
@@ -61,9 +65,14 @@ def residual_flexibility(
 
     In m/N, or of an x-derivative as there. Raises ValueError as `influence_line` does.
     """
-    layout = mesh_layout(case) if layout is None else layout
-    exact = influence_line(case, x, load_positions, derivative, layout)
+    layout = validated_layout(case, layout, x=x, positions=load_positions)
+    return _residual_flexibility(case, x, load_positions, derivative, layout)
+
+
+def _residual_flexibility(case: Case, x, load_positions, derivative: int, layout: Layout):
+    """The same of a case and positions that are known to be valid."""
     x, load_positions = xp.asarray(x, float), xp.asarray(load_positions, float)
+    exact = unchecked_influence_line(case, layout, x, load_positions, derivative)
     return exact - _modal_influence_line(case, layout, x, load_positions, derivative)
 
 
@@ -109,14 +118,14 @@ def corrected_history(
     if case.loads:
         on_beam = xp.isfinite(motion.load_position)
         positions = xp.where(on_beam, motion.load_position, 0.0)
-        residual = residual_flexibility(case, x, positions, derivative, layout)
+        residual = _residual_flexibility(case, x, positions, derivative, layout)
         # Wheels of vehicles press on the ground, too.
         forces = xp.where(on_beam, motion.contact_force, 0.0)
         history = history + xp.einsum("tl,tl...->t...", forces, residual)
     for support in case.supports:
         if support.damping is not None:
             velocity = motion.rates @ modes.shapes(support.position)
-            residual = residual_flexibility(case, x, support.position, derivative, layout)
+            residual = _residual_flexibility(case, x, support.position, derivative, layout)
             history = history + xp.tensordot(support.damping * velocity, residual, axes=0)
     if case.actuators:
         residual = residual_port_flexibility(case, x, derivative, layout)

@@ -24,7 +24,8 @@ PEAK_POSITIONS = tuple(float(share) for share in np.linspace(0, 1, 10))
 
 
 @compiled_if_traced
-def _influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
+def unchecked_influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
+    """`influence_line` of a case and positions (arrays) that are known to be valid."""
     greens = flexibility(case, layout, x.reshape(-1), derivative)
     length = case.beam.length
     order = abs(derivative)  # that of the slope is 1, too
@@ -53,8 +54,8 @@ def influence_line(
     -0.027778
     """
     x, load_positions = xp.asarray(x, float), xp.asarray(load_positions, float)
-    layout = _validated_layout(case, layout, x=x, positions=load_positions)
-    return _influence_line(case, layout, x, load_positions, derivative)
+    layout = validated_layout(case, layout, x=x, positions=load_positions)
+    return unchecked_influence_line(case, layout, x, load_positions, derivative)
 
 
 def static_deflection(
@@ -114,7 +115,7 @@ def static_deflection_per_port_force(
     In m/N for a force, 1/N for a couple; otherwise as `static_deflection_per_command`.
     """
     x = xp.asarray(x, float)
-    layout = _validated_layout(case, layout, x=x)
+    layout = validated_layout(case, layout, x=x)
     return _deflection_per_port_force(case, layout, x, derivative)
 
 
@@ -153,7 +154,7 @@ def static_peak(
     1.89 mm
     """
     x = xp.asarray(x, float)
-    layout = _validated_layout(case, layout, x=x)
+    layout = validated_layout(case, layout, x=x)
     if not case.loads:
         return xp.zeros(x.shape)
     return _static_peak(case, layout, x, derivative)
@@ -182,7 +183,7 @@ def _static_peak(case: Case, layout: Layout, x, derivative: int):
     return (highest * length ** (3 - order) / case.beam.bending_stiffness).reshape(x.shape)
 
 
-def _validated_layout(case: Case, layout: Layout | None, **positions) -> Layout:
+def validated_layout(case: Case, layout: Layout | None, **positions) -> Layout:
     """Layout of a case, after checks of its concrete numbers, positions and supports.
 
     Raises ValueError as `influence_line` does.

@@ -1,19 +1,19 @@
 """Errors of what the sensors of a run measure: of its time steps, and of the modes left out."""
 
-import dataclasses
-
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.quantities import QUANTITIES, quantity_of
+from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.step_size import StepTrial
 from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.sensing.output_rows import sensor_history
-from jaxbeam.model.static_correction import Motion, corrected_history
+from jaxbeam.model.sensing.mode_band import band_weights
+from jaxbeam.model.sensing.output_rows import beside, modal_row, sensor_history
+from jaxbeam.model.static_correction import Motion, corrected_history, is_supported
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation.motion.at_samples import motion_at
 
@@ -42,7 +42,7 @@ def step_errors(case: Case, model: ModalModel, trial: StepTrial) -> Float[Array,
     errors = []
     for sensor in case.sensors:
         known, better = (sensor_history(case, model.modes, m, sensor) for m in (coarse, fine))
-        errors.append(_relative_change(better, known))
+        errors.append(_relative(better - known, better))
     return xp.array(errors).reshape(-1)
 
 
@@ -51,47 +51,47 @@ def truncation_errors(case: Case, modes: Modes, motion: Motion) -> Float[Array, 
     """Estimated truncation error of the quantity of each sensor, relative to its largest value.
 
     From the samples of a run. Of a deflection or rotation, the largest part that the static
-    correction would add. Of others, the largest change with the dynamic part of the three highest
-    modes left out, which exceeds that of all higher modes where their contributions fall;
-    accelerations under point forces do not converge, and their modes are a convention. NaN for
-    those of a case with one mode, and for slopes of a beam that is not uniform.
+    correction would add. Of others, the largest part of the three highest modes, which exceeds that
+    of all higher modes where their contributions fall: of what is statically corrected, their
+    dynamic part, -(q'' + damping q') / stiffness. Accelerations under point forces do not converge,
+    and their modes are a convention. NaN for those of a case with one mode, and for slopes of a
+    beam that is not uniform.
     """
     errors = []
-    fewer = _with_fewer_modes(case, modes, motion)
     for sensor in case.sensors:
         full = sensor_history(case, modes, motion, sensor)
         quantity = QUANTITIES[sensor.quantity]
         if quantity.of_axis and not is_uniform(case):
-            other = full * xp.nan
+            change = full * xp.nan
         elif quantity.time_derivative == 0 and not quantity.bends:
-            other = corrected_history(case, modes, motion, sensor.position, quantity.x_derivative)
+            order = quantity.x_derivative
+            change = corrected_history(case, modes, motion, sensor.position, order) - full
+        elif case.beam.modes == 1:
+            change = full * xp.nan
         else:
-            other = full * xp.nan if fewer is None else sensor_history(*fewer, sensor)
-        errors.append(_relative_change(full, other))
+            change = _highest_modes(case, modes, motion, sensor)
+        errors.append(_relative(change, full))
     return xp.array(errors).reshape(-1)
 
 
-def _relative_change(values, others):
-    """Largest difference of others, relative to the largest value; zero where all are zero."""
-    largest, change = xp.max(xp.abs(values)), xp.max(xp.abs(values - others))
+def _highest_modes(
+    case: Case, modes: Modes, motion: Motion, sensor: Sensor
+) -> Float[Array, " time"]:
+    """Part of the LEFT_OUT highest modes, or of all but one, in what a sensor measures."""
+    quantity = quantity_of(sensor.quantity, sensor.fibre_distance, sensor.section_modulus)
+    highest = np.s_[max(1, case.beam.modes - LEFT_OUT) :]
+    parameters = sensor.quantity, sensor.fibre_distance, sensor.section_modulus
+    x = beside(case, sensor.position) if quantity.bends else sensor.position
+    row = modal_row(modes.fields, case, x, *parameters) * band_weights(modes, sensor.mode_band)
+    amplitudes = tuple(part[:, highest] for part in motion[:3])
+    if quantity.bends and is_supported(case, modes.layout):
+        _, rates, accelerations = amplitudes
+        dynamic = -(accelerations + modes.damping[highest] * rates) / modes.stiffness[highest]
+        return dynamic @ row[highest]
+    return amplitudes[quantity.time_derivative] @ row[highest]
+
+
+def _relative(change, values):
+    """Largest change relative to the largest of some values; zero where all are zero."""
+    largest, change = xp.max(xp.abs(values)), xp.max(xp.abs(change))
     return xp.where(largest == 0, 0.0, change / xp.where(largest == 0, 1.0, largest))
-
-
-def _with_fewer_modes(
-    case: Case, modes: Modes, motion: Motion
-) -> tuple[Case, Modes, Motion] | None:
-    """A run without its highest modes; None with one mode."""
-    count = case.beam.modes
-    kept = count - min(LEFT_OUT, count - 1)
-    if kept == count:
-        return None
-    beam = dataclasses.replace(case.beam, modes=kept, damping_ratio=_of_lowest(case.beam, kept))
-    amplitudes = {name: getattr(motion, name)[:, :kept] for name in Motion._fields[:3]}
-    fewer = motion._replace(**amplitudes)
-    return dataclasses.replace(case, beam=beam), modes.lowest(kept), fewer
-
-
-def _of_lowest(beam, count: int):
-    """Damping ratios of the lowest modes: one for all, or a list."""
-    ratio = beam.damping_ratio
-    return ratio[:count] if np.ndim(ratio) else ratio

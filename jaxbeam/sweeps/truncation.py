@@ -7,18 +7,19 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case, replace
 from jaxbeam.case.quantities import QUANTITIES
-from jaxbeam.integrator.static_shapes import static_shapes
-from jaxbeam.integrator.step_size import check_step_count, longest_trial_step
+from jaxbeam.integrator.static_shapes import longest_stable_step, max_concurrent_loads
+from jaxbeam.integrator.step_size import check_step_count, trial_run, without_later_vibration
+from jaxbeam.model.load_set import load_set
+from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import is_supported, residual_flexibility
 from jaxbeam.model.statics import influence_line
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.simulation.errors import truncation_errors
-from jaxbeam.simulation.integration_plan import IntegrationPlan, steps_per_interval
+from jaxbeam.simulation.motion.at_samples import motion_at
 from jaxbeam.simulation.motion.moving_forces import motion_of_forces
-from jaxbeam.simulation.simulate import motion_of_run
 
-SAMPLES = 400  # of the run from which errors of corrected quantities are estimated
+SAMPLES = 200  # at least, of the run from which errors of corrected quantities are estimated
 
 
 class TruncationWarning(UserWarning):
@@ -67,14 +68,16 @@ def static_shares(case: Case) -> dict[str, float]:
     return shares
 
 
-def estimated_errors(case: Case, worst: dict[str, dict[str, float]]) -> dict[str, float]:
+def estimated_errors(
+    case: Case, worst: dict[str, dict[str, float]], static: dict[str, float] | None = None
+) -> dict[str, float]:
     """Truncation errors of peaks relative to the largest, by quantity, where they are known.
 
     `worst` has the numbers of the run with the largest peak of each quantity. Of deflections and
     rotations the error is the static one; others are estimated from that run (see
-    `Record.truncation_errors`), without a controller.
+    `Record.truncation_errors`), without a controller. `static` are the `static_shares`, if known.
     """
-    errors, found_before = static_shares(case), {}
+    errors, found_before = dict(static_shares(case) if static is None else static), {}
     quantities = [sensor.quantity for sensor in case.sensors]
     if case.controller is not None:
         return errors
@@ -94,16 +97,21 @@ def estimated_errors(case: Case, worst: dict[str, dict[str, float]]) -> dict[str
 
 def _errors_of_run(case: Case) -> Float[Array, " sensor"] | None:
     """Truncation errors at the sensors; None where no step is found: they are not known."""
-    times = np.linspace(0.0, float(case.run.duration), SAMPLES)
-    found = motion_of_forces(case, times)
+    loads, model = load_set(case), modal_model(case, mesh_layout(case), has_coupling(case))
+    case = without_later_vibration(case, model)
+    duration = float(case.run.duration)
+    found = motion_of_forces(case, np.linspace(0.0, duration, SAMPLES))
     if found is not None:
         return truncation_errors(case, *found)
-    shapes = static_shapes(case)
+    if model.modes.has_repeated:
+        model = modal_model(case, model.modes.layout)
     # The longest stable step: an estimate needs no search for the step of an error.
-    step = longest_trial_step(case, shapes)
+    step = min(duration / SAMPLES, float(longest_stable_step(case, model, loads)))
     try:
-        check_step_count(float(case.run.duration) / step, step)
+        check_step_count(duration / step, step)
     except RuntimeError:
         return None
-    plan = IntegrationPlan(shapes, steps_per_interval(times[1], step), 0, True, np.nan)
-    return truncation_errors(case, *motion_of_run(case, times, plan))
+    most = max_concurrent_loads(np.asarray(loads.entry_exit_times()))
+    times, states = trial_run(case, model, loads, most, step)
+    motion, _ = motion_at(case, model, loads, times, states)
+    return truncation_errors(case, model.modes, motion)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 from tuning.logs.log import Log
+from tuning.modal.forced.blows import Windows, check_windows
 
 KINDS = ("free decay", "ambient")
 SPECTRAL_METHODS = ("fdd", "plscf")
@@ -21,12 +22,16 @@ def check_band(log: Log, rate: float, band: tuple[float, float] | None) -> None:
         )
 
 
-def check_force(force: Sequence[str] | None, kind: str | None, method: str | None) -> None:
-    """Check a measured force beside the kind of excitation and the method.
+def check_force(
+    force: Sequence[str] | None, windows: Windows, kind: str | None, method: str | None
+) -> None:
+    """Check a measured force, and windows of it, beside the kind of excitation and the method.
 
-    Raises ValueError for a force beside a kind, or with a method that does not use it.
+    Raises ValueError for either beside a kind, or with a method that does not use it, and for
+    windows that do not last.
     """
-    if force is None:
+    check_windows(windows)
+    if force is None and windows == Windows():
         return
     if method not in (None, "plscf"):
         raise ValueError(f"a measured force is used by method 'plscf', not by {method!r}")

@@ -9,6 +9,7 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -51,6 +52,9 @@ def settled_law(law: Any, t: Any, stationary: Any) -> Any:
     if isinstance(law, LawOfCommanded):
         return dataclasses.replace(law, law=settled_law(law.law, t, stationary))
     if not (isinstance(law, SampledStateLaw) and isinstance(law.filter, CrossingFilter)):
+        parts = jax.tree.leaves(law, is_leaf=lambda part: isinstance(part, CrossingFilter))
+        if any(isinstance(part, CrossingFilter) for part in parts):
+            raise ValueError("the gain of the Kalman filter varies as the loads cross")
         return law
     filter = eqx.tree_at(lambda x: x.filtered.plant.loads, law.filter, replace_fn=stationary)
     transition, C, D = filter.model_at(t)

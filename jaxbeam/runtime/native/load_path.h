@@ -72,8 +72,13 @@ static void evaluate_trajectory(const Workspace *w, int64_t load, double time, d
     *acceleration = 2 * c[2] + t * 6 * c[3];
 }
 
-/* Mode shapes (mode, node) and contact rows (state, node) under the loads of a step:
- * model/contact.py, `contact_rows`. */
+/* Rows (load, state, node) of a motion of the beam under the loads. */
+static double *motion_rows(const Workspace *w, int motion) {
+    return w->contact_rows + (ptrdiff_t)motion * w->max_loads * w->states * PADDED_NODES;
+}
+
+/* Mode shapes (mode, node) and rows (state, node) of motions under the loads of a step:
+ * model/contact.py, `surface_rows`. */
 static void load_path(const Workspace *w, const Step *step) {
     const int block_size = w->block_size, modes = w->modes, all_modes = w->all_modes;
     for (int s = 0; s < step->loads; s++) {
@@ -87,8 +92,7 @@ static void load_path(const Workspace *w, const Step *step) {
         for (int first = 0; first < NODES; first += REGISTER_WIDTH) {
             const Register v = load_full(speed + first), a = load_full(acceleration + first);
             double *shape = w->shape + (ptrdiff_t)s * all_modes * PADDED_NODES + first;
-            double *contact_rows =
-                w->contact_rows + (ptrdiff_t)s * w->states * PADDED_NODES + first;
+            const ptrdiff_t at = (ptrdiff_t)s * w->states * PADDED_NODES + first;
             evaluate_shapes(w, load_full(position + first));
             const Register *value = w->shape_sums, *slope = value + all_modes,
                            *curvature = slope + all_modes;
@@ -103,7 +107,14 @@ static void load_path(const Workspace *w, const Step *step) {
                     row += value[b * modes + n] * rates[2 * n * block_size];
                 if (j < 2 * modes)
                     row += j % 2 ? 2 * v * slope[m] : v * v * curvature[m] + a * slope[m];
-                store(contact_rows + i * PADDED_NODES, row, REGISTER_WIDTH);
+                store(motion_rows(w, ACCELERATION) + at + i * PADDED_NODES, row, REGISTER_WIDTH);
+                if (w->motions == 1) continue;
+                const Register zero = {0};
+                const int is_state = j < 2 * modes, is_rate = j % 2;
+                store(motion_rows(w, DEFLECTION) + at + i * PADDED_NODES,
+                      is_state && !is_rate ? value[m] : zero, REGISTER_WIDTH);
+                store(motion_rows(w, VELOCITY) + at + i * PADDED_NODES,
+                      !is_state ? zero : is_rate ? value[m] : v * slope[m], REGISTER_WIDTH);
             }
         }
     }
@@ -121,22 +132,30 @@ static void add_influence(const Workspace *w, const Step *step, int s) {
     const double left = breaks[piece], width = breaks[piece + 1] - left;
     const double *series = w->inputs[INFLUENCE_SERIES] +
                            (ptrdiff_t)piece * w->influence_terms * w->positions;
-    for (int p = 0; p < PEAK_POINTS; p++) {
-        evaluate_trajectory(w, step->load_numbers[s],
-                            step->start + step->length * w->inputs[PEAK_FRACTIONS][p], &position,
-                            &speed, &acceleration);
-        const double x = fmin(fmax(2 * (position - left) / width - 1, -1), 1);
-        const double *weights = w->inputs[PEAK_FORCE_WEIGHTS] + p * NODES;
+    /* Peak nodes side by side in a register, since each term of the series waits for the last. */
+    for (int first = 0; first < PEAK_POINTS; first += REGISTER_WIDTH) {
+        const int left_over = PEAK_POINTS - first;
+        const int count = left_over < REGISTER_WIDTH ? left_over : REGISTER_WIDTH;
+        Register x = {0};
+        for (int p = 0; p < count; p++) {
+            const double fraction = w->inputs[PEAK_FRACTIONS][first + p];
+            evaluate_trajectory(w, step->load_numbers[s], step->start + step->length * fraction,
+                                &position, &speed, &acceleration);
+            x[p] = fmin(fmax(2 * (position - left) / width - 1, -1), 1);
+        }
+        const Register twice = 2 * x;
         for (int output = 0; output < w->positions; output++) {
-            double sum = 0, above = 0; /* Clenshaw's recurrence */
+            Register sum = {0}, above = {0}; /* Clenshaw's recurrence */
             for (int k = w->influence_terms - 1; k > 0; k--) {
-                const double next = series[k * w->positions + output] + 2 * x * sum - above;
+                const Register next = series[k * w->positions + output] - above + twice * sum;
                 above = sum, sum = next;
             }
-            sum = series[output] + x * sum - above;
-            for (int f = 0; f < NODES; f++)
-                step->sample_rows[(ptrdiff_t)(w->states + s * NODES + f) * w->sample_count +
-                                  p * w->positions + output] += weights[f] * sum;
+            sum = series[output] - above + x * sum;
+            for (int p = 0; p < count; p++)
+                for (int f = 0; f < NODES; f++)
+                    step->sample_rows[(ptrdiff_t)(w->states + s * NODES + f) * w->sample_count +
+                                      (first + p) * w->positions + output] +=
+                        w->inputs[PEAK_FORCE_WEIGHTS][(first + p) * NODES + f] * sum[p];
         }
     }
 }

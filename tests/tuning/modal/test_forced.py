@@ -7,8 +7,8 @@ from scipy.signal import firwin, lfilter
 from tests.oracles.planted_structures import FINER, coloured_noise, response
 from tests.tuning.modal.test_subspace import small_structure
 from tuning import Log, identify_modes
+from tuning.modal.forced.common_denominator import fit_common_denominator, products, transforms
 from tuning.modal.shapes import mac_matrix
-from tuning.modal.spectral.forced_fraction import fit_common_denominator, products, transforms
 
 RATE = 40.0
 

@@ -30,6 +30,9 @@ def modes_from_log(
     order: int | None = None,
     method: str | None = None,
     force: str | None = None,
+    exponential: float | None = None,
+    force_window: float | None = None,
+    responses: str | None = None,
     kind: str | None = None,
     exclude: str | None = None,
     count: int | None = None,
@@ -72,6 +75,14 @@ def modes_from_log(
     force
         NAME,NAME,...: channels of measured forces (N), of a hammer or shaker; by default all in N.
         The responses to them are fitted by p-LSCF.
+    exponential
+        Time constant (s) of an exponential window from each blow of the hammer on, on responses
+        and force; the damping that it adds is subtracted.
+    force_window
+        Time (s) after each blow from which on the force is taken for zero.
+    responses
+        H1, H2 or Hv: draw frequency responses to the forces, by this estimate, with their coherence
+        to a PNG named after the first log.
     kind
         ambient or "free decay".
     exclude
@@ -100,10 +111,17 @@ def modes_from_log(
     )
     refuse_option(output is not None and case is None, "-o writes the fitted case: give --case")
     bounds = dict(parse_bounds(text) for text in free)
+    refuse_option(
+        responses not in (None, "H1", "H2", "Hv"),
+        f"--responses takes H1, H2 or Hv, not {responses!r}",
+    )
     excluded = _numbers("--exclude", exclude)
     check_exists("log file", *logs)
     picture = figure_path(None, logs[0]) if plot else None
-    options.check_outputs(output, picture)
+    drawn = None
+    if responses is not None:
+        drawn = figure_path(None, logs[0].with_stem(f"{logs[0].stem}_responses"))
+    options.check_outputs(output, picture, drawn)
     if case is not None:
         options.check_case(case)
 
@@ -129,11 +147,23 @@ def modes_from_log(
         order=order,
         method=method,
         force=_names(force),
+        exponential=exponential,
+        force_window=force_window,
         exclude=excluded,
         progress=None if options.json_ or not sys.stderr.isatty() else print_message,
     )
     if picture:
         fit.plot(picture, length=length)
+    if drawn is not None:
+        tuning.measured_responses(
+            read,
+            _names(force),
+            estimator=responses,
+            channels=_names(channels),
+            window=window,
+            exponential=exponential,
+            force_window=force_window,
+        ).plot(drawn)
     answer, lines = fit.to_dict(), [str(fit)]
     if case is not None:
         model = options.read(case)
@@ -141,7 +171,7 @@ def modes_from_log(
         answer, lines = {**answer, "fit": updated.to_dict()}, [*lines, "", str(updated)]
         if output is not None:
             jb.save_case(updated.case, output, options.overwrite)
-    options.report(answer, lines, output, picture)
+    options.report(answer, lines, output, picture, drawn)
 
 
 def _names(text: str | None) -> list[str] | None:

@@ -17,13 +17,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
+MAX_ANGLE = 2.8  # of z on the circle, of a band from 0
 PART_LINES = 4096  # lines whose products are formed at once
 
 
 class Lines(NamedTuple):
     """Lines of the transforms of all records: spectra (line, output), (line, input), z and record.
 
-    `step` is the sampling step (s).
+    `step` is the sampling step (s); `level`, if any, is what spectra of each line were multiplied
+    by, so that errors of all lines have one variance; `window_rate` (1/s) is what an exponential
+    window of the records added to each decay rate.
     """
 
     outputs: Complex[np.ndarray, "line output"]
@@ -31,11 +34,19 @@ class Lines(NamedTuple):
     z: Complex[np.ndarray, " line"]
     record: Int[np.ndarray, " line"]
     step: float
+    level: Float[np.ndarray, " line"] | None = None
+    window_rate: float = 0.0
+
+    @property
+    def spacing(self) -> float:
+        """Typical distance (1/s) of neighbouring lines."""
+        return float(np.median(np.abs(np.diff(np.angle(self.z)))) / self.step)
 
     @property
     def unforced(self) -> Float[np.ndarray, "line record"]:
         """Columns of one at the lines of each record, for its transient."""
-        return (self.record[:, None] == np.arange(self.record.max() + 1)).astype(float)
+        own = (self.record[:, None] == np.arange(self.record.max() + 1)).astype(float)
+        return own if self.level is None else own * self.level[:, None]
 
 
 class Products(NamedTuple):
@@ -59,12 +70,17 @@ class CommonDenominator(NamedTuple):
 
 
 def transforms(
-    records: tuple[Float[np.ndarray, "time output"], ...],
-    forces: tuple[Float[np.ndarray, "time input"], ...],
+    records: tuple[Float[np.ndarray, "_ output"], ...],
+    forces: tuple[Float[np.ndarray, "_ input"], ...],
     rate: float,
     band: tuple[float, float],
 ) -> Lines:
-    """Discrete Fourier transforms of records and forces at the lines of a band (Hz)."""
+    """Discrete Fourier transforms of records and forces at the lines of a band (Hz).
+
+    These are of whole records as sampled. The step of z is stretched, so that the band fills most
+    of the circle, which powers of z need.
+    """
+    step = max(MAX_ANGLE / (2 * np.pi * band[1]), 1 / rate)
     outputs, inputs, z, numbers = [], [], [], []
     for number, (record, force) in enumerate(zip(records, forces, strict=True)):
         bins = np.fft.rfftfreq(len(record), 1 / rate)
@@ -72,11 +88,11 @@ def transforms(
         scale = 1 / np.sqrt(len(record))
         outputs.append(scale * np.fft.rfft(record, axis=0)[lines])
         inputs.append(scale * np.fft.rfft(force, axis=0)[lines])
-        z.append(np.exp(2j * np.pi * bins[lines] / rate))
+        z.append(np.exp(2j * np.pi * bins[lines] * step))
         numbers.append(np.full(lines.sum(), number))
     return Lines(
         np.concatenate(outputs), np.concatenate(inputs), np.concatenate(z),
-        np.concatenate(numbers), 1 / rate,
+        np.concatenate(numbers), step,
     )  # fmt: skip
 
 

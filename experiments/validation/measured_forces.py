@@ -1,0 +1,103 @@
+"""Modes from measured forces of planted structures: coverage of intervals, misses, false modes.
+
+    python -m experiments.validation.measured_forces 10
+
+Random structures by finite elements (`tests/oracles/planted_structures.py`), each struck by one,
+three or ten blows of a hammer or shaken by a random force at one place, with coloured noise of 5 to
+30 % rms on the responses. The force is measured, through the anti-alias filter of the logger like
+the responses.
+"""
+
+import sys
+import time
+from collections.abc import Iterable
+
+import numpy as np
+from scipy.signal import firwin, lfilter
+
+from experiments.validation.modal_identification import PlantedComparison, compare, summary
+from tests.oracles.planted_structures import (
+    FINER,
+    Planted,
+    Structure,
+    coloured_noise,
+    random_structure,
+    response,
+)
+from tuning.logs.log import Log
+from tuning.modal.identify_modes import identify_modes
+
+EXCITATIONS = ("1 blow", "3 blows", "10 blows", "random force")
+DURATION = 60.0  # s
+
+
+def forced_log(
+    structure: Structure, excitation: str, seed: int, duration: float = DURATION
+) -> tuple[Log, Planted]:
+    """Log of a measured force and the velocities at the channels, with what was planted in it."""
+    random = np.random.default_rng(7000 + seed)
+    rate = 2.56 * structure.frequencies[-1] * random.uniform(1.2, 2.5)
+    fine = FINER * rate
+    forces = np.zeros((int(duration * fine), structure.inputs.shape[1]))
+    if excitation == "random force":
+        forces[:, 0] = random.normal(size=len(forces))
+    else:
+        blows = int(excitation.split()[0])
+        starts = 0.05 + 0.9 * (np.arange(blows) + random.uniform(0, 0.5, blows)) / blows
+        for start in starts * (1 if blows > 1 else 0.2):
+            first = int(start * len(forces))
+            shape = np.sin(np.pi * (np.arange(2 * FINER) + 0.5) / (2 * FINER))
+            forces[first : first + 2 * FINER, 0] += random.uniform(0.5, 1.5) * shape
+    # The anti-alias filter of the logger, for all channels.
+    forces = lfilter(firwin(161, 0.8 / FINER), 1.0, forces, axis=0)
+    parts = []
+    for k in range(structure.frequencies.size):
+        one = Structure(*(field[k : k + 1] for field in structure))
+        parts.append(response(one, forces, fine)[::FINER])
+    parts = np.stack(parts)
+    clean = parts.sum(axis=0)
+    noise = random.uniform(0.05, 0.3) * clean.std()
+    values = clean + noise * coloured_noise(random, clean.shape)
+    energies = np.mean(parts.var(axis=1) / clean.var(axis=0), axis=1)
+    channels = values.shape[1]
+    log = Log(
+        np.arange(len(values)) / rate,
+        np.column_stack([forces[::FINER, 0], values]),
+        ("hammer", *(f"v{i + 1}" for i in range(channels))),
+        ("force", *["velocity"] * channels),
+        ("N", *["m/s"] * channels),
+        "planted",
+    )
+    return log, Planted(structure, values, rate, energies)
+
+
+def assess(excitation: str, seeds: Iterable[int]) -> list[PlantedComparison]:
+    """Comparison for each seed, printed as it comes."""
+    found = []
+    for seed in seeds:
+        log, planted = forced_log(random_structure(seed), excitation, seed)
+        start = time.process_time()
+        frequencies = planted.structure.frequencies
+        fit = identify_modes(
+            log, band=(0.7 * frequencies[0], min(1.25 * frequencies[-1], 0.45 * planted.rate))
+        )
+        one = compare(fit, planted)
+        found.append(one)
+        print(
+            f"{excitation} {seed}: {len(fit.modes)} modes of {planted.energies.size}, "
+            f"covered {one.covered.sum(axis=0)} of {len(one.covered)}, false {one.false_modes}, "
+            f"missed {one.missed}, {time.process_time() - start:.1f} s",
+            flush=True,
+        )
+    return found
+
+
+def main(arguments: list[str]) -> None:
+    """Print the comparison for a number of structures (10)."""
+    count = int(arguments[0]) if arguments else 10
+    for excitation in EXCITATIONS:
+        print(f"{excitation}: {summary(assess(excitation, range(count)))}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

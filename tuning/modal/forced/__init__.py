@@ -1,0 +1,1 @@
+"""Modes and frequency responses where the force was measured."""

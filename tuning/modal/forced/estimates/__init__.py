@@ -1,0 +1,1 @@
+"""Estimates of frequency responses to measured forces."""

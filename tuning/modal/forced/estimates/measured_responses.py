@@ -1,0 +1,181 @@
+"""Frequency responses from measured forces: estimates H1, H2 and Hv with their coherence."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Complex, Float
+from matplotlib.figure import Figure
+
+from tuning.logs.log import Log
+from tuning.modal.forced.blows import Windows, check_windows, find_blows, pieces_of_blows
+from tuning.modal.forced.forces import force_names, force_records, without_forces
+from tuning.modal.samples import samples_of, with_channels
+
+ESTIMATORS = ("H1", "H2", "Hv")
+SEGMENTS = 8  # into which records of a random force are divided if nothing is said
+MIN_SEGMENT = 16
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredResponses:
+    """Frequency responses of the channels of a log to the forces measured in it.
+
+    `values` are complex, in SI units of each channel per N; `coherence` is that of each output with
+    all forces together, NaN of a single average, which tells none; `averages` is the number of
+    segments or blows. `decay_rate` (1/s) is what an exponential window added to that of each mode.
+
+    >>> import numpy as np
+    >>> import tuning
+    >>> force = np.random.default_rng(0).normal(size=4000)
+    >>> columns = ("f", "v1"), ("force", "velocity"), ("N", "m/s")
+    >>> log = tuning.Log(
+    ...     0.001 * np.arange(4000), np.column_stack([force, 2e-3 * force]), *columns
+    ... )
+    >>> found = tuning.measured_responses(log)
+    >>> print(f"{abs(found.values).mean():.1e} m/s/N, coherence {found.coherence.mean():.2f}")
+    2.0e-03 m/s/N, coherence 1.00
+    """
+
+    frequencies: Float[np.ndarray, " frequency"]
+    values: Complex[np.ndarray, "frequency output force"]
+    coherence: Float[np.ndarray, "frequency output"]
+    outputs: tuple[str, ...]
+    units: tuple[str, ...]
+    forces: tuple[str, ...]
+    estimator: str
+    averages: int
+    decay_rate: float = 0.0
+    source: str = "log"
+
+    @property
+    def deviations(self) -> Float[np.ndarray, "frequency output"]:
+        """Relative standard deviations of the values, sqrt((1 - g^2) / (2 n g^2)).
+
+        (Bendat and Piersol 2010, Random Data, section 9.1.)
+        """
+        coherence = np.clip(self.coherence, 1e-12, 1.0)
+        return np.sqrt((1 - coherence) / (2 * self.averages * coherence))
+
+    def true_damping_ratio(self, frequency: float, damping_ratio: float) -> float:
+        """Damping ratio without the exponential window, z - a / w, of one that is read from these.
+
+        `frequency` is the natural frequency (Hz).
+        """
+        return damping_ratio - self.decay_rate / (2 * np.pi * frequency)
+
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Draw magnitude, phase and coherence of all outputs; saved if a path is given."""
+        from tuning.modal.forced.estimates.responses_plot import plot_responses
+
+        return plot_responses(self, path)
+
+
+def measured_responses(
+    log: Log | Sequence[Log],
+    force: Sequence[str] | None = None,
+    *,
+    estimator: str = "H1",
+    channels: Sequence[str] | None = None,
+    window: tuple[float, float] | None = None,
+    segment: float | None = None,
+    exponential: float | None = None,
+    force_window: float | None = None,
+) -> MeasuredResponses:
+    """Frequency responses to the measured forces `force` (names; all in N if left out).
+
+    With spectra S averaged over segments, H1 = S_yf S_ff^-1 is free of the bias of noise in the
+    responses, H2 = S_yy / S_fy of that of noise in the force, Hv = sqrt(S_yy / S_ff) with the phase
+    of H1 shares it between both (Rocklin, Crowley and Vold 1985); the last two are for one force.
+    Of a hammer a segment is the time from one blow to the next, all as long as the shortest; else
+    segments of `segment` s (an eighth of the log) have a window of Hann and overlap by half.
+    `exponential` (s) is the time constant of a window on blows and responses, `force_window` (s)
+    the time after which the force is taken for zero. `window` (s) is the part of the log used.
+
+    Raises ValueError for an unknown estimator, an H2 or Hv of several forces, windows without
+    blows, no force, fewer segments than forces, and what `identify_modes` raises for its logs.
+    """
+    if estimator not in ESTIMATORS:
+        raise ValueError(f"estimator must be {', '.join(ESTIMATORS)}, not {estimator!r}")
+    windows = Windows(exponential, force_window)
+    check_windows(windows)
+    logs = [log] if isinstance(log, Log) else list(log)
+    names = force_names(logs[0], force)
+    if not names:
+        raise ValueError(f"{logs[0].source}: no channel is a force in N; name it by force")
+    if estimator != "H1" and len(names) > 1:
+        raise ValueError(f"{estimator} is for one force, not {len(names)}; use H1")
+    measured = [without_forces(with_channels(one, channels)) for one in logs]
+    samples = samples_of(measured, window)
+    driving = force_records(logs, names, window, samples)
+    records = [record - np.median(record, axis=0) for record in samples.records]
+    hammer = all(find_blows(one).size for one in driving)
+    if hammer and segment is None:
+        pieces = [
+            piece[1:]
+            for record, own in zip(records, driving, strict=True)
+            for piece in pieces_of_blows(record, own, samples.rate, windows, alike=True)
+        ]
+        taper = None
+    elif windows != Windows():
+        raise ValueError(
+            f"{logs[0].source}: windows are for blows of a hammer; leave out exponential and "
+            f"force_window with {'a segment' if hammer else 'a steady force'}"
+        )
+    else:
+        pieces = _segments(records, driving, samples.rate, segment)
+        taper = np.hanning(len(pieces[0][0]) + 1)[:-1, None]
+    size = min(len(piece[0]) for piece in pieces)
+    if len(pieces) < len(names):
+        raise ValueError(
+            f"{logs[0].source}: {len(pieces)} segments do not tell {len(names)} forces apart"
+        )
+    values, coherence = _estimate(pieces, size, taper, estimator)
+    bins = np.fft.rfftfreq(size, 1 / samples.rate)
+    return MeasuredResponses(
+        bins[1:], values[1:], coherence[1:], measured[0].names, measured[0].units, names,
+        estimator, len(pieces), windows.decay_rate, logs[0].source,
+    )  # fmt: skip
+
+
+def _segments(records, driving, rate, segment):
+    """Pieces of all records, half their length apart."""
+    longest = max(map(len, records))
+    size = longest // SEGMENTS if segment is None else int(segment * rate)
+    if not MIN_SEGMENT <= size <= longest:
+        raise ValueError(
+            f"a segment of {size} samples is not within {MIN_SEGMENT} and the {longest} of a record"
+        )
+    return [
+        (record[first : first + size], force[first : first + size])
+        for record, force in zip(records, driving, strict=True)
+        for first in range(0, len(record) - size + 1, max(size // 2, 1))
+    ]
+
+
+def _estimate(pieces, size, taper, estimator):
+    """Responses (line, output, force) and coherence (line, output) of averaged spectra."""
+    outputs, forces = [], []
+    for record, force in pieces:
+        if taper is not None:
+            record, force = record - record.mean(axis=0), force - force.mean(axis=0)
+        both = [one[:size] if taper is None else one * taper for one in (record, force)]
+        outputs.append(np.fft.rfft(both[0], axis=0))
+        forces.append(np.fft.rfft(both[1], axis=0))
+    y, f = np.stack(outputs, axis=1), np.stack(forces, axis=1)  # line, average, channel
+    across = np.einsum("lno,lni->loi", y, f.conj())
+    among = np.einsum("lni,lnj->lij", f, f.conj())
+    power = np.maximum(np.sum(np.abs(y) ** 2, axis=1), 1e-300)
+    first = across @ np.linalg.pinv(among, hermitian=True)
+    explained = np.einsum("loi,loi->lo", first, across.conj()).real
+    coherence = np.clip(explained / power, 0.0, 1.0)
+    if len(pieces) <= f.shape[2]:
+        coherence = np.full_like(coherence, np.nan)
+    if estimator == "H2":
+        reverse = across.conj()
+        return power[:, :, None] / np.where(np.abs(reverse) > 0, reverse, np.inf), coherence
+    if estimator == "Hv":
+        size = np.sqrt(power[:, :, None] / np.maximum(among.real, 1e-300))
+        return size * np.exp(1j * np.angle(first)), coherence
+    return first, coherence

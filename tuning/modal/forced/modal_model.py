@@ -1,0 +1,127 @@
+"""Modal model of responses to measured forces: modes with their uncertainties."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import t as student
+
+from tuning.modal.forced.common_denominator import Lines
+from tuning.modal.forced.likelihood import FittedModel, resonances_of, split_coefficients
+from tuning.modal.forced.uncertainty import BLOCKS, replicates
+from tuning.modal.result import IdentifiedMode, frequency_and_damping
+
+
+def _blocks(rows: Float[np.ndarray, "row *more"]) -> Float[np.ndarray, "block place *more"]:
+    """Rows of real, then imaginary parts in blocks of lines; missing ones are zero."""
+    more = rows.shape[1:]
+    parts = rows.reshape(2, len(rows) // 2, *more)
+    missing = -parts.shape[1] % BLOCKS
+    padded = np.pad(parts, [(0, 0), (0, missing), *[(0, 0)] * (rows.ndim - 1)])
+    each = padded.shape[1] // BLOCKS
+    divided = padded.reshape(2, each, BLOCKS, *more)
+    return np.moveaxis(divided, 2, 0).reshape(BLOCKS, 2 * each, *more)
+
+
+def _steps(model: FittedModel) -> list[Float[np.ndarray, "block part"]]:
+    """Changes of real and imaginary parts of moving poles for errors that could have been.
+
+    They are those of each block of lines, carried through the step of Gauss-Newton: a sandwich, so
+    that the errors may have any spectrum.
+    """
+    solution = np.linalg.pinv(model.normal, rcond=1e-12, hermitian=True)
+    slopes = _blocks(np.swapaxes(model.slopes * model.weight, 1, 2))
+    slopes = slopes.reshape(BLOCKS, slopes.shape[1] * slopes.shape[2], slopes.shape[3])
+    return [
+        np.sqrt(share) * (_blocks(errors).reshape(BLOCKS, 1, -1) @ slopes)[:, 0] @ solution
+        for errors, share in replicates(model.free)
+    ]
+
+
+def _coefficient_steps(model: FittedModel, pole_steps):
+    """Changes of the coefficients (replicate, column, output) beside those of the poles."""
+    inverse = np.swapaxes(_blocks(model.fit.inverse.T), 1, 2)
+    found = []
+    for (errors, share), steps in zip(replicates(model.free), pole_steps, strict=True):
+        own = np.sqrt(share) * inverse @ _blocks(errors)
+        found.append(own - np.tensordot(steps, model.by_poles, axes=(1, 1)))
+    return np.concatenate(found)
+
+
+def pole_covariances(model: FittedModel) -> Float[np.ndarray, "mode 2 2"]:
+    """Covariances of decay rate and angular frequency (1/s), zero for poles not refined.
+
+    The change of a pole with fewer terms for the modes that are not in the model adds to them.
+    """
+    steps, moving = np.concatenate(_steps(model)), model.moving
+    found = np.zeros((model.poles.size, 2, 2))
+    for place, k in enumerate(moving):
+        pair = [place, place + moving.size]
+        own = steps[:, pair] * [-1.0, 1.0]
+        found[k] = own.T @ own + np.diag(model.model_errors[pair] ** 2)
+    return found
+
+
+def damping_doubts(model: FittedModel) -> Float[np.ndarray, " mode"]:
+    """Half the 95 % interval of each damping ratio, over the ratio."""
+    found = []
+    for k, (pole, covariance) in enumerate(zip(model.poles, pole_covariances(model), strict=True)):
+        pole = complex(pole) + model.lines.window_rate
+        _, _, damping, damping_sd = frequency_and_damping(pole, covariance)
+        half = _quantile(model, k) * damping_sd
+        found.append(half / damping if damping > 0 else np.inf)
+    return np.array(found)
+
+
+def _quantile(model: FittedModel, k: int) -> float:
+    return float(student.ppf(0.975, model.freedom(k)))
+
+
+def unexplained(model: FittedModel) -> Lines:
+    """Lines of the band with the errors of the model as outputs."""
+    errors, level = model.fit.errors, model.lines.level
+    assert level is not None
+    count = len(level)
+    return model.plain._replace(outputs=(errors[:count] + 1j * errors[count:]) / level[:, None])
+
+
+def modes_of_model(
+    model: FittedModel, scale: Float[np.ndarray, " output"]
+) -> tuple[IdentifiedMode, ...]:
+    """Modes of a fitted model with uncertainties; those of poles not refined have none.
+
+    Outputs are in units of `scale`, shapes in those of the log.
+    """
+    plain, lines, poles, fit = model.plain, model.lines, model.poles, model.fit
+    covariances = pole_covariances(model)
+    residues = split_coefficients(fit.found, lines, poles.size)[0]
+    changes = _coefficient_steps(model, _steps(model))
+    changes = np.array([split_coefficients(one, lines, poles.size)[0] for one in changes])
+    resonances, mirrored = resonances_of(lines, poles)
+    power = np.maximum(np.sum(np.abs(plain.outputs) ** 2, axis=0), 1e-300)
+    modes = []
+    for k, pole in enumerate(poles):
+        # A residue (input, output) is participation times shape.
+        along = np.linalg.svd(residues[k])[0][:, 0].conj()
+        physical = (along @ residues[k]) * scale
+        largest = int(np.argmax(np.abs(physical)))
+        unit = physical / physical[largest]
+        moved = (along @ changes[:, k]) * scale / physical[largest]
+        moved = moved - moved[:, [largest]] * unit
+        parts = np.concatenate([moved.real, moved.imag], axis=1)
+        frequency, frequency_sd, damping, damping_sd = frequency_and_damping(
+            complex(pole) + lines.window_rate, covariances[k]
+        )
+        part = resonances[:, [k]] * (plain.inputs @ residues[k])
+        part = part + mirrored[:, [k]] * (plain.inputs @ residues[k].conj())
+        modes.append(
+            IdentifiedMode(
+                frequency=frequency,
+                frequency_sd=frequency_sd,
+                damping_ratio=damping,
+                damping_sd=damping_sd,
+                energy_share=float(np.mean(np.sum(np.abs(part) ** 2, axis=0) / power)),
+                shape=unit,
+                shape_covariance=parts.T @ parts,
+                quantile=_quantile(model, k),
+            )
+        )
+    return tuple(modes)

@@ -1,0 +1,215 @@
+"""Modes from responses to measured forces, of a hammer or a shaker.
+
+Poles of p-LSCF (`common_denominator`) that are stable are refined by the likelihood of a modal
+model, to which poles are added where errors are more than noise. A wide band is divided into bands
+of three octaves.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.signal import detrend
+
+from tuning.modal.ambient import (
+    Candidate,
+    divided_band,
+    overlapping,
+    without_duplicates,
+)
+from tuning.modal.forced.common_denominator import (
+    Lines,
+    fit_common_denominator,
+    products,
+    transforms,
+)
+from tuning.modal.forced.likelihood import fit_modal_model
+from tuning.modal.forced.modal_model import damping_doubts, modes_of_model, unexplained
+from tuning.modal.forced.significance import (
+    criterion,
+    missing_pole,
+    residue_chances,
+    single_pole_chances,
+    split_pole,
+)
+from tuning.modal.result import rejection_reason
+from tuning.modal.stabilisation import Diagram, stabilise
+from tuning.modal.subspace import Poles
+
+MAX_ORDER = 60
+MAX_ADDED = 12  # poles, one at a time
+HIGHEST_LINE = 1.15  # over the upper end of a band
+PASSES = 2  # of the search for modes
+WEIGHT_DEGREE_SHARE = 0.5  # degree of the denominator that weights lines, over the highest
+MIN_WEIGHT = 1e-3  # size of the denominator, over its median, below which weights are equal
+CHANCE = 1e-3  # probability below which noise is no explanation
+SAME_POLE = 0.5  # distance of two poles over the smaller decay rate, below which they are one
+
+
+class ForcedModes(NamedTuple):
+    """Candidate modes, stabilisation diagrams, and the share of the responses explained."""
+
+    candidates: tuple[Candidate, ...]
+    diagrams: tuple[Diagram, ...]
+    explained: float
+
+
+def forced_modes(
+    records: tuple[Float[np.ndarray, "_ channel"], ...],
+    forces: tuple[Float[np.ndarray, "_ force"], ...],
+    rate: float,
+    band: tuple[float, float],
+    *,
+    order: int | None = None,
+    window_rate: float = 0.0,
+    progress: Callable[[str], None] | None = None,
+) -> ForcedModes:
+    """Modes of a band (Hz) from records and the forces measured with them.
+
+    `window_rate` (1/s) is that of an exponential window of records and forces; it is subtracted
+    from the decay rates.
+
+    Raises ValueError if a force is zero throughout.
+    """
+    duration = sum(map(len, records)) / rate
+    records, forces = (tuple(detrend(r, axis=0) for r in some) for some in (records, forces))
+    found: list[Candidate] = []
+    diagrams, rest, whole = [], 0.0, 0.0
+    for low, high in divided_band(band):
+        if progress:
+            progress(f"modes from {low:.3g} Hz to {high:.4g} Hz")
+        part = overlapping((low, high), band)
+        lines = transforms(records, forces, rate, (part[0] / 2, HIGHEST_LINE * part[1]))
+        scale, force_scale = (
+            np.sqrt(np.mean(np.abs(one) ** 2, axis=0)) for one in (lines.outputs, lines.inputs)
+        )
+        if not np.all(force_scale > 0):
+            raise ValueError("a measured force is zero throughout; leave it out")
+        scale = np.where(scale > 0, scale, 1.0)
+        lines = lines._replace(
+            outputs=lines.outputs / scale,
+            inputs=lines.inputs / force_scale,
+            window_rate=window_rate,
+        )
+        candidates, diagram, shares = _modes_of_lines(
+            lines, scale, part, band, duration, order, _poles(found, window_rate)
+        )
+        found += candidates
+        diagrams.append(diagram)
+        rest, whole = rest + shares[0], whole + shares[1]
+    return ForcedModes(without_duplicates(found), tuple(diagrams), 1 - rest / max(whole, 1e-300))
+
+
+def _poles(found, window_rate):
+    """Poles of candidates that are well identified, with the damping of the window."""
+    return np.array([one.mode.pole - window_rate for one in found if not one.reason], complex)
+
+
+def _modes_of_lines(lines: Lines, scale, part, band, duration, order, known):
+    """Candidates and diagram of a part of a band, and the powers of errors and responses.
+
+    What the modes found leave is searched again, for modes that stood in the shade of others.
+    Poles `known` from other parts of the band reach into this one by their flanks.
+    """
+    drawn, used, rest, dropped = None, known, lines, []
+    for _ in range(PASSES):
+        diagram = _diagram(rest, scale, part, order)
+        drawn = drawn or diagram
+        before = used.size
+        used = _distinct(used, diagram)
+        if used.size == before and drawn is not diagram:
+            break
+        model, gone = _refined(lines, used, scale, part)
+        model = _completed(lines, model, scale, part)
+        dropped += gone
+        used, rest = model.poles, unexplained(model)
+    modes = [mode for mode in modes_of_model(model, scale) if part[0] <= mode.frequency <= part[1]]
+    candidates = [Candidate(mode, rejection_reason(mode, duration, band), 1) for mode in modes]
+    candidates += [
+        Candidate(mode, rejection_reason(mode, duration, band) or reason, 1)
+        for mode, reason in dropped
+        if part[0] <= mode.frequency <= part[1]
+    ]
+    return (
+        candidates,
+        drawn,
+        (np.sum(np.abs(rest.outputs) ** 2), np.sum(np.abs(model.plain.outputs) ** 2)),
+    )
+
+
+def _diagram(lines: Lines, scale, part, order) -> Diagram:
+    """Stabilisation diagram of common denominators of rising degree."""
+    highest = min(order or MAX_ORDER, len(lines.z) // (4 * lines.inputs.shape[1] + 4))
+    degrees = range(2, max(highest, 3) + 1)
+    first = fit_common_denominator(
+        products(lines, degrees[-1]), max(int(WEIGHT_DEGREE_SHARE * degrees[-1]), 2)
+    )
+    size = np.abs(np.polyval(first.denominator[::-1], lines.z))
+    weights = 1 / np.maximum(size, MIN_WEIGHT * np.median(size))
+    system = products(lines, degrees[-1], weights / weights.max())
+    fits = [fit_common_denominator(system, degree) for degree in degrees]
+    sizes = [fit.poles.size for fit in fits]
+    poles = Poles(
+        np.repeat(np.array(degrees), sizes),
+        np.concatenate([fit.poles for fit in fits]),
+        np.concatenate([fit.shapes for fit in fits]) * scale,
+        np.zeros(sum(sizes)),
+    )
+    # Modes beside the band leave their flanks in it.
+    return stabilise(poles, (part[0] / 4, 0.5 / lines.step))
+
+
+def _refined(lines, poles, scale, part):
+    """Model of those poles that are determined, and the modes of the others with reasons.
+
+    Two poles for one resonance, or one for none, make others uncertain, so that one goes at a time.
+    """
+    dropped = []
+    while True:
+        model = fit_modal_model(lines, poles, part)
+        doubts, chances, reason = damping_doubts(model), residue_chances(model), ""
+        if np.any(doubts >= 1):
+            worst = int(np.argmax(doubts))
+        elif np.any(chances > CHANCE):
+            worst = int(np.argmax(chances))
+            reason = "no response to the force beyond what noise explains"
+        else:
+            return model, dropped
+        dropped.append((modes_of_model(model, scale)[worst], reason))
+        poles = np.delete(model.poles, worst)
+
+
+def _completed(lines, model, scale, part):
+    """Model with poles added where errors are more than noise, if that is the better one."""
+    tried: list[complex] = []
+    for _ in range(MAX_ADDED):
+        missing, chance = missing_pole(model, part)
+        chances = [chance, *single_pole_chances(model)]
+        places = [missing, *model.poles[model.moving]]
+        new = [
+            k
+            for k in np.argsort(chances)
+            if chances[k] < CHANCE
+            and all(abs(places[k] - one) > SAME_POLE * -one.real for one in tried)
+        ]
+        if not new:
+            break
+        tried.append(complex(places[new[0]]))
+        poles = np.append(model.poles, missing)
+        if new[0] > 0:
+            poles = split_pole(model, int(model.moving[new[0] - 1]))
+        other, _ = _refined(lines, poles, scale, part)
+        if criterion(model.lines, other.poles) < criterion(model.lines, model.poles):
+            model = other
+    return model
+
+
+def _distinct(known, diagram: Diagram) -> Complex[np.ndarray, " mode"]:
+    """Known poles, and those of the chains of a diagram, the longer first, that are others."""
+    kept = [complex(pole) for pole in known]
+    for chain in sorted(diagram.chains, key=lambda chain: -chain.members.size):
+        pole = complex(diagram.poles.poles[chain.best])
+        if all(abs(pole - one) > SAME_POLE * min(-pole.real, -one.real) for one in kept):
+            kept.append(pole)
+    return np.array(sorted(kept, key=abs), complex)

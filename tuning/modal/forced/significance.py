@@ -1,0 +1,154 @@
+"""Tests of a modal model: residues that chance explains, resonances that are two, missing poles.
+
+A pole placed at a chance peak of the noise fits it well, so that its errors tell nothing against
+it; but its residue, at one of many lines, is not larger than the noise makes it. Two poles close
+together taken for one leave errors along the derivative of the resonance by its pole,
+1 / (s - p)^2, with residues of its own: were there one pole, these would be those of noise. A pole
+that is missing leaves errors along 1 / (s - p). These are tests of F.
+"""
+
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.stats import f as fisher
+
+from tuning.modal.forced.common_denominator import Lines
+from tuning.modal.forced.likelihood import (
+    FittedModel,
+    both_parts,
+    linear_fit,
+    refined_poles,
+    resonances_of,
+    times_signals,
+    transients_of,
+)
+from tuning.modal.forced.uncertainty import NEIGHBOURS, line_means
+
+DAMPING_RATIOS = (0.004, 0.016, 0.064)  # of poles that are tried
+MOST_PROMISING = 3  # of them, whose probabilities are computed
+SPLITS = 0.5 * np.array([1j, 1.0, 3j, 1 + 1j, 1 - 1j])  # of a pole, over its decay rate
+
+
+def residue_chances(model: FittedModel) -> Float[np.ndarray, " mode"]:
+    """Probability that noise gives a residue as large as that of each mode, at any of the lines."""
+    inputs, outputs = model.lines.inputs.shape[1], model.fit.errors.shape[1]
+    modes, found = model.poles.size, []
+    variance = _local_variance(model.fit.errors, model.free.free)
+    scatter = model.fit.inverse @ model.fit.inverse.T
+    for k in range(modes):
+        own = k * inputs + np.arange(inputs)
+        own = np.concatenate([own, modes * inputs + own])
+        values = model.fit.found[own]
+        sizes = np.sum(values * np.linalg.solve(scatter[np.ix_(own, own)], values), axis=0)
+        peak, freedom = model.peak(k), model.freedom(k)
+        count = own.size * outputs
+        statistic = np.sum(sizes / variance[peak]) / count
+        found.append(len(model.lines.z) * fisher.sf(statistic, count, freedom * outputs))
+    return np.array(found)
+
+
+def single_pole_chances(model: FittedModel) -> Float[np.ndarray, " moving"]:
+    """Probability that noise alone leaves the errors along the derivative of each resonance."""
+    found = []
+    for k in model.moving.tolist():
+        chance = _chance(model, complex(model.poles[k]), model.freedom(k), 2)
+        found.append(chance * max(model.moving.size, 1))
+    return np.array(found)
+
+
+def missing_pole(model: FittedModel, band: tuple[float, float]) -> tuple[complex, float]:
+    """The pole (1/s) that would lower the errors most, and the probability that noise does so.
+
+    Poles of several damping ratios are tried, a half-power bandwidth apart.
+    """
+    low, high = 2 * np.pi * band[0], 2 * np.pi * band[1]
+    tried = [
+        -ratio * angular + 1j * angular
+        for ratio in DAMPING_RATIOS
+        for angular in np.geomspace(low, high, int(np.log(high / low) / (2 * ratio)) + 2).tolist()
+    ]
+    # Without the terms of the model in them, columns explain less than they could: a first choice.
+    best = sorted(tried, key=lambda pole: -_least_statistic(model, pole))[:MOST_PROMISING]
+    chances = [_chance(model, pole, model.freedom_at(pole), 1) for pole in best]
+    least = int(np.argmin(chances))
+    return best[least], len(tried) * chances[least]
+
+
+def _least_statistic(model: FittedModel, pole) -> float:
+    """What 1 / (s - p) explains of the errors, over their variance, if the model keeps its own."""
+    columns = _columns_of(model.lines, pole, 1)
+    along = np.linalg.qr(columns)[0].T @ model.fit.errors
+    peak = model.peak_at(pole)
+    rows = slice(max(peak - NEIGHBOURS, 0), peak + NEIGHBOURS + 1)
+    variance = np.mean(model.fit.errors[: len(model.lines.z)][rows] ** 2, axis=0)
+    return float(np.sum(np.sum(along**2, axis=0) / np.maximum(variance, 1e-300)))
+
+
+def _columns_of(lines: Lines, pole, power):
+    """Columns (row, column) of 1 / (s - p)^power, forced and free."""
+    parts = []
+    for signals, (own, other) in (
+        (lines.inputs, resonances_of(lines, np.array([pole]))),
+        (lines.unforced, transients_of(lines, np.array([pole]))),
+    ):
+        first, second = own**power, other**power
+        parts += [times_signals(first + second, signals)]
+        parts += [times_signals(1j * (first - second), signals)]
+    return both_parts(np.concatenate(parts, axis=1))
+
+
+def _chance(model: FittedModel, pole: complex, freedom: float, power: int) -> float:
+    """Probability by noise of what 1 / (s - p)^power explains of the errors."""
+    fit, columns = model.fit, _columns_of(model.lines, pole, power)
+    basis = np.linalg.qr(columns - fit.columns @ (fit.inverse @ columns))[0]
+    along = basis.T @ fit.errors
+    variance = _without(model, basis, along, model.peak_at(pole))
+    # Errors are already least along two directions for each pole, its own change.
+    count = max(along.size - 2 * (power - 1), 1)
+    statistic = np.sum(np.sum(along**2, axis=0) / variance) / count
+    freedom = max(freedom - basis.shape[1], 1.0) * fit.errors.shape[1]
+    return float(fisher.sf(statistic, count, freedom))
+
+
+def _without(model: FittedModel, basis, along, peak):
+    """Variance of each output about a line, without the errors along a basis."""
+    count = len(model.lines.z)
+    lines = np.arange(max(peak - NEIGHBOURS, 0), min(peak + NEIGHBOURS + 1, count))
+    rows = np.concatenate([lines, count + lines])
+    errors = model.fit.errors[rows] - basis[rows] @ along
+    free = model.free.free[rows] - np.sum(basis[rows] ** 2, axis=1)[:, None]
+    return np.sum(errors**2, axis=0) / np.maximum(np.sum(free, axis=0), 1e-3 * rows.size)
+
+
+def criterion(lines: Lines, poles: Complex[np.ndarray, " mode"]) -> float:
+    """Bayesian information criterion (Schwarz 1978) of poles for lines with errors of one level.
+
+    It is less for the better model.
+    """
+    fit = linear_fit(lines, poles)
+    rows, outputs = fit.errors.shape
+    parameters = outputs * fit.columns.shape[1] + 2 * poles.size
+    size = np.sum(np.log(np.maximum(np.mean(fit.errors**2, axis=0), 1e-300)))
+    return float(rows * size + parameters * np.log(rows))
+
+
+def split_pole(model: FittedModel, k: int) -> Complex[np.ndarray, " mode"]:
+    """Poles of the model with two in the place of the k-th: of several starts, the best."""
+    best, least = model.poles, np.inf
+    for split in SPLITS:
+        step = -model.poles[k].real * split
+        pair = np.array([model.poles[k] - step, model.poles[k] + step])
+        pair = np.minimum(pair.real, 0.1 * model.poles[k].real) + 1j * pair.imag
+        poles = np.concatenate([np.delete(model.poles, k), pair])
+        moving = np.flatnonzero(np.isin(np.delete(np.arange(model.poles.size), k), model.moving))
+        moving = np.concatenate([moving, poles.size - np.array([2, 1])])
+        poles = refined_poles(model.lines, poles, moving)
+        size = np.sum(np.log(np.sum(linear_fit(model.lines, poles).errors ** 2, axis=0)))
+        if size < least:
+            best, least = poles, size
+    return best
+
+
+def _local_variance(errors, free):
+    """Variance of a real or imaginary part at each line (line, output), by its neighbours."""
+    power, shares = (line_means(one, NEIGHBOURS) for one in (errors**2, free))
+    return power / np.maximum(shares, 1e-3)
