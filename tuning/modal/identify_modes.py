@@ -71,7 +71,8 @@ def identify_modes(
     the default, fits the responses to them. Blows of a hammer may be cut into pieces with windows:
     `exponential` (s) is the time constant of one on responses and forces, whose damping is
     subtracted, `force_window` (s) the time after which a force is taken for zero. `exclude`
-    are frequencies (Hz) that are no modes. `progress` is called with a few words on what is being done.
+    are frequencies (Hz) that are no modes. `progress` is called with a few words on what is being
+    done.
 
     Raises ValueError for a log without evenly sampled records, or too short, a window outside the
     log, a band above half the sampling rate, an impossible count or order, unknown channels, kinds
