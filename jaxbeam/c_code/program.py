@@ -64,9 +64,9 @@ def export_c(case: Case, name: str) -> CProgram:
     check_case(case)
     for i, actuator in enumerate(case.actuators):
         if actuator.compensation is not None:
-            raise NoCCodeError(
-                f"there is no C code for the compensation of actuators.{i}: leave it out, and apply"
-                " the inverse of its hysteresis to the commands"
+            raise ValueError(
+                f"actuators.{i}.compensation cannot be exported as C: leave it out, and apply the"
+                " inverse of its hysteresis to the commands"
             )
     controller = case.controller
     if controller is None:

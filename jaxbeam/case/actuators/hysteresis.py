@@ -31,7 +31,7 @@ class Hysteresis(ReprWithUnits, eqx.Module):
     >>> patch = jb.Patch(0.25, 0.35, moment_per_volt=8e-4)
     >>> hysteresis = jb.Hysteresis(thresholds=[0.0, 1.0], weights=[0.8, 0.4])
     >>> print(hysteresis.outputs([0.0, 5.0, 3.0, 0.0]))
-    [0.  5.6 4.  0.8]
+    [0.  5.6 4.  0.4]
     """
 
     thresholds: Float[Array, " play"] = number(
