@@ -142,3 +142,17 @@ def test_a_method_refuses_what_it_cannot_use():
         identify_modes(log, method="fdd", kind="free decay")
     with pytest.raises(ValueError, match="no models and no order"):
         identify_modes(log, method="fdd", order=10)
+
+
+def test_efdd_parts_a_pair_with_one_peak():
+    """Orthogonal shapes, two per cent apart: within a bandwidth of the segments."""
+    structure = small_structure(0)._replace(
+        frequencies=np.array([4.0, 4.08, 9.0]),
+        damping_ratios=np.array([0.006, 0.006, 0.008]),
+        shapes=np.array([[1.0, 1.0, 0.4], [1.0, -0.9, 0.3], [0.5, 0.2, -1.0]]),
+    )
+    planted = sampled(structure, "ambient", 3, 600.0)
+    fit = identify_modes(log_of(planted), band=(2.0, 11.0), method="fdd")
+    np.testing.assert_allclose(fit.frequencies, structure.frequencies, rtol=4e-3)
+    assert np.all(np.diag(mac_matrix(fit.shapes, structure.shapes + 0j)) > 0.95)
+    np.testing.assert_allclose(fit.damping_ratios, structure.damping_ratios, rtol=0.5)

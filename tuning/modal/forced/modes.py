@@ -29,7 +29,7 @@ from tuning.modal.forced.modal_model import damping_doubts, modes_of_model, unex
 from tuning.modal.forced.significance import (
     criterion,
     missing_pole,
-    residue_chances,
+    mode_chances,
     single_pole_chances,
     split_pole,
 )
@@ -160,12 +160,12 @@ def _refined(lines, poles, scale, part):
     dropped = []
     while True:
         model = fit_modal_model(lines, poles, part)
-        doubts, chances, reason = damping_doubts(model), residue_chances(model), ""
+        doubts, chances, reason = damping_doubts(model), mode_chances(model), ""
         if np.any(doubts >= 1):
             worst = int(np.argmax(doubts))
         elif np.any(chances > CHANCE):
             worst = int(np.argmax(chances))
-            reason = "no response to the force beyond what noise explains"
+            reason = "no response beyond what noise explains"
         else:
             return model, dropped
         dropped.append((modes_of_model(model, scale)[worst], reason))
