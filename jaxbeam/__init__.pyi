@@ -21,6 +21,7 @@ from .analysis.sections.amplification import (
 )
 from .analysis.sections.characteristic_points import characteristic_points as characteristic_points
 from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
+from .case.actuators.hysteresis import Hysteresis as Hysteresis
 from .case.actuators.patch import Patch as Patch
 from .case.actuators.point import PointForce as PointForce
 from .case.actuators.shaker import Shaker as Shaker
@@ -99,6 +100,7 @@ from .control.receptance import (
 from .control.scheduled_feedback import ScheduledFeedback as ScheduledFeedback
 from .control.sliding_mode import SlidingMode as SlidingMode
 from .control.state_feedback import StateFeedback as StateFeedback
+from .estimation.extended_kalman import ExtendedKalman as ExtendedKalman
 from .estimation.inversion import Inversion as Inversion
 from .estimation.kalman import Kalman as Kalman
 from .estimation.observer import Observer as Observer

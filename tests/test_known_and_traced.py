@@ -311,6 +311,9 @@ NO_PROGRAM = {
     "an open loop": "jb.simulate(case)",
     "another number of loads and modes": "jb.simulate(other)",
     **{name: f"jb.simulate(laws[{i}])" for i, name in enumerate(LAWS)},
+    "poles of a loop": "frozen_poles(laws[0], np.array([0.0, 0.02])).poles",
+    "its growth": "growth(laws[0])",
+    "its margins": "stability_margin(laws[1])",
 }
 
 
@@ -321,7 +324,9 @@ def test_plain_calls_compile_nothing(tmp_path):
     lines = [f"print({name!r}, file=sys.stderr); {call}" for name, call in NO_PROGRAM.items()]
     code = (
         "import jax; jax.config.update('jax_log_compiles', True)\n"
-        "import dataclasses, sys, jaxbeam as jb\n"
+        "import dataclasses, sys, numpy as np, jaxbeam as jb\n"
+        "from jaxbeam.analysis.crossing_margin import stability_margin\n"
+        "from jaxbeam.analysis.stability import frozen_poles, growth\n"
         "case = jb.load_case('case.toml')\n"
         "beam = dataclasses.replace(case.beam, modes=7, damping_ratio=0.01)\n"
         "other = dataclasses.replace(case, beam=beam, loads=case.loads[:2])\n"

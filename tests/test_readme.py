@@ -81,6 +81,8 @@ def test_options_exist():
     named = {option for span in spans() for option in re.findall(r"(?<![\w-])--[a-z][\w-]*", span)}
     modules = {
         "--quick",
+        "--list",
+        "--pages",
         "--modes",
         "--keep",
         "--extra",
@@ -148,3 +150,24 @@ def test_the_three_jobs_print_what_readme_shows(capsys, monkeypatch):
             assert any(
                 same_words(words, one.split("; estimated")[0] if error else one) for one in printed
             ), f"README shows, but the code does not print: {line}"
+
+
+SPEED_ROWS = {
+    "jaxbeam, in C, where there is a C compiler": "jaxbeam native",
+    "jaxbeam, in XLA": "jaxbeam",
+    "numba, adaptive Runge-Kutta, parallel over runs": "numba, parallel over runs",
+    "diffrax, mapped over speeds, vmapped over masses": "diffrax, vmapped",
+    "scipy DOP853 in a loop": "scipy DOP853, scaled",
+}
+
+
+def test_speeds_are_those_that_the_benchmark_printed():
+    """README has the seconds of `docs/_static/benchmarks/sweep.md`, without exponents."""
+    printed = (ROOT / "docs" / "_static" / "benchmarks" / "sweep.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([a-z][^|]*) \| ([0-9.e+]+) \|", printed, re.M)
+    section = TEXT["README.md"].split("## Speed")[1]
+    shown = re.findall(r"^\| (\w[^|]+) \| ([0-9.]+) s \| ([0-9.]+) s \|", section, re.M)
+    assert [name for name, *_ in shown] == list(SPEED_ROWS)
+    for name, *seconds in shown:
+        measured = [float(value) for row, value in rows if row == SPEED_ROWS[name]]
+        assert [float(value) for value in seconds] == measured

@@ -6,6 +6,9 @@ import inspect
 import re
 import textwrap
 
+from docutils import nodes
+from sphinx import addnodes
+
 import jaxbeam
 import tuning
 
@@ -144,8 +147,30 @@ def _signature(app, what, name, obj, options, signature, returns):
     return signature, returns
 
 
+def _skip(app, what, name, obj, skip, options):
+    """Leave out fields of named tuples, which the table of fields has, with types and meanings."""
+    return True if (inspect.getdoc(obj) or "").startswith("Alias for field number") else None
+
+
+def plain_type(text: str) -> str:
+    """Type as in the source, `Float[Array, 'time']`, for what jaxtyping makes of it."""
+    array = r"(\w+)\[jaxlib\._jax\.Array, ('[^']*')\]( \| \1\[ndarray, \2\])?( \| generic)?"
+    return re.sub(array, r"\1[Array, \2]", text)
+
+
+def _plain_types(app, doctree):
+    """Types of properties as the source has them."""
+    for node in doctree.findall(addnodes.desc_annotation):
+        text = node.astext()
+        if plain_type(text) != text:
+            node.children = []
+            node += nodes.Text(plain_type(text))
+
+
 def setup(app):
     """Connect to autodoc."""
     app.connect("autodoc-process-docstring", _rewrite)
     app.connect("autodoc-process-signature", _signature)
+    app.connect("autodoc-skip-member", _skip)
+    app.connect("doctree-read", _plain_types)
     return {"parallel_read_safe": True}

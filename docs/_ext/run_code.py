@@ -56,6 +56,7 @@ class RunBase(SphinxDirective):
         "hide-code": directives.flag,
         "hide-output": directives.flag,
         "fails": directives.flag,
+        "wrap": directives.flag,
         "alt": directives.unchanged,
         "width": directives.unchanged,
     }
@@ -84,7 +85,8 @@ class RunBase(SphinxDirective):
         if len(lines) > MAX_LINES:
             raise self.error(f"prints {len(lines)} lines; show fewer")
         shown = "\n".join(lines).replace(str(self.page.folder) + "/", "")
-        classes = ["output", "message"] if "fails" in self.options else ["output"]
+        is_message = self.options.keys() & {"fails", "wrap"}  # long lines are wrapped
+        classes = ["output", "message"] if is_message else ["output"]
         return [nodes.literal_block(shown, shown, language="text", classes=classes)]
 
     def picture(self, suffix: str) -> Path:

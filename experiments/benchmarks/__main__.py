@@ -1,16 +1,22 @@
 """All benchmarks, or those named, one after the other, each in its own process.
 
-    python -m experiments.benchmarks [NAME ...] [--quick] [--list]
+    python -m experiments.benchmarks [NAME ...] [--quick] [--list] [--pages]
 
-Each prints its table; those that fail are named at the end, and the others still run. `python -m
-experiments.benchmarks.NAME --help` prints the options of one benchmark.
+Each prints its table; those that fail are named at the end, and the others still run. With --pages
+what they print is written to `docs/_static/benchmarks`, too, which the pages of the site show.
+`python -m experiments.benchmarks.NAME --help` prints the options of one benchmark.
 """
 
+import datetime
+import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import NamedTuple
 
 from experiments.benchmarks.common import parser
+
+PAGES = Path(__file__).parents[2] / "docs" / "_static" / "benchmarks"
 
 
 class Benchmark(NamedTuple):
@@ -25,7 +31,9 @@ BENCHMARKS = {
     "cases": Benchmark("one and two spans, loops, histories: scipy and diffrax", "--quick"),
     "kernel": Benchmark("sweeps: the same method by hand in C", "--modes 3"),
     "first_answer": Benchmark("first answers of fresh processes: a script with scipy", "--quick"),
+    "quantities": Benchmark("sweeps of every quantity, beside deflections", "--modes 3"),
     "trains": Benchmark("ten trains at many speeds: a script with numpy", "--speeds 5"),
+    "vehicles": Benchmark("quarter cars: moving masses, and a script with scipy", "--runs 20"),
     "growth": Benchmark("time and peak memory of growing sweeps; compiling", "--runs 4096 40000"),
     "identification": Benchmark("identification: scipy's least squares"),
     "regulator_designs": Benchmark("designs of regulators, many at once"),
@@ -52,6 +60,7 @@ def main() -> None:
     )
     options.add_argument("--quick", action="store_true", help="short runs, to check that all work")
     options.add_argument("--list", action="store_true", help="only list the benchmarks")
+    options.add_argument("--pages", action="store_true", help="write what is printed to the docs")
     arguments = options.parse_args()
     names = [_current_name(name) for name in arguments.names]
     unknown = set(names) - set(BENCHMARKS)
@@ -66,10 +75,23 @@ def main() -> None:
             continue
         print(f"\n## {name}: {about}\n", flush=True)
         command = [sys.executable, "-m", f"experiments.benchmarks.{name}"]
-        if subprocess.run(command + (quick.split() if arguments.quick else [])).returncode:
+        command += quick.split() if arguments.quick else []
+        pipe = subprocess.PIPE if arguments.pages else None
+        ended = subprocess.run(command, stdout=pipe, text=True)
+        if ended.returncode:
             failed.append(name)
+        elif arguments.pages:
+            print(ended.stdout)
+            write_page(name, ended.stdout)
     if failed:
         raise SystemExit(f"failed: {', '.join(failed)}")
+
+
+def write_page(name: str, printed: str) -> None:
+    """What a benchmark printed, with number of cores and date, as a part of a page of the site."""
+    PAGES.mkdir(exist_ok=True)
+    where = f"{os.cpu_count()} cores, {datetime.date.today().isoformat()}:"
+    (PAGES / f"{name}.md").write_text(f"{where}\n\n{printed.strip()}\n", encoding="utf-8")
 
 
 def _current_name(name: str) -> str:

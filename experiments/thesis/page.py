@@ -2,8 +2,9 @@
 
     python -m experiments.thesis.page out/reproduce/report.json
 
-writes docs/explanation/thesis.md, and the sentences between the marks of README.md and of
-docs/howto/reproduce.md. Run it after `jaxbeam reproduce --all`.
+writes docs/explanation/thesis.md, the sentences between the marks of README.md and of
+docs/howto/reproduce.md, and the tables of docs/explanation/results.md. Run it after
+`jaxbeam reproduce --all`.
 """
 
 import json
@@ -15,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.thesis.report import ALL_VERDICTS
+from experiments.thesis.results_tables import PAGE as RESULTS, with_tables
 from experiments.thesis.verdicts import (
     EXPLAINED,
     FITTED,
@@ -131,8 +133,9 @@ def with_counts(text: str, report: dict) -> str:
 
 
 def write(report: dict) -> None:
-    """Write the page, and the counts in README and on the page about `reproduce`."""
+    """Write the page, the tables of results, and the counts in README and about `reproduce`."""
     PAGE.write_text(page(report), encoding="utf-8")
+    RESULTS.write_text(with_tables(RESULTS.read_text(encoding="utf-8"), report), encoding="utf-8")
     for file in (ROOT / "README.md", ROOT / "docs" / "howto" / "reproduce.md"):
         file.write_text(with_counts(file.read_text(encoding="utf-8"), report), encoding="utf-8")
 

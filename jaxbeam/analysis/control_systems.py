@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any, NamedTuple
 
-from jaxbeam.analysis.linearised_loop import loop_with_mass_at, standing_mass
+from jaxbeam.analysis.loops.stationary_loop import loop_with_mass_at, standing_mass
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.mass import MovingMass

@@ -7,12 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxbeam.analysis.linearised_loop import stationary_loops
+from jaxbeam.analysis.loops.stationary_loop import stationary_loops
 from jaxbeam.analysis.margins import margins
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.fields import concrete
 from jaxbeam.control.predictive.mpc import MPC
-from jaxbeam.estimation.kalman import Kalman
 
 LOAD_POSITIONS = 13  # load positions along a crossing at which margins are computed
 MIN_RATE = 1e-6  # 1/s; a pole whose real part is smaller counts as marginally stable
@@ -107,7 +106,7 @@ def stability_margin(case: Case) -> StabilityMargin:
 def _has_varying_filter(controller) -> bool:
     """Whether a Kalman filter propagates its covariance, which has no equilibrium of its own."""
     estimator = getattr(controller, "estimator", None)
-    return isinstance(estimator, Kalman) and estimator.loads != "ignored"
+    return estimator is not None and estimator.varies
 
 
 def _no_margin(obstacle: str) -> StabilityMargin:

@@ -4,29 +4,31 @@ The state holds plant with sensor filters and vehicles, states of law and digita
 queues of delayed readings and commands. Limits, ranges and resolution are left out.
 """
 
+import itertools
 import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
+from jaxbeam.analysis.loops.affine import affine_jacobian
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw, Measurement
+from jaxbeam.case.filters import filter_step
 from jaxbeam.case.trajectory import NEVER, AbstractTrajectory
 from jaxbeam.model.modal_model import compiled_modal_model
 from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensing.sensor_signals import (
-    filtered_reading,
     initial_filter_state,
     sensor_sections,
 )
 from jaxbeam.model.state_space import Plant, build_plant
-from jaxbeam.runtime.arrays import Array, expm, known, scan, xp
+from jaxbeam.numerics.discretisation import propagate
+from jaxbeam.runtime.arrays import Array, known, ravel_pytree, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
+from jaxbeam.runtime.module import Module
 
 PERIOD_TOLERANCE = 1e-9  # of a period; smaller differences of times count as zero
 
@@ -65,7 +67,7 @@ class FrozenTrajectory(AbstractTrajectory):
         return xp.zeros(0)
 
 
-class LoopDynamics(eqx.Module):
+class LoopDynamics(Module):
     """Plant with sensor filters, and control law, as functions of their states.
 
     `augmented_plant` has the analogue filters of the sensors as further states; `output_rows` map
@@ -110,9 +112,11 @@ class LoopDynamics(eqx.Module):
 
         controller_states = self.law.state_count
         zero_state = xp.zeros(size + controller_states)
-        controller_rows, controller_inputs = jax.jacfwd(rates, argnums=(0, 1))(
-            zero_state, zero_command
+        jacobian = affine_jacobian(
+            lambda both: rates(both[: len(zero_state)], both[len(zero_state) :]),
+            xp.zeros(len(zero_state) + command_count),
         )
+        controller_rows, controller_inputs = xp.split(jacobian, [len(zero_state)], axis=1)
         A = xp.concatenate([xp.pad(system.A, ((0, 0), (0, controller_states))), controller_rows])
         input_matrix = xp.concatenate([system.B[:, :command_count], controller_inputs])
         weight_rates = xp.append(
@@ -146,11 +150,38 @@ class LoopDynamics(eqx.Module):
             )
         )
 
-    def sampling_step(self, timing: LoopTiming, state, t, command_given=None, substeps: int = 1):
+    def plant_transitions(
+        self, timing: LoopTiming, t, substeps: int | None = None, weights: bool = True
+    ) -> list:
+        """Matrices from state, commands and weights to the state, over intervals of a period.
+
+        The period begins at t (s), one time or several. Loads are frozen there, or move, in
+        `substeps` of each interval. Those of deviations are without `weights`.
+        """
+        system = self.augmented_plant.at(t)
+        states, commands = system.A.shape[-1], len(self.plant.case.actuators)
+        inputs = system.B.shape[-1] if weights else commands
+
+        def augmented_matrix(time):
+            # Held inputs as further states.
+            now = system if substeps is None else self.augmented_plant.at(time)
+            top = xp.concatenate([now.A, now.B[..., :inputs]], axis=-1)
+            return xp.pad(top, [*[(0, 0)] * (top.ndim - 2), (0, inputs), (0, 0)])
+
+        identity = xp.broadcast_to(xp.eye(states + inputs), (*xp.shape(t), *[states + inputs] * 2))
+        return [
+            propagate(augmented_matrix, t + start, end - start, substeps or 1, identity)[
+                ..., :states, :
+            ]
+            for start, end in _intervals(timing)
+        ]
+
+    def sampling_step(self, timing: LoopTiming, state, t, transitions, command_given=None):
         """State just before the next sample, from that just before a sample at t (s); commands.
 
-        `command_given` replaces the commands of the law. Moving loads take `substeps` between
-        changes of the command.
+        `transitions` are those of the plant over the period, of its state and inputs, or of its
+        deviations, without the weights. `command_given` replaces the commands of the law. All may
+        be columns (entry, column) if the law takes them.
         """
         plant_state, filters, signal_history, law_state, command_queue = state
         case, signal_history, states, readings = self.plant.case, list(signal_history), [], []
@@ -164,13 +195,14 @@ class LoopDynamics(eqx.Module):
             else:
                 signal_history[i] = xp.concatenate([signals[i : i + 1], signal_history[i]])
             sections = sensor_sections(sensor, timing.period)
-            reading, after = filtered_reading(
-                _ideal_sensor(sensor), sections, filters[i], signal_history[i][whole]
-            )
+            # An ideal sensor, without range, resolution and offset.
+            reading, after = signal_history[i][whole], None
+            if sections is not None:
+                reading, after = filter_step(sections, filters[i], reading)
             readings.append(reading)
             states.append(after)
             signal_history[i] = signal_history[i][:history_length]
-        readings = xp.stack(readings) if readings else xp.zeros(0)
+        readings = xp.stack(readings) if readings else xp.zeros((0, *plant_state.shape[1:]))
         measurement = self._measurement(readings, plant_state, command_queue[whole_periods])
         controller_command, law_state, _ = self.law.step(law_state, measurement, t)
         command_queue = xp.concatenate(
@@ -178,14 +210,10 @@ class LoopDynamics(eqx.Module):
         )
         # Within the period the command changes once, and delayed sensors take their samples.
         change = share * timing.period
-        events = sorted({0.0, change, *delayed_samples, timing.period})
-        for start, end in zip(events[:-1], events[1:], strict=True):
-            command = (
-                command_queue[whole_periods + 1] if end <= change else command_queue[whole_periods]
-            )
-            plant_state = self._advance_plant(
-                plant_state, command, t + start, end - start, substeps
-            )
+        for (_, end), transition in zip(_intervals(timing), transitions, strict=True):
+            command = command_queue[whole_periods + (end <= change)]
+            inputs = self._inputs(command)[: transition.shape[1] - plant_state.shape[0]]
+            plant_state = transition @ xp.concatenate([plant_state, inputs])
             for i in delayed_samples.get(end, ()):
                 signal = self._sensor_inputs(plant_state, command, t + end)[i : i + 1]
                 signal_history[i] = xp.concatenate([signal, signal_history[i]])[
@@ -199,23 +227,6 @@ class LoopDynamics(eqx.Module):
             command_queue[: whole_periods + 1],
         ), controller_command
 
-    def _advance_plant(self, state, command, t, duration, substeps):
-        """State of the plant after a duration (s) under held commands.
-
-        Each substep is two exponentials of matrices at Gauss nodes (order 4; Blanes and Moan,
-        Applied Numerical Mathematics 56, 2006), exact for frozen loads.
-        """
-        inputs = xp.concatenate([command, self.augmented_plant.weights])
-
-        def augmented_matrix(time):
-            # Held inputs as further states.
-            system = self.augmented_plant.at(time)
-            top = xp.concatenate([system.A, system.B], axis=1)
-            return xp.pad(top, ((0, inputs.shape[0]), (0, 0)))
-
-        start = xp.concatenate([state, inputs])
-        return propagate(augmented_matrix, t, duration, substeps, start)[: state.shape[0]]
-
     def _sensor_inputs(self, state, command, t):
         """Inputs of the sensors (sensor,) after their analogue filters."""
         beam = state[: self.output_rows.shape[1]]
@@ -224,10 +235,17 @@ class LoopDynamics(eqx.Module):
         if not has_feedthrough.any():
             return signals
         system = self.augmented_plant.at(t)
-        accelerations = system.C @ state + system.D @ xp.concatenate(
-            [command, self.augmented_plant.weights]
-        )
+        accelerations = system.C @ state + system.D @ self._inputs(command)
+        has_feedthrough = has_feedthrough.reshape(-1, *(1,) * (signals.ndim - 1))
         return xp.where(has_feedthrough, accelerations, signals)
+
+    def _inputs(self, command):
+        """Commands, then the weights; columns of both for columns of commands."""
+        weights = self.augmented_plant.weights
+        weights = weights.reshape(-1, *(1,) * (command.ndim - 1))
+        return xp.concatenate(
+            [command, xp.broadcast_to(weights, (*weights.shape[:1], *command.shape[1:]))]
+        )
 
     def _measurement(self, readings, state, command):
         beam = state[: self.output_rows.shape[1]]
@@ -253,36 +271,12 @@ def _loop_dynamics(case, model):
 _compiled_dynamics, _known_dynamics = compiled(_loop_dynamics), compiled_if_traced(_loop_dynamics)
 
 
-def propagate(matrix, t, duration, substeps: int, start):
-    """x(t + duration) of x' = matrix(time) x, x(t) = start, a vector or matrix; order 4."""
-    step = duration / substeps
-    first_node, second_node = 0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6
-    larger_weight, smaller_weight = (
-        (0.25 + math.sqrt(3) / 6) * step,
-        (0.25 - math.sqrt(3) / 6) * step,
-    )
-
-    def step_state(state, time):
-        first, second = matrix(time + first_node * step), matrix(time + second_node * step)
-        for part in (
-            larger_weight * first + smaller_weight * second,
-            smaller_weight * first + larger_weight * second,
-        ):
-            state = expm(part) @ state
-        return state, None
-
-    return scan(step_state, start, t + step * np.arange(substeps))[0]
-
-
-def _ideal_sensor(sensor):
-    """Sensor without range, resolution and offset."""
-    fields = ("range", "resolution", "offset")
-    return eqx.tree_at(
-        lambda s: [getattr(s, name) for name in fields],
-        sensor,
-        [None, None, xp.zeros(())],
-        is_leaf=lambda x: x is None,
-    )
+def _intervals(timing: LoopTiming) -> list[tuple[float, float]]:
+    """Start and end (s) of the intervals of a period with a constant command, between samples."""
+    share = _split_delay(timing.delay / timing.period)[1]
+    remainders = (_split_delay(lag / timing.period)[1] for lag in timing.sensor_delays)
+    samples = ((1 - remainder) * timing.period for remainder in remainders if remainder)
+    return list(itertools.pairwise(sorted({0.0, share * timing.period, *samples, timing.period})))
 
 
 def _split_delay(periods: float) -> tuple[int, float, int]:

@@ -45,11 +45,16 @@ def margins(loop: LinearisedLoop, actuator: int = 0) -> Margins:
     curve = response(omega)
 
     def crossings(function):
+        def value(w):
+            return function(response(w))[0]
+
         signs = np.sign(function(curve))
         for i in np.flatnonzero(signs[:-1] * signs[1:] < 0):
-            yield scipy.optimize.brentq(
-                lambda w: function(response(w))[0], omega[i], omega[i + 1], rtol=1e-13
-            )
+            ends = omega[i : i + 2]
+            if np.sign(value(ends[0])) == np.sign(value(ends[1])):  # zero but for rounding
+                yield min(ends, key=lambda w: abs(value(w)))
+            else:
+                yield scipy.optimize.brentq(value, *ends, rtol=1e-13)
 
     gains = [1 / response(w)[0].real for w in crossings(np.imag)]
     ends = (value for value in (curve[0], curve[-1]) if abs(value.imag) < 1e-9)

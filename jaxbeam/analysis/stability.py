@@ -14,19 +14,22 @@ import equinox as eqx
 import jax
 import numpy as np
 import scipy
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Complex, Float
 
-from jaxbeam.analysis.frozen_loop import LoopDynamics, LoopTiming, loop_dynamics, propagate
-from jaxbeam.analysis.linearised_loop import linearise, loop_timing
+from jaxbeam.analysis.frozen_loop import LoopDynamics, LoopTiming, loop_dynamics
+from jaxbeam.analysis.linearised_loop import linearise_each, loop_timing
+from jaxbeam.analysis.loops.affine import NotAffineError
+from jaxbeam.analysis.loops.affine_loop import linear_loop, ravel_columns
 from jaxbeam.case.case import Case, concrete_case, crossing_times
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.runtime.arrays import scan, xp
+from jaxbeam.numerics.discretisation import propagate
+from jaxbeam.runtime.arrays import known, ravel_pytree, scan, xp
 from jaxbeam.runtime.compiling import compiled
 
 MAX_PHASE_PER_STEP = 0.15  # rad: phase of the fastest mode per step of the transition matrix
+SAMPLES_AT_ONCE = 2048  # of which the plant is propagated together
 
 
 class FrozenPoles(NamedTuple):
@@ -87,7 +90,7 @@ def frozen_poles(case: Case, times: Float[np.ndarray, " time"] | None = None) ->
         times = np.linspace(*_crossing_interval(case), 101)[:-1] if case.loads else np.zeros(1)
     times = np.asarray(times, float)
     loop = loop_dynamics(case, mesh_layout(concrete_case(case)))
-    poles = [linearise(loop, timing, t).poles() for t in times]
+    poles = [frozen.poles() for frozen in linearise_each(loop, timing, times)]
     return FrozenPoles(times, _tracked_branches(np.stack(poles)))
 
 
@@ -109,7 +112,6 @@ def growth(case: Case, points: int = 100) -> Growth:
         times = sampling_instants * timing.period
     steps = _substeps(loop, timing, times)
     transitions, energy = _transition_matrices(loop, timing, times, steps)
-    transitions, energy = np.asarray(transitions), np.asarray(energy)
     size = energy.shape[0]
     energy_root = np.linalg.cholesky(energy).T
     energy_transitions = energy_root @ transitions[:, :size, :size] @ np.linalg.inv(energy_root)
@@ -153,7 +155,7 @@ def stream(case: Case, spacing: float) -> Stream:
     times = start + np.linspace(0.0, spacing, max(intervals, 20 if timing is None else 1) + 1)
     steps = _substeps(loop, timing, times)
     transitions, _ = _transition_matrices(loop, timing, times, steps)
-    return Stream(np.linalg.eigvals(np.asarray(transitions[-1])), float(spacing))
+    return Stream(np.linalg.eigvals(transitions[-1]), float(spacing))
 
 
 def _crossing_interval(case: Case) -> tuple[float, float]:
@@ -172,16 +174,52 @@ def _substeps(loop, timing, times) -> int:
     return max(1, math.ceil(fastest * longest / MAX_PHASE_PER_STEP))
 
 
-@compiled
-def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, substeps: int):
+def _transition_matrices(
+    loop: LoopDynamics, timing: LoopTiming | None, times, substeps: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Transition matrices (time, state, state) from the first time; energy matrix of q and q'."""
+    if timing is not None:
+        try:
+            return _affine_transitions(loop, timing, times, substeps), _energy_matrix(loop)
+        except NotAffineError:
+            pass
+    return known(_compiled_transitions(loop, timing, times, substeps)), _energy_matrix(loop)
+
+
+def _affine_transitions(loop: LoopDynamics, timing: LoopTiming, times, substeps: int):
+    """Transition matrices of a sampled loop of known numbers; raises NotAffineError if not affine.
+
+    The law may change from sample to sample.
+    """
+    linear = linear_loop(loop, times[0])
+    start, unpack = linear.rest_state(timing)
+    columns = unpack(np.eye(len(start)))
+    transitions, product = [np.eye(len(start))], np.eye(len(start))
+    for first in range(0, len(times) - 1, SAMPLES_AT_ONCE):
+        chunk = times[:-1][first : first + SAMPLES_AT_ONCE]
+        plant = linear.plant_transitions(timing, chunk, substeps, weights=False)
+        for i, t in enumerate(chunk):
+            linear = linear_loop(loop, t, linear)
+            after, _ = linear.sampling_step(timing, columns, t, [part[i] for part in plant])
+            product = ravel_columns(after) @ product
+            transitions.append(product)
+    return np.stack(transitions)
+
+
+def _energy_matrix(loop: LoopDynamics) -> Float[np.ndarray, "state state"]:
+    """Matrix of twice the mechanical energy of q and q'."""
     model, modes = loop.plant, loop.plant.coordinate_scale.shape[0]
     stiffness = model.modal_model.stiffness() / xp.outer(
         model.coordinate_scale, model.coordinate_scale
     )
     mass = xp.diag(1 / model.coordinate_scale**2)
     zeros = xp.zeros((modes, modes))
-    energy = xp.block([[stiffness, zeros], [zeros, mass]])
+    return np.asarray(xp.block([[stiffness, zeros], [zeros, mass]]))
+
+
+@compiled
+def _compiled_transitions(loop: LoopDynamics, timing: LoopTiming | None, times, substeps: int):
+    """Transition matrices of any loop."""
     if timing is None:
 
         def closed_matrix(t):
@@ -205,17 +243,19 @@ def _transition_matrices(loop: LoopDynamics, timing: LoopTiming | None, times, s
         )
 
         def advance_sample(transition, t):
+            plant = unweighted.plant_transitions(timing, t, substeps)
+
             def after(state):
-                return ravel_pytree(
-                    unweighted.sampling_step(timing, rebuild(state), t, None, substeps)[0]
-                )[0]
+                return ravel_pytree(unweighted.sampling_step(timing, rebuild(state), t, plant)[0])[
+                    0
+                ]
 
             transition = jax.jacfwd(after)(rest_state) @ transition
             return transition, transition
 
         start = xp.eye(rest_state.shape[0])
         transitions = scan(advance_sample, start, times[:-1])[1]
-    return xp.concatenate([start[None], transitions]), energy
+    return xp.concatenate([start[None], transitions])
 
 
 def _tracked_branches(

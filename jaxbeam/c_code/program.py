@@ -30,7 +30,7 @@ from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import known
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.whole_file import whole_file
-from jaxbeam.simulation.command_limits import command_ranges
+from jaxbeam.simulation.commands.limits import command_ranges
 
 MAX_SAMPLES = 2000  # recorded ones, of the start of the run
 
@@ -62,6 +62,12 @@ def export_c(case: Case, name: str) -> CProgram:
     if not (name.isidentifier() and name.isascii()):
         raise ValueError(f"{name!r} cannot be the name of functions in C: take letters, digits, _")
     check_case(case)
+    for i, actuator in enumerate(case.actuators):
+        if actuator.compensation is not None:
+            raise ValueError(
+                f"actuators.{i}.compensation cannot be exported as C: leave it out, and apply the"
+                " inverse of its hysteresis to the commands"
+            )
     controller = case.controller
     if controller is None:
         raise ValueError("controller is missing: there is nothing to export; add one to the case")

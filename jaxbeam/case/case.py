@@ -316,7 +316,8 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
             leaves[index[address]] = value
         else:
             if value.shape:
-                raise ValueError(f"{address} takes one number, not {value.shape}")
+                shape = "x".join(map(str, value.shape))
+                raise ValueError(f"{address} takes one number, not a list of {shape}")
             leaves[index[parent]] = set_at(leaves[index[parent]], entry, value)
     return jax.tree_util.tree_unflatten(structure, leaves)
 

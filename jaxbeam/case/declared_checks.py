@@ -139,9 +139,11 @@ def validate_direct_or_derived(
     absent = [name for name in sources if getattr(part, name) is None]
     if not absent:
         return None
+    verb = "is" if len(absent) == 1 else "are"
+    which = "" if len(absent) == len(sources) else f" (of which {', '.join(absent)} {verb} missing)"
     return (
         f"{address}.{direct} is missing; give it, or all of {', '.join(sources[:-1])} and"
-        f" {sources[-1]} (of which {', '.join(absent)} is missing)"
+        f" {sources[-1]}{which}"
     )
 
 

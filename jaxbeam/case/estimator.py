@@ -18,17 +18,27 @@ from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.module import Module
 
 
+class EstimatedLoads(NamedTuple):
+    """Masses (kg), positions (m) and speeds (m/s, negative to the left) of loads of one wheel."""
+
+    masses: Float[Array, " load"]
+    positions: Float[Array, " load"]
+    speeds: Float[Array, " load"]
+
+
 class Estimate(NamedTuple):
     """Estimate of the state of the plant, and of the weights of the loads (N) if estimated too.
 
     The state is that of the beam of the plant for which the filter is designed. `weights` has one
     entry for each wheel of the case, zero while it is off the beam; None where weights are not
-    estimated. `vehicles` are the states of vehicles, None where the filter does not have them.
+    estimated. `vehicles` are the states of vehicles, None where the filter does not have them;
+    `loads` are the loads of a filter that follows their masses and speeds, else None.
     """
 
     state: Float[Array, " state"]
     weights: Float[Array, " wheel"] | None = None
     vehicles: Float[Array, " vehicle_state"] | None = None
+    loads: EstimatedLoads | None = None
 
 
 class AbstractSampledFilter(Module):
@@ -87,6 +97,11 @@ class AbstractEstimator(ReprWithUnits, eqx.Module, metaclass=AcceptsFormerArgume
     @property
     def has_vehicles(self) -> bool:
         """Whether estimates have the states of vehicles."""
+        return False
+
+    @property
+    def varies(self) -> bool:
+        """Whether the gain changes as the loads cross, so that a loop has no equilibrium."""
         return False
 
     @abc.abstractmethod

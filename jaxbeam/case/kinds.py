@@ -36,7 +36,7 @@ def kinds(family: type) -> dict[str, type]:
         if _full_name(other) != _full_name(part_class):
             raise TypeError(
                 f"the kind {kind!r} is declared by both {_full_name(other)} and"
-                f" {_full_name(part_class)}"
+                f" {_full_name(part_class)}: give one of them another kind"
             )
         classes[kind] = part_class
     return dict(sorted(classes.items()))

@@ -281,6 +281,9 @@ def _sampled_features(case: Case) -> Iterator[str]:
     for i, actuator in enumerate(case.actuators):
         if actuator.command_rate_limit() is not None:
             yield f"the rate limit of actuators.{i}"
+        for name in ("hysteresis", "compensation"):
+            if getattr(actuator, name) is not None:
+                yield f"the {name} of actuators.{i}"
     if not case.controller.open_loop:
         for i, sensor in enumerate(case.sensors):
             yield from sensor.sampled_features(f"sensors.{i}")

@@ -102,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except MemoryError as error:
-        print_message(f"not enough memory: {error}")
+        print_message(f"not enough memory: {error}; take fewer runs, samples or modes")
         sys.exit(1)
     except UnusedCliTokensError as error:
         words, what = " ".join(error.unused_tokens or ()), " ".join(error.command_chain or ())

@@ -157,6 +157,6 @@ def _check_effect(effect, rows, input_rows) -> None:
     shares = np.linalg.svd(effect / np.where(largest > 0, largest, 1.0), compute_uv=False)
     if shares[-1] < SMALLEST_EFFECT:
         raise ValueError(
-            "controller.positions: the commands do not move the deflections there one by one; take"
-            " positions near the actuators"
+            "controller.positions: no commands hold each of the deflections there apart from the"
+            " others; take positions near the actuators"
         )

@@ -96,22 +96,28 @@ class CrossingFilter(AbstractSampledFilter):
 
     def update(self, state, measurement, t):
         prediction = self.predict(state, measurement.command, t)
-        gain, covariance = self.correction(prediction.covariance, prediction.C)
+        noise = self.sensor_chain.noise_covariance
+        gain, covariance = corrected(prediction.covariance, prediction.C, noise)
         x = prediction.x + gain @ (measurement.readings - prediction.readings)
         return self._estimate(x, t), FilterState(x, covariance, measurement.command)
-
-    def correction(
-        self, covariance: Square, C: Float[Array, "sensor state"]
-    ) -> tuple[Float[Array, "state sensor"], Square]:
-        """Gain for a prediction of this covariance, and the covariance after its correction."""
-        noise = self.sensor_chain.noise_covariance
-        gain = filter_gain(covariance, C, noise)
-        # Joseph's form: symmetric and positive semidefinite in spite of rounding.
-        error_matrix = xp.eye(covariance.shape[0]) - gain @ C
-        corrected = error_matrix @ covariance @ error_matrix.T + gain @ noise @ gain.T
-        return gain, symmetric_part(corrected)
 
     def _estimate(self, x, t) -> Estimate:
         plant = self.filtered.plant
         added = x[plant.modal_model.state_count : self.sensor_chain.plant_states]
         return with_loads(plant, x[: self.plant_states], added, t, self.estimates_weights)
+
+
+def corrected(
+    covariance: Square,
+    C: Float[Array, "sensor state"],
+    noise_covariance: Float[Array, "sensor sensor"],
+) -> tuple[Float[Array, "state sensor"], Square]:
+    """Gain for a prediction of this covariance, and the covariance after its correction.
+
+    By readings C x with noise of a covariance.
+    """
+    gain = filter_gain(covariance, C, noise_covariance)
+    # Joseph's form: symmetric and positive semidefinite in spite of rounding.
+    error_matrix = xp.eye(covariance.shape[0]) - gain @ C
+    after = error_matrix @ covariance @ error_matrix.T + gain @ noise_covariance @ gain.T
+    return gain, symmetric_part(after)

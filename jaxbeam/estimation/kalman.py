@@ -7,13 +7,18 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractEstimator
-from jaxbeam.case.fields import POSITIVE, choice, concrete, count, is_concrete, number
+from jaxbeam.case.fields import POSITIVE, choice, concrete, count, number
 from jaxbeam.estimation.constant_gain import ConstantGainFilter, sensor_offsets
 from jaxbeam.estimation.continuous import ContinuousCrossingFilter, TimeInvariantFilter
 from jaxbeam.estimation.crossing_filter import CrossingFilter
 from jaxbeam.estimation.gains import kalman_gain, sampled_kalman_gain
+from jaxbeam.estimation.kalman_noise import (
+    delay_error,
+    missing_noise_error,
+    modal_noise_intensity,
+    reading_variance,
+)
 from jaxbeam.estimation.observability import detectability_error, mode_count
-from jaxbeam.estimation.sampled_plant import PERIOD_ROUNDING
 from jaxbeam.estimation.sensor_chain import filtered_plant, sensor_chain
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance
@@ -92,12 +97,18 @@ class Kalman(AbstractEstimator):
     def has_vehicles(self):
         return self.loads != "ignored"
 
+    @property
+    def varies(self):
+        return self.loads != "ignored"
+
     def sampled_filter(self, plant, timing):
         filtered = filtered_plant(plant)
-        filtered_model, intensity = filtered.plant, self.noise_intensity(filtered.plant)
+        filtered_model = filtered.plant
+        intensity = modal_noise_intensity(filtered_model, self.process_noise)
         states, start = intensity.shape[0], plant.augmented_start
         loads = start.shape[0]  # states of vehicles, weights, and one for what else is known
-        variance, scale = self.reading_variance(plant), balance(filtered_model.unloaded.A)
+        variance = reading_variance(plant, self.measurement_noise)
+        scale = balance(filtered_model.unloaded.A)
         plant_states = plant.modal_model.state_count
         if self.loads == "ignored":
             system = filtered.with_filtered_outputs(filtered_model.unloaded)
@@ -123,7 +134,8 @@ class Kalman(AbstractEstimator):
 
     def continuous_filter(self, plant):
         filtered, count = filtered_plant(plant), len(plant.case.sensors)
-        filtered_model, intensity = filtered.plant, self.noise_intensity(filtered.plant)
+        filtered_model = filtered.plant
+        intensity = modal_noise_intensity(filtered_model, self.process_noise)
         noise = xp.diag(xp.broadcast_to(self.measurement_intensity, (count,)))
         states, start = intensity.shape[0], plant.augmented_start
         offset, plant_states = sensor_offsets(plant), plant.modal_model.state_count
@@ -171,20 +183,6 @@ class Kalman(AbstractEstimator):
         weights = np.s_[plant.vehicle_states : plant.vehicle_states + count]
         return set_at(variance, weights, xp.broadcast_to(deviation**2, (count,)))
 
-    def noise_intensity(self, plant: Plant) -> Square:
-        """Intensity of the white noise in the rates of the states, (unit of each)^2 s."""
-        modes = plant.coordinate_scale.shape[0]
-        force = self.process_noise * plant.coordinate_scale**2
-        actuator_intensity = xp.zeros(plant.modal_model.state_count - 2 * modes)
-        return xp.diag(xp.concatenate([xp.zeros(modes), force, actuator_intensity]))
-
-    def reading_variance(self, plant: Plant) -> Float[Array, " sensor"]:
-        """Variance of the noise of each reading, in its unit squared."""
-        sensors = plant.case.sensors
-        if self.measurement_noise is None:
-            return xp.stack([sensor.noise_variance for sensor in sensors])
-        return xp.broadcast_to(self.measurement_noise**2, (len(sensors),))
-
     def validate(self, case, system):
         if not case.sensors:
             return "kind needs sensors; add one"
@@ -193,23 +191,11 @@ class Kalman(AbstractEstimator):
             return "measurement_intensity must be given without a controller.period, and only then"
         if period is None and self.measurement_noise is not None:
             return "measurement_noise is that of samples; without a period leave it out"
-        if period is not None and self.measurement_noise is None:
-            for i, sensor in enumerate(case.sensors):
-                if sensor.noise is None or (
-                    is_concrete(sensor.noise) and concrete(sensor.noise) == 0
-                ):
-                    return f"measurement_noise must be given, as sensors.{i} has no noise"
-        for i, sensor in enumerate(case.sensors):
-            sampled = period is not None and sensor.delay is not None
-            if sampled and is_concrete(sensor.delay) and is_concrete(period):
-                delay_periods = math.ceil(
-                    concrete(sensor.delay) / concrete(period) - PERIOD_ROUNDING
-                )
-                if delay_periods > self.max_delay_periods:
-                    return (
-                        f"max_delay_periods must be at least {delay_periods}, the periods of"
-                        f" sensors.{i}.delay"
-                    )
+        if period is not None:
+            missing = missing_noise_error(case) if self.measurement_noise is None else None
+            error = missing or delay_error(case, self.max_delay_periods)
+            if error is not None:
+                return error
         if self.loads != "ignored" and not case.loads:
             return "loads must be 'ignored': there are none"
         if (self.loads == "estimated") != (self.weight_deviation is not None):

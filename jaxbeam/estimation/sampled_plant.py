@@ -39,8 +39,8 @@ class Transition(Module):
     input_matrix: Inputs
     noise_covariance: Square
 
-    def predict(self, state, previous_input, input) -> Float[Array, " state"]:
-        """State at the end of the period without noise."""
+    def predict(self, state, previous_input, input) -> Float[Array, "*sample state"]:
+        """State at the end of the period without noise; of each sample, from one state."""
         return (
             self.matrix @ state
             + self.previous_input_matrix @ previous_input

@@ -22,7 +22,8 @@ def check_ending(path: str | os.PathLike, content: str, allowed: tuple[str, ...]
     ending = Path(path).suffix
     if ending not in allowed:
         first = Path(path).with_suffix(allowed[0])
-        others = f", or {', '.join(allowed[1:])}" if allowed[1:] else ""
+        more = [one for one in dict.fromkeys(allowed) if one != allowed[0]]
+        others = f", or {', '.join(more)}" if more else ""
         raise ValueError(f"{content} is written to a {allowed[0]} file; call it {first}{others}")
     package = PACKAGES.get(ending, "")
     if package and importlib.util.find_spec(package) is None:

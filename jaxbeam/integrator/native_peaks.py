@@ -14,7 +14,7 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import discrete_model
@@ -32,7 +32,7 @@ from jaxbeam.integrator.running_peaks import PEAK_MARGIN, Peaks
 from jaxbeam.integrator.step_matrices import CHUNK_STEPS
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.layout import is_uniform
-from jaxbeam.model.load_set import LoadSet
+from jaxbeam.model.load_set import LoadSet, WheelSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.corrected_rows import StaticCorrection
 from jaxbeam.model.sensing.linear_outputs import linear_outputs
@@ -70,7 +70,7 @@ C_MACROS = {
 }
 HEADERS = (
     *("ffi", "load_path", "matrices", "peak_search", "propagators"),
-    *("registers", "step_matrices", "steps", "workspace"),
+    *("registers", "step_matrices", "steps", "vehicles", "workspace"),
 )
 LIBRARY = Library(
     sources=("integrate_peaks.c",),
@@ -97,9 +97,7 @@ def supports(case: Case) -> bool:
         and case.profile is None
         and not has_settlement(case)
         and not may_have_kinks(case)
-        and not any(
-            load.vehicle(case.run.gravity).names or load.force_histories() for load in case.loads
-        )
+        and not any(load.force_histories() for load in case.loads)
     )
     # The static influence is then a polynomial in each step.
     return plain and (
@@ -160,6 +158,7 @@ def integrate_peaks(
             grids.on_beam_intervals,
         ),
         *(*jax.vmap(LoadSet.cubics)(loads), loads.wheels.inertia, loads.wheels.weight),
+        *_vehicle_arguments(loads.wheels),
         *(linear.rows, bounds, *influence),
         *(part[None] for part in constants),
     )
@@ -167,16 +166,41 @@ def integrate_peaks(
     modes = shapes.shape[-1]
     blocks, block_size = models.state_matrix.shape[1:3]
     beam = grids.counts.shape[1], blocks, block_size, modes // blocks, *shapes.shape[1:3]
-    sizes = *beam, max_loads, load_count, count, batch_size
+    groups = vehicle_numbers(loads.wheels)
+    sizes = *beam, max_loads, load_count, count, batch_size, len(groups)
     workspace_size = LIBRARY.load().workspace_size
-    workspace_size.restype, workspace_size.argtypes = ctypes.c_int64, [ctypes.c_int64] * len(sizes)
+    pointer = np.ctypeslib.ndpointer(np.int64, flags="C")
+    workspace_size.restype = ctypes.c_int64
+    workspace_size.argtypes = [*(ctypes.c_int64,) * len(sizes), pointer]
     results = [(tasks, batch_size, columns) for columns in (count, count, load_count, load_count)]
     call = jax.ffi.ffi_call(
         LIBRARY.ffi_name("integrate_peaks"),
-        [jax.ShapeDtypeStruct(shape, float) for shape in (*results, (workspace_size(*sizes),))],
+        [
+            jax.ShapeDtypeStruct(shape, float)
+            for shape in (*results, (workspace_size(*sizes, groups),))
+        ],
         vmap_method="sequential",
     )
     return Peaks(*call(*arguments, max_loads=np.int64(max_loads))[:-1])
+
+
+def vehicle_numbers(wheels: WheelSet) -> Int[np.ndarray, "group 4"]:
+    """First wheel, wheels and states of one vehicle, and number of vehicles, of loads with them."""
+    numbers = [(group.first_wheel, *group.H.shape[-3:-1], group.count) for group in wheels.vehicles]
+    return np.array(numbers, np.int64).reshape(-1, 4)
+
+
+def _vehicle_arguments(wheels: WheelSet):
+    """Springs of the wheels, numbers of the vehicles, and their matrices, one after the other."""
+    if not wheels.vehicles:
+        none = np.zeros((1, 0, 1))
+        return none, none, np.zeros((1, 0, 4), np.int64), none, none, none
+    parts = []
+    for name in ("A", "B", "H"):
+        matrices = [getattr(group, name) for group in wheels.vehicles]
+        flat = [part.reshape(part.shape[0], -1, part.shape[-1]) for part in matrices]
+        parts.append(jnp.concatenate(flat, axis=1))
+    return wheels.stiffness, wheels.damping, vehicle_numbers(wheels)[None], *parts
 
 
 @integrate_peaks.defjvp

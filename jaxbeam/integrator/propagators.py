@@ -13,6 +13,7 @@ rigid-body modes and lags of actuators, and differentiable.
 
 import functools
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,7 +23,7 @@ from jaxtyping import Float
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS
 from jaxbeam.numerics.gauss import gauss_nodes, lagrange_coefficients
-from jaxbeam.runtime.arrays import Array, scan, set_at, stop_gradient, vmap, xp
+from jaxbeam.runtime.arrays import Array, cond, scan, set_at, stop_gradient, vmap, xp
 
 NODE_COUNT = 6  # Gauss nodes in a step; the integrator has order 12
 DOUBLINGS = 7
@@ -119,11 +120,27 @@ def phi_functions_of(
     matrix: Float[Array, "side side *system"],
     input_matrix: Float[Array, "side input *#system"],
     durations: Float[Array, "*duration"],
+    few_doublings: bool = False,
 ) -> tuple[Float[Array, "side side *all"], Float[Array, "phi side input *all"]]:
-    """exp(A t), and t phi_p(A t) B for p = 1 to 6, of systems over durations t (s)."""
-    x = matrix[..., None] * durations.ravel() / 2**DOUBLINGS
+    """exp(A t), and t phi_p(A t) B for p = 1 to 6, of systems over durations t (s).
+
+    With `few_doublings` only as many as the largest norm of A t needs; a `vmap` takes all the same.
+    """
+    doublings: Any = DOUBLINGS
+    if few_doublings:
+        norm = xp.max(xp.sum(xp.abs(matrix), axis=1)) * xp.max(durations)
+        doublings = xp.ceil(xp.log2(xp.maximum(2 * norm, 1.0))).astype(int)
+        doublings = stop_gradient(xp.minimum(doublings, DOUBLINGS))
+    x = matrix[..., None] * durations.ravel() / 2**doublings
     functions = _taylor_series(x, input_matrix[..., None])
-    (transition, phi_functions), _ = scan(_double_argument, functions, length=DOUBLINGS)
+
+    def double(functions, i):
+        if not few_doublings:
+            return _double_argument(functions, i)
+        doubled = cond(i < doublings, lambda f: _double_argument(f, i)[0], lambda f: f, functions)
+        return doubled, None
+
+    (transition, phi_functions), _ = scan(double, functions, np.arange(DOUBLINGS))
     phi_functions = phi_functions * durations.ravel()
     parts = (transition, phi_functions)
     transition, phi_functions = (part.reshape(*part.shape[:-1], *durations.shape) for part in parts)

@@ -22,7 +22,7 @@ from jaxbeam.model.linear_system import Signal, StateSpace
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.model.modes import Layout
-from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.sensing.output_rows import OutputRows, sensor_rows
 from jaxbeam.model.vehicles.contact_rows import (
     ContactRows,
     contact_rows,
@@ -157,20 +157,18 @@ class Plant(Module):
         )
 
     @property
-    def _state_order(self) -> np.ndarray:
-        """Index of each state z among the states of the modal model."""
-        modal = 2 * self.coordinate_scale.shape[0]
-        actuator_states = np.arange(modal, self.modal_model.state_count)
-        return np.concatenate([np.arange(0, modal, 2), np.arange(1, modal, 2), actuator_states])
+    def output_rows(self) -> OutputRows:
+        """Rows of the ideal sensors on the coordinates of the modal model."""
+        return sensor_rows(self.modal_model, self.case, self.case.sensors)
 
-    @property
-    def _state_scales(self) -> Float[Array, " state"]:
-        """Scale of each state z relative to that of the modal model."""
-        actuator_scales = xp.ones(self.modal_model.state_count - 2 * self.coordinate_scale.shape[0])
-        return xp.concatenate([self.coordinate_scale, self.coordinate_scale, actuator_scales])
+    def with_contact(
+        self, contact: ContactRows | None, output_rows: OutputRows | None = None
+    ) -> StateSpace:
+        """System with loads of given contact rows (*time), or without loads.
 
-    def _system_with_loads(self, contact: ContactRows | None) -> StateSpace:
-        """System with loads of given contact rows (*time), or without loads."""
+        Inputs and states are those of `at`; without loads those of `unloaded`. `output_rows` are
+        those of the plant, computed if None.
+        """
         model, states = self.modal_model, self.modal_model.state_count
         rates, matrix, command = model.rate_index, model.A, model.command_matrix
         order, scales, signals, weights = self._state_order, self._state_scales, self.states, ()
@@ -202,7 +200,8 @@ class Plant(Module):
             command = command - force_input @ (mass[..., None] * (shape @ command[rates]))
             inputs = xp.concatenate([command, -force_input], axis=-1)
             weights = tuple(Signal(f"load_{i}", "N") for i in range(wheels))
-        C, D = sensor_rows(model, self.case, self.case.sensors).of_system(model, matrix, inputs)
+        rows = self.output_rows if output_rows is None else output_rows
+        C, D = rows.of_system(model, matrix, inputs)
         return StateSpace(
             A=matrix[..., order[:, None], order] * scales[:, None] / scales,
             B=inputs[..., order, :] * scales[:, None],
@@ -215,15 +214,28 @@ class Plant(Module):
             ),
         )
 
+    @property
+    def _state_order(self) -> np.ndarray:
+        """Index of each state z among the states of the modal model."""
+        modal = 2 * self.coordinate_scale.shape[0]
+        actuator_states = np.arange(modal, self.modal_model.state_count)
+        return np.concatenate([np.arange(0, modal, 2), np.arange(1, modal, 2), actuator_states])
+
+    @property
+    def _state_scales(self) -> Float[Array, " state"]:
+        """Scale of each state z relative to that of the modal model."""
+        actuator_scales = xp.ones(self.modal_model.state_count - 2 * self.coordinate_scale.shape[0])
+        return xp.concatenate([self.coordinate_scale, self.coordinate_scale, actuator_scales])
+
 
 @compiled_if_traced
 def _plant_at(plant: Plant, t) -> StateSpace:
-    return plant._system_with_loads(contact_rows(plant.modal_model, plant.loads, t))
+    return plant.with_contact(contact_rows(plant.modal_model, plant.loads, t))
 
 
 @compiled_if_traced
 def _unloaded_plant(plant: Plant) -> StateSpace:
-    return plant._system_with_loads(None)
+    return plant.with_contact(None)
 
 
 def _command_signals(case: Case) -> tuple[Signal, ...]:

@@ -5,9 +5,21 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.runtime.arrays import Array, expm, fori_loop, scan, set_at, stop_gradient, take, xp
+from jaxbeam.runtime.arrays import (
+    Array,
+    expm,
+    fori_loop,
+    is_jax,
+    scan,
+    set_at,
+    stop_gradient,
+    take,
+    xp,
+)
 
 DOUBLINGS = 14  # of the short interval of the series
+SERIES_ROUNDING = 1e-16  # of a term of a series of exp(M), below which it is the last
+MAX_SERIES_TERMS = 20  # while the norm of M is below 1
 SERIES_TERMS = 10  # exact to rounding while the norm of the matrix over that interval is below 0.05
 
 
@@ -83,6 +95,56 @@ def balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
 
     start = xp.ones_like(xp.diagonal(matrix))
     return stop_gradient(fori_loop(0, 20, equalise, start))
+
+
+def propagate(matrix, t, duration, substeps: int, start):
+    """x(t + duration) of x' = matrix(time) x, x(t) = start, a vector or matrix.
+
+    Each substep is two exponentials of matrices at Gauss nodes (order 4; Blanes and Moan, Applied
+    Numerical Mathematics 56, 2006), exact for a constant matrix. Of several known times t at once,
+    where `matrix` and `start` have them as their first axis.
+    """
+    step = duration / substeps
+    first_node, second_node = 0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6
+    larger_weight, smaller_weight = (
+        (0.25 + math.sqrt(3) / 6) * step,
+        (0.25 - math.sqrt(3) / 6) * step,
+    )
+
+    def step_state(state, time):
+        first, second = matrix(time + first_node * step), matrix(time + second_node * step)
+        for part in (
+            larger_weight * first + smaller_weight * second,
+            smaller_weight * first + larger_weight * second,
+        ):
+            state = exponential_times(part, state)
+        return state, None
+
+    starts = np.arange(substeps).reshape(-1, *(1,) * xp.ndim(t))
+    return scan(step_state, start, t + step * starts)[0]
+
+
+def exponential_times(matrix, state):
+    """exp(M) X; of a stack of known matrices by its series, without the exponentials."""
+    if is_jax(matrix) or matrix.ndim == 2:
+        return expm(matrix) @ state
+    scale = balance(np.max(np.abs(matrix), axis=0))
+    matrix, state = matrix * scale / scale[:, None], state / scale[:, None]
+    # Inputs, whose rates are zero, add nothing to powers of the matrix.
+    varies = np.any(matrix, axis=(0, 2))
+    norm = np.max(np.sum(np.abs(matrix[:, :, varies]), axis=1), initial=0.0)
+    parts = max(1, math.ceil(norm))
+    bounds = np.cumprod(norm / parts / np.arange(1, MAX_SERIES_TERMS))
+    terms = 2 + int(np.sum(bounds > SERIES_ROUNDING))
+    matrix = matrix / parts
+    for _ in range(parts):
+        series = state
+        for power in range(terms, 0, -1):
+            series = matrix @ series
+            series /= power
+            series += state
+        state = series
+    return state * scale[:, None]
 
 
 def hermite_cubics(

@@ -337,6 +337,25 @@ def cholesky(matrix) -> Any:
         return np.tril(np.full_like(matrix, np.nan))
 
 
+def ravel_pytree(tree) -> tuple[Any, Callable]:
+    """`jax.flatten_util.ravel_pytree`: a tree as one vector, and the function that unpacks it.
+
+    The latter also unpacks columns (entry, column), as leaves with a last axis.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    leaves = [leaf if is_jax(leaf) else np.asarray(leaf) for leaf in leaves]
+    ends = np.cumsum([leaf.size for leaf in leaves])
+
+    def unpack(vector):
+        parts = zip(leaves, ends, strict=True)
+        return structure.unflatten(
+            vector[end - leaf.size : end].reshape(*leaf.shape, *vector.shape[1:]).astype(leaf.dtype)
+            for leaf, end in parts
+        )
+
+    return xp.concatenate([xp.zeros(0), *(xp.ravel(leaf) for leaf in leaves)]), unpack
+
+
 def expm(matrix) -> Any:
     """Exponential of a matrix."""
     if is_jax(matrix):

@@ -20,7 +20,7 @@ from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensing.sensor_signals import noise_samples, sensor_sections
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import Array, any_jax, block_diag, set_at, xp
-from jaxbeam.simulation.command_limits import command_ranges
+from jaxbeam.simulation.commands.path import command_path
 from jaxbeam.simulation.continuous_loop import ContinuousLoop
 from jaxbeam.simulation.sampled_loop import SampledLoop
 
@@ -103,7 +103,7 @@ def closed_loop(
         loads=loads,
         schedule=schedule,
         filter_sections=sections,
-        ranges=command_ranges(case),
+        path=command_path(case),
         noise=noise,
     )
 

@@ -14,7 +14,7 @@ from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.sensor_signals import filtered_reading
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, scan, vmap, xp
-from jaxbeam.simulation.command_limits import limit_commands
+from jaxbeam.simulation.commands.limits import limit_commands
 
 NEWTON_ITERATIONS = 4  # for the commands of a step; one suffices for a linear law
 

@@ -42,7 +42,8 @@ class Record(RecordViews):
     solution of its optimisation. If the closed loop diverges the samples are NaN from then on, and
     so are the peaks. `error_estimate` of the time steps is relative to the largest deflection,
     `step_errors` to the largest value of what each sensor measures. `controller_readings`
-    are the readings that a sampled controller has received, None without one.
+    are the readings that a sampled controller has received, None without one; `acting_command` are
+    the commands behind the hysteresis of the actuators, None if no actuator has one.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -84,6 +85,7 @@ class Record(RecordViews):
     step_errors: Float[Array, " sensor"]
     steps: int = eqx.field(static=True)
     controller_readings: Float[Array, "time sensor"] | None = None
+    acting_command: Float[Array, "time actuator"] | None = None
 
     shown = renamed_property("shown", "controller_readings")
 
@@ -107,7 +109,7 @@ class Record(RecordViews):
             self.accelerations,
             self.load_position,
             self.contact_force,
-            self.command,
+            self.command if self.acting_command is None else self.acting_command,
         )
 
     def at(

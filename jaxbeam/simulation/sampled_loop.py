@@ -21,22 +21,21 @@ from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.model.sensing.sensor_signals import filtered_reading, initial_filter_state
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, cond, is_jax, take, vmap, xp
-from jaxbeam.simulation.command_limits import CommandRanges, limit_commands
+from jaxbeam.simulation.commands.path import CommandMemory, CommandPath
 
 
 class LoopMemory(NamedTuple):
     """Memory of a sampled loop, batch axis last.
 
-    State of the law, present command, states of the digital filters, latest readings and those not
-    available yet (newest first), commands that have not begun yet (newest first), and the number of
-    samples at which the law found no solution.
+    State of the law, commands on their way, states of the digital filters, latest readings and
+    those not available yet (newest first), and the number of samples at which the law found no
+    solution.
     """
 
     law_state: Any
-    command: Float[Array, "actuator batch"]
+    commands: CommandMemory
     filter_states: list
     readings: Float[Array, "age sensor batch"]
-    command_queue: Float[Array, "age actuator batch"]
     failures: Float[Array, " batch"]
 
 
@@ -45,7 +44,7 @@ class SampledLoop(AbstractInputPolicy):
 
     The model includes the analogue filters of the sensors; `filter_sections` are those of the
     digital ones. `measured_rows` are those of the quantities, of which accelerations follow from
-    the forces too; None without accelerations. `ranges` are those of the commands.
+    the forces too; None without accelerations. `path` is the way of the commands.
     """
 
     plant: Plant
@@ -57,7 +56,7 @@ class SampledLoop(AbstractInputPolicy):
     loads: LoadSet
     schedule: EventSchedule
     filter_sections: tuple
-    ranges: CommandRanges
+    path: CommandPath
     noise: Float[Array, "sample sensor"] | None
     implicit: bool = eqx.field(static=True, default=False)
     holds_commands: ClassVar[bool] = True
@@ -71,13 +70,11 @@ class SampledLoop(AbstractInputPolicy):
             for pair, state in zip(pairs, filter_states, strict=True)
         ]
         readings = xp.stack(readings) if readings else xp.zeros((0, batch_size))
-        command = xp.zeros((len(self.plant.case.actuators), batch_size))
         return LoopMemory(
             _broadcast_to_batch(self.law.initial_state(), batch_size),
-            command,
+            self.path.start(batch_size, self.schedule.max_waiting),
             filter_states,
             xp.broadcast_to(readings, (self.schedule.max_age + 1, *readings.shape)),
-            xp.zeros((self.schedule.max_waiting + 1, *command.shape)),
             zero,
         )
 
@@ -88,11 +85,17 @@ class SampledLoop(AbstractInputPolicy):
             lambda memory: memory,
             memory,
         )
-        return xp.broadcast_to(memory.command, (NODE_COUNT, *memory.command.shape)), memory
+        acting = self.path.acting(memory.commands)
+        return xp.broadcast_to(acting, (NODE_COUNT, *acting.shape)), memory
 
     def observe(self, memory, info):
-        """Available readings (sensor, batch), and number of failures of the law (batch)."""
-        return self._available_readings(memory.readings, info.event), memory.failures
+        """Available readings (sensor, batch), and number of failures of the law (batch).
+
+        And the commands (actuator, batch) where they act through a hysteresis, else None.
+        """
+        through_hysteresis = any(one is not None for one in self.path.hysteresis)
+        sent = memory.commands.command if through_hysteresis else None
+        return self._available_readings(memory.readings, info.event), memory.failures, sent
 
     def failures(self, memory) -> Float[Array, " batch"]:
         """Number of samples at which the law found no solution, up to the end of the run."""
@@ -104,31 +107,28 @@ class SampledLoop(AbstractInputPolicy):
         filter_states, readings = self._sample_sensors(memory, state, info)
 
         def step(inputs):
-            law_state, queue, failures = inputs
+            law_state, commands, failures = inputs
             available = self._available_readings(readings, event)
             command, law_state, solved = self._step_law(
-                law_state, available, state, memory.command, info.start
+                law_state, available, state, self.path.known_to_law(commands), info.start
             )
-            command = limit_commands(self.plant.case, command, queue[0], self.ranges)
-            queue = xp.concatenate([command[None], queue[:-1]])
-            return law_state, queue, failures + ~solved
+            return law_state, self.path.send(commands, command), failures + ~solved
 
-        law_state, queue, failures = cond(
+        law_state, commands, failures = cond(
             take(schedule.control_sample, event) >= 0,
             step,
             lambda inputs: inputs,
-            (memory.law_state, memory.command_queue, memory.failures),
+            (memory.law_state, memory.commands, memory.failures),
         )
-        age = take(schedule.command_age, event)
-        command = xp.where(age >= 0, take(queue, xp.maximum(age, 0)), memory.command)
-        return LoopMemory(law_state, command, filter_states, readings, queue, failures)
+        commands = self.path.begin(commands, take(schedule.command_age, event))
+        return LoopMemory(law_state, commands, filter_states, readings, failures)
 
     def _sample_sensors(self, memory, state, info):
         """Filter states and readings after the samples that are due at an event."""
         readings, filter_states, histories = memory.readings, [], []
         signals = cond(
             xp.any(take(self.schedule.reading, info.event) >= 0),
-            lambda state: self._sensor_inputs(state, memory.command, info.start),
+            lambda state: self._sensor_inputs(state, self.path.acting(memory.commands), info.start),
             lambda state: xp.zeros((self.output_rows.shape[0], state.shape[1])),
             state,
         )

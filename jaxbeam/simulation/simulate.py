@@ -28,7 +28,7 @@ from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, any_jax, put, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop
-from jaxbeam.simulation.command_limits import command_ranges
+from jaxbeam.simulation.commands.limits import acting_ranges
 from jaxbeam.simulation.extremes import monitored_sensors, sensor_extremes
 from jaxbeam.simulation.integration_plan import (
     TOLERANCE,
@@ -161,7 +161,7 @@ def _record(case: Case, integration: "_Integration", times, errors) -> Record:
         case=case,
         modes=integration.model.modes,
         times=times,
-        **outputs.motion._asdict(),
+        **_motion_fields(outputs),
         **outputs.vehicles._asdict(),
         failures=xp.zeros(times.shape) if outputs.failures is None else outputs.failures,
         controller_readings=outputs.readings,
@@ -172,6 +172,14 @@ def _record(case: Case, integration: "_Integration", times, errors) -> Record:
         step_errors=errors[1],
         steps=integration.steps,
     )
+
+
+def _motion_fields(outputs: "Outputs") -> dict:
+    """Fields of a record that follow from its motion."""
+    fields = outputs.motion._asdict()
+    if outputs.sent is None:
+        return fields
+    return fields | {"command": outputs.sent, "acting_command": fields["command"]}
 
 
 _simulate = compiled_if_traced(_simulate_record)
@@ -231,7 +239,9 @@ def simulate_histories(
         for name in quantities
         if (own := [sensor for sensor in case.sensors if sensor.quantity == name])
     }
-    return Histories(deflection, motion.command, contact_force, measured)
+    sent = integration.outputs.sent
+    command = motion.command if sent is None else sent
+    return Histories(deflection, command, contact_force, measured)
 
 
 class IntegrationSetup(NamedTuple):
@@ -314,9 +324,11 @@ def _integrate(case: Case, plan: IntegrationPlan, times, monitored, noisy=True, 
         discrete, loads, max_loads=plan.shapes.max_loads, steps=steps, policy=policy
     )
     states = all_states[sample_steps]
-    observed, failures = (
-        (None, None) if observed is None else (part[sample_steps, ..., 0] for part in observed)
-    )
+
+    def at_samples(part):
+        return None if part is None else part[sample_steps, ..., 0]
+
+    readings, failures, sent = (None,) * 3 if observed is None else tuple(map(at_samples, observed))
     if policy is not None:
         # In continuous time from the law itself: extrapolation from the Gauss nodes is less exact.
         commands = (
@@ -325,7 +337,7 @@ def _integrate(case: Case, plan: IntegrationPlan, times, monitored, noisy=True, 
             else _commands_at_steps(case, commands, sample_steps)
         )
     motion, vehicles = motion_at(case, model, loads, times, states, commands)
-    outputs = Outputs(motion, vehicles, observed, failures)
+    outputs = Outputs(motion, vehicles, readings, failures, sent)
     return _Integration(running_peaks, outputs, model, discrete.grid, all_states, steps)
 
 
@@ -333,14 +345,18 @@ def _commands_at_steps(case: Case, commands, steps):
     """Commands (time, actuator) at the starts of steps, by extrapolation from their Gauss nodes."""
     histories = commands[..., 0].reshape(commands.shape[0], NODE_COUNT, -1)
     commands_at_start = xp.tensordot(histories, end_weights()[:, 0], axes=[1, 0])[steps]
-    low, high, _ = command_ranges(case)
+    low, high, _ = acting_ranges(case)
     return xp.clip(commands_at_start, low, high)
 
 
 class Outputs(NamedTuple):
-    """Motion of beam and vehicles at the samples; readings and failures of a controller, if any."""
+    """Motion of beam and vehicles at the samples; readings and failures of a controller, if any.
+
+    `sent` are its commands where they act through a hysteresis; the motion has those that act.
+    """
 
     motion: Motion
     vehicles: VehicleMotion
     readings: Float[Array, "time sensor"] | None
     failures: Float[Array, " time"] | None
+    sent: Float[Array, "time actuator"] | None = None

@@ -56,7 +56,7 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
     if missing:
         raise ValueError(f"not a record of jaxbeam: it lacks {', '.join(missing)}")
     values = {name: xp.asarray(dataset[name].values) for name in _STORED_VARIABLES}
-    layout = mesh_layout(case)
+    layout, acting = mesh_layout(case), dataset.variables.get("acting_command")
     return Record(
         case=case,
         modes=Modes(
@@ -72,6 +72,7 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
         error_estimate=xp.asarray(float(dataset.attrs["error_estimate"])),
         steps=int(dataset.attrs["steps"]),
         controller_readings=xp.asarray(dataset["measured"].values) if _is_sampled(case) else None,
+        acting_command=None if acting is None else xp.asarray(acting.values),
         **values,
     )
 

@@ -47,16 +47,19 @@ class ForceRunner:
         self.case, self.batches, self.system = case, batches, system
         self.pool = ThreadPoolExecutor(os.cpu_count())
         wheels = load_set(case).wheel_count
-        self.block_runs = max(1, min(BLOCK_RUNS, int(BLOCK_PAIRS / wheels**2)))
-        self.block_count = -(-len(batches.run_index) // self.block_runs)
+        most, count = max(1, min(BLOCK_RUNS, int(BLOCK_PAIRS / wheels**2))), len(batches.run_index)
+        # As equal as can be: cores wait for the last block.
+        self.block_runs = -(-count // -(-count // most))
+        self.block_count = -(-count // self.block_runs)
 
     def choose_step_sizes(self) -> tuple[Float[np.ndarray, " path"], float]:
         """Phases (rad) of the fastest pole in a step, and the relative error of peaks with them."""
         count = len(self.batches.run_index)
         sample = stratified_sample(np.arange(1.0, count + 1), min(TRIAL_RUNS, count))
-        coarse, fine = (
-            self._peaks(sample, phase).peak_deflection for phase in (PHASE, PHASE / REFINEMENT)
+        trials = self.pool.map(
+            lambda phase: self._peaks(sample, phase), (PHASE, PHASE / REFINEMENT)
         )
+        coarse, fine = (trial.peak_deflection for trial in trials)
         error = float(np.nanmax(relative_changes(coarse, fine), initial=0.0))
         return np.full(count, PHASE), error
 

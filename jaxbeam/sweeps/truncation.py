@@ -68,14 +68,16 @@ def static_shares(case: Case) -> dict[str, float]:
     return shares
 
 
-def estimated_errors(case: Case, worst: dict[str, dict[str, float]]) -> dict[str, float]:
+def estimated_errors(
+    case: Case, worst: dict[str, dict[str, float]], static: dict[str, float] | None = None
+) -> dict[str, float]:
     """Truncation errors of peaks relative to the largest, by quantity, where they are known.
 
     `worst` has the numbers of the run with the largest peak of each quantity. Of deflections and
     rotations the error is the static one; others are estimated from that run (see
-    `Record.truncation_errors`), without a controller.
+    `Record.truncation_errors`), without a controller. `static` are the `static_shares`, if known.
     """
-    errors, found_before = static_shares(case), {}
+    errors, found_before = dict(static_shares(case) if static is None else static), {}
     quantities = [sensor.quantity for sensor in case.sensors]
     if case.controller is not None:
         return errors

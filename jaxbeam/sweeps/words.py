@@ -26,7 +26,7 @@ from jaxbeam.files.case_file import case_to_dict, with_settings
 from jaxbeam.sweeps import MAX_RUNS, store as sweep_store
 from jaxbeam.sweeps.computation import compute_sweep, count_as_done, worst_runs
 from jaxbeam.sweeps.specification import SweepSpecification, sweep_specification
-from jaxbeam.sweeps.truncation import estimated_errors
+from jaxbeam.sweeps.truncation import estimated_errors, static_shares
 from jaxbeam.sweeps.zarr_files import BLOCKS_GROUP, FINGERPRINT_ATTRIBUTE, new_store, replace_blocks
 
 if TYPE_CHECKING:
@@ -190,12 +190,15 @@ def compute_word_sweep(
 
 def _estimates(plan: WordSweep, datasets: "Sequence[xarray.Dataset]") -> dict[str, float]:
     """Truncation errors by quantity, each of the words with the largest peak of it."""
-    errors = {}
+    errors, static = {}, {}
     for quantity in {sensor.quantity for sensor in plan.case.sensors}:
         peaks = [part[f"peak_{quantity}"].max().item() for part in datasets]
         worst = int(np.argmax(np.nan_to_num(peaks)))
         part, run = plan.sweeps[worst], worst_runs(plan.sweeps[worst], datasets[worst])
-        found = estimated_errors(part.case, {q: run[q] for q in run if q == quantity})
+        if worst not in static:
+            static[worst] = static_shares(part.case)
+        of_quantity = {q: run[q] for q in run if q == quantity}
+        found = estimated_errors(part.case, of_quantity, static[worst])
         errors |= {q: share for q, share in found.items() if q == quantity}
     return errors
 

@@ -155,6 +155,8 @@ def test_refusals():
         jb.assess(BRIDGE, 40.0, trains=["HSLM-A11"])
     with pytest.raises(ValueError, match="line_speed must be positive"):
         jb.assess(BRIDGE, -1.0)
+    with pytest.raises(ValueError, match="900 km/h, faster than any train: .*write '250 km/h'"):
+        jb.assess(BRIDGE, 250)
     free = dataclasses.replace(BRIDGE, beam=jb.Beam(25.0, 3e10, 15e3, ends="free-free"))
     with pytest.raises(ValueError, match="can move as a rigid body"):
         jb.assess(free, 40.0)

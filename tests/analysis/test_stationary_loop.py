@@ -10,7 +10,8 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.analysis.crossing_margin import stability_margin
-from jaxbeam.analysis.linearised_loop import linearised_loop, loop_with_mass_at
+from jaxbeam.analysis.linearised_loop import linearised_loop
+from jaxbeam.analysis.loops.stationary_loop import loop_with_mass_at
 from jaxbeam.analysis.margins import loop_gain, margins
 from jaxbeam.analysis.stability import growth
 from jaxbeam.cli import main

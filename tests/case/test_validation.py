@@ -138,7 +138,7 @@ CASES = [
     ),
     (
         Case(BEAM, actuators=[Patch(0.2, 0.3, d33=460e-12, modulus=30e9)]),
-        "(of which electrode_spacing, beam_height, patch_height, patch_width is missing)",
+        "(of which electrode_spacing, beam_height, patch_height, patch_width are missing)",
     ),
     (
         Case(BEAM, actuators=[Patch(0.2, 0.3, 1e-3, d33=460e-12)]),

@@ -204,11 +204,21 @@ def test_invalid_case_file_is_refused_with_its_address(tmp_path, old, new, messa
     assert "\n" not in str(caught.value)
 
 
-def test_invalid_toml_is_refused_with_its_line(tmp_path):
+@pytest.mark.parametrize(
+    "value, mend",
+    [
+        ("0.6 m", ': put a number with a unit in quotes, "0.6 m"'),
+        ("0,6  # m", ": write a decimal point, 0.6"),
+        ("pinned-free", ': put a word in quotes, "pinned-free"'),
+        ("[0.6", ""),
+    ],
+)
+def test_invalid_toml_is_refused_with_its_line_and_its_mend(tmp_path, value, mend):
     path = tmp_path / "case.toml"
-    path.write_text("[beam]\nlength = 0.6 m\n")
-    with pytest.raises(ValueError, match="not valid TOML: .*line 2"):
+    path.write_text(f"[beam]\nlength = {value}\n")
+    with pytest.raises(ValueError, match=f"not valid TOML: .*{re.escape(mend)}$") as caught:
         load_case(path)
+    assert "line 2" in str(caught.value) or not mend
 
 
 def test_unreadable_files_are_refused(tmp_path):

@@ -98,12 +98,10 @@ GRID = {"loads.0.mass": np.linspace(0.05, 1.0, 13), "loads.0.speed": [1.0, 2.0, 
 
 
 @pytest.fixture(scope="module", autouse=True)
-def folder(tmp_path_factory):
-    """The C integrator, compiled into a cache folder of these tests."""
+def folder(native_cache):
+    """The C integrator, compiled into a cache folder of the tests."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        assert not native_peaks.available()
-        assert native_peaks.LIBRARY.build() == native_peaks.LIBRARY.library_path()
+        patch.setenv("XDG_CACHE_HOME", native_cache)
         assert native_peaks.available()
         yield native_peaks.LIBRARY.library_path().parent
 

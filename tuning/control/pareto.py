@@ -94,7 +94,7 @@ def pareto(
     limits = tuple(sorted(map(float, limits), reverse=True))
     objectives = [_with_limits(objective, {metric: limit}) for limit in limits]
     if not objectives:
-        raise ValueError("a Pareto front needs at least one limit")
+        raise ValueError(f"a Pareto front needs at least one limit of {metric}, such as [0.1, 0.2]")
     check_arguments(free, cases, objectives[0], method, steps, least_peaks=least_peaks)
     problem = TuningProblem(case, free, cases, objectives[0], stable, positions, least_peaks)
     tuned = _tune_successively(problem, objectives, method, steps, seed, progress)

@@ -265,7 +265,11 @@ def identify_responses(
         correlation=found.uncertainty.correlation,
         unidentifiable=found.uncertainty.unidentifiable,
         degrees_of_freedom=found.degrees_of_freedom,
-        verdict="converged" if found.converged else f"not converged after {MAX_STEPS} steps",
+        verdict=(
+            "converged"
+            if found.converged
+            else f"not converged after {MAX_STEPS} steps: start closer"
+        ),
         case=replace(case, values),
         fitted=measured.values * np.exp(relative),
         relative_misfit=np.sqrt(np.mean(np.abs(relative) ** 2, axis=0)),

@@ -40,7 +40,7 @@ def identify(
     every log at `logs.*.loads.0.speed`. Loads are those of the logs, or else the case's.
 
     Minimised is the sum of squared residuals over their noise, and of squared prior residuals, by
-    bounded Levenberg-Marquardt (optimistix) with exact forward derivatives; noise levels of the
+    bounded Levenberg-Marquardt with exact forward derivatives; noise levels of the
     channels are estimated from the residuals. Standard errors follow from the Jacobian, widened
     where residuals are autocorrelated; directions that are not identifiable are named.
 

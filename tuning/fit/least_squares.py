@@ -3,22 +3,24 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 from jaxtyping import Bool, Float
 
-from jaxbeam.runtime.compiling import compiled, xla_options
-from tuning.fit.loss import check_loss, robust_residual, variance_factor
+from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.compiling import xla_options
+from tuning.fit.levenberg_marquardt import levenberg_marquardt
+from tuning.fit.loss import check_loss, robust_residual, robust_slope, variance_factor
 from tuning.fit.uncertainty.covariance import Uncertainty, autocorrelation_factor, uncertainty
 from tuning.parameters.free import FreeParameter, to_unbounded
 
 NOISE_ITERATIONS = 2  # fits, each with the noise levels that the one before has estimated
 MAX_STEPS = 60  # steps of one fit
+RTOL, ATOL = 1e-8, 1e-6  # of search variables and residuals, at which a fit has converged
+KEPT_POINTS = 3  # whose samples and derivatives are kept
 WEAK_PRIOR_WIDTH = 2.0  # standard deviation in search variables: e^2, or two typical sizes
 
 
@@ -78,64 +80,19 @@ class LeastSquares:
         predict = data.predictor([p.address for p in parameters])
 
         def values_at(y):
-            return jnp.stack([p.from_unbounded(y[i]) for i, p in enumerate(parameters)])
+            return xp.stack([p.from_unbounded(y[i]) for i, p in enumerate(parameters)])
 
         def prior_residuals(values):
-            return jnp.stack([p.prior.prior_residual(values[i]) for i, p in enumerate(parameters)])
+            return xp.stack([p.prior.prior_residual(values[i]) for i, p in enumerate(parameters)])
 
         def linearised(values):
             # One pass gives samples and derivatives (see `Dataset.predictor`).
             samples, push = jax.linearize(predict, values)
             return samples, jax.vmap(push, out_axes=-1)(jnp.eye(values.shape[0]))
 
-        def misfit(z, args):
-            scale, weights, measured, free, held = args
-            y = jnp.where(free, z * scale, held)
-            values = values_at(y)
-            residuals = robust_residual(loss, (measured - predict(values)) * weights)
-            # A weak Gaussian prior around the start (in the second fit, around the result of the
-            # first) keeps unidentifiable directions bounded; it is left out of standard errors.
-            weak_prior_residuals = (z * scale - held) / weak_prior_widths
-            return jnp.concatenate(
-                [residuals.ravel(), prior_residuals(values), weak_prior_residuals]
-            )
-
-        solver = optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-6)
-
-        def minimise(y, scale, weights, measured, free):
-            found = optimistix.least_squares(
-                misfit,
-                solver,
-                y / scale,
-                (scale, weights, measured, free, y),
-                max_steps=MAX_STEPS,
-                throw=False,
-            )
-            ended = jnp.where(free, found.value * scale, y)
-            return ended, found.result == optimistix.RESULTS.successful
-
         self.from_unbounded, self.prior_residuals = values_at, prior_residuals
-        self._values_at = compiled(values_at)
-        self._unbounded_slopes = compiled(lambda y: jnp.diag(jax.jacfwd(values_at)(y)))
-        self._prior_residuals = compiled(prior_residuals)
-        self._prior_jacobian = compiled(jax.jacfwd(prior_residuals))
-        self._linearised_function, self._minimise_function = linearised, minimise
-
-    @functools.cached_property
-    def _compiled_programs(self):
-        """The two compiled programs: samples with derivatives, and the whole search."""
-        count, samples = len(self.parameters), jnp.zeros(self.data.measured.shape)
-        point = jnp.zeros(count)
-        given = point, point, samples, samples, jnp.zeros(count, bool)
-        # Compiling takes most of the time of a small fit, so both are compiled at once. JAX reuses
-        # traces only under the same mesh, and optimistix traces under an empty one.
-        empty = jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ()))
-        with ThreadPoolExecutor(1) as pool, empty:
-            linear = pool.submit(
-                jax.jit(self._linearised_function).lower(point).compile, xla_options()
-            )
-            minimise = jax.jit(self._minimise_function).lower(*given).compile(xla_options())
-            return linear.result(), minimise
+        self.weak_prior_widths = weak_prior_widths
+        self._program, self._evaluated = jax.jit(linearised), {}
 
     def solve(
         self,
@@ -193,12 +150,36 @@ class LeastSquares:
         )
 
     def linearised(self, values):
-        """Predicted samples at values, and their derivatives (log, time, channel, parameter)."""
-        return tuple(map(np.asarray, self._compiled_programs[0](jnp.asarray(values))))
+        """Predicted samples at values, and their derivatives (log, time, channel, parameter).
+
+        Those of the last points are kept: searches begin and end at points already computed.
+        """
+        key = np.asarray(values, float).tobytes()
+        found = self._evaluated.pop(key, None)
+        if found is None:
+            found = tuple(map(np.asarray, self._compiled_program(jnp.asarray(values))))
+        self._evaluated[key] = found
+        while len(self._evaluated) > KEPT_POINTS:
+            del self._evaluated[next(iter(self._evaluated))]
+        return found
+
+    @functools.cached_property
+    def _compiled_program(self):
+        """The compiled program of samples and derivatives."""
+        return self._program.lower(jnp.zeros(len(self.parameters))).compile(xla_options())
 
     def values_at(self, y) -> Float[np.ndarray, " parameter"]:
         """Values of the parameters at search variables."""
-        return np.asarray(self._values_at(jnp.asarray(y)))
+        return np.asarray(self.from_unbounded(np.asarray(y)))
+
+    def _slopes(self, y) -> Float[np.ndarray, " parameter"]:
+        """Derivatives of the values by the search variables."""
+        return np.array([p.slope(float(v)) for p, v in zip(self.parameters, y, strict=True)])
+
+    def _prior_jacobian(self, values) -> Float[np.ndarray, "parameter parameter"]:
+        """Derivatives of the residuals of the priors by the values."""
+        pairs = zip(self.parameters, values, strict=True)
+        return np.diag([p.prior.residual_slope(float(value)) for p, value in pairs])
 
     def step_scale(
         self, y: Float[np.ndarray, " parameter"], noise, mask=None, jacobian=None
@@ -211,7 +192,7 @@ class LeastSquares:
         weights = self.weights(noise, mask)
         if jacobian is None:
             _, jacobian = self.linearised(self.values_at(y))
-        rows = jacobian * weights[..., None] * np.asarray(self._unbounded_slopes(y))
+        rows = jacobian * weights[..., None] * self._slopes(y)
         strength = np.sqrt(np.sum(rows**2, axis=(0, 1, 2)))
         return 1e3 / np.maximum(strength, max(1e-9 * strength.max(), 1e-300))
 
@@ -221,8 +202,8 @@ class LeastSquares:
         Infinite where the case cannot be simulated.
         """
         residuals = (measured - self.linearised(values)[0]) * self.weights(noise, mask)
-        squares = jnp.sum(robust_residual(self.loss, jnp.asarray(residuals)) ** 2) + jnp.sum(
-            self._prior_residuals(values) ** 2
+        squares = np.sum(robust_residual(self.loss, residuals) ** 2) + np.sum(
+            self.prior_residuals(np.asarray(values)) ** 2
         )
         return float(squares / 2) if np.isfinite(squares) else np.inf
 
@@ -253,9 +234,31 @@ class LeastSquares:
         free: Bool[np.ndarray, " parameter"],
     ) -> tuple[Float[np.ndarray, " parameter"], bool]:
         """Search variables at the minimum found from a point, and whether the search converged."""
-        given = (point, scale, weights, measured, free)
-        ended, converged = self._compiled_programs[1](*map(jnp.asarray, given))
-        return np.asarray(ended), bool(converged)
+
+        start = point / scale
+
+        def linearised(z):
+            # At the start exactly the point, where samples are already known.
+            y = point if z is start else np.where(free, z * scale, point)
+            values, slopes = self.values_at(y), self._slopes(y) * np.where(free, scale, 0.0)
+            samples, jacobian = self.linearised(values)
+            residuals = (measured - samples) * weights
+            rows = -jacobian * (robust_slope(self.loss, residuals) * weights)[..., None]
+            # A weak Gaussian prior around the start (in the second fit, around the result of the
+            # first) keeps unidentifiable directions bounded; it is left out of standard errors.
+            weak_prior_residuals = (z * scale - point) / self.weak_prior_widths
+            parts = robust_residual(self.loss, residuals).ravel(), self.prior_residuals(values)
+            return np.concatenate([*parts, weak_prior_residuals]), np.vstack(
+                [
+                    rows.reshape(-1, len(slopes)) * slopes,
+                    self._prior_jacobian(values) * slopes,
+                    np.diag(scale / self.weak_prior_widths),
+                ]
+            )
+
+        with np.errstate(all="ignore"):  # of points that cannot be simulated
+            found = levenberg_marquardt(linearised, start, RTOL, ATOL, MAX_STEPS)
+        return np.where(free, found.point * scale, point), found.converged
 
     def _uncertainty(self, values, jacobian, mask, noise, widened, residuals, free) -> Uncertainty:
         """Uncertainty from samples and priors; standard errors of held parameters are 0."""

@@ -4,11 +4,10 @@ Each loss is half the square of `robust_residual(r)`, so that least squares mini
 r is a residual over the standard deviation of the noise.
 """
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 
 LOSSES = ("squares", "soft-l1", "huber")
 HUBER_THRESHOLD = 1.345  # 95 % of the efficiency of squares for normal noise
@@ -26,15 +25,29 @@ def robust_residual(loss: str, residual: Float[Array, "*any"]) -> Float[Array, "
     soft-l1: f^2 / 2 = sqrt(1 + r^2) - 1; Huber: f^2 / 2 = k |r| - k^2 / 2 beyond k.
     """
     if loss == "soft-l1":
-        return residual * jnp.sqrt(2 / (1 + jnp.sqrt(1 + residual**2)))
+        return residual * xp.sqrt(2 / (1 + xp.sqrt(1 + residual**2)))
     if loss == "huber":
-        clipped = jnp.maximum(jnp.abs(residual), HUBER_THRESHOLD)
-        return jnp.where(
-            jnp.abs(residual) <= HUBER_THRESHOLD,
+        clipped = xp.maximum(xp.abs(residual), HUBER_THRESHOLD)
+        return xp.where(
+            xp.abs(residual) <= HUBER_THRESHOLD,
             residual,
-            jnp.sign(residual) * jnp.sqrt(2 * HUBER_THRESHOLD * clipped - HUBER_THRESHOLD**2),
+            xp.sign(residual) * xp.sqrt(2 * HUBER_THRESHOLD * clipped - HUBER_THRESHOLD**2),
         )
     return residual
+
+
+def robust_slope(loss: str, residual: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+    """Derivative of `robust_residual` of known residuals.
+
+    That of the loss over f: r / sqrt(1 + r^2) for soft-l1, k sign(r) beyond k for Huber.
+    """
+    size = np.abs(robust_residual(loss, residual))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if loss == "soft-l1":
+            return np.where(size > 0, np.abs(residual) / np.sqrt(1 + residual**2) / size, 1.0)
+        if loss == "huber":
+            return np.where(np.abs(residual) > HUBER_THRESHOLD, HUBER_THRESHOLD / size, 1.0)
+    return np.ones_like(residual)
 
 
 def variance_factor(loss: str, residuals: Float[np.ndarray, " sample"]) -> float:

@@ -114,5 +114,8 @@ def _distinct_minima(least_squares: LeastSquares, measured, noise, found) -> lis
             point = found["points"][i]
             minima.append(LocalMinimum(float(costs[i]), values[i], point, 1, converged))
     if not minima:
-        raise RuntimeError("no start led to values with which the case can be simulated")
+        raise RuntimeError(
+            "no start led to values with which the case can be simulated: begin closer to the"
+            " logs, or give the free parameters narrower bounds"
+        )
     return minima

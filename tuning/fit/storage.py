@@ -82,7 +82,7 @@ def load_fit(path: str | os.PathLike) -> Fit:
     """
     path = Path(path)
     if not path.is_file():
-        raise ValueError(f"{path}: there is no such fit")
+        raise ValueError(f"{path}: there is no such fit; name the .npz file that identify wrote")
     arrays, header = _read(path)
     nominal_case = case_from_dict(header["nominal_case"])
     beam = header["nominal_case"]["beam"]

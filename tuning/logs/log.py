@@ -114,7 +114,7 @@ def check_samples(
         what = "the cell is empty, or says nan" if np.isnan(value) else f"{value} is not finite"
         raise ValueError(
             f"{where(row)}, column {names[column]!r}: {what}; fill in what was measured, cut the "
-            'log there, or read it with missing="mask", which leaves such samples out'
+            'log there, or leave such samples out, by missing="mask" or --mask missing'
         )
     if len(values) < 2:
         raise ValueError(f"{source}: a log needs at least two samples, this one has {len(values)}")

@@ -5,15 +5,13 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, list_sizes, replace, unit_at, value_at
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.joint_addresses import ALL, overlap
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 from tuning.parameters.prior import Prior, as_prior
 
 LOG_ADDRESS = re.compile(r"logs\.(\d+)\.(.+)")
@@ -85,17 +83,31 @@ class FreeParameter:
     def from_unbounded(self, unbounded: Float[Array, ""]) -> Float[Array, ""]:
         """Value of a search variable."""
         if np.isfinite(self.high - self.low):
-            share = (1 + jnp.sin(unbounded)) / 2
+            share = (1 + xp.sin(unbounded)) / 2
             if self.prior.scale == "log":
                 return self.low * (self.high / self.low) ** share
             if self.prior.scale == "logit":
-                share = jax.nn.sigmoid(unbounded)
+                share = (1 + xp.tanh(unbounded / 2)) / 2
             return self.low + (self.high - self.low) * share
         if np.isfinite(self.low):
-            return self.low + jnp.exp(unbounded)
+            return self.low + xp.exp(unbounded)
         if np.isfinite(self.high):
-            return self.high - jnp.exp(-unbounded)
+            return self.high - xp.exp(-unbounded)
         return unbounded
+
+    def slope(self, unbounded: float) -> float:
+        """Derivative of `from_unbounded`."""
+        if np.isfinite(self.high - self.low):
+            if self.prior.scale == "logit":
+                return (self.high - self.low) / 4 / np.cosh(unbounded / 2) ** 2
+            share_slope = np.cos(unbounded) / 2
+            if self.prior.scale == "log":
+                value = float(self.from_unbounded(np.float64(unbounded)))
+                return value * np.log(self.high / self.low) * share_slope
+            return (self.high - self.low) * share_slope
+        if np.isfinite(self.low):
+            return np.exp(unbounded)
+        return np.exp(-unbounded) if np.isfinite(self.high) else 1.0
 
 
 def to_unbounded(

@@ -3,11 +3,10 @@
 import dataclasses
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 from tuning.aliases import current_word
 
 SCALES = ("linear", "log", "logit")
@@ -62,10 +61,16 @@ class Prior:
     def prior_residual(self, value: Float[Array, ""]) -> Float[Array, ""]:
         """Deviation of a value from the mean of the prior, over the prior's; 0 without a prior."""
         if self.mean is None:
-            return jnp.zeros_like(value)
+            return xp.zeros_like(value)
         if self.scale == "log":
-            return jnp.log(value / self.mean) * self.mean / self.deviation
+            return xp.log(value / self.mean) * self.mean / self.deviation
         return (value - self.mean) / self.deviation
+
+    def residual_slope(self, value: float) -> float:
+        """Derivative of `prior_residual` by the value."""
+        if self.mean is None:
+            return 0.0
+        return (self.mean / value if self.scale == "log" else 1.0) / self.deviation
 
 
 def as_prior(bounds: Any) -> Prior:

@@ -91,7 +91,7 @@ def main() -> None:
     options.add_argument("--speeds", type=int, default=101, help="number of speeds")
     count = options.parse_args().speeds
     found = measure(np.linspace(40.0, 90.0, count))
-    print(f"{len(TRAINS)} trains at {count} speeds")
+    print(f"{len(TRAINS)} trains at {count} speeds\n")
     print_table(["", "wall (s)", "processor (s)"])
     print_row(["`jb.sweep`", f"{found['wall']:.2f}", f"{found['processor']:.2f}"])
     print_row(["the script, scaled", "", f"{found['script']:.0f}"])

@@ -28,6 +28,7 @@ CODES = ("en1991-2",)
 TRACKS = ("ballasted", "slab")
 MAINTENANCE = ("careful", "standard")
 HSLM_A = tuple(f"HSLM-A{i}" for i in range(1, 11))
+FASTEST = 150.0  # m/s, 540 km/h: no train in service or on trial comes near
 MANY_MODES = 60  # among which those that count for accelerations are found
 
 
@@ -84,6 +85,11 @@ def assess(
     for name, number in positive.items():
         if not 0 < number < np.inf:
             raise ValueError(f"{name} must be positive; it is {number:g}")
+    if speed > FASTEST:
+        raise ValueError(
+            f"line_speed is {speed:g} m/s, {3.6 * speed:.4g} km/h, faster than any train: a number"
+            f" is in m/s; write '{speed:g} km/h', say"
+        )
     if not 0 <= added_damping < 1:
         raise ValueError(f"added_damping is a ratio, as 0.005; it is {added_damping:g}")
     bridge = _bridge(case)

@@ -34,7 +34,7 @@ from jaxbeam.integrator.static_shapes import static_shapes
 from jaxbeam.integrator.step_size import choose_step_size, run_peaks
 from jaxbeam.model.channels import accepts_commands
 from jaxbeam.runtime.compiling import compiled_if_traced
-from jaxbeam.simulation.command_limits import command_ranges
+from jaxbeam.simulation.commands.limits import acting_ranges
 from jaxbeam.simulation.record import Record
 
 DEFAULT_PERIOD = 0.01  # s, over which commands are held without a sampled controller
@@ -238,6 +238,6 @@ def _uncontrolled_peak(case: Case, positions) -> float:
 
 
 def held_command_limits(case: Case, period: float) -> tuple[Float[np.ndarray, " actuator"], ...]:
-    """Lowest and highest command of each actuator, and its largest change from hold to hold."""
-    low, high, rate = (np.asarray(part) for part in command_ranges(case))
+    """Lowest and highest command that acts, and its largest change from hold to hold."""
+    low, high, rate = (np.asarray(part) for part in acting_ranges(case))
     return low, high, rate * period

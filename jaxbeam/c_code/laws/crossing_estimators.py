@@ -16,7 +16,7 @@ from jaxbeam.c_code.source import CSource
 from jaxbeam.c_code.tables import at_samples
 from jaxbeam.c_code.writers import EstimateCode, write_filter
 from jaxbeam.estimation.constant_gain import sensor_offsets
-from jaxbeam.estimation.crossing_filter import CrossingFilter
+from jaxbeam.estimation.crossing_filter import CrossingFilter, corrected
 from jaxbeam.estimation.simulated_vehicles import SampledWithVehicles
 from jaxbeam.runtime.arrays import xp
 
@@ -33,9 +33,10 @@ def _(filter: CrossingFilter, code: CSource) -> EstimateCode:
 
     A, previous, present, C, D, noise, on_beam = at_samples(model, code)
     gains, covariance = [], np.asarray(filter.initial_covariance)
+    of_readings = filter.sensor_chain.noise_covariance
     for k in range(len(A)):
         covariance = A[k] @ covariance @ A[k].T + noise[k]
-        gain, covariance = (np.asarray(part) for part in filter.correction(covariance, C[k]))
+        gain, covariance = (np.asarray(part) for part in corrected(covariance, C[k], of_readings))
         gains.append(gain)
     x = code.state("estimate", filter.initial, "estimated states, of beam, loads and sensors")
     model_at_samples = FilterModel(A, previous, present, C, D, np.stack(gains))

@@ -56,7 +56,8 @@ def _(law: SlidingModeLaw, code: CSource, estimate: EstimateCode) -> None:
 
 @write_state_law.register
 def _(law: PositionGainLaw, code: CSource, estimate: EstimateCode) -> None:
-    gains, forward = (np.asarray(part) for part in at_samples(law.combined, code))
+    known = at_samples(lambda t: law.combined(law.loads_at(t)), code)
+    gains, forward = (np.asarray(part) for part in known)
     code.add("/* u = f - K x, with K and f along the known ways of the loads */")
     code.add(f"copy({code.output}, {code.per_sample('forward', forward)}, {code.actuators});")
     gain = code.per_sample("gain", gains)

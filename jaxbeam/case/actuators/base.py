@@ -6,6 +6,7 @@ from typing import ClassVar
 import equinox as eqx
 from jaxtyping import Float
 
+from jaxbeam.case.actuators.hysteresis import Hysteresis
 from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.module import Module
@@ -56,6 +57,16 @@ class AbstractActuator(ReprWithUnits, Module):
 
     kind: ClassVar[str]
     limits: eqx.AbstractVar[Float[Array, "2"] | None]
+
+    @property
+    def hysteresis(self) -> Hysteresis | None:
+        """Operator from the commands to those that act; None if they act as they are."""
+        return None
+
+    @property
+    def compensation(self) -> Hysteresis | None:
+        """Operator whose inverse is applied to the commands of a controller; None if none is."""
+        return None
 
     @abc.abstractmethod
     def displacement_map(self) -> tuple[tuple[Float[Array, ""], int, float], ...]:

@@ -5,6 +5,7 @@ from typing import ClassVar
 from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment, SectionStiffening
+from jaxbeam.case.actuators.hysteresis import Hysteresis
 from jaxbeam.case.declared_checks import validate_direct_or_derived
 from jaxbeam.case.fields import (
     INCREASING,
@@ -14,6 +15,7 @@ from jaxbeam.case.fields import (
     concrete,
     is_concrete,
     number,
+    part,
 )
 from jaxbeam.runtime.arrays import Array, xp
 
@@ -37,7 +39,9 @@ class Patch(AbstractActuator):
     `added_mass` and `added_rigidity` act over its length and enter the modes.
 
     Commands stay within `limits` and within the voltages `depolarisation`, beyond which the patch
-    loses its polarisation; `rate_limit` is that of the amplifier.
+    loses its polarisation; `rate_limit` is that of the amplifier. Commands act through the
+    `hysteresis` of the patch, if it has one; the inverse of `compensation`, identified from a log
+    by `tuning.fit.hysteresis.fitted_hysteresis`, makes it act as a linear one.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -98,6 +102,10 @@ class Patch(AbstractActuator):
     rate_limit: Float[Array, ""] | None = number(
         "V/s", "largest rate of change of the command", POSITIVE, default=None
     )
+    hysteresis: Hysteresis | None = part("hysteresis of the patch", Hysteresis)
+    compensation: Hysteresis | None = part(
+        "hysteresis whose inverse the controller applies to its commands", Hysteresis
+    )
 
     @property
     def moment_constant(self) -> Float[Array, ""]:
@@ -151,4 +159,9 @@ class Patch(AbstractActuator):
                 f"{address}.limits leave no command that the patch takes: its depolarisation limits"
                 f" over its amplifier_gain allow {low:g} to {high:g} V"
             )
+        for name in ("hysteresis", "compensation"):
+            operator = getattr(self, name)
+            error = None if operator is None else operator.validate()
+            if error is not None:
+                return f"{address}.{name}.{error}"
         return validate_direct_or_derived(address, self, "moment_per_volt", MOMENT_SOURCES)

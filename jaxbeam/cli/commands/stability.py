@@ -48,7 +48,8 @@ def stability(
     parsed_case = options.read(case)
 
     from jaxbeam.analysis.crossing_margin import stability_margin
-    from jaxbeam.analysis.linearised_loop import linearised_loop, loop_with_mass_at
+    from jaxbeam.analysis.linearised_loop import linearised_loop
+    from jaxbeam.analysis.loops.stationary_loop import loop_with_mass_at
     from jaxbeam.analysis.stability import frozen_poles, growth, stream
     from jaxbeam.analysis.stability_limits import (
         largest_frozen_pole,

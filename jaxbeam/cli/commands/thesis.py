@@ -12,8 +12,8 @@ from jaxbeam.cli.options import (
     PrintOptions,
     enable_compile_cache,
     print_message,
-    table,
 )
+from jaxbeam.files.report import text_table
 
 MAX_PROCESSES = 2  # experiments at once, each of which takes a core and up to 2 GB
 
@@ -63,7 +63,9 @@ def reproduce(
     if list_:
         options.report(
             {one.name: {"covers": one.covers, "claim": one.claim} for one in available.values()},
-            table(("name", "covers"), [(one.name, one.covers) for one in available.values()]),
+            text_table(
+                ("name", "covers"), [(one.name, one.covers) for one in available.values()], "<<"
+            ),
         )
         return
     runs = reproduction.reproduce(

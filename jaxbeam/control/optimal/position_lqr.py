@@ -8,7 +8,7 @@ masses as weights, and the commands for their weights W, fed forward by the gain
 """
 
 import dataclasses
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.controller import ControlStep
+from jaxbeam.case.estimator import EstimatedLoads
 from jaxbeam.case.fields import INCREASING, choice, concrete, is_concrete, number
 from jaxbeam.case.loads.base import trajectory
 from jaxbeam.case.loads.mass import MovingMass
@@ -36,7 +37,8 @@ class PositionLQR(AbstractFiniteHorizonRegulator):
     reads the tables, interpolated linearly, at its measured position and present speed, which may
     change, rather than at a time. Of several loads on the beam the gains of the state are averaged
     with their masses as weights; with loads "known" the commands for their weights, in proportion
-    to the masses, are added. With none on the beam, `after` holds for those that have left.
+    to the masses, are added. With none on the beam, `after` holds for those that have left. An
+    estimator that follows the loads, `kalman-extended`, gives their masses, positions and speeds.
 
     >>> import jaxbeam as jb
     >>> weights = {"state_weight": [1e4, 1.0], "command_weight": [1e-3]}
@@ -107,11 +109,25 @@ class PositionLQR(AbstractFiniteHorizonRegulator):
         return error or super().validate(case)
 
 
+class ReadLoads(NamedTuple):
+    """Loads that read the tables: their clocks, speeds (m/s), masses (kg) and weights (N).
+
+    The clock is negative before entry, the share of the beam travelled on it, and 1 plus the time
+    since the exit (s) after.
+    """
+
+    clock: Float[Array, " load"]
+    speeds: Float[Array, " load"]
+    on_beam: Bool[Array, " load"]
+    masses: Float[Array, " load"]
+    weights: Float[Array, " load"]
+
+
 class PositionGainLaw(AbstractStateLaw):
     """Gain schedules (mass, speed) of single loads, and the loads that read them.
 
     `load_masses` (kg) and `load_weights` (N) are those of the loads, whose positions are those of
-    `load_set`.
+    `load_set`; loads of an estimate take their place.
     """
 
     schedules: GainSchedule
@@ -121,25 +137,35 @@ class PositionGainLaw(AbstractStateLaw):
     load_weights: Float[Array, " load"]
     load_set: LoadSet
 
-    def clocks(
-        self, t: Float[Array, ""]
-    ) -> tuple[Float[Array, " load"], Float[Array, " load"], Bool[Array, " load"]]:
-        """Clock of each load, speed (m/s), and whether it is on the beam, at t (s).
-
-        The clock is negative before entry, the share of the beam travelled on it, and 1 plus the
-        time since the exit (s) after.
-        """
+    def loads_at(self, t: Float[Array, ""]) -> ReadLoads:
+        """The loads of the case at t (s)."""
         positions, speeds, _ = self.load_set.kinematics(t)
         entry, leave = self.load_set.entry_exit_times().T
+        clock = jnp.where(t < leave, jnp.clip(self._share(positions), 0.0, 1.0), 1.0 + t - leave)
+        clock = jnp.where(t < entry, -1.0, clock)
+        on_beam = (entry <= t) & (t < leave)
+        return ReadLoads(clock, jnp.abs(speeds), on_beam, self.load_masses, self.load_weights)
+
+    def estimated_loads(self, loads: EstimatedLoads) -> ReadLoads:
+        """The loads as an estimator follows them; they have left at their present speed."""
+        share, speeds = self._share(loads.positions), jnp.abs(loads.speeds)
+        length = self.load_set.trajectories[0].length
+        since_exit = jnp.maximum(share - 1.0, 0.0) * length
+        moving = speeds > 0
+        since_exit = jnp.where(moving, since_exit / jnp.where(moving, speeds, 1.0), 0.0)
+        clock = jnp.where(share < 0, -1.0, jnp.minimum(share, 1.0) + since_exit)
+        on_beam = (share >= 0) & (share < 1)
+        weights = loads.masses * self.load_weights / self.load_masses
+        return ReadLoads(clock, speeds, on_beam, loads.masses, weights)
+
+    def _share(self, positions):
+        """Share of the beam that loads at positions (m) have travelled."""
         path = self.load_set.trajectories[0]
         share = positions / path.length
-        share = jnp.clip(jnp.where(path.direction() < 0, 1.0 - share, share), 0.0, 1.0)
-        clock = jnp.where(t < leave, share, 1.0 + t - leave)
-        return jnp.where(t < entry, -1.0, clock), jnp.abs(speeds), (entry <= t) & (t < leave)
+        return jnp.where(path.direction() < 0, 1.0 - share, share)
 
-    def load_gains(self, t: Float[Array, ""]) -> Float[Array, "load actuator column"]:
-        """Gain that each load reads at t (s), as if it were alone."""
-        clocks, speeds, _ = self.clocks(t)
+    def load_gains(self, loads: ReadLoads) -> Float[Array, "load actuator column"]:
+        """Gain that each load reads, as if it were alone."""
 
         def of_load(clock, mass, speed):
             def gain(schedule):
@@ -150,25 +176,27 @@ class PositionGainLaw(AbstractStateLaw):
             shares = _hat_weights(self.masses, mass), _hat_weights(self.speeds, speed)
             return jnp.einsum("m,v,mvac->ac", *shares, gains)
 
-        return jax.vmap(of_load)(clocks, self.load_masses, speeds)
+        return jax.vmap(of_load)(loads.clock, loads.masses, loads.speeds)
 
     def combined(
-        self, t: Float[Array, ""]
+        self, loads: ReadLoads
     ) -> tuple[Float[Array, "actuator state"], Float[Array, " actuator"]]:
-        """Gain of the state, and commands that are fed forward, at t (s)."""
-        gains, (clocks, _, on_beam) = self.load_gains(t), self.clocks(t)
-        counted = jnp.where(jnp.any(on_beam), on_beam, clocks >= 1)
-        shares = jnp.where(counted, self.load_masses, 0.0)
+        """Gain of the state, and commands that are fed forward, for some loads."""
+        gains, on_beam = self.load_gains(loads), loads.on_beam
+        counted = jnp.where(jnp.any(on_beam), on_beam, loads.clock >= 1)
+        shares = jnp.where(counted, loads.masses, 0.0)
         total = jnp.sum(shares)
         shares = shares / jnp.where(total > 0, total, 1.0)
         states = gains.shape[-1] - self.schedules.load_weights.shape[-1]
         forward = jnp.zeros(gains.shape[1])
         if self.schedules.load_feedforward:
-            forward = -jnp.where(on_beam, self.load_weights, 0.0) @ gains[..., states]
+            forward = -jnp.where(on_beam, loads.weights, 0.0) @ gains[..., states]
         return jnp.einsum("l,lac->ac", shares, gains[..., :states]), forward
 
     def step(self, state, estimate, measurement, t):
-        gain, forward = self.combined(t)
+        followed = estimate.loads
+        loads = self.loads_at(t) if followed is None else self.estimated_loads(followed)
+        gain, forward = self.combined(loads)
         return ControlStep(forward - gain @ estimate.state, state)
 
 

@@ -52,7 +52,9 @@ def read_gains(path: str | os.PathLike) -> Gains:
         raise ValueError(f"{path}: not a file of gains written by jaxbeam") from None
     computed = gains.checksum, gains.test_command.tolist(), gains.test_estimate.tolist()
     if computed != check_values:
-        raise ValueError(f"{path}: the numbers contradict the check values; the file was changed")
+        raise ValueError(
+            f"{path}: the numbers contradict the check values; the file was changed: export it anew"
+        )
     return gains
 
 

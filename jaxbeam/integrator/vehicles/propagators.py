@@ -22,7 +22,7 @@ from jaxbeam.integrator.propagators import (
 )
 from jaxbeam.model.load_set import LoadSet, VehicleGroup
 from jaxbeam.numerics.batched_linalg import matmul_last
-from jaxbeam.runtime.arrays import Array, stop_gradient, xp
+from jaxbeam.runtime.arrays import Array, any_jax, cond, map_elements, stop_gradient, xp
 
 
 class VehiclePropagators(eqx.Module):
@@ -60,9 +60,40 @@ def vehicle_propagators(
     group: VehicleGroup, lengths: Float[Array, " length"]
 ) -> VehiclePropagators:
     """Propagators of the vehicles of a load over steps of the given lengths (s)."""
+    if not any_jax(group, lengths):
+        return _propagators(group, lengths)
+
+    def of_length(length):
+        """Most panels of a compiled program are empty."""
+        parts = cond(
+            length > 0, lambda t: _propagators(group, t), lambda t: _at_once(group, t), length[None]
+        )
+        return jax.tree.map(lambda part: part[0], parts)
+
+    return map_elements(of_length, lengths)
+
+
+def _at_once(group: VehicleGroup, lengths: Float[Array, " length"]) -> VehiclePropagators:
+    """Propagators over steps of no length."""
+    states, wheels, batch_size = group.B.shape
+    rows = wheels * NODE_COUNT
+
+    def of_all(matrix):
+        shape = *lengths.shape, *matrix.shape[:2], batch_size
+        return xp.broadcast_to(xp.asarray(matrix, lengths.dtype), shape)
+
+    return VehiclePropagators(
+        of_all(np.eye(states)[..., None]),
+        of_all(np.zeros((states, rows, 1))),
+        of_all(xp.repeat(group.H, NODE_COUNT, axis=0)),
+        of_all(np.eye(rows)[..., None]),
+    )
+
+
+def _propagators(group: VehicleGroup, lengths: Float[Array, " length"]) -> VehiclePropagators:
     A, B, H, scale = _scaled_systems(group)
     durations = lengths[:, None] * np.append(GAUSS_NODES, 1.0)
-    transition, phi_functions = phi_functions_of(A, B, durations)
+    transition, phi_functions = phi_functions_of(A, B, durations, few_doublings=True)
     inputs = xp.einsum("cfp,pswblc->lcfswb", force_weights(), phi_functions)
     transition = xp.einsum("stblc->lcstb", transition)
     nodes = slice(0, NODE_COUNT)

@@ -11,9 +11,9 @@ The profile and forces that vary in time add to W and q what `known_disturbance`
 """
 
 import equinox as eqx
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from jaxbeam.model.contact import surface_rows
+from jaxbeam.model.contact import SurfaceRows, surface_rows
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import Array, block_diag, set_at, xp
@@ -36,20 +36,41 @@ def contact_rows(model: ModalModel, loads: LoadSet, times: Float[Array, "*time"]
     kinematics = (*loads.kinematics(times), loads.on_beam(times))
     position, speed, acceleration, active = (xp.moveaxis(part, 0, -1) for part in kinematics)
     wheels, springs = loads.wheels, bool(loads.wheels.vehicles)
-    rows = surface_rows(model, position, speed, acceleration, active, springs)
-    sizes = {"shape": model.mode_count, "state": model.state_count}
-    shape = rows.shape.reshape(*position.shape, sizes["shape"])
-    of_acceleration = rows.acceleration.reshape(*position.shape, sizes["state"])
-    mass = xp.where(active, loads.inertia[:, 0], 0.0)
-    force = mass[..., None] * of_acceleration
+    motion = position, speed, acceleration, active
+    mass_rows, rows = _mass_rows(model, motion, loads.inertia[:, 0], springs)
     if not springs:
-        return ContactRows(shape, mass, force, None)
+        return mass_rows
+    shape, mass, force = mass_rows.shape, mass_rows.mass, mass_rows.force
     surface = wheels.stiffness * rows.deflection.reshape(force.shape)
     surface = surface + wheels.damping * rows.velocity.reshape(force.shape)
     of_vehicles = xp.where(active[..., None], vehicle_system(loads)[2], 0.0)
     return ContactRows(
         shape, mass, xp.concatenate([force + surface, -of_vehicles], axis=-1), surface
     )
+
+
+def mass_contact_rows(
+    model: ModalModel,
+    position: Float[Array, "*time wheel"],
+    speed: Float[Array, "*time wheel"],
+    active: Bool[Array, "*time wheel"],
+    mass: Float[Array, "*time wheel"],
+) -> ContactRows:
+    """Contact law of masses (kg) at positions (m) that travel at constant speeds (m/s).
+
+    `active` ones are on the beam.
+    """
+    return _mass_rows(model, (position, speed, xp.zeros_like(speed), active), mass, False)[0]
+
+
+def _mass_rows(model, motion, inertia, springs) -> tuple[ContactRows, SurfaceRows]:
+    """Contact law of the masses (kg) alone, and the rows of the surface under the wheels."""
+    position, speed, acceleration, active = motion
+    rows = surface_rows(model, position, speed, acceleration, active, springs)
+    shape = rows.shape.reshape(*position.shape, model.mode_count)
+    of_acceleration = rows.acceleration.reshape(*position.shape, model.state_count)
+    mass = xp.where(active, inertia, 0.0)
+    return ContactRows(shape, mass, mass[..., None] * of_acceleration, None), rows
 
 
 def vehicle_system(

@@ -10,7 +10,8 @@
  * in every call would take long. */
 int64_t workspace_size(int64_t panels, int64_t blocks, int64_t block_size, int64_t modes,
                        int64_t segments, int64_t terms, int64_t max_loads, int64_t loads,
-                       int64_t positions, int64_t batch_size) {
+                       int64_t positions, int64_t batch_size, int64_t groups_of_vehicles,
+                       const int64_t *vehicles) {
     Workspace w = {.panels = (int)panels,
                    .blocks = (int)blocks,
                    .block_size = (int)block_size,
@@ -20,7 +21,9 @@ int64_t workspace_size(int64_t panels, int64_t blocks, int64_t block_size, int64
                    .max_loads = (int)max_loads,
                    .loads = (int)loads,
                    .positions = (int)positions,
-                   .batch_size = batch_size};
+                   .batch_size = batch_size,
+                   .groups_of_vehicles = (int)groups_of_vehicles,
+                   .vehicles = vehicles};
     derive_sizes(&w);
     return (int64_t)((partition_workspace(&w, 0) + sizeof(Register)) / 8);
 }
@@ -29,6 +32,9 @@ int64_t workspace_size(int64_t panels, int64_t blocks, int64_t block_size, int64
 static void reset(Workspace *w) {
     const size_t batch_size = (size_t)w->batch_size, sampled = (size_t)w->positions * batch_size;
     memset(w->state, 0, 8 * (size_t)w->states * batch_size);
+    memset(w->vehicle_state, 0, 8 * (size_t)w->vehicle_states * batch_size);
+    for (size_t i = 0; i < batch_size; i += REGISTER_WIDTH)
+        w->vehicle_panel[i / REGISTER_WIDTH] = -1;
     memset(w->peak_samples, 0, 8 * PEAK_POINTS * sampled);
     memset(w->peak, 0, 8 * sampled);
     memset(w->peak_step_start, 0, 8 * sampled);
@@ -72,6 +78,7 @@ static void integrate_task(Workspace *w) {
     reset(w);
     shape_series(w);
     compute_propagators(w);
+    set_vehicle_times(w);
     const double exit_time = last_exit(w);
     int panel = 0;
     int64_t done = 0;
@@ -154,7 +161,9 @@ XLA_FFI_Error *integrate_peaks(XLA_FFI_CallFrame *frame) {
                            .positions = (int)dims[OUTPUT_ROWS][1],
                            .influence_pieces = (int)dims[INFLUENCE_SERIES][1],
                            .influence_terms = (int)dims[INFLUENCE_SERIES][2],
-                           .batch_size = dims[INERTIA][2]};
+                           .batch_size = dims[INERTIA][2],
+                           .groups_of_vehicles = (int)dims[VEHICLES][1],
+                           .vehicles = ((XLA_FFI_Buffer *)frame->args.args[VEHICLES])->data};
     Workspace *w = &workspace;
     derive_sizes(w);
     for (int i = 0; i < RESULT_COUNT; i++) w->outputs[i] = results[i]->data;

@@ -72,8 +72,13 @@ static void evaluate_trajectory(const Workspace *w, int64_t load, double time, d
     *acceleration = 2 * c[2] + t * 6 * c[3];
 }
 
-/* Mode shapes (mode, node) and contact rows (state, node) under the loads of a step:
- * model/contact.py, `contact_rows`. */
+/* Rows (load, state, node) of a motion of the beam under the loads. */
+static double *motion_rows(const Workspace *w, int motion) {
+    return w->contact_rows + (ptrdiff_t)motion * w->max_loads * w->states * PADDED_NODES;
+}
+
+/* Mode shapes (mode, node) and rows (state, node) of motions under the loads of a step:
+ * model/contact.py, `surface_rows`. */
 static void load_path(const Workspace *w, const Step *step) {
     const int block_size = w->block_size, modes = w->modes, all_modes = w->all_modes;
     for (int s = 0; s < step->loads; s++) {
@@ -87,8 +92,7 @@ static void load_path(const Workspace *w, const Step *step) {
         for (int first = 0; first < NODES; first += REGISTER_WIDTH) {
             const Register v = load_full(speed + first), a = load_full(acceleration + first);
             double *shape = w->shape + (ptrdiff_t)s * all_modes * PADDED_NODES + first;
-            double *contact_rows =
-                w->contact_rows + (ptrdiff_t)s * w->states * PADDED_NODES + first;
+            const ptrdiff_t at = (ptrdiff_t)s * w->states * PADDED_NODES + first;
             evaluate_shapes(w, load_full(position + first));
             const Register *value = w->shape_sums, *slope = value + all_modes,
                            *curvature = slope + all_modes;
@@ -103,7 +107,14 @@ static void load_path(const Workspace *w, const Step *step) {
                     row += value[b * modes + n] * rates[2 * n * block_size];
                 if (j < 2 * modes)
                     row += j % 2 ? 2 * v * slope[m] : v * v * curvature[m] + a * slope[m];
-                store(contact_rows + i * PADDED_NODES, row, REGISTER_WIDTH);
+                store(motion_rows(w, ACCELERATION) + at + i * PADDED_NODES, row, REGISTER_WIDTH);
+                if (w->motions == 1) continue;
+                const Register zero = {0};
+                const int is_state = j < 2 * modes, is_rate = j % 2;
+                store(motion_rows(w, DEFLECTION) + at + i * PADDED_NODES,
+                      is_state && !is_rate ? value[m] : zero, REGISTER_WIDTH);
+                store(motion_rows(w, VELOCITY) + at + i * PADDED_NODES,
+                      !is_state ? zero : is_rate ? value[m] : v * slope[m], REGISTER_WIDTH);
             }
         }
     }

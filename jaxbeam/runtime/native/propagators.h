@@ -45,29 +45,28 @@ static void balance_states(const Workspace *w, const double *matrix) {
 static const double INVERSE_FACTORIAL[] = {1, 1, 1 / 2., 1 / 6., 1 / 24., 1 / 120., 1 / 720.};
 _Static_assert(NODES < sizeof INVERSE_FACTORIAL / sizeof(double), "factorials for all nodes");
 
-/* Exponential (state, state) of a block over a length, and its phi functions times the inputs
- * (state, phi function and mode): Taylor series of a fraction of the length, doubled. */
-static void block_exponential(Workspace *w, const double *matrix, Register length) {
-    const int block_size = w->block_size, modes = w->modes;
+/* Exponential (state, state) of `block_matrix`, doubled so often, and its phi functions times the
+ * `input_matrix` (state, phi function and input): Taylor series, doubled. */
+static void exponential_and_phi(Workspace *w, int block_size, int modes) {
     const int width = block_size + modes, columns = NODES * modes;
-    for (int i = 0; i < block_size; i++)
-        for (int j = 0; j < block_size; j++)
-            w->block_matrix[i * block_size + j] =
-                length *
-                (matrix[i * block_size + j] * w->scale[i] / w->scale[j] / (1 << DOUBLINGS));
-    /* (state, state and mode): identity and input matrix, then partial sums */
+    /* (state, state and input): identity and input matrix, then partial sums */
     Register *sums = w->series_sums, *product = w->product;
     memset(sums, 0, (size_t)(block_size * width) * sizeof *sums);
-    for (int i = 0; i < block_size; i++) sums[i * width + i] = broadcast(1);
-    for (int m = 0; m < modes; m++) sums[(2 * m + 1) * width + block_size + m] = broadcast(1);
+    for (int i = 0; i < block_size; i++) {
+        sums[i * width + i] = broadcast(1);
+        memcpy(sums + i * width + block_size, w->input_matrix + i * modes,
+               (size_t)modes * sizeof *sums);
+    }
     for (int term = TAYLOR_TERMS; term > 0; term--) {
         multiply(product, w->block_matrix, block_size, block_size, sums, width);
-        for (int i = 0; i < block_size; i++)
-            for (int j = 0; j < width; j++) {
-                const int own = j < block_size ? i == j : i == 2 * (j - block_size) + 1;
-                sums[i * width + j] =
-                    product[i * width + j] / (term + (j < block_size ? 0 : NODES)) + own;
-            }
+        for (int i = 0; i < block_size; i++) {
+            for (int j = 0; j < block_size; j++)
+                sums[i * width + j] = product[i * width + j] / term + (i == j);
+            for (int m = 0; m < modes; m++)
+                sums[i * width + block_size + m] =
+                    product[i * width + block_size + m] / (term + NODES) +
+                    w->input_matrix[i * modes + m];
+        }
     }
     for (int i = 0; i < block_size; i++) {
         memcpy(w->exponential + i * block_size, sums + i * width,
@@ -79,7 +78,7 @@ static void block_exponential(Workspace *w, const double *matrix, Register lengt
     for (int p = NODES - 1; p > 0; p--) {
         for (int i = 0; i < block_size; i++)
             for (int m = 0; m < modes; m++) {
-                Register sum = broadcast(i == 2 * m + 1 ? INVERSE_FACTORIAL[p] : 0);
+                Register sum = w->input_matrix[i * modes + m] * INVERSE_FACTORIAL[p];
                 for (int k = 0; k < block_size; k++)
                     sum +=
                         w->block_matrix[i * block_size + k] * w->phi[k * columns + p * modes + m];
@@ -103,6 +102,20 @@ static void block_exponential(Workspace *w, const double *matrix, Register lengt
         spare = w->exponential, w->exponential = w->doubled_exponential,
         w->doubled_exponential = spare;
     }
+}
+
+/* Exponential of a block over a length, and its phi functions times the inputs (state, phi function
+ * and mode). */
+static void block_exponential(Workspace *w, const double *matrix, Register length) {
+    const int block_size = w->block_size, modes = w->modes;
+    for (int i = 0; i < block_size; i++)
+        for (int j = 0; j < block_size; j++)
+            w->block_matrix[i * block_size + j] =
+                length *
+                (matrix[i * block_size + j] * w->scale[i] / w->scale[j] / (1 << DOUBLINGS));
+    memset(w->input_matrix, 0, (size_t)(block_size * modes) * sizeof *w->input_matrix);
+    for (int m = 0; m < modes; m++) w->input_matrix[(2 * m + 1) * modes + m] = broadcast(1);
+    exponential_and_phi(w, block_size, modes);
 }
 
 /* Transition and force response of a block from its exponential and phi functions; contact forces

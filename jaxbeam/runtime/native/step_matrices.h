@@ -5,8 +5,8 @@
 #include "load_path.h"
 
 /* Rows of one load for its Gauss nodes from `first` on, as many as a register holds: contact
- * response, force response and contact compliance. */
-static void step_matrices_at_nodes(const Workspace *w, const Step *step, int s, int first) {
+ * response and compliance of a motion. */
+static void contact_at_nodes(const Workspace *w, const Step *step, int s, int first, int motion) {
     const int block_size = w->block_size, modes = w->modes, all_modes = w->all_modes;
     const int rows = step->rows, states = w->states, last = NODES - first;
     const int count = last < REGISTER_WIDTH ? last : REGISTER_WIDTH;
@@ -14,32 +14,26 @@ static void step_matrices_at_nodes(const Workspace *w, const Step *step, int s, 
         w->node_transition + (size_t)step->panel * node_transition_size(w) + first;
     const double *node_force_response =
         w->node_force_response + (size_t)step->panel * node_force_response_size(w) + first;
-    const double *end_response =
-        w->force_response + (size_t)step->panel * force_response_size(w) + first;
     const double *shape = w->shape + (ptrdiff_t)s * all_modes * PADDED_NODES + first;
-    const double *contact_rows = w->contact_rows + (ptrdiff_t)s * states * PADDED_NODES + first;
-    double *contact_response = step->contact_response + s * NODES + first;
-    double *force_response = step->force_response + (ptrdiff_t)(s * NODES + first) * states;
+    const double *contact_rows =
+        motion_rows(w, motion) + (ptrdiff_t)s * states * PADDED_NODES + first;
+    double *contact_response = step->contact_response[motion] + s * NODES + first;
     for (int i = 0; i < states; i++) {
         const double *rows_of = contact_rows + i / block_size * block_size * PADDED_NODES;
         const double *transitions = node_transition +
                                     i / block_size * block_size * block_size * PADDED_NODES +
                                     i % block_size * PADDED_NODES;
-        Register response = {0}, response_of_force = {0};
+        Register response = {0};
         for (int j = 0; j < block_size; j++)
             response += load_full(rows_of + j * PADDED_NODES) *
                         load_full(transitions + j * block_size * PADDED_NODES);
-        for (int m = 0; m < modes; m++)
-            response_of_force += load_full(shape + (i / block_size * modes + m) * PADDED_NODES) *
-                                 load_full(end_response + (i * modes + m) * PADDED_NODES);
         store(contact_response + i * rows, response, count);
-        for (int k = 0; k < count; k++) force_response[k * states + i] = response_of_force[k];
     }
     Register *acceleration = w->acceleration;
     for (int c = 0; c < NODES; c++) {
         const double *there = shape - first + c, *contact_rows_there = contact_rows - first + c;
         Register here = {0}; /* direct term: the force accelerates the beam under the load */
-        if (c >= first && c < first + REGISTER_WIDTH) here[c - first] = 1;
+        if (motion == ACCELERATION && c >= first && c < first + REGISTER_WIDTH) here[c - first] = 1;
         for (int m = 0; m < all_modes; m++) {
             const int from = m / modes * block_size;
             const double *response_of_force =
@@ -55,9 +49,26 @@ static void step_matrices_at_nodes(const Workspace *w, const Step *step, int s, 
             Register contact_compliance = {0};
             for (int m = 0; m < all_modes; m++)
                 contact_compliance += acceleration[m] * load_full(under + m * PADDED_NODES);
-            store(step->contact_compliance + (s * NODES + c) * rows + q * NODES + first,
+            store(step->contact_compliance[motion] + (s * NODES + c) * rows + q * NODES + first,
                   contact_compliance, count);
         }
+    }
+}
+
+/* Force response of one load for its Gauss nodes from `first` on, as many as a register holds. */
+static void force_response_at_nodes(const Workspace *w, const Step *step, int s, int first) {
+    const int modes = w->modes, states = w->states, last = NODES - first;
+    const int count = last < REGISTER_WIDTH ? last : REGISTER_WIDTH;
+    const double *shape = w->shape + (ptrdiff_t)s * w->all_modes * PADDED_NODES + first;
+    const double *end_response =
+        w->force_response + (size_t)step->panel * force_response_size(w) + first;
+    double *force_response = step->force_response + (ptrdiff_t)(s * NODES + first) * states;
+    for (int i = 0; i < states; i++) {
+        Register response = {0};
+        for (int m = 0; m < modes; m++)
+            response += load_full(shape + (i / w->block_size * modes + m) * PADDED_NODES) *
+                        load_full(end_response + (i * modes + m) * PADDED_NODES);
+        for (int k = 0; k < count; k++) force_response[k * states + i] = response[k];
     }
 }
 
@@ -73,8 +84,11 @@ static void step_matrices(const Workspace *w, const Step *step) {
         w->sample_response + (size_t)step->panel * sample_response_size(w);
     for (int s = 0; s < step->loads; s++) {
         const double *shape = w->shape + (ptrdiff_t)s * all_modes * PADDED_NODES;
-        for (int first = 0; first < NODES; first += REGISTER_WIDTH)
-            step_matrices_at_nodes(w, step, s, first);
+        for (int first = 0; first < NODES; first += REGISTER_WIDTH) {
+            force_response_at_nodes(w, step, s, first);
+            for (int motion = 0; motion < w->motions; motion++)
+                contact_at_nodes(w, step, s, first, motion);
+        }
         for (int f = 0; f < NODES; f++)
             for (int l = 0; l < sample_count; l += REGISTER_WIDTH) {
                 const double *input_row = sample_response + f * all_modes * padded + l;

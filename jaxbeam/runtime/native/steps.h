@@ -6,6 +6,7 @@
 #include "propagators.h"
 #include "peak_search.h"
 #include "step_matrices.h"
+#include "vehicles.h"
 
 /* Smallest contact forces so far, and the first times at which they are tensile. */
 static void update_contact_minimum(const Workspace *w, const Step *step, const Group *g) {
@@ -32,7 +33,7 @@ static inline ALWAYS_INLINE void contact_forces(const Workspace *w, const Step *
                                                 Register *forces) {
     const int rows = loads * NODES;
     memset(forces, 0, (size_t)rows * sizeof *forces);
-    add_product(forces, step->contact_response, rows, g->state, w->states);
+    add_product(forces, step->contact_response[ACCELERATION], rows, g->state, w->states);
     for (int s = 0; s < loads; s++) {
         const ptrdiff_t at = step->load_numbers[s] * w->batch_size + g->first;
         Register mass = load(w->inputs[INERTIA] + at, g->count),
@@ -40,10 +41,11 @@ static inline ALWAYS_INLINE void contact_forces(const Workspace *w, const Step *
         for (int i = s * NODES; i < (s + 1) * NODES; i++) {
             forces[i] = -(weight + mass * forces[i]);
             for (int j = 0; j < rows; j++)
-                matrix[i * rows + j] = mass * step->contact_compliance[i * rows + j];
+                matrix[i * rows + j] = mass * step->contact_compliance[ACCELERATION][i * rows + j];
             matrix[i * rows + i] += 1;
         }
     }
+    if (w->groups_of_vehicles) add_vehicles(w, step, g, loads, matrix, forces);
     solve_contact_system(matrix, forces, rows);
 }
 
@@ -133,25 +135,40 @@ static void update_peaks(const Workspace *w, int steps, const Group *g, int posi
     }
 }
 
+/* States of beam and vehicles of a group of runs. */
+static void load_states(const Workspace *w, const Group *g) {
+    for (int i = 0; i < w->states; i++)
+        g->state[i] = load(w->state + i * w->batch_size + g->first, g->count);
+    for (int i = 0; i < w->vehicle_states; i++)
+        g->vehicle_state[i] = load(w->vehicle_state + i * w->batch_size + g->first, g->count);
+}
+
 /* All steps of the chunk for a few groups, interleaved: while the divisions of one wait, another
  * computes. */
-static void advance_chunk(const Workspace *w, int steps, Group *groups, int group_count) {
+static void advance_chunk(Workspace *w, int steps, Group *groups, int group_count) {
     Group *end = groups + group_count;
     for (const Group *g = groups; g < end; g++)
-        for (int i = 0; i < w->states; i++)
-            g->state[i] = load(w->state + i * w->batch_size + g->first, g->count);
+        load_states(w, g);
     for (int t = 0; t < steps; t++) {
         const Step *step = w->steps + t;
+        const int vehicles = vehicles_move(w, step);
+        if (vehicles)
+            for (const Group *g = groups; g < end; g++) vehicle_propagators(w, step, g);
         if (step->loads) {
             for (const Group *g = groups; g < end; g++) solve_contact(w, step, g);
             for (const Group *g = groups; g < end; g++) update_contact_minimum(w, step, g);
         }
         for (const Group *g = groups; g < end; g++) sample_positions(w, t, step, g);
-        for (Group *g = groups; g < end; g++) propagate(w, step, g);
+        for (Group *g = groups; g < end; g++) {
+            if (vehicles) propagate_vehicles(w, step, g);
+            propagate(w, step, g);
+        }
     }
     for (const Group *g = groups; g < end; g++) {
         for (int position = 0; position < w->positions; position++)
             update_peaks(w, steps, g, position);
+        for (int i = 0; i < w->vehicle_states; i++)
+            store(w->vehicle_state + i * w->batch_size + g->first, g->vehicle_state[i], g->count);
         Register zero = {0}; /* NaN if a state is infinite or NaN, which it then stays */
         for (int i = 0; i < w->states; i++) {
             store(w->state + i * w->batch_size + g->first, g->state[i], g->count);

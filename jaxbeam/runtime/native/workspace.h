@@ -28,6 +28,12 @@ enum {
     CUBICS,
     INERTIA,
     WEIGHT,
+    STIFFNESS,
+    DAMPING,
+    VEHICLES,
+    VEHICLE_STATE_MATRIX,
+    VEHICLE_INPUT_MATRIX,
+    VEHICLE_OUTPUT_MATRIX,
     OUTPUT_ROWS,
     OUTPUT_BOUNDS,
     INFLUENCE_BREAKS,
@@ -41,22 +47,30 @@ enum {
 };
 enum { PEAK, PEAK_TIME, LOWEST_FORCE, CONTACT_LOSS_TIME, WORKSPACE, RESULT_COUNT };
 
+/* Numbers of the vehicles of a load, all alike: first wheel, and wheels and states of each. */
+enum { FIRST_WHEEL, WHEELS, STATES, COUNT, VEHICLE_NUMBERS };
+
+/* Motions of the beam under a wheel; the last two are those that springs of vehicles need. */
+enum { ACCELERATION, DEFLECTION, VELOCITY, MOTIONS };
+
 /* A step and its matrices, stored by columns: contact response (state, row), contact compliance
- * (row, row), force response (row, state), sample rows (state and row, sample). Rows are the Gauss
- * nodes of all loads on the beam. */
+ * (row, row), both of each motion, force response (row, state), sample rows (state and row, sample).
+ * Rows are the Gauss nodes of all loads on the beam. */
 typedef struct {
     int panel, loads, rows;
     double start, length;
     const double *transition;
     int64_t *load_numbers;
-    double *contact_response, *contact_compliance, *force_response, *sample_rows;
+    double *contact_response[MOTIONS], *contact_compliance[MOTIONS], *force_response, *sample_rows;
 } Step;
 
-/* Runs that fill a register; contact forces follow the state in memory. */
+/* Runs that fill a register; contact forces follow the state in memory. Vehicles: their states, the
+ * forces q of the beam on the springs of the rows, and these per contact force. */
 typedef struct {
     ptrdiff_t first;
     int count;
     Register *state, *next_state, *matrix;
+    Register *vehicle_state, *next_vehicle_state, *surface, *impedance;
     Register *samples; /* (step, sample, position) */
     /* (step, position): largest of the samples, and bound of the curve between them */
     Register *sample_peak, *peak_bound;
@@ -67,6 +81,10 @@ typedef struct {
     int panels, blocks, block_size, modes, segments, terms, pieces, max_loads, loads, positions;
     int influence_pieces, influence_terms;
     int states, all_modes, sample_count, columns;
+    /* Loads with vehicles and their VEHICLE_NUMBERS; motions that are needed, states of all
+     * vehicles, the largest numbers of one, registers of the propagators of all loads. */
+    int groups_of_vehicles, motions, vehicle_states, most_states, most_wheels, vehicle_registers;
+    const int64_t *vehicles;
     ptrdiff_t batch_size;
     const double *inputs[ARGUMENT_COUNT];
     double *outputs[RESULT_COUNT];
@@ -77,8 +95,8 @@ typedef struct {
         *sample_response;
     /* Exponential of a block, for several fractions of steps at once. */
     double *scale;
-    Register *block_matrix, *series_sums, *product, *exponential, *doubled_exponential, *phi,
-        *doubled_phi, *weights;
+    Register *block_matrix, *input_matrix, *series_sums, *product, *exponential,
+        *doubled_exponential, *phi, *doubled_phi, *weights, *vehicle_scale;
     /* Of a step: mode shapes and contact rows at the Gauss nodes. */
     double *shape, *contact_rows;
     Register *acceleration, *shape_sums, *chebyshev;
@@ -86,7 +104,11 @@ typedef struct {
     Register *root_energy;
     /* Of each run: state, running peaks, smallest contact forces; whether it is finite. */
     double *state, *peak, *peak_samples, *peak_step_start, *peak_step_length, *lowest_force,
-        *contact_loss_time, *finite;
+        *contact_loss_time, *finite, *vehicle_state;
+    /* Of each group of runs: propagators of vehicles, and the panel whose steps they are for. */
+    Register *vehicle_propagators;
+    int64_t *vehicle_panel;
+    double first_vehicle_entry, last_vehicle_exit; /* s */
     Group groups[INTERLEAVED_GROUPS];
     Step steps[CHUNK_STEPS];
     double end_slopes[2 * PEAK_POINTS]; /* weights of the samples in the slopes at both ends */
@@ -133,16 +155,21 @@ static size_t partition_workspace(Workspace *w, uintptr_t start) {
     w->sample_rows = allocate(start, &used, panels * sample_rows_size(w));
     w->sample_response = allocate(start, &used, panels * sample_response_size(w));
     w->scale = allocate(start, &used, block_size);
-    w->block_matrix = allocate(start, &used, block_size * block_size * REGISTER_WIDTH);
-    w->series_sums = allocate(start, &used, block_size * (block_size + modes) * REGISTER_WIDTH);
-    w->product = allocate(start, &used, block_size * (block_size + NODES * modes) * REGISTER_WIDTH);
-    w->exponential = allocate(start, &used, block_size * block_size * REGISTER_WIDTH);
-    w->doubled_exponential = allocate(start, &used, block_size * block_size * REGISTER_WIDTH);
-    w->phi = allocate(start, &used, block_size * NODES * modes * REGISTER_WIDTH);
-    w->doubled_phi = allocate(start, &used, block_size * NODES * modes * REGISTER_WIDTH);
+    const size_t side = block_size > (size_t)w->most_states ? block_size : (size_t)w->most_states,
+                 forces = modes > (size_t)w->most_wheels ? modes : (size_t)w->most_wheels;
+    w->block_matrix = allocate(start, &used, side * side * REGISTER_WIDTH);
+    w->input_matrix = allocate(start, &used, side * forces * REGISTER_WIDTH);
+    w->series_sums = allocate(start, &used, side * (side + forces) * REGISTER_WIDTH);
+    w->product = allocate(start, &used, side * (side + forces) * REGISTER_WIDTH);
+    w->exponential = allocate(start, &used, side * side * REGISTER_WIDTH);
+    w->doubled_exponential = allocate(start, &used, side * side * REGISTER_WIDTH);
+    w->phi = allocate(start, &used, side * NODES * forces * REGISTER_WIDTH);
+    w->doubled_phi = allocate(start, &used, side * NODES * forces * REGISTER_WIDTH);
+    w->vehicle_scale = allocate(start, &used, (size_t)w->most_states * REGISTER_WIDTH);
     w->weights = allocate(start, &used, NODES * NODES * REGISTER_WIDTH);
     w->shape = allocate(start, &used, (size_t)w->max_loads * all_modes * PADDED_NODES);
-    w->contact_rows = allocate(start, &used, (size_t)w->max_loads * states * PADDED_NODES);
+    w->contact_rows =
+        allocate(start, &used, (size_t)(w->motions * w->max_loads) * states * PADDED_NODES);
     w->acceleration = allocate(start, &used, all_modes * REGISTER_WIDTH);
     w->shape_sums = allocate(start, &used, (size_t)2 * w->columns * REGISTER_WIDTH);
     w->chebyshev = allocate(start, &used, (size_t)w->terms * REGISTER_WIDTH);
@@ -155,6 +182,11 @@ static size_t partition_workspace(Workspace *w, uintptr_t start) {
     w->lowest_force = allocate(start, &used, (size_t)w->loads * batch_size);
     w->contact_loss_time = allocate(start, &used, (size_t)w->loads * batch_size);
     w->finite = allocate(start, &used, batch_size);
+    const size_t register_count = (batch_size + REGISTER_WIDTH - 1) / REGISTER_WIDTH;
+    w->vehicle_state = allocate(start, &used, (size_t)w->vehicle_states * batch_size);
+    w->vehicle_propagators =
+        allocate(start, &used, register_count * (size_t)w->vehicle_registers * REGISTER_WIDTH);
+    w->vehicle_panel = allocate(start, &used, register_count);
     for (int k = 0; k < INTERLEAVED_GROUPS; k++) {
         Group *g = w->groups + k;
         g->state = allocate(start, &used, (states + rows) * REGISTER_WIDTH);
@@ -163,22 +195,44 @@ static size_t partition_workspace(Workspace *w, uintptr_t start) {
         g->samples = allocate(start, &used, CHUNK_STEPS * sample_count * REGISTER_WIDTH);
         g->sample_peak = allocate(start, &used, CHUNK_STEPS * positions * REGISTER_WIDTH);
         g->peak_bound = allocate(start, &used, CHUNK_STEPS * positions * REGISTER_WIDTH);
+        if (!w->groups_of_vehicles) continue;
+        g->vehicle_state = allocate(start, &used, (size_t)w->vehicle_states * REGISTER_WIDTH);
+        g->next_vehicle_state = allocate(start, &used, (size_t)w->vehicle_states * REGISTER_WIDTH);
+        g->surface = allocate(start, &used, MOTIONS * rows * REGISTER_WIDTH);
+        g->impedance = allocate(start, &used, rows * rows * REGISTER_WIDTH);
     }
     for (int t = 0; t < CHUNK_STEPS; t++) {
         Step *step = w->steps + t;
         step->load_numbers = allocate(start, &used, (size_t)w->max_loads);
-        step->contact_response = allocate(start, &used, rows * states);
-        step->contact_compliance = allocate(start, &used, rows * rows);
+        for (int motion = 0; motion < w->motions; motion++) {
+            step->contact_response[motion] = allocate(start, &used, rows * states);
+            step->contact_compliance[motion] = allocate(start, &used, rows * rows);
+        }
         step->force_response = allocate(start, &used, rows * states);
         step->sample_rows = allocate(start, &used, (states + rows) * sample_count);
     }
     return used;
 }
 
+/* Registers of the propagators of one vehicle: transition (state, state), spring states (wheel,
+ * node, state), input (wheel, state, node), spring surface (wheel, wheel, node, node). */
+static int vehicle_registers(int states, int wheels) {
+    return (states + wheels * NODES) * (states + wheels * NODES);
+}
+
 /* Sizes that follow from others. */
 static void derive_sizes(Workspace *w) {
     w->states = w->blocks * w->block_size, w->all_modes = w->blocks * w->modes;
     w->sample_count = PEAK_POINTS * w->positions, w->columns = 3 * w->all_modes;
+    w->motions = w->groups_of_vehicles ? MOTIONS : 1;
+    for (int group = 0; group < w->groups_of_vehicles; group++) {
+        const int64_t *numbers = w->vehicles + group * VEHICLE_NUMBERS;
+        const int states = (int)numbers[STATES], wheels = (int)numbers[WHEELS];
+        w->vehicle_states += (int)numbers[COUNT] * states;
+        w->vehicle_registers += vehicle_registers(states, wheels);
+        if (states > w->most_states) w->most_states = states;
+        if (wheels > w->most_wheels) w->most_wheels = wheels;
+    }
 }
 
 /* Arguments of a task. */

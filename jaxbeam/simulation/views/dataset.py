@@ -11,6 +11,7 @@ from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.model.modes import Modes
 from jaxbeam.simulation.labels import wheel_labels
 from jaxbeam.simulation.result_variables import (
+    ACTING_COMMAND,
     MODE_FIELDS,
     MODE_VARIABLES,
     ROTATION_SERIES,
@@ -48,6 +49,10 @@ def dataset_parts(
         dims, unit, words = ROTATION_SERIES
         labels = {"units": unit, "long_name": words}
         variables["mode_rotation_series"] = (dims, np.asarray(modes.rotation_series), labels)
+    if (acting := value("acting_command")) is not None:
+        dims, unit, words = ACTING_COMMAND
+        labels = {"units": unit, "long_name": words}
+        variables["acting_command"] = (dims, np.asarray(acting), labels)
     coordinates = {
         "time": ("time", np.asarray(times), {"units": "s"}),
         **sensor_coordinates(case),

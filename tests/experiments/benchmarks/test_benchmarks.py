@@ -1,5 +1,6 @@
 """Each benchmark on its cheapest real path; for the other solvers see `test_baselines`."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -153,3 +154,10 @@ def test_a_profile_divides_the_time_between_stages():
     stages = " ".join(shares)  # XLA may have made one kernel of two stages
     assert all(stage in stages for stage in ("collocation", "propagation", "running_peaks"))
     assert 95 <= sum(shares.values()) <= 105
+
+
+def test_what_is_printed_is_written_for_the_pages(tmp_path, monkeypatch):
+    monkeypatch.setattr(__main__, "PAGES", tmp_path)
+    __main__.write_page("sweep", "| a |\n| --- |\n")
+    written = (tmp_path / "sweep.md").read_text(encoding="utf-8")
+    assert re.fullmatch(r"\d+ cores, \d{4}-\d\d-\d\d:\n\n\| a \|\n\| --- \|\n", written)

@@ -95,6 +95,15 @@ def measured_responses(
 
     Raises ValueError for an unknown estimator, an H2 or Hv of several forces, windows without
     blows, no force, fewer segments than forces, and what `identify_modes` raises for its logs.
+
+    >>> import numpy as np
+    >>> import tuning
+    >>> force = np.random.default_rng(0).normal(size=1000)
+    >>> columns = ("f", "v1"), ("force", "velocity"), ("N", "m/s")
+    >>> log = tuning.Log(0.01 * np.arange(1000), np.stack([force, 3.0 * force], axis=1), *columns)
+    >>> found = tuning.measured_responses(log, estimator="H2", segment=1.0)
+    >>> print(found.frequencies[:3].round(2), f"{abs(found.values).mean():.2f} m/s/N")
+    [1. 2. 3.] 3.00 m/s/N
     """
     if estimator not in ESTIMATORS:
         raise ValueError(f"estimator must be {', '.join(ESTIMATORS)}, not {estimator!r}")

@@ -17,6 +17,26 @@ def command_ranges(case: Case) -> CommandRanges:
     return low, high, xp.array([xp.inf if rate is None else rate for rate in rates])
 
 
+def acting_ranges(case: Case) -> CommandRanges:
+    """Lowest and highest command that acts, behind the hysteresis, and its largest rate (1/s)."""
+    low, high, rate = command_ranges(case)
+    operators = [actuator.hysteresis for actuator in case.actuators]
+    if all(one is None for one in operators):
+        return low, high, rate
+
+    def acts(ends):
+        """Commands that act at these ends of the ranges."""
+        return xp.stack(
+            [
+                end if one is None else xp.where(xp.isinf(end), end, one.first_output(end))
+                for one, end in zip(operators, ends, strict=True)
+            ]
+        )
+
+    slopes = xp.stack([xp.ones(()) if one is None else xp.sum(one.weights) for one in operators])
+    return acts(low), acts(high), rate * slopes
+
+
 def limit_commands(
     case: Case,
     commands: Float[Array, "actuator *batch"],

@@ -1,0 +1,1 @@
+"""Sweeps of vehicles beside those of masses, and beside a script with scipy."""

@@ -1,0 +1,1 @@
+"""Loops of known numbers: of affine laws, and with stationary loads."""

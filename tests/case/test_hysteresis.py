@@ -1,0 +1,132 @@
+"""Hysteresis of actuators: properties of the operator, its inverse, and loops with both."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.analysis.bound.bound import held_command_limits
+from jaxbeam.case.validation import check_case
+from jaxbeam.simulation.commands.path import with_exact_compensation
+from jaxbeam.simulation.stored_record import record_from_xarray
+
+OPERATOR = jb.Hysteresis([0.0, 0.5, 1.5, 3.0], [0.7, 0.15, 0.1, 0.15])
+OTHER = jb.Hysteresis([0.0, 0.8, 2.0], [0.75, 0.2, 0.15])
+COMMANDS = arrays(float, st.integers(2, 12), elements=st.floats(-6, 6, allow_subnormal=False))
+
+
+def patch_case(limits=None, **operators) -> jb.Case:
+    patch = jb.Patch(0.2575, 0.3425, 0.15, limits=limits, **operators)
+    return jb.Case(
+        jb.Beam(0.6, 13.211, 0.812, damping_ratio=0.03, modes=2),
+        actuators=[patch],
+        sensors=[jb.Sensor(0.3)],
+        loads=[jb.MovingMass(mass=0.4, speed=3.0)],
+        controller=jb.Feedback([3000.0], period=0.004, delay=0.006),
+        run=jb.Run(0.2, 250.0),
+    )
+
+
+def by_hand(commands):
+    """Outputs of OPERATOR by play operators written out."""
+    plays, found = [0.0] * 4, []
+    for u in commands:
+        for i, r in enumerate((0.0, 0.5, 1.5, 3.0)):
+            if u - plays[i] > r:
+                plays[i] = u - r
+            elif plays[i] - u > r:
+                plays[i] = u + r
+        found.append(0.7 * plays[0] + 0.15 * plays[1] + 0.1 * plays[2] + 0.15 * plays[3])
+    return found
+
+
+@settings(deadline=None, max_examples=15)
+@given(COMMANDS)
+def test_properties_of_the_operator(commands):
+    outputs = OPERATOR.outputs(commands)
+    assert_allclose(outputs, by_hand(commands), atol=1e-12)
+    # Rate independence: the same at whatever times, with points in between on the way.
+    between = np.interp(np.arange(0, 3 * len(commands) - 2) / 3, np.arange(len(commands)), commands)
+    assert_allclose(OPERATOR.outputs(between)[::3], outputs, atol=1e-12)
+    # Wiping out: a loop within the range of the next command leaves no memory.
+    low, high = sorted(commands[:2])
+    loop = [low, high, (low + high) / 2, high, *commands]
+    wiped = OPERATOR.outputs([low, high, *commands])[2:]
+    assert_allclose(OPERATOR.outputs(loop)[4:], wiped, atol=1e-12)
+    # The inverse undoes the operator, on either side.
+    inverse = OPERATOR.inverse()
+    assert_allclose(OPERATOR.outputs(inverse.outputs(commands)), commands, atol=1e-12)
+    assert_allclose(inverse.outputs(outputs), commands, atol=1e-12)
+
+
+def test_compensated_loop_is_that_of_the_linear_patch():
+    linear = jb.simulate(patch_case())
+    hysteretic, rough, exact = (
+        jb.simulate(patch_case(hysteresis=OPERATOR, compensation=compensation))
+        for compensation in (None, OTHER, OPERATOR)
+    )
+    size = np.max(np.abs(linear.deflection))
+    errors = [np.max(np.abs(r.deflection - linear.deflection)) for r in (hysteretic, rough, exact)]
+    assert errors[0] > 0.02 * size and errors[1] < errors[0] / 2 and errors[2] < 1e-11 * size
+    assert_allclose(exact.acting_command, linear.command, atol=1e-9)
+    # Commands that were sent are within the limits, and act through the operator.
+    acting = OPERATOR.outputs(np.asarray(hysteretic.command)[:, 0])
+    assert_allclose(np.asarray(hysteretic.acting_command)[:, 0], acting, atol=1e-12)
+
+
+def test_limits_are_those_of_the_commands_that_are_sent():
+    """At the limits the law knows what acts, so that the inverse follows on leaving them."""
+    record = jb.simulate(patch_case(limits=[-1.0, 2.0], hysteresis=OPERATOR, compensation=OPERATOR))
+    command = np.asarray(record.command)
+    assert command.max() == 2.0 and command.min() >= -1.0
+    # 0.7 x 2 + 0.15 x 1.5 + 0.1 x 0.5, and 0.7 + 0.15 x 0.5 on the other side.
+    assert_allclose(np.max(record.acting_command), 1.675, rtol=1e-12)
+    low, high, _ = held_command_limits(record.case, 0.004)
+    assert_allclose([low[0], high[0]], [-0.775, 1.675])
+
+
+def test_commands_of_the_bound_act_where_the_hysteresis_is_compensated():
+    case = patch_case(limits=[-1.0, 2.0], hysteresis=OPERATOR)
+    least = jb.bound(case, period=0.04)
+    replay = dataclasses.replace(with_exact_compensation(case), controller=least.controller())
+    assert_allclose(jb.simulate(replay).peak_deflection.max(), least.peak, rtol=2e-3)
+
+
+def test_derivative_by_the_weights():
+    """Of the linear way out and back: outputs of a rising command are linear in the weights."""
+    points = np.array([0.0, 2.0, 4.0])
+    change = dataclasses.replace(OPERATOR, weights=OPERATOR.weights + np.array([0, 0.1, 0, 0]))
+    expected = 0.1 * np.maximum(points - 0.5, 0.0)
+    assert_allclose(change.outputs(points) - OPERATOR.outputs(points), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("operator", "message"),
+    [
+        (([0.0, 1.0], [0.5]), "actuators.0.hysteresis.weights must be as many as thresholds"),
+        (([0.1, 1.0], [0.5, 0.5]), "actuators.0.hysteresis.thresholds must begin with 0"),
+        (([0.0, 1.0], [0.5, -0.1]), "actuators.0.hysteresis.weights must not be negative"),
+    ],
+)
+def test_errors(operator, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        check_case(patch_case(hysteresis=jb.Hysteresis(*operator)))
+
+
+def test_hysteresis_needs_samples():
+    case = patch_case(hysteresis=OPERATOR)
+    continuous = dataclasses.replace(case, controller=jb.Feedback([3000.0]))
+    with pytest.raises(ValueError, match="the hysteresis of actuators.0 needs a controller that"):
+        check_case(continuous)
+
+
+def test_round_trip_of_a_record():
+    record = jb.simulate(patch_case(hysteresis=OPERATOR))
+    found = record_from_xarray(record.to_xarray())
+    assert_allclose(found.acting_command, record.acting_command)
+    assert found.case.actuators[0].hysteresis.weights[3] == 0.15
