@@ -86,6 +86,7 @@ from .control.optimal.sampled_lqr import DiscreteLQR as DiscreteLQR
 from .control.optimal.sampling_loss import sampling_limit as sampling_limit
 from .control.optimal.scheduled_lqr import ScheduledLQR as ScheduledLQR
 from .control.output_feedback import OutputFeedback as OutputFeedback
+from .control.predictive.adaptive_gpc import AdaptiveGPC as AdaptiveGPC
 from .control.predictive.gpc import GPC as GPC
 from .control.predictive.mpc import MPC as MPC
 from .control.prescribed import Prescribed as Prescribed

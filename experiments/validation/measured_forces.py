@@ -50,7 +50,7 @@ def forced_log(
             shape = np.sin(np.pi * (np.arange(2 * FINER) + 0.5) / (2 * FINER))
             forces[first : first + 2 * FINER, 0] += random.uniform(0.5, 1.5) * shape
     # The anti-alias filter of the logger, for all channels.
-    forces = lfilter(firwin(161, 0.8 / FINER), 1.0, forces, axis=0)
+    forces = np.asarray(lfilter(firwin(161, 0.8 / FINER), 1.0, forces, axis=0))
     parts = []
     for k in range(structure.frequencies.size):
         one = Structure(*(field[k : k + 1] for field in structure))

@@ -12,6 +12,7 @@ from jaxbeam.analysis.margins import margins
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.fields import concrete
 from jaxbeam.control.predictive.mpc import MPC
+from jaxbeam.estimation.kalman import Kalman
 
 LOAD_POSITIONS = 13  # load positions along a crossing at which margins are computed
 MIN_RATE = 1e-6  # 1/s; a pole whose real part is smaller counts as marginally stable
@@ -75,7 +76,7 @@ def stability_margin(case: Case) -> StabilityMargin:
     if isinstance(controller, MPC) and controller.solver != "unconstrained":
         return _no_margin("a constrained MPC law is not linear at its limits")
     if controller.period is not None and _has_varying_filter(controller):
-        return _no_margin("the gain of the Kalman filter varies as the loads cross")
+        return _no_margin("the gain of the filter varies with its estimates")
     try:
         times = _crossing_times(case)
         found = stationary_loops(case, times)
@@ -104,9 +105,9 @@ def stability_margin(case: Case) -> StabilityMargin:
 
 
 def _has_varying_filter(controller) -> bool:
-    """Whether a Kalman filter propagates its covariance, which has no equilibrium of its own."""
+    """Whether a filter propagates its covariance, other than one that settles (`settled_law`)."""
     estimator = getattr(controller, "estimator", None)
-    return estimator is not None and estimator.varies
+    return estimator is not None and estimator.varies and not isinstance(estimator, Kalman)
 
 
 def _no_margin(obstacle: str) -> StabilityMargin:

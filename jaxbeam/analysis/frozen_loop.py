@@ -17,6 +17,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw, Measurement
 from jaxbeam.case.filters import filter_step
 from jaxbeam.case.trajectory import NEVER, AbstractTrajectory
+from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import compiled_modal_model
 from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
@@ -81,14 +82,8 @@ class LoopDynamics(Module):
 
     def freeze_loads(self, t) -> "LoopDynamics":
         """The same dynamics with loads frozen at t (s)."""
-        loads, length = self.augmented_plant.loads, self.plant.case.beam.length
-        counts = [behind.shape[0] for behind in loads.behind]
-        on = xp.split(loads.on_beam(t), np.cumsum(counts)[:-1]) if counts else []
-        trajectories = tuple(
-            FrozenTrajectory(*path.kinematics(t), path.direction(), on_beam, length)
-            for path, on_beam in zip(loads.trajectories, on, strict=True)
-        )
-        return eqx.tree_at(lambda loop: loop.augmented_plant.loads.trajectories, self, trajectories)
+        frozen = frozen_loads(self.augmented_plant.loads, self.plant.case.beam.length, t)
+        return eqx.tree_at(lambda loop: loop.augmented_plant.loads, self, frozen)
 
     def continuous_dynamics(self, t):
         """A, B, rates due to the weights, and the commands as a function of the state, at t (s).
@@ -269,6 +264,17 @@ def _loop_dynamics(case, model):
 
 
 _compiled_dynamics, _known_dynamics = compiled(_loop_dynamics), compiled_if_traced(_loop_dynamics)
+
+
+def frozen_loads(loads: LoadSet, length, t) -> LoadSet:
+    """Loads frozen at t (s) on a beam of a length (m)."""
+    counts = [behind.shape[0] for behind in loads.behind]
+    on = xp.split(loads.on_beam(t), np.cumsum(counts)[:-1]) if counts else []
+    trajectories = tuple(
+        FrozenTrajectory(*path.kinematics(t), path.direction(), on_beam, length)
+        for path, on_beam in zip(loads.trajectories, on, strict=True)
+    )
+    return eqx.tree_at(lambda loads: loads.trajectories, loads, trajectories)
 
 
 def _intervals(timing: LoopTiming) -> list[tuple[float, float]]:

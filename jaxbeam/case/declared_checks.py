@@ -61,9 +61,7 @@ def suggestion(word: str, allowed: Iterable[str]) -> str:
 
 def missing_error(address: str, field: dataclasses.Field) -> ValueError:
     """Error for a field that is left out and has no default."""
-    return ValueError(
-        f"{address} is missing; give the {field.metadata['meaning']}{_in_unit(field)}"
-    )
+    return ValueError(f"{address} is missing; give the {field.metadata['meaning']}{in_unit(field)}")
 
 
 def check_fields(address: str, part: Any) -> None:
@@ -198,7 +196,8 @@ def _unit_suffix(field: dataclasses.Field) -> str:
     return "" if unit in ("1", OF_QUANTITY) else f" {unit}"
 
 
-def _in_unit(field: dataclasses.Field) -> str:
+def in_unit(field: dataclasses.Field) -> str:
+    """Words " in N/m" behind the meaning of a number, none where it has no unit."""
     return f" in{_unit_suffix(field)}" if _unit_suffix(field) else ""
 
 

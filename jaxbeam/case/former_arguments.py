@@ -3,15 +3,14 @@
 import dataclasses
 from typing import TYPE_CHECKING
 
-import equinox as eqx
-
 from jaxbeam.case.aliases import KEYS, warn_renamed
+from jaxbeam.case.display.arguments import ExplainsArguments
 
 if TYPE_CHECKING:  # a type checker takes the fields of a module for its arguments
     AcceptsFormerArguments = type
 else:
 
-    class AcceptsFormerArguments(type(eqx.Module)):
+    class AcceptsFormerArguments(ExplainsArguments):
         """Metaclass that replaces former words among the keyword arguments by the present ones."""
 
         def __call__(cls, *args, **arguments):

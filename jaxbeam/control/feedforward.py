@@ -65,6 +65,9 @@ class Feedforward(AbstractController):
     confirmation: Float[Array, ""] | None = number(
         "m", "downward reading of a deflection sensor that shows a load", POSITIVE, default=None
     )
+    gate_errors: Float[Array, "2"] = number(
+        "m", "distance by which each gate is farther along than the law has it", default=(0.0, 0.0)
+    )
 
     def validate(self, case):
         if self.period is None:
@@ -78,15 +81,19 @@ class Feedforward(AbstractController):
             )
         if self.confirmation is not None and not _deflection_sensors(case.sensors):
             return "confirmation needs a sensor of the deflection: add one, or leave it out"
-        if not all(is_concrete(leaf) for leaf in jax.tree.leaves((self.gates, case))):
+        if not all(is_concrete(leaf) for leaf in jax.tree.leaves((self, case))):
             return None
-        if np.any(~(np.diff(_gate_times(self.gates, case.loads, case.beam.length)) > 0)):
+        true_gates = self.gates + self.gate_errors
+        if np.any(~(np.diff(_gate_times(true_gates, case.loads, case.beam.length)) > 0)):
             return "gates must be two positions that every load passes, the first before the other"
         return None
 
     def design_law(self, plant):
         gate_times = xp.stack(
-            [path.passage_times(self.gates)[:2] for path in plant.loads.trajectories]
+            [
+                path.passage_times(self.gates + self.gate_errors)[:2]
+                for path in plant.loads.trajectories
+            ]
         )
         settings = self.gates, self.shares, self.values, self.lead
         length = plant.case.beam.length

@@ -65,6 +65,9 @@ class LoadIdentification(ReprWithUnits, eqx.Module):
     threshold: Float[Array, ""] | None = number(
         "m", "deflection above which a load is on the beam, without gates", POSITIVE, default=None
     )
+    gate_errors: Float[Array, "2"] = number(
+        "m", "distance by which each gate is farther along than the law has it", default=(0.0, 0.0)
+    )
 
     def validate(self, case: Any) -> str | None:
         """Error of these settings in a case, as "key must ...", or None."""
@@ -113,7 +116,8 @@ class LoadIdentification(ReprWithUnits, eqx.Module):
         }
         if self.gates is None:
             return DeflectionIdentifier(threshold=self.threshold, **common)
-        gate_times = plant.loads.trajectories[0].passage_times(self.gates)[:2]
+        true_gates = self.gates + self.gate_errors
+        gate_times = plant.loads.trajectories[0].passage_times(true_gates)[:2]
         return GateIdentifier(gates=self.gates, gate_times=gate_times, **common)
 
 

@@ -85,9 +85,14 @@ class CrossingFilter(AbstractSampledFilter):
         system = system_at(t)
         return transition, *self.sensor_chain.output_matrices(system.C, system.D)
 
-    def predict(self, state: FilterState, command, t: Float[Array, ""]) -> OneStepPrediction:
-        """Prediction for the sample at t (s) under the command since the last sample."""
-        transition, C, D = self.model_at(t)
+    def predict(
+        self, state: FilterState, command, t: Float[Array, ""], model: SampleModel | None = None
+    ) -> OneStepPrediction:
+        """Prediction for the sample at t (s) under the command since the last sample.
+
+        The `model` is that of the sample if it is left out.
+        """
+        transition, C, D = self.model_at(t) if model is None else model
         x = transition.predict(state.x, state.command, command)
         covariance = transition.predict_covariance(state.covariance)
         readings = C @ x + D @ command + sensor_offsets(self.filtered.plant)
@@ -99,9 +104,10 @@ class CrossingFilter(AbstractSampledFilter):
         noise = self.sensor_chain.noise_covariance
         gain, covariance = corrected(prediction.covariance, prediction.C, noise)
         x = prediction.x + gain @ (measurement.readings - prediction.readings)
-        return self._estimate(x, t), FilterState(x, covariance, measurement.command)
+        return self.estimate(x, t), FilterState(x, covariance, measurement.command)
 
-    def _estimate(self, x, t) -> Estimate:
+    def estimate(self, x: Float[Array, " state"], t: Float[Array, ""]) -> Estimate:
+        """Estimate for states x at t (s)."""
         plant = self.filtered.plant
         added = x[plant.modal_model.state_count : self.sensor_chain.plant_states]
         return with_loads(plant, x[: self.plant_states], added, t, self.estimates_weights)

@@ -8,6 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+# Known trains that the library lacks, and why.
+LEFT_OUT = {
+    "HSLM-B": "its axles and spacings by span are curves of EN 1991-2 without open numbers",
+    "FLM2-lorry-3": "one of its distances could not be confirmed",
+    "FLM3": "its distances were found in pictures alone",
+    "FLM4": "its distances were found in pictures alone",
+}
+
 
 class Train(NamedTuple):
     """Axles of a train: offsets behind the first axle (m), and forces (N) or masses (kg).

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.analysis.crossing_margin import stability_margin
 from jaxbeam.analysis.linearised_loop import linearised_loop
-from jaxbeam.analysis.loops.stationary_loop import loop_with_mass_at
+from jaxbeam.analysis.loops.stationary_loop import loop_with_mass_at, stationary_loops
 from jaxbeam.analysis.margins import loop_gain, margins
 from jaxbeam.analysis.stability import growth
 from jaxbeam.cli import main
@@ -117,17 +117,47 @@ def test_commands_have_one_verdict(printed, tmp_path):
     assert found["verdict"] == "unstable" and found["stable_without_loads"]
 
 
-def test_a_filter_that_follows_the_loads_has_no_verdict():
-    """Its covariance depends on the way here, so that no loop with stationary loads stands for it.
+def observed_case(loads: str, nominal_force: float = FORCE) -> jb.Case:
+    """A regulator on a Kalman filter, designed for an actuator of another force, maybe."""
+    weight_deviation = 1.0 if loads == "estimated" else None
+    estimator = jb.Kalman(
+        process_noise=0.1, measurement_noise=1e-5, loads=loads, weight_deviation=weight_deviation
+    )
+    controller = jb.DiscreteLQR(
+        state_weight=[1e6, 1e6, 0.0, 0.0, 0.0],
+        command_weight=[1e-2],
+        period=PERIOD,
+        estimator=estimator,
+    )
+    case = dataclasses.replace(lagging_case(), controller=controller)
+    nominal = jb.state_space(jb.replace(case, {"actuators.0.force_per_volt": nominal_force}))
+    controller = dataclasses.replace(controller, nominal_plant=nominal)
+    return dataclasses.replace(case, controller=controller)
 
-    One that ignores the loads has a constant gain.
-    """
-    weights = {"state_weight": [1.0] * 5, "command_weight": [1.0], "period": PERIOD}
-    margins_found = []
-    for loads in ("ignored", "known"):
-        estimator = jb.Kalman(process_noise=0.1, measurement_noise=1e-5, loads=loads)
-        controller = jb.DiscreteLQR(**weights, estimator=estimator)
-        case = dataclasses.replace(lagging_case(), controller=controller)
-        margins_found.append(stability_margin(case))
-    assert [margin.verdict for margin in margins_found] == ["stable", "undetermined"]
-    assert "gain of the Kalman filter varies" in margins_found[1].obstacle
+
+@pytest.mark.parametrize("loads", ["known", "estimated"])
+@pytest.mark.parametrize(("nominal_force", "verdict"), [(FORCE, "stable"), (FORCE / 3, "unstable")])
+def test_a_filter_settles_under_stationary_loads(loads, nominal_force, verdict):
+    """Its covariance depends on the way here, but tends to that of loads at rest."""
+    found = stability_margin(observed_case(loads, nominal_force))
+    assert found.verdict == verdict and not found.obstacle
+
+
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+@pytest.mark.parametrize("nominal_force", [FORCE, FORCE / 3])
+def test_poles_with_a_settled_filter_are_those_of_a_run(nominal_force):
+    """Readings of a load that stands obey the difference equation with these poles."""
+    case = observed_case("known", nominal_force)
+    standing = jb.MovingMass(mass=0.3, times=[0.0, 3.0], positions=[POSITION, POSITION])
+    case = dataclasses.replace(case, loads=(standing,), run=jb.Run(0.9, 1 / PERIOD))
+    nominal = jb.state_space(jb.replace(case, {"actuators.0.force_per_volt": nominal_force}))
+    controller = dataclasses.replace(case.controller, nominal_plant=nominal)
+    case = dataclasses.replace(case, controller=controller)
+    (loop,) = stationary_loops(case, [0.5])
+    assert (loop.poles()[0].real > 0) == (nominal_force < FORCE)
+    coefficients = np.poly(np.linalg.eigvals(loop.closed_matrix)).real
+    changes = np.diff(np.asarray(jb.simulate(case).deflection)[100:, 0])
+    left = np.convolve(changes, coefficients, "valid")
+    assert_allclose(left, 0.0, atol=1e-7 * np.max(np.convolve(abs(changes), abs(coefficients))))
+    wrong = np.poly(1.02 * np.linalg.eigvals(loop.closed_matrix)).real
+    assert np.max(np.abs(np.convolve(changes, wrong, "valid"))) > 30 * np.max(np.abs(left))

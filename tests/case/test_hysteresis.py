@@ -45,7 +45,7 @@ def by_hand(commands):
     return found
 
 
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=8)
 @given(COMMANDS)
 def test_properties_of_the_operator(commands):
     outputs = OPERATOR.outputs(commands)

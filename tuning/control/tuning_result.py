@@ -134,8 +134,8 @@ class TuningResult:
         if not math.isfinite(last.peaks_after.max()):
             return f"{sentence}; a {last.name} run diverges: not fit for use"
         sentence += (
-            f"; worst {last.name} run: peak {_beside_no_control(reductions[worst])}"
-            f" ({_beside_no_control(before, reductions[worst])} before tuning)"
+            f"; worst {last.name} run: peak {beside_no_control(reductions[worst])}"
+            f" ({beside_no_control(before, reductions[worst])} before tuning)"
         )
         if np.isfinite(last.least_peaks).all():
             shares = last.attained_shares(last.peaks_after)
@@ -232,7 +232,7 @@ class TuningResult:
         return plot_tuning(panels, self.history, title=self.case.title)
 
 
-def _beside_no_control(reduction: float, other: float = -math.inf) -> str:
+def beside_no_control(reduction: float, other: float = -math.inf) -> str:
     """A share of the peak without control, below or above it; short where another says as much."""
     side = "below" if reduction >= 0 else "above"
     same_side = (reduction >= 0) == (other >= 0) and math.isfinite(other)

@@ -8,6 +8,8 @@ from jaxtyping import Float
 
 ACCEPTED_SHARE = 0.01  # of the predicted decrease, from which a step is accepted
 GOOD_SHARE = 0.99  # of the predicted decrease, above which the next step is damped less
+# Of the sum of squares, a predicted decrease too small to be told from rounding of the residuals.
+NEGLIGIBLE_SHARE = 1e-11
 LESS_DAMPING, MORE_DAMPING = 1 / 3.5, 4.0  # factors of the damping after good and rejected steps
 
 
@@ -30,8 +32,9 @@ def levenberg_marquardt(
     `linearised` maps a point to residuals (residual,) and their derivatives (residual, variable).
     A step d minimises |r + J d|^2 + damping |d|^2, the damping is 1 at first; with a trust region
     as Gould et al. (4OR 3, 2005) chose it for it. Converged once an accepted step changes no
-    variable and no residual by more than atol + rtol times its size. Points at which residuals are
-    not finite are rejected.
+    variable and no residual by more than atol + rtol times its size, or the next promises a
+    decrease by less than a share of NEGLIGIBLE_SHARE. Points at which residuals are not finite are
+    rejected.
     """
     point, damping = start, 1.0
     residuals, jacobian = linearised(start)
@@ -41,8 +44,10 @@ def levenberg_marquardt(
         if not np.all(np.isfinite(factor)):
             break
         change = _damped_step(factor, damping)
-        trial_residuals, jacobian = linearised(point + change)
         predicted = (np.sum((factor @ np.append(change, 1.0)) ** 2) - _squares(factor)) / 2
+        if damping <= 1 and -predicted <= NEGLIGIBLE_SHARE * _squares(factor):
+            return Minimum(point, True)
+        trial_residuals, jacobian = linearised(point + change)
         trial_factor = _factor(trial_residuals, jacobian)
         decrease = (_squares(trial_factor) - _squares(factor)) / 2
         if not decrease <= ACCEPTED_SHARE * predicted:

@@ -23,7 +23,7 @@ LENGTH, RIGIDITY, MASS, DAMPING, MODES = 25.0, 3.05e10, 15000.0, 0.01, 5
 GRAVITY, DURATION, FREE = 9.81, 1.6, 0.3  # the script stops so long (s) after the exit
 AXLE, SUSPENSION, DAMPER, TYRE, TYRE_DAMPER = 1200.0, 8e5, 2e4, 3.5e6, 1e4
 TOLERANCE = 9e-7
-SCRIPT_TOLERANCE = 2e-7  # of DOP853, whose peaks are then as accurate
+SCRIPT_TOLERANCE = 1e-4  # of DOP853, whose peaks are then as accurate as those of jaxbeam
 SAMPLES = 800  # of the script, with a parabola through the highest three
 REPEATS = 5
 
@@ -134,8 +134,10 @@ def main() -> None:
     """Print the table."""
     options = parser(__doc__)
     options.add_argument("--runs", type=int, default=64, help="numbers of masses, and of speeds")
-    found = measure(options.parse_args().runs)
-    print_table(["5 modes", "processor (s)", "times masses", "script over it"])
+    count = options.parse_args().runs
+    found = measure(count)
+    print(f"{count**2} crossings, 5 modes\n")
+    print_table(["", "processor (s)", "times masses", "script over it"])
     for steps in ("C", "XLA"):
         if f"mass, {steps}" not in found:
             continue
@@ -144,9 +146,8 @@ def main() -> None:
         ratios = f"{car / mass:.2g}", f"{found['script'] / car:.0f}"
         print_row([f"quarter cars, {steps}", f"{car:.3g}", *ratios])
     print_row(["the script, scaled", f"{found['script']:.0f}", "", ""])
-    for name in ("error of the script", "error of jaxbeam"):
-        print(f"\n{name}: {found[name]:.1e}", end="")
-    print()
+    errors = (f"{name} {found[name]:.1e}" for name in ("error of the script", "error of jaxbeam"))
+    print(f"\n{', '.join(errors)}")
 
 
 if __name__ == "__main__":

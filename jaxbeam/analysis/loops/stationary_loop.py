@@ -5,8 +5,9 @@ import dataclasses
 import equinox as eqx
 import numpy as np
 
-from jaxbeam.analysis.frozen_loop import FrozenTrajectory, LoopDynamics, loop_dynamics
+from jaxbeam.analysis.frozen_loop import FrozenTrajectory, LoopDynamics, frozen_loads, loop_dynamics
 from jaxbeam.analysis.linearised_loop import LinearisedLoop, linearise, loop_timing
+from jaxbeam.analysis.loops.settled_filter import settled_law
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.mass import MovingMass
@@ -14,6 +15,8 @@ from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.arrays import xp
+
+ROUNDING = 1e-14  # of the entries of a constant state in a matrix of a loop
 
 
 def stationary_loops(case: Case, times) -> list[LinearisedLoop]:
@@ -68,7 +71,8 @@ def without_constant_states(loop: LinearisedLoop) -> LinearisedLoop:
     if loop.period is None:
         return loop
     size = loop.A.shape[0]
-    constant = np.all(np.asarray(loop.A) == np.eye(size), axis=1) & ~np.any(loop.B, axis=1)
+    unchanged = np.abs(np.asarray(loop.A) - np.eye(size)) <= ROUNDING
+    constant = np.all(unchanged, axis=1) & ~np.any(loop.B, axis=1)
     kept = ~constant
     return LinearisedLoop(
         loop.A[kept][:, kept], loop.B[kept], loop.K[:, kept], loop.period, loop.modal_states
@@ -76,13 +80,22 @@ def without_constant_states(loop: LinearisedLoop) -> LinearisedLoop:
 
 
 def _with_stationary_loads(loop: LoopDynamics, t: float) -> LoopDynamics:
-    """Loop with stationary loads at their positions of t (s)."""
-    loop, zero = loop.freeze_loads(xp.asarray(t)), xp.zeros(())
-    stationary = tuple(
-        dataclasses.replace(load, speed=zero, acceleration=zero)
-        for load in loop.augmented_plant.loads.trajectories
-    )
-    return eqx.tree_at(lambda loop: loop.augmented_plant.loads.trajectories, loop, stationary)
+    """Loop with stationary loads at their positions of t (s), and a filter settled under them.
+
+    Raises ValueError for a filter that does not settle.
+    """
+    length, zero = loop.plant.case.beam.length, xp.zeros(())
+
+    def stationary(loads: LoadSet) -> LoadSet:
+        frozen = frozen_loads(loads, length, xp.asarray(t))
+        paths = tuple(
+            dataclasses.replace(path, speed=zero, acceleration=zero) for path in frozen.trajectories
+        )
+        return eqx.tree_at(lambda loads: loads.trajectories, frozen, paths)
+
+    law = settled_law(loop.law, np.float64(t), stationary)
+    loads = stationary(loop.augmented_plant.loads)
+    return eqx.tree_at(lambda loop: (loop.law, loop.augmented_plant.loads), loop, (law, loads))
 
 
 def _passage_time(case: Case, position: float) -> float:

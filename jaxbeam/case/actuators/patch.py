@@ -41,7 +41,7 @@ class Patch(AbstractActuator):
     Commands stay within `limits` and within the voltages `depolarisation`, beyond which the patch
     loses its polarisation; `rate_limit` is that of the amplifier. Commands act through the
     `hysteresis` of the patch, if it has one; the inverse of `compensation`, identified from a log
-    by `tuning.fit.hysteresis.fitted_hysteresis`, makes it act as a linear one.
+    by `tuning.fit.actuators.hysteresis.fitted_hysteresis`, makes it act as a linear one.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(

@@ -19,7 +19,7 @@ from jaxbeam.case.loads.row import AbstractRowLoad
 from jaxbeam.case.loads.vehicle_checks import length_error
 from jaxbeam.case.loads.vehicle_model import plain_wheels
 from jaxbeam.runtime.arrays import Array, xp
-from jaxbeam.vehicles.trains import Train, trains
+from jaxbeam.vehicles.trains import LEFT_OUT, Train, trains
 
 
 class Axles(AbstractRowLoad):
@@ -88,6 +88,11 @@ class Axles(AbstractRowLoad):
         return error or self.overlap_error(address, offsets[-1] - offsets[0], "axles")
 
     def _train_error(self, address: str) -> str | None:
+        if self.train in LEFT_OUT:
+            return (
+                f"{address}.train cannot be {self.train!r}, which the library leaves out:"
+                f" {LEFT_OUT[self.train]}; give positions and forces"
+            )
         if self.train not in trains():
             return f"{address}.train cannot be {self.train!r}; {suggestion(self.train, trains())}"
         for name in ("offsets", "forces", "masses"):

@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 import jaxbeam as jb
 from jaxbeam.case.reading.toml_file import read_toml
-from jaxbeam.cli.arguments import parse_sweep_values, refuse_option
+from jaxbeam.cli.arguments import check_exists, parse_sweep_values, refuse_option
 from jaxbeam.cli.options import CaseOptions, DrawingOptions, Output, Over, table
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ def compare(
     *,
     controllers: Annotated[tuple[Path, ...], Parameter(consume_multiple=True)] = (),
     over: Over = (),
+    cases: Path | None = None,
     period: float | None = None,
     output: Output = None,
     pictures: DrawingOptions = DrawingOptions(),
@@ -35,6 +36,11 @@ def compare(
     controllers
         Files with a table [controller], or case files whose controllers are taken. Controllers
         are named after their files.
+    cases
+        Runs, TOML, as of `jaxbeam tune`: those of [held_out], or of [training], over loads,
+        plants, delays, errors of gates (`controller.gate_errors.0`) and sensors, listed or drawn.
+        Laws do not know what differs of beam, supports, actuators and sensors; a law drawn by hand
+        is added.
     period
         Time (s) for which commands are held in the least achievable peak; if left out, the
         shortest period of the controllers, or 0.01.
@@ -44,7 +50,11 @@ def compare(
     values = parse_sweep_values(over)
     pictures.check(output)
     refuse_option(bool(output and over), "a picture shows one load case: leave out -o or --over")
+    refuse_option(bool(cases and over), "--cases has runs of its own: leave out --over")
+    refuse_option(bool(output and cases), "a picture shows one load case: leave out -o or --cases")
     options.check_outputs(output)
+    if cases is not None:
+        check_exists("file of load cases", cases)
     for file in controllers:
         read_toml(file)
     parsed_case = options.read(case)
@@ -54,6 +64,9 @@ def compare(
     from jaxbeam.case.validation import check_case
 
     laws = _read_controllers(case, parsed_case, controllers)
+    if cases is not None:
+        _report_runs(parsed_case, laws, cases, period, options)
+        return
     runs = [dict(zip(values, row, strict=True)) for row in itertools.product(*values.values())]
     load_cases = [jb.replace(parsed_case, run) for run in runs]
     for load_case in load_cases:
@@ -83,6 +96,37 @@ def compare(
         },
         [*lines, f"over all {len(comparisons)} load cases:", *_overall_table(overall)],
         output,
+    )
+
+
+def _report_runs(case, laws, path: Path, period, options: CaseOptions) -> None:
+    """Report the controllers over the runs of a file."""
+    from jaxbeam.analysis.compare import metrics_over_cases
+    from tuning.control.comparison import compare_runs
+    from tuning.control.load_cases import read_load_cases
+
+    load_cases = read_load_cases(path, case)
+    runs = load_cases.held_out or load_cases.training
+    comparisons = compare_runs(case, laws, runs, period)
+    overall = metrics_over_cases(comparisons)
+    lines = [f"over {len(runs)} runs of {path}:", *_overall_table(overall)]
+    for name in overall:
+        shares = [one.metrics[name].share for one in comparisons]
+        worst = shares.index(min(shares))
+        where = ", ".join(f"{address} = {value:.4g}" for address, value in runs[worst].items())
+        verdicts = [one.metrics[name].stability_margin.verdict for one in comparisons]
+        unstable = verdicts.count("unstable")
+        note = f"; unstable in {unstable} runs" if unstable else ""
+        lines.append(f"{name}: worst at {where}{note}")
+    options.report(
+        {
+            "cases": [
+                {"values": run} | _to_dict(one) for run, one in zip(runs, comparisons, strict=True)
+            ],
+            "over_all": {name: _overall_to_dict(metrics) for name, metrics in overall.items()},
+        },
+        lines,
+        None,
     )
 
 

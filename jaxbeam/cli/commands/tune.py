@@ -235,12 +235,26 @@ def _write_and_print(result, tuned, files, picture, pictures, options: CaseOptio
         for one, loop in zip(tuned, loops, strict=True)
         if not one.case.controller.open_loop
     ]
+    by_hand = _beside_hand_drawn(tuned)
     options.report(
         summaries[0] if len(summaries) == 1 else {"front": summaries},
-        [str(result), *closed],
+        [str(result), *by_hand, *closed],
         *files,
         picture,
     )
+
+
+def _beside_hand_drawn(tuned) -> list[str]:
+    """Sentence on the law drawn by hand in the last set of runs, if the case allows one."""
+    from tuning import TuningResult
+    from tuning.control.comparison import beside_hand_drawn, hand_drawn_peaks
+
+    found = [one for one in tuned if isinstance(one, TuningResult)]
+    if not found:
+        return []
+    outcome = found[0].run_sets[-1]
+    peaks = hand_drawn_peaks(found[0].case, outcome.runs)
+    return [] if peaks is None else [beside_hand_drawn(outcome, peaks)]
 
 
 def _with_identified_plant(case, loads, file: Path, count: int, posterior: bool, seed: int):

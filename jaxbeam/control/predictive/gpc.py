@@ -19,6 +19,7 @@ from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, concrete, count, is_conc
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.control.predictive.prediction import sampled_plant
+from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, add_at, solve, xp
 
 
@@ -205,22 +206,29 @@ class GPC(AbstractController):
         error = None if self.design is None else self.design.validate(case)
         return None if error is None else f"design.{error}"
 
-    def design_law(self, plant):
+    def design_model(self, plant: Plant) -> PolynomialModel:
+        """Polynomials of the sampled plant of the design, without loads."""
         design = plant if self.design is None else self.design.design_plant(plant, "modal")
-        system, actuators = design.unloaded, len(plant.case.actuators)
-        outputs = len(design.case.sensors)
+        system, outputs = design.unloaded, len(design.case.sensors)
         none = xp.zeros((system.A.shape[0], 0))
         sampled = sampled_plant(system.A, system.B, none, self.period, self.delay)
         C = system.C[:outputs]
         C = xp.pad(C, ((0, 0), (0, sampled.A.shape[0] - C.shape[1])))
+        return polynomial_model(sampled.A, sampled.B, C)
+
+    def weights(self, plant: Plant) -> tuple[Array, Array, Array]:
+        """Weights of the readings and of the moves, and the references."""
+        outputs, actuators = len(plant.case.sensors), len(plant.case.actuators)
         weight = 1.0 if self.output_weight is None else self.output_weight
-        gains = predictive_gains(
-            polynomial_model(sampled.A, sampled.B, C),
-            (self.first, self.horizon, self.moves),
-            xp.broadcast_to(xp.asarray(weight), outputs),
-            xp.broadcast_to(self.move_weight, actuators),
+        return (
+            xp.broadcast_to(xp.asarray(weight), (outputs,)),
+            xp.broadcast_to(self.move_weight, (actuators,)),
             xp.zeros(outputs) if self.reference is None else self.reference,
         )
+
+    def design_law(self, plant):
+        horizons = self.first, self.horizon, self.moves
+        gains = predictive_gains(self.design_model(plant), horizons, *self.weights(plant))
         return GPCLaw(*gains)
 
 

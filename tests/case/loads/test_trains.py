@@ -91,6 +91,7 @@ def test_every_train_has_a_source_and_increasing_axles(name):
     ("settings", "message"),
     [
         ({"train": "HSLM-A11"}, "loads.0.train cannot be 'HSLM-A11'; did you mean 'HSLM-A1'"),
+        ({"train": "HSLM-B"}, "'HSLM-B', which the library leaves out.*give positions and forces"),
         ({"train": "HSLM-A1", "count": 2}, "loads.0.count must be 1 for HSLM-A1.*whole train"),
         ({"train": "EN15528-A", "count": 2, "spacing": 9.0}, "exceed the wheelbase of the axles"),
         ({"train": "EN15528-A", "masses": 3.0}, "has both train and masses"),

@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+import jaxbeam as jb
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, load_case, save_case
 
@@ -114,6 +115,24 @@ def test_what_is_left_out_is_named():
         check_case(case_with("axles", without=["offsets"]))
     with pytest.raises(ValueError, match="has neither forces nor masses"):
         check_case(case_with("axles", without=["forces"]))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: jb.Oscillator(speed=1.0, mass=2.0), "lacks stiffness, the spring in N/m: give it"),
+        (
+            lambda: jb.QuarterCar(speed=1.0, body_mass=1.0, axle_mass=1.0, tyre_stiffness=1.0),
+            "suspension_stiffness, the spring of the body in N/m; suspension_damping, .*give them",
+        ),
+        (lambda: jb.Oscillator(2.0), "^Oscillator lacks stiffness"),
+        (lambda: jb.MovingMass(mas=1.0), "MovingMass has no mas; did you mean 'mass'?"),
+        (lambda: jb.PD(), "PD lacks gains, the"),
+    ],
+)
+def test_arguments_in_python_are_named(make, message):
+    with pytest.raises(TypeError, match=message):
+        make()
 
 
 def test_wagons_follow_at_their_spacing():

@@ -30,7 +30,10 @@ def test_minimum_is_that_of_scipy():
         lambda x: decay(x)[0], [2.0, 1.0], lambda x: decay(x)[1], xtol=1e-14, ftol=1e-14
     )
     assert found.converged
-    np.testing.assert_allclose(found.point, expected.x, rtol=1e-8)
+    # The search ends where rounding hides a decrease: far within a standard error.
+    variance = 2 * expected.cost / (TIMES.size - 2)
+    errors = np.sqrt(variance * np.diag(np.linalg.inv(expected.jac.T @ expected.jac)))
+    assert np.all(np.abs(found.point - expected.x) < 1e-5 * errors)
 
 
 def test_points_without_residuals_are_rejected():

@@ -1,0 +1,1 @@
+"""Actuators from logs: their hysteresis."""
