@@ -3,9 +3,9 @@
     python -m experiments.validation.measured_forces 10
 
 Random structures by finite elements (`tests/oracles/planted_structures.py`), each struck by one,
-three or ten blows of a hammer or shaken by a random force at one place, with coloured noise of 5 to
-30 % rms on the responses. The force is measured, through the anti-alias filter of the logger like
-the responses.
+three or ten blows of a hammer at one place, or shaken by one random force or two, with coloured
+noise of 5 to 30 % rms on the responses. Forces are measured, through the anti-alias filter of the
+logger like the responses.
 """
 
 import sys
@@ -27,20 +27,21 @@ from tests.oracles.planted_structures import (
 from tuning.logs.log import Log
 from tuning.modal.identify_modes import identify_modes
 
-EXCITATIONS = ("1 blow", "3 blows", "10 blows", "random force")
+EXCITATIONS = ("1 blow", "3 blows", "10 blows", "random force", "two random forces")
 DURATION = 60.0  # s
 
 
 def forced_log(
     structure: Structure, excitation: str, seed: int, duration: float = DURATION
 ) -> tuple[Log, Planted]:
-    """Log of a measured force and the velocities at the channels, with what was planted in it."""
+    """Log of measured forces and the velocities at the channels, with what was planted in it."""
     random = np.random.default_rng(7000 + seed)
     rate = 2.56 * structure.frequencies[-1] * random.uniform(1.2, 2.5)
     fine = FINER * rate
     forces = np.zeros((int(duration * fine), structure.inputs.shape[1]))
-    if excitation == "random force":
-        forces[:, 0] = random.normal(size=len(forces))
+    shakers = {"random force": 1, "two random forces": 2}.get(excitation, 0)
+    if shakers:
+        forces[:, :shakers] = random.normal(size=(len(forces), shakers))
     else:
         blows = int(excitation.split()[0])
         starts = 0.05 + 0.9 * (np.arange(blows) + random.uniform(0, 0.5, blows)) / blows
@@ -49,7 +50,7 @@ def forced_log(
             shape = np.sin(np.pi * (np.arange(2 * FINER) + 0.5) / (2 * FINER))
             forces[first : first + 2 * FINER, 0] += random.uniform(0.5, 1.5) * shape
     # The anti-alias filter of the logger, for all channels.
-    forces = lfilter(firwin(161, 0.8 / FINER), 1.0, forces, axis=0)
+    forces = np.asarray(lfilter(firwin(161, 0.8 / FINER), 1.0, forces, axis=0))
     parts = []
     for k in range(structure.frequencies.size):
         one = Structure(*(field[k : k + 1] for field in structure))
@@ -59,13 +60,13 @@ def forced_log(
     noise = random.uniform(0.05, 0.3) * clean.std()
     values = clean + noise * coloured_noise(random, clean.shape)
     energies = np.mean(parts.var(axis=1) / clean.var(axis=0), axis=1)
-    channels = values.shape[1]
+    channels, inputs = values.shape[1], max(shakers, 1)
     log = Log(
         np.arange(len(values)) / rate,
-        np.column_stack([forces[::FINER, 0], values]),
-        ("hammer", *(f"v{i + 1}" for i in range(channels))),
-        ("force", *["velocity"] * channels),
-        ("N", *["m/s"] * channels),
+        np.column_stack([forces[::FINER, :inputs], values]),
+        (*(f"f{i + 1}" for i in range(inputs)), *(f"v{i + 1}" for i in range(channels))),
+        (*["force"] * inputs, *["velocity"] * channels),
+        (*["N"] * inputs, *["m/s"] * channels),
         "planted",
     )
     return log, Planted(structure, values, rate, energies)

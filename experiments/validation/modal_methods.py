@@ -1,12 +1,14 @@
 """Methods of modal identification side by side with pyOMA-2, on the same planted structures.
 
     python -m experiments.validation.modal_methods 12
+    python -m experiments.validation.modal_methods 6 excitations
 
 Random structures by finite elements (`tests/oracles/planted_structures.py`) under ambient
 excitation, with coloured noise of 5 to 30 % rms. pyOMA-2 (extra `test`) runs its covariance-driven
 SSI with its own criteria of stability; a mode is found if five of its poles within 2 % of the truth
-are stable, and their median is its estimate: it is told where to look, ours is not. The table is
-written for the page on logs.
+are stable, and their median is its estimate: it is told where to look, ours is not. The second
+command takes other excitations, unknown or measured, with what `identify_modes` chooses by itself;
+pyOMA-2 uses the responses only. The tables are written for the page on logs.
 """
 
 import sys
@@ -19,12 +21,24 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from experiments.validation.modal_identification import MATCH_SHARE, MIN_ENERGY, compare, log_of
+from experiments.validation.measured_forces import EXCITATIONS as MEASURED, forced_log
+from experiments.validation.modal_identification import (
+    DURATIONS,
+    MATCH_SHARE,
+    MIN_ENERGY,
+    compare,
+    log_of,
+)
+from experiments.validation.planted_modes import FIRST_SEED, WORDS
 from jaxbeam.files.report import ReportTable
 from tests.oracles.planted_structures import Planted, random_structure, sampled
+from tuning.logs.log import Log
 from tuning.modal.identify_modes import identify_modes
 
 TABLE_FILE = Path(__file__).parents[2] / "docs" / "_static" / "modal_methods.md"
+EXCITATIONS_FILE = TABLE_FILE.with_name("modal_excitations.md")
+EXCITATIONS = ("motor", "shaken", "blows", "decay", "1 blow", "10 blows", "random force")
+JAXBEAM = "jaxbeam, by itself"
 METHODS = ("covariance", "data", "plscf", "fdd")
 PYOMA = "pyOMA-2, SSI-COV"
 HEADER = (
@@ -57,9 +71,14 @@ def band_of(planted: Planted) -> tuple[float, float]:
 
 
 def ours(planted: Planted, method: str) -> Estimates:
-    """Estimates of a method of `identify_modes`."""
+    """Estimates of a method of `identify_modes` for ambient excitation."""
+    return automatic(planted, log_of(planted), kind="ambient", method=method)
+
+
+def automatic(planted: Planted, log: Log, **arguments) -> Estimates:
+    """Estimates of `identify_modes` with what it chooses itself, but for some arguments."""
     start = time.process_time()
-    fit = identify_modes(log_of(planted), band=band_of(planted), kind="ambient", method=method)
+    fit = identify_modes(log, band=band_of(planted), **arguments)
     seconds = time.process_time() - start
     compared = compare(fit, planted)
     errors = np.full((planted.energies.size, 2), np.nan)
@@ -126,9 +145,40 @@ def table(structures: Sequence[Planted], found: Mapping[str, Sequence[Estimates]
     return ReportTable(HEADER, rows)
 
 
+def excitations(count: int) -> ReportTable:
+    """Both programs for a number of structures under each of the other excitations."""
+    rows, header = [], ("excitation", *HEADER)
+    for kind in EXCITATIONS:
+        structures: list[Planted] = []
+        found: dict[str, list[Estimates]] = {PYOMA: [], JAXBEAM: []}
+        for seed in range(FIRST_SEED, FIRST_SEED + count):
+            structure = random_structure(seed)
+            if kind in MEASURED:
+                log, planted = forced_log(structure, kind, seed)
+            else:
+                planted = sampled(structure, kind, seed, DURATIONS[kind])
+                log = log_of(planted)
+            structures.append(planted)
+            found[PYOMA].append(pyoma(planted))
+            found[JAXBEAM].append(automatic(planted, log))
+        rows += [(WORDS[kind], *row) for row in table(structures, found).rows]
+        print(rows[-2:], flush=True)
+    return ReportTable(header, rows)
+
+
+def _write(result: ReportTable, path: Path) -> None:
+    lines = [result.header, ["---"] * len(result.header), *result.rows]
+    text = "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    path.write_text(text, encoding="utf-8")
+    print(text)
+
+
 def main(arguments: list[str]) -> None:
-    """Write the table for a number of structures (12)."""
+    """Write a table for a number of structures (12)."""
     count = int(arguments[0]) if arguments else 12
+    if arguments[1:] == ["excitations"]:
+        _write(excitations(count), EXCITATIONS_FILE)
+        return
     structures: list[Planted] = []
     found: dict[str, list[Estimates]] = {name: [] for name in (PYOMA, *METHODS)}
     for seed in range(count):
@@ -138,11 +188,7 @@ def main(arguments: list[str]) -> None:
         for method in METHODS:
             found[method].append(ours(planted, method))
         print(f"structure {seed}: {planted.energies.size} modes", flush=True)
-    result = table(structures, found)
-    lines = [result.header, ["---"] * len(result.header), *result.rows]
-    text = "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
-    TABLE_FILE.write_text(text, encoding="utf-8")
-    print(text)
+    _write(table(structures, found), TABLE_FILE)
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ def test_modes_of_a_file_without_headings(run, decay_log):
     np.testing.assert_allclose(part["frequencies_hz"], [12], rtol=2e-3)
 
 
-def test_a_measured_force(run, decay_log):
+def test_a_measured_force(run, refused, decay_log):
     """The first column is a blow of a hammer, in N by the unit given to it."""
     rows = np.loadtxt(decay_log / "node.csv", delimiter=",")
     rows[:, 1] = np.arange(1500) == 0
@@ -49,6 +49,11 @@ def test_a_measured_force(run, decay_log):
     np.testing.assert_allclose(found["frequencies_hz"], [12], rtol=1e-3)
     np.testing.assert_allclose(found["damping_ratios"], [0.01], rtol=0.05)
     assert found == run(f"{line} --json"), "a channel in N is a force"
+    drawn = run(f"{line} --responses Hv --exponential 0.5 --force-window 0.1")
+    assert "written: hammer_responses.png" in drawn
+    assert (decay_log / "hammer_responses.png").stat().st_size > 10_000
+    assert "--responses takes H1, H2 or Hv" in refused(f"{line} --responses H3")
+    assert "--exponential is for --responses" in refused(f"{line} --exponential 0.5")
 
 
 def test_the_rate_of_a_file_without_times(run, decay_log):

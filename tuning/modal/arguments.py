@@ -23,15 +23,15 @@ def check_band(log: Log, rate: float, band: tuple[float, float] | None) -> None:
 
 
 def check_force(
-    force: Sequence[str] | None, windows: Windows, kind: str | None, method: str | None
+    force: Sequence[str] | None, force_window: float | None, kind: str | None, method: str | None
 ) -> None:
-    """Check a measured force, and windows of it, beside the kind of excitation and the method.
+    """Check a measured force, and its window, beside the kind of excitation and the method.
 
-    Raises ValueError for either beside a kind, or with a method that does not use it, and for
-    windows that do not last.
+    Raises ValueError for either beside a kind, or with a method that does not use it, and for a
+    window that does not last.
     """
-    check_windows(windows)
-    if force is None and windows == Windows():
+    check_windows(Windows(force=force_window))
+    if force is None and force_window is None:
         return
     if method not in (None, "plscf"):
         raise ValueError(f"a measured force is used by method 'plscf', not by {method!r}")

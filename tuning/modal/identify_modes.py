@@ -28,7 +28,7 @@ from tuning.modal.arguments import (
 )
 from tuning.modal.decay.modes import Decays, excited, free_decay_modes
 from tuning.modal.fit import Choice, ModalFit
-from tuning.modal.forced.blows import Windows, pieces_of_blows
+from tuning.modal.forced.blows import force_at_blows
 from tuning.modal.forced.forces import force_names, force_records, without_forces
 from tuning.modal.forced.modes import forced_modes
 from tuning.modal.harmonics import Line, harmonic_lines, is_steady, without_lines
@@ -53,7 +53,6 @@ def identify_modes(
     order: int | None = None,
     method: str | None = None,
     force: Sequence[str] | None = None,
-    exponential: float | None = None,
     force_window: float | None = None,
     exclude: Sequence[float] = (),
     progress: Callable[[str], None] | None = None,
@@ -68,16 +67,14 @@ def identify_modes(
     decomposition) or "plscf" (poly-reference least-squares complex frequency), of which the last
     two take every log for a response to broadband excitation; `force` are the names of the channels
     of forces that were measured, of a hammer or shaker, by default all in N: method "plscf", then
-    the default, fits the responses to them. Blows of a hammer may be cut into pieces with windows:
-    `exponential` (s) is the time constant of one on responses and forces, whose damping is
-    subtracted, `force_window` (s) the time after which a force is taken for zero. `exclude`
-    are frequencies (Hz) that are no modes. `progress` is called with a few words on what is being
-    done.
+    the default, fits the responses to them. `force_window` (s) is the time after each blow of a
+    hammer from which on the force is taken for zero. `exclude` are frequencies (Hz) that are no
+    modes. `progress` is called with a few words on what is being done.
 
     Raises ValueError for a log without evenly sampled records, or too short, a window outside the
     log, a band above half the sampling rate, an impossible count or order, unknown channels, kinds
-    and methods, a kind or forces that the method cannot use, channels that are no forces, windows
-    without blows, and logs that differ in channels or sampling rate.
+    and methods, a kind or forces that the method cannot use, channels that are no forces, a force
+    window without blows, and logs that differ in channels or sampling rate.
 
     >>> import numpy as np
     >>> import tuning
@@ -91,13 +88,12 @@ def identify_modes(
     """
     logs = [log] if isinstance(log, Log) else list(log)
     check_arguments(count, kind, order, method)
-    windows = Windows(exponential, force_window)
-    check_force(force, windows, kind, method)
+    check_force(force, force_window, kind, method)
     measured = logs
     forces = () if kind or method not in (None, "plscf") else force_names(logs[0], force)
     logs = [without_forces(with_channels(one, channels)) for one in logs]
-    if not forces and windows != Windows():
-        raise ValueError(f"{logs[0].source}: windows are for measured forces, and none is in N")
+    if not forces and force_window is not None:
+        raise ValueError(f"{logs[0].source}: a force window is for measured forces; none is in N")
     samples = samples_of(logs, window)
     check_band(logs[0], samples.rate, band)
     choices = []
@@ -109,9 +105,11 @@ def identify_modes(
         )
     if forces:
         driving = force_records(measured, forces, window, samples)
+        if force_window is not None:
+            driving = tuple(force_at_blows(one, samples.rate, force_window) for one in driving)
         if progress:
             progress("responses to the measured forces")
-        found, explained = _forced(samples, driving, windows, used_band, order, progress)
+        found, explained = _forced(samples, driving, used_band, order, progress)
         choices.append(
             Choice(
                 f"excitation: measured force {' and '.join(forces)}, which explains "
@@ -167,17 +165,10 @@ def _add_order(choices, order, found: _Found) -> None:
         choices.append(Choice(f"models of orders to {highest}", "--order N"))
 
 
-def _forced(samples: Samples, driving, windows, band, order, progress) -> tuple[_Found, float]:
+def _forced(samples: Samples, driving, band, order, progress) -> tuple[_Found, float]:
     """Modes of the responses to forces, and the share of the responses that these explain."""
-    records = samples.records
-    if windows != Windows():
-        pairs = zip(records, driving, strict=True)
-        cut = [one for pair in pairs for one in pieces_of_blows(*pair, samples.rate, windows)]
-        records, driving = (tuple(piece[k] for piece in cut) for k in (1, 2))
-    found = forced_modes(
-        records, driving, samples.rate, band,
-        order=order, window_rate=windows.decay_rate, progress=progress,
-    )  # fmt: skip
+    arguments = (samples.records, driving, samples.rate, band)
+    found = forced_modes(*arguments, order=order, progress=progress)
     return _Found(found.candidates, found.diagrams, None, kind=FORCED), found.explained
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import percentile_filter
-from scipy.signal import butter, detrend, firwin, resample_poly, sosfiltfilt, welch
+from scipy.signal import butter, detrend, find_peaks, firwin, resample_poly, sosfiltfilt, welch
 
 RATE_OVER_BAND = 2.56  # sampling rate after decimation over the upper end of the band
 MIN_SEGMENTS = 8  # segments averaged for the spectrum that decides the band
@@ -65,8 +65,11 @@ def kinetic_band(
     share = np.cumsum(kinetic) / kinetic.sum()
     low = bins[np.searchsorted(share, 1 - BAND_ENERGY_SHARE)]
     high = bins[min(int(np.searchsorted(share, BAND_ENERGY_SHARE)), bins.size - 1)]
-    stands_out = np.any(excess > 0, axis=1) & (bins >= low)
-    tops = bins[np.flatnonzero(stands_out & ~np.append(stands_out[1:], False))]
+    # Chance makes the flanks of one resonance ragged, but not by as much as a peak stands out.
+    level = np.log(np.max(power / _backgrounds(bins, power), axis=1))
+    least = np.log(RESONANCE_RATIO)
+    tops = bins[find_peaks(level, height=least, prominence=least)[0]]
+    tops = tops[tops >= low]
     if tops.size > MAX_RESONANCES:
         high = min(high, float(tops[MAX_RESONANCES - 1]))
     high = min(high * BAND_MARGIN, 0.4 * rate)
@@ -113,18 +116,20 @@ def resonance_excess(
     bins: Float[np.ndarray, " bin"], power: Float[np.ndarray, "bin channel"]
 ) -> Float[np.ndarray, "bin channel"]:
     """Power above the background where it stands out by 8 dB, else zero."""
+    background = _backgrounds(bins, power)
+    return np.where(power > RESONANCE_RATIO * background, power - background, 0.0)
+
+
+def _backgrounds(bins, power):
+    """Lower quartile of the power (bin, channel) over an octave about each bin."""
     points = max(512, 2 * bins.size)
     grid = np.geomspace(bins[0], bins[-1], points)
     width = max(int(BACKGROUND_OCTAVES * points / np.log2(bins[-1] / bins[0])), 3)
     found = []
     for column in power.T:
         level = np.interp(grid, bins, np.log(column + 1e-300))
-        background = np.exp(
-            np.interp(
-                bins, grid, percentile_filter(level, BACKGROUND_PERCENT, width, mode="nearest")
-            )
-        )
-        found.append(np.where(column > RESONANCE_RATIO * background, column - background, 0.0))
+        quartile = percentile_filter(level, BACKGROUND_PERCENT, width, mode="nearest")
+        found.append(np.exp(np.interp(bins, grid, quartile)))
     return np.stack(found, axis=1)
 
 

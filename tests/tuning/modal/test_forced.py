@@ -82,6 +82,38 @@ def test_close_modes_of_a_hammer_test_are_told_apart():
     np.testing.assert_allclose(fit.frequencies, structure.frequencies, rtol=1e-3)
 
 
+def test_two_forces_at_once():
+    """Shakers at two places, whose forces are correlated."""
+    structure, random = small_structure(0), np.random.default_rng(5)
+    fine = FINER * RATE
+    forces = np.zeros((int(60 * fine), structure.inputs.shape[1]))
+    forces[:, :2] = random.normal(size=(len(forces), 2)) @ [[1.0, 0.5], [0.0, 1.0]]
+    forces = lfilter(firwin(161, 0.8 / FINER), 1.0, forces, axis=0)
+    values = response(structure, forces, fine)[::FINER]
+    values = values + 0.1 * values.std() * coloured_noise(random, values.shape)
+    log = Log(
+        np.arange(len(values)) / RATE,
+        np.column_stack([forces[::FINER, :2], values]),
+        ("f1", "f2", "v1", "v2"),
+        ("force", "force", "velocity", "velocity"),
+        ("N", "N", "m/s", "m/s"),
+        "planted",
+    )
+    fit = identify_modes(log, band=(2.0, 11.0))
+    np.testing.assert_allclose(fit.frequencies, structure.frequencies, rtol=1e-3)
+    assert np.all(np.diag(mac_matrix(fit.shapes, structure.shapes + 0j)) > 0.999)
+
+
+def test_noise_beside_a_force_has_no_modes():
+    random = np.random.default_rng(7)
+    values = np.column_stack([random.normal(size=2400), coloured_noise(random, (2400, 2))])
+    log = Log(
+        np.arange(2400) / RATE, values, ("f", "v1", "v2"), ("force", "velocity", "velocity"),
+        ("N", "m/s", "m/s"), "noise",
+    )  # fmt: skip
+    assert not identify_modes(log, band=(2.0, 11.0)).modes
+
+
 def test_a_force_is_no_response():
     log = measured(small_structure(0), "shaker", 0, 0.1, 20.0)
     fit = identify_modes(log, band=(2.0, 11.0), method="covariance")
@@ -96,6 +128,8 @@ def test_a_force_is_no_response():
         ({"force": ["hammer"], "method": "fdd"}, "used by method 'plscf', not by 'fdd'"),
         ({"force": ["hammer"], "kind": "ambient"}, "leave out kind 'ambient'"),
         ({"channels": ["hammer"]}, "the log has forces only, and no response to them"),
+        ({"force_window": -1.0}, "the force window must last longer than 0 s, not -1 s"),
+        ({"force_window": 1.0}, "the measured force has no blows of a hammer"),
         ({"force": ["zero"]}, "a measured force is zero throughout; leave it out"),
     ],
 )

@@ -162,6 +162,18 @@ def test_the_band_ends_above_the_twelfth_resonance():
     assert 120 < high < 170
 
 
+def test_the_band_holds_broad_resonances_of_ragged_spectra():
+    """Each has many lines of an average of nine segments, which chance makes ragged."""
+    random, values = np.random.default_rng(0), 0.0
+    for frequency in (3.0, 11.0, 25.0):
+        pole = np.exp(root(frequency, 0.03) / 150.0)
+        white = random.normal(size=45_000)
+        one = lfilter([1.0], [1, -2 * pole.real, abs(pole) ** 2], white)
+        values = values + one / one.std()
+    _, high = kinetic_band((values[:, None],), 150.0, (1,))
+    assert 25 < high < 40
+
+
 def test_samples_are_left_out_while_a_sensor_settles():
     """Saturated for a second after it is switched on, then an exponential, as AC coupling has."""
     quiet = ambient(0, duration=60.0)

@@ -6,7 +6,7 @@ import scipy.signal
 import scipy.stats
 
 from experiments.validation.modal_identification import compare, log_of
-from tests.oracles.planted_structures import sampled
+from tests.oracles.planted_structures import Structure, sampled
 from tests.tuning.modal.test_subspace import small_structure
 from tuning import identify_modes
 from tuning.modal.shapes import mac_matrix
@@ -142,3 +142,17 @@ def test_a_method_refuses_what_it_cannot_use():
         identify_modes(log, method="fdd", kind="free decay")
     with pytest.raises(ValueError, match="no models and no order"):
         identify_modes(log, method="fdd", order=10)
+
+
+def test_efdd_parts_a_pair_with_one_peak():
+    """Two per cent apart, closer than the segments resolve; shapes are unlike."""
+    random = np.random.default_rng(9001)
+    frequencies, ratios = np.array([4.0, 4.08, 9.0]), random.uniform(0.002, 0.01, 3)
+    structure = Structure(
+        frequencies, ratios, random.normal(size=(3, 5)), random.normal(size=(3, 4))
+    )
+    planted = sampled(structure, "ambient", 9001, 600.0)
+    fit = identify_modes(log_of(planted), band=(2.8, 11.0), method="fdd")
+    np.testing.assert_allclose(fit.frequencies, frequencies, rtol=4e-3)
+    np.testing.assert_allclose(fit.damping_ratios, ratios, rtol=0.5)
+    assert np.all(np.diag(mac_matrix(fit.shapes, structure.shapes + 0j)) > 0.9)

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 BLOW_SHARE = 0.1  # of the largest force, above which there is a blow
 MAX_STRUCK_SHARE = 0.05  # of the samples of a log of blows
-PRE_TRIGGER = 0.01  # of the time to the next blow, before a blow
+BEFORE = 8  # samples before a blow that belong to it: ringing of an anti-alias filter
 
 
 class Windows(NamedTuple):
@@ -54,32 +54,45 @@ def find_blows(force: Float[np.ndarray, "time force"]) -> Int[np.ndarray, " blow
     return begins[far]
 
 
+def _blows_of(force):
+    """Samples at which blows begin. Raises ValueError if there are none."""
+    blows = find_blows(force)
+    if not blows.size:
+        raise ValueError("the measured force has no blows of a hammer, and windows are for these")
+    return blows
+
+
+def force_at_blows(
+    force: Float[np.ndarray, "time force"], rate: float, duration: float
+) -> Float[np.ndarray, "time force"]:
+    """The force for `duration` s from each blow on, and a little before; else zero.
+
+    Raises ValueError if there is no blow.
+    """
+    kept = np.zeros(len(force), bool)
+    for blow in _blows_of(force).tolist():
+        kept[max(blow - BEFORE, 0) : blow + max(int(duration * rate), 1)] = True
+    return np.where(kept[:, None], force, 0.0)
+
+
 def pieces_of_blows(
     record: Float[np.ndarray, "time output"],
     force: Float[np.ndarray, "time force"],
     rate: float,
     windows: Windows,
-    *,
-    alike: bool = False,
-) -> list[tuple[int, Float[np.ndarray, "sample output"], Float[np.ndarray, "sample force"]]]:
-    """First sample, response and force of each piece from one blow to the next, with windows.
+) -> list[tuple[Float[np.ndarray, "sample output"], Float[np.ndarray, "sample force"]]]:
+    """Response and force from each blow on for the shortest time between blows, with windows.
 
-    Pieces begin a little before their blow; with `alike` all are as long as the shortest. Raises
-    ValueError if there is no blow.
+    Pieces begin a little before their blow. Raises ValueError if there is no blow.
     """
-    blows = find_blows(force)
-    if not blows.size:
-        raise ValueError("the measured force has no blows of a hammer, and windows are for these")
-    gaps = np.diff(np.append(blows, len(record)))
-    before = min(int(PRE_TRIGGER * gaps.min()), int(blows[0]))
-    length = int(gaps.min())
-    found = []
-    for blow, gap in zip(blows.tolist(), gaps.tolist(), strict=True):
-        first = blow - before
-        piece = slice(first, min(first + (length if alike else gap), len(record)))
-        own, driving = record[piece].copy(), force[piece].copy()
-        if windows.force is not None:
-            driving[before + max(int(windows.force * rate), 1) :] = 0.0
-        fade = np.exp(-windows.decay_rate * np.arange(len(own)) / rate)[:, None]
-        found.append((first, own * fade, driving * fade))
-    return found
+    blows = _blows_of(force)
+    if windows.force is not None:
+        force = force_at_blows(force, rate, windows.force)
+    length = int(np.diff(np.append(blows, len(record))).min())
+    fade = np.exp(-windows.decay_rate * np.arange(length) / rate)[:, None]
+    starts = np.maximum(blows - BEFORE, 0).tolist()
+    return [
+        (record[first : first + length] * fade, force[first : first + length] * fade)
+        for first in starts
+        if first + length <= len(record)
+    ]

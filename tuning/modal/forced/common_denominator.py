@@ -25,8 +25,7 @@ class Lines(NamedTuple):
     """Lines of the transforms of all records: spectra (line, output), (line, input), z and record.
 
     `step` is the sampling step (s); `level`, if any, is what spectra of each line were multiplied
-    by, so that errors of all lines have one variance; `window_rate` (1/s) is what an exponential
-    window of the records added to each decay rate.
+    by, so that errors of all lines have one variance.
     """
 
     outputs: Complex[np.ndarray, "line output"]
@@ -35,7 +34,6 @@ class Lines(NamedTuple):
     record: Int[np.ndarray, " line"]
     step: float
     level: Float[np.ndarray, " line"] | None = None
-    window_rate: float = 0.0
 
     @property
     def spacing(self) -> float:

@@ -64,10 +64,8 @@ def damping_doubts(model: FittedModel) -> Float[np.ndarray, " mode"]:
     """Half the 95 % interval of each damping ratio, over the ratio."""
     found = []
     for k, (pole, covariance) in enumerate(zip(model.poles, pole_covariances(model), strict=True)):
-        pole = complex(pole) + model.lines.window_rate
-        _, _, damping, damping_sd = frequency_and_damping(pole, covariance)
-        half = _quantile(model, k) * damping_sd
-        found.append(half / damping if damping > 0 else np.inf)
+        _, _, damping, damping_sd = frequency_and_damping(complex(pole), covariance)
+        found.append(_quantile(model, k) * damping_sd / damping)
     return np.array(found)
 
 
@@ -108,7 +106,7 @@ def modes_of_model(
         moved = moved - moved[:, [largest]] * unit
         parts = np.concatenate([moved.real, moved.imag], axis=1)
         frequency, frequency_sd, damping, damping_sd = frequency_and_damping(
-            complex(pole) + lines.window_rate, covariances[k]
+            complex(pole), covariances[k]
         )
         part = resonances[:, [k]] * (plain.inputs @ residues[k])
         part = part + mirrored[:, [k]] * (plain.inputs @ residues[k].conj())

@@ -29,7 +29,7 @@ from tuning.modal.forced.modal_model import damping_doubts, modes_of_model, unex
 from tuning.modal.forced.significance import (
     criterion,
     missing_pole,
-    residue_chances,
+    mode_chances,
     single_pole_chances,
     split_pole,
 )
@@ -62,13 +62,9 @@ def forced_modes(
     band: tuple[float, float],
     *,
     order: int | None = None,
-    window_rate: float = 0.0,
     progress: Callable[[str], None] | None = None,
 ) -> ForcedModes:
     """Modes of a band (Hz) from records and the forces measured with them.
-
-    `window_rate` (1/s) is that of an exponential window of records and forces; it is subtracted
-    from the decay rates.
 
     Raises ValueError if a force is zero throughout.
     """
@@ -87,13 +83,9 @@ def forced_modes(
         if not np.all(force_scale > 0):
             raise ValueError("a measured force is zero throughout; leave it out")
         scale = np.where(scale > 0, scale, 1.0)
-        lines = lines._replace(
-            outputs=lines.outputs / scale,
-            inputs=lines.inputs / force_scale,
-            window_rate=window_rate,
-        )
+        lines = lines._replace(outputs=lines.outputs / scale, inputs=lines.inputs / force_scale)
         candidates, diagram, shares = _modes_of_lines(
-            lines, scale, part, band, duration, order, _poles(found, window_rate)
+            lines, scale, part, band, duration, order, _poles(found)
         )
         found += candidates
         diagrams.append(diagram)
@@ -101,9 +93,9 @@ def forced_modes(
     return ForcedModes(without_duplicates(found), tuple(diagrams), 1 - rest / max(whole, 1e-300))
 
 
-def _poles(found, window_rate):
-    """Poles of candidates that are well identified, with the damping of the window."""
-    return np.array([one.mode.pole - window_rate for one in found if not one.reason], complex)
+def _poles(found):
+    """Poles of candidates that are well identified."""
+    return np.array([one.mode.pole for one in found if not one.reason], complex)
 
 
 def _modes_of_lines(lines: Lines, scale, part, band, duration, order, known):
@@ -168,12 +160,12 @@ def _refined(lines, poles, scale, part):
     dropped = []
     while True:
         model = fit_modal_model(lines, poles, part)
-        doubts, chances, reason = damping_doubts(model), residue_chances(model), ""
+        doubts, chances, reason = damping_doubts(model), mode_chances(model), ""
         if np.any(doubts >= 1):
             worst = int(np.argmax(doubts))
         elif np.any(chances > CHANCE):
             worst = int(np.argmax(chances))
-            reason = "no response to the force beyond what noise explains"
+            reason = "no response beyond what noise explains"
         else:
             return model, dropped
         dropped.append((modes_of_model(model, scale)[worst], reason))

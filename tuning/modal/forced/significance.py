@@ -1,7 +1,7 @@
-"""Tests of a modal model: residues that chance explains, resonances that are two, missing poles.
+"""Tests of a modal model: poles that chance explains, resonances that are two, missing poles.
 
 A pole placed at a chance peak of the noise fits it well, so that its errors tell nothing against
-it; but its residue, at one of many lines, is not larger than the noise makes it. Two poles close
+it; but what it explains, at one of many lines, is not more than the noise makes it. Two poles close
 together taken for one leave errors along the derivative of the resonance by its pole,
 1 / (s - p)^2, with residues of its own: were there one pole, these would be those of noise. A pole
 that is missing leaves errors along 1 / (s - p). These are tests of F.
@@ -28,21 +28,20 @@ MOST_PROMISING = 3  # of them, whose probabilities are computed
 SPLITS = 0.5 * np.array([1j, 1.0, 3j, 1 + 1j, 1 - 1j])  # of a pole, over its decay rate
 
 
-def residue_chances(model: FittedModel) -> Float[np.ndarray, " mode"]:
-    """Probability that noise gives a residue as large as that of each mode, at any of the lines."""
-    inputs, outputs = model.lines.inputs.shape[1], model.fit.errors.shape[1]
-    modes, found = model.poles.size, []
+def mode_chances(model: FittedModel) -> Float[np.ndarray, " mode"]:
+    """Probability that noise explains what each mode does, forced and free, at any of the lines.
+
+    Both together, as the response to a blow at the start of a record is like a free one.
+    """
+    outputs, found = model.fit.errors.shape[1], []
     variance = _local_variance(model.fit.errors, model.free.free)
-    scatter = model.fit.inverse @ model.fit.inverse.T
-    for k in range(modes):
-        own = k * inputs + np.arange(inputs)
-        own = np.concatenate([own, modes * inputs + own])
-        values = model.fit.found[own]
-        sizes = np.sum(values * np.linalg.solve(scatter[np.ix_(own, own)], values), axis=0)
-        peak, freedom = model.peak(k), model.freedom(k)
-        count = own.size * outputs
-        statistic = np.sum(sizes / variance[peak]) / count
-        found.append(len(model.lines.z) * fisher.sf(statistic, count, freedom * outputs))
+    for k in range(model.poles.size):
+        without = linear_fit(model.lines, np.delete(model.poles, k))
+        gains = np.sum(without.errors**2, axis=0) - np.sum(model.fit.errors**2, axis=0)
+        count = (model.fit.columns.shape[1] - without.columns.shape[1]) * outputs
+        statistic = np.sum(gains / variance[model.peak(k)]) / count
+        chance = fisher.sf(statistic, count, model.freedom(k) * outputs)
+        found.append(len(model.lines.z) * chance)
     return np.array(found)
 
 

@@ -6,6 +6,10 @@ is that along its shape, as far as a singular vector of each bin resembles it (M
 Fourier transform is the correlation of a single mode: zero crossings tell its frequency, the
 logarithmic decrement of its extremes its damping ratio (Brincker, Ventura and Andersen 2001). The
 window of the segments multiplies correlations and is divided out, so that it does not damp.
+
+Two modes closer than their bells show one peak. What is orthogonal to the shape at it is then a
+spectrum of the other mode alone: its peak is that of the second singular value. Along the part of
+the first shape that is orthogonal to the second, the spectrum is that of the first.
 """
 
 from typing import NamedTuple
@@ -27,12 +31,18 @@ PEAK_BINS = 2  # by which the highest bin of a peak exceeds its neighbours
 
 
 class Bell(NamedTuple):
-    """Bins (first, last exclusive) around a peak that belong to one mode, and its shape."""
+    """Bins (first, last exclusive) around a peak that belong to one mode, and its shape.
+
+    `along` is the vector along which the spectrum is that of this mode alone: the shape, or for
+    one of a pair the part of it that the other has not.
+    """
 
     peak: int
     first: int
     last: int
     shape: Complex[np.ndarray, " channel"]
+    along: Complex[np.ndarray, " channel"]
+    of_pair: bool = False
 
 
 class SingleMode(NamedTuple):
@@ -71,12 +81,63 @@ def bells(spectra: CrossSpectra, band: tuple[float, float]) -> tuple[Bell, ...]:
         )
         if not known:
             found.append(_bell(spectra, vectors, peak, shape, inside))
-    return tuple(one for one in found if _falls(spectra, one))
+    found = [one for one in found if _falls(spectra, one)]
+    for one in tuple(found):
+        partner = _partner(spectra, one, inside)
+        known = partner is None or any(
+            other.first <= partner.peak < other.last and _mac(other.shape, partner.shape) > MIN_MAC
+            for other in found
+        )
+        if partner is not None and not known:
+            place = next(k for k, other in enumerate(found) if other is one)
+            found[place] = _apart(spectra, one, partner.shape, inside)
+            found.append(partner)
+    return tuple(found)
+
+
+def _partner(spectra, bell, inside) -> Bell | None:
+    """The other mode of a pair: a peak within a bell of the spectrum without the bell's shape.
+
+    Its shape is the response with its part that is orthogonal to the other shape: the sum of
+    cross-spectra G v over its bell.
+    """
+    if bell.shape.size < 2:
+        return None
+    rest = np.eye(bell.shape.size) - np.outer(bell.shape, bell.shape.conj())
+    values, vectors = singular_values(rest @ spectra.mean @ rest)
+    level = values[:, 0]
+    excess = np.zeros(level.size)
+    excess[inside] = resonance_excess(spectra.bins[inside], level[inside, None])[:, 0]
+    # The other's own bell begins where the shape ceases.
+    low, high = 2 * bell.first - bell.peak, 2 * bell.last - bell.peak
+    window = np.arange(max(low, inside[0]), min(high, inside[-1]))
+    shifts = [k for k in range(-PEAK_BINS, PEAK_BINS + 1) if k]
+    highest = np.all(level > np.stack([np.roll(level, k) for k in shifts]), axis=0)
+    tops = window[(excess[window] > 0) & highest[window]]
+    if not tops.size:
+        return None
+    peak = int(tops[np.argmax(level[tops])])
+    along = vectors[peak, 0]
+    first, last = _edges(spectra, along, peak, inside)
+    shape = np.sum(spectra.mean[first:last], axis=0) @ along
+    found = Bell(peak, first, last, shape / np.linalg.norm(shape), along, of_pair=True)
+    return found if _falls(spectra, found) else None
+
+
+def _apart(spectra, bell, other, inside) -> Bell:
+    """A bell along the part of its shape that the other of a pair has not."""
+    along = bell.shape - other * (other.conj() @ bell.shape)
+    along = along / np.linalg.norm(along)
+    density = along_shape(spectra.mean, along)
+    around = np.arange(max(bell.peak - PEAK_BINS, 0), bell.peak + PEAK_BINS + 1)
+    peak = int(around[np.argmax(density[around])])
+    first, last = _edges(spectra, along, peak, inside)
+    return bell._replace(peak=peak, first=first, last=last, along=along)
 
 
 def _falls(spectra, bell):
     """Whether the spectrum falls enough on both sides of a peak within its bell."""
-    along = along_shape(spectra.mean, bell.shape)
+    along = along_shape(spectra.mean, bell.along)
     sides = along[bell.first : bell.peak + 1].min(), along[bell.peak : bell.last].min()
     return along[bell.peak] > MIN_FALL * max(sides)
 
@@ -87,18 +148,26 @@ def _mac(a, b):
 
 def _bell(spectra, vectors, peak, shape, inside) -> Bell:
     """Bins on both sides of a peak, as far as a singular vector resembles its shape."""
-    along = along_shape(spectra.mean, shape)
+    similar = np.max(
+        np.abs(vectors @ shape.conj()) ** 2 / np.sum(np.abs(vectors) ** 2, axis=2), axis=1
+    )
+    first, last = _edges(spectra, shape, peak, inside, similar > MIN_MAC)
+    return Bell(peak, first, last, shape, shape)
+
+
+def _edges(spectra, vector, peak, inside, allowed=None):
+    """First and last bin (exclusive) of the bell around a peak of the spectrum along a vector."""
+    along = along_shape(spectra.mean, vector)
     edges = []
     for step, limit in ((-1, inside[0]), (1, inside[-1])):
         k, least = peak, along[peak]
         while k != limit:
             k += step
-            similar = np.max(mac_matrix(vectors[k], shape[None])) > MIN_MAC
-            if not similar or along[k] > MAX_RISE * least:
+            if (allowed is not None and not allowed[k]) or along[k] > MAX_RISE * least:
                 break
             least = min(least, along[k])
         edges.append(int(k))
-    return Bell(peak, edges[0], edges[1] + 1, shape)
+    return edges[0], edges[1] + 1
 
 
 def along_shape(

@@ -61,7 +61,7 @@ def efdd_modes(
 def _mode(spectra: CrossSpectra, bell: Bell, power) -> IdentifiedMode | None:
     """Mode of a bell, with the jackknife over groups of segments; None without enough extremes."""
     window, groups = spectra.correlation_window, len(spectra.groups)
-    densities = along_shape(spectra.groups, bell.shape)
+    densities = along_shape(spectra.groups, bell.along)
     whole = single_mode(densities.sum(axis=0), bell, spectra.rate, window)
     if whole is None:
         return None
@@ -69,16 +69,17 @@ def _mode(spectra: CrossSpectra, bell: Bell, power) -> IdentifiedMode | None:
         single_mode(densities.sum(axis=0) - density, bell, spectra.rate, window)
         for density in densities
     ]
-    at_peak = spectra.groups[:, bell.peak]
     largest = int(np.argmax(np.abs(bell.shape)))
     unit = bell.shape / bell.shape[largest]
-    shapes = singular_values(at_peak.sum(axis=0) - at_peak)[1][:, 0]
+    shapes = _shapes_without_each(spectra, bell)
     shapes = shapes / shapes[:, [largest]] - unit
     known = [one for one in left_out if one is not None]
     spread = np.cov(np.array(known).T, bias=True) if len(known) == groups > 1 else np.eye(2)
     deviations = np.sqrt((groups - 1) * np.diag(spread))
     parts = np.concatenate([shapes.real, shapes.imag], axis=1)
-    own = np.sum(densities[:, bell.first : bell.last]) * np.abs(bell.shape) ** 2
+    # Along another vector than the shape a mode has a part of its power only.
+    part = np.abs(bell.along.conj() @ bell.shape) ** 2
+    own = np.sum(densities[:, bell.first : bell.last]) * np.abs(bell.shape) ** 2 / part
     return IdentifiedMode(
         frequency=whole.frequency,
         frequency_sd=float(deviations[0]),
@@ -89,3 +90,12 @@ def _mode(spectra: CrossSpectra, bell: Bell, power) -> IdentifiedMode | None:
         shape_covariance=(groups - 1) / groups * parts.T @ parts,
         quantile=float(student.ppf(0.975, max(groups - 1, 1))),
     )
+
+
+def _shapes_without_each(spectra: CrossSpectra, bell: Bell):
+    """Shapes (group, channel) of a bell without each group of segments."""
+    if bell.of_pair:
+        in_bell = np.sum(spectra.groups[:, bell.first : bell.last], axis=1)
+        return (in_bell.sum(axis=0) - in_bell) @ bell.along
+    at_peak = spectra.groups[:, bell.peak]
+    return singular_values(at_peak.sum(axis=0) - at_peak)[1][:, 0]

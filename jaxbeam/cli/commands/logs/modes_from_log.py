@@ -30,9 +30,9 @@ def modes_from_log(
     order: int | None = None,
     method: str | None = None,
     force: str | None = None,
-    exponential: float | None = None,
     force_window: float | None = None,
     responses: str | None = None,
+    exponential: float | None = None,
     kind: str | None = None,
     exclude: str | None = None,
     count: int | None = None,
@@ -75,14 +75,14 @@ def modes_from_log(
     force
         NAME,NAME,...: channels of measured forces (N), of a hammer or shaker; by default all in N.
         The responses to them are fitted by p-LSCF.
-    exponential
-        Time constant (s) of an exponential window from each blow of the hammer on, on responses
-        and force; the damping that it adds is subtracted.
     force_window
         Time (s) after each blow from which on the force is taken for zero.
     responses
         H1, H2 or Hv: draw frequency responses to the forces, by this estimate, with their coherence
         to a PNG named after the first log.
+    exponential
+        Time constant (s) of an exponential window from each blow on, for `--responses`. Modes are
+        found without it.
     kind
         ambient or "free decay".
     exclude
@@ -114,6 +114,10 @@ def modes_from_log(
     refuse_option(
         responses not in (None, "H1", "H2", "Hv"),
         f"--responses takes H1, H2 or Hv, not {responses!r}",
+    )
+    refuse_option(
+        exponential is not None and responses is None,
+        "--exponential is for --responses; modes are found without it",
     )
     excluded = _numbers("--exclude", exclude)
     check_exists("log file", *logs)
@@ -147,7 +151,6 @@ def modes_from_log(
         order=order,
         method=method,
         force=_names(force),
-        exponential=exponential,
         force_window=force_window,
         exclude=excluded,
         progress=None if options.json_ or not sys.stderr.isatty() else print_message,

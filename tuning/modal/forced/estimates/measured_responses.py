@@ -122,9 +122,9 @@ def measured_responses(
     hammer = all(find_blows(one).size for one in driving)
     if hammer and segment is None:
         pieces = [
-            piece[1:]
+            piece
             for record, own in zip(records, driving, strict=True)
-            for piece in pieces_of_blows(record, own, samples.rate, windows, alike=True)
+            for piece in pieces_of_blows(record, own, samples.rate, windows)
         ]
         taper = None
     elif windows != Windows():
