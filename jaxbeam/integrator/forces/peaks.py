@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from jaxbeam.integrator.forces.panels import Panels, force_panels
 from jaxbeam.integrator.forces.paths import ForcePaths
+from jaxbeam.integrator.forces.products import product
 from jaxbeam.integrator.forces.system import ForceResponses
 from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.running_peaks import Peaks
@@ -65,7 +66,7 @@ class _Search:
         forced_bend = np.einsum(
             "ps,pso->po", np.abs(on_beam), responses.curvature[panels.response]
         )[self.panel]
-        self.bend = size @ (largest * np.abs(self.poles[:, None]) ** 2) + forced_bend
+        self.bend = product(size, largest * np.abs(self.poles[:, None]) ** 2) + forced_bend
         lines, self.cubic_slack = (
             2 * np.einsum("ps,pso->po", np.abs(on_beam), error[panels.response])
             for error in (responses.table_error, responses.cubic_error)
@@ -73,11 +74,11 @@ class _Search:
         self.slack = lines[self.panel]
         forced = np.stack([self._forced(share) for share in (0.0, 0.5, 1.0)])
         half = (self.length / 2)[:, None]
-        self.bound = size @ largest + np.abs(forced).max(axis=0) + forced_bend * half**2 / 8
+        self.bound = product(size, largest) + np.abs(forced).max(axis=0) + forced_bend * half**2 / 8
         self.bound += self.slack
         self.tables = np.ascontiguousarray(np.moveaxis(responses.table, 2, 0))
         self.tables = self.tables.reshape(self.C.shape[0], -1)
-        self.first = np.abs(forced[0] + (self.amplitude @ self.C.T).real)
+        self.first = np.abs(forced[0] + product(self.amplitude, self.C.T).real)
 
     def _place_forces(self):
         """Where forces are in the tables: index of the point before it at t = 0, and points/s."""
@@ -187,7 +188,8 @@ class _Search:
     def _refined(self, output, panel, start, length, amplitude):
         """Peaks, and times (s), by the polynomials through exact values at nodes of short steps."""
         since = np.array(PEAK_NODES) * length[:, None]
-        free = np.exp(since[..., None] * self.poles) @ (amplitude * self.C[output])[..., None]
+        growth = np.exp(since[..., None] * self.poles)
+        free = growth @ (amplitude * self.C[output])[..., None]
         samples = (free[..., 0].real + self._exact(output, panel, start[:, None] + since)).T
         number = self.panels.run[panel] * self.C.shape[0] + output
         order = np.lexsort((estimate_peak(samples, PEAK_NODES), number))

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 from numpy.polynomial import chebyshev
 
+from jaxbeam.integrator.forces.products import product
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.linear_outputs import LinearOutputs
 
@@ -195,7 +196,8 @@ def force_responses(system: ForceSystem, speeds: Float[np.ndarray, " speed"]) ->
     for s in range(system.nodes.size - 1):
         own = system.segment[piece] == s
         local = _local(system.nodes, s, points[own])
-        table[:, own] = chebyshev.chebvander(local, solutions.shape[2] - 1) @ on_outputs[:, s]
+        shapes = chebyshev.chebvander(local, solutions.shape[2] - 1)
+        table[:, own] = product(shapes, on_outputs[:, s])
     table += system.static_part(points, piece)
     bends, fourth = (_differences(table, piece, order) for order in (2, 4))
     distance = np.diff(system.breaks) / (count - 1)
