@@ -32,7 +32,7 @@ def test_blocks_are_read(tmp_path, text):
     path = tmp_path / "block.toml"
     path.write_text(text, encoding="utf-8")
     if "training" in content:
-        assert read_load_cases(path).held_out
+        assert read_load_cases(path).training
     elif "bodies" in content:
         assert load_vehicle(path).axles
     else:

@@ -84,7 +84,8 @@ def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
         *peak_search_points,
         rates,
     )
-    parts = [*numbers, pinned_beam.frequencies**2, discrete_models.flexibility[0]]
+    flexibility = np.sum(discrete_models.energy_bounds[0] ** 2, axis=-1)  # of all modes together
+    parts = [*numbers, pinned_beam.frequencies**2, flexibility]
     beam = np.concatenate([np.ravel(part) for part in parts])
     crossings = []
     for i, speed in enumerate(runner.batches.shared_values[:, 0]):

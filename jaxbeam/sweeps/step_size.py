@@ -161,13 +161,23 @@ def choose_step_sizes(
     sample = stratified_sample(
         crossing_rates, count * max(1, round(np.sqrt(crossing_rates.size / count) / SAMPLE_DIVISOR))
     )
+    error, fails, fastest = (
+        np.zeros(sample.size),
+        np.ones(sample.size, bool),
+        crossing_rates.argmax(),
+    )
     for _ in range(MAX_ROUNDS):
-        error = step_errors(peaks, sample, steps[sample], map_function)
-        worst = float(np.max(np.where(np.isnan(error), 0.0, error)))
-        if worst <= target_error:
-            return steps, worst
+        rows = np.where(fails, sample, fastest)  # a program has a fixed size
+        found = step_errors(peaks, rows, steps[rows], map_function)
+        error = np.where(fails, np.nan_to_num(found, posinf=np.inf), error)
+        fails = error > target_error
+        if not fails.any():
+            return steps, float(error.max())
         with np.errstate(divide="ignore"):
-            steps = steps * max(0.7, 0.95 * (target_error / worst) ** (1 / CONVERGENCE_ORDER))
+            factor = np.maximum(0.7, 0.92 * (target_error / error) ** (1 / CONVERGENCE_ORDER))
+        # Only up to the next batches of the sample, whose steps are short enough.
+        factor = np.where(fails, factor, 1.0)
+        steps = steps * _interpolate_conservatively(crossing_rates, crossing_rates[sample], factor)
     raise _no_step_error(tolerance)
 
 

@@ -54,7 +54,7 @@ def test_case_of_a_train_in_words(run, folder):
         "1/3732 of the span of 25 m",
         "critical speed: 177.7 m/s (639.8 km/h)",
         "loads.0: HSLM-A1 at 60 m/s (216 km/h), on the beam from 0 s to 7.042 s",
-        "the run ends at 16 s",
+        "the run ends at 18 s",
         "sensors: midspan (deflection at 12.5 m), deck (acceleration at 12.5 m)",
         "50 wheels, of which",
         "397.525",

@@ -85,6 +85,11 @@ FUNCTIONS = {
     "index_in_dim": (lambda a, i: arrays.index_in_dim(a, i, axis=1), MATRIX, 2),
     "index_in_dim, one less": (lambda i: arrays.index_in_dim(MATRIX, i, 0, keepdims=False), 1),
     "collapse": (lambda a: arrays.collapse(a, 0, 2), MATRIX.reshape(2, 2, 3)),
+    "ravel_pytree": (
+        lambda a, b: arrays.ravel_pytree({"a": a, "b": b})[1](np.arange(1.0, a.size + b.size + 1)),
+        MATRIX,
+        VECTOR,
+    ),
     "searchsorted": (lambda a, v: arrays.searchsorted(a, v), np.sort(VECTOR), VECTOR),
     "checkpoint": (
         lambda a: arrays.checkpoint(xp.sin, jax.checkpoint_policies.everything_saveable)(a),

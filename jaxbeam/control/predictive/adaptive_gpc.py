@@ -8,11 +8,11 @@ section 2.2) follow the polynomials of `gpc` from increments of readings and com
 in which a steady load is not seen. Lift and delay of the plant follow from the polynomials.
 """
 
+import functools
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
-import scipy.signal
 from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractSampledLaw, ControlStep
@@ -177,7 +177,8 @@ class AdaptiveGPCLaw(AbstractSampledLaw):
         powers = gains.command_gains.shape[0]
         wanted = wanted - xp.einsum("pab,pb->a", gains.command_gains, commands[:powers])
         if self.probes:
-            wanted = xp.where(t < self.until, self.probe * take(PROBE, sample % len(PROBE)), wanted)
+            signs = probe_signs()
+            wanted = xp.where(t < self.until, self.probe * take(signs, sample % len(signs)), wanted)
         return ControlStep(wanted, state)
 
     def identified(
@@ -222,4 +223,9 @@ def lift_and_delay(
     return B / A, of_numerators - powers @ model.denominator / A
 
 
-PROBE = 2.0 * scipy.signal.max_len_seq(PROBE_BITS)[0] - 1.0
+@functools.cache
+def probe_signs() -> Float[np.ndarray, " sample"]:
+    """Signs of the probing sequence: a maximum-length one, whose spectrum is white."""
+    from scipy.signal import max_len_seq  # half a second, and most cases do not probe
+
+    return 2.0 * max_len_seq(PROBE_BITS)[0] - 1.0
