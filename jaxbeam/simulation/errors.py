@@ -42,13 +42,24 @@ def step_errors(case: Case, model: ModalModel, trial: StepTrial) -> Float[Array,
     errors = []
     for sensor in case.sensors:
         known, better = (sensor_history(case, model.modes, m, sensor) for m in (coarse, fine))
-        errors.append(_relative(better - known, better))
+        errors.append(_ratio(xp.max(xp.abs(better - known)), xp.max(xp.abs(better))))
     return xp.array(errors).reshape(-1)
 
 
 @np.errstate(all="ignore")  # of extreme numbers
 def truncation_errors(case: Case, modes: Modes, motion: Motion) -> Float[Array, " sensor"]:
     """Estimated truncation error of the quantity of each sensor, relative to its largest value.
+
+    See `truncation_changes`.
+    """
+    values = (sensor_history(case, modes, motion, sensor) for sensor in case.sensors)
+    largest = xp.array([xp.max(xp.abs(one)) for one in values]).reshape(-1)
+    return _ratio(truncation_changes(case, modes, motion), largest)
+
+
+@np.errstate(all="ignore")  # of extreme numbers
+def truncation_changes(case: Case, modes: Modes, motion: Motion) -> Float[Array, " sensor"]:
+    """Estimated truncation error of the quantity of each sensor, in its unit.
 
     From the samples of a run. Of a deflection or rotation, the largest part that the static
     correction would add. Of others, the largest part of the three highest modes, which exceeds that
@@ -57,21 +68,21 @@ def truncation_errors(case: Case, modes: Modes, motion: Motion) -> Float[Array, 
     and their modes are a convention. NaN for those of a case with one mode, and for slopes of a
     beam that is not uniform.
     """
-    errors = []
+    changes = []
     for sensor in case.sensors:
-        full = sensor_history(case, modes, motion, sensor)
         quantity = QUANTITIES[sensor.quantity]
         if quantity.of_axis and not is_uniform(case):
-            change = full * xp.nan
+            change = xp.nan
         elif quantity.time_derivative == 0 and not quantity.bends:
             order = quantity.x_derivative
-            change = corrected_history(case, modes, motion, sensor.position, order) - full
+            change = corrected_history(case, modes, motion, sensor.position, order)
+            change = change - sensor_history(case, modes, motion, sensor)
         elif case.beam.modes == 1:
-            change = full * xp.nan
+            change = xp.nan
         else:
             change = _highest_modes(case, modes, motion, sensor)
-        errors.append(_relative(change, full))
-    return xp.array(errors).reshape(-1)
+        changes.append(xp.max(xp.abs(change)))
+    return xp.array(changes).reshape(-1)
 
 
 def _highest_modes(
@@ -91,7 +102,6 @@ def _highest_modes(
     return amplitudes[quantity.time_derivative] @ row[highest]
 
 
-def _relative(change, values):
-    """Largest change relative to the largest of some values; zero where all are zero."""
-    largest, change = xp.max(xp.abs(values)), xp.max(xp.abs(change))
+def _ratio(change, largest):
+    """Change relative to the largest value; zero where that is."""
     return xp.where(largest == 0, 0.0, change / xp.where(largest == 0, 1.0, largest))

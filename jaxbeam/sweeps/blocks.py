@@ -172,8 +172,10 @@ class Runner:
         count = _round_up(MIN_TRIAL_BATCHES, self.trial_batches)
 
         def peaks(batch_indices, steps, extra_steps=0, single=False):
-            calls = batch_indices.size // self.trial_batches
-            parts = zip(np.split(batch_indices, calls), np.split(steps, calls), strict=True)
+            calls = -(-batch_indices.size // self.trial_batches)
+            parts = zip(
+                *(np.array_split(part, calls) for part in (batch_indices, steps)), strict=True
+            )
             settings = None, single, extra_steps, False
             results = [self._integrate(*part, *settings) for part in parts]
             found = [one["peak_deflection"] for one in results]

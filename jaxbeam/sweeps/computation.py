@@ -20,7 +20,7 @@ from jaxbeam.sweeps.block_store import BlockStore, MemoryStore
 from jaxbeam.sweeps.blocks import Runner
 from jaxbeam.sweeps.force_runner import ForceRunner
 from jaxbeam.sweeps.specification import SweepSpecification
-from jaxbeam.sweeps.truncation import estimated_errors, is_corrected
+from jaxbeam.sweeps.truncation import WorstRun, estimated_errors, is_corrected
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -168,14 +168,17 @@ def _to_dataset(
     return xarray.Dataset(variables, coordinates, attributes)
 
 
-def worst_runs(specification: SweepSpecification, dataset) -> dict[str, dict[str, float]]:
-    """Numbers of the run with the largest peak of each quantity; none where all runs failed."""
+def worst_runs(specification: SweepSpecification, dataset) -> dict[str, WorstRun]:
+    """Run with the largest peak of each quantity; none where all runs failed."""
     runs, worst = specification.runs(), {}
-    for quantity in {sensor.quantity for sensor in specification.case.sensors}:
-        peaks = dataset[f"peak_{quantity}"].values.reshape(len(runs), -1)
-        if np.isfinite(peaks).any():
-            row = runs[np.nanargmax(peaks) // peaks.shape[1]]
-            worst[quantity] = dict(zip(specification.axes, map(float, row), strict=True))
+    quantities = [sensor.quantity for sensor in specification.case.sensors]
+    peaks = {q: dataset[f"peak_{q}"].values.reshape(len(runs), -1) for q in set(quantities)}
+    for quantity, values in peaks.items():
+        if np.isfinite(values).any():
+            row = np.nanargmax(values) // values.shape[1]
+            numbers = dict(zip(specification.axes, map(float, runs[row]), strict=True))
+            of_sensors = [peaks[name][row, i] for i, name in enumerate(quantities)]
+            worst[quantity] = WorstRun(numbers, np.array(of_sensors, float))
     return worst
 
 

@@ -139,9 +139,9 @@ def choose_step_sizes(
 ) -> tuple[Float[np.ndarray, " path"], float]:
     """Longest steps (s) of all batches for a tolerance, and the largest error of the sample.
 
-    `peaks` is called, through `map_function`, with indices of batches, a multiple of `count`. The
-    search over `crossing_rates` (1/s) starts from `initial_steps` (s) and is limited by `max_steps`
-    (s). Raises RuntimeError if no step meets the tolerance.
+    `peaks` is called, through `map_function`, with indices of batches. The search over
+    `crossing_rates` (1/s) starts from `initial_steps` (s) and is limited by `max_steps` (s). Raises
+    RuntimeError if no step meets the tolerance.
     """
     target_error = tolerance / SAFETY_FACTOR
     chosen = log_spaced_sample(crossing_rates, count)
@@ -161,23 +161,20 @@ def choose_step_sizes(
     sample = stratified_sample(
         crossing_rates, count * max(1, round(np.sqrt(crossing_rates.size / count) / SAMPLE_DIVISOR))
     )
-    error, fails, fastest = (
-        np.zeros(sample.size),
-        np.ones(sample.size, bool),
-        crossing_rates.argmax(),
-    )
+    error, fails = np.full(sample.size, np.nan), np.ones(sample.size, bool)
     for _ in range(MAX_ROUNDS):
-        rows = np.where(fails, sample, fastest)  # a program has a fixed size
-        found = step_errors(peaks, rows, steps[rows], map_function)
-        error = np.where(fails, np.nan_to_num(found, posinf=np.inf), error)
-        fails = error > target_error
+        found = step_errors(peaks, sample[fails], steps[sample[fails]], map_function)
+        error[fails] = found
+        fails, known = error > target_error, ~np.isnan(error)  # NaN: no run succeeds
         if not fails.any():
-            return steps, float(error.max())
+            return steps, float(np.nanmax(error, initial=0.0))
         with np.errstate(divide="ignore"):
             factor = np.maximum(0.7, 0.92 * (target_error / error) ** (1 / CONVERGENCE_ORDER))
         # Only up to the next batches of the sample, whose steps are short enough.
         factor = np.where(fails, factor, 1.0)
-        steps = steps * _interpolate_conservatively(crossing_rates, crossing_rates[sample], factor)
+        steps = steps * _interpolate_conservatively(
+            crossing_rates, crossing_rates[sample[known]], factor[known]
+        )
     raise _no_step_error(tolerance)
 
 
@@ -203,10 +200,8 @@ def _search_step_sizes(
     error = np.zeros(batches.size)
     step_factor = np.ones(batches.size)
     for _ in range(0 if settled.all() else MAX_ROUNDS):
-        # The compiled program has a fixed size: the fastest batch, the cheapest, is its padding.
-        rows = np.where(settled, batches.size - 1, np.arange(batches.size))
-        measured = step_errors(peaks, batches[rows], steps[rows], map_function)
-        error = np.where(settled, error, measured)
+        left = ~settled
+        error[left] = step_errors(peaks, batches[left], steps[left], map_function)
         meets_tolerance = ~(error > tolerance)
         longest_valid = np.where(meets_tolerance, np.maximum(longest_valid, steps), longest_valid)
         shortest_invalid = np.where(

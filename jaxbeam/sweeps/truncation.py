@@ -1,7 +1,10 @@
 """What the modes that a sweep leaves out change of its peaks: warning, and estimated errors."""
 
 import warnings
+from collections.abc import Collection
+from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -15,7 +18,7 @@ from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import is_supported, residual_flexibility
 from jaxbeam.model.statics import influence_line
 from jaxbeam.runtime.arrays import Array
-from jaxbeam.simulation.errors import truncation_errors
+from jaxbeam.simulation.errors import truncation_changes
 from jaxbeam.simulation.motion.at_samples import motion_at
 from jaxbeam.simulation.motion.moving_forces import motion_of_forces
 
@@ -68,41 +71,67 @@ def static_shares(case: Case) -> dict[str, float]:
     return shares
 
 
+class WorstRun(NamedTuple):
+    """Numbers of the run with the largest peak of a quantity, and the peaks of all its sensors."""
+
+    numbers: dict[str, float]
+    peaks: Float[np.ndarray, " sensor"]
+
+
 def estimated_errors(
-    case: Case, worst: dict[str, dict[str, float]], static: dict[str, float] | None = None
+    case: Case, worst: dict[str, WorstRun], static: dict[str, float] | None = None
 ) -> dict[str, float]:
     """Truncation errors of peaks relative to the largest, by quantity, where they are known.
 
-    `worst` has the numbers of the run with the largest peak of each quantity. Of deflections and
-    rotations the error is the static one; others are estimated from that run (see
-    `Record.truncation_errors`), without a controller. `static` are the `static_shares`, if known.
+    `worst` is the run with the largest peak of each quantity. Of deflections and rotations the
+    error is the static one; others are estimated from that run (see `truncation_changes`), without
+    a controller. `static` are the `static_shares`, if known.
     """
     errors, found_before = dict(static_shares(case) if static is None else static), {}
     quantities = [sensor.quantity for sensor in case.sensors]
     if case.controller is not None:
         return errors
-    for quantity, numbers in worst.items():
+    for quantity, run in worst.items():
         if quantity in errors:
             continue
-        key = tuple(numbers.items())
+        own = np.array([one == quantity for one in quantities])
+        key = tuple(run.numbers.items())
         if key not in found_before:
-            found_before[key] = _errors_of_run(concrete_case(replace(case, numbers)))
+            found_before[key] = _changes_in_run(concrete_case(replace(case, run.numbers)), errors)
         if found_before[key] is None:
             continue
-        found = np.asarray(found_before[key])[np.array(quantities) == quantity]
+        peaks = run.peaks[own]
+        found = np.where(peaks == 0, 0.0, found_before[key][own] / np.where(peaks == 0, 1, peaks))
         if np.isfinite(found).any():
             errors[quantity] = float(np.nanmax(found))
     return errors
 
 
-def _errors_of_run(case: Case) -> Float[Array, " sensor"] | None:
-    """Truncation errors at the sensors; None where no step is found: they are not known."""
+def _changes_in_run(case: Case, known: Collection[str]) -> Float[np.ndarray, " sensor"] | None:
+    """Truncation errors at the sensors; NaN where those of its quantity are known.
+
+    None where no step is found.
+    """
+    asked = np.array([sensor.quantity not in known for sensor in case.sensors])
+    sensors = tuple(
+        sensor for sensor, is_asked in zip(case.sensors, asked, strict=True) if is_asked
+    )
+    found = _truncation_of(eqx.tree_at(lambda c: c.sensors, case, sensors))
+    if found is None:
+        return None
+    changes = np.full(asked.size, np.nan)
+    changes[asked] = found
+    return changes
+
+
+def _truncation_of(case: Case) -> Float[Array, " sensor"] | None:
+    """`truncation_changes` of a run."""
     loads, model = load_set(case), modal_model(case, mesh_layout(case), has_coupling(case))
     case = without_later_vibration(case, model)
     duration = float(case.run.duration)
     found = motion_of_forces(case, np.linspace(0.0, duration, SAMPLES))
     if found is not None:
-        return truncation_errors(case, *found)
+        return truncation_changes(case, *found)
     if model.modes.has_repeated:
         model = modal_model(case, model.modes.layout)
     # The longest stable step: an estimate needs no search for the step of an error.
@@ -114,4 +143,4 @@ def _errors_of_run(case: Case) -> Float[Array, " sensor"] | None:
     most = max_concurrent_loads(np.asarray(loads.entry_exit_times()))
     times, states = trial_run(case, model, loads, most, step)
     motion, _ = motion_at(case, model, loads, times, states)
-    return truncation_errors(case, model.modes, motion)
+    return truncation_changes(case, model.modes, motion)

@@ -93,10 +93,11 @@ def test_stated_truncation_is_that_of_a_run_with_short_steps():
     step = min(float(case.run.duration) / SAMPLES, longest)
     times = np.unique(trial_run(case, model, loads, 2, step)[0])
     assert times.size <= MAX_SAMPLES
-    expected = jb.simulate(case, times, tolerance=1e-8).truncation_errors
+    record = jb.simulate(case, times, tolerance=1e-8)
+    changes = record.truncation_errors * np.abs(record.sensor_values).max(axis=0)
     for i, name in enumerate(("moment", "acceleration")):
-        stated = found[f"peak_{name}"].attrs["truncation_error"]
-        assert_allclose(stated, expected[i], rtol=1e-2)
+        peaks = found[f"peak_{name}"]
+        assert_allclose(peaks.attrs["truncation_error"] * peaks[0, i], changes[i], rtol=1e-2)
 
 
 def test_peaks_under_a_slow_axle_are_the_static_ones():
