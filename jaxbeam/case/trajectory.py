@@ -6,7 +6,16 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.runtime.arrays import Array, fori_loop, set_at, stop_gradient, take, vmap, xp
+from jaxbeam.runtime.arrays import (
+    Array,
+    fori_loop,
+    is_jax,
+    set_at,
+    stop_gradient,
+    take,
+    vmap,
+    xp,
+)
 from jaxbeam.runtime.module import Module
 
 NEVER = 1e30  # s, beyond any run; finite, also in single precision, so that derivatives exist
@@ -206,7 +215,10 @@ class TabulatedTrajectory(AbstractPiecewiseTrajectory):
         return breakpoints, xp.concatenate([inner, end[None]])
 
     def kinematics(self, t):
-        breakpoints, cubics = self.cubics()
+        return self._kinematics(t, *self.cubics())
+
+    def _kinematics(self, t, breakpoints, cubics):
+        """Position, speed and acceleration at t (s), from the `cubics`."""
         inside = (t >= breakpoints[0]) & (t <= breakpoints[-1])
         clipped = xp.clip(t, breakpoints[0], breakpoints[-1])
         i = xp.clip(
@@ -233,16 +245,19 @@ class TabulatedTrajectory(AbstractPiecewiseTrajectory):
         last = xp.argmax(passed)
         low, high = take(self.times, xp.maximum(last - 1, 0)), take(self.times, last)
         start_side = xp.sign(self.positions[0] - target)
+        if not is_jax(passed) and not passed.any():
+            return xp.asarray(NEVER)
+        path = self.cubics()
 
         def halve(_, bracket):
             low, high = bracket
             middle = (low + high) / 2
-            before = xp.sign(self.kinematics(middle)[0] - target) == start_side
+            before = xp.sign(self._kinematics(middle, *path)[0] - target) == start_side
             return xp.where(before, middle, low), xp.where(before, high, middle)
 
         low, high = fori_loop(0, 60, halve, stop_gradient((low, high)))
         time = (low + high) / 2
-        position, speed, _ = self.kinematics(time)
+        position, speed, _ = self._kinematics(time, *path)
         moving = xp.abs(speed) > 0
         step = xp.where(moving, (position - target) / xp.where(moving, speed, 1.0), 0.0)
         return xp.where(xp.any(passed), time - (step - stop_gradient(step)), NEVER)
