@@ -39,6 +39,7 @@ from tuning.modal.spectral.plscf_modes import plscf_modes
 from tuning.modal.stabilisation import Diagram
 
 FORCED = "measured force"
+HALF_POWER = 2.0  # dip between resonances of the band in which decays are sought again
 TRANSIENT_SHARE = 0.01  # struck samples of a log with transients of crossing loads
 
 
@@ -99,10 +100,6 @@ def identify_modes(
     choices = []
     derivatives = tuple(time_derivative(name) for name in logs[0].quantities)
     used_band = band or kinetic_band(samples.records, samples.rate, derivatives)
-    if band is None:
-        choices.append(
-            Choice(f"band {used_band[0]:.3g} Hz to {used_band[1]:.4g} Hz", "--band LOW:HIGH")
-        )
     if forces:
         driving = force_records(measured, forces, window, samples)
         if force_window is not None:
@@ -118,6 +115,7 @@ def identify_modes(
             )
         )
         _add_order(choices, order, found)
+        choices = [*_band_choice(band, used_band), *choices]
         return _result(logs, samples, found, used_band, (), choices, "plscf", count, exclude)
     if progress:
         progress("harmonic lines and excitation")
@@ -127,10 +125,15 @@ def identify_modes(
     struck = excited(samples, derivatives, used_band)
     found = None
     if kind != "ambient" and method not in SPECTRAL_METHODS:
-        found = free_decay_modes(
-            samples, struck, derivatives, used_band,
-            kind=kind, whole=window is not None, order=order,
-        )  # fmt: skip
+        how = {"kind": kind, "whole": window is not None, "order": order}
+        found = free_decay_modes(samples, struck, derivatives, used_band, **how)
+        if found is None and band is None:
+            # A decay drowns sooner in the noise of a wide band.
+            lower = kinetic_band(samples.records, samples.rate, derivatives, HALF_POWER)
+            found = free_decay_modes(
+                samples, excited(samples, derivatives, lower), derivatives, lower, **how
+            )
+            used_band = used_band if found is None else lower
     if kind == "free decay" and found is None:
         raise ValueError(f"{logs[0].source}: no free decay found; give its window, or kind ambient")
     used_method = "decay"
@@ -146,7 +149,15 @@ def identify_modes(
     if method is None:
         choices.append(Choice(f"method {used_method}", f"--method {', '.join(METHODS)}"))
     _add_order(choices, order, found)
+    choices = [*_band_choice(band, used_band), *choices]
     return _result(logs, samples, found, used_band, lines, choices, used_method, count, exclude)
+
+
+def _band_choice(band, used: tuple[float, float]) -> list[Choice]:
+    """The band that was used, if it was chosen."""
+    if band is not None:
+        return []
+    return [Choice(f"band {used[0]:.3g} Hz to {used[1]:.4g} Hz", "--band LOW:HIGH")]
 
 
 class _Found(NamedTuple):

@@ -38,10 +38,13 @@ def kinetic_band(
     records: tuple[Float[np.ndarray, "time channel"], ...],
     rate: float,
     derivatives: tuple[int, ...],
+    dip: float = RESONANCE_RATIO,
 ) -> tuple[float, float]:
     """Band (Hz) of the lowest resonances of a vibration, MAX_RESONANCES at most.
 
-    It ends earlier where they hold nearly all of its kinetic energy.
+    Two resonances are apart if the spectrum between them falls by a factor of `dip`; a small one
+    counts the ragged flanks of one resonance as several. The band ends earlier where they hold
+    nearly all of its kinetic energy.
 
     Resonances are where the spectrum exceeds its background (lower quartile over an octave) by
     8 dB; their excess is converted to velocities by `derivatives`, the order of each channel as a
@@ -68,7 +71,7 @@ def kinetic_band(
     # Chance makes the flanks of one resonance ragged, but not by as much as a peak stands out.
     level = np.log(np.max(power / _backgrounds(bins, power), axis=1))
     least = np.log(RESONANCE_RATIO)
-    tops = bins[find_peaks(level, height=least, prominence=least)[0]]
+    tops = bins[find_peaks(level, height=least, prominence=np.log(dip))[0]]
     tops = tops[tops >= low]
     if tops.size > MAX_RESONANCES:
         high = min(high, float(tops[MAX_RESONANCES - 1]))
