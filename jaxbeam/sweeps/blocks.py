@@ -173,11 +173,9 @@ class Runner:
 
         def peaks(batch_indices, steps, extra_steps=0, single=False):
             calls = -(-batch_indices.size // self.trial_batches)
-            parts = zip(
-                *(np.array_split(part, calls) for part in (batch_indices, steps)), strict=True
-            )
+            parts = np.array_split(batch_indices, calls), np.array_split(steps, calls)
             settings = None, single, extra_steps, False
-            results = [self._integrate(*part, *settings) for part in parts]
+            results = [self._integrate(*part, *settings) for part in zip(*parts, strict=True)]
             found = [one["peak_deflection"] for one in results]
             return self._compared_by_quantity(np.concatenate(found))
 
