@@ -32,7 +32,8 @@ def test_blocks_are_read(tmp_path, text):
     path = tmp_path / "block.toml"
     path.write_text(text, encoding="utf-8")
     if "training" in content:
-        assert read_load_cases(path).training
+        found = read_load_cases(path)
+        assert found.training and bool(found.held_out) == ("held_out" in content)
     elif "bodies" in content:
         assert load_vehicle(path).axles
     else:
