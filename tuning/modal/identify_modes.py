@@ -120,6 +120,11 @@ def identify_modes(
     if progress:
         progress("harmonic lines and excitation")
     lines, cleaned = _subtract_lines(samples, used_band, exclude)
+    if lines and band is None:
+        # Strong lines hold most of the kinetic energy, but resonances decide the band.
+        low, high = kinetic_band(cleaned, samples.rate, derivatives)
+        used_band = min(low, used_band[0]), max(high, used_band[1])
+        lines, cleaned = _subtract_lines(samples, used_band, exclude)
     if lines:
         choices.append(Choice(f"{len(lines)} harmonic lines subtracted", "--exclude FREQUENCY"))
     struck = excited(samples, derivatives, used_band)
