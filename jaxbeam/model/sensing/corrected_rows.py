@@ -137,13 +137,6 @@ class StaticCorrection(Module):
     rows: CorrectionRows
     influence: LoadInfluence
 
-    def scaled(self, share) -> "StaticCorrection":
-        """This share of the correction."""
-        influence = eqx.tree_at(
-            lambda one: one.series, self.influence, share * self.influence.series
-        )
-        return StaticCorrection(jax.tree.map(lambda row: share * row, self.rows), influence)
-
 
 def static_correction(
     model: ModalModel,
