@@ -20,10 +20,10 @@ from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.input_steps import advance_known_with_inputs, step_with_inputs
 from jaxbeam.integrator.kinks.steps import weights_with_impulses, with_impulses
-from jaxbeam.integrator.peaks.monitored_rows import energies
-from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
 from jaxbeam.integrator.peaks.end_forces import END_FRACTIONS, end_forces
+from jaxbeam.integrator.peaks.monitored_rows import energies
 from jaxbeam.integrator.peaks.running_peaks import RunningPeaks, initial_peaks, update_peaks
+from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
 from jaxbeam.integrator.step import (
     CHECKPOINT_NAME,
     advance_unforced,
@@ -94,9 +94,7 @@ def _of_wheels(
     return selected[:, :, None]
 
 
-def _weights(
-    loads: LoadSet, path: LoadPath, fractions
-) -> Float[Array, "step load fraction batch"]:
+def _weights(loads: LoadSet, path: LoadPath, fractions) -> Float[Array, "step load fraction batch"]:
     """Weights (N) of the wheels at fractions of the steps, with forces that vary in time."""
     weight = xp.repeat(_of_wheels(loads.weight, path), len(fractions), axis=2)
     for wheel, history in loads.wheels.histories.items():

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
 from jaxbeam.integrator import native_peaks
@@ -35,7 +34,6 @@ from jaxbeam.model.sensing.corrected_rows import (
     static_correction,
 )
 from jaxbeam.model.sensing.output_rows import OutputRows, sensor_rows
-from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,
     PARALLEL_COMPILATION,

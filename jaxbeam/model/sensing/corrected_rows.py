@@ -11,7 +11,6 @@ accelerations and commands; the residual of the loads depends on where they are.
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import chebyshev
