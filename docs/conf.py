@@ -25,6 +25,7 @@ extensions = [
     "plain_docstrings",
     "run_code",
     "svg_math",
+    "thumbnails",
 ]
 exclude_patterns = ["_ext", "_static", "figures", "_run"]
 suppress_warnings = ["myst.header", "mystnb.unknown_mime_type"]

@@ -11,7 +11,8 @@ masses and speeds.
 
 scipy is DOP853 in a loop with the tolerance at which its peaks are right to one part in a million,
 timed on some runs and scaled; for peaks it stops half a second after the exit. diffrax has all
-masses of a speed on shared steps, and is timed for peaks without a controller.
+masses of a speed on shared steps, and is timed for peaks without a controller. jaxbeam computes
+by XLA, without its C code.
 """
 
 import argparse
@@ -31,6 +32,7 @@ from experiments.benchmarks.common import (
     print_row,
     print_table,
     time_call,
+    without_native,
 )
 from experiments.benchmarks.rivals import baselines
 from experiments.benchmarks.rivals.pinned_beam import MOMENT, PATCH, SPAN, PinnedBeam
@@ -96,7 +98,8 @@ def measure(spans: int, loop: str, saved: str, modes: int, side: int) -> dict[st
 
     def by_jaxbeam():
         options = {"progress": False, "tolerance": TOLERANCE, "histories": histories}
-        return jb.sweep(case, over, **options)
+        with without_native():
+            return jb.sweep(case, over, **options)
 
     timing = time_call(by_jaxbeam, repeat=3)
     memory, results = peak_memory(), by_jaxbeam()
