@@ -10,7 +10,8 @@ from tests.modules import ROOT
 NAME = r"(?:(?:de|De|Van|Van der) )*[A-Z][a-z][\w-]+"
 # "Peeters and De Roeck 1999", "Neu et al. 2017", "Clarke, Mohtadi and Tuffs, Automatica 23, 1987".
 CITATION = re.compile(
-    rf"({NAME})(?:, {NAME})*(?:,? and {NAME}| et al\.),?(?: \(?|[^.;()|]{{0,90}}?\b)((?:19|20)\d\d)\b"
+    rf"({NAME})(?:, {NAME})*(?:,? and {NAME}| et al\.),?"
+    r"(?: \(?|[^.;()|]{0,90}?\b)((?:19|20)\d\d)\b"
 )
 PLACES = ("jaxbeam", "tuning", "docs/explanation", "docs/howto")
 
