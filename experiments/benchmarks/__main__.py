@@ -9,6 +9,7 @@ what they print is written to `docs/_static/benchmarks`, too, which the pages of
 
 import datetime
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -96,10 +97,17 @@ def main() -> None:
 
 
 def write_page(name: str, printed: str) -> None:
-    """What a benchmark printed, with number of cores and date, as a part of a page of the site."""
+    """What a benchmark printed, as a part of a page of the site, with cores, load and date.
+
+    The load is the mean number of processes that ran or waited in the last minute, the benchmark
+    included: times are good where it is not above the number of cores. How long all took is left
+    out.
+    """
     PAGES.mkdir(exist_ok=True)
-    where = f"{os.cpu_count()} cores, {datetime.date.today().isoformat()}:"
-    (PAGES / f"{name}.md").write_text(f"{where}\n\n{printed.strip()}\n", encoding="utf-8")
+    day, load = datetime.date.today().isoformat(), os.getloadavg()[0]
+    where = f"{os.cpu_count()} cores, load {load:.1f}, {day}:"
+    text = re.sub(r"^took .*$", "", printed, flags=re.M).strip()
+    (PAGES / f"{name}.md").write_text(f"{where}\n\n{text}\n", encoding="utf-8")
 
 
 def _current_name(name: str) -> str:

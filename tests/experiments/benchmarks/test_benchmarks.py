@@ -158,6 +158,6 @@ def test_a_profile_divides_the_time_between_stages():
 
 def test_what_is_printed_is_written_for_the_pages(tmp_path, monkeypatch):
     monkeypatch.setattr(__main__, "PAGES", tmp_path)
-    __main__.write_page("sweep", "| a |\n| --- |\n")
+    __main__.write_page("sweep", "| a |\n| --- |\n\ntook 2 s in all\n")
     written = (tmp_path / "sweep.md").read_text(encoding="utf-8")
-    assert re.fullmatch(r"\d+ cores, \d{4}-\d\d-\d\d:\n\n\| a \|\n\| --- \|\n", written)
+    assert re.fullmatch(r"\d+ cores, load [\d.]+, [\d-]{10}:\n\n\| a \|\n\| --- \|\n", written)
