@@ -1,4 +1,4 @@
-"""The tables of the page on results are those of the report; README has their headline."""
+"""The tables of the page on results are those of the report."""
 
 import pytest
 
