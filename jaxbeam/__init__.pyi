@@ -22,6 +22,7 @@ from .analysis.sections.amplification import (
 from .analysis.sections.characteristic_points import characteristic_points as characteristic_points
 from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
 from .case.actuators.hysteresis import Hysteresis as Hysteresis
+from .case.actuators.inner_loops import CurrentLoop as CurrentLoop, ForceLoop as ForceLoop
 from .case.actuators.patch import Patch as Patch
 from .case.actuators.point import PointForce as PointForce
 from .case.actuators.shaker import Shaker as Shaker
