@@ -20,6 +20,7 @@ from .analysis.sections.amplification import (
     envelope as envelope,
 )
 from .analysis.sections.characteristic_points import characteristic_points as characteristic_points
+from .case.actuators.creep import Creep as Creep
 from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
 from .case.actuators.hysteresis import Hysteresis as Hysteresis
 from .case.actuators.inner_loops import CurrentLoop as CurrentLoop, ForceLoop as ForceLoop
