@@ -81,6 +81,7 @@ from .control.optimal.crossing_lqr import (
     FiniteLQR as FiniteLQR,
     StepLQR as StepLQR,
 )
+from .control.optimal.h_infinity import HInfinity as HInfinity
 from .control.optimal.integral_lqr import IntegralLQR as IntegralLQR
 from .control.optimal.lqr import LQR as LQR
 from .control.optimal.position_lqr import PositionLQR as PositionLQR

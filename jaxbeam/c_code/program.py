@@ -63,10 +63,10 @@ def export_c(case: Case, name: str) -> CProgram:
         raise ValueError(f"{name!r} cannot be the name of functions in C: take letters, digits, _")
     check_case(case)
     for i, actuator in enumerate(case.actuators):
-        for name, effect in (("compensation", "hysteresis"), ("creep_compensation", "creep")):
-            if getattr(actuator, name) is not None:
+        for key, effect in (("compensation", "hysteresis"), ("creep_compensation", "creep")):
+            if getattr(actuator, key) is not None:
                 raise ValueError(
-                    f"actuators.{i}.{name} cannot be exported as C: leave it out, and apply the"
+                    f"actuators.{i}.{key} cannot be exported as C: leave it out, and apply the"
                     f" inverse of its {effect} to the commands"
                 )
     controller = case.controller

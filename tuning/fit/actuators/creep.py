@@ -49,7 +49,7 @@ def fitted_creep(
     The readings are linear in the weights of the plays for given weights of the lags, and the other
     way round; each step lowers the residual. Between samples commands go straight. They are to turn
     at several sizes from rest and to be held, or to turn slowly, for as long as creep matters; the
-    beam follows statically. `rates` (1/s) are a decade apart by default, from a tenth of the
+    beam follows statically. `rates` (1/s) are a decade apart by default, from half of the
     sampling rate down to one over the length of the log; `thresholds` as in `fitted_hysteresis`,
     [0] for a creep without hysteresis.
 
@@ -74,7 +74,7 @@ def fitted_creep(
     times, commands, readings = channel_pair(log, command, reading)
     thresholds = checked_thresholds(thresholds, commands)
     if rates is None:
-        slowest, fastest = 1 / np.ptp(times), 0.1 / np.median(np.diff(times))
+        slowest, fastest = 1 / np.ptp(times), 0.5 / np.median(np.diff(times))
         decades = max(1, round(np.log10(fastest / slowest)))
         rates = np.geomspace(fastest, slowest, decades + 1)
     rates = np.asarray(rates, float)
