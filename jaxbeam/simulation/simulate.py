@@ -352,7 +352,7 @@ def _commands_at_steps(case: Case, commands, steps):
 class Outputs(NamedTuple):
     """Motion of beam and vehicles at the samples; readings and failures of a controller, if any.
 
-    `sent` are its commands where they act through a hysteresis; the motion has those that act.
+    `sent` are its commands where they act through hysteresis or creep; those in the motion act.
     """
 
     motion: Motion
