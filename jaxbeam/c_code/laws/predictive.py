@@ -133,7 +133,7 @@ def _interior_operations(R: int, V: int) -> int:
     """Operations of a step of the interior-point method for R limits and V variables, at most."""
     newton = 4 * R * V + 3 * V * V + 16 * R + 6 * V
     factor = (3 * R + 2) * V * (V + 1) // 2 + V * V * V + 3 * V * V + 4 * R
-    return factor + 2 * newton + 10 * R * V + 48 * R + 12 * V + 32
+    return factor + 2 * newton + 10 * R * V + 58 * R + 12 * V + 32
 
 
 def _sweep_operations(R: int, V: int) -> int:

@@ -12,9 +12,10 @@ from jaxbeam.case.controller import ControlStep
 from jaxbeam.control.predictive.prediction import Prediction, SampledPlant, predict
 from jaxbeam.control.predictive.preview import Preview
 from jaxbeam.control.predictive.qp import solve_qp
+from jaxbeam.control.predictive.terminal import Terminal
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.estimation.sampled_plant import in_blocks
-from jaxbeam.runtime.arrays import Array, block_diag, set_at, solve, take, xp
+from jaxbeam.runtime.arrays import Array, add_at, block_diag, set_at, solve, take, xp
 
 
 class CommandLimits(NamedTuple):
@@ -32,6 +33,37 @@ class QuadraticProgram(NamedTuple):
     f: Float[Array, " variable"]
     M: Float[Array, "row variable"]
     gamma: Float[Array, " row"]
+
+    def within(
+        self, rows: Float[Array, "limit variable"], sides: Float[Array, " limit"]
+    ) -> "QuadraticProgram":
+        """Program with further limits on its variables, or on the first of them."""
+        rows = xp.pad(rows, ((0, 0), (0, self.f.shape[0] - rows.shape[1])))
+        return self._replace(
+            M=xp.concatenate([self.M, rows]), gamma=xp.concatenate([self.gamma, sides])
+        )
+
+    def softly_within(
+        self,
+        rows: Float[Array, "limit variable"],
+        sides: Float[Array, " limit"],
+        excess: Float[Array, "limit excess"],
+        costs: Float[Array, " excess"],
+    ) -> "QuadraticProgram":
+        """Program with limits rows x - excess e <= sides, and further variables e of cost c e^2."""
+        further = excess.shape[1]
+        rows = xp.pad(rows, ((0, 0), (0, self.f.shape[0] - rows.shape[1])))
+        return QuadraticProgram(
+            block_diag(self.H, xp.diag(2 * costs)),
+            xp.pad(self.f, (0, further)),
+            xp.concatenate(
+                [
+                    xp.pad(self.M, ((0, 0), (0, further))),
+                    xp.concatenate([rows, -excess], axis=1),
+                ]
+            ),
+            xp.concatenate([self.gamma, sides]),
+        )
 
 
 class MPCLaw(AbstractStateLaw):
@@ -55,7 +87,7 @@ class MPCLaw(AbstractStateLaw):
     soft_limit: Float[Array, " *output"] | None
     soft_weight: Float[Array, ""]
     hard_limit: Float[Array, " *output"] | None
-    terminal_cost: Float[Array, "augmented augmented"] | None
+    terminal: Terminal | None
     preview: Preview | None
     delayed: bool = eqx.field(static=True)
     known_weights: bool = eqx.field(static=True)
@@ -130,32 +162,52 @@ class MPCLaw(AbstractStateLaw):
     def quadratic_program(self, prediction: Prediction, initial, previous_command):
         """Quadratic program of a sample, in the moves, and in the excesses over soft limits.
 
+        Those over soft limits of deflections come first, then that over a soft terminal set.
+
         `initial` are the initial conditions of `Prediction`: the state, its unexplained change, the
         previous command u(k-1), and 1.
         """
         free_response = prediction.F @ initial
         weight, Phi, maps = self.output_weights, prediction.Phi, self.move_maps
-        if self.terminal_cost is not None:
+        if self.terminal is not None:
             weight = set_at(weight, -1, 0.0)  # included in P
         weighted = (weight[..., None] * Phi).reshape(-1, Phi.shape[2])
         weighted_moves = (self.move_weights[:, None] * maps).reshape(-1, maps.shape[2])
         move_cost = weighted_moves.T @ maps.reshape(-1, maps.shape[2])
         H = weighted.T @ Phi.reshape(-1, Phi.shape[2]) + move_cost
         f = weighted.T @ free_response.reshape(-1)
-        if self.terminal_cost is not None:
-            terminal_gradient = prediction.terminal_phi.T @ self.terminal_cost
-            H = H + terminal_gradient @ prediction.terminal_phi
-            f = f + terminal_gradient @ (prediction.terminal @ initial)
+        end, end_phi = None, None
+        if self.terminal is not None:
+            end_phi = self.terminal.map @ prediction.end_phi
+            end = self.terminal.map @ (prediction.end @ initial)
+            H = H + end_phi.T @ self.terminal.cost @ end_phi
+            f = f + end_phi.T @ (self.terminal.cost @ end)
         H, f, M = 2 * H, 2 * f, self.limits.rows
         gamma = self.limits.limits - self.limits.command_rows @ previous_command
+        program = QuadraticProgram(H, f, M, gamma)
         if self.solver == "unconstrained":
-            return QuadraticProgram(H, f, M[:0], gamma[:0])
+            return program._replace(M=M[:0], gamma=gamma[:0])
         if self.hard_limit is not None:
-            rows, sides = _rows_within(Phi, free_response, self.hard_limit)
-            M, gamma = xp.concatenate([M, rows]), xp.concatenate([gamma, sides])
+            program = program.within(*_rows_within(Phi, free_response, self.hard_limit))
+        terminal = self.terminal
+        limited = terminal is not None and terminal.rows.shape[0] > 0
+        if limited and terminal.weight is None:
+            program = program.within(terminal.rows @ end_phi, 1 - terminal.rows @ end)
         if self.soft_limit is not None:
-            return self._with_soft_limits(H, f, M, gamma, Phi, free_response)
-        return QuadraticProgram(H, f, M, gamma)
+            rows, sides = _rows_within(Phi, free_response, self.soft_limit)
+            horizon, outputs, _ = Phi.shape
+            excess = xp.tile(xp.eye(outputs), (2 * horizon, 1))
+            costs = xp.full(outputs, self.soft_weight)
+            program = program.softly_within(rows, sides, excess, costs)
+        if limited and terminal.weight is not None:
+            rows, sides = terminal.rows @ end_phi, 1 - terminal.rows @ end
+            weight, excess = terminal.weight[None], xp.ones((rows.shape[0], 1))
+            program = program.softly_within(rows, sides, excess, weight)
+            # The linear cost is one of the initial condition 1, of which the program is linear.
+            program = program._replace(
+                f=add_at(program.f, -1, terminal.weight * initial[-1])
+            ).within(xp.eye(1, program.f.shape[0], k=program.f.shape[0] - 1) * -1, xp.zeros(1))
+        return program
 
     def _first_move(self, prediction, initial, previous_command):
         """First move of the solution, and whether there is one."""
@@ -165,16 +217,6 @@ class MPCLaw(AbstractStateLaw):
             return maps[0] @ -solve(program.H, program.f), xp.ones((), bool)
         solution = solve_qp(*program, self.solver)
         return maps[0] @ solution.x[: maps.shape[2]], solution.solved
-
-    def _with_soft_limits(self, H, f, M, gamma, Phi, free_response):
-        """Program with the excess over the soft limit of each output as a further variable."""
-        horizon, outputs, _ = Phi.shape
-        H = block_diag(H, 2 * self.soft_weight * xp.eye(outputs))
-        excess = xp.tile(xp.eye(outputs), (2 * horizon, 1))
-        rows, sides = _rows_within(Phi, free_response, self.soft_limit)
-        M = xp.block([[M, xp.zeros((M.shape[0], outputs))], [rows, -excess]])
-        gamma = xp.concatenate([gamma, sides])
-        return QuadraticProgram(H, xp.pad(f, (0, outputs)), M, gamma)
 
 
 def _rows_within(Phi, free_response, limit):
