@@ -89,6 +89,7 @@ from .control.output_feedback import OutputFeedback as OutputFeedback
 from .control.predictive.adaptive_gpc import AdaptiveGPC as AdaptiveGPC
 from .control.predictive.gpc import GPC as GPC
 from .control.predictive.mpc import MPC as MPC
+from .control.predictive.scenario_mpc import ScenarioMPC as ScenarioMPC
 from .control.prescribed import Prescribed as Prescribed
 from .control.receptance import (
     ReceptanceFeedback as ReceptanceFeedback,
