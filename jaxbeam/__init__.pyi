@@ -105,6 +105,7 @@ from .control.state_feedback import StateFeedback as StateFeedback
 from .estimation.extended_kalman import ExtendedKalman as ExtendedKalman
 from .estimation.inversion import Inversion as Inversion
 from .estimation.kalman import Kalman as Kalman
+from .estimation.moving_horizon.estimator import MovingHorizon as MovingHorizon
 from .estimation.observer import Observer as Observer
 from .files.case_file import load_case as load_case, save_case as save_case
 from .files.profile_file import profile_from_file as profile_from_file

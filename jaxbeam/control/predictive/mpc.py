@@ -31,7 +31,6 @@ from jaxbeam.control.predictive.prediction import (
     sampled_plant,
 )
 from jaxbeam.control.predictive.preview import preview
-from jaxbeam.control.predictive.qp import METHODS
 from jaxbeam.control.predictive.terminal import (
     TerminalRegulator,
     dual_mode_terminal,
@@ -42,6 +41,7 @@ from jaxbeam.control.predictive.terminal import (
 )
 from jaxbeam.control.state_controller import AbstractStateController, deflection_rows
 from jaxbeam.model.state_space import Plant
+from jaxbeam.numerics.optimisation.qp import METHODS
 from jaxbeam.runtime.arrays import Array, xp
 
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from jaxtyping import Bool, Float
 
-from jaxbeam.control.predictive.qp import solve_qp
+from jaxbeam.numerics.optimisation.qp import solve_qp
 from jaxbeam.runtime.arrays import Array, block_diag, solve, xp
 
 
