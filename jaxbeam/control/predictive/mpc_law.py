@@ -27,6 +27,9 @@ class CommandLimits(NamedTuple):
     command_rows: Float[Array, "row actuator"]
 
 
+QuadraticCost = tuple[Float[Array, "variable variable"], Float[Array, " variable"]]
+
+
 class MPCLaw(AbstractStateLaw):
     """Predictive law of a design plant; its state is the state of the plant at the last sample.
 
@@ -139,12 +142,13 @@ class MPCLaw(AbstractStateLaw):
         `initial` are the initial conditions of `Prediction`: the state, its unexplained change, the
         previous command u(k-1), and 1.
         """
-        program = self.of_moves(*self.merit(prediction, initial), previous_command)
+        H, f = self.merit(prediction, initial)
+        program = self.of_moves(H, f, previous_command)
         if self.solver == "unconstrained":
             return program._replace(M=program.M[:0], gamma=program.gamma[:0])
         return self.limited(program, prediction, initial)
 
-    def merit(self, prediction: Prediction, initial) -> tuple[Float[Array, "..."], ...]:
+    def merit(self, prediction: Prediction, initial) -> QuadraticCost:
         """H and f of the cost of the moves, x'H x + 2 f'x."""
         free_response, weight, Phi = prediction.F @ initial, self.output_weights, prediction.Phi
         if self.terminal is not None:
