@@ -68,9 +68,10 @@ def identify_modes(
     decomposition) or "plscf" (poly-reference least-squares complex frequency), of which the last
     two take every log for a response to broadband excitation; `force` are the names of the channels
     of forces that were measured, of a hammer or shaker, by default all in N: method "plscf", then
-    the default, fits the responses to them. `force_window` (s) is the time after each blow of a
-    hammer from which on the force is taken for zero. `exclude` are frequencies (Hz) that are no
-    modes. `progress` is called with a few words on what is being done.
+    the default, fits the responses to them; a force that one of several logs lacks, as of a hammer
+    that strikes another place in each, is zero there. `force_window` (s) is the time after each
+    blow of a hammer from which on the force is taken for zero. `exclude` are frequencies (Hz) that
+    are no modes. `progress` is called with a few words on what is being done.
 
     Raises ValueError for a log without evenly sampled records, or too short, a window outside the
     log, a band above half the sampling rate, an impossible count or order, unknown channels, kinds
@@ -91,7 +92,7 @@ def identify_modes(
     check_arguments(count, kind, order, method)
     check_force(force, force_window, kind, method)
     measured = logs
-    forces = () if kind or method not in (None, "plscf") else force_names(logs[0], force)
+    forces = () if kind or method not in (None, "plscf") else force_names(logs, force)
     logs = [without_forces(with_channels(one, channels)) for one in logs]
     if not forces and force_window is not None:
         raise ValueError(f"{logs[0].source}: a force window is for measured forces; none is in N")
