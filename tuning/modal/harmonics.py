@@ -23,6 +23,7 @@ RATIO_SD, STEADY_SDS = 0.23, 4.0  # deviation of its estimate from one value, an
 STEADY_RATIO = 0.35  # of the envelope of a line in noise of a tenth of its power
 HALF_POWER_WIDTHS = 4.0  # half width of the filter around a pole
 MAX_LINES = 30
+MIN_SERIES = 3  # lines that are multiples of one frequency
 
 
 class Line(NamedTuple):
@@ -75,6 +76,28 @@ def harmonic_lines(
     shares = [share_of(record, rate, f) for f in lines]
     ranked = sorted(zip(shares, lines, strict=True), reverse=True)[:MAX_LINES]
     return tuple(sorted(Line(f, share) for share, f in ranked))
+
+
+def fundamental(lines: tuple[Line, ...], rate: float, count: int) -> float | None:
+    """Frequency (Hz) of which most lines of a record of `count` samples are multiples, or None.
+
+    They are at least three, and within half of the resolution of the record.
+    """
+    frequencies = np.array([line.frequency for line in lines])
+    for first in frequencies:
+        multiples = np.round(frequencies / first)
+        near = np.abs(frequencies - multiples * first) < multiples * 0.5 * rate / count
+        if first > 2 * rate / count and near.sum() >= max(MIN_SERIES, 0.5 * len(lines)):
+            weights = multiples[near]
+            return float(weights @ frequencies[near] / (weights @ weights))
+    return None
+
+
+def is_multiple(frequency: float, tolerance: float, speed: float | None) -> bool:
+    """Whether a frequency (Hz) is that of a higher harmonic of a speed (Hz), if there is one."""
+    if speed is None:
+        return False
+    return abs(frequency - max(round(frequency / speed), 1) * speed) < tolerance
 
 
 def share_of(record: Float[np.ndarray, "time channel"], rate: float, frequency: float) -> float:

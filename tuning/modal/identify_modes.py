@@ -31,7 +31,14 @@ from tuning.modal.fit import Choice, ModalFit
 from tuning.modal.forced.blows import force_at_blows
 from tuning.modal.forced.forces import force_names, force_records, without_forces
 from tuning.modal.forced.modes import forced_modes
-from tuning.modal.harmonics import Line, harmonic_lines, is_steady, without_lines
+from tuning.modal.harmonics import (
+    Line,
+    fundamental,
+    harmonic_lines,
+    is_multiple,
+    is_steady,
+    without_lines,
+)
 from tuning.modal.preprocessing import kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels
 from tuning.modal.spectral.efdd_modes import SingularValues, efdd_modes
@@ -40,6 +47,7 @@ from tuning.modal.stabilisation import Diagram
 
 FORCED = "measured force"
 HALF_POWER = 2.0  # dip between resonances of the band in which decays are sought again
+NARROW = 0.005  # damping ratio of a mode below which it may be a harmonic
 TRANSIENT_SHARE = 0.01  # struck samples of a log with transients of crossing loads
 
 
@@ -240,7 +248,9 @@ def _wandering_lines(candidates, cleaned, samples, band) -> tuple[Line, ...]:
 
 def _result(logs, samples, found: _Found, band, lines, choices, method, count, exclude):
     """The fit: candidates divided into modes and rejected ones."""
-    resolution = samples.rate / max(len(record) for record in samples.records)
+    longest = max(len(record) for record in samples.records)
+    resolution = samples.rate / longest
+    speed = fundamental(lines, samples.rate, longest) if found.decays is None else None
     modes, rejected = [], []
     for candidate in found.candidates:
         mode, reason = candidate.mode, candidate.reason
@@ -250,6 +260,10 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, count, e
             reason = f"excluded, {near[0]:g} Hz"
         elif hit and found.decays is None and mode.damping_ratio < 0.002:
             reason = f"a harmonic line, {hit[0].frequency:.3f} Hz"
+        elif mode.damping_ratio < NARROW and is_multiple(
+            mode.frequency, max(0.5 * resolution, 2 * mode.frequency_sd), speed
+        ):
+            reason = f"narrow, and a multiple of the lines' {speed:.3f} Hz"
         elif any(one.pole == mode.pole for one in lines):
             reason = "of steady amplitude: a harmonic line that wanders"
         (rejected if reason else modes).append((mode, reason))

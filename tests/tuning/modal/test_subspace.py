@@ -9,7 +9,7 @@ from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import Structure, random_structure, sampled
 from tuning import identify_modes
 from tuning.modal.ambient import Candidate, without_duplicates
-from tuning.modal.harmonics import harmonic_lines, is_steady, without_lines
+from tuning.modal.harmonics import Line, fundamental, harmonic_lines, is_steady, without_lines
 from tuning.modal.result import IdentifiedMode
 from tuning.modal.shapes import mac_matrix, normalised, phase_collinearity
 from tuning.modal.subspace import decompose, poles_of_order, spreads
@@ -122,6 +122,14 @@ def test_a_line_is_found_and_subtracted():
     rest = without_lines(noise + line, 100.0, (found.frequency,))
     np.testing.assert_allclose(rest, noise, atol=0.15)
     assert harmonic_lines(noise, 100.0, (1.0, 40.0)) == ()
+
+
+def test_the_fundamental_of_harmonics():
+    """Lines of a shaker at multiples of 4.646 Hz, one missing, and one line of another machine."""
+    lines = tuple(Line(f, 0.1) for f in (4.64, 9.515, 13.93, 18.581, 23.232))
+    assert fundamental(lines, 100.0, 2000) == pytest.approx(4.646, abs=0.002)
+    assert fundamental(lines[:2], 100.0, 2000) is None
+    assert fundamental((Line(3.1, 0.2), Line(7.7, 0.1), Line(11.2, 0.1)), 100.0, 2000) is None
 
 
 def test_complexity_and_normalisation_of_shapes():
