@@ -6,12 +6,17 @@ must have the same amplitude and phase throughout the record, which a resonance 
 decay of a lightly damped mode.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.signal.windows import dpss
 from scipy.stats import f as f_distribution
+
+from tuning.modal.ambient import Candidate
+from tuning.modal.preprocessing import prepare
+from tuning.modal.samples import Samples
 
 TAPERS, TIME_BANDWIDTH = 7, 4.0
 FALSE_ALARM_PROBABILITY = 1e-3  # of a line in noise, in a whole spectrum
@@ -184,3 +189,32 @@ def without_lines(
     phases = 2 * np.pi * np.multiply.outer(np.arange(len(record)) / rate, frequencies)
     basis = np.concatenate([np.cos(phases), np.sin(phases)], axis=1)
     return record - basis @ np.linalg.lstsq(basis, record, rcond=None)[0]
+
+
+def subtract_lines(
+    samples: Samples, band: tuple[float, float], exclude: Sequence[float]
+) -> tuple[tuple[Line, ...], tuple[Float[np.ndarray, "_ channel"], ...]]:
+    """Harmonic lines in a band (Hz), and the records without them and excluded frequencies (Hz)."""
+    prepared = prepare(samples.records, samples.starts, samples.rate, band)
+    longest = max(range(len(samples.records)), key=lambda i: len(samples.records[i]))
+    lines = harmonic_lines(prepared.records[longest], prepared.rate, band)
+    frequencies = tuple(line.frequency for line in lines) + tuple(exclude)
+    centred = (record - record.mean(axis=0) for record in samples.records)
+    return lines, tuple(without_lines(one, samples.rate, frequencies) for one in centred)
+
+
+def wandering_lines(
+    candidates: Sequence[Candidate],
+    cleaned: tuple[Float[np.ndarray, "_ channel"], ...],
+    samples: Samples,
+    band: tuple[float, float],
+) -> tuple[Line, ...]:
+    """Candidates of steady amplitude: lines of machines whose speed wanders."""
+    record = max(prepare(cleaned, samples.starts, samples.rate, band).records, key=len)
+    rate = samples.rate * len(record) / max(map(len, cleaned))
+    return tuple(
+        Line(c.mode.frequency, min(c.mode.energy_share, 1.0), c.mode.pole)
+        for c in candidates
+        if c.mode.damping_ratio > 0
+        and is_steady(record, rate, c.mode.frequency, c.mode.damping_ratio)
+    )

@@ -32,12 +32,10 @@ from tuning.modal.forced.blows import force_at_blows
 from tuning.modal.forced.forces import force_names, force_records, without_forces
 from tuning.modal.forced.modes import forced_modes
 from tuning.modal.harmonics import (
-    Line,
     fundamental,
-    harmonic_lines,
     is_multiple,
-    is_steady,
-    without_lines,
+    subtract_lines,
+    wandering_lines,
 )
 from tuning.modal.preprocessing import kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels
@@ -128,12 +126,12 @@ def identify_modes(
         return _result(logs, samples, found, used_band, (), choices, "plscf", count, exclude)
     if progress:
         progress("harmonic lines and excitation")
-    lines, cleaned = _subtract_lines(samples, used_band, exclude)
+    lines, cleaned = subtract_lines(samples, used_band, exclude)
     if lines and band is None:
         # Strong lines hold most of the kinetic energy, but resonances decide the band.
         low, high = kinetic_band(cleaned, samples.rate, derivatives)
         used_band = min(low, used_band[0]), max(high, used_band[1])
-        lines, cleaned = _subtract_lines(samples, used_band, exclude)
+        lines, cleaned = subtract_lines(samples, used_band, exclude)
     if lines:
         choices.append(Choice(f"{len(lines)} harmonic lines subtracted", "--exclude FREQUENCY"))
     struck = excited(samples, derivatives, used_band)
@@ -154,7 +152,7 @@ def identify_modes(
     if found is None:
         used_method = method or "covariance"
         found = _ambient_modes(cleaned, samples, used_band, used_method, order, progress)
-        lines += _wandering_lines(found.candidates, cleaned, samples, used_band)
+        lines += wandering_lines(found.candidates, cleaned, samples, used_band)
     else:
         found = _Found(*found)
     if kind is None:
@@ -222,28 +220,6 @@ def _kind_words(found: _Found, struck, lines) -> str:
     if np.mean(np.concatenate(struck)) > TRANSIENT_SHARE:
         return "excitation: transients (crossing loads or blows) without a clear free decay"
     return "excitation: ambient"
-
-
-def _subtract_lines(samples: Samples, band, exclude):
-    """Harmonic lines, and the records without them and without excluded frequencies."""
-    prepared = prepare(samples.records, samples.starts, samples.rate, band)
-    longest = max(range(len(samples.records)), key=lambda i: len(samples.records[i]))
-    lines = harmonic_lines(prepared.records[longest], prepared.rate, band)
-    frequencies = tuple(line.frequency for line in lines) + tuple(exclude)
-    centred = (record - record.mean(axis=0) for record in samples.records)
-    return lines, tuple(without_lines(one, samples.rate, frequencies) for one in centred)
-
-
-def _wandering_lines(candidates, cleaned, samples, band) -> tuple[Line, ...]:
-    """Candidates of steady amplitude: lines of machines whose speed wanders."""
-    record = max(prepare(cleaned, samples.starts, samples.rate, band).records, key=len)
-    rate = samples.rate * len(record) / max(map(len, cleaned))
-    return tuple(
-        Line(c.mode.frequency, min(c.mode.energy_share, 1.0), c.mode.pole)
-        for c in candidates
-        if c.mode.damping_ratio > 0
-        and is_steady(record, rate, c.mode.frequency, c.mode.damping_ratio)
-    )
 
 
 def _result(logs, samples, found: _Found, band, lines, choices, method, count, exclude):
