@@ -20,8 +20,10 @@ from .analysis.sections.amplification import (
     envelope as envelope,
 )
 from .analysis.sections.characteristic_points import characteristic_points as characteristic_points
+from .case.actuators.creep import Creep as Creep
 from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
 from .case.actuators.hysteresis import Hysteresis as Hysteresis
+from .case.actuators.inner_loops import CurrentLoop as CurrentLoop, ForceLoop as ForceLoop
 from .case.actuators.patch import Patch as Patch
 from .case.actuators.point import PointForce as PointForce
 from .case.actuators.shaker import Shaker as Shaker
@@ -79,6 +81,7 @@ from .control.optimal.crossing_lqr import (
     FiniteLQR as FiniteLQR,
     StepLQR as StepLQR,
 )
+from .control.optimal.h_infinity import HInfinity as HInfinity
 from .control.optimal.integral_lqr import IntegralLQR as IntegralLQR
 from .control.optimal.lqr import LQR as LQR
 from .control.optimal.position_lqr import PositionLQR as PositionLQR
@@ -89,6 +92,7 @@ from .control.output_feedback import OutputFeedback as OutputFeedback
 from .control.predictive.adaptive_gpc import AdaptiveGPC as AdaptiveGPC
 from .control.predictive.gpc import GPC as GPC
 from .control.predictive.mpc import MPC as MPC
+from .control.predictive.scenario_mpc import ScenarioMPC as ScenarioMPC
 from .control.prescribed import Prescribed as Prescribed
 from .control.receptance import (
     ReceptanceFeedback as ReceptanceFeedback,
@@ -104,6 +108,7 @@ from .control.state_feedback import StateFeedback as StateFeedback
 from .estimation.extended_kalman import ExtendedKalman as ExtendedKalman
 from .estimation.inversion import Inversion as Inversion
 from .estimation.kalman import Kalman as Kalman
+from .estimation.moving_horizon.estimator import MovingHorizon as MovingHorizon
 from .estimation.observer import Observer as Observer
 from .files.case_file import load_case as load_case, save_case as save_case
 from .files.profile_file import profile_from_file as profile_from_file
