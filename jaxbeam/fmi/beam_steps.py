@@ -38,7 +38,7 @@ class BeamSteps:
     >>> beam.step(0.04)
     >>> beam.step(0.01)
     >>> print(f"{beam.time:.2f} s, {1e3 * beam.readings[0]:.3f} mm")
-    0.05 s, -0.716 mm
+    0.05 s, -1.467 mm
     """
 
     def __init__(self, case: Case):
