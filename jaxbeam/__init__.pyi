@@ -92,6 +92,7 @@ from .control.output_feedback import OutputFeedback as OutputFeedback
 from .control.predictive.adaptive_gpc import AdaptiveGPC as AdaptiveGPC
 from .control.predictive.gpc import GPC as GPC
 from .control.predictive.mpc import MPC as MPC
+from .control.predictive.scenario_mpc import ScenarioMPC as ScenarioMPC
 from .control.prescribed import Prescribed as Prescribed
 from .control.receptance import (
     ReceptanceFeedback as ReceptanceFeedback,
@@ -107,6 +108,7 @@ from .control.state_feedback import StateFeedback as StateFeedback
 from .estimation.extended_kalman import ExtendedKalman as ExtendedKalman
 from .estimation.inversion import Inversion as Inversion
 from .estimation.kalman import Kalman as Kalman
+from .estimation.moving_horizon.estimator import MovingHorizon as MovingHorizon
 from .estimation.observer import Observer as Observer
 from .files.case_file import load_case as load_case, save_case as save_case
 from .files.profile_file import profile_from_file as profile_from_file

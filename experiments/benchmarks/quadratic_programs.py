@@ -37,8 +37,8 @@ from experiments.benchmarks.common import (
 )
 from experiments.benchmarks.controller_steps import PREDICTIVE, patch_case
 from jaxbeam.control.optimal.sampling_loss import SamplingWarning
-from jaxbeam.control.predictive.qp import solve_qp
 from jaxbeam.model.state_space import state_space
+from jaxbeam.numerics.optimisation.qp import solve_qp
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.simulate import ContactLossWarning
 

@@ -114,11 +114,21 @@ class AbstractStateController(AbstractController):
                 lambda leaf: xp.asarray(concrete(leaf)),
                 (dataclasses.replace(self, nominal_plant=None), case),
             )
-            system = _unloaded_design_plant(controller, concrete_case, mesh_layout(concrete_case))
+            design_plant = _design_plant(controller, concrete_case, mesh_layout(concrete_case))
+            system = design_plant.unloaded
             if self.period is not None:
                 self.warn(system, case)
             error = None if self.estimator is None else self.estimator.validate(case, system)
+            if error is None:
+                return controller.design_error(design_plant)
         return None if error is None else f"estimator.{error}"
+
+    def design_error(self, design_plant: Plant) -> str | None:
+        """Error of these settings for a design plant of known numbers, as "key must ...", or None.
+
+        The numbers of these settings are known, too.
+        """
+        return None
 
     def warn(self, system: StateSpace, case: Case) -> None:
         """Warn of doubtful settings for the design plant without loads, before a sampled run."""
@@ -137,9 +147,9 @@ class AbstractStateController(AbstractController):
 
 
 @compiled_if_traced
-def _unloaded_design_plant(controller: AbstractStateController, case, layout) -> StateSpace:
-    """Design plant without loads."""
-    return controller.design_plant(state_space(case, layout=layout)).unloaded
+def _design_plant(controller: AbstractStateController, case, layout) -> Plant:
+    """Design plant of a case."""
+    return controller.design_plant(state_space(case, layout=layout))
 
 
 def _design_state_map(plant: Plant, design_plant: Plant) -> Float[Array, "design_state state"]:

@@ -6,15 +6,13 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.estimator import AbstractEstimator
 from jaxbeam.case.fields import POSITIVE, choice, concrete, count, number
 from jaxbeam.estimation.constant_gain import ConstantGainFilter, sensor_offsets
 from jaxbeam.estimation.continuous import ContinuousCrossingFilter, TimeInvariantFilter
 from jaxbeam.estimation.crossing_filter import CrossingFilter
 from jaxbeam.estimation.gains import kalman_gain, sampled_kalman_gain
 from jaxbeam.estimation.kalman_noise import (
-    delay_error,
-    missing_noise_error,
+    AbstractKalmanEstimator,
     modal_noise_intensity,
     reading_variance,
 )
@@ -30,7 +28,7 @@ MAX_PHASE_PER_INTERVAL = 3.0  # rad, phase advance of the fastest mode in an int
 Square = Float[Array, "state state"]
 
 
-class Kalman(AbstractEstimator):
+class Kalman(AbstractKalmanEstimator):
     """Kalman filter: the estimate of least variance if noise and plant are as stated.
 
     White forces of intensity `process_noise` act on the (mass-normalised) modes; each reading has
@@ -72,22 +70,12 @@ class Kalman(AbstractEstimator):
     kind: ClassVar[str] = "kalman"
     continuous_time: ClassVar[bool] = True
 
-    process_noise: Float[Array, " *mode"] = number(
-        "N^2 s/kg", "intensity of the white force on each mode", POSITIVE
-    )
-    measurement_noise: Float[Array, " *sensor"] | None = number(
-        "unit of quantity",
-        "standard deviation of readings; that of the sensors if left out",
-        POSITIVE,
-        default=None,
-    )
     loads: str = choice(
         "loads in the model of the filter", "ignored", "known", "estimated", default="ignored"
     )
     weight_deviation: Float[Array, " *load"] | None = number(
         "N", "standard deviation of the weights of the design", POSITIVE, default=None
     )
-    max_delay_periods: int = count("largest delay of a sensor, in periods, rounded up", default=1)
     measurement_intensity: Float[Array, " *sensor"] | None = number(
         "unit of quantity^2 s", "intensity of the noise of readings", POSITIVE, default=None
     )
@@ -192,8 +180,7 @@ class Kalman(AbstractEstimator):
         if period is None and self.measurement_noise is not None:
             return "measurement_noise is that of samples; without a period leave it out"
         if period is not None:
-            missing = missing_noise_error(case) if self.measurement_noise is None else None
-            error = missing or delay_error(case, self.max_delay_periods)
+            error = self.sampled_noise_error(case)
             if error is not None:
                 return error
         if self.loads != "ignored" and not case.loads:
@@ -204,12 +191,9 @@ class Kalman(AbstractEstimator):
         sizes["measurement_intensity"] = len(case.sensors)
         if system is not None:
             sizes["process_noise"] = mode_count(system)
-        for name, size in sizes.items():
-            value = getattr(self, name)
-            if value is not None and value.shape not in ((), (size,)):
-                return f"{name} must be one number or {size}, not {value.shape[0]}"
-        if system is None:
-            return None
+        error = self.size_error(sizes)
+        if error is not None or system is None:
+            return error
         return detectability_error(system) or self._interval_error(case, system)
 
     def _interval_error(self, case, system) -> str | None:

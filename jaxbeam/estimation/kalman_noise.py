@@ -1,14 +1,45 @@
-"""Noise of the plant and of the readings in Kalman filters, and the checks of its settings."""
+"""Noise of the plant and of the readings in Kalman filters: settings, and their checks."""
 
 import math
 
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.estimator import AbstractEstimator
+from jaxbeam.case.fields import POSITIVE, concrete, count, is_concrete, number
 from jaxbeam.estimation.sampled_plant import PERIOD_ROUNDING
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, xp
+
+
+class AbstractKalmanEstimator(AbstractEstimator):
+    """Settings that Kalman filters share: noise of plant and readings, and delays of sensors."""
+
+    process_noise: Float[Array, " *mode"] = number(
+        "N^2 s/kg", "intensity of the white force on each mode", POSITIVE
+    )
+    measurement_noise: Float[Array, " *sensor"] | None = number(
+        "unit of quantity",
+        "standard deviation of readings; that of the sensors if left out",
+        POSITIVE,
+        default=None,
+    )
+    max_delay_periods: int = count(
+        "largest delay of a sensor, in periods, rounded up", default=1, kw_only=True
+    )
+
+    def sampled_noise_error(self, case: Case) -> str | None:
+        """Error of noise and delays of readings at samples, or None."""
+        missing = missing_noise_error(case) if self.measurement_noise is None else None
+        return missing or delay_error(case, self.max_delay_periods)
+
+    def size_error(self, sizes: dict[str, int]) -> str | None:
+        """Error of a setting that has neither one entry nor as many as its size, or None."""
+        for name, size in sizes.items():
+            value = getattr(self, name)
+            if value is not None and value.shape not in ((), (size,)):
+                return f"{name} must be one number or {size}, not {value.shape[0]}"
+        return None
 
 
 def modal_noise_intensity(

@@ -162,6 +162,18 @@ CASES = {
             period=PERIOD,
         )
     ),
+    "mpc-dual-mode": rig(
+        jb.MPC(
+            3,
+            3,
+            1e-9,
+            hard_limit=3e-3,
+            terminal="dual-mode",
+            terminal_periods=6,
+            terminal_weight=1e-3,
+            period=PERIOD,
+        )
+    ),
     "kalman-known": rig(
         jb.LQR(**WEAK, estimator=jb.Kalman(0.02, 1e-5, loads="known"), delay=2e-3), **SHORT
     ),

@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike
 from jaxbeam.analysis.bound.bound import checked_influence, held_command_limits
 from jaxbeam.analysis.bound.input_influence import InputInfluence
 from jaxbeam.case.case import Case
-from jaxbeam.control.predictive.qp import STATUS_TEXT, solve_qp
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.model.channels import accepts_commands
+from jaxbeam.numerics.optimisation.qp import STATUS_TEXT, solve_qp
 from jaxbeam.simulation.record import Record
 
 REGULARISATION = 1e-10  # on squared commands, of the largest effect of one: some have no effect

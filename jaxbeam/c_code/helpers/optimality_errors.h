@@ -10,12 +10,13 @@ static real optimality_errors(real *stationary, real *limits, const real *G, con
     for (i = 0; i < rows; i++) {
         const real *g = G + i * variables;
         const real smaller = l[i] < s[i] ? l[i] : s[i];
+        const real size = fabs(h[i]) > 1 ? (real)fabs(h[i]) : 1; /* rounded in proportion */
         limits[i] = s[i] - h[i];
         for (j = 0; j < variables; j++) {
             limits[i] += g[j] * z[j];
             stationary[j] += g[j] * l[i];
         }
-        if (!(fabs(limits[i]) <= worst)) worst = fabs(limits[i]);
+        if (!(fabs(limits[i]) <= worst * size)) worst = fabs(limits[i]) / size;
         if (!(smaller <= worst)) worst = smaller;
     }
     for (j = 0; j < variables; j++)

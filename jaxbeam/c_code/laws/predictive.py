@@ -1,6 +1,6 @@
 """C code of model predictive control: prediction and quadratic program as data of the law.
 
-The program of a sample is brought to its least-distance form (`jaxbeam.control.predictive.qp`)
+The program of a sample is brought to its least-distance form (`jaxbeam.numerics.optimisation.qp`)
 beforehand: minimise |z| subject to G z <= h, all of which but h is constant, or known over time.
 """
 
@@ -14,7 +14,7 @@ from jaxbeam.c_code.tables import at_samples
 from jaxbeam.c_code.writers import EstimateCode, write_state_law
 from jaxbeam.case.estimator import Estimate
 from jaxbeam.control.predictive.mpc_law import MPCLaw
-from jaxbeam.control.predictive.qp import MAX_STEPS, MAX_SWEEPS
+from jaxbeam.numerics.optimisation.qp import MAX_STEPS, MAX_SWEEPS
 from jaxbeam.runtime.arrays import vmap, xp
 
 Rows = Float[np.ndarray, "sample row column"]
@@ -133,7 +133,7 @@ def _interior_operations(R: int, V: int) -> int:
     """Operations of a step of the interior-point method for R limits and V variables, at most."""
     newton = 4 * R * V + 3 * V * V + 16 * R + 6 * V
     factor = (3 * R + 2) * V * (V + 1) // 2 + V * V * V + 3 * V * V + 4 * R
-    return factor + 2 * newton + 10 * R * V + 48 * R + 12 * V + 32
+    return factor + 2 * newton + 10 * R * V + 58 * R + 12 * V + 32
 
 
 def _sweep_operations(R: int, V: int) -> int:

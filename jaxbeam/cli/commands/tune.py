@@ -225,6 +225,7 @@ def _write_and_print(result, tuned, files, picture, pictures, options: CaseOptio
         drawn = result if hasattr(result, "plot") else tuned[0]
         pictures.save(pictures.titled(drawn.plot()), picture)
     from jaxbeam.analysis.crossing_margin import stability_margin
+    from tuning.control.comparison import beside_hand_drawn
 
     loops = [stability_margin(one.case) for one in tuned]
     summaries = [
@@ -235,7 +236,12 @@ def _write_and_print(result, tuned, files, picture, pictures, options: CaseOptio
         for one, loop in zip(tuned, loops, strict=True)
         if not one.case.controller.open_loop
     ]
-    by_hand = _beside_hand_drawn(tuned)
+    by_hand = []
+    drawn_by_hand = _hand_drawn(tuned)
+    if drawn_by_hand is not None:
+        index, outcome, peaks = drawn_by_hand
+        by_hand = [beside_hand_drawn(outcome, peaks)]
+        summaries[index]["runs"][outcome.name]["peak_drawn_by_hand"] = peaks.tolist()
     options.report(
         summaries[0] if len(summaries) == 1 else {"front": summaries},
         [str(result), *by_hand, *closed],
@@ -244,17 +250,20 @@ def _write_and_print(result, tuned, files, picture, pictures, options: CaseOptio
     )
 
 
-def _beside_hand_drawn(tuned) -> list[str]:
-    """Sentence on the law drawn by hand in the last set of runs, if the case allows one."""
-    from tuning import TuningResult
-    from tuning.control.comparison import beside_hand_drawn, hand_drawn_peaks
+def _hand_drawn(tuned):
+    """Index of the first tuning, its last set of runs, and the peaks (m) of the law drawn by hand.
 
-    found = [one for one in tuned if isinstance(one, TuningResult)]
-    if not found:
-        return []
-    outcome = found[0].run_sets[-1]
-    peaks = hand_drawn_peaks(found[0].case, outcome.runs)
-    return [] if peaks is None else [beside_hand_drawn(outcome, peaks)]
+    None if the case allows no such law.
+    """
+    from tuning import TuningResult
+    from tuning.control.comparison import hand_drawn_peaks
+
+    for index, one in enumerate(tuned):
+        if isinstance(one, TuningResult):
+            outcome = one.run_sets[-1]
+            peaks = hand_drawn_peaks(one.case, outcome.runs)
+            return None if peaks is None else (index, outcome, peaks)
+    return None
 
 
 def _with_identified_plant(case, loads, file: Path, count: int, posterior: bool, seed: int):

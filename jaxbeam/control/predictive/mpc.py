@@ -24,7 +24,6 @@ from jaxbeam.case.fields import (
 )
 from jaxbeam.control.predictive.mpc_law import MPCLaw, command_limits, output_weights
 from jaxbeam.control.predictive.prediction import (
-    incremental_model,
     move_basis,
     move_maps,
     predict,
@@ -32,10 +31,17 @@ from jaxbeam.control.predictive.prediction import (
     sampled_plant,
 )
 from jaxbeam.control.predictive.preview import preview
-from jaxbeam.control.predictive.qp import METHODS
+from jaxbeam.control.predictive.terminal import (
+    TerminalRegulator,
+    dual_mode_terminal,
+    incremental_terminal,
+    limits_error,
+    periods_needed,
+    terminal_regulator,
+)
 from jaxbeam.control.state_controller import AbstractStateController, deflection_rows
 from jaxbeam.model.state_space import Plant
-from jaxbeam.numerics.riccati import dare
+from jaxbeam.numerics.optimisation.qp import METHODS
 from jaxbeam.runtime.arrays import Array, xp
 
 
@@ -55,11 +61,18 @@ class MPC(AbstractStateController):
 
     Limits and rate limits of each actuator are kept; a `soft_limit` on deflections is exceeded
     where that costs less, at `soft_weight` times the square of the excess. A `hard_limit` is kept
-    in every predicted period; where no commands keep it there is no solution. With the `terminal`
-    cost "riccati" the regulator of the unloaded plant is assumed to act after the horizon, eq.
-    (7.31). `solver` is the method for the quadratic program; "unconstrained" is the law (7.9),
-    clipped by the actuators only. Where no solution is found the last command is held, and the
-    record counts a failure.
+    in every predicted period; where no commands keep it there is no solution. `solver` is the
+    method for the quadratic program; "unconstrained" is the law (7.9), clipped by the actuators
+    only. Where no solution is found the last command is held, and the record counts a failure.
+
+    With the `terminal` cost "riccati" the regulator of the unloaded plant is assumed to act after
+    the horizon, eq. (7.31), under what persists of the loads. In "dual-mode", for any number of
+    sensors, the loads have left by then: the regulator brings deflections and commands to zero, and
+    the horizon ends in the set of states from which it keeps limits, rate limits and `hard_limit`
+    for ever, by the limits of its next `terminal_periods` periods. Without loads the cost then
+    decreases from sample to sample, and a problem that has a solution goes on having one. With a
+    `terminal_weight` (1e-3, say, a thousand times the square of 1 mm) the set is left where no
+    commands reach it.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -108,7 +121,16 @@ class MPC(AbstractStateController):
     laguerre_pole: Float[Array, ""] | None = number(
         "1", "pole of Laguerre functions, 0 to 1", NOT_NEGATIVE, default=None
     )
-    terminal: str = choice("cost after the horizon", "none", "riccati", default="none")
+    terminal: str = choice(
+        "cost, and set, after the horizon", "none", "riccati", "dual-mode", default="none"
+    )
+    terminal_periods: int = count("periods whose limits make up the terminal set", default=20)
+    terminal_weight: Float[Array, ""] | None = number(
+        "m^2",
+        "cost of exceeding limits after the horizon by once their size",
+        POSITIVE,
+        default=None,
+    )
     solver: str = choice(
         "method for the quadratic program", *METHODS, "unconstrained", default="interior"
     )
@@ -151,44 +173,108 @@ class MPC(AbstractStateController):
             return "loads must be 'ignored' where there are none"
         if self.terminal == "riccati" and outputs > len(case.actuators):
             return (
-                f"terminal must be 'none': {len(case.actuators)} actuators cannot bring"
-                f" {outputs} deflections to zero, so that the cost after the horizon is infinite"
+                f"terminal must be 'none' or 'dual-mode': {len(case.actuators)} actuators cannot"
+                f" bring {outputs} deflections under a load to zero, so that the cost after the"
+                " horizon is infinite"
             )
+        if self.terminal_weight is not None and self.terminal != "dual-mode":
+            return "terminal_weight is that of a terminal set: leave it out, or take 'dual-mode'"
+        if self.terminal == "dual-mode":
+            error = self._dual_mode_error(case, outputs)
+            if error is not None:
+                return error
         return super().validate(case)
 
-    def design_state_law(self, plant, design_plant):
-        actuators, system = plant.case.actuators, design_plant.unloaded
-        sampled = sampled_plant(
-            system.A, system.B, xp.zeros((system.A.shape[0], 0)), self.period, self.delay
+    def _dual_mode_error(self, case, outputs: int) -> str | None:
+        """Error of settings that do not allow for a terminal set, or None."""
+        if self.laguerre_pole is not None or self.moves != self.horizon:
+            return (
+                "moves must be as many as the horizon has periods, and plain, with terminal"
+                " 'dual-mode': the regulator takes over after the last of them"
+            )
+        if outputs < len(case.actuators):
+            return (
+                f"positions must be {len(case.actuators)} or more with terminal 'dual-mode':"
+                f" commands of so many actuators are not all seen in {outputs} deflections"
+            )
+        return limits_error(case.actuators)
+
+    def design_error(self, design_plant):
+        if self.terminal != "dual-mode" or self.solver == "unconstrained":
+            return None
+        regulator = self._regulator(*self._sampled(design_plant), design_plant.case.actuators)
+        needed = periods_needed(regulator, self.terminal_periods)
+        if needed == self.terminal_periods:
+            return None
+        if needed is None:
+            return (
+                "terminal must be 'none': no number of periods gives a terminal set, as the"
+                " regulator brings the beam to rest too slowly"
+            )
+        return (
+            f"terminal_periods must be at least {needed}: limits of fewer periods do not keep those"
+            " of all later ones"
         )
-        states = sampled.A.shape[0]
-        positions = design_plant.case.sensor_positions if self.positions is None else self.positions
-        C = deflection_rows(design_plant, positions)
-        beam, loaded_plant = C.shape[1], self._loaded_plant(design_plant)
-        C = xp.pad(C, ((0, 0), (0, states - beam)))  # the delay adds states
+
+    def design_state_law(self, plant, design_plant):
+        actuators = plant.case.actuators
+        sampled, C, weights = self._sampled(design_plant)
+        beam, loaded_plant = design_plant.modal_model.state_count, self._loaded_plant(design_plant)
         vehicles = 0 if loaded_plant is None else loaded_plant.vehicle_states
         basis = move_basis(self.horizon, self.moves, self.laguerre_pole)
         maps = move_maps(basis, len(actuators))
-        weights = output_weights(self.horizon, C.shape[0], self.horizon_weight, self.output_weight)
+        terminal = None
+        if self.terminal == "riccati":
+            terminal = incremental_terminal(
+                sampled, C, weights[-1], self._move_weights(len(actuators)), beam, vehicles
+            )
+        elif self.terminal == "dual-mode":
+            regulator = self._regulator(sampled, C, weights, actuators)
+            states = sampled.A.shape[0] + vehicles
+            terminal = dual_mode_terminal(
+                regulator, self.terminal_periods, self.terminal_weight, states
+            )
         # After the last of plain moves commands stay, and with them the limits are kept.
         limited_periods = self.horizon if self.laguerre_pole is not None else self.moves
         return MPCLaw(
             sampled_plant=sampled,
             prediction=predict(repeat_plant(sampled, self.horizon), C, maps, xp.zeros(0)),
-            C=_with_vehicles(C, beam, vehicles, 1),
+            C=_with_vehicles(C, beam, vehicles),
             move_maps=maps,
             limits=command_limits(actuators, maps[:limited_periods], self.period),
             output_weights=weights,
-            move_weights=xp.broadcast_to(self.move_weight, (len(actuators),)),
+            move_weights=self._move_weights(len(actuators)),
             soft_limit=self.soft_limit,
             soft_weight=self.soft_weight,
             hard_limit=self.hard_limit,
-            terminal_cost=self._terminal_cost(sampled, C, weights, vehicles),
+            terminal=terminal,
             preview=loaded_plant and preview(loaded_plant, self.period, self.delay),
             delayed=self.delay is not None,
             known_weights=self.loads == "known",
             solver=self.solver,
         )
+
+    def _sampled(self, design_plant: Plant):
+        """Unloaded plant over a period, rows of its controlled deflections, and their weights."""
+        system = design_plant.unloaded
+        sampled = sampled_plant(
+            system.A, system.B, xp.zeros((system.A.shape[0], 0)), self.period, self.delay
+        )
+        positions = design_plant.case.sensor_positions if self.positions is None else self.positions
+        C = deflection_rows(design_plant, positions)
+        C = xp.pad(C, ((0, 0), (0, sampled.A.shape[0] - C.shape[1])))  # the delay adds states
+        weights = output_weights(self.horizon, C.shape[0], self.horizon_weight, self.output_weight)
+        return sampled, C, weights
+
+    def _regulator(self, sampled, C, weights, actuators) -> TerminalRegulator:
+        """Regulator after the horizon of the unloaded plant."""
+        move_weights = self._move_weights(len(actuators))
+        parts = weights[-1], move_weights, actuators, self.period, self.hard_limit
+        return terminal_regulator(sampled, self.delay is not None, C, *parts)
+
+    def _move_weights(self, actuators: int) -> Float[Array, " actuator"]:
+        """Weight of the moves of each actuator."""
+        return xp.broadcast_to(self.move_weight, (actuators,))
 
     def _loaded_plant(self, design_plant: Plant) -> Plant | None:
         """Plant of predictions that vary with time, or None; its wheels may be massless."""
@@ -202,22 +288,8 @@ class MPC(AbstractStateController):
             replace_fn=lambda inertia: np.zeros(inertia.shape),
         )
 
-    def _terminal_cost(self, sampled, C, weights, vehicles):
-        """P of the terminal cost, of the incremental model under its regulator, or None.
 
-        States of vehicles have no cost of their own.
-        """
-        if self.terminal == "none":
-            return None
-        A, B, output_rows = incremental_model(sampled.A, sampled.B, C)
-        Q = output_rows.T @ (weights[-1, :, None] * output_rows)
-        P = dare(A, B, Q, xp.diag(xp.broadcast_to(self.move_weight, B.shape[1])))
-        beam = sampled.A.shape[0] - (0 if self.delay is None else B.shape[1])
-        return _with_vehicles(_with_vehicles(P, beam, vehicles, 0), beam, vehicles, 1)
-
-
-def _with_vehicles(matrix, beam: int, count: int, axis: int):
-    """A matrix with zeros for the states of vehicles after the `beam` ones, along an axis."""
-    before, after = xp.split(matrix, [beam], axis=axis)
-    zeros = xp.zeros_like(xp.take(matrix, np.zeros(count, int), axis=axis))
-    return xp.concatenate([before, zeros, after], axis=axis)
+def _with_vehicles(rows: Float[Array, "row state"], beam: int, count: int):
+    """Rows with zeros for the states of vehicles after the `beam` ones."""
+    zeros = xp.zeros((rows.shape[0], count))
+    return xp.concatenate([rows[:, :beam], zeros, rows[:, beam:]], axis=1)

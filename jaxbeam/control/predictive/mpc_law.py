@@ -1,4 +1,4 @@
-"""Law of model predictive control: the quadratic program of a sample, and its first move."""
+"""Law of model predictive control: the quadratic program of a sample from its prediction."""
 
 import dataclasses
 from typing import NamedTuple
@@ -9,12 +9,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.controller import ControlStep
+from jaxbeam.case.estimator import Estimate
 from jaxbeam.control.predictive.prediction import Prediction, SampledPlant, predict
 from jaxbeam.control.predictive.preview import Preview
-from jaxbeam.control.predictive.qp import solve_qp
+from jaxbeam.control.predictive.terminal import Terminal
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.estimation.sampled_plant import in_blocks
-from jaxbeam.runtime.arrays import Array, block_diag, set_at, solve, take, xp
+from jaxbeam.numerics.optimisation.quadratic_program import QuadraticProgram, first_move
+from jaxbeam.runtime.arrays import Array, add_at, set_at, take, xp
 
 
 class CommandLimits(NamedTuple):
@@ -25,13 +27,7 @@ class CommandLimits(NamedTuple):
     command_rows: Float[Array, "row actuator"]
 
 
-class QuadraticProgram(NamedTuple):
-    """Minimise 1/2 x'H x + f'x subject to M x <= gamma."""
-
-    H: Float[Array, "variable variable"]
-    f: Float[Array, " variable"]
-    M: Float[Array, "row variable"]
-    gamma: Float[Array, " row"]
+QuadraticCost = tuple[Float[Array, "variable variable"], Float[Array, " variable"]]
 
 
 class MPCLaw(AbstractStateLaw):
@@ -55,7 +51,7 @@ class MPCLaw(AbstractStateLaw):
     soft_limit: Float[Array, " *output"] | None
     soft_weight: Float[Array, ""]
     hard_limit: Float[Array, " *output"] | None
-    terminal_cost: Float[Array, "augmented augmented"] | None
+    terminal: Terminal | None
     preview: Preview | None
     delayed: bool = eqx.field(static=True)
     known_weights: bool = eqx.field(static=True)
@@ -75,7 +71,20 @@ class MPCLaw(AbstractStateLaw):
         return xp.zeros(self.C.shape[1])
 
     def step(self, state, estimate, measurement, t):
-        previous_state, previous_command, state = state, measurement.command, estimate.state
+        command = measurement.command
+        prediction, initial, state = self.conditions(state, estimate, command, t)
+        program = self.quadratic_program(prediction, initial, command)
+        move, solved = first_move(program, self.move_maps, self.solver)
+        return ControlStep(command + xp.where(solved, move, 0.0), state, solved)
+
+    def conditions(
+        self, previous_state, estimate: Estimate, previous_command, t
+    ) -> tuple[Prediction, Float[Array, " initial"], Float[Array, " state"]]:
+        """Prediction from a sample at t (s), its initial conditions, and the state at the sample.
+
+        `previous_state` and `previous_command` are those of the last sample.
+        """
+        state = estimate.state
         if self.vehicle_states:
             state = xp.concatenate([state, estimate.vehicles])
         if self.delayed:
@@ -85,8 +94,7 @@ class MPCLaw(AbstractStateLaw):
             past_plant.A @ previous_state + past_plant.B @ previous_command + past_plant.E @ weights
         )
         initial = xp.concatenate([state, state - predicted_state, previous_command, xp.ones(1)])
-        move, solved = self._first_move(prediction, initial, previous_command)
-        return ControlStep(previous_command + xp.where(solved, move, 0.0), state, solved)
+        return prediction, initial, state
 
     def _predict(self, t, estimate):
         """Plant over the last period, prediction from t (s), and the known inputs in it.
@@ -130,54 +138,74 @@ class MPCLaw(AbstractStateLaw):
     def quadratic_program(self, prediction: Prediction, initial, previous_command):
         """Quadratic program of a sample, in the moves, and in the excesses over soft limits.
 
+        Those over soft limits of deflections come first, then that over a soft terminal set.
         `initial` are the initial conditions of `Prediction`: the state, its unexplained change, the
         previous command u(k-1), and 1.
         """
-        free_response = prediction.F @ initial
-        weight, Phi, maps = self.output_weights, prediction.Phi, self.move_maps
-        if self.terminal_cost is not None:
+        H, f = self.merit(prediction, initial)
+        program = self.of_moves(H, f, previous_command)
+        if self.solver == "unconstrained":
+            return program._replace(M=program.M[:0], gamma=program.gamma[:0])
+        return self.limited(program, prediction, initial)
+
+    def merit(self, prediction: Prediction, initial) -> QuadraticCost:
+        """H and f of the cost of the moves, x'H x + 2 f'x."""
+        free_response, weight, Phi = prediction.F @ initial, self.output_weights, prediction.Phi
+        if self.terminal is not None:
             weight = set_at(weight, -1, 0.0)  # included in P
         weighted = (weight[..., None] * Phi).reshape(-1, Phi.shape[2])
-        weighted_moves = (self.move_weights[:, None] * maps).reshape(-1, maps.shape[2])
-        move_cost = weighted_moves.T @ maps.reshape(-1, maps.shape[2])
-        H = weighted.T @ Phi.reshape(-1, Phi.shape[2]) + move_cost
+        H = weighted.T @ Phi.reshape(-1, Phi.shape[2]) + self.move_cost()
         f = weighted.T @ free_response.reshape(-1)
-        if self.terminal_cost is not None:
-            terminal_gradient = prediction.terminal_phi.T @ self.terminal_cost
-            H = H + terminal_gradient @ prediction.terminal_phi
-            f = f + terminal_gradient @ (prediction.terminal @ initial)
-        H, f, M = 2 * H, 2 * f, self.limits.rows
-        gamma = self.limits.limits - self.limits.command_rows @ previous_command
-        if self.solver == "unconstrained":
-            return QuadraticProgram(H, f, M[:0], gamma[:0])
-        if self.hard_limit is not None:
-            rows, sides = _rows_within(Phi, free_response, self.hard_limit)
-            M, gamma = xp.concatenate([M, rows]), xp.concatenate([gamma, sides])
-        if self.soft_limit is not None:
-            return self._with_soft_limits(H, f, M, gamma, Phi, free_response)
-        return QuadraticProgram(H, f, M, gamma)
+        if self.terminal is not None:
+            end_phi = self.terminal.map @ prediction.end_phi
+            end = self.terminal.map @ (prediction.end @ initial)
+            H = H + end_phi.T @ self.terminal.cost @ end_phi
+            f = f + end_phi.T @ (self.terminal.cost @ end)
+        return H, f
 
-    def _first_move(self, prediction, initial, previous_command):
-        """First move of the solution, and whether there is one."""
-        program = self.quadratic_program(prediction, initial, previous_command)
+    def move_cost(self) -> Float[Array, "variable variable"]:
+        """H of the cost of the squared moves alone."""
         maps = self.move_maps
-        if program.M.shape[0] == 0:
-            return maps[0] @ -solve(program.H, program.f), xp.ones((), bool)
-        solution = solve_qp(*program, self.solver)
-        return maps[0] @ solution.x[: maps.shape[2]], solution.solved
+        weighted = (self.move_weights[:, None] * maps).reshape(-1, maps.shape[2])
+        return weighted.T @ maps.reshape(-1, maps.shape[2])
 
-    def _with_soft_limits(self, H, f, M, gamma, Phi, free_response):
-        """Program with the excess over the soft limit of each output as a further variable."""
-        horizon, outputs, _ = Phi.shape
-        H = block_diag(H, 2 * self.soft_weight * xp.eye(outputs))
-        excess = xp.tile(xp.eye(outputs), (2 * horizon, 1))
-        rows, sides = _rows_within(Phi, free_response, self.soft_limit)
-        M = xp.block([[M, xp.zeros((M.shape[0], outputs))], [rows, -excess]])
-        gamma = xp.concatenate([gamma, sides])
-        return QuadraticProgram(H, xp.pad(f, (0, outputs)), M, gamma)
+    def of_moves(self, H, f, previous_command) -> QuadraticProgram:
+        """Program of a cost x'H x + 2 f'x of the moves, within limits of the commands."""
+        gamma = self.limits.limits - self.limits.command_rows @ previous_command
+        return QuadraticProgram(2 * H, 2 * f, self.limits.rows, gamma)
+
+    def limited(
+        self, program: QuadraticProgram, prediction: Prediction, initial, share: float = 1.0
+    ) -> QuadraticProgram:
+        """Program within the limits of what is predicted; a `share` of the cost of excesses."""
+        free_response, Phi = prediction.F @ initial, prediction.Phi
+        if self.hard_limit is not None:
+            program = program.within(*rows_within(Phi, free_response, self.hard_limit))
+        rows, sides, weight = None, None, None
+        if self.terminal is not None and self.terminal.rows.shape[0]:
+            terminal = self.terminal
+            rows = terminal.rows @ (terminal.map @ prediction.end_phi)
+            sides = 1 - terminal.rows @ (terminal.map @ (prediction.end @ initial))
+            weight = terminal.weight
+            if weight is None:
+                program = program.within(rows, sides)
+        if self.soft_limit is not None:
+            horizon, outputs, _ = Phi.shape
+            excess = xp.tile(xp.eye(outputs), (2 * horizon, 1))
+            costs = xp.full(outputs, share * self.soft_weight)
+            soft_rows = rows_within(Phi, free_response, self.soft_limit)
+            program = program.softly_within(*soft_rows, excess, costs)
+        if rows is not None and weight is not None:
+            cost = share * weight
+            program = program.softly_within(rows, sides, xp.ones((rows.shape[0], 1)), cost[None])
+            # The linear cost is one of the initial condition 1, of which the program is linear.
+            program = program._replace(f=add_at(program.f, -1, cost * initial[-1]))
+            last = program.f.shape[0] - 1
+            program = program.within(-xp.eye(1, last + 1, k=last), xp.zeros(1))
+        return program
 
 
-def _rows_within(Phi, free_response, limit):
+def rows_within(Phi, free_response, limit):
     """Rows and right sides of |Phi variables + free response| <= limit, of each output."""
     horizon, outputs, variables = Phi.shape
     rows, free_deflections = Phi.reshape(-1, variables), free_response.reshape(-1)

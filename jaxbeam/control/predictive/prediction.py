@@ -27,17 +27,17 @@ class SampledPlant(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """Future outputs Y = F initial + Phi variables, eq. (7.4), and the state after the horizon.
+    """Future outputs Y = F initial + Phi variables, eq. (7.4), and the end of the horizon.
 
     `initial` are the initial conditions (x(k), w, u(k-1), 1), with a column of F for each; that of
-    1 is the response to the loads. `terminal` and `terminal_phi` give x(k+N) - x(k+N-1), then
-    y(k+N), N the horizon. Of one sample, or of several along a first axis.
+    1 is the response to the loads. `end` and `end_phi` give x(k+N-1), x(k+N) and u(k+N-1), N the
+    horizon. Of one sample, or of several along a first axis.
     """
 
     F: Float[Array, "*sample horizon output initial"]
     Phi: Float[Array, "*sample horizon output variable"]
-    terminal: Float[Array, "*sample augmented initial"]
-    terminal_phi: Float[Array, "*sample augmented variable"]
+    end: Float[Array, "*sample end initial"]
+    end_phi: Float[Array, "*sample end variable"]
 
     def under(self, load_weights: Float[Array, " load"]) -> "Prediction":
         """Prediction under weights (N) from one whose last initial conditions are those weights."""
@@ -47,7 +47,7 @@ class Prediction(NamedTuple):
             of_loads = columns[..., own:] @ load_weights
             return xp.concatenate([columns[..., :own], of_loads[..., None]], axis=-1)
 
-        return self._replace(F=combined(self.F), terminal=combined(self.terminal))
+        return self._replace(F=combined(self.F), end=combined(self.end))
 
 
 def sampled_plant(
@@ -163,13 +163,14 @@ def predict(
     _, trajectory = scan(advance, initial_state, (plants, commands))
     outputs = C @ trajectory
     trajectory = xp.concatenate([initial_state[None], trajectory])
-    terminal = xp.concatenate([trajectory[-1] - trajectory[-2], outputs[-1]], axis=-2)
+    last_command = xp.broadcast_to(commands[-1], (*samples, actuators, columns))
+    end = xp.concatenate([trajectory[-2], trajectory[-1], last_command], axis=-2)
     outputs = xp.moveaxis(outputs, 0, -3)
     return Prediction(
         outputs[..., :initial_count],
         outputs[..., initial_count:],
-        terminal[..., :initial_count],
-        terminal[..., initial_count:],
+        end[..., :initial_count],
+        end[..., initial_count:],
     )
 
 

@@ -132,7 +132,10 @@ def test_case_file_keeps_the_controller():
         ({"move_weight": 0.0}, "move_weight must be positive"),
         ({"laguerre_pole": 1.0}, "laguerre_pole must be below 1"),
         ({"positions": []}, "positions must be given"),
-        ({"positions": [0.1, 0.5], "terminal": "riccati"}, "terminal must be 'none': 1 actuators"),
+        (
+            {"positions": [0.1, 0.5], "terminal": "riccati"},
+            "terminal must be 'none' or 'dual-mode': 1",
+        ),
         ({"solver": "simplex"}, "solver"),
         ({"solver": "qpax"}, "solver cannot be 'qpax'"),
     ],

@@ -30,8 +30,8 @@ def test_derivatives_of_a_closed_loop_of_two_spans():
     """Reverse mode, by r_w of each patch and weights of sensors and periods; limits are active.
 
     The cost is smooth but where a limit becomes active at a sample, where the derivative of the
-    program is smoothed (see `control.predictive.qp`). No sample is at such a point, as differences
-    of two step sizes agree.
+    program is smoothed (see `numerics.optimisation.qp`). No sample is at such a point, as
+    differences of two step sizes agree.
     """
     plan, sizes = integration_plan(CASE, None, 1e-6), [jb.addresses(CASE)[name] for name in FREE]
     ends = np.cumsum([size.size for size in sizes])[:-1]

@@ -42,7 +42,10 @@ def test_prediction_against_the_incremental_model():
     unexplained = state - A @ previous - B @ command
     free_response = found.F @ np.concatenate([state, unexplained, command, [1.0]])
     assert_allclose(free_response, F @ np.concatenate([state - previous, C @ state]), atol=1e-13)
-    assert_allclose(found.terminal[4:], found.F[-1], atol=1e-14)
+    end = np.asarray(found.end)
+    assert_allclose(C @ end[4:8], found.F[-1], atol=1e-14)
+    assert_allclose(C @ end[:4], found.F[-2], atol=1e-14)
+    assert_array_equal(end[8:], np.eye(2, 11, k=8))
 
 
 def test_sampling_with_a_delay():

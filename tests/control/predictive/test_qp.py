@@ -8,7 +8,7 @@ import pytest
 import scipy.sparse
 from numpy.testing import assert_allclose, assert_array_equal
 
-from jaxbeam.control.predictive.qp import INFEASIBLE, METHODS, SOLVED, UNFINISHED, solve_qp
+from jaxbeam.numerics.optimisation.qp import INFEASIBLE, METHODS, SOLVED, UNFINISHED, solve_qp
 from tests.differences import central
 
 SIZES = [(3, 8), (6, 12), (8, 32)]
@@ -154,6 +154,16 @@ def test_invalid_problems_are_not_solved(method):
     numbers = [(-eye, ones, ones), (eye, ones * jnp.nan, ones), (eye, ones, -ones * jnp.inf)]
     for H, f, gamma in numbers:
         assert solve_qp(H, f, eye, gamma, method).status == UNFINISHED
+
+
+def test_limits_far_away_change_nothing():
+    """Their slack is rounded by more than the tolerance of limits that matter."""
+    for problem in zip(*(np.asarray(part[:5]) for part in problems("plain", 4, 8)), strict=True):
+        H, f, M, gamma = problem
+        far = np.append(M, M[:, ::-1], axis=0), np.append(gamma, np.full(8, 3e9))
+        found, expected = solve_qp(H, f, *far), solve_qp(*problem)
+        assert found.solved and found.steps < 30
+        assert_allclose(found.x, expected.x, rtol=0, atol=1e-9)
 
 
 def test_unknown_methods_are_refused():

@@ -44,6 +44,9 @@ def test_from_a_fit_to_a_tuned_case(call, tmp_path, monkeypatch):
     result = json.loads(out)
     assert len(result["runs"]["training"]["cases"]) == 4
     assert len(result["runs"]["held out"]["cases"]) == 2
+    by_hand = result["runs"]["held out"]["peak_drawn_by_hand"]
+    assert np.all(np.array(by_hand) < result["runs"]["held out"]["uncontrolled_peak"])
+    assert len(by_hand) == 2 and "peak_drawn_by_hand" not in result["runs"]["training"]
     plants = [run[RIGIDITY] for kind in result["runs"].values() for run in kind["cases"]]
     assert len(set(plants)) == 4
     assert np.all(np.abs(np.array(plants) - identified.values[0]) < 6 * identified.errors[0])

@@ -189,10 +189,12 @@ def _status(lib, tolerance, error, z, previous_multipliers, multipliers, h, G):
 def _interior_point(G, h, limits_matter):
     """Mehrotra's predictor-corrector method (SIAM J. Optimization 2, 1992), regularised in l."""
     (rows, variables), lib = G.shape, array_namespace(G, h, limits_matter)
+    sizes = lib.maximum(abs(h), 1.0)
 
     def optimality_errors(z, multipliers, slack):
         stationary, limits = z + G.T @ multipliers, G @ z + slack - h
-        worst = lib.maximum(abs(stationary).max(), abs(limits).max())
+        # The slack of a limit far away is rounded in proportion.
+        worst = lib.maximum(abs(stationary).max(), (abs(limits) / sizes).max())
         return lib.maximum(worst, lib.minimum(multipliers, slack).max()), stationary, limits
 
     def unfinished(state):
