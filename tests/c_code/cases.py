@@ -176,6 +176,48 @@ CASES = {
     "kalman-known": rig(
         jb.LQR(**WEAK, estimator=jb.Kalman(0.02, 1e-5, loads="known"), delay=2e-3), **SHORT
     ),
+    "mpc-scenario-worst": rig(
+        jb.ScenarioMPC(
+            3,
+            2,
+            1e-7,
+            stiffness_factors=[0.8, 1.2],
+            delays=[0.0, 2e-3],
+            merit="worst",
+            estimator=KALMAN,
+            period=PERIOD,
+            delay=1e-3,
+        )
+    ),
+    "mpc-scenario-mean": rig(
+        jb.ScenarioMPC(
+            3,
+            2,
+            1e-9,
+            stiffness_factors=[0.8, 1.2],
+            delays=[0.0, 2e-3],
+            merit="mean",
+            soft_limit=1e-4,
+            estimator=KALMAN,
+            period=PERIOD,
+            delay=1e-3,
+        )
+    ),
+    "moving-horizon": rig(
+        jb.LQR(
+            **WEAK,
+            estimator=jb.MovingHorizon(
+                0.02,
+                1e-5,
+                weight_deviation=1.0,
+                max_weight=3.6,
+                window=2,
+                deflection_limit=3e-4,
+            ),
+            delay=2e-3,
+        ),
+        **SHORT,
+    ),
     "mpc-unconstrained": rig(jb.MPC(6, 2, 1e-10, solver="unconstrained", period=PERIOD)),
 }
 
