@@ -25,11 +25,13 @@ extensions = [
     "plain_docstrings",
     "run_code",
     "svg_math",
+    "thumbnails",
 ]
 exclude_patterns = ["_ext", "_static", "figures", "_run"]
 suppress_warnings = ["myst.header", "mystnb.unknown_mime_type"]
 
 # Notebooks are executed by the tests (`.ci/run`); the site shows the outputs that they have then.
+smartquotes = False  # quotes in commands are to be copied
 nb_execution_mode = "off"
 myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3

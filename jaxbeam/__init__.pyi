@@ -20,8 +20,10 @@ from .analysis.sections.amplification import (
     envelope as envelope,
 )
 from .analysis.sections.characteristic_points import characteristic_points as characteristic_points
+from .case.actuators.creep import Creep as Creep
 from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
 from .case.actuators.hysteresis import Hysteresis as Hysteresis
+from .case.actuators.inner_loops import CurrentLoop as CurrentLoop, ForceLoop as ForceLoop
 from .case.actuators.patch import Patch as Patch
 from .case.actuators.point import PointForce as PointForce
 from .case.actuators.shaker import Shaker as Shaker
@@ -79,6 +81,7 @@ from .control.optimal.crossing_lqr import (
     FiniteLQR as FiniteLQR,
     StepLQR as StepLQR,
 )
+from .control.optimal.h_infinity import HInfinity as HInfinity
 from .control.optimal.integral_lqr import IntegralLQR as IntegralLQR
 from .control.optimal.lqr import LQR as LQR
 from .control.optimal.position_lqr import PositionLQR as PositionLQR

@@ -5,6 +5,7 @@ import itertools
 from hypothesis import strategies as st
 
 from jaxbeam.case.actuators.electrodynamic import Electrodynamic
+from jaxbeam.case.actuators.inner_loops import AbstractInnerLoop, CurrentLoop, ForceLoop
 from jaxbeam.case.actuators.patch import Patch
 from jaxbeam.case.actuators.point import PointForce
 from jaxbeam.case.actuators.shaker import Shaker
@@ -71,6 +72,16 @@ def supports(draw, length: float) -> tuple[Support, ...]:
 
 
 @st.composite
+def inner_loops(draw) -> AbstractInnerLoop:
+    """An inner loop of a shaker of either kind."""
+    limits = draw(maybe(st.just([-1.0, 2.0])))
+    if draw(st.booleans()):
+        return CurrentLoop(bandwidth=draw(numbers(1.0, 1e4)), limits=limits)
+    lag = draw(maybe(numbers(1.0, 1e4)))
+    return ForceLoop(None, draw(numbers(0.1, 9.0)), draw(maybe(numbers(1.0, 9.0))), lag, limits)
+
+
+@st.composite
 def actuators(draw, length: float):
     """An actuator of any kind."""
     position = numbers(0.0, length)
@@ -83,6 +94,7 @@ def actuators(draw, length: float):
     if kind == "spring":
         return SpringDamper(draw(position), draw(numbers(0.0, 1e5)), draw(numbers(0.0, 100.0)))
     if kind == "electrodynamic":
+        loop = draw(maybe(inner_loops()))
         return Electrodynamic(
             position=draw(position),
             resistance=draw(numbers(0.1, 10.0)),
@@ -90,7 +102,8 @@ def actuators(draw, length: float):
             force_constant=draw(numbers(-20.0, 20.0)),
             back_emf=draw(maybe(numbers(-20.0, 20.0))),
             mass=draw(numbers(0.0, 0.1)),
-            limits=draw(limits),
+            limits=draw(limits) if loop is None else None,
+            inner_loop=loop,
         )
     return Patch(
         start=draw(numbers(0.0, 0.45 * length)),

@@ -1,6 +1,7 @@
 """Parts of several benchmarks: timing, memory, subprocesses, and command lines."""
 
 import argparse
+import contextlib
 import importlib
 import json
 import os
@@ -12,11 +13,13 @@ import time
 from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import NamedTuple
+from unittest import mock
 
 import jax
 import numpy as np
 
 import jaxbeam as jb
+from jaxbeam.integrator import native_peaks
 
 SLOWEST, FASTEST = 0.3, 10.0  # m/s, of the crossings of sweeps
 
@@ -80,6 +83,11 @@ def interleaved_best(functions, *args, rounds=40) -> np.ndarray:
         jax.block_until_ready(function(*args))
     times = [[_seconds(function, *args) for function in functions] for _ in range(rounds)]
     return np.min(times, axis=0)
+
+
+def without_native() -> contextlib.AbstractContextManager:
+    """A context in which sweeps of peaks are computed by XLA, as where there is no C compiler."""
+    return mock.patch.object(native_peaks, "chosen_for", lambda case, runs: False)
 
 
 def peak_memory() -> float:

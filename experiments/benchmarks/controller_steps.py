@@ -20,6 +20,7 @@ from experiments.benchmarks.common import parser, print_row, print_table
 from experiments.benchmarks.computing_time import ComputingTimes, computing_times
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.kinds import kinds
+from jaxbeam.control.design_model import DesignModel
 from jaxbeam.control.optimal.sampling_loss import SamplingWarning
 from jaxbeam.simulation.simulate import ContactLossWarning
 
@@ -28,6 +29,13 @@ WEIGHTS = {"state_weight": [1e6] * (2 * MODES), "command_weight": [1.0], "period
 FINITE_HORIZON = {**WEIGHTS, "points": 600}
 PREDICTIVE = {"move_weight": 1e-11, "period": PERIOD}
 MPC_4 = {"horizon": 6, "moves": 4, **PREDICTIVE}
+GPC = {
+    "horizon": 8,
+    "moves": 3,
+    "move_weight": 1e-9,
+    "period": PERIOD,
+    "design": DesignModel(modes=2),
+}
 NOISE = {"process_noise": 0.02, "measurement_noise": 1e-5}
 GATE_IDENTIFICATION = jb.LoadIdentification(gates=[-0.2, -0.1], until=0.3)
 SCHEDULE_GRID = {"masses": [0.2, 0.4, 0.6], "speeds": [1.0, 1.5]}
@@ -47,6 +55,8 @@ CONTROLLERS = {
         load_identification=GATE_IDENTIFICATION,
         period=PERIOD,
     ),
+    "output-feedback": jb.OutputFeedback(gains=[[2e3] * 5], period=PERIOD),
+    "sliding-mode": jb.SlidingMode(rate=30.0, reaching_rate=10.0, layer=0.1, period=PERIOD),
     "pd": jb.PD(gains=[2e3], rate_gains=20.0, lag=0.02, period=PERIOD),
     "lead": jb.Lead(gains=[2e3], zero=2.0, pole=8.0, period=PERIOD),
     "ppf": jb.PositivePositionFeedback(
@@ -64,12 +74,23 @@ CONTROLLERS = {
         **WEIGHTS, estimator=jb.Kalman(**NOISE, loads="estimated", weight_deviation=2.0)
     ),
     "dlqr": jb.DiscreteLQR(**WEIGHTS),
+    "lqr-integral": jb.IntegralLQR(**WEIGHTS, integral_weight=[1e9], reference=[0.0]),
     "lqr-step": jb.StepLQR(**FINITE_HORIZON),
     "lqr-finite": jb.FiniteLQR(**FINITE_HORIZON),
     "lqr-augmented": jb.AugmentedLQR(**FINITE_HORIZON),
     "lqr-scheduled, load identified": jb.ScheduledLQR(
         **FINITE_HORIZON, **SCHEDULE_GRID, load_identification=GATE_IDENTIFICATION
     ),
+    "lqr-position, Kalman filter, loads known": jb.PositionLQR(
+        **FINITE_HORIZON, **SCHEDULE_GRID, estimator=jb.Kalman(**NOISE, loads="known")
+    ),
+    "lqr-position, extended Kalman filter": jb.PositionLQR(
+        **FINITE_HORIZON,
+        **SCHEDULE_GRID,
+        estimator=jb.ExtendedKalman(**NOISE, mass_deviation=0.1, speed_deviation=0.1),
+    ),
+    "gpc": jb.GPC(**GPC),
+    "gpc-adaptive": jb.AdaptiveGPC(**GPC, until=0.1, measurement_noise=1e-6),
     "mpc, unconstrained": jb.MPC(**MPC_4, solver="unconstrained"),
     "mpc, 4 variables": jb.MPC(**MPC_4),
     "mpc, 6 variables": jb.MPC(horizon=8, moves=6, **PREDICTIVE),
@@ -120,7 +141,7 @@ def main() -> None:
     classes = {type(controller) for controller in CONTROLLERS.values()}
     lacking = [kind for kind, each in kinds(AbstractController).items() if each not in classes]
     if lacking:
-        print(f"not timed, as no example is listed here: {', '.join(lacking)}")
+        print(f"not timed, as no example is listed here: {', '.join(lacking)}\n")
     print_table(("microseconds per step", "median", "worst", "256 at once", "worst"))
     for name, controller in CONTROLLERS.items():
         if only in name:

@@ -1,12 +1,15 @@
 """Where the time of a sweep goes, by stages of the physics.
 
-    python -m experiments.benchmarks.profile [--modes 3] [--keep FOLDER]
+    python -m experiments.benchmarks.profile [--modes 3 12] [--keep FOLDER]
 
-The sweep of the speed benchmark runs once under JAX's profiler. Each kernel that XLA makes counts
-for the innermost `jax.named_scope` of jaxbeam in which it was written; loops and branches are left
-out, as they only contain others. --keep saves the trace for https://ui.perfetto.dev.
+The sweep of the speed benchmark runs once under JAX's profiler, by XLA, each number of modes in its
+own process. Each kernel that XLA makes counts for the innermost `jax.named_scope` of jaxbeam in
+which it was written; loops and branches are left out, as they only contain others. Stages that are
+never in a kernel take too little time to be seen. --keep saves the traces, a folder for each number
+of modes, for https://ui.perfetto.dev.
 """
 
+import argparse
 import collections
 import gzip
 import json
@@ -17,7 +20,13 @@ from pathlib import Path
 
 import jax
 
-from experiments.benchmarks.common import parser, print_row, print_table
+from experiments.benchmarks.common import (
+    measure_in_subprocess,
+    parser,
+    print_row,
+    print_table,
+    without_native,
+)
 from experiments.benchmarks.sweep import sweep_peaks
 from jaxbeam.sweeps.programs import integrate_block
 
@@ -30,7 +39,6 @@ STAGES = (
     "propagation",
     "running_peaks",
     "peaks",
-    "native",
 )
 # Their time is that of the kernels they call; a call without kernels is a kernel itself.
 CONTROL_FLOW = re.compile(r"(while|cond|conditional)[.\d]*$")
@@ -93,26 +101,39 @@ def stage_shares(trace: Path, stages: dict[str, str], module: str) -> dict[str, 
     return {stage: time / times.total() for stage, time in times.most_common()}
 
 
-def main() -> None:
-    """Profile the sweep and print the table."""
-    options = parser(__doc__)
-    options.add_argument("--modes", type=int, default=3)
-    options.add_argument("--keep", type=Path, help="folder for the trace")
-    arguments = options.parse_args()
-    folder = arguments.keep or Path(tempfile.mkdtemp())
+def measure(modes: int, folder: Path) -> dict[str, float]:
+    """Share of each stage in the time of a sweep, largest first; its trace is kept in a folder."""
     flags = f"--xla_dump_to={folder / 'hlo'} --xla_dump_hlo_as_text"
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
     jax.config.update("jax_enable_compilation_cache", False)  # cached programs are not dumped
-    sweep_peaks(arguments.modes)
     settings = jax.profiler.ProfileOptions()
     settings.python_tracer_level = 0
-    with jax.profiler.trace(str(folder / "trace"), profiler_options=settings):
-        sweep_peaks(arguments.modes)
+    with without_native():
+        sweep_peaks(modes)
+        with jax.profiler.trace(str(folder / "trace"), profiler_options=settings):
+            sweep_peaks(modes)
     module = f"jit_{integrate_block.__name__}"
-    stages = operation_stages(folder / "hlo", module)
-    print_table((f"{arguments.modes} modes, 4096 crossings", "share of the time"))
-    for stage, share in stage_shares(folder / "trace", stages, module).items():
-        print_row((stage, f"{share:.0%}"))
+    return stage_shares(folder / "trace", operation_stages(folder / "hlo", module), module)
+
+
+def main() -> None:
+    """Profile the sweeps and print the table."""
+    options = parser(__doc__, modes=[3, 12])
+    options.add_argument("--keep", type=Path, help="folder for the traces")
+    options.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
+    arguments = options.parse_args()
+    if arguments.measure:
+        modes, folder = arguments.measure
+        print(json.dumps(measure(int(modes), Path(folder))))
+        return
+    kept, shares = arguments.keep or Path(tempfile.mkdtemp()), []
+    for modes in arguments.modes:
+        folder = (kept / f"modes_{modes}").absolute()
+        shares.append(measure_in_subprocess("experiments.benchmarks.profile", modes, folder))
+    print_table(("share of the time of 4096 crossings", *(f"{n} modes" for n in arguments.modes)))
+    for stage in dict.fromkeys(stage for found in shares for stage in found):
+        cells = (f"{100 * found.get(stage, 0.0):.0f} %" for found in shares)
+        print_row((stage, *cells))
 
 
 if __name__ == "__main__":

@@ -34,6 +34,7 @@ from experiments.benchmarks.common import (
     print_row,
     print_table,
     time_call,
+    without_native,
 )
 from experiments.benchmarks.rivals import baselines, numba_peaks
 from experiments.benchmarks.rivals.pinned_beam import PinnedBeam
@@ -72,7 +73,7 @@ def compare(modes: int) -> list[tuple[str, Timing, float]]:
 
     def by_jaxbeam():
         """By XLA, as on a machine without a C compiler."""
-        with mock.patch.object(native_peaks, "chosen_for", lambda case, runs: False):
+        with without_native():
             return sweep_peaks(modes)
 
     def add_row(name, solve, repeat=3 if modes < 6 else 1):

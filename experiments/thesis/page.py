@@ -2,8 +2,8 @@
 
     python -m experiments.thesis.page out/reproduce/report.json
 
-writes docs/explanation/thesis.md, the sentences between the marks of README.md and of
-docs/howto/reproduce.md, and the tables of docs/explanation/results.md. Run it after
+writes docs/explanation/thesis.md, the tables of docs/explanation/results.md, and the sentences
+between the marks of README.md and of docs/howto/reproduce.md. Run it after
 `jaxbeam reproduce --all`.
 """
 
@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.thesis.report import ALL_VERDICTS
-from experiments.thesis.results_tables import PAGE as RESULTS, with_tables
+from experiments.thesis.results_tables import PAGE as RESULTS, with_shares, with_tables
 from experiments.thesis.verdicts import (
     EXPLAINED,
     FITTED,
@@ -133,10 +133,13 @@ def with_counts(text: str, report: dict) -> str:
 
 
 def write(report: dict) -> None:
-    """Write the page, the tables of results, and the counts in README and about `reproduce`."""
+    """Write the page, the tables of results, and numbers of both in README and `reproduce.md`."""
     PAGE.write_text(page(report), encoding="utf-8")
     RESULTS.write_text(with_tables(RESULTS.read_text(encoding="utf-8"), report), encoding="utf-8")
-    for file in (ROOT / "README.md", ROOT / "docs" / "howto" / "reproduce.md"):
+    readme = ROOT / "README.md"
+    shares = with_shares(readme.read_text(encoding="utf-8"), RESULTS.read_text(encoding="utf-8"))
+    readme.write_text(shares, encoding="utf-8")
+    for file in (readme, ROOT / "docs" / "howto" / "reproduce.md"):
         file.write_text(with_counts(file.read_text(encoding="utf-8"), report), encoding="utf-8")
 
 

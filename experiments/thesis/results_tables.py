@@ -1,6 +1,7 @@
 """Tables of the page on results, written from a report of `reproduce` between marks of the page.
 
-The remarks of the experiments `tuned`, `sensed` and `fragile` have the numbers.
+The remarks of the experiments `tuned`, `sensed` and `fragile` have the numbers. README has a
+paragraph on the same tables, between marks too.
 """
 
 import re
@@ -36,6 +37,7 @@ FRAGILE_COLUMNS = {
     "tuned, sensors only": "tuned, sensors only",
 }
 NO_GAIN = "worse than no control"
+BEGIN_SHARES, END_SHARES = "<!-- shares of laws -->", "<!-- end of shares -->"
 
 
 def shares_table(remarks: Sequence[str], rows: Mapping[str, tuple[str, ...]]) -> list[str]:
@@ -94,3 +96,52 @@ def with_tables(text: str, report: Mapping) -> str:
             raise ValueError(f"there are no marks {begin} and {end} in the text")
         text = "\n".join([before + begin, "", *lines, "", end + after])
     return text
+
+
+def shares_paragraph(text: str) -> str:
+    """What README says of the laws, in numbers of the tables of the page.
+
+    Raises KeyError if the page lacks a row.
+    """
+    tables = {
+        name: {
+            cells[0]: cells[1:]
+            for line in _between(text, f"<!-- {name} -->", f"<!-- end of {name} -->").splitlines()
+            if (cells := [cell.strip() for cell in line.strip("| ").split("|")])
+        }
+        for name in ("tuned", "sensed", "fragile")
+    }
+
+    def worst(name: str, row: str) -> str:
+        return " and ".join(cell.partition(" (")[0] for cell in tables[name][row])
+
+    gates, hand, published = (worst("tuned", row) for row in list(TUNED_ROWS)[2::-1])
+    drawn, sensors = (worst("sensed", row) for row in list(SENSED_ROWS)[1:3])
+    light, fast = (tables["fragile"][change] for change in ("0.1 kg", "2 m/s"))
+    other = tables["fragile"]["filter of the other rig"][-1]
+    other = f"{'is' if other == NO_GAIN else 'attains'} {other}"
+    return (
+        "Tuned laws of the laboratory rigs, share of the attainable reduction of the peak on"
+        f" held-out loads, at worst, of one and two spans: by two gates {gates}, drawn by hand (a"
+        f" trapezium of four numbers) {hand}; by sensors alone {sensors}, drawn by hand {drawn};"
+        f" cubic feedback as published {published}. They have limits: the law by gates attains"
+        f" {light[1]} with a load of 0.1 kg and {fast[1]} at 2 m/s, the trapezium {light[0]} and"
+        f" {fast[0]}; with the filter of the other rig the law by sensors of one span {other}."
+    )
+
+
+def with_shares(text: str, results: str) -> str:
+    """A text with the paragraph on the laws between its marks, by the page on results.
+
+    Raises ValueError if it has no marks.
+    """
+    old = _between(text, BEGIN_SHARES, END_SHARES)
+    return text.replace(old, f"\n{shares_paragraph(results)}\n")
+
+
+def _between(text: str, begin: str, end: str) -> str:
+    _, found, rest = text.partition(begin)
+    inner, closed, _ = rest.partition(end)
+    if not (found and closed):
+        raise ValueError(f"there are no marks {begin} and {end} in the text")
+    return inner

@@ -12,11 +12,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxbeam.analysis.plausible_numbers import Plausibility, plausible_numbers
+from jaxbeam.case.actuators.electrodynamic import Electrodynamic
 from jaxbeam.case.beam import END_CONDITIONS, Support
 from jaxbeam.case.case import Case, concrete_case, crossing_times
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import Modes, modes
+from jaxbeam.model.poles_zeros import poles
 
 LEAST_SPAN_OVER_DEFLECTION = 50.0  # under loads: a beam yields, or is no longer nearly straight
 LEAST_SPAN_OVER_OWN_DEFLECTION = 10.0  # under its own weight, which a camber may make up for
@@ -65,6 +67,7 @@ def _warnings(case: Case, found: Modes, numbers: Plausibility) -> Iterator[str]:
     yield from _mass_warnings(case, numbers)
     yield from _travel_warnings(case, numbers)
     yield from _support_warnings(case)
+    yield from _inner_loop_warnings(case)
     if not case.sensors:
         yield (
             "there are no sensors, so that only contact forces are reported: write [[sensors]]"
@@ -191,6 +194,24 @@ def _support_warnings(case: Case) -> Iterator[str]:
                 f"{first} and {second} are only {apart:.3g} m apart, and clamp the beam: are"
                 " positions in m? Leave one out, or clamp the end"
             )
+
+
+def _inner_loop_warnings(case: Case) -> Iterator[str]:
+    looped = [
+        f"actuators.{i}.inner_loop"
+        for i, actuator in enumerate(case.actuators)
+        if isinstance(actuator, Electrodynamic) and actuator.inner_loop is not None
+    ]
+    if not looped:
+        return
+    fastest = max(poles(case), key=lambda pole: pole.real)
+    if fastest.real > 0:
+        hertz = abs(fastest.imag) / (2 * math.pi)
+        yield (
+            f"the beam with {' and '.join(looped)} is unstable without any controller: it grows as"
+            f" exp({fastest.real:.3g} t / s) at {hertz:.3g} Hz; lower the bandwidth or the gains of"
+            " the loop, or raise its sensor_bandwidth"
+        )
 
 
 def _stiffness(support: Support) -> float:

@@ -63,11 +63,12 @@ def export_c(case: Case, name: str) -> CProgram:
         raise ValueError(f"{name!r} cannot be the name of functions in C: take letters, digits, _")
     check_case(case)
     for i, actuator in enumerate(case.actuators):
-        if actuator.compensation is not None:
-            raise ValueError(
-                f"actuators.{i}.compensation cannot be exported as C: leave it out, and apply the"
-                " inverse of its hysteresis to the commands"
-            )
+        for key, effect in (("compensation", "hysteresis"), ("creep_compensation", "creep")):
+            if getattr(actuator, key) is not None:
+                raise ValueError(
+                    f"actuators.{i}.{key} cannot be exported as C: leave it out, and apply the"
+                    f" inverse of its {effect} to the commands"
+                )
     controller = case.controller
     if controller is None:
         raise ValueError("controller is missing: there is nothing to export; add one to the case")

@@ -281,7 +281,7 @@ def _sampled_features(case: Case) -> Iterator[str]:
     for i, actuator in enumerate(case.actuators):
         if actuator.command_rate_limit() is not None:
             yield f"the rate limit of actuators.{i}"
-        for name in ("hysteresis", "compensation"):
+        for name in ("hysteresis", "compensation", "creep", "creep_compensation"):
             if getattr(actuator, name) is not None:
                 yield f"the {name} of actuators.{i}"
     if not case.controller.open_loop:

@@ -33,9 +33,8 @@ class ExtendedKalman(AbstractKalmanEstimator):
     zero. Laws whose tables are read by the positions of the loads, as `lqr-position`, take those of
     the estimate; laws that feed forward weights take the estimated ones.
 
-    With an uncertain entry and nearly exact readings the filter is too sure of its linearisation:
-    in a trial with an entry 5 ms off it found 0.34 kg for 0.4 kg. State more `measurement_noise`
-    than the sensors have there.
+    With an uncertain entry and nearly exact readings the filter is too sure of its linearisation,
+    and may stay at a wrong mass. State more `measurement_noise` than the sensors have there.
 
     White forces of intensity `process_noise` act on the (mass-normalised) modes; each reading has
     white noise of standard deviation `measurement_noise`. Filters and delays of the sensors are

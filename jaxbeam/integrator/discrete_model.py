@@ -8,11 +8,16 @@ import equinox as eqx
 from jaxtyping import Float
 
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
-from jaxbeam.integrator.monitored_rows import bounds_by_energy, monitored_rows
+from jaxbeam.integrator.peaks.monitored_rows import (
+    bounds_by_energy,
+    commands_at_once,
+    monitored_rows,
+)
 from jaxbeam.integrator.propagators import PEAK_NODES, Propagators, propagators
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.corrected_rows import LoadInfluence, StaticCorrection
+from jaxbeam.model.sensing.linear_outputs import linear_outputs
 from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.runtime.arrays import Array, xp
 
@@ -22,8 +27,8 @@ class DiscreteModel(eqx.Module):
 
     Outputs are deflections, or other quantities of sensors. `energy_bounds` bound each of them by
     the energies of the blocks (see `bounds_by_energy`). With `with_node_states`, step matrices
-    include the states at the nodes. `load_influence` is that of statically corrected outputs. Peaks
-    are those of the `magnitude` of an output, by default its absolute value.
+    include the states at the nodes. `load_influence` is that of outputs that forces change at once.
+    Peaks are those of the `magnitude` of an output, by default its absolute value.
     """
 
     model: ModalModel
@@ -69,20 +74,20 @@ def discrete_model(
     if outputs is None:
         shapes = model.shapes(positions, (0,))[0]
         outputs = OutputRows(shapes, xp.zeros((shapes.shape[0], 0)), (0,) * shapes.shape[0])
-    rows, influence = (
-        (None, None) if correction is None else (correction.rows, correction.influence)
-    )
-    transition, force_response = monitored_rows(model, step_propagators, outputs, commands, rows)
+    linear = linear_outputs(model, outputs, correction)
+    corrected = None if correction is None else correction.rows
+    direct = None if commands is None else commands_at_once(outputs, commands, corrected)
+    transition, force_response = monitored_rows(model, step_propagators, linear.rows, direct)
     return DiscreteModel(
         model,
         grid,
         step_propagators,
         transition,
         force_response,
-        bounds_by_energy(model, outputs, rows),
+        bounds_by_energy(model, outputs, corrected),
         commands,
         with_node_states,
-        influence,
+        linear.influence,
     )
 
 

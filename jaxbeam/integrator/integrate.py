@@ -20,9 +20,10 @@ from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.input_steps import advance_known_with_inputs, step_with_inputs
 from jaxbeam.integrator.kinks.steps import weights_with_impulses, with_impulses
-from jaxbeam.integrator.monitored_rows import energies
+from jaxbeam.integrator.peaks.end_forces import END_FRACTIONS, end_forces
+from jaxbeam.integrator.peaks.monitored_rows import energies
+from jaxbeam.integrator.peaks.running_peaks import RunningPeaks, initial_peaks, update_peaks
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
-from jaxbeam.integrator.running_peaks import RunningPeaks, initial_peaks, update_peaks
 from jaxbeam.integrator.step import (
     CHECKPOINT_NAME,
     advance_unforced,
@@ -85,23 +86,29 @@ def longest_force_step(case: Case, loads: LoadSet) -> Float[Array, ""]:
     return stop_gradient(MAX_PASSAGE_PER_STEP / (wavenumber * speed + 1e-30))
 
 
-def _values_by_row(
+def _of_wheels(
     values: Float[Array, "wheel batch"], path: LoadPath
-) -> Float[Array, "step row batch"]:
-    """A property of the wheels for each row of the contact equations; zero off the beam."""
+) -> Float[Array, "step load 1 batch"]:
+    """A property of the wheels in the rows of a path; zero off the beam."""
     selected = xp.where(path.on_beam[..., None], take(values, path.loads), 0.0)
-    return xp.repeat(selected, len(GAUSS_NODES), axis=1)
+    return selected[:, :, None]
+
+
+def _weights(loads: LoadSet, path: LoadPath, fractions) -> Float[Array, "step load fraction batch"]:
+    """Weights (N) of the wheels at fractions of the steps, with forces that vary in time."""
+    weight = xp.repeat(_of_wheels(loads.weight, path), len(fractions), axis=2)
+    for wheel, history in loads.wheels.histories.items():
+        of_wheel = (path.loads == wheel) & path.on_beam
+        times = path.start[:, None] + path.length[:, None] * np.asarray(fractions)
+        force = history.at(times)[:, None]  # step, 1, fraction, batch
+        weight = weight + xp.where(of_wheel[..., None, None], force, 0.0)
+    return weight
 
 
 def _step_inputs(discrete: DiscreteModel, loads: LoadSet, path: LoadPath) -> StepInput:
     """Matrices and wheels of the steps of a chunk."""
-    inertia, weight = (_values_by_row(part, path) for part in (loads.inertia, loads.weight))
-    for wheel, history in loads.wheels.histories.items():
-        of_wheel = (path.loads == wheel) & path.on_beam
-        times = path.start[:, None] + path.length[:, None] * np.asarray(GAUSS_NODES)
-        force = history.at(times)[:, None]  # step, 1, node, batch
-        rows = xp.where(of_wheel[..., None, None], force, 0.0)
-        weight = weight + rows.reshape(*weight.shape[:2], -1)
+    weight = collapse(_weights(loads, path, GAUSS_NODES), 1, 3)
+    inertia = xp.repeat(_of_wheels(loads.inertia, path)[:, :, 0], NODE_COUNT, axis=1)
     if path.surface is not None:
         by_wheel = xp.take_along_axis(path.surface[:, 2], path.loads[..., None], axis=1)
         weight = weight + inertia * by_wheel.reshape(*by_wheel.shape[:1], -1, 1)
@@ -146,10 +153,19 @@ def _chunk_function(
                 (steps, infos),
             )
         if running_peaks is not None:
-            beam_states = states[:, : discrete.model.state_count]
-            running_peaks = update_peaks(
-                running_peaks, steps.matrices, path, beam_states, forces, commands
-            )
+            count = discrete.model.state_count
+            before, ends = states[:, :count], None
+            if path.influence is not None:
+                after = xp.concatenate([before[1:], state[None, :count]])
+                ends = end_forces(
+                    path.ends,
+                    steps.inertia,
+                    _weights(loads, path, END_FRACTIONS),
+                    xp.stack([before, after], axis=1),
+                    forces,
+                )
+            inputs = [before, forces, ends, commands]
+            running_peaks = update_peaks(running_peaks, steps.matrices, path, inputs)
         end = path.start[-1] + path.length[-1]
         return state, memory, running_peaks, end, (states, commands, observed)
 

@@ -20,7 +20,8 @@ from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_peaks as integrate_peaks_in_jax
 from jaxbeam.integrator.kinks.passages import may_have_kinks
-from jaxbeam.integrator.monitored_rows import bounds_by_energy, force_weights_at_peaks
+from jaxbeam.integrator.peaks.monitored_rows import bounds_by_energy, force_weights_at_peaks
+from jaxbeam.integrator.peaks.running_peaks import PEAK_MARGIN, Peaks
 from jaxbeam.integrator.propagators import (
     DOUBLINGS,
     GAUSS_NODES,
@@ -28,7 +29,6 @@ from jaxbeam.integrator.propagators import (
     PEAK_NODES,
     TAYLOR_TERMS,
 )
-from jaxbeam.integrator.running_peaks import PEAK_MARGIN, Peaks
 from jaxbeam.integrator.step_matrices import CHUNK_STEPS
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.layout import is_uniform

@@ -13,14 +13,13 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.kinks.passages import KinkSteps
-from jaxbeam.integrator.monitored_rows import force_weights_at_peaks
+from jaxbeam.integrator.peaks.end_forces import EndRows, end_rows
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT, PEAK_NODES
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.contact import ModalCompliance, SurfaceRows, surface_rows
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.runtime.arrays import (
     Array,
-    add_at,
     any_jax,
     cond,
     index_in_dim,
@@ -67,7 +66,8 @@ class StepMatrices(eqx.Module):
     `contact_response` maps the state at the start to the acceleration under the loads at the
     nodes, `contact_compliance` the contact forces; both are None where no load has inertia.
     `springs` are None where no wheel has springs. `monitored` acts on state at the start, contact
-    forces and commands, one after the other. A step is `loaded` with a load on the beam.
+    forces, those at the ends if outputs follow them at once, and commands, one after the other. A
+    step is `loaded` with a load on the beam.
     """
 
     contact_response: Float[Array, "step row state"] | None
@@ -92,8 +92,8 @@ class LoadPath(eqx.Module):
     `length_index` is the index of a step's length among those of the grid; start and length are in
     s. `loads` are the indices of the wheels in the rows. `surface` is the height of the profile (m)
     under all wheels, and its first and second rate, where there is a profile. `influence` is the
-    static one of a force of each wheel at the peak nodes on corrected outputs; `kinks` tell which
-    steps are passages over kinks, if there are any.
+    static one of a force of each wheel at the peak nodes on corrected outputs, `ends` the wheels at
+    the ends of steps; `kinks` tell which steps are passages over kinks, if there are any.
     """
 
     length_index: Int[Array, " step"]
@@ -104,6 +104,7 @@ class LoadPath(eqx.Module):
     rows: SurfaceRows
     surface: Float[Array, "step 3 wheel node"] | None
     influence: Float[Array, "step load sample output"] | None = None
+    ends: EndRows | None = None
     kinks: KinkSteps | None = None
 
     @property
@@ -163,15 +164,17 @@ def load_path(
     motion = position, speed, acceleration, on_beam_at_nodes
     rows = surface_rows(model, *motion, springs, not loads.massless)
     surface = None if surface is None else xp.stack(surface, axis=1)
-    influence = None
+    influence = ends = None
     if discrete.load_influence is not None:
         influence = _static_influence(discrete, loads, start, length, load_index, on_beam)
+        if discrete.modal_command_matrix is None:
+            ends = end_rows(model, loads, start, length, load_index, on_beam)
     kinks = None
     if grid.kinks is not None and not loads.massless:
         passage = xp.where(grid.starts_panel(index, panel), take(grid.passage, panel), -1)
         kinks = grid.kinks.of_steps(passage, load_index, on_beam, speed[..., 0])
     return LoadPath(
-        length_index, start, length, load_index, on_beam, rows, surface, influence, kinks
+        length_index, start, length, load_index, on_beam, rows, surface, influence, ends, kinks
     )
 
 
@@ -204,11 +207,23 @@ def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
 
 
 def _with_influence(discrete: DiscreteModel, monitored, path: LoadPath):
-    """Rows of monitored outputs, with the static influence of the forces at the peak nodes."""
-    of_forces = xp.einsum("pf,tlps->tpslf", force_weights_at_peaks(), path.influence)
-    of_forces = of_forces.reshape(*monitored.shape[:2], -1)
-    first = discrete.model.state_count
-    return add_at(monitored, np.s_[:, :, first : first + of_forces.shape[2]], of_forces)
+    """Rows of monitored outputs, with the static influence of the forces at the peak nodes.
+
+    Peak nodes are the start, the Gauss nodes and the end of a step.
+    """
+    steps, loads = path.on_beam.shape
+    first, samples = discrete.model.state_count, monitored.shape[1]
+
+    def of_forces(influence, peaks):
+        """Rows on forces at these peak nodes, each of which acts on the outputs there."""
+        at = np.eye(len(PEAK_NODES))[:, peaks]
+        return xp.einsum("pf,tlps->tpslf", at, influence).reshape(steps, samples, -1)
+
+    at_nodes = of_forces(path.influence, np.arange(1, NODE_COUNT + 1))
+    at_ends = of_forces(path.influence, np.array([0, NODE_COUNT + 1]))
+    last = first + loads * NODE_COUNT
+    parts = monitored[..., :first], monitored[..., first:last] + at_nodes
+    return xp.concatenate([*parts, at_ends, monitored[..., last:]], axis=2)
 
 
 def _matrices_by_length(discrete: DiscreteModel, path: LoadPath):

@@ -13,7 +13,7 @@ from jaxbeam.case.case import Case, concrete_case, replace
 from jaxbeam.case.fields import concrete
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_history, integrate_peaks
-from jaxbeam.integrator.running_peaks import RunningPeaks
+from jaxbeam.integrator.peaks.running_peaks import RunningPeaks
 from jaxbeam.integrator.static_shapes import StaticShapes, model_limits
 from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.load_set import LoadSet, load_set

@@ -8,6 +8,7 @@ Outputs:
     sensors.I                      reading of sensor I without noise, filter and delay
     deflection@X, velocity@X, ...  quantity at X m (`case.quantities`, but those at a fibre)
     actuators.I.current            current in the coil of an electrodynamic shaker
+    actuators.I.voltage            voltage across it, which an inner loop sets
     actuators.I.active_force       as above
     actuators.I.transmitted_force  force on the beam: active force less that of mass and suspension
 
@@ -32,7 +33,8 @@ from jaxbeam.runtime.arrays import set_at, xp
 POINT_QUANTITIES = tuple(
     name for name, entry in QUANTITIES.items() if not (entry.at_fibre or entry.over_modulus)
 )
-ACTUATOR_QUANTITIES = ("current", "active_force", "transmitted_force")
+COIL_UNITS = {"current": "A", "voltage": "V"}
+ACTUATOR_QUANTITIES = (*COIL_UNITS, "active_force", "transmitted_force")
 
 
 class ChannelPair(NamedTuple):
@@ -131,13 +133,21 @@ def output_row(case: Case, model: ModalModel, output: str):
     sizes = [device.state_matrix.shape[0] for device in attachments]
     start = 2 * model.mode_count + sum(sizes[:index])
     attachment, device_states = attachments[index], np.arange(start, start + sizes[index])
-    if actuator_output == "current":
-        return set_at(zero_row, device_states, 1.0), zero_row, feedthrough
+    displacement, actuator = model.displacement_map[index], case.actuators[index]
+    if isinstance(actuator, Electrodynamic) and actuator_output != "transmitted_force":
+        port = actuator.coil_port()
+        signal = port.voltage if actuator_output == "voltage" else port.current
+        factor = actuator.force_constant if actuator_output == "active_force" else 1.0
+        on_states = set_at(zero_row, device_states, signal.states)
+        for order in (0, 1):
+            on_states = on_states + signal.port[order] * row_on_states(model, displacement, order)
+        on_rates = signal.port[2] * row_on_states(model, displacement, 1)
+        feedthrough = set_at(feedthrough, index, factor * signal.command)
+        return factor * on_states, factor * on_rates, feedthrough
     active_force = set_at(zero_row, device_states, attachment.output_matrix)
     feedthrough = set_at(feedthrough, index, attachment.feedthrough)
     if actuator_output == "active_force":
         return active_force, zero_row, feedthrough
-    displacement = model.displacement_map[index]
     suspension_force = attachment.stiffness * row_on_states(
         model, displacement, 0
     ) + attachment.damping * row_on_states(model, displacement, 1)
@@ -183,10 +193,10 @@ def _output_unit(case: Case, channel: str) -> str:
             f"the output {channel!r} does not exist;"
             f" {suggestion(actuator_output, ACTUATOR_QUANTITIES)}"
         )
-    if actuator_output == "current" and not isinstance(actuator, Electrodynamic):
+    if actuator_output in COIL_UNITS and not isinstance(actuator, Electrodynamic):
         kind = type(actuator).__name__
         raise ValueError(f"the output {channel!r} does not exist: a {kind} has no coil")
-    return "A" if actuator_output == "current" else _force_unit(actuator)
+    return COIL_UNITS.get(actuator_output) or _force_unit(actuator)
 
 
 def _parse_actuator(case: Case, channel: str, role: str) -> tuple[AbstractActuator, str]:

@@ -147,7 +147,7 @@ def contact_at(
     mass_on_beam = xp.where(on_beam, mass, 0.0)
     identity = np.eye(position.shape[-1])[..., None]
     matrix = identity + mass_on_beam[..., None, :] * (shape @ shape.mT)[..., None]
-    force = _solve_at_instants(matrix, free_force)
+    force = solve_at_instants(matrix, free_force)
     return ContactState(force, modal_acceleration + shape.mT @ force, vehicle_acceleration)
 
 
@@ -173,7 +173,7 @@ def forces_of_wheels(loads: LoadSet, spring_forces, like, axis: int = -2):
     return xp.concatenate([*parts, xp.zeros_like(slice_in_dim(like, first, None, axis))], axis=axis)
 
 
-def _solve_at_instants(
+def solve_at_instants(
     matrix: Float[Array, "*time load load batch"], right: Float[Array, "*time load batch"]
 ) -> Float[Array, "*time load batch"]:
     """Solutions of small systems, with instants and batch as one batch axis."""

@@ -99,6 +99,14 @@ def dlqr(
     return solve(R + B.T @ cost @ B, cross), cost
 
 
+def indefinite_dare(A: Square, G: Square, H: Square) -> Square:
+    """Stabilising P of P = A'P (1 + G P)^-1 A + H for symmetric G and H of any sign.
+
+    Differentiable; nan if the doubling finds none.
+    """
+    return _dare(A, G, H)
+
+
 @custom_jvp
 def _care(A, G, H):
     """P of A'P + P A - P G P + H = 0."""

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.integrator.running_peaks import Peaks
+from jaxbeam.integrator.peaks.running_peaks import Peaks
 from jaxbeam.runtime.arrays import Array, xp
 
 

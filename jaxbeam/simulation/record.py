@@ -43,7 +43,7 @@ class Record(RecordViews):
     so are the peaks. `error_estimate` of the time steps is relative to the largest deflection,
     `step_errors` to the largest value of what each sensor measures. `controller_readings`
     are the readings that a sampled controller has received, None without one; `acting_command` are
-    the commands behind the hysteresis of the actuators, None if no actuator has one.
+    the commands behind hysteresis and creep of the actuators, None if no actuator has any.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(

@@ -31,7 +31,7 @@ VARIABLES = {
     "body_velocity": (("time", "body"), "m/s or rad/s", "velocity of the body"),
     "body_acceleration": (("time", "body"), "m/s^2 or rad/s^2", "acceleration of the body"),
 }
-# Where an actuator has a hysteresis.
+# Where an actuator has a hysteresis or creep.
 ACTING_COMMAND = (("time", "actuator"), "unit of a command", "command that acts on the beam")
 # Variables of a run in a sweep; the dimensions of the sweep come first.
 SWEEP_VARIABLES = VARIABLES | {

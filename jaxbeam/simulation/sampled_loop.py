@@ -91,10 +91,10 @@ class SampledLoop(AbstractInputPolicy):
     def observe(self, memory, info):
         """Available readings (sensor, batch), and number of failures of the law (batch).
 
-        And the commands (actuator, batch) where they act through a hysteresis, else None.
+        And the commands (actuator, batch) where they act through hysteresis or creep, else None.
         """
-        through_hysteresis = any(one is not None for one in self.path.hysteresis)
-        sent = memory.commands.command if through_hysteresis else None
+        through_operator = any(one is not None for one in self.path.operators)
+        sent = memory.commands.command if through_operator else None
         return self._available_readings(memory.readings, info.event), memory.failures, sent
 
     def failures(self, memory) -> Float[Array, " batch"]:

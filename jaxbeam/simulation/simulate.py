@@ -15,8 +15,8 @@ from jaxbeam.integrator.discrete_model import DiscreteModel, discrete_model, sig
 from jaxbeam.integrator.events import sample_schedule
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history
+from jaxbeam.integrator.peaks.running_peaks import Peaks
 from jaxbeam.integrator.propagators import NODE_COUNT, end_weights
-from jaxbeam.integrator.running_peaks import Peaks
 from jaxbeam.integrator.time_grid import TimeGrid, grid_by_schedule
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
@@ -352,7 +352,7 @@ def _commands_at_steps(case: Case, commands, steps):
 class Outputs(NamedTuple):
     """Motion of beam and vehicles at the samples; readings and failures of a controller, if any.
 
-    `sent` are its commands where they act through a hysteresis; the motion has those that act.
+    `sent` are its commands where they act through hysteresis or creep; those in the motion act.
     """
 
     motion: Motion

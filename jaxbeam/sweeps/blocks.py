@@ -165,7 +165,7 @@ class Runner:
         self.initial_steps = initial * initial_share(s.quantity for s in self.case.sensors)
 
     def choose_step_sizes(self) -> tuple[Float[np.ndarray, " path"], float]:
-        """Step sizes (s) of all batches, and the relative error of peaks measured with them.
+        """Step sizes (s) of all batches, and the estimated relative error of their peaks.
 
         Raises RuntimeError if no time step meets the tolerance.
         """
@@ -174,7 +174,7 @@ class Runner:
         def peaks(batch_indices, steps, extra_steps=0, single=False):
             calls = -(-batch_indices.size // self.trial_batches)
             parts = np.array_split(batch_indices, calls), np.array_split(steps, calls)
-            settings = None, single, extra_steps, False
+            settings = None, single, extra_steps
             results = [self._integrate(*part, *settings) for part in zip(*parts, strict=True)]
             found = [one["peak_deflection"] for one in results]
             return self._compared_by_quantity(np.concatenate(found))
@@ -232,10 +232,8 @@ class Runner:
         if not self.same_model:
             yield programs.modal_models, (program, shared_values)
 
-    def _integrate(
-        self, batch_indices, steps, substeps, single, extra_steps=0, corrected: bool = True
-    ):
-        """Results of at most a block of batches by name; statically corrected, or not."""
+    def _integrate(self, batch_indices, steps, substeps, single, extra_steps=0):
+        """Results of at most a block of batches by name."""
         # Fewer batches are spread over the block, so that each device has its part.
         rows = np.arange(batch_indices.size) * self.batches_per_block // batch_indices.size
         mask = np.zeros(self.batches_per_block, bool)
@@ -243,7 +241,7 @@ class Runner:
         nearest_row = np.cumsum(mask) - 1
         batch_indices, steps = batch_indices[nearest_row], steps[nearest_row]
         step_size = steps, np.full(batch_indices.size, extra_steps)
-        program, models = self.program(substeps, corrected), self._models_of(batch_indices)
+        program, models = self.program(substeps), self._models_of(batch_indices)
         shared_values, batched_values = self._values_of(batch_indices)
         if self.discretise_separately:
             models = programs.discrete_models(program, mask, models, shared_values, step_size)
@@ -275,12 +273,13 @@ class Runner:
         """Shared and batched values of batches."""
         return self.batches.shared_values[batch_indices], self.batches.batched_values[batch_indices]
 
-    def program(self, substeps: int | None = None, corrected: bool = True) -> programs.Program:
+    def program(self, substeps: int | None = None) -> programs.Program:
         """Data of the programs; with `substeps` per sample interval, also for histories."""
         scheduled = substeps is not None or self.case.controller is not None
         sampling = (self.schedule if scheduled else None), substeps
-        outputs = self.known_outputs, np.asarray(float(corrected))
-        return programs.Program(self.case, self.shapes, *self.addresses, *sampling, *outputs)
+        return programs.Program(
+            self.case, self.shapes, *self.addresses, *sampling, self.known_outputs
+        )
 
 
 def _round_up(count: int, unit: int) -> int:

@@ -19,7 +19,7 @@ from jaxbeam.integrator.forces.system import (
     force_responses,
     force_system,
 )
-from jaxbeam.integrator.running_peaks import Peaks
+from jaxbeam.integrator.peaks.running_peaks import Peaks
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
 from jaxbeam.integrator import native_peaks
@@ -35,7 +34,6 @@ from jaxbeam.model.sensing.corrected_rows import (
     static_correction,
 )
 from jaxbeam.model.sensing.output_rows import OutputRows, sensor_rows
-from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,
     PARALLEL_COMPILATION,
@@ -52,9 +50,7 @@ class Program(NamedTuple):
 
     With a `schedule` steps end at its events; with `substeps` there are so many between events, and
     histories are saved, otherwise the step size of each batch determines their number.
-    `known_outputs` are those of all batches, if they share them. The share of the static correction
-    in the outputs is one, or zero while step sizes are chosen: by the sums of the modes, as peaks
-    of an axle that passes a sensor are nearly exact with any step.
+    `known_outputs` are those of all batches, if they share them.
     """
 
     case: Case
@@ -64,7 +60,6 @@ class Program(NamedTuple):
     schedule: EventSchedule | None = None
     substeps: int | None = None
     known_outputs: Outputs | None = None
-    correction_share: Float[Array, ""] | float = 1.0
 
     def case_with(self, shared_values) -> Case:
         """Case of a batch."""
@@ -104,13 +99,11 @@ class Program(NamedTuple):
 
     def outputs(self, model, shared_values) -> Outputs:
         """Outputs of a batch."""
-        if self.known_outputs is None:
-            varied = self.case_with(shared_values)
-            rows = sensor_rows(model, varied, varied.sensors)
-            correction = static_correction(model, varied, varied.sensors, rows)
-        else:
-            rows, correction = self.known_outputs
-        return rows, correction and correction.scaled(self.correction_share)
+        if self.known_outputs is not None:
+            return self.known_outputs
+        varied = self.case_with(shared_values)
+        rows = sensor_rows(model, varied, varied.sensors)
+        return rows, static_correction(model, varied, varied.sensors, rows)
 
 
 @compiled(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)

@@ -46,11 +46,10 @@ def initial_step_sizes(
 def initial_share(quantities: Iterable[str]) -> float:
     """Share of initial steps with which a search for those of some quantities begins.
 
-    Their errors are those of higher modes. Median steps of beams of one and two spans with 2 to 12
-    modes are 0.9 of the initial ones for moments, 0.65 for shear forces, and 0.25 for
-    accelerations: a trial with somewhat shorter steps is useful, one with longer steps is not.
+    Their errors are those of higher modes. Of beams of one and two spans with 2 to 12 modes the
+    median steps are these shares: 0.9 for moments, 0.65 for shear forces, 0.25 for accelerations.
     """
-    in_x, in_time = (1.0, 0.9, 0.75, 0.55), (1.0, 0.45, 0.22)
+    in_x, in_time = (1.0, 0.9, 0.9, 0.65), (1.0, 0.45, 0.25)
     found = (QUANTITIES[name] for name in quantities)
     return min((in_x[q.x_derivative] * in_time[q.time_derivative] for q in found), default=1.0)
 
@@ -137,7 +136,10 @@ def choose_step_sizes(
     tolerance: float,
     map_function: Callable = map,
 ) -> tuple[Float[np.ndarray, " path"], float]:
-    """Longest steps (s) of all batches for a tolerance, and the largest error of the sample.
+    """Longest steps (s) of all batches for a tolerance, and the estimated error of their runs.
+
+    That is SAFETY_FACTOR times the largest error of the sample: of random sweeps of beams of one
+    and two spans and all quantities, 0.02 % of the runs had larger true errors, at most twice.
 
     `peaks` is called, through `map_function`, with indices of batches. The search over
     `crossing_rates` (1/s) starts from `initial_steps` (s) and is limited by `max_steps` (s). Raises
@@ -167,7 +169,7 @@ def choose_step_sizes(
         error[fails] = found
         fails, known = error > target_error, ~np.isnan(error)  # NaN: no run succeeds
         if not fails.any():
-            return steps, float(np.nanmax(error, initial=0.0))
+            return steps, SAFETY_FACTOR * float(np.nanmax(error, initial=0.0))
         with np.errstate(divide="ignore"):
             factor = np.maximum(0.7, 0.92 * (target_error / error) ** (1 / CONVERGENCE_ORDER))
         # Only up to the next batches of the sample, whose steps are short enough.

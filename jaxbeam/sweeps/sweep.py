@@ -50,11 +50,13 @@ def sweep(
 
     Runs are computed in blocks on all cores, compiled once, with the longest time steps whose
     relative errors of peaks are below `tolerance`. Errors are measured on a stratified random
-    sample of the runs, where they are at most a sixth of the tolerance; `error_estimate` is the
-    largest of these. Other runs may have errors ten times as large, and more near critical speeds
-    of heavy masses. In `precision` "single" models and propagators are made in float64 and runs are
-    integrated in float32, which is faster where arithmetic dominates, as on a GPU. Results are then
-    float32, and the rounding error of peaks, a few parts in a million, is measured and included in
+    sample of the runs, where they are at most a sixth of the tolerance; `error_estimate` is six
+    times the largest of these, as errors of other runs may be larger: one run in thousands exceeds
+    it, near the critical speed of a heavy mass.
+
+    In `precision` "single" models and propagators are made in float64 and runs are integrated in
+    float32, which is faster where arithmetic dominates, as on a GPU. Results are then float32, and
+    the rounding error of peaks, a few parts in a million, is measured and included in
     `error_estimate`.
 
     With a `store` each block is written to a zarr store when it is done; with `resume` an

@@ -55,14 +55,19 @@ def static_shares(case: Case) -> dict[str, float]:
     At each sensor under a load there; a rotation, which may be zero there, under one at a quarter
     of the span.
     """
+    static = [
+        sensor
+        for sensor in case.sensors
+        if not (QUANTITIES[sensor.quantity].bends or QUANTITIES[sensor.quantity].time_derivative)
+    ]
+    if not static:
+        return {}
     case = concrete_case(case)
     layout, shares = mesh_layout(case), {}
     if not is_supported(case, layout):
         return shares
-    for sensor in case.sensors:
+    for sensor in static:
         entry, x = QUANTITIES[sensor.quantity], sensor.position
-        if entry.bends or entry.time_derivative:
-            continue
         at = x if entry.x_derivative == 0 else case.beam.length / 4
         exact = float(influence_line(case, x, at, entry.x_derivative, layout))
         missing = float(residual_flexibility(case, x, at, entry.x_derivative, layout))

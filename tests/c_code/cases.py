@@ -149,6 +149,7 @@ CASES = {
             6, 2, 1e-8, output_weight=[1.0, 1.0, 1e-5], reference=[1e-4, 0.0, 0.0], period=PERIOD
         )
     ),
+    "h-infinity": rig(jb.HInfinity(2e-4, 2.0, 1.0, [1e-5, 1e-5, 1e-3], period=PERIOD)),
     "mpc-soft": rig(
         jb.MPC(
             6,

@@ -346,3 +346,21 @@ def test_peaks_of_curves_through_any_samples(tmp_path):
     rows = interpolation_matrix(PEAK_NODES)[: len(PEAK_NODES)].T
     search(curves, np.ascontiguousarray(rows), heights, heights.size)
     assert_allclose(heights, refine_peak(jnp.asarray(curves), PEAK_NODES)[0], rtol=1e-11)
+
+
+@pytest.mark.parametrize("quantity", ["moment", "shear", "deflection"])
+def test_stated_errors_hold(quantity):
+    """Peaks beside those of ten thousand times smaller tolerance, static corrections included."""
+    case = jb.Case(
+        jb.Beam(1.0, 1.0, 1.0, damping_ratio=0.01, modes=4),
+        sensors=[jb.Sensor(0.43, quantity)],
+        loads=[jb.MovingMass(mass=0.3, speed=0.3)],
+        run=jb.Run(20.0, sample_rate=20.0),
+    )
+    over = {"loads.0.mass": [0.02, 0.2, 0.4], "loads.0.speed": np.geomspace(0.15, 2.5, 24)}
+    found, exact = (
+        jb.sweep(case, over, progress=False, tolerance=tolerance) for tolerance in (1e-7, 1e-11)
+    )
+    peaks, expected = (one[f"peak_{quantity}"] for one in (found, exact))
+    assert found.error_estimate <= 1e-7
+    assert_allclose(peaks, expected, rtol=found.error_estimate)

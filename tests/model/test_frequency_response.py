@@ -342,7 +342,7 @@ INVALID = [
     ({"pairs": [("voltage", "sensors.0")]}, "the input 'voltage' does not exist; write, for"),
     ({"pairs": [("force@0.3", "sensors.2")]}, "'sensors.2' does not exist; the case has 2 sensors"),
     ({"pairs": [("force@0.3", "deflecton@0.3")]}, "did you mean 'deflection'?, as deflection@0.3"),
-    ({"pairs": [("force@0.3", "actuators.0")]}, "it may be current, active_force, transmitted_"),
+    ({"pairs": [("force@0.3", "actuators.0")]}, "it may be current, voltage, active_force"),
     ({"pairs": [("force@0.3", "actuators.0.curent")]}, "did you mean 'current'?"),
 ]
 

@@ -116,7 +116,7 @@ def test_short_initial_steps_are_lengthened():
     steps, error = choose_step_sizes(
         peaks_with_error(best), rates, np.full(20, 0.7 * longest), np.ones(20), 4, 1e-7
     )
-    assert np.all(steps > 0.9 * longest) and error <= 1e-7 / SAFETY_FACTOR
+    assert np.all(steps > 0.9 * longest) and error <= 1e-7
 
 
 def test_no_step_meets_the_tolerance():

@@ -110,7 +110,7 @@ def _modes_of_band(prepared: Prepared, whole, data_driven, order, refine):
     lengths = [chain.members.size for chain in diagram.chains]
     reasons = [rejection_reason(mode, duration, whole) for mode in modes]
     modes = [
-        mode if reason else _with_usual_spread(mode, chain, spread_of)
+        mode if reason else _with_usual_spread(mode, poles, chain, spread_of)
         for mode, reason, chain in zip(modes, reasons, diagram.chains, strict=True)
     ]
     if refine and any(reasons):
@@ -181,15 +181,27 @@ def mode_of_chain(poles: Poles, chain: Chain, found: dict[int, Spread], scale) -
     )
 
 
-def _with_usual_spread(mode: IdentifiedMode, chain: Chain, found: dict[int, Spread]):
-    """The mode with the uncertainty of the lower eighth of its chain.
+def _with_usual_spread(
+    mode: IdentifiedMode, poles: Poles, chain: Chain, found: dict[int, Spread]
+) -> IdentifiedMode:
+    """The mode with the uncertainty of the lower eighth of its chain, and that of the order.
 
     The pole of least uncertainty decides whether there is a mode; but that it is the least makes it
-    too small by chance.
+    too small by chance. A model of low order, in which close or weak modes are one, has poles that
+    vary little from block to block, and are biased: what the better half of the chain differs from
+    the pole adds to its variance.
     """
-    ranked = sorted((found[k].covariance for k in chain.members.tolist()), key=np.linalg.det)
-    variances = np.maximum(np.diag(ranked[len(ranked) // 8]), np.diag(ranked[0]))
-    frequency_sd, damping_sd = np.sqrt(variances).tolist()
+    ranked = sorted(chain.members.tolist(), key=lambda k: np.linalg.det(found[k].covariance))
+    usual, least = (np.diag(found[k].covariance) for k in (ranked[len(ranked) // 8], ranked[0]))
+    half = ranked[: max(len(ranked) // 2, 1)]
+    by_order = [
+        np.mean((values[half] - own) ** 2)
+        for values, own in (
+            (poles.frequencies, mode.frequency),
+            (poles.damping_ratios, mode.damping_ratio),
+        )
+    ]
+    frequency_sd, damping_sd = np.sqrt(np.maximum(usual, least) + by_order).tolist()
     return mode._replace(frequency_sd=frequency_sd, damping_sd=damping_sd)
 
 

@@ -6,6 +6,7 @@ from jaxbeam.c_code.source import CSource, interpolation_operations, search_oper
 from jaxbeam.c_code.writers import write_law, write_load_source
 from jaxbeam.control.compensators import SampledCompensator
 from jaxbeam.control.feedback import Feedback
+from jaxbeam.control.optimal.h_infinity import HInfinityLaw
 from jaxbeam.control.output_feedback import OutputFeedback
 from jaxbeam.control.predictive.gpc import GPCLaw
 from jaxbeam.control.scheduled_feedback import ScheduledFeedbackLaw
@@ -71,6 +72,26 @@ def _(law: GPCLaw, code: CSource) -> None:
             f"copy({kept}, {latest}, {width});"
         )
         code.multiply_add(code.output, gain, kept, actuators, size, -1)
+
+
+@write_law.register
+def _(law: HInfinityLaw, code: CSource) -> None:
+    states, outputs = np.shape(law.G)
+    actuators = code.actuators
+    F = code.constant("state_matrix", law.F)
+    G = code.constant("reading_matrix", law.G)
+    B = code.constant("command_matrix", law.B)
+    K = code.constant("state_gain", law.K)
+    D = code.constant("reading_gain", law.D)
+    state = code.state("predicted", np.zeros(states), "state, but for the last command")
+    predicted = code.work("known", states, "state with the last command")
+    code.add("/* u = K x + D y of the state x with the last command; then F x + G y */")
+    code.add(f"copy({predicted}, {state}, {states});")
+    code.multiply_add(predicted, B, code.command, states, actuators)
+    code.multiply(code.output, K, predicted, actuators, states)
+    code.multiply_add(code.output, D, code.readings, actuators, outputs)
+    code.multiply(state, F, predicted, states, states)
+    code.multiply_add(state, G, code.readings, states, outputs)
 
 
 @write_law.register

@@ -6,6 +6,7 @@ from typing import ClassVar
 import equinox as eqx
 from jaxtyping import Float
 
+from jaxbeam.case.actuators.creep import Creep
 from jaxbeam.case.actuators.hysteresis import Hysteresis
 from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.runtime.arrays import Array, xp
@@ -66,6 +67,16 @@ class AbstractActuator(ReprWithUnits, Module):
     @property
     def compensation(self) -> Hysteresis | None:
         """Operator whose inverse is applied to the commands of a controller; None if none is."""
+        return None
+
+    @property
+    def creep(self) -> Creep | None:
+        """Drift of the commands that act, behind the hysteresis; None if there is none."""
+        return None
+
+    @property
+    def creep_compensation(self) -> Creep | None:
+        """Creep whose inverse is applied to the commands of a controller; None if none is."""
         return None
 
     @abc.abstractmethod

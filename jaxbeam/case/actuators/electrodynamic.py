@@ -5,8 +5,9 @@ from typing import ClassVar
 from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment
-from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, number
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.case.actuators.inner_loops import AbstractInnerLoop, Coil, LoopPort, coil_alone
+from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, number, part
+from jaxbeam.runtime.arrays import Array
 
 
 class Electrodynamic(AbstractActuator):
@@ -15,6 +16,11 @@ class Electrodynamic(AbstractActuator):
     L I' = u - R I - K_v w',   force = K_f I - m w'' - c w' - k w: eqs (2.26) to (2.34) of the
     thesis in the time domain. Its state is the current I. A positive voltage lifts the beam. A
     command of zero shorts the coil; its back-EMF then damps the beam.
+
+    With an `inner_loop` the amplifier sets the voltage, and the command is a current in A
+    (`CurrentLoop`) or a force in N (`ForceLoop`), bounded by the `limits` of the loop. Where the
+    amplifier runs out of voltage is not modelled: `limits` of the voltage are refused with a loop;
+    the voltage is the output `actuators.I.voltage` of `jaxbeam frf`.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -46,19 +52,44 @@ class Electrodynamic(AbstractActuator):
     limits: Float[Array, "2"] | None = number(
         "V", "smallest and largest voltage", INCREASING, default=None
     )
+    inner_loop: AbstractInnerLoop | None = part(
+        "loop of the amplifier, by which commands are currents or forces", AbstractInnerLoop
+    )
 
     def displacement_map(self):
         return ((self.position, 0, 1.0),)
 
     def attachment(self) -> Attachment:
-        back_emf = self.force_constant if self.back_emf is None else self.back_emf
-        return Attachment(
-            state_matrix=-(self.resistance / self.inductance)[None, None],
-            input_matrix=1 / self.inductance[None],
-            velocity_matrix=-(back_emf / self.inductance)[None],
-            output_matrix=self.force_constant[None],
-            feedthrough=xp.zeros(()),
-            stiffness=self.stiffness,
-            damping=self.damping,
-            mass=self.mass,
+        return self.coil_port().attachment
+
+    def coil_port(self) -> LoopPort:
+        """Attachment of the coil, with the current in it and the voltage across it as signals."""
+        coil = Coil(
+            self.resistance,
+            self.inductance,
+            self.force_constant,
+            self.force_constant if self.back_emf is None else self.back_emf,
+            self.mass,
+            self.damping,
+            self.stiffness,
         )
+        return coil_alone(coil) if self.inner_loop is None else self.inner_loop.port(coil)
+
+    @property
+    def command_unit(self) -> str:
+        return "V" if self.inner_loop is None else self.inner_loop.command_unit
+
+    def command_limits(self) -> Float[Array, "2"] | None:
+        return self.limits if self.inner_loop is None else self.inner_loop.limits
+
+    def validate(self, address: str) -> str | None:
+        if self.inner_loop is None:
+            return None
+        if self.limits is not None:
+            return (
+                f"{address}.limits bound the voltage, which {address}.inner_loop sets beyond them:"
+                f" give {address}.inner_loop.limits, in {self.inner_loop.command_unit}, or leave"
+                " the loop out"
+            )
+        error = self.inner_loop.validate()
+        return None if error is None else f"{address}.inner_loop.{error}"

@@ -5,6 +5,7 @@ from typing import ClassVar
 from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment, SectionStiffening
+from jaxbeam.case.actuators.creep import Creep
 from jaxbeam.case.actuators.hysteresis import Hysteresis
 from jaxbeam.case.declared_checks import validate_direct_or_derived
 from jaxbeam.case.fields import (
@@ -40,8 +41,9 @@ class Patch(AbstractActuator):
 
     Commands stay within `limits` and within the voltages `depolarisation`, beyond which the patch
     loses its polarisation; `rate_limit` is that of the amplifier. Commands act through the
-    `hysteresis` of the patch, if it has one; the inverse of `compensation`, identified from a log
-    by `tuning.fit.actuators.hysteresis.fitted_hysteresis`, makes it act as a linear one.
+    `hysteresis` of the patch and then its `creep`, if it has them; the inverses of `compensation`
+    and `creep_compensation`, identified from a log by `tuning.fit.actuators.hysteresis` and
+    `tuning.fit.actuators.creep`, make it act as a linear one.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -106,6 +108,10 @@ class Patch(AbstractActuator):
     compensation: Hysteresis | None = part(
         "hysteresis whose inverse the controller applies to its commands", Hysteresis
     )
+    creep: Creep | None = part("creep of the patch, behind its hysteresis", Creep)
+    creep_compensation: Creep | None = part(
+        "creep whose inverse the controller applies to its commands", Creep
+    )
 
     @property
     def moment_constant(self) -> Float[Array, ""]:
@@ -159,7 +165,7 @@ class Patch(AbstractActuator):
                 f"{address}.limits leave no command that the patch takes: its depolarisation limits"
                 f" over its amplifier_gain allow {low:g} to {high:g} V"
             )
-        for name in ("hysteresis", "compensation"):
+        for name in ("hysteresis", "compensation", "creep", "creep_compensation"):
             operator = getattr(self, name)
             error = None if operator is None else operator.validate()
             if error is not None:

@@ -13,8 +13,8 @@ from jaxbeam.integrator.forces.panels import Panels, force_panels
 from jaxbeam.integrator.forces.paths import ForcePaths
 from jaxbeam.integrator.forces.products import product
 from jaxbeam.integrator.forces.system import ForceResponses
+from jaxbeam.integrator.peaks.running_peaks import Peaks
 from jaxbeam.integrator.propagators import PEAK_NODES
-from jaxbeam.integrator.running_peaks import Peaks
 from jaxbeam.numerics.peak_search import estimate_peak, refine_peak
 
 CHUNK_STEPS = 16  # of a chunk, or FEW_STEPS of one that is no longer than these

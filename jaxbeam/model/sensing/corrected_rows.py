@@ -11,7 +11,6 @@ accelerations and commands; the residual of the loads depends on where they are.
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import chebyshev
@@ -136,13 +135,6 @@ class StaticCorrection(Module):
 
     rows: CorrectionRows
     influence: LoadInfluence
-
-    def scaled(self, share) -> "StaticCorrection":
-        """This share of the correction."""
-        influence = eqx.tree_at(
-            lambda one: one.series, self.influence, share * self.influence.series
-        )
-        return StaticCorrection(jax.tree.map(lambda row: share * row, self.rows), influence)
 
 
 def static_correction(

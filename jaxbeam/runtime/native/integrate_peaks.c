@@ -61,7 +61,7 @@ static int next_chunk(Workspace *w, int *panel, int64_t *done) {
         const uint8_t *active = (const uint8_t *)w->inputs[LOADS_ON_BEAM] + *panel * w->loads;
         for (int l = 0; l < w->loads && step->loads < w->max_loads; l++)
             if (active[l]) step->load_numbers[step->loads++] = l;
-        step->rows = step->loads * NODES;
+        step->rows = step->loads * NODES, step->ends = w->influence_terms ? 2 * step->loads : 0;
         step_matrices(w, step);
     }
     return count;

@@ -77,19 +77,22 @@ static double *motion_rows(const Workspace *w, int motion) {
     return w->contact_rows + (ptrdiff_t)motion * w->max_loads * w->states * PADDED_NODES;
 }
 
+static const double END_FRACTIONS[2] = {1e-9, 1 - 1e-9}; /* peaks/end_forces.py */
+
 /* Mode shapes (mode, node) and rows (state, node) of motions under the loads of a step:
- * model/contact.py, `surface_rows`. */
+ * model/contact.py, `surface_rows`. After the Gauss nodes the start and the end of the step, if it
+ * uses them: their limits within it, where the acceleration of a load jumps. */
 static void load_path(const Workspace *w, const Step *step) {
     const int block_size = w->block_size, modes = w->modes, all_modes = w->all_modes;
+    const int used = step->ends ? PATH_NODES : NODES;
     for (int s = 0; s < step->loads; s++) {
         double position[PADDED_NODES], speed[PADDED_NODES], acceleration[PADDED_NODES];
         for (int k = 0; k < PADDED_NODES; k++) {
-            double time =
-                step->start + step->length * w->inputs[GAUSS_NODES][k < NODES ? k : NODES - 1];
-            evaluate_trajectory(w, step->load_numbers[s], time, position + k, speed + k,
-                                acceleration + k);
+            const double fraction = k < NODES ? w->inputs[GAUSS_NODES][k] : END_FRACTIONS[k > NODES];
+            evaluate_trajectory(w, step->load_numbers[s], step->start + step->length * fraction,
+                                position + k, speed + k, acceleration + k);
         }
-        for (int first = 0; first < NODES; first += REGISTER_WIDTH) {
+        for (int first = 0; first < used; first += REGISTER_WIDTH) {
             const Register v = load_full(speed + first), a = load_full(acceleration + first);
             double *shape = w->shape + (ptrdiff_t)s * all_modes * PADDED_NODES + first;
             const ptrdiff_t at = (ptrdiff_t)s * w->states * PADDED_NODES + first;
@@ -151,11 +154,13 @@ static void add_influence(const Workspace *w, const Step *step, int s) {
                 above = sum, sum = next;
             }
             sum = series[output] - above + x * sum;
-            for (int p = 0; p < count; p++)
-                for (int f = 0; f < NODES; f++)
-                    step->sample_rows[(ptrdiff_t)(w->states + s * NODES + f) * w->sample_count +
-                                      (first + p) * w->positions + output] +=
-                        w->inputs[PEAK_FORCE_WEIGHTS][(first + p) * NODES + f] * sum[p];
+            for (int p = 0; p < count; p++) {
+                const int point = first + p; /* the start, the Gauss nodes, the end */
+                const int is_node = point > 0 && point <= NODES;
+                const int row = is_node ? s * NODES + point - 1 : step->rows + 2 * s + (point > 0);
+                step->sample_rows[(ptrdiff_t)(w->states + row) * w->sample_count +
+                                  point * w->positions + output] += sum[p];
+            }
         }
     }
 }

@@ -72,6 +72,27 @@ static void force_response_at_nodes(const Workspace *w, const Step *step, int s,
     }
 }
 
+/* Contact at the ends of a step, each of which is a node of the load path: peaks/end_forces.py. */
+static void contact_at_ends(const Workspace *w, const Step *step) {
+    const int loads = step->loads, all_modes = w->all_modes;
+    for (int end = 0; end < 2; end++)
+        for (int s = 0; s < loads; s++) {
+            const int at = NODES + end;
+            const double *rows =
+                motion_rows(w, ACCELERATION) + (ptrdiff_t)s * w->states * PADDED_NODES + at;
+            const double *shape = w->shape + (ptrdiff_t)s * all_modes * PADDED_NODES + at;
+            for (int i = 0; i < w->states; i++)
+                step->end_response[(end * w->states + i) * loads + s] = rows[i * PADDED_NODES];
+            for (int q = 0; q < loads; q++) {
+                const double *other = w->shape + (ptrdiff_t)q * all_modes * PADDED_NODES + at;
+                double sum = 0;
+                for (int m = 0; m < all_modes; m++)
+                    sum += shape[m * PADDED_NODES] * other[m * PADDED_NODES];
+                step->end_compliance[(end * loads + s) * loads + q] = sum;
+            }
+        }
+}
+
 /* Matrices of a step with its loads. */
 static void step_matrices(const Workspace *w, const Step *step) {
     const int all_modes = w->all_modes, states = w->states;
@@ -100,6 +121,10 @@ static void step_matrices(const Workspace *w, const Step *step) {
                 store(stored, sampled,
                       sample_count - l < REGISTER_WIDTH ? sample_count - l : REGISTER_WIDTH);
             }
-        if (w->influence_terms) add_influence(w, step, s);
     }
+    if (!step->ends) return;
+    contact_at_ends(w, step);
+    memset(step->sample_rows + (ptrdiff_t)(states + step->rows) * sample_count, 0,
+           8 * (size_t)step->ends * sample_count);
+    for (int s = 0; s < step->loads; s++) add_influence(w, step, s);
 }

@@ -1,5 +1,5 @@
 /* A chunk of steps for a group of runs: integrator/step.py, `advance`, and
- * integrator/running_peaks.py, `update_peaks`, without commands. */
+ * integrator/peaks/running_peaks.py, `update_peaks`, without commands. */
 
 #pragma once
 
@@ -59,11 +59,44 @@ static void solve_contact(const Workspace *w, const Step *step, const Group *g) 
     }
 }
 
-/* Deflections at the peak nodes of a step, the largest of them, and a bound of those between. */
+/* Contact forces at the ends of a step from the states there, before and after it. Those of
+ * vehicles are extrapolated from the Gauss nodes: peaks/end_forces.py. */
+static void end_forces(const Workspace *w, const Step *step, const Group *g) {
+    const int loads = step->loads;
+    Register *forces = g->next_state + w->states, *found = forces + step->rows;
+    for (int end = 0; end < 2; end++) {
+        Register *right = g->end_forces, *matrix = g->matrix;
+        memset(right, 0, (size_t)loads * sizeof *right);
+        if (w->groups_of_vehicles) {
+            const double *weights =
+                w->inputs[PEAK_FORCE_WEIGHTS] + (end ? (PEAK_POINTS - 1) * NODES : 0);
+            for (int s = 0; s < loads; s++)
+                for (int k = 0; k < NODES; k++) right[s] += weights[k] * forces[s * NODES + k];
+        } else {
+            add_product(right, step->end_response + (ptrdiff_t)end * loads * w->states, loads,
+                        end ? g->state : g->next_state, w->states);
+            for (int s = 0; s < loads; s++) {
+                const ptrdiff_t at = step->load_numbers[s] * w->batch_size + g->first;
+                const Register mass = load(w->inputs[INERTIA] + at, g->count);
+                right[s] = -(load(w->inputs[WEIGHT] + at, g->count) + mass * right[s]);
+                for (int q = 0; q < loads; q++)
+                    matrix[s * loads + q] =
+                        mass * step->end_compliance[(end * loads + s) * loads + q];
+                matrix[s * loads + s] += 1;
+            }
+            solve_contact_system(matrix, right, loads);
+        }
+        for (int s = 0; s < loads; s++) found[2 * s + end] = right[s];
+    }
+}
+
+/* Deflections at the peak nodes of a step, the largest of them, and a bound of those between; from
+ * the state before the step. */
 static void sample_positions(const Workspace *w, int t, const Step *step, const Group *g) {
     Register *sampled = g->samples + t * w->sample_count;
     memset(sampled, 0, (size_t)w->sample_count * sizeof *sampled);
-    add_product(sampled, step->sample_rows, w->sample_count, g->state, w->states + step->rows);
+    add_product(sampled, step->sample_rows, w->sample_count, g->next_state,
+                w->states + step->rows + step->ends);
     for (int position = 0; position < w->positions; position++) {
         Register largest = {0};
         for (int i = position; i < w->sample_count; i += w->positions)
@@ -158,11 +191,13 @@ static void advance_chunk(Workspace *w, int steps, Group *groups, int group_coun
             for (const Group *g = groups; g < end; g++) solve_contact(w, step, g);
             for (const Group *g = groups; g < end; g++) update_contact_minimum(w, step, g);
         }
-        for (const Group *g = groups; g < end; g++) sample_positions(w, t, step, g);
         for (Group *g = groups; g < end; g++) {
             if (vehicles) propagate_vehicles(w, step, g);
             propagate(w, step, g);
         }
+        if (step->ends)
+            for (const Group *g = groups; g < end; g++) end_forces(w, step, g);
+        for (const Group *g = groups; g < end; g++) sample_positions(w, t, step, g);
     }
     for (const Group *g = groups; g < end; g++) {
         for (int position = 0; position < w->positions; position++)

@@ -10,6 +10,7 @@
 
 enum { PADDED_NODES = (NODES + PADDING - 1) / PADDING * PADDING };
 enum { STEP_FRACTIONS = NODES + 1 }; /* Gauss nodes and end of a step */
+enum { PATH_NODES = NODES + 2 };     /* Gauss nodes, start and end of a step; no more than padded */
 enum { INTERLEAVED_GROUPS = 2 };     /* groups of runs that are advanced together */
 
 /* Arguments of the call, with tasks as the first axis, of length one if shared: modal model, panels
@@ -54,22 +55,26 @@ enum { FIRST_WHEEL, WHEELS, STATES, COUNT, VEHICLE_NUMBERS };
 enum { ACCELERATION, DEFLECTION, VELOCITY, MOTIONS };
 
 /* A step and its matrices, stored by columns: contact response (state, row), contact compliance
- * (row, row), both of each motion, force response (row, state), sample rows (state and row, sample).
- * Rows are the Gauss nodes of all loads on the beam. */
+ * (row, row), both of each motion, force response (row, state), sample rows (state, row and end,
+ * sample). Rows are the Gauss nodes of all loads on the beam. Outputs that follow forces at once use
+ * those at the ends of the step, too, two for each load: end response (end, state, load) and
+ * compliance (end, load, load). */
 typedef struct {
-    int panel, loads, rows;
+    int panel, loads, rows, ends;
     double start, length;
     const double *transition;
     int64_t *load_numbers;
     double *contact_response[MOTIONS], *contact_compliance[MOTIONS], *force_response, *sample_rows;
+    double *end_response, *end_compliance;
 } Step;
 
-/* Runs that fill a register; contact forces follow the state in memory. Vehicles: their states, the
- * forces q of the beam on the springs of the rows, and these per contact force. */
+/* Runs that fill a register; contact forces follow the state in memory, then those at the ends of
+ * the step. Vehicles: their states, the forces q of the beam on the springs of the rows, and these
+ * per contact force. */
 typedef struct {
     ptrdiff_t first;
     int count;
-    Register *state, *next_state, *matrix;
+    Register *state, *next_state, *matrix, *end_forces;
     Register *vehicle_state, *next_vehicle_state, *surface, *impedance;
     Register *samples; /* (step, sample, position) */
     /* (step, position): largest of the samples, and bound of the curve between them */
@@ -143,8 +148,8 @@ static void *allocate(uintptr_t start, size_t *used, size_t numbers) {
 static size_t partition_workspace(Workspace *w, uintptr_t start) {
     size_t used = 0, batch_size = (size_t)w->batch_size, panels = (size_t)w->panels,
            block_size = (size_t)w->block_size;
-    size_t rows = (size_t)w->max_loads * NODES, states = (size_t)w->states,
-           sample_count = (size_t)w->sample_count;
+    size_t loads = (size_t)w->max_loads, rows = loads * NODES, ends = 2 * loads;
+    size_t states = (size_t)w->states, sample_count = (size_t)w->sample_count;
     size_t positions = (size_t)w->positions, all_modes = (size_t)w->all_modes,
            modes = (size_t)w->modes;
     w->series = allocate(start, &used, (size_t)w->segments * w->terms * w->columns);
@@ -189,8 +194,9 @@ static size_t partition_workspace(Workspace *w, uintptr_t start) {
     w->vehicle_panel = allocate(start, &used, register_count);
     for (int k = 0; k < INTERLEAVED_GROUPS; k++) {
         Group *g = w->groups + k;
-        g->state = allocate(start, &used, (states + rows) * REGISTER_WIDTH);
-        g->next_state = allocate(start, &used, (states + rows) * REGISTER_WIDTH);
+        g->state = allocate(start, &used, (states + rows + ends) * REGISTER_WIDTH);
+        g->next_state = allocate(start, &used, (states + rows + ends) * REGISTER_WIDTH);
+        g->end_forces = allocate(start, &used, loads * REGISTER_WIDTH);
         g->matrix = allocate(start, &used, rows * rows * REGISTER_WIDTH);
         g->samples = allocate(start, &used, CHUNK_STEPS * sample_count * REGISTER_WIDTH);
         g->sample_peak = allocate(start, &used, CHUNK_STEPS * positions * REGISTER_WIDTH);
@@ -209,7 +215,9 @@ static size_t partition_workspace(Workspace *w, uintptr_t start) {
             step->contact_compliance[motion] = allocate(start, &used, rows * rows);
         }
         step->force_response = allocate(start, &used, rows * states);
-        step->sample_rows = allocate(start, &used, (states + rows) * sample_count);
+        step->sample_rows = allocate(start, &used, (states + rows + ends) * sample_count);
+        step->end_response = allocate(start, &used, ends * states);
+        step->end_compliance = allocate(start, &used, ends * loads);
     }
     return used;
 }

@@ -18,23 +18,28 @@ def command_ranges(case: Case) -> CommandRanges:
 
 
 def acting_ranges(case: Case) -> CommandRanges:
-    """Lowest and highest command that acts, behind the hysteresis, and its largest rate (1/s)."""
+    """Bounds of the commands that act, behind hysteresis and creep, and of their rates (1/s)."""
     low, high, rate = command_ranges(case)
-    operators = [actuator.hysteresis for actuator in case.actuators]
-    if all(one is None for one in operators):
+    actuators = case.actuators
+    if all(one.hysteresis is None and one.creep is None for one in actuators):
         return low, high, rate
+    creeps = xp.stack([xp.ones(()) if a.creep is None else a.creep.final_gain for a in actuators])
 
     def acts(ends):
-        """Commands that act at these ends of the ranges."""
-        return xp.stack(
+        """Commands that act in the end at these ends of the ranges."""
+        return creeps * xp.stack(
             [
-                end if one is None else xp.where(xp.isinf(end), end, one.first_output(end))
-                for one, end in zip(operators, ends, strict=True)
+                end
+                if a.hysteresis is None
+                else xp.where(xp.isinf(end), end, a.hysteresis.first_output(end))
+                for end, a in zip(ends, actuators, strict=True)
             ]
         )
 
-    slopes = xp.stack([xp.ones(()) if one is None else xp.sum(one.weights) for one in operators])
-    return acts(low), acts(high), rate * slopes
+    slopes = [
+        xp.ones(()) if a.hysteresis is None else xp.sum(a.hysteresis.weights) for a in actuators
+    ]
+    return acts(low), acts(high), rate * creeps * xp.stack(slopes)
 
 
 def limit_commands(

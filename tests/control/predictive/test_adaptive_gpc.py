@@ -103,6 +103,34 @@ def test_coefficients_are_those_of_weighted_batch_least_squares():
     assert np.all(np.asarray(found)[~kept] == 0)
 
 
+def test_covariance_is_capped_without_excitation():
+    """Forgetting alone would make it 0.98^-400 = 3200 times that of the design in a quiet time.
+
+    By its inverse, the information, to which a sample adds row row' / noise^2: six samples with
+    moves, of which the covariance falls, then none, until it is that of the start again in trace.
+    """
+    law = designed(dataclasses.replace(ADAPTIVE, until=None, probe=None, measurement_noise=1e-5))
+    quiet = probed(law, np.zeros(400), np.zeros(400))[-1]
+    assert_allclose(quiet.covariance, law.start_covariance, rtol=1e-9)
+    kept = np.diag(law.start_covariance) > 0
+    start = law.start_covariance[np.ix_(kept, kept)]
+    commands, readings = signals(100, *plant_by_scipy(8.0, 1))
+    commands[7:], readings[7:] = commands[6], readings[6]
+    states = probed(law, commands, readings)
+    moves, rises = np.diff(commands, prepend=0.0), np.diff(readings, prepend=0.0)
+    covariance, capped = start, 0
+    for k in range(1, 100):
+        past = [-rises[k - i] if k >= i else 0.0 for i in (1, 2)]
+        row = np.array(past + [moves[k - i] if k >= i else 0.0 for i in range(4)])
+        information = 0.98 * np.linalg.inv(covariance) + np.outer(row, row) / 1e-5**2
+        covariance = np.linalg.inv(information)
+        excess = np.trace(covariance) / np.trace(start)
+        covariance, capped = covariance / max(excess, 1.0), capped + (excess > 1)
+        found = np.asarray(states[k].covariance)[np.ix_(kept, kept)]
+        assert_allclose(found, covariance, rtol=1e-6, atol=1e-9 * np.max(np.abs(start)))
+    assert 0 < capped < 99  # both happened
+
+
 def test_lift_and_delay_of_a_pure_delay():
     model = PolynomialModel(np.zeros(4), np.array([0.0, 0.0, 2.0, 0.0]).reshape(4, 1, 1))
     assert_allclose(np.ravel(lift_and_delay(model)), [2.0, 3.0])

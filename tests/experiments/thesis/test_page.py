@@ -39,6 +39,14 @@ def test_counts_are_written_between_the_marks():
         page.with_counts("nothing", REPORT)
 
 
+def test_shares_in_readme_are_those_of_the_tables():
+    readme = (page.ROOT / "README.md").read_text(encoding="utf-8")
+    results = page.RESULTS.read_text(encoding="utf-8")
+    assert page.with_shares(readme, results) == readme
+    with pytest.raises(ValueError, match="no marks"):
+        page.with_shares("nothing", results)
+
+
 def test_all_pages_have_the_same_counts():
     sentences = set()
     for name in ("README.md", "docs/howto/reproduce.md"):

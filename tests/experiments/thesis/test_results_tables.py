@@ -1,11 +1,8 @@
-"""The tables of the page on results are those of the report; README has their headline."""
-
-import re
+"""The tables of the page on results are those of the report."""
 
 import pytest
 
 from experiments.thesis import results_tables
-from tests.modules import ROOT
 
 
 def rig(*shares: tuple[str, float, float]) -> list[str]:
@@ -42,17 +39,3 @@ def test_tables_are_written_between_their_marks():
     assert "| filter |  |  |  |  | worse than no control |" in written and "lift" not in written
     with pytest.raises(ValueError, match="no marks <!-- sensed -->"):
         results_tables.with_tables(MARKED.replace("sensed", "x"), REPORT)
-
-
-def test_the_headline_of_readme_is_that_of_the_page():
-    page = results_tables.PAGE.read_text(encoding="utf-8")
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    for name, words in {
-        "tuned table": r"by two gates ([\d.]+) and ([\d.]+) %",
-        "trapezium drawn by hand, same gates and limits": r"numbers\)\s([\d.]+) and ([\d.]+) %",
-        "tuned, sensors only, as on the test rig": r"by sensors alone ([\d.]+)\sand ([\d.]+) %",
-        "table drawn by hand, sensors only": r"by hand ([\d.]+) and ([\d.]+) %",
-    }.items():
-        row = re.search(rf"\| {re.escape(name)} \| ([\d.]+) % .*\| ([\d.]+) % ", page)
-        shown = re.search(words, readme)
-        assert row and shown and row.groups() == shown.groups(), name

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import Structure, random_structure, response, sampled
-from tuning import identify_modes
+from tuning import Log, identify_modes
 from tuning.modal.decay.stretches import Stretch, excited_samples, free_decays, stacked
 from tuning.modal.harmonics import harmonic_lines
-from tuning.modal.preprocessing import kinetic_band
+from tuning.modal.preprocessing import kinetic_band, prepare
 
 
 def structure(damping=(0.01, 0.03, 0.008)):
@@ -70,6 +71,36 @@ def test_decays_after_blows_in_quick_succession_are_used_together():
         assert fit.kind == "free decay" and len(fit.windows) == 5
         np.testing.assert_allclose(fit.frequencies, planted_log.structure.frequencies, rtol=5e-3)
         np.testing.assert_allclose(fit.damping_ratios, [0.03, 0.03, 0.02], rtol=0.1)
+
+
+@pytest.mark.parametrize("seed", [311, 512, 518])
+def test_a_record_that_begins_with_a_blow_is_a_decay(seed):
+    """Close modes beat, or the decay is over within a tenth of the record."""
+    planted = sampled(random_structure(seed), "decay", seed, 20.0)
+    prepared = prepare((planted.values,), (0.0,), planted.rate, (2.0, 40.0))
+    quiet = (np.zeros(len(planted.values), bool),)
+    frequency = float(planted.structure.frequencies[np.argmax(planted.energies)])
+    (found,) = free_decays(quiet, prepared.records, prepared.rate, frequency)
+    assert found.start == 0
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.01])
+def test_what_nonlinearity_adds_is_no_mode(shift):
+    """Cubic stiffness raises the first frequency by 1 %: the response has a part that decays as the
+    cube of the rest, three times as fast."""
+    times, omega, damping = np.arange(1500) / 100, 2 * np.pi * 3.7, 0.008
+
+    def slope(_, state):
+        force = omega**2 * (state[0] + 8 / 3 * shift * state[0] ** 3)
+        return [state[1], -2 * damping * omega * state[1] - force]
+
+    solved = solve_ivp(slope, (0, 15), [1.0, 0.0], t_eval=times, rtol=1e-7, atol=1e-9)
+    values = np.outer(solved.y[0], [1.0, 0.7])
+    values = values + 0.02 * np.random.default_rng(0).normal(size=values.shape)
+    log = Log(times, values, ("d1", "d2"), ("deflection",) * 2, ("m",) * 2)
+    fit = identify_modes(log, band=(1.0, 12.0))
+    assert fit.kind == "free decay" and fit.frequencies == pytest.approx([3.7], rel=0.005)
+    assert ("nonlinearity" in str(fit)) == (shift > 0)
 
 
 def test_a_lightly_damped_decay_is_no_harmonic_line():

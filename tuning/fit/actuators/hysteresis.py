@@ -52,41 +52,64 @@ def fitted_hysteresis(
     >>> print(fitted_hysteresis(log, "u", "w", np.array([0.0, 1.0])).hysteresis.weights)
     [0.8  0.25]
     """
+    _, commands, readings = channel_pair(log, command, reading)
+    thresholds = checked_thresholds(thresholds, commands)
+    plays = plays_of(thresholds, commands)
+    sign = 1.0 if np.cov(commands, readings)[0, 1] >= 0 else -1.0
+    weights, offset = non_negative(sign * plays, readings)
+    if not weights[0] > 0:
+        raise ValueError(
+            f"{reading!r} does not follow {command!r} where it turns: take a slower log, or fewer"
+            " thresholds"
+        )
+    size = np.max(np.abs(commands))
+    scale = weights @ np.maximum(size - thresholds, 0.0) / size
+    left = readings - offset - sign * plays @ weights
+    return HysteresisFit(
+        Hysteresis(thresholds, weights / scale),
+        float(sign * scale),
+        float(offset),
+        float(np.std(left)),
+        spread_after_line(commands, readings),
+    )
+
+
+def channel_pair(log: Log, command: str, reading: str) -> tuple[np.ndarray, ...]:
+    """Times (s), commands and readings of the samples that are valid in both channels.
+
+    Raises ValueError for a channel that the log lacks and for commands that are constant.
+    """
     for name in (command, reading):
         if name not in log.names:
             raise ValueError(f"the log has no channel {name!r}; it has {', '.join(log.names)}")
     places = [log.names.index(name) for name in (command, reading)]
     rows = slice(None) if log.valid is None else np.all(log.valid[:, places], axis=1)
     commands, readings = log.values[rows][:, places].T
-    size = np.max(np.abs(commands))
     if np.ptp(commands) == 0:
         raise ValueError(f"the commands {command!r} are constant: a hysteresis shows as they turn")
+    return np.asarray(log.times)[rows], commands, readings
+
+
+def checked_thresholds(thresholds, commands) -> Float[np.ndarray, " play"]:
+    """Thresholds of plays, by default evenly spaced up to the largest command.
+
+    Raises ValueError if they do not begin with zero and increase.
+    """
     if thresholds is None:
-        thresholds = size * np.arange(DEFAULT_PLAYS) / DEFAULT_PLAYS
+        return np.max(np.abs(commands)) * np.arange(DEFAULT_PLAYS) / DEFAULT_PLAYS
     thresholds = np.asarray(thresholds, float)
     if thresholds.size == 0 or thresholds[0] != 0 or np.any(np.diff(thresholds) <= 0):
         raise ValueError("thresholds must begin with 0 and increase")
-    plays = _plays(thresholds, commands)
-    sign = 1.0 if np.cov(commands, readings)[0, 1] >= 0 else -1.0
-    weights, offset = _non_negative(sign * plays, readings)
-    if not weights[0] > 0:
-        raise ValueError(
-            f"{reading!r} does not follow {command!r} where it turns: take a slower log, or fewer"
-            " thresholds"
-        )
-    scale = weights @ np.maximum(size - thresholds, 0.0) / size
-    left = readings - offset - sign * plays @ weights
+    return thresholds
+
+
+def spread_after_line(commands, readings) -> float:
+    """Standard deviation of what a line through the commands leaves of the readings."""
     line = np.polynomial.Polynomial.fit(commands, readings, 1)(commands)
-    return HysteresisFit(
-        Hysteresis(thresholds, weights / scale),
-        float(sign * scale),
-        float(offset),
-        float(np.std(left)),
-        float(np.std(readings - line)),
-    )
+    return float(np.std(readings - line))
 
 
-def _plays(thresholds, commands) -> Float[np.ndarray, "time play"]:
+def plays_of(thresholds, commands) -> Float[np.ndarray, "time play"]:
     """Plays of unit weight at each sample, from rest."""
     operator, plays, found = Hysteresis(thresholds, np.ones(thresholds.size)), thresholds * 0, []
     for one in commands:
@@ -95,8 +118,11 @@ def _plays(thresholds, commands) -> Float[np.ndarray, "time play"]:
     return np.array(found)
 
 
-def _non_negative(plays, readings) -> tuple[Float[np.ndarray, " play"], float]:
-    """Weights of the plays, and an offset of either sign, by least squares in scaled columns."""
+def non_negative(plays, readings) -> tuple[Float[np.ndarray, " play"], float]:
+    """Weights of columns, such as plays, and an offset of either sign, by least squares.
+
+    Columns are scaled, so that no unit matters.
+    """
     columns = np.column_stack([plays, np.ones(len(plays)), -np.ones(len(plays))])
     norms = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     size = np.max(np.abs(readings)) or 1.0

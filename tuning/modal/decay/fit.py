@@ -9,6 +9,7 @@ from scipy.signal import detrend
 from scipy.stats import t as student
 
 from tuning.modal.decay.poles import (
+    FEWER_LEAKAGE_ORDER,
     PoleFit,
     Spectrum,
     band_spectrum,
@@ -52,7 +53,8 @@ def fit_decay(
     `poles` (1/s) are those to start from, of a subspace method. A weak mode must be reproduced in
     the window without its first and without its last fifth. The change of a pole there, beyond what
     noise explains, adds to its uncertainty (frequency and damping of a real structure depend
-    slightly on amplitude). None if the band has too few bins.
+    slightly on amplitude), and so does the change with fewer terms for modes outside the band.
+    None if the band has too few bins.
     """
     count = len(values)
     values = detrend(values, axis=0)  # lines are among the drifts that the fit allows
@@ -67,7 +69,10 @@ def fit_decay(
         (_refit(found, spectrum, band_spectrum(values[first:last], rate, band)), told)
         for first, last, told in ((cut, count, lasting), (0, count - cut, lasting | True))
     ]
-    modes = _identified_modes(found, _nonstationary_variance(found, shorter), spectrum, channels)
+    fewer = refine(found.poles, spectrum, found.noise, leakage_order=FEWER_LEAKAGE_ORDER)
+    outside = (pole_parameters(fewer.poles) - pole_parameters(found.poles)) ** 2
+    variance = _nonstationary_variance(found, shorter) + outside
+    modes = _identified_modes(found, variance, spectrum, channels)
     gone = _not_reproduced(found, shorter, spectrum)
     return DecayFit(
         modes=modes,
@@ -137,7 +142,7 @@ def _identified_modes(
 ) -> tuple[IdentifiedMode, ...]:
     """Frequency |p| / 2 pi and damping ratio s / |p| of each pole, with standard deviations."""
     modes = []
-    quantile = float(student.ppf(0.975, max(found.degrees_of_freedom, 3.0)))
+    quantiles = student.ppf(0.975, np.maximum(found.degrees_of_freedom, 3.0)).tolist()
     for k, pole in enumerate(found.poles):
         covariance = found.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]
         covariance = covariance + np.diag(scatter[2 * k : 2 * k + 2])
@@ -152,7 +157,7 @@ def _identified_modes(
                 energy_share=math.nan,  # told by `energies`
                 shape=shape,
                 shape_covariance=shape_covariance,
-                quantile=quantile,
+                quantile=quantiles[k],
             )
         )
     return tuple(modes)

@@ -16,8 +16,9 @@ from tuning.modal.ambient import (
 from tuning.modal.decay.fit import fit_decay
 from tuning.modal.decay.stretches import Stretch, excited_samples, free_decays, stacked
 from tuning.modal.preprocessing import prepare, strongest_frequency
-from tuning.modal.result import rejection_reason
+from tuning.modal.result import IdentifiedMode, rejection_reason
 from tuning.modal.samples import MIN_SAMPLES, Samples
+from tuning.modal.shapes import mac_matrix
 from tuning.modal.stabilisation import Diagram
 
 MIN_DECAY_ENERGY = 0.3  # share of the energy of a log in its decays, if they are to stand for it
@@ -25,6 +26,8 @@ LONG_FALL_NEPERS = 2.0  # or fall of the energy; 95 % of that of an exponential 
 MIN_START_LEVEL = 0.2  # energy at the start of such a decay over the mean energy of the log
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
 NOT_REPRODUCED = "not the same in parts of the window"
+NONLINEAR_DECAY = 2.5, 4.5  # decay rates over that of a mode, of what its nonlinearity adds to it
+NONLINEAR_MAC = 0.95
 MAX_RESIDUAL_OF_WINDOW = 0.05  # the same for a window that the user gives and that falls little
 
 
@@ -132,7 +135,29 @@ def _candidates(fits, channels, duration, band) -> tuple[Candidate, ...]:
                 mode = mode._replace(energy_share=share)
                 reason = rejection_reason(mode, duration, band) or (NOT_REPRODUCED if gone else "")
                 found.append(Candidate(mode, reason, 1))
-    return without_duplicates(found)
+    return without_duplicates(_without_nonlinearity(found))
+
+
+def _without_nonlinearity(found: list[Candidate]) -> list[Candidate]:
+    """Candidates; those that a nonlinear restoring force makes of others are rejected.
+
+    The cube of a decaying vibration has its frequency and shape, and three times its decay rate.
+    """
+    good = [one.mode for one in found if not one.reason]
+    return [
+        one if one.reason else one._replace(reason=next(
+            (f"what nonlinearity adds to the mode of {other.frequency:.4g} Hz" for other in good
+             if _is_cube(one.mode, other)), ""))
+        for one in found
+    ]  # fmt: skip
+
+
+def _is_cube(mode: IdentifiedMode, other: IdentifiedMode) -> bool:
+    """Whether a mode decays as the cube of another does, within its half-power bandwidth."""
+    rate = mode.pole.real / other.pole.real
+    near = abs(mode.frequency - other.frequency) < mode.damping_ratio * mode.frequency
+    alike = mac_matrix(mode.shape[None], other.shape[None])[0, 0] > NONLINEAR_MAC
+    return bool(near and alike and NONLINEAR_DECAY[0] < rate < NONLINEAR_DECAY[1])
 
 
 def _dominate(decays, records, ratio, cycle) -> bool:

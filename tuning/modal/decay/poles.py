@@ -27,12 +27,13 @@ MAX_ADDED_MODES = 6  # to those that a subspace method has found
 FALSE_ALARM_PROBABILITY = 1e-4  # of a mode found in noise, over all bins
 # No structure is exactly linear: the misfit of a strong mode looks like weak ones beside it. What
 # is below this share of the amplitudes nearby is not taken for a mode.
-NONLINEARITY_SHARE = 0.1
+NONLINEARITY_SHARE = 0.03
 NEARBY_BINS = 2  # bins on either side that count as nearby
 COARSE_TOLERANCE = 1e-3  # of the refinement while modes are counted
 MAX_POLE_SHIFT_BINS = 1.5  # bins by which a pole may move in one refinement
 DRIFT_ORDER = 3  # of the polynomial for the drift over the window
 LEAKAGE_ORDER = 2  # of the polynomial for leakage from modes outside the band
+FEWER_LEAKAGE_ORDER = 0  # with which poles are compared
 
 
 class Spectrum(NamedTuple):
@@ -55,7 +56,7 @@ class PoleFit(NamedTuple):
     `poles` (1/s) are in the upper half plane; `covariance` is that of (s_1, w_1, s_2,
     w_2, ...), minus their real parts and their imaginary parts; `amplitudes` are those at the start
     of the window and `amplitude_variance` their variances; `model` is the part of the spectrum due
-    to modes; `degrees_of_freedom` are those of the noise level, for intervals.
+    to modes; `degrees_of_freedom` are those of the noise level about each pole, for intervals.
     """
 
     poles: Complex[np.ndarray, " mode"]
@@ -65,7 +66,7 @@ class PoleFit(NamedTuple):
     model: Complex[np.ndarray, "bin channel"]
     residual: Complex[np.ndarray, "bin channel"]
     noise: Float[np.ndarray, "bin channel"]
-    degrees_of_freedom: float
+    degrees_of_freedom: Float[np.ndarray, " mode"]
 
 
 def band_spectrum(
@@ -97,7 +98,7 @@ def find_poles(
         + np.log(trials / FALSE_ALARM_PROBABILITY)
         + np.sqrt(2 * (channels + 1) * np.log(trials))
     )
-    best = _fit_amplitudes(np.zeros(0, complex), spectrum, _robust_level(spectrum.values))
+    best = refine(np.zeros(0, complex), spectrum, _robust_level(spectrum.values))
     misfit_level = (
         NONLINEARITY_SHARE**2
         * _smooth(np.abs(spectrum.values) ** 2, NEARBY_BINS)
@@ -194,7 +195,7 @@ def _pole_transform(poles, spectrum: Spectrum):
     return numerator / denominator, spectrum.step * slope
 
 
-def _nuisance_columns(spectrum: Spectrum):
+def _nuisance_columns(spectrum: Spectrum, leakage_order=LEAKAGE_ORDER):
     """Columns of a drift over the window, and of leakage from modes outside the band."""
     time = np.linspace(-1, 1, spectrum.samples)
     all_bins = np.fft.rfftfreq(spectrum.samples, spectrum.step)
@@ -204,7 +205,7 @@ def _nuisance_columns(spectrum: Spectrum):
         for order in range(1, DRIFT_ORDER + 1)
     ]
     across = np.linspace(-1, 1, spectrum.bins.size)
-    leakage = [across**order * unit for order in range(LEAKAGE_ORDER + 1) for unit in (1, 1j)]
+    leakage = [across**order * unit for order in range(leakage_order + 1) for unit in (1, 1j)]
     columns = np.stack([*drifts, *leakage], axis=1)
     return columns / np.linalg.norm(columns, axis=0)
 
@@ -263,13 +264,16 @@ def refine(
     spectrum: Spectrum,
     level: Float[np.ndarray, "bin channel"],
     accuracy: float = 1e-8,
+    leakage_order: int = LEAKAGE_ORDER,
 ) -> PoleFit:
     """Poles refined together by least squares, weighted by the noise level, in the order given.
 
     The search ends when a step reduces the squares by less than the share `accuracy`.
+    `leakage_order` is that of the polynomial for modes outside the band.
     """
+    nuisance = _nuisance_columns(spectrum, leakage_order)
     if poles.size:
-        duration, nuisance, weights = spectrum.duration, _nuisance_columns(spectrum), level**-0.5
+        duration, weights = spectrum.duration, level**-0.5
 
         # In units of 1 / duration changes of order one change a spectrum.
         start = pole_parameters(poles) * duration
@@ -296,14 +300,14 @@ def refine(
         )
         poles = _poles_from_parameters((start + solved.x) / duration)
         poles = np.where(poles.imag < 0, poles.conj(), poles)
-    return _fit_amplitudes(poles, spectrum, level)
+    return _fit_amplitudes(poles, spectrum, level, nuisance)
 
 
-def _fit_amplitudes(poles, spectrum: Spectrum, level) -> PoleFit:
+def _fit_amplitudes(poles, spectrum: Spectrum, level, nuisance) -> PoleFit:
     """Amplitudes, noise level and covariance at given poles."""
     bins, channels = spectrum.values.shape
     stacked, slopes, solutions, model, leverages = _project_amplitudes(
-        poles, spectrum, level**-0.5, _nuisance_columns(spectrum)
+        poles, spectrum, level**-0.5, nuisance
     )
     weighted = (stacked[:, :bins] + 1j * stacked[:, bins:]).T  # bin, channel
     slopes = slopes[:, :bins] + 1j * slopes[:, bins:]  # channel, bin, parameter
@@ -323,15 +327,19 @@ def _fit_amplitudes(poles, spectrum: Spectrum, level) -> PoleFit:
     cross = cross / np.sqrt(level[:, :, None] * level[:, None, :])
     score = np.einsum("cjp,jcd,djq->pq", slopes.conj(), cross, slopes).real / 2
     pairs = solutions[:, : 2 * poles.size].reshape(channels, poles.size, 2)
+    peaks = np.argmin(np.abs(spectrum.bins[:, None] - poles.imag / (2 * np.pi)), axis=0)
+    freedom = 2 * np.min(count[peaks], axis=1)
+    # Weights of so few degrees of freedom make the covariance smaller than it is.
+    smaller = np.repeat(np.sqrt(freedom / np.maximum(freedom - 2, 1.0)), 2)
     return PoleFit(
         poles=poles,
-        covariance=inverse @ score @ inverse,
+        covariance=inverse @ score @ inverse * np.multiply.outer(smaller, smaller),
         amplitudes=(pairs[..., 0] + 1j * pairs[..., 1]).T,
         amplitude_variance=_amplitude_variance(poles, spectrum, noise),
         model=model,
         residual=residual,
         noise=noise,
-        degrees_of_freedom=float(2 * np.median(count)),
+        degrees_of_freedom=freedom,
     )
 
 

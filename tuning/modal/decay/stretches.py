@@ -24,9 +24,11 @@ CONTACT_SAMPLES = 4  # within which past and future fail after a blow
 MIN_ENERGY_RISE = 2.0  # energy in two cycles after a blow over that before it
 MIN_DECAY_CYCLES = 5.0  # of the strongest vibration
 MIN_FALL_NEPERS = 1.0  # of the energy over a decay
+MIN_START_RATIO = 10.0  # energy of the first tenth over that of the second half, after a blow
 MIN_LINEARITY = 0.6  # share of the variance of the log energy that a straight line explains
 MAX_COLUMNS = 24  # channels times decays that are fitted together
 FALL_PARTS = 10  # parts of a decay whose mean energies tell its fall
+NOISE_QUANTILE = 0.25  # of the energy of a stretch: that of the noise, if the decay has ended
 CORE, WHOLE = 0.95, 0.999  # shares of the energy of a decay: for its fall, and for its end
 
 
@@ -132,7 +134,8 @@ def free_decays(
     `records` are those of the band, at the `rate` (Hz) after decimation; `frequency` (Hz) is that
     of the strongest vibration. A decay lasts at least five cycles, in which the energy falls by
     one neper, along a line or after a blow that raised it; it ends when 99.9 % of the energy above
-    the least has passed.
+    the least has passed. A record may begin right after a blow: its energy is then far above that
+    at its end, though close modes make it rise and fall on the way.
     """
     found = []
     shortest = int(np.ceil(MIN_DECAY_CYCLES * rate / frequency))
@@ -151,13 +154,34 @@ def free_decays(
             if last - first < shortest:
                 continue
             risen = energy[first : first + width].mean()
-            blow = i > 0 and (before < 0 or risen > MIN_ENERGY_RISE * energy[before])
-            fall, linearity = _fall(energy[first : first + _length(energy[first:last], CORE)])
-            if fall > MIN_FALL_NEPERS and (blow or linearity > MIN_LINEARITY):
+            if i == 0:
+                blow = _begins_high(energy[first:last])
+            else:
+                blow = before < 0 or risen > MIN_ENERGY_RISE * energy[before]
+            fall = _fall_of_decay(energy[first:last], blow)
+            if fall > MIN_FALL_NEPERS:
                 length = max(_length(energy[first:last], WHOLE), shortest)
                 stop = min(stop, start + int(length * ratio))
                 found.append(Stretch(number, start, stop, fall))
     return tuple(found)
+
+
+def _begins_high(energy):
+    """Whether the energy at the start is far above the usual one of the second half."""
+    start = energy[: max(energy.size // FALL_PARTS, 1)].mean()
+    return start > MIN_START_RATIO * np.median(energy[energy.size // 2 :])
+
+
+def _fall_of_decay(energy, blow):
+    """Fall in nepers of the energy of a decay; zero if it is neither after a blow nor linear.
+
+    A decay that goes on to the end of a stretch has most of the energy above its least. Noise that
+    lasts long after a decay holds much energy, too, but as much below its level as above it.
+    """
+    whole = np.cumsum(energy - np.quantile(energy, NOISE_QUANTILE))
+    lengths = _length(energy, CORE), int(np.argmax(whole >= CORE * whole.max())) + 1
+    falls = [_fall(energy[:length]) for length in lengths]
+    return max((fall for fall, linearity in falls if blow or linearity > MIN_LINEARITY), default=0)
 
 
 def _length(energy, share):

@@ -64,13 +64,18 @@ class RunningPeaks(eqx.Module):
 
 @jax.named_scope("running_peaks")
 def update_peaks(
-    running_peaks: RunningPeaks, matrices: StepMatrices, path: LoadPath, states, forces, commands
+    running_peaks: RunningPeaks, matrices: StepMatrices, path: LoadPath, inputs
 ) -> RunningPeaks:
-    """Running peaks after a further chunk of steps."""
+    """Running peaks after a further chunk of steps.
+
+    `inputs` of the monitored outputs are states, contact forces, those at the ends of the steps and
+    commands; the last two may be None.
+    """
+    states, forces, *_ = inputs
     steps, batch_size = states.shape[0], states.shape[-1]
     start, length = path.start, path.length
-    parts = (states, forces) if commands is None else (states, forces, commands)
-    deflections = matrices.monitored @ xp.concatenate(parts, axis=1)
+    given = [part for part in inputs if part is not None]
+    deflections = matrices.monitored @ xp.concatenate(given, axis=1)
     samples = deflections.reshape(steps, len(PEAK_NODES), -1, batch_size)
     samples = optimization_barrier(samples)
 

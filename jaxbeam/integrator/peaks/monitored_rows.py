@@ -14,57 +14,54 @@ from jaxbeam.runtime.arrays import Array, add_at, cholesky, solve_triangular, xp
 def monitored_rows(
     model: ModalModel,
     propagators: Propagators,
-    outputs: OutputRows,
-    command_rates: Float[Array, "mode actuator"] | None,
-    corrected: CorrectionRows | None = None,
+    rows: Float[Array, "output state"],
+    on_commands: Float[Array, "output command"] | None,
 ) -> tuple[
     Float[Array, "length sample block side"],
     Float[Array, "length sample force block input"],
 ]:
     """Rows of outputs on the state at the start of a step and on the forces at its Gauss nodes.
 
-    Samples are the outputs at each peak node, one node after the other; inputs are the generalised
-    forces, then the commands, whose `command_rates` are accelerations of the modes. Accelerations
-    are q'' = (rows of A) z + forces, with the forces as polynomials through the Gauss nodes.
-    `corrected` are rows of the static correction, in addition.
+    `rows` are those on states at the same instant, `on_commands` on commands. Samples are the
+    outputs at each peak node, one node after the other; inputs are the generalised forces, then the
+    commands, both polynomials through the Gauss nodes.
     """
-    blocks, count = model.state_matrix.shape[0], model.modes_per_block
-    rows = outputs.rows.reshape(-1, blocks, count)
+    blocks, side, _ = model.state_matrix.shape
+    on_side = rows.reshape(-1, blocks, side)
     transition, response = _at_peak_nodes(propagators)
-    accelerations = model.state_matrix[:, 1 : 2 * count : 2]
-    orders = np.array(outputs.time_derivatives, int)
-    on_state, on_forces, grouped = [], [], []
-    for order in np.unique(orders) if orders.size else (0,):
-        index = np.flatnonzero(orders == order)
-        on_side, sides = rows[index], np.s_[order : 2 * count : 2]
-        if order == 2:
-            on_side, sides = xp.einsum("wbm,bmj->wbj", on_side, accelerations), np.s_[:]
-        on_state.append(xp.einsum("wbm,lpbmj->lpwbj", on_side, transition[..., sides, :]))
-        on_forces.append(xp.einsum("wbm,lpfbmk->lpwfbk", on_side, response[..., sides, :]))
-        grouped.append(index)
-    on_state, on_forces = xp.concatenate(on_state, axis=2), xp.concatenate(on_forces, axis=2)
-    if len(grouped) > 1:
-        as_given = np.argsort(np.concatenate(grouped))
-        on_state, on_forces = on_state[:, :, as_given], on_forces[:, :, as_given]
-    if corrected is not None:
-        for order, extra in ((1, corrected.rates), (2, corrected.accelerations)):
-            if extra is None:
-                continue
-            on_side, sides = extra.reshape(-1, blocks, count), np.s_[1 : 2 * count : 2]
-            if order == 2:
-                on_side, sides = xp.einsum("wbm,bmj->wbj", on_side, accelerations), np.s_[:]
-            on_state = on_state + xp.einsum("wbm,lpbmj->lpwbj", on_side, transition[..., sides, :])
-            added = xp.einsum("wbm,lpfbmk->lpwfbk", on_side, response[..., sides, :])
-            on_forces = on_forces + added
-    forces_at_once = _feedthrough(outputs, rows, command_rates, response.shape[-1], corrected)
-    if forces_at_once is not None:
-        weights = force_weights_at_peaks()[:, None, :, None, None]
-        on_forces = on_forces + weights * forces_at_once[:, None]
+    on_state = xp.einsum("wbi,lpbij->lpwbj", on_side, transition)
+    on_forces = xp.einsum("wbi,lpfbik->lpwfbk", on_side, response)
+    if on_commands is not None:
+        first = model.modes_per_block
+        commands = np.s_[..., 0, first : first + on_commands.shape[1]]
+        at_nodes = force_weights_at_peaks()[:, None, :, None] * on_commands[:, None]
+        on_forces = add_at(on_forces, commands, at_nodes)
     lengths = on_state.shape[0]
     return (
         on_state.reshape(lengths, -1, *on_state.shape[3:]),
         on_forces.reshape(lengths, -1, *on_forces.shape[3:]),
     )
+
+
+def commands_at_once(
+    outputs: OutputRows,
+    command_rates: Float[Array, "mode command"],
+    corrected: CorrectionRows | None,
+) -> Float[Array, "output command"]:
+    """What commands change of outputs at the same instant.
+
+    `command_rates` are the accelerations of the modes, which accelerations follow; the active
+    moments of actuators are part of section forces.
+    """
+    accelerations = outputs.has_feedthrough[:, None] * outputs.rows
+    if corrected is not None and corrected.accelerations is not None:
+        accelerations = accelerations + corrected.accelerations
+    direct, actuators = accelerations @ command_rates, outputs.on_commands.shape[1]
+    if actuators:
+        direct = add_at(direct, np.s_[:, :actuators], outputs.on_commands)
+    if actuators and corrected is not None:
+        direct = add_at(direct, np.s_[:, :actuators], corrected.commands)
+    return direct
 
 
 def _at_peak_nodes(propagators: Propagators):
@@ -89,35 +86,6 @@ def force_weights_at_peaks() -> np.ndarray:
     """Weights (sample, force) from forces at the Gauss nodes to those at the peak nodes."""
     powers = np.array(PEAK_NODES)[:, None] ** np.arange(NODE_COUNT)
     return powers @ lagrange_coefficients(NODE_COUNT).T
-
-
-def _feedthrough(
-    outputs: OutputRows, rows, command_rates, input_count: int, corrected: CorrectionRows | None
-):
-    """Outputs per input at the same instant (output, block, input); None if they are all zero."""
-    count = rows.shape[-1]
-    has_commands = command_rates is not None and outputs.on_commands.shape[1] > 0
-    has_masses = corrected is not None and corrected.accelerations is not None
-    if not (outputs.has_feedthrough.any() or has_commands or has_masses):
-        return None
-    direct = xp.zeros((*rows.shape[:2], input_count))
-    for i in np.flatnonzero(outputs.has_feedthrough):
-        direct = add_at(direct, np.s_[i, :, :count], rows[i])
-        if command_rates is not None:
-            direct = add_at(direct, np.s_[i, :, count:], rows[i] @ command_rates)
-    if has_commands:
-        actuators = outputs.on_commands.shape[1]
-        direct = add_at(direct, np.s_[:, 0, count : count + actuators], outputs.on_commands)
-    if corrected is None:
-        return direct
-    if corrected.accelerations is not None:
-        on_accelerations = corrected.accelerations.reshape(rows.shape)
-        direct = add_at(direct, np.s_[..., :count], on_accelerations)
-        if command_rates is not None:
-            direct = add_at(direct, np.s_[:, :, count:], on_accelerations @ command_rates)
-    if has_commands:
-        direct = add_at(direct, np.s_[:, 0, count : count + actuators], corrected.commands)
-    return direct
 
 
 def bounds_by_energy(

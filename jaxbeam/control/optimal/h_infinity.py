@@ -1,0 +1,200 @@
+"""H-infinity control of the readings, designed for the sampled loop."""
+
+from typing import ClassVar, NamedTuple
+
+from jaxtyping import Float
+
+from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep
+from jaxbeam.case.declared_checks import check_on_beam
+from jaxbeam.case.fields import ON_BEAM, POSITIVE, concrete, is_concrete, number, part
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.control.design_model import DesignModel
+from jaxbeam.control.optimal.minimax import Game, is_attained, least_level, minimax_law
+from jaxbeam.control.predictive.prediction import sampled_plant
+from jaxbeam.model.sensing.output_rows import row_on_states
+from jaxbeam.model.state_space import Plant
+from jaxbeam.runtime.arrays import Array, xp
+
+EXCESS = 1.05  # of the level over the least one, where none is given
+
+
+class HInfinity(AbstractController):
+    """Law that makes the worst gain from forces and noise to readings and commands small.
+
+    Forces d on the beam and noise n of the readings y, in units of `force_size` and `noise_size`,
+    cause readings and commands u in units of `output_size` and `command_size`; with T the period,
+
+        sum of (y / output_size)^2 + (u / command_size)^2
+            <= attenuation^2 x sum of (d / force_size)^2 + (n / noise_size)^2
+
+    over the samples, for every course of d and n. Without `attenuation` it is 1.05 times the least
+    that any linear law attains (`least_attenuation`). A larger `output_size` or a smaller
+    `force_size` asks for less control. With `corner`, readings count through a first-order
+    low-pass: slow deflections matter, and fast ones do not.
+
+    The plant is that of the case without loads, or of the `design` model, exactly discretised with
+    held forces and commands, and a `delay` below the period. Forces act at `positions`, by default
+    those of the sensors; filters of the sensors are no part of it. The law is linear, of the order
+    of this plant; it knows the commands as limited by the actuators.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=2),
+    ...     actuators=[jb.PointForce(0.3)],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.HInfinity(
+    ...         output_size=2e-4, command_size=4.0, force_size=4.0, noise_size=1e-5, period=0.005
+    ...     ),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    0.592 mm
+    """
+
+    kind: ClassVar[str] = "h-infinity"
+    leaves_passive_out: ClassVar[bool] = True
+
+    output_size: Float[Array, " *output"] = number(
+        "unit of a reading", "size of each reading that counts as 1", POSITIVE
+    )
+    command_size: Float[Array, " *actuator"] = number(
+        "unit of a command", "size of each command that counts as 1", POSITIVE
+    )
+    force_size: Float[Array, " *force"] = number(
+        "N", "size of each disturbing force that counts as 1", POSITIVE
+    )
+    noise_size: Float[Array, " *output"] = number(
+        "unit of a reading", "size of the noise of each reading that counts as 1", POSITIVE
+    )
+    positions: Float[Array, " force"] | None = number(
+        "m",
+        "places of the disturbing forces; those of the sensors if left out",
+        ON_BEAM,
+        default=None,
+    )
+    corner: Float[Array, ""] | None = number(
+        "Hz",
+        "corner frequency of the low-pass through which readings count",
+        POSITIVE,
+        default=None,
+    )
+    attenuation: Float[Array, ""] | None = number(
+        "1", "worst gain, 1.05 times the least one if left out", POSITIVE, default=None
+    )
+    design: DesignModel | None = part("design model of the plant", DesignModel)
+
+    @property
+    def design_depends_on_loads(self) -> bool:
+        return False
+
+    def validate(self, case):
+        outputs = len(case.sensors)
+        actuators = sum(actuator.command_unit != "1" for actuator in case.actuators)
+        if self.period is None:
+            return "period must be given: kind 'h-infinity' acts at samples"
+        excess_delay = None if self.delay is None else self.delay - self.period
+        if excess_delay is not None and is_concrete(excess_delay) and concrete(excess_delay) >= 0:
+            return "delay must be less than the period: one pending command is allowed for"
+        if outputs == 0:
+            return "kind needs a sensor: its readings are fed back"
+        for i, sensor in enumerate(case.sensors):
+            quantity = QUANTITIES[sensor.quantity]
+            if quantity.time_derivative > 1 or quantity.x_derivative > 1:
+                return (
+                    "kind needs sensors of deflection, slope or velocity, which forces do not"
+                    f" move at once; sensors.{i} measures {sensor.quantity}"
+                )
+        forces = outputs if self.positions is None else self.positions.shape[0]
+        sizes = {
+            "output_size": outputs,
+            "command_size": actuators,
+            "force_size": forces,
+            "noise_size": outputs,
+        }
+        for name, size in sizes.items():
+            value = getattr(self, name)
+            if value.shape not in ((), (size,)):
+                return f"{name} must be one number or {size}, not {value.size}"
+        if self.positions is not None:
+            check_on_beam("controller.positions", self.positions, case.beam.length)
+        error = None if self.design is None else self.design.validate(case)
+        return None if error is None else f"design.{error}"
+
+    def game(self, plant: Plant) -> Game:
+        """Sampled plant of the design, in units of the sizes; its noise has the covariance 1.
+
+        Its last states are, with a delay, the pending commands, and with a corner the filtered
+        readings.
+        """
+        design = plant if self.design is None else self.design.design_plant(plant, "modal")
+        system, sensors, model = design.unloaded, design.case.sensors, design.modal_model
+        positions = self.positions
+        if positions is None:
+            positions = xp.stack([sensor.position for sensor in sensors])
+        shapes = model.shapes(positions, (0,))[0]
+        columns = xp.stack([row_on_states(model, shape, 1) for shape in shapes], axis=1)
+        forces = design.from_modal(columns) * self.force_size
+        sampled = sampled_plant(system.A, system.B, forces, self.period, self.delay)
+        states, outputs = sampled.A.shape[0], len(sensors)
+        rows = xp.pad(system.C[:outputs], ((0, 0), (0, states - system.A.shape[0])))
+        A, B, E = sampled.A, sampled.B, sampled.E
+        measured = rows / xp.broadcast_to(self.noise_size, (outputs,))[:, None]
+        counted = rows / xp.broadcast_to(self.output_size, (outputs,))[:, None]
+        if self.corner is not None:
+            kept = xp.exp(-2 * xp.pi * self.corner * self.period)
+            lower = xp.concatenate([(1 - kept) * counted, kept * xp.eye(outputs)], axis=1)
+            A = xp.concatenate([xp.pad(A, ((0, 0), (0, outputs))), lower])
+            B, E = (xp.pad(part, ((0, outputs), (0, 0))) for part in (B, E))
+            measured = xp.pad(measured, ((0, 0), (0, outputs)))
+            counted = xp.concatenate([xp.zeros((outputs, states)), xp.eye(outputs)], axis=1)
+        weight = xp.broadcast_to(self.command_size, (B.shape[1],)) ** -2
+        return Game(A, B, measured, E, counted.T @ counted, xp.diag(weight), xp.eye(outputs))
+
+    def least_attenuation(self, plant: Plant) -> Float[Array, ""]:
+        """Least worst gain of any linear law at these samples, for a plant (`state_space`).
+
+        Raises ValueError if no law makes the loop stable.
+        """
+        return least_level(self.game(plant))
+
+    def design_law(self, plant):
+        game = self.game(plant)
+        level = self.attenuation
+        if level is None:
+            level = EXCESS * least_level(game)
+        else:
+            attained = is_attained(game, level)
+            if is_concrete(attained) and not concrete(attained):
+                raise ValueError(
+                    f"controller.attenuation is {concrete(level):g}, but no law has a worst gain"
+                    f" below {concrete(least_level(game)):.6g}: raise it, or leave it out"
+                )
+        law = minimax_law(game, level)
+        noise_size = xp.broadcast_to(self.noise_size, (game.C.shape[0],))
+        return HInfinityLaw(law.F, law.G / noise_size, game.B, law.K, law.D / noise_size)
+
+
+class PredictedState(NamedTuple):
+    """State x as predicted up to the last command, which is not known as limited until later."""
+
+    state: Float[Array, " state"]
+
+
+class HInfinityLaw(AbstractSampledLaw):
+    """Linear law u = K x + D y, x+ = F x + G y + B u, with the command u as limited."""
+
+    F: Float[Array, "state state"]
+    G: Float[Array, "state output"]
+    B: Float[Array, "state actuator"]
+    K: Float[Array, "actuator state"]
+    D: Float[Array, "actuator output"]
+
+    def initial_state(self):
+        return PredictedState(xp.zeros(self.F.shape[0]))
+
+    def step(self, state, measurement, t):
+        readings = measurement.readings[: self.G.shape[1]]
+        predicted = state.state + self.B @ measurement.command
+        command = self.K @ predicted + self.D @ readings
+        return ControlStep(command, PredictedState(self.F @ predicted + self.G @ readings))
