@@ -35,8 +35,8 @@ def rig(controller, **changes):
         "loads": [jb.MovingMass(mass=0.4, speed=2.4, entry_time=0.02)],
         "run": Run(duration=0.3),
     }
-    beam = jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2)
-    return jb.Case(beam, controller=controller, **(parts | changes))
+    parts["beam"] = jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2)
+    return jb.Case(controller=controller, **(parts | changes))
 
 
 FILTERED = [jb.Sensor(0.2, filter=jb.Filter(40.0, 3), offset=1e-4), jb.Sensor(0.4, resolution=1e-5)]
@@ -150,6 +150,22 @@ CASES = {
         )
     ),
     "h-infinity": rig(jb.HInfinity(2e-4, 2.0, 1.0, [1e-5, 1e-5, 1e-3], period=PERIOD)),
+    "gpc-adaptive": rig(
+        jb.AdaptiveGPC(
+            6,
+            2,
+            1e-8,
+            probe=[0.5, 0.3],
+            until=0.12,
+            more_delay=1,
+            measurement_noise=1e-4,
+            period=PERIOD,
+        ),
+        beam=jb.Beam(0.6, 12.0, 0.5, 0.1, modes=2),
+        actuators=[jb.PointForce(0.25, limits=(-4.0, 4.0)), jb.PointForce(0.45)],
+        sensors=[jb.Sensor(0.2), jb.Sensor(0.4)],
+        loads=[jb.MovingForce(mass=0.3, speed=4.0, entry_time=0.13)],
+    ),
     "mpc-soft": rig(
         jb.MPC(
             6,
