@@ -152,7 +152,7 @@ class HInfinity(AbstractController):
         return Game(A, B, measured, E, counted.T @ counted, xp.diag(weight), xp.eye(outputs))
 
     def least_attenuation(self, plant: Plant) -> Float[Array, ""]:
-        """Least worst gain of any linear law at these samples, for a plant (`state_space`).
+        """Smallest worst-case gain of any linear law at these samples, for a plant (`state_space`).
 
         Raises ValueError if no law makes the loop stable.
         """

@@ -30,7 +30,7 @@ class ScenarioMPC(MPC):
     `delays[i]`; one number holds in all scenarios, and what is left out is that of the design.
     Damping ratios stay. Each scenario explains the present state by an unexplained change of its
     own. Limits of commands, and the `hard_limit` and `soft_limit` in every scenario, belong to one
-    quadratic program, whose merit is that of `MPC`, the "mean" over the scenarios, or, with the
+    quadratic program, whose objective is that of `MPC`, the "mean" over the scenarios, or, with the
     "worst", horizon times the square of the largest predicted deflection, weighted by the roots of
     its weights, of any scenario, period and position, and the cost of the moves.
 
@@ -136,7 +136,7 @@ class ScenarioMPC(MPC):
 class ScenarioLaw(AbstractStateLaw):
     """Law of several scenarios, each with the predictive law of its plant.
 
-    `mass_factors` are those of estimated weights; with `worst` the merit is the largest deflection.
+    `mass_factors` are those of estimated weights; with `worst` the objective is the largest deflection.
     """
 
     laws: tuple[MPCLaw, ...]

@@ -38,12 +38,13 @@ def end_rows(
         return None
     times = start[:, None] + length[:, None] * xp.asarray(END_FRACTIONS, length.dtype)
     index = load_index[:, None]
-    motion = [
+    position, speed, acceleration = (
         xp.take_along_axis(xp.moveaxis(part, 0, -1), index, axis=2)
         for part in loads.kinematics(times)
-    ]
-    active = xp.broadcast_to(on_beam[:, None], motion[0].shape)
-    rows, surface = surface_rows(model, *motion, active), loads.surface_motion(*motion)
+    )
+    active = xp.broadcast_to(on_beam[:, None], position.shape)
+    rows = surface_rows(model, position, speed, acceleration, active)
+    surface = loads.surface_motion(position, speed, acceleration)
     return EndRows(
         rows.shape.reshape(*active.shape, -1),
         rows.acceleration.reshape(*active.shape, -1),

@@ -1,5 +1,7 @@
 """Rows of monitored outputs at the peak nodes of a step, on its initial state and its forces."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -53,7 +55,7 @@ def commands_at_once(
     `command_rates` are the accelerations of the modes, which accelerations follow; the active
     moments of actuators are part of section forces.
     """
-    accelerations = outputs.has_feedthrough[:, None] * outputs.rows
+    accelerations: Any = outputs.has_feedthrough[:, None] * outputs.rows
     if corrected is not None and corrected.accelerations is not None:
         accelerations = accelerations + corrected.accelerations
     direct, actuators = accelerations @ command_rates, outputs.on_commands.shape[1]
