@@ -220,6 +220,27 @@ CASES = {
             delay=1e-3,
         )
     ),
+    "kalman-extended": rig(
+        jb.LQR(
+            **WEAK,
+            estimator=jb.ExtendedKalman(
+                0.02, 1e-5, mass_deviation=0.1, speed_deviation=0.2, acceleration_noise=0.1
+            ),
+            delay=2e-3,
+        ),
+        **SHORT
+        | {
+            "sensors": [
+                jb.Sensor(0.2, offset=1e-4),
+                jb.Sensor(0.4, "acceleration", noise=0.05),
+                jb.Sensor(0.3, filter=jb.Filter(60.0, realisation="analogue")),
+            ],
+            "loads": [
+                jb.MovingMass(mass=0.4, speed=15.0),
+                jb.MovingForce(mass=0.2, speed=12.0, entry_time=0.01),
+            ],
+        },
+    ),
     "moving-horizon": rig(
         jb.LQR(
             **WEAK,

@@ -136,7 +136,8 @@ class ScenarioMPC(MPC):
 class ScenarioLaw(AbstractStateLaw):
     """Law of several scenarios, each with the predictive law of its plant.
 
-    `mass_factors` are those of estimated weights; with `worst` the objective is the largest deflection.
+    `mass_factors` are those of estimated weights; with `worst` the objective is the largest
+    deflection.
     """
 
     laws: tuple[MPCLaw, ...]
