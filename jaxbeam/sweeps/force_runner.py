@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from jaxbeam.integrator.forces.paths import constant_speeds, force_paths
+from jaxbeam.integrator.forces.paths import constant_speeds, force_paths, force_wheels
 from jaxbeam.integrator.forces.peaks import peaks_of_forces
 from jaxbeam.integrator.forces.system import (
     ForceResponses,
@@ -46,8 +46,8 @@ class ForceRunner:
     def __init__(self, case: Case, batches: Batches, system: str):
         self.case, self.batches, self.system = case, batches, system
         self.pool = ThreadPoolExecutor(os.cpu_count())
-        wheels = load_set(case).wheel_count
-        most, count = max(1, min(BLOCK_RUNS, int(BLOCK_PAIRS / wheels**2))), len(batches.run_index)
+        self.wheels, count = force_wheels(case), len(batches.run_index)
+        most = max(1, min(BLOCK_RUNS, int(BLOCK_PAIRS / self.wheels.force.size**2)))
         # As equal as can be: cores wait for the last block.
         self.block_runs = -(-count // -(-count // most))
         self.block_count = -(-count // self.block_runs)
@@ -90,7 +90,8 @@ class ForceRunner:
             found = [self._peaks(np.array([run]), phase) for run in runs]
             return Peaks(*map(np.concatenate, zip(*found, strict=True)))
         batches = self.batches
-        paths = force_paths(self.case, batches.shared_addresses, batches.shared_values[runs])
+        values = batches.shared_values[runs]
+        paths = force_paths(self.case, self.wheels, batches.shared_addresses, values)
         speeds = tuple(np.unique(paths.speed).tolist())
         return peaks_of_forces(_responses(self.system, speeds), paths, phase)
 

@@ -134,9 +134,9 @@ def _truncation_of(case: Case) -> Float[Array, " sensor"] | None:
     loads, model = load_set(case), modal_model(case, mesh_layout(case), has_coupling(case))
     case = without_later_vibration(case, model)
     duration = float(case.run.duration)
-    found = motion_of_forces(case, np.linspace(0.0, duration, SAMPLES))
+    found = motion_of_forces(case, model, loads, np.linspace(0.0, duration, SAMPLES))
     if found is not None:
-        return truncation_changes(case, *found)
+        return truncation_changes(case, model.modes, found)
     if model.modes.has_repeated:
         model = modal_model(case, model.modes.layout)
     # The longest stable step: an estimate needs no search for the step of an error.

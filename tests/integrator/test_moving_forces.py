@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.integrator.forces.paths import ForcePaths, force_paths
+from jaxbeam.integrator.forces.paths import ForcePaths, force_paths, force_wheels
 from jaxbeam.integrator.forces.peaks import peaks_of_forces
 from jaxbeam.integrator.forces.states import outputs_of_forces
 from jaxbeam.integrator.forces.system import force_responses, force_system, particular_solutions
@@ -125,7 +125,7 @@ def test_paths_are_those_of_the_loads():
     names = "loads.*.speed", "loads.0.spacing", "loads.1.entry_time", "loads.0.start_position"
     names += ("run.duration",)
     values = np.array([[12.0, 5.0, 0.1, -3.0, 2.0], [-30.0, 8.0, 0.0, 4.0, 1.5]])
-    paths = force_paths(case, names, values)
+    paths = force_paths(case, force_wheels(case), names, values)
     for run, row in enumerate(values):
         one = jb.replace(case, dict(zip(names, row, strict=True)))
         loads, times = load_set(one), np.array([0.2, 0.9])

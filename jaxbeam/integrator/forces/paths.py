@@ -45,8 +45,30 @@ def constant_speeds(loads: LoadSet) -> bool:
     return bool(straight and np.all(times[:, 1:] >= NEVER))
 
 
+class ForceWheels(NamedTuple):
+    """What the wheels of all runs share: forces upwards (N), distances behind the first (m)."""
+
+    force: Float[np.ndarray, " wheel"]
+    behind: tuple[Float[np.ndarray, " wheel_of_load"], ...]
+
+
+def force_wheels(case: Case) -> ForceWheels:
+    """Wheels of the loads of a case; once for all runs, as it takes longer than their paths."""
+    behind = tuple(_distances(case, i) for i in range(len(case.loads)))
+    return ForceWheels(-np.asarray(load_set(case).weight)[:, 0], behind)
+
+
+def _distances(case: Case, load: int) -> Float[np.ndarray, " wheel"]:
+    """Distances (m) of the wheels of a load behind its first."""
+    vehicle = case.loads[load].vehicle(case.run.gravity)
+    return np.asarray(concrete(wheel_distances(case.loads[load], vehicle)))
+
+
 def force_paths(
-    case: Case, addresses: Sequence[str], values: Float[np.ndarray, "run address"]
+    case: Case,
+    wheels: ForceWheels,
+    addresses: Sequence[str],
+    values: Float[np.ndarray, "run address"],
 ) -> ForcePaths:
     """Paths in runs of a case of constant speeds that differ in the values at some addresses.
 
@@ -66,17 +88,13 @@ def force_paths(
 
         speed, entry = of_load("speed"), of_load("entry_time")
         start = of_load("start_position", np.where(speed < 0, length, 0.0))
-        vehicle = load.vehicle(case.run.gravity)
-        spaced = {f"loads.{i}.spacing", f"loads.{ALL}.spacing"} & set(addresses)
-        if spaced:
+        behind = wheels.behind[i]
+        if {f"loads.{i}.spacing", f"loads.{ALL}.spacing"} & set(addresses):
             spacings, index = np.unique(of_load("spacing"), return_inverse=True)
-            own = [replace(case, {f"loads.{i}.spacing": one}).loads[i] for one in spacings]
-            behind = np.stack([concrete(wheel_distances(one, vehicle)) for one in own])[index]
-        else:
-            behind = concrete(wheel_distances(load, vehicle))
+            own = [replace(case, {f"loads.{i}.spacing": one}) for one in spacings]
+            behind = np.stack([_distances(one, i) for one in own])[index]
         first = (start - speed * entry)[:, None]
         origins.append(first - np.sign(speed)[:, None] * behind)
         speeds.append(np.broadcast_to(speed[:, None], origins[-1].shape))
-    force = -np.asarray(load_set(case).weight)[:, 0]
     duration = column.get("run.duration", np.full(runs, float(case.run.duration)))
-    return ForcePaths(np.concatenate(origins, 1), np.concatenate(speeds, 1), force, duration)
+    return ForcePaths(np.concatenate(origins, 1), np.concatenate(speeds, 1), wheels.force, duration)
