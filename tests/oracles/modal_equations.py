@@ -53,7 +53,7 @@ class Span:
 
 @dataclass(frozen=True, eq=False)
 class KnownModes:
-    """A beam whose modes are known: shapes map positions and orders of derivatives to their rows."""
+    """A beam of known modes: `rows` map positions and orders of derivatives to their shapes."""
 
     length: float  # m
     stiffness: np.ndarray  # squares of the natural angular frequencies, 1/s^2
