@@ -189,8 +189,8 @@ def with_usual_spread(
 
     The pole of least uncertainty decides whether there is a mode; but that it is the least makes it
     too small by chance. A model of low order, in which close or weak modes are one, has poles that
-    vary little from block to block, and are biased: what the less uncertain half of the chain differs from
-    the pole adds to its variance.
+    vary little from block to block, and are biased: what the less uncertain half of the chain
+    differs from the pole adds to its variance.
     """
     ranked = sorted(chain.members.tolist(), key=lambda k: np.linalg.det(found[k].covariance))
     usual, least = (np.diag(found[k].covariance) for k in (ranked[len(ranked) // 8], ranked[0]))
