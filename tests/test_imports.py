@@ -23,7 +23,7 @@ jaxbeam.integrator  jaxbeam.estimation
 jaxbeam.control
 jaxbeam.files
 jaxbeam.rigs  jaxbeam.simulation
-jaxbeam.sweeps  jaxbeam.c_code
+jaxbeam.sweeps  jaxbeam.c_code  jaxbeam.fmi
 jaxbeam.analysis
 jaxbeam.plot
 jaxbeam
@@ -34,8 +34,9 @@ tuning.fit
 tuning.weighing  tuning.control
 tuning
 experiments.thesis  experiments.demo
-experiments.studies  experiments.validation
-experiments.benchmarks  experiments
+experiments.studies
+experiments.benchmarks
+experiments.validation  experiments
 jaxbeam.cli
 jaxbeam.__main__
 """
