@@ -18,7 +18,8 @@ class NoCCodeError(ValueError):
 class EstimateCode(NamedTuple):
     """C expressions of an estimate: state, weights of the wheels, states of vehicles, or None.
 
-    `states` and `wheels` are numbers of entries.
+    `states` and `wheels` are numbers of entries. With `followed_loads` the estimate has masses and
+    motion of the loads, too, which no law of C code takes.
     """
 
     state: str
@@ -26,6 +27,7 @@ class EstimateCode(NamedTuple):
     weights: str | None = None
     wheels: int = 0
     vehicles: str | None = None
+    followed_loads: bool = False
 
 
 class LoadCode(NamedTuple):

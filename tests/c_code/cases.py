@@ -35,8 +35,8 @@ def rig(controller, **changes):
         "loads": [jb.MovingMass(mass=0.4, speed=2.4, entry_time=0.02)],
         "run": Run(duration=0.3),
     }
-    beam = jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2)
-    return jb.Case(beam, controller=controller, **(parts | changes))
+    parts["beam"] = jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2)
+    return jb.Case(controller=controller, **(parts | changes))
 
 
 FILTERED = [jb.Sensor(0.2, filter=jb.Filter(40.0, 3), offset=1e-4), jb.Sensor(0.4, resolution=1e-5)]
@@ -150,6 +150,22 @@ CASES = {
         )
     ),
     "h-infinity": rig(jb.HInfinity(2e-4, 2.0, 1.0, [1e-5, 1e-5, 1e-3], period=PERIOD)),
+    "gpc-adaptive": rig(
+        jb.AdaptiveGPC(
+            6,
+            2,
+            1e-8,
+            probe=[0.5, 0.3],
+            until=0.12,
+            more_delay=1,
+            measurement_noise=1e-4,
+            period=PERIOD,
+        ),
+        beam=jb.Beam(0.6, 12.0, 0.5, 0.1, modes=2),
+        actuators=[jb.PointForce(0.25, limits=(-4.0, 4.0)), jb.PointForce(0.45)],
+        sensors=[jb.Sensor(0.2), jb.Sensor(0.4)],
+        loads=[jb.MovingForce(mass=0.3, speed=4.0, entry_time=0.13)],
+    ),
     "mpc-soft": rig(
         jb.MPC(
             6,
@@ -176,6 +192,69 @@ CASES = {
     ),
     "kalman-known": rig(
         jb.LQR(**WEAK, estimator=jb.Kalman(0.02, 1e-5, loads="known"), delay=2e-3), **SHORT
+    ),
+    "mpc-scenario-worst": rig(
+        jb.ScenarioMPC(
+            3,
+            2,
+            1e-7,
+            stiffness_factors=[0.8, 1.2],
+            delays=[0.0, 2e-3],
+            merit="worst",
+            estimator=KALMAN,
+            period=PERIOD,
+            delay=1e-3,
+        )
+    ),
+    "mpc-scenario-mean": rig(
+        jb.ScenarioMPC(
+            3,
+            2,
+            1e-9,
+            stiffness_factors=[0.8, 1.2],
+            delays=[0.0, 2e-3],
+            merit="mean",
+            soft_limit=1e-4,
+            estimator=KALMAN,
+            period=PERIOD,
+            delay=1e-3,
+        )
+    ),
+    "kalman-extended": rig(
+        jb.LQR(
+            **WEAK,
+            estimator=jb.ExtendedKalman(
+                0.02, 1e-5, mass_deviation=0.1, speed_deviation=0.2, acceleration_noise=0.1
+            ),
+            delay=2e-3,
+        ),
+        **SHORT
+        | {
+            "sensors": [
+                jb.Sensor(0.2, offset=1e-4),
+                jb.Sensor(0.4, "acceleration", noise=0.05),
+                jb.Sensor(0.3, filter=jb.Filter(60.0, realisation="analogue")),
+            ],
+            "loads": [
+                jb.MovingMass(mass=0.4, speed=15.0),
+                jb.MovingForce(mass=0.2, speed=12.0, entry_time=0.01),
+            ],
+        },
+    ),
+    "moving-horizon": rig(
+        jb.LQR(
+            **WEAK,
+            estimator=jb.MovingHorizon(
+                0.02,
+                1e-5,
+                weight_deviation=1.0,
+                max_weight=3.6,
+                window=2,
+                deflection_limit=3e-4,
+            ),
+            delay=2e-3,
+        ),
+        **SHORT,
     ),
     "mpc-unconstrained": rig(jb.MPC(6, 2, 1e-10, solver="unconstrained", period=PERIOD)),
 }

@@ -19,6 +19,8 @@ SANITIZED = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 ALL = CASES | DESIGNED_TABLES
 KINDS = [*CASES, *DESIGNED_TABLES]
 ROUNDING, SINGLE_ROUNDING = 1e-12, 1e-2  # of the largest command
+# Derivatives by differences over 1e-4 of a number, which multiply rounding by as much.
+BY_DIFFERENCES = {"kalman-extended": 1e-10}
 MIN_OPERATIONS_SHARE = 0.3  # of the stated operations that a loop without a quadratic program takes
 
 
@@ -47,7 +49,7 @@ def checked(kind: str, folder: Path, *options: str) -> tuple[float, int]:
 def test_program_gives_the_commands_of_the_loop(kind, tmp_path):
     """To rounding, without warnings and memory errors; the memory is stated."""
     error, state_bytes = checked(kind, tmp_path, *SANITIZED)
-    assert error < ROUNDING
+    assert error < BY_DIFFERENCES.get(kind, ROUNDING)
     assert state_bytes == exported(kind).state_bytes
 
 

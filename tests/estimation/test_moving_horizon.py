@@ -45,6 +45,7 @@ def estimates(estimator, case=CASE, layout=None, readings=None, commands=None):
     )
     plant = jb.state_space(case, layout=layout)
     filter = estimator.sampled_filter(plant, sample_timing(case.controller))
+    filter = filter.tabulated(PERIOD * np.arange(len(readings)))
     state, found = filter.initial_state(), []
     for k, (command, reading) in enumerate(zip(commands, readings, strict=True)):
         measurement = Measurement(reading, np.zeros(5), command)

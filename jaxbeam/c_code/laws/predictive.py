@@ -9,12 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.c_code.quadratic_programs import write_solution
 from jaxbeam.c_code.source import CSource
 from jaxbeam.c_code.tables import at_samples
 from jaxbeam.c_code.writers import EstimateCode, write_state_law
 from jaxbeam.case.estimator import Estimate
 from jaxbeam.control.predictive.mpc_law import MPCLaw
-from jaxbeam.numerics.optimisation.qp import MAX_STEPS, MAX_SWEEPS
+from jaxbeam.control.predictive.scenario_mpc import ScenarioLaw
 from jaxbeam.runtime.arrays import vmap, xp
 
 Rows = Float[np.ndarray, "sample row column"]
@@ -23,7 +24,7 @@ Rows = Float[np.ndarray, "sample row column"]
 class _Program(NamedTuple):
     """Numbers of the law at each sample; columns are those of the initial conditions.
 
-    `past` predicts the present state from the last one, the command and the known inputs, 1;
+    `past` predicts the present state, in each scenario, from the last one, the command and 1;
     `minimiser` gives the unconstrained one, `limits` the right-hand sides, over the lengths of the
     rows of M L'^-1, which are `rows`; `move` the first move from z.
     """
@@ -37,32 +38,49 @@ class _Program(NamedTuple):
 
 @write_state_law.register
 def _(law: MPCLaw, code: CSource, estimate: EstimateCode) -> None:
+    _write_predictive_law(ScenarioLaw((law,), np.ones(1), False), code, estimate)
+
+
+@write_state_law.register
+def _(law: ScenarioLaw, code: CSource, estimate: EstimateCode) -> None:
+    _write_predictive_law(law, code, estimate)
+
+
+def _write_predictive_law(scenarios: ScenarioLaw, code: CSource, estimate: EstimateCode) -> None:
+    """Step of a law of several scenarios; of one, it is that of model predictive control."""
+    law = scenarios.laws[0]
     wheels = estimate.wheels if law.known_weights else 0
-    program = _program(law, code, wheels)
+    program = _program(scenarios, code, wheels)
     states, actuators = np.shape(law.C)[1], code.actuators
+    unexplained_states = states * len(scenarios.laws)
     limits, variables = program.rows.shape[1:]
-    columns = 2 * states + actuators + 1 + wheels
+    columns = states + unexplained_states + actuators + 1 + wheels
     last = code.state("last_state", np.zeros(states), "state at the last sample")
     initial = code.work("initial", columns, "initial conditions of the prediction")
-    predicted = code.work("predicted_state", states, "state that the last sample predicts")
+    # State and command of the last sample, 1 and weights: what the present state is predicted from.
+    before = code.work("before", columns - unexplained_states, "what the state is predicted from")
+    predicted = code.work("predicted_state", unexplained_states, "state predicted, by scenario")
     minimiser = code.work("minimiser", variables, "unconstrained minimiser, then solution")
-    unexplained, command = f"{initial} + {states}", f"{initial} + {2 * states}"
+    unexplained, command = f"{initial} + {states}", f"{initial} + {states + unexplained_states}"
     code.add("/* Initial conditions: state, its unexplained change, last command, 1 */")
     _copy_state(law, code, estimate, initial)
     code.add(
-        f"copy({command}, {code.command}, {actuators});\n{initial}[{columns - wheels - 1}] = 1;\n"
-        f"copy({unexplained}, {last}, {states});"
+        f"copy({command}, {code.command}, {actuators});\n{initial}[{columns - wheels - 1}] = 1;"
     )
     if wheels:
         code.add(f"copy({initial} + {columns - wheels}, {estimate.weights}, {wheels});")
-    past = code.per_sample("past", program.past)
-    code.multiply(predicted, past, unexplained, states, columns - states)
     code.add(
-        f"for (i = 0; i < {states}; i++)"
-        f" {initial}[{states} + i] = {initial}[i] - {predicted}[i];\n"
+        f"copy({before}, {last}, {states});\n"
+        f"copy({before} + {states}, {command}, {columns - states - unexplained_states});"
+    )
+    past = code.per_sample("past", program.past)
+    code.multiply(predicted, past, before, unexplained_states, columns - unexplained_states)
+    code.add(
+        f"for (i = 0; i < {unexplained_states}; i++)"
+        f" ({unexplained})[i] = {initial}[i % {states}] - {predicted}[i];\n"
         f"copy({last}, {initial}, {states});\n"
         "/* Quadratic program: minimise |z| subject to G z <= h */",
-        states,
+        unexplained_states,
     )
     matrix = code.per_sample("minimiser", program.minimiser)
     code.multiply(minimiser, matrix, initial, variables, columns)
@@ -93,82 +111,63 @@ def _copy_state(law: MPCLaw, code: CSource, estimate: EstimateCode, initial: str
 
 def _write_quadratic_program(law, code: CSource, program: _Program, minimiser, initial) -> None:
     """The solution replaces the unconstrained minimiser; `solved` is whether there is one."""
-    code.variables += ["real scale", "int solved"]
     limits, variables = program.rows.shape[1:]
     h = code.work("limits", limits, "right-hand sides h")
-    z = code.work("solution", variables, "solution of the least-distance form")
+    columns = program.minimiser.shape[2]
+    code.multiply(h, code.per_sample("limit_rows", program.limits), initial, limits, columns)
     G = code.per_sample("rows", program.rows)
-    code.multiply(
-        h, code.per_sample("limit_rows", program.limits), initial, limits, initial_size(program)
-    )
-    if law.solver == "hildreth":
-        work = code.work("qp_work", 2 * limits + variables)
-        operations = MAX_SWEEPS * _sweep_operations(limits, variables)
-        code.notes.append(f"Hildreth's procedure ends after {MAX_SWEEPS} sweeps at the latest.")
-        steps = MAX_SWEEPS
-    else:
-        work = code.work("qp_work", variables * variables + 4 * variables + 10 * limits)
-        operations = MAX_STEPS * _interior_operations(limits, variables)
-        code.notes.append(f"The interior-point method ends after {MAX_STEPS} steps at the latest.")
-        steps = MAX_STEPS
-    failures = code.counter("failures", "samples without a solution, at which the command stayed")
-    method = "hildreth" if law.solver == "hildreth" else "interior_point"
-    code.add(
-        f"""
-scale = least_distance({h}, {G}, {minimiser}, {limits}, {variables});
-solved = scale <= 0 || {method}({z}, {G}, {h}, {limits}, {variables}, {steps}, {work});
-if (!solved) {failures}++;
-if (scale > 0)
-    for (i = 0; i < {variables}; i++) {minimiser}[i] += scale * {z}[i];""",
-        operations + limits * (2 * variables + 6) + 4 * variables + 4,
-    )
+    counter = "failures", "samples without a solution, at which the command stayed"
+    write_solution(code, law.solver, h, G, minimiser, limits, variables, counter)
 
 
-def initial_size(program: _Program) -> int:
-    """Number of initial conditions."""
-    return program.minimiser.shape[2]
-
-
-def _interior_operations(R: int, V: int) -> int:
-    """Operations of a step of the interior-point method for R limits and V variables, at most."""
-    newton = 4 * R * V + 3 * V * V + 16 * R + 6 * V
-    factor = (3 * R + 2) * V * (V + 1) // 2 + V * V * V + 3 * V * V + 4 * R
-    return factor + 2 * newton + 10 * R * V + 58 * R + 12 * V + 32
-
-
-def _sweep_operations(R: int, V: int) -> int:
-    """Operations of a sweep of Hildreth's procedure, at most."""
-    return 10 * R * V + 14 * R + 8 * V + 12
-
-
-def _program(law: MPCLaw, code: CSource, wheels: int) -> _Program:
+def _program(scenarios: ScenarioLaw, code: CSource, wheels: int) -> _Program:
     """Numbers of the law at all samples; at one if they do not change.
 
     The last of the initial conditions are estimated weights of a number of `wheels`.
     """
+    law, factors = scenarios.laws[0], np.asarray(scenarios.mass_factors)
     states, actuators = np.shape(law.C)[1], code.actuators
-    columns = 2 * states + actuators + 1
+    count = len(scenarios.laws)
+    first_command = states * (1 + count)
+    columns = first_command + actuators + 1
     unit, commands = np.eye(columns), np.zeros((columns, actuators))
-    commands[2 * states : 2 * states + actuators] = np.eye(actuators)
+    commands[first_command : first_command + actuators] = np.eye(actuators)
 
     def numbers(t):
-        def prediction_for(weights):
-            return law._predict(t, Estimate(xp.zeros(states), weights if wheels else None))
+        def predictions_for(weights):
+            found = []
+            for each, factor in zip(scenarios.laws, factors, strict=True):
+                known = weights * factor if wheels else None
+                found.append(each._predict(t, Estimate(xp.zeros(states), known)))
+            return found
 
-        past, prediction, weights = prediction_for(xp.zeros(wheels))
-        known = past.E @ weights if weights.shape[0] else xp.zeros(states)
-        past = xp.concatenate([past.A, past.B, known[:, None], past.E[:, :wheels]], axis=1)
-        start = law.quadratic_program(prediction, xp.zeros(columns), xp.zeros(actuators))
-        programs = vmap(lambda *at: law.quadratic_program(prediction, *at)[1::2])(unit, commands)
+        def program(predictions, initial, command):
+            parts = []
+            for i, (each, (_, prediction, _)) in enumerate(
+                zip(scenarios.laws, predictions, strict=True)
+            ):
+                own = states * (1 + i)
+                change = initial[own : own + states]
+                conditions = xp.concatenate([initial[:states], change, initial[first_command:]])
+                parts.append((each, prediction, conditions))
+            return scenarios.quadratic_program(parts, command)
+
+        known = predictions_for(xp.zeros(wheels))
+        pasts = []
+        for factor, (past, _, weights) in zip(factors, known, strict=True):
+            forces = past.E @ weights if weights.shape[0] else xp.zeros(states)
+            of_wheels = factor * past.E[:, :wheels]
+            pasts.append(xp.concatenate([past.A, past.B, forces[:, None], of_wheels], axis=1))
+        start = program(known, xp.zeros(columns), xp.zeros(actuators))
+        programs = vmap(lambda *at: program(known, *at)[1::2])(unit, commands)
         f, limits = programs[0], programs[1] - start.gamma
         constant = limits[-1] + start.gamma
         # A weight changes the response to the condition 1.
         for weight in np.eye(wheels):
-            _, loaded, _ = prediction_for(weight)
-            program = law.quadratic_program(loaded, unit[-1], commands[-1])
-            f = xp.concatenate([f, (program.f - f[columns - 1])[None]])
-            limits = xp.concatenate([limits, (program.gamma - constant)[None]])
-        return past, start.H, f.T, start.M, limits.T, start.gamma
+            loaded = program(predictions_for(weight), unit[-1], commands[-1])
+            f = xp.concatenate([f, (loaded.f - f[columns - 1])[None]])
+            limits = xp.concatenate([limits, (loaded.gamma - constant)[None]])
+        return xp.concatenate(pasts), start.H, f.T, start.M, limits.T, start.gamma
 
     past, H, f, M, limit_columns, gamma = at_samples(numbers, code, varies=law.preview is not None)
     inverse_factor = np.linalg.inv(np.linalg.cholesky(H))

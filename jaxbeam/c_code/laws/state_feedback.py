@@ -8,6 +8,7 @@ from jaxbeam.c_code.source import CSource, search_operations
 from jaxbeam.c_code.tables import at_samples
 from jaxbeam.c_code.writers import (
     EstimateCode,
+    NoCCodeError,
     write_filter,
     write_law,
     write_load_source,
@@ -56,6 +57,10 @@ def _(law: SlidingModeLaw, code: CSource, estimate: EstimateCode) -> None:
 
 @write_state_law.register
 def _(law: PositionGainLaw, code: CSource, estimate: EstimateCode) -> None:
+    if estimate.followed_loads:
+        raise NoCCodeError(
+            "there is no code for 'lqr-position' at the positions of 'kalman-extended'"
+        )
     known = at_samples(lambda t: law.combined(law.loads_at(t)), code)
     gains, forward = (np.asarray(part) for part in known)
     code.add("/* u = f - K x, with K and f along the known ways of the loads */")

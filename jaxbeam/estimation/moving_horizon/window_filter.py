@@ -15,11 +15,12 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.case.estimator import AbstractSampledFilter
 from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.crossing_filter import CrossingFilter, corrected
+from jaxbeam.estimation.sampled_plant import Transition
 from jaxbeam.numerics.matrices import symmetric_part
 from jaxbeam.numerics.optimisation.qp import solve_qp
 from jaxbeam.runtime.arrays import Array, cholesky, solve_triangular, xp
@@ -27,12 +28,28 @@ from jaxbeam.runtime.arrays import Array, cholesky, solve_triangular, xp
 RIDGE = 1e-10  # added to correlations, which the deflections of a window make singular
 
 
+Joint = Float[Array, "joint joint"]
+
+
 class WindowState(NamedTuple):
     """Mean of states and earlier deflections after a sample, covariance, and the last command."""
 
     mean: Float[Array, " joint"]
-    covariance: Float[Array, "joint joint"]
+    covariance: Joint
     command: Float[Array, " actuator"]
+
+
+class BoundFactor(NamedTuple):
+    """Bounded numbers c = mean + `size` `root` z from independent standard normal numbers z.
+
+    The states and earlier deflections are mean + `columns` z where they depend on c. Numbers that
+    are `certain` have no variance.
+    """
+
+    size: Float[Array, " bound"]
+    root: Float[Array, "bound bound"]
+    columns: Float[Array, "joint bound"]
+    certain: Bool[Array, " bound"]
 
 
 class WindowFilter(AbstractSampledFilter):
@@ -68,20 +85,26 @@ class WindowFilter(AbstractSampledFilter):
     def update(self, state, measurement, t):
         command = measurement.command
         transition, C, D = self.filter.model_at(t)
-        states, earlier = self.rows.shape[1], self.earlier
+        matrix, noise, rows = self.joint(transition, C)
+        x = transition.predict(state.mean[: C.shape[-1]], state.command, command)
+        mean = xp.concatenate([x, matrix[C.shape[-1] :] @ state.mean])
+        covariance = symmetric_part(matrix @ state.covariance @ matrix.T + noise)
+        readings = C @ x + D @ command + sensor_offsets(self.filter.filtered.plant)
+        gain, covariance = corrected(covariance, rows, self.filter.sensor_chain.noise_covariance)
+        mean = mean + gain @ (measurement.readings - readings)
+        within = self._within_bounds(mean, covariance)[: C.shape[-1]]
+        return self.filter.estimate(within, t), WindowState(mean, covariance, command)
+
+    def joint(
+        self, transition: Transition, C: Float[Array, "sensor state"]
+    ) -> tuple[Joint, Joint, Float[Array, "sensor joint"]]:
+        """Transition of states and earlier deflections, covariance of its noise, and C."""
+        earlier = self.earlier
         # Deflections of the last sample become the first of the earlier ones.
         shift = self._deflections()[:earlier]
         matrix = xp.concatenate([xp.pad(transition.matrix, ((0, 0), (0, earlier))), shift])
-        x = transition.predict(state.mean[:states], state.command, command)
-        mean = xp.concatenate([x, shift @ state.mean])
         noise = xp.pad(transition.noise_covariance, (0, earlier))
-        covariance = symmetric_part(matrix @ state.covariance @ matrix.T + noise)
-        readings = C @ x + D @ command + sensor_offsets(self.filter.filtered.plant)
-        C = xp.pad(C, ((0, 0), (0, earlier)))
-        gain, covariance = corrected(covariance, C, self.filter.sensor_chain.noise_covariance)
-        mean = mean + gain @ (measurement.readings - readings)
-        within = self._within_bounds(mean, covariance)
-        return self.filter.estimate(within[:states], t), WindowState(mean, covariance, command)
+        return matrix, noise, xp.pad(C, ((0, 0), (0, earlier)))
 
     def _deflections(self) -> Float[Array, "deflection joint"]:
         """Rows of the present and of the earlier deflections."""
@@ -89,30 +112,46 @@ class WindowFilter(AbstractSampledFilter):
         present = xp.pad(self.rows, ((0, 0), (0, earlier)))
         return xp.concatenate([present, xp.eye(earlier, states + earlier, k=states)])
 
-    def _within_bounds(self, mean, covariance):
-        """Most probable point within the bounds; the mean where there is none."""
+    def bounds(
+        self,
+    ) -> tuple[Float[Array, "bound joint"], Float[Array, " bound"], Float[Array, " bound"]]:
+        """Rows of the bounded numbers, and their least and largest values, infinite where free."""
         deflections = self._deflections()
         weights = xp.pad(self.weight_rows, ((0, 0), (0, self.earlier)))
-        rows = xp.concatenate([deflections, weights])
-        counts = deflections.shape[0], weights.shape[0]
-        if not sum(counts):
-            return mean
-        limits = xp.full(counts[0], self.deflection_limit)
-        highest = xp.concatenate([limits, xp.full(counts[1], self.max_weight)])
-        lowest = xp.concatenate([-limits, xp.full(counts[1], self.min_weight)])
-        numbers, common = rows @ mean, rows @ covariance
+        limits = xp.full(deflections.shape[0], self.deflection_limit)
+        count = weights.shape[0]
+        lowest = xp.concatenate([-limits, xp.full(count, self.min_weight)])
+        highest = xp.concatenate([limits, xp.full(count, self.max_weight)])
+        return xp.concatenate([deflections, weights]), lowest, highest
+
+    def factor(self, covariance: Joint) -> BoundFactor:
+        """Bounded numbers from independent ones, by their covariance."""
+        rows, _, _ = self.bounds()
+        count, common = rows.shape[0], rows @ covariance
         variance = xp.diagonal(common @ rows.T)
         certain = variance <= 0
         size = xp.sqrt(xp.where(certain, 1.0, variance))
-        correlation = (common @ rows.T) / (size * size[:, None]) + RIDGE * np.eye(sum(counts))
-        correlation = xp.where(certain[:, None] | certain, np.eye(sum(counts)), correlation)
+        correlation = (common @ rows.T) / (size * size[:, None]) + RIDGE * np.eye(count)
+        correlation = xp.where(certain[:, None] | certain, np.eye(count), correlation)
         root = cholesky(correlation)
-        M = xp.concatenate([root, -root])
-        sides = xp.concatenate([highest - numbers, numbers - lowest]) / xp.concatenate([size, size])
-        # A number that is known, as before the first readings, is no matter of bounds.
-        free = xp.concatenate([certain, certain]) | ~xp.isfinite(sides)
+        columns = solve_triangular(
+            root, xp.where(certain, 0.0, 1 / size)[:, None] * common, lower=True
+        )
+        return BoundFactor(size, root, columns.T, certain)
+
+    def _within_bounds(self, mean: Float[Array, " joint"], covariance: Joint):
+        """Most probable point within the bounds; the mean where none is found."""
+        rows, lowest, highest = self.bounds()
+        count = rows.shape[0]
+        if not count:
+            return mean
+        factor, numbers = self.factor(covariance), rows @ mean
+        M = xp.concatenate([factor.root, -factor.root])
+        sides = xp.concatenate(
+            [(highest - numbers) / factor.size, (numbers - lowest) / factor.size]
+        )
+        # A number that is known, as at the start, is no matter of bounds.
+        free = xp.concatenate([factor.certain, factor.certain]) | ~xp.isfinite(sides)
         M, sides = xp.where(free[:, None], 0.0, M), xp.where(free, 1.0, sides)
-        found = solve_qp(np.eye(sum(counts)), xp.zeros(sum(counts)), M, sides)
-        change = solve_triangular(root, found.x, lower=True, transposed=True) / size
-        change = xp.where(certain | ~found.solved, 0.0, change)
-        return mean + common.T @ change
+        found = solve_qp(np.eye(count), xp.zeros(count), M, sides)
+        return mean + factor.columns @ xp.where(found.solved, found.x, 0.0)
