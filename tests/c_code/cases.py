@@ -51,6 +51,12 @@ WEIGHTS = {
     "period": PERIOD,
 }
 WEAK = WEIGHTS | {"command_weight": [1e-2, 1e-1]}
+OPERATORS = {
+    "hysteresis": jb.Hysteresis([0.0, 0.2, 0.5], [0.7, 0.2, 0.2]),
+    "compensation": jb.Hysteresis([0.0, 0.3], [0.75, 0.3]),
+    "creep": jb.Creep([9.0], [0.1]),
+    "creep_compensation": jb.Creep([10.0, 1.0], [0.06, 0.05]),
+}
 KALMAN = jb.Kalman(0.02, 1e-5)
 TWO_LOADS = [
     jb.MovingMass(mass=0.4, speed=2.4, entry_time=0.02),
@@ -148,6 +154,22 @@ CASES = {
         jb.GPC(
             6, 2, 1e-8, output_weight=[1.0, 1.0, 1e-5], reference=[1e-4, 0.0, 0.0], period=PERIOD
         )
+    ),
+    "compensation": rig(
+        Feedback([2000.0, 2000.0], period=PERIOD, delay=1.5 * PERIOD),
+        actuators=[
+            jb.Patch(0.2, 0.3, 0.15, limits=[-0.5, 1.0], **OPERATORS),
+            jb.PointForce(0.45),
+        ],
+    ),
+    "compensation-kalman": rig(
+        DiscreteLQR(
+            [1e4, 1e2, 1.0, 0.1], [1e-2, 1e-2], period=PERIOD, delay=2e-3, estimator=KALMAN
+        ),
+        actuators=[
+            jb.Patch(0.2, 0.3, 0.15, compensation=jb.Hysteresis([0.0, 0.1], [0.8, 0.3])),
+            jb.PointForce(0.45),
+        ],
     ),
     "h-infinity": rig(jb.HInfinity(2e-4, 2.0, 1.0, [1e-5, 1e-5, 1e-3], period=PERIOD)),
     "gpc-adaptive": rig(
