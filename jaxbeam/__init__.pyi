@@ -129,6 +129,7 @@ from .model.statics import (
     static_deflection as static_deflection,
     static_peak as static_peak,
 )
+from .simulation.coil_history import coil_history as coil_history
 from .simulation.corrected_deflection import corrected_deflection as corrected_deflection
 from .simulation.record import Record as Record
 from .simulation.simulate import simulate as simulate

@@ -23,7 +23,7 @@ jaxbeam.integrator  jaxbeam.estimation
 jaxbeam.control
 jaxbeam.files
 jaxbeam.rigs  jaxbeam.simulation
-jaxbeam.sweeps  jaxbeam.c_code
+jaxbeam.sweeps  jaxbeam.c_code  jaxbeam.fmi
 jaxbeam.analysis
 jaxbeam.plot
 jaxbeam

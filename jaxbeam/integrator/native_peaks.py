@@ -20,7 +20,12 @@ from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_peaks as integrate_peaks_in_jax
 from jaxbeam.integrator.kinks.passages import may_have_kinks
-from jaxbeam.integrator.peaks.monitored_rows import bounds_by_energy, force_weights_at_peaks
+from jaxbeam.integrator.peaks.contact_minimum import (
+    FORCE_FRACTIONS,
+    force_weights_at_fractions,
+    spread_factor,
+)
+from jaxbeam.integrator.peaks.monitored_rows import bounds_by_energy
 from jaxbeam.integrator.peaks.running_peaks import PEAK_MARGIN, Peaks
 from jaxbeam.integrator.propagators import (
     DOUBLINGS,
@@ -59,6 +64,8 @@ C_MACROS = {
     "TAYLOR_TERMS": TAYLOR_TERMS,
     "DOUBLINGS": DOUBLINGS,
     "PEAK_POINTS": len(PEAK_NODES),
+    "FORCE_POINTS": len(FORCE_FRACTIONS),
+    "SPREAD_FACTOR": spread_factor(),
     "PEAK_MARGIN": PEAK_MARGIN,
     "END_PEAK_MARGIN": (PEAK_MARGIN - 1)
     * float(np.diff(PEAK_NODES)[0] / np.diff(PEAK_NODES).max()) ** 2,
@@ -137,7 +144,8 @@ def integrate_peaks(
         lagrange_coefficients(NODE_COUNT),
         interpolation_matrix(PEAK_NODES)[: len(PEAK_NODES)].T,
         np.asarray(PEAK_NODES),
-        force_weights_at_peaks(),
+        FORCE_FRACTIONS,
+        force_weights_at_fractions(),
     )
     shared = None if models.state_matrix.shape[0] == 1 else 0
     own = jax.tree.map(lambda leaf: leaf[0], models) if shared is None else models

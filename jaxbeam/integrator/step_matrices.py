@@ -6,6 +6,8 @@ state at the start, to the acceleration under the loads at the nodes, the state 
 deflections at monitored positions.
 """
 
+import math
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -312,9 +314,9 @@ def _matrices_of_one_length(discrete: DiscreteModel, propagators, motion: Surfac
             force_to_deflection.reshape(steps, deflection_count, size),
         ]
         if discrete.modal_command_matrix is not None:
-            parts.append(
-                for_all_steps(deflection_force_response[:, :, 0, modes:], deflection_count, -1)
-            )
+            responses = deflection_force_response[:, :, 0, modes:]
+            width = math.prod(responses.shape[1:])  # not -1: there may be no deflections
+            parts.append(for_all_steps(responses, deflection_count, width))
         matrices = (*matrices, xp.concatenate(parts, axis=2))
     commands = node_states = None
     if discrete.modal_command_matrix is not None:

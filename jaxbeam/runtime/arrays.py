@@ -394,7 +394,7 @@ def index_in_dim(array, index, axis: int = 0, keepdims: bool = True) -> Any:
 def collapse(array, start: int, end: int) -> Any:
     """The array with the axes from start until before end made one."""
     shape = array.shape
-    return array.reshape(*shape[:start], -1, *shape[end:])
+    return array.reshape(*shape[:start], math.prod(shape[start:end]), *shape[end:])
 
 
 def searchsorted(ascending, values) -> Any:

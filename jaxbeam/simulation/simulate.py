@@ -132,7 +132,7 @@ def _first_run(case: Case, times, records: dict[int, Record]) -> FirstRun | None
 def _simulate_first(case: Case, plan: IntegrationPlan, times, policy):
     """Record of a run without its errors, and its states at all events."""
     monitored = monitored_sensors(case.sensors)
-    integration = _integrate(case, plan, times, monitored, policy=policy)
+    integration = run_integration(case, plan, times, monitored, policy=policy)
     event = integration.grid.event_at(np.arange(integration.steps))
     states = integration.states[:-1]
     at_events = put(
@@ -147,10 +147,10 @@ def _simulate_first(case: Case, plan: IntegrationPlan, times, policy):
 
 def _simulate_record(case: Case, plan: IntegrationPlan, times, errors) -> Record:
     monitored = monitored_sensors(case.sensors)
-    return _record(case, _integrate(case, plan, times, monitored), times, errors)
+    return _record(case, run_integration(case, plan, times, monitored), times, errors)
 
 
-def _record(case: Case, integration: "_Integration", times, errors) -> Record:
+def _record(case: Case, integration: "Integration", times, errors) -> Record:
     outputs = integration.outputs
     peaks = Peaks(*(part[0] for part in integration.running_peaks.peaks()))
     extremes, peaks = sensor_extremes(case.sensors, peaks)
@@ -195,7 +195,7 @@ def simulate_readings(
     is unknown. For fits: less to compile and differentiate than `simulate`, without its checks and
     warnings.
     """
-    integration = _integrate(case, plan, times, None, noisy=False)
+    integration = run_integration(case, plan, times, None, noisy=False)
     outputs = integration.outputs
     readings = outputs.readings
     if readings is None:
@@ -229,7 +229,7 @@ def simulate_histories(
 
     See `simulate_readings`.
     """
-    integration = _integrate(case, plan, times, None)
+    integration = run_integration(case, plan, times, None)
     motion, modal = integration.outputs.motion, integration.model.modes
     deflection = motion.coordinates @ modal.shapes(positions).T
     on_beam = xp.isfinite(motion.load_position)
@@ -303,18 +303,22 @@ def integration_setup(
     )
 
 
-class _Integration(NamedTuple):
-    """Running peaks, outputs at the sample times, model, grid, states (boundary, state, batch)."""
+class Integration(NamedTuple):
+    """Running peaks, outputs at the sample times, model, grid, states (boundary, state, batch).
+
+    `sampled_states` (time, state) are those at the sample times.
+    """
 
     running_peaks: Any
     outputs: "Outputs"
     model: ModalModel
     grid: TimeGrid
     states: Array
+    sampled_states: Array
     steps: int
 
 
-def _integrate(case: Case, plan: IntegrationPlan, times, monitored, noisy=True, policy=None):
+def run_integration(case: Case, plan: IntegrationPlan, times, monitored, noisy=True, policy=None):
     """An integration as planned, under the input policy of the case unless one is given."""
     discrete, loads, policy, sample_steps, steps = integration_setup(
         case, plan, times, monitored, noisy, policy
@@ -338,7 +342,9 @@ def _integrate(case: Case, plan: IntegrationPlan, times, monitored, noisy=True, 
         )
     motion, vehicles = motion_at(case, model, loads, times, states, commands)
     outputs = Outputs(motion, vehicles, readings, failures, sent)
-    return _Integration(running_peaks, outputs, model, discrete.grid, all_states, steps)
+    return Integration(
+        running_peaks, outputs, model, discrete.grid, all_states, states[..., 0], steps
+    )
 
 
 def _commands_at_steps(case: Case, commands, steps):

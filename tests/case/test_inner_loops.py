@@ -45,7 +45,7 @@ def crossing(*actuators, **changes) -> jb.Case:
 
 
 def by_its_equations(loop, times):
-    """Deflection at the sensor by scipy: sine modes, coil, error of the loop, as they are.
+    """Deflection at the sensor, current and voltage, by scipy from sine modes and the coil.
 
     States: coordinates, rates, current, integral of the error, what the sensor shows of the force.
     """
@@ -83,20 +83,28 @@ def by_its_equations(loop, times):
         return [*velocity, *acceleration, rise, error, follow]
 
     options = {"method": "LSODA", "rtol": 1e-8, "atol": 1e-11}
-    history = [np.zeros(7)]
+    history, volts = [np.zeros(7)], []
     for start, end in itertools.pairwise(times):
         command = -GAIN * at_sensor @ history[-1][:2]
         span = np.linspace(start, end, 2)
-        found = solve_ivp(rates, span, history[-1], args=(command,), **options)
+        # The voltage of the beginning period, from L I' = u - R I - K_v w'.
+        first = history[-1]
+        rise = rates(start, first, command)[4]
+        volts.append(L * rise + R * first[4] + KV * at_coil @ first[2:4])
+        found = solve_ivp(rates, span, first, args=(command,), **options)
         history.append(found.y[:, -1])
-    return np.array(history)[:, :2] @ at_sensor
+    history = np.array(history)
+    return history[:, :2] @ at_sensor, history[:, 4], np.array(volts)
 
 
 @pytest.mark.parametrize("name", LOOPS)
 def test_crossing_under_outer_feedback(name):
-    record = jb.simulate(crossing(shaker(LOOPS[name])))
-    expected = by_its_equations(LOOPS[name], np.asarray(record.times))
+    case = crossing(shaker(LOOPS[name]))
+    record, coil = jb.simulate(case), jb.coil_history(case)
+    expected, *of_coil = by_its_equations(LOOPS[name], np.asarray(record.times))
     assert_allclose(record.deflection[:, 0], expected, atol=1e-6 * np.abs(expected).max())
+    for history, own in zip((coil.current, coil.voltage[:-1]), of_coil, strict=True):
+        assert_allclose(history, own, atol=1e-6 * np.abs(own).max())
 
 
 def test_poles_of_the_loop_with_the_coil_at_rest():
@@ -235,6 +243,11 @@ def test_derivatives_of_a_peak():
 def test_errors(actuator, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         check_case(crossing(actuator))
+
+
+def test_a_patch_has_no_coil():
+    with pytest.raises(ValueError, match="actuators.0 is no electrodynamic shaker"):
+        jb.coil_history(crossing(jb.PointForce(PLACE)))
 
 
 def test_commands_stay_within_the_limits_of_the_loop():

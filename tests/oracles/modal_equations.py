@@ -11,7 +11,7 @@ for a force), weight P, position x(t) and column phi = phi(x(t)),
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +51,29 @@ class Span:
         return np.sqrt(2.0 / (self.mass_per_length * self.length)) * k**derivative * np.sin(phase)
 
 
+@dataclass(frozen=True, eq=False)
+class KnownModes:
+    """A beam of known modes: `rows` map positions and orders of derivatives to their shapes."""
+
+    length: float  # m
+    stiffness: np.ndarray  # squares of the natural angular frequencies, 1/s^2
+    damping_ratio: float
+    rows: Callable  # (positions, orders) -> (order, *position, mode), in 1 / (sqrt(kg) m^order)
+
+    @property
+    def modes(self) -> int:
+        return len(self.stiffness)
+
+    @functools.cached_property
+    def frequencies(self) -> np.ndarray:
+        """Natural angular frequencies in rad/s."""
+        return np.sqrt(np.maximum(self.stiffness, 0.0))
+
+    def shapes(self, x: float | np.ndarray, derivative: int = 0) -> np.ndarray:
+        """Modes or their x-derivatives: (..., mode), in 1 / (sqrt(kg) m^derivative)."""
+        return np.asarray(self.rows(np.asarray(x), (derivative,))[0])
+
+
 @functools.lru_cache(16)  # solvers ask many times for the same position
 def under(span, x: float) -> tuple[np.ndarray, ...]:
     """Modes, slopes and curvatures of a span at a position; read-only arrays."""
@@ -88,19 +111,39 @@ def respond(
     for start, end in zip(events[:-1], events[1:], strict=True):
         system = _System(span, loads, 0.5 * (start + end))
         sample_indices = np.flatnonzero((times >= start) & (times <= end))
-        solution = solve_ivp(
-            system.rate, (start, end), state, method="DOP853",
-            t_eval=np.append(times[sample_indices[times[sample_indices] < end]], end),
-            rtol=1e-12, atol=1e-15,
-        )  # fmt: skip
-        if not solution.success:
-            raise RuntimeError(solution.message)
+        marks = np.append(times[sample_indices[times[sample_indices] < end]], end)
+        if any(system.on):
+            solution = solve_ivp(
+                system.rate, (start, end), state, method="DOP853", t_eval=marks,
+                rtol=1e-12, atol=1e-15,
+            )  # fmt: skip
+            if not solution.success:
+                raise RuntimeError(solution.message)
+            path = solution.y.T
+        else:
+            path = free_vibration(span, state, marks - start)
         for i, k in enumerate(sample_indices):
-            states[k] = solution.y[:, i]
+            states[k] = path[i]
             contact_force[k] = system.contact_forces(times[k], states[k])
-        state = solution.y[:, -1]
+        state = path[-1]
     deflection = states[:, :n] @ span.shapes(np.asarray(sensors)).T
     return ModalResponse(times, deflection, contact_force, states[:, :n], states[:, n:])
+
+
+def free_vibration(span, state: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """States (time, 2 mode) of the damped modes without loads, times (s) after a state."""
+    q, u = np.split(state, 2)
+    decay = span.damping_ratio * span.frequencies
+    damped = span.frequencies * np.sqrt(1.0 - span.damping_ratio**2)
+    cosine = np.cos(np.multiply.outer(times, damped))
+    sine = np.multiply.outer(times, np.ones(len(q))) * np.sinc(
+        np.multiply.outer(times, damped) / np.pi
+    )  # sin(damped t) / damped, also at zero frequency
+    fall = np.exp(-np.multiply.outer(times, decay))
+    start = u + decay * q
+    displacement = fall * (q * cosine + start * sine)
+    rate = fall * (start * cosine - q * damped**2 * sine) - decay * displacement
+    return np.concatenate([displacement, rate], axis=1)
 
 
 class _System:

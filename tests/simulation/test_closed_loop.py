@@ -323,3 +323,14 @@ def test_energy_is_conserved():
     assert_allclose(
         total(supplied) + total(work), stored + total(dissipation), rtol=0, atol=1e-8 * size
     )
+
+
+def test_a_loop_without_sensors_and_loads():
+    """A steady force for 2 s: the deflection that statics has, by modes 1 to 3, and no peaks."""
+    beam = jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.3, modes=3)
+    law = jb.Prescribed(offsets=[2.0], period=0.01)
+    case = jb.Case(beam, actuators=[jb.PointForce(0.3)], controller=law, run=jb.Run(2.0, 50.0))
+    record = jb.simulate(case)
+    expected = 2.0 * 2 * 0.6**3 / (np.pi**4 * 12.0) * (1 + 1 / 3**4)
+    assert_allclose(record.at(0.3)[-1], expected, rtol=1e-9)
+    assert record.peak_deflection.shape == (0,)

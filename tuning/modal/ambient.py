@@ -110,9 +110,10 @@ def _modes_of_band(prepared: Prepared, whole, data_driven, order, refine):
     lengths = [chain.members.size for chain in diagram.chains]
     reasons = [rejection_reason(mode, duration, whole) for mode in modes]
     modes = [
-        mode if reason else _with_usual_spread(mode, poles, chain, spread_of)
+        mode if reason else with_usual_spread(mode, poles, chain, spread_of)
         for mode, reason, chain in zip(modes, reasons, diagram.chains, strict=True)
     ]
+    reasons = [rejection_reason(mode, duration, whole) for mode in modes]
     if refine and any(reasons):
         modes, reasons = _decided(modes, reasons, records, prepared.rate, scale, duration, whole)
     candidates = [Candidate(*found) for found in zip(modes, reasons, lengths, strict=True)]
@@ -181,15 +182,15 @@ def mode_of_chain(poles: Poles, chain: Chain, found: dict[int, Spread], scale) -
     )
 
 
-def _with_usual_spread(
+def with_usual_spread(
     mode: IdentifiedMode, poles: Poles, chain: Chain, found: dict[int, Spread]
 ) -> IdentifiedMode:
     """The mode with the uncertainty of the lower eighth of its chain, and that of the order.
 
     The pole of least uncertainty decides whether there is a mode; but that it is the least makes it
     too small by chance. A model of low order, in which close or weak modes are one, has poles that
-    vary little from block to block, and are biased: what the less uncertain half of the chain differs from
-    the pole adds to its variance.
+    vary little from block to block, and are biased: what the less uncertain half of the chain
+    differs from the pole adds to its variance.
     """
     ranked = sorted(chain.members.tolist(), key=lambda k: np.linalg.det(found[k].covariance))
     usual, least = (np.diag(found[k].covariance) for k in (ranked[len(ranked) // 8], ranked[0]))

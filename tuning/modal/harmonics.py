@@ -6,12 +6,17 @@ must have the same amplitude and phase throughout the record, which a resonance 
 decay of a lightly damped mode.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.signal.windows import dpss
 from scipy.stats import f as f_distribution
+
+from tuning.modal.ambient import Candidate
+from tuning.modal.preprocessing import prepare
+from tuning.modal.samples import Samples
 
 TAPERS, TIME_BANDWIDTH = 7, 4.0
 FALSE_ALARM_PROBABILITY = 1e-3  # of a line in noise, in a whole spectrum
@@ -23,6 +28,7 @@ RATIO_SD, STEADY_SDS = 0.23, 4.0  # deviation of its estimate from one value, an
 STEADY_RATIO = 0.35  # of the envelope of a line in noise of a tenth of its power
 HALF_POWER_WIDTHS = 4.0  # half width of the filter around a pole
 MAX_LINES = 30
+MIN_SERIES = 3  # lines that are multiples of one frequency
 
 
 class Line(NamedTuple):
@@ -75,6 +81,28 @@ def harmonic_lines(
     shares = [share_of(record, rate, f) for f in lines]
     ranked = sorted(zip(shares, lines, strict=True), reverse=True)[:MAX_LINES]
     return tuple(sorted(Line(f, share) for share, f in ranked))
+
+
+def fundamental(lines: tuple[Line, ...], rate: float, count: int) -> float | None:
+    """Frequency (Hz) of which most lines of a record of `count` samples are multiples, or None.
+
+    They are at least three, and within half of the resolution of the record.
+    """
+    frequencies = np.array([line.frequency for line in lines])
+    for first in frequencies:
+        multiples = np.round(frequencies / first)
+        near = np.abs(frequencies - multiples * first) < multiples * 0.5 * rate / count
+        if first > 2 * rate / count and near.sum() >= max(MIN_SERIES, 0.5 * len(lines)):
+            weights = multiples[near]
+            return float(weights @ frequencies[near] / (weights @ weights))
+    return None
+
+
+def is_multiple(frequency: float, tolerance: float, speed: float | None) -> bool:
+    """Whether a frequency (Hz) is that of a higher harmonic of a speed (Hz), if there is one."""
+    if speed is None:
+        return False
+    return abs(frequency - max(round(frequency / speed), 1) * speed) < tolerance
 
 
 def share_of(record: Float[np.ndarray, "time channel"], rate: float, frequency: float) -> float:
@@ -161,3 +189,32 @@ def without_lines(
     phases = 2 * np.pi * np.multiply.outer(np.arange(len(record)) / rate, frequencies)
     basis = np.concatenate([np.cos(phases), np.sin(phases)], axis=1)
     return record - basis @ np.linalg.lstsq(basis, record, rcond=None)[0]
+
+
+def subtract_lines(
+    samples: Samples, band: tuple[float, float], exclude: Sequence[float]
+) -> tuple[tuple[Line, ...], tuple[Float[np.ndarray, "_ channel"], ...]]:
+    """Harmonic lines in a band (Hz), and the records without them and excluded frequencies (Hz)."""
+    prepared = prepare(samples.records, samples.starts, samples.rate, band)
+    longest = max(range(len(samples.records)), key=lambda i: len(samples.records[i]))
+    lines = harmonic_lines(prepared.records[longest], prepared.rate, band)
+    frequencies = tuple(line.frequency for line in lines) + tuple(exclude)
+    centred = (record - record.mean(axis=0) for record in samples.records)
+    return lines, tuple(without_lines(one, samples.rate, frequencies) for one in centred)
+
+
+def wandering_lines(
+    candidates: Sequence[Candidate],
+    cleaned: tuple[Float[np.ndarray, "_ channel"], ...],
+    samples: Samples,
+    band: tuple[float, float],
+) -> tuple[Line, ...]:
+    """Candidates of steady amplitude: lines of machines whose speed wanders."""
+    record = max(prepare(cleaned, samples.starts, samples.rate, band).records, key=len)
+    rate = samples.rate * len(record) / max(map(len, cleaned))
+    return tuple(
+        Line(c.mode.frequency, min(c.mode.energy_share, 1.0), c.mode.pole)
+        for c in candidates
+        if c.mode.damping_ratio > 0
+        and is_steady(record, rate, c.mode.frequency, c.mode.damping_ratio)
+    )

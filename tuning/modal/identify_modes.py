@@ -31,7 +31,12 @@ from tuning.modal.fit import Choice, ModalFit
 from tuning.modal.forced.blows import force_at_blows
 from tuning.modal.forced.forces import force_names, force_records, without_forces
 from tuning.modal.forced.modes import forced_modes
-from tuning.modal.harmonics import Line, harmonic_lines, is_steady, without_lines
+from tuning.modal.harmonics import (
+    fundamental,
+    is_multiple,
+    subtract_lines,
+    wandering_lines,
+)
 from tuning.modal.preprocessing import kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels
 from tuning.modal.spectral.efdd_modes import SingularValues, efdd_modes
@@ -40,6 +45,7 @@ from tuning.modal.stabilisation import Diagram
 
 FORCED = "measured force"
 HALF_POWER = 2.0  # dip between resonances of the band in which decays are sought again
+NARROW = 0.005  # damping ratio of a mode below which it may be a harmonic
 TRANSIENT_SHARE = 0.01  # struck samples of a log with transients of crossing loads
 
 
@@ -68,9 +74,10 @@ def identify_modes(
     decomposition) or "plscf" (poly-reference least-squares complex frequency), of which the last
     two take every log for a response to broadband excitation; `force` are the names of the channels
     of forces that were measured, of a hammer or shaker, by default all in N: method "plscf", then
-    the default, fits the responses to them. `force_window` (s) is the time after each blow of a
-    hammer from which on the force is taken for zero. `exclude` are frequencies (Hz) that are no
-    modes. `progress` is called with a few words on what is being done.
+    the default, fits the responses to them; a force that one of several logs lacks, as of a hammer
+    that strikes another place in each, is zero there. `force_window` (s) is the time after each
+    blow of a hammer from which on the force is taken for zero. `exclude` are frequencies (Hz) that
+    are no modes. `progress` is called with a few words on what is being done.
 
     Raises ValueError for a log without evenly sampled records, or too short, a window outside the
     log, a band above half the sampling rate, an impossible count or order, unknown channels, kinds
@@ -91,7 +98,7 @@ def identify_modes(
     check_arguments(count, kind, order, method)
     check_force(force, force_window, kind, method)
     measured = logs
-    forces = () if kind or method not in (None, "plscf") else force_names(logs[0], force)
+    forces = () if kind or method not in (None, "plscf") else force_names(logs, force)
     logs = [without_forces(with_channels(one, channels)) for one in logs]
     if not forces and force_window is not None:
         raise ValueError(f"{logs[0].source}: a force window is for measured forces; none is in N")
@@ -119,7 +126,12 @@ def identify_modes(
         return _result(logs, samples, found, used_band, (), choices, "plscf", count, exclude)
     if progress:
         progress("harmonic lines and excitation")
-    lines, cleaned = _subtract_lines(samples, used_band, exclude)
+    lines, cleaned = subtract_lines(samples, used_band, exclude)
+    if lines and band is None:
+        # Strong lines hold most of the kinetic energy, but resonances decide the band.
+        low, high = kinetic_band(cleaned, samples.rate, derivatives)
+        used_band = min(low, used_band[0]), max(high, used_band[1])
+        lines, cleaned = subtract_lines(samples, used_band, exclude)
     if lines:
         choices.append(Choice(f"{len(lines)} harmonic lines subtracted", "--exclude FREQUENCY"))
     struck = excited(samples, derivatives, used_band)
@@ -140,7 +152,7 @@ def identify_modes(
     if found is None:
         used_method = method or "covariance"
         found = _ambient_modes(cleaned, samples, used_band, used_method, order, progress)
-        lines += _wandering_lines(found.candidates, cleaned, samples, used_band)
+        lines += wandering_lines(found.candidates, cleaned, samples, used_band)
     else:
         found = _Found(*found)
     if kind is None:
@@ -210,31 +222,11 @@ def _kind_words(found: _Found, struck, lines) -> str:
     return "excitation: ambient"
 
 
-def _subtract_lines(samples: Samples, band, exclude):
-    """Harmonic lines, and the records without them and without excluded frequencies."""
-    prepared = prepare(samples.records, samples.starts, samples.rate, band)
-    longest = max(range(len(samples.records)), key=lambda i: len(samples.records[i]))
-    lines = harmonic_lines(prepared.records[longest], prepared.rate, band)
-    frequencies = tuple(line.frequency for line in lines) + tuple(exclude)
-    centred = (record - record.mean(axis=0) for record in samples.records)
-    return lines, tuple(without_lines(one, samples.rate, frequencies) for one in centred)
-
-
-def _wandering_lines(candidates, cleaned, samples, band) -> tuple[Line, ...]:
-    """Candidates of steady amplitude: lines of machines whose speed wanders."""
-    record = max(prepare(cleaned, samples.starts, samples.rate, band).records, key=len)
-    rate = samples.rate * len(record) / max(map(len, cleaned))
-    return tuple(
-        Line(c.mode.frequency, min(c.mode.energy_share, 1.0), c.mode.pole)
-        for c in candidates
-        if c.mode.damping_ratio > 0
-        and is_steady(record, rate, c.mode.frequency, c.mode.damping_ratio)
-    )
-
-
 def _result(logs, samples, found: _Found, band, lines, choices, method, count, exclude):
     """The fit: candidates divided into modes and rejected ones."""
-    resolution = samples.rate / max(len(record) for record in samples.records)
+    longest = max(len(record) for record in samples.records)
+    resolution = samples.rate / longest
+    speed = fundamental(lines, samples.rate, longest) if found.decays is None else None
     modes, rejected = [], []
     for candidate in found.candidates:
         mode, reason = candidate.mode, candidate.reason
@@ -244,6 +236,10 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, count, e
             reason = f"excluded, {near[0]:g} Hz"
         elif hit and found.decays is None and mode.damping_ratio < 0.002:
             reason = f"a harmonic line, {hit[0].frequency:.3f} Hz"
+        elif mode.damping_ratio < NARROW and is_multiple(
+            mode.frequency, max(0.5 * resolution, 2 * mode.frequency_sd), speed
+        ):
+            reason = f"narrow, and a multiple of the lines' {speed:.3f} Hz"
         elif any(one.pole == mode.pole for one in lines):
             reason = "of steady amplitude: a harmonic line that wanders"
         (rejected if reason else modes).append((mode, reason))

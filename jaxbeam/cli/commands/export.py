@@ -1,7 +1,7 @@
 """Command `export`: a controller as a program in C, or its gains, for a real-time system."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -22,12 +22,14 @@ def export(
     *,
     output: Annotated[Path, Parameter(("-o", "--output"))],
     points: int = 1001,
+    part: Literal["beam", "controller"] | None = None,
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Write a controller for a real-time system, with its estimator and the filters of its sensors.
 
     As a program in C99 for a controller of any kind: source, header, samples of a simulated run and
-    a loop that checks the commands for them. Or as a table of gains, for those that are one.
+    a loop that checks the commands for them. Or as a table of gains, for those that are one. Or the
+    beam, or the controller, as a unit for co-simulation by FMI 3.0.
 
     Parameters
     ----------
@@ -35,21 +37,31 @@ def export(
         Case file with a controller that has a period, TOML.
     output
         NAME.c for a program, whose files and functions begin with NAME; GAINS.csv, .mat, .tdms or
-        .h (C) for gains.
+        .h (C) for gains; NAME.fmu for a unit of FMI 3.0, which needs the extra "fmi".
     points
         Number of points of the gain table over the crossing; 1001 if left out.
+    part
+        What a .fmu holds: "beam", if left out, or "controller".
     """
     endings = ", ".join(GAIN_FILES)
     is_program = output.suffix == ".c"
+    is_unit = output.suffix == ".fmu"
     refuse_option(
-        not is_program and output.suffix not in GAIN_FILES,
-        f"gains are written to {endings}, and programs to .c, not to {output}",
+        not (is_program or is_unit) and output.suffix not in GAIN_FILES,
+        f"gains are written to {endings}, programs to .c and units to .fmu, not to {output}",
     )
+    refuse_option(part is not None and not is_unit, "--part is that of a unit, NAME.fmu")
     files = [output.with_name(output.stem + ending) for ending in PROGRAM_FILES]
     options.check_outputs(*(files if is_program else [output]))
     parsed_case = options.read(case)
     if is_program:
         _write_program(parsed_case, output, files, options)
+        return
+    if is_unit:
+        from jaxbeam.fmi import write_fmu
+
+        write_fmu(parsed_case, output, part or "beam", options.overwrite)
+        options.report({"part": part or "beam"}, [], output)
         return
 
     from jaxbeam.files.export import export_gains, write_gains

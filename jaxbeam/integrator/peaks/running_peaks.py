@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.integrator.propagators import GAUSS_NODES, PEAK_NODES
+from jaxbeam.integrator.peaks.contact_minimum import contact_minimum
+from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.step_matrices import LoadPath, StepMatrices
 from jaxbeam.numerics.peak_search import estimate_peak, max_with_ties, refine_peak
 from jaxbeam.runtime.arrays import Array, cond, optimization_barrier, take, xp
@@ -108,26 +109,17 @@ def update_peaks(
         lambda best: best,
         running_peaks,
     )
-    least_of_step = xp.min(-forces.reshape(steps, -1, len(GAUSS_NODES), batch_size), axis=2)
     # Loads off the beam do not count, nor do impulses.
     is_load = (
         path.loads[:, :, None] == np.arange(running_peaks.lowest_contact_force.shape[0])
     ) & path.pressing[..., None]
-    least_of_load = xp.where(is_load[..., None], least_of_step[:, :, None], xp.inf)
-    lowest_force = xp.minimum(
-        running_peaks.lowest_contact_force, xp.min(least_of_load, axis=(0, 1), initial=xp.inf)
-    )
-
-    def first_loss(earlier):
-        tensile = -forces.reshape(steps, -1, 1, len(GAUSS_NODES), batch_size) < 0
-        times = (start[:, None] + length[:, None] * xp.asarray(GAUSS_NODES, length.dtype))[
-            :, None, None, :, None
-        ]
-        when = xp.where(tensile & is_load[..., None, None], times, NEVER)
-        return xp.minimum(earlier, xp.min(when, axis=(0, 1, 3), initial=NEVER))
-
-    contact_lost_time = cond(
-        xp.any(lowest_force < 0), first_loss, lambda first: first, running_peaks.contact_lost_time
+    lowest_force, contact_lost_time = contact_minimum(
+        running_peaks.lowest_contact_force,
+        running_peaks.contact_lost_time,
+        forces,
+        is_load,
+        start,
+        length,
     )
     finite = running_peaks.finite & xp.all(xp.isfinite(largest), axis=0)
     return eqx.tree_at(

@@ -8,21 +8,55 @@
 #include "step_matrices.h"
 #include "vehicles.h"
 
+/* Largest pull of a load in a step, from its forces at fractions of it, and the first fraction with
+ * a pull, infinite without one: peaks/contact_minimum.py. */
+static Register largest_pull(const double *fractions, const Register *pulls, Register *first) {
+    Register most = pulls[0], at = choose(pulls[0] > 0, broadcast(0), broadcast(INFINITY));
+    for (int p = 1; p < FORCE_POINTS; p++) {
+        const double gap = fractions[p] - fractions[p - 1];
+        const Register former = pulls[p - 1], here = pulls[p], rise = (here - former) / gap;
+        const Mask crosses = (former <= 0) & (here > 0);
+        if (any(crosses)) {
+            Register zero = fractions[p - 1] + gap * (former / (former - here));
+            at = choose(crosses, minimum(zero, at), at);
+        }
+        most = maximum(here, most);
+        if (p == FORCE_POINTS - 1) break;
+        const double next_gap = fractions[p + 1] - fractions[p];
+        const Register fall = (pulls[p + 1] - here) / next_gap;
+        const Mask inside = (rise > 0) & (fall < 0);
+        if (!any(inside)) continue;
+        const Register curvature = (fall - rise) / (gap + next_gap), slope = rise + curvature * gap;
+        const Register top = here - slope * slope / (4 * curvature);
+        const Register vertex = fractions[p] - slope / (2 * curvature);
+        most = choose(inside, maximum(top, most), most);
+        at = choose(inside & (top > 0) & (here <= 0), minimum(vertex, at), at);
+    }
+    *first = at;
+    return most;
+}
+
 /* Smallest contact forces so far, and the first times at which they are tensile. */
 static void update_contact_minimum(const Workspace *w, const Step *step, const Group *g) {
     for (int s = 0; s < step->loads; s++) {
         const Register *forces = g->state + w->states + s * NODES;
         const ptrdiff_t at = step->load_numbers[s] * w->batch_size + g->first;
-        Register pull = forces[0];
-        for (int k = 1; k < NODES; k++) pull = maximum(forces[k], pull);
-        store(w->lowest_force + at, minimum(-pull, load(w->lowest_force + at, g->count)), g->count);
-        if (!any(pull > 0)) continue;
-        Register loss_time = load(w->contact_loss_time + at, g->count);
-        for (int k = 0; k < NODES; k++) {
-            Register time = broadcast(step->start + step->length * w->inputs[GAUSS_NODES][k]);
-            loss_time = choose(forces[k] > 0, minimum(time, loss_time), loss_time);
-        }
-        store(w->contact_loss_time + at, loss_time, g->count);
+        Register most = forces[0], least = forces[0];
+        for (int k = 1; k < NODES; k++)
+            most = maximum(forces[k], most), least = minimum(forces[k], least);
+        const Register lowest = load(w->lowest_force + at, g->count),
+                       loss_time = load(w->contact_loss_time + at, g->count),
+                       bound = 0.5 * (most + least) + SPREAD_FACTOR * (most - least);
+        if (!any((bound > -lowest) | ((bound > 0) & (loss_time == INFINITY)))) continue;
+        Register pulls[FORCE_POINTS] = {{0}}, first;
+        const double *weights = w->inputs[FORCE_WEIGHTS];
+        for (int p = 0; p < FORCE_POINTS; p++, weights += NODES)
+            for (int k = 0; k < NODES; k++) pulls[p] += weights[k] * forces[k];
+        most = largest_pull(w->inputs[FORCE_FRACTIONS], pulls, &first);
+        store(w->lowest_force + at, minimum(-most, lowest), g->count);
+        if (!any(first <= 1)) continue;
+        store(w->contact_loss_time + at, minimum(step->start + step->length * first, loss_time),
+              g->count);
     }
 }
 
@@ -69,7 +103,7 @@ static void end_forces(const Workspace *w, const Step *step, const Group *g) {
         memset(right, 0, (size_t)loads * sizeof *right);
         if (w->groups_of_vehicles) {
             const double *weights =
-                w->inputs[PEAK_FORCE_WEIGHTS] + (end ? (PEAK_POINTS - 1) * NODES : 0);
+                w->inputs[FORCE_WEIGHTS] + (end ? (FORCE_POINTS - 1) * NODES : 0);
             for (int s = 0; s < loads; s++)
                 for (int k = 0; k < NODES; k++) right[s] += weights[k] * forces[s * NODES + k];
         } else {

@@ -1,5 +1,6 @@
 /* Arguments, outputs and workspace of a call. Macros: CHUNK_STEPS (steps of a chunk), NODES (Gauss
- * nodes of a step), PEAK_POINTS (samples of a step). A last axis of nodes or samples is padded to a
+ * nodes of a step), PEAK_POINTS (samples of a step), FORCE_POINTS (fractions at which its forces are
+ * compared), SPREAD_FACTOR (of these). A last axis of nodes or samples is padded to a
  * multiple of PADDING. */
 
 #pragma once
@@ -43,7 +44,8 @@ enum {
     LAGRANGE_COEFFICIENTS,
     INTERPOLATION,
     PEAK_FRACTIONS,
-    PEAK_FORCE_WEIGHTS,
+    FORCE_FRACTIONS,
+    FORCE_WEIGHTS,
     ARGUMENT_COUNT
 };
 enum { PEAK, PEAK_TIME, LOWEST_FORCE, CONTACT_LOSS_TIME, WORKSPACE, RESULT_COUNT };

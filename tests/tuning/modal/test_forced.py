@@ -82,6 +82,26 @@ def test_close_modes_of_a_hammer_test_are_told_apart():
     np.testing.assert_allclose(fit.frequencies, structure.frequencies, rtol=1e-3)
 
 
+def test_a_hammer_that_strikes_another_place_in_each_log():
+    """Two modes 1 % apart, of which each place excites one more: one fit of both forces."""
+    structure = small_structure(0)._replace(
+        frequencies=np.array([4.0, 4.04, 9.0]), damping_ratios=np.array([0.004, 0.005, 0.008])
+    )
+    logs = []
+    for place in range(2):
+        turned = structure._replace(inputs=np.roll(structure.inputs, -place, axis=1))
+        one = measured(turned, "blows", place, 0.05)
+        names = (f"at {place}", *one.names[1:])
+        logs.append(Log(one.times, one.values, names, one.quantities, one.units, one.source))
+    fit = identify_modes(logs, band=(2.0, 11.0))
+    np.testing.assert_allclose(fit.frequencies, structure.frequencies, rtol=1e-3)
+    np.testing.assert_allclose(fit.damping_ratios, structure.damping_ratios, rtol=0.05)
+    assert np.all(np.diag(mac_matrix(fit.shapes, structure.shapes + 0j)) > 0.99)
+    assert "at 0 and at 1" in str(fit)
+    with pytest.raises(ValueError, match="no channel 'at 2'"):
+        identify_modes(logs, band=(2.0, 11.0), force=["at 2"])
+
+
 def test_two_forces_at_once():
     """Shakers at two places, whose forces are correlated."""
     structure, random = small_structure(0), np.random.default_rng(5)

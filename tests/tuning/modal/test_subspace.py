@@ -8,11 +8,12 @@ from scipy.signal import lfilter
 from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import Structure, random_structure, sampled
 from tuning import identify_modes
-from tuning.modal.ambient import Candidate, without_duplicates
-from tuning.modal.harmonics import harmonic_lines, is_steady, without_lines
+from tuning.modal.ambient import Candidate, mode_of_chain, with_usual_spread, without_duplicates
+from tuning.modal.harmonics import Line, fundamental, harmonic_lines, is_steady, without_lines
 from tuning.modal.result import IdentifiedMode
 from tuning.modal.shapes import mac_matrix, normalised, phase_collinearity
-from tuning.modal.subspace import decompose, poles_of_order, spreads
+from tuning.modal.stabilisation import Chain
+from tuning.modal.subspace import Poles, Spread, decompose, poles_of_order, spreads
 
 
 def free_response(times):
@@ -124,6 +125,14 @@ def test_a_line_is_found_and_subtracted():
     assert harmonic_lines(noise, 100.0, (1.0, 40.0)) == ()
 
 
+def test_the_fundamental_of_harmonics():
+    """Lines of a shaker at multiples of 4.646 Hz, one missing, and one line of another machine."""
+    lines = tuple(Line(f, 0.1) for f in (4.64, 9.515, 13.93, 18.581, 23.232))
+    assert fundamental(lines, 100.0, 2000) == pytest.approx(4.646, abs=0.002)
+    assert fundamental(lines[:2], 100.0, 2000) is None
+    assert fundamental((Line(3.1, 0.2), Line(7.7, 0.1), Line(11.2, 0.1)), 100.0, 2000) is None
+
+
 def test_complexity_and_normalisation_of_shapes():
     shapes = np.array([[1j, -0.5j, 0.2j], [1.0, 1j, -1.0]])
     np.testing.assert_allclose(phase_collinearity(shapes)[0], 1.0)
@@ -153,6 +162,24 @@ def test_an_envelope_tells_a_line_that_wanders_from_a_resonance():
     driven = lfilter([1.0], [1, -2 * pole.real, abs(pole) ** 2], random.normal(size=(count, 1)), 0)
     assert not is_steady(driven, rate, 4.0, 0.01)
     assert not is_steady(driven[:300], rate, 4.0, 0.01)
+
+
+def test_what_a_pole_varies_with_the_order_adds_to_its_uncertainty():
+    """Of sixteen orders the lowest vary least from block to block, and are biased."""
+    frequencies = np.where(np.arange(16) < 2, 5.0, 5.1)
+    values = 2 * np.pi * frequencies * (-0.01 + 1j * np.sqrt(1 - 0.01**2))
+    shapes = np.ones((16, 2), complex)
+    poles = Poles(2 * np.arange(1, 17), values, shapes, np.full(16, 0.5))
+    spread = {
+        k: Spread((1 + 0.1 * k) * np.diag([1e-4, 1e-6]), shapes[k], np.zeros((4, 4)), 23.0)
+        for k in range(16)
+    }
+    chain = Chain(np.arange(16), 8)
+    mode = with_usual_spread(mode_of_chain(poles, chain, spread, np.ones(2)), poles, chain, spread)
+    assert mode.frequency == pytest.approx(5.0)
+    # Six of the better eight orders have it 0.1 Hz higher.
+    assert mode.frequency_sd == pytest.approx(np.sqrt(1.2e-4 + 6 / 8 * 0.1**2))
+    assert mode.damping_sd == pytest.approx(np.sqrt(1.2e-6))
 
 
 def identified(frequency, frequency_sd, damping_ratio, damping_sd):

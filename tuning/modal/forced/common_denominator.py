@@ -15,7 +15,7 @@ lowest coefficient of one, poles that stand for noise are unstable, and fall awa
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 MAX_ANGLE = 2.8  # of z on the circle, of a band from 0
 PART_LINES = 4096  # lines whose products are formed at once
@@ -45,6 +45,14 @@ class Lines(NamedTuple):
         """Columns of one at the lines of each record, for its transient."""
         own = (self.record[:, None] == np.arange(self.record.max() + 1)).astype(float)
         return own if self.level is None else own * self.level[:, None]
+
+    def part(self, lines: Bool[np.ndarray, " line"]) -> "Lines":
+        """Some of the lines."""
+        level = None if self.level is None else self.level[lines]
+        return Lines(
+            self.outputs[lines], self.inputs[lines], self.z[lines], self.record[lines], self.step,
+            level,
+        )  # fmt: skip
 
 
 class Products(NamedTuple):

@@ -26,17 +26,26 @@ STEPS = 12
 WIDE = 16  # lines on either side whose errors tell the level of a line
 MIN_SPREAD = 1e-3  # of errors, over that of all lines
 MAX_STEP = 0.5  # of a pole, over its decay rate
-CONVERGED = 1e-6  # step over the decay rate
+CONVERGED = 1e-4  # step over the decay rate; what is left after it is of the order of its square
 MAX_SHIFT = 3.0  # from the start, over the decay rate; beyond, a pole is none of the data
 
 
 class LinearFit(NamedTuple):
-    """Columns of the linear least squares, their pseudo-inverse, coefficients and errors."""
+    """Columns of the linear least squares, coefficients and errors.
+
+    `basis` is orthonormal; `inverse_factor` times its transpose is the pseudo-inverse of columns.
+    """
 
     columns: Float[np.ndarray, "row column"]
-    inverse: Float[np.ndarray, "column row"]
+    basis: Float[np.ndarray, "row column"]
+    inverse_factor: Float[np.ndarray, "column column"]
     found: Float[np.ndarray, "column output"]
     errors: Float[np.ndarray, "row output"]
+
+    @property
+    def inverse(self) -> Float[np.ndarray, "column row"]:
+        """Pseudo-inverse of the columns."""
+        return self.inverse_factor @ self.basis.T
 
 
 class FittedModel(NamedTuple):
@@ -98,10 +107,14 @@ def fit_modal_model(
     poles = refined_poles(plain, starts, moving)
     lines = whitened(plain, poles)
     poles = refined_poles(lines, poles, moving)
-    others = refined_poles(lines, poles, moving, FEWER_REST_POWERS)[moving] - poles[moving]
+    fewer = refined_poles(lines, poles, moving, FEWER_REST_POWERS)
+    others = fewer[moving] - poles[moving]
     fit = linear_fit(lines, poles)
-    slopes, by_poles = slopes_by_poles(lines, fit, poles, moving)
-    weight, normal = normal_equations(slopes, fit.errors)
+    columns = _pole_columns(lines, poles[moving])
+    inside, directions = fit.basis.T @ columns, _pole_directions(lines, fit, poles.size, moving)
+    slopes = np.einsum("rc,cko->rko", columns - fit.basis @ inside, directions, optimize=True)
+    by_poles = np.tensordot(fit.inverse_factor @ inside, directions, axes=1)
+    weight, normal, _ = _normal_equations(fit, columns, directions)
     free = free_errors(fit.errors, fit.columns, fit.inverse, slopes, normal, weight)
     return FittedModel(
         plain, lines, poles, moving, fit, slopes, by_poles, weight, normal, free,
@@ -109,12 +122,17 @@ def fit_modal_model(
     )  # fmt: skip
 
 
-def normal_equations(
-    slopes: Float[np.ndarray, "row part output"], errors: Float[np.ndarray, "row output"]
-) -> tuple[Float[np.ndarray, " output"], Float[np.ndarray, "part part"]]:
-    """Weights of the outputs, and the matrix of the normal equations of the poles."""
-    weight = 1 / np.maximum(np.mean(errors**2, axis=0), 1e-300)
-    return weight, np.einsum("rko,rlo,o->kl", slopes, slopes, weight, optimize=True)
+def _normal_equations(fit: LinearFit, columns, directions):
+    """Weights of the outputs; matrix and right-hand side of the normal equations of the poles.
+
+    Slopes by the poles are `columns` in some `directions`, less what residues make up for.
+    """
+    weight = 1 / np.maximum(np.mean(fit.errors**2, axis=0), 1e-300)
+    inside = fit.basis.T @ columns
+    gram = columns.T @ columns - inside.T @ inside
+    matrix = np.einsum("cko,cd,dlo,o->kl", directions, gram, directions, weight, optimize=True)
+    right = np.einsum("cko,co,o->k", directions, columns.T @ fit.errors, weight, optimize=True)
+    return weight, matrix, right
 
 
 def refined_poles(
@@ -127,9 +145,8 @@ def refined_poles(
     poles = starts.astype(complex)
     for _ in range(STEPS if moving.size else 0):
         fit = linear_fit(lines, poles, powers)
-        slopes, _ = slopes_by_poles(lines, fit, poles, moving)
-        weight, normal = normal_equations(slopes, fit.errors)
-        right = np.einsum("rko,ro,o->k", slopes, fit.errors, weight, optimize=True)
+        directions = _pole_directions(lines, fit, poles.size, moving)
+        _, normal, right = _normal_equations(fit, _pole_columns(lines, poles[moving]), directions)
         step = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
         change = step[: moving.size] + 1j * step[moving.size :]
         limit = MAX_STEP * np.abs(poles[moving].real)
@@ -160,24 +177,30 @@ def linear_fit(
     """Residues, transients and rest by least squares, for poles (1/s) and `powers` of z."""
     target = both_parts(lines.outputs)
     columns = _columns(lines, poles, powers)
-    inverse = np.linalg.pinv(columns)
-    found = inverse @ target
-    return LinearFit(columns, inverse, found, target - columns @ found)
+    basis, factor = np.linalg.qr(columns)
+    inside = basis.T @ target
+    inverse_factor = np.linalg.pinv(factor)
+    return LinearFit(
+        columns, basis, inverse_factor, inverse_factor @ inside, target - basis @ inside
+    )
 
 
 def _columns(lines: Lines, poles, powers):
     """Real parts above imaginary parts of the columns: residues, transients, rest."""
+    columns = _by_coefficients(lines, resonances_of(lines, poles), transients_of(lines, poles))
+    signals = np.concatenate([lines.inputs, lines.unforced], axis=1)
+    return both_parts(np.concatenate([*columns, times_signals(_rest(lines, powers), signals)], 1))
+
+
+def _by_coefficients(lines: Lines, resonances, transients):
+    """Columns by real, then imaginary parts of residues, and likewise of transients."""
     columns = []
-    for signals, first, second in (
-        (lines.inputs, *resonances_of(lines, poles)),
-        (lines.unforced, *transients_of(lines, poles)),
-    ):
+    for signals, first, second in ((lines.inputs, *resonances), (lines.unforced, *transients)):
         columns += [
             times_signals(first + second, signals),
             times_signals(1j * (first - second), signals),
         ]
-    signals = np.concatenate([lines.inputs, lines.unforced], axis=1)
-    return both_parts(np.concatenate([*columns, times_signals(_rest(lines, powers), signals)], 1))
+    return columns
 
 
 def _rest(lines: Lines, powers):
@@ -215,6 +238,16 @@ def times_signals(
     return (terms[:, :, None] * signals[:, None, :]).reshape(len(terms), -1)
 
 
+def coefficient_places(lines: Lines, modes: int, k: int) -> Int[np.ndarray, " place"]:
+    """Rows of the coefficients that are those of the k-th of some modes, forced and free."""
+    places, first = [], 0
+    for signals in (lines.inputs.shape[1], lines.unforced.shape[1]):
+        for _ in range(2):  # real parts, imaginary parts
+            places.append(first + k * signals + np.arange(signals))
+            first += modes * signals
+    return np.concatenate(places)
+
+
 def split_coefficients(
     found: Float[np.ndarray, "column output"], lines: Lines, modes: int
 ) -> list[Complex[np.ndarray, "mode signal output"]]:
@@ -228,33 +261,35 @@ def split_coefficients(
     return parts
 
 
-def slopes_by_poles(
-    lines: Lines,
-    fit: LinearFit,
-    poles: Complex[np.ndarray, " mode"],
-    moving: Int[np.ndarray, " moving"],
-) -> tuple[Float[np.ndarray, "row part output"], Float[np.ndarray, "column part output"]]:
-    """Derivatives by real and imaginary parts of moving poles: of the responses, and residues.
+def _pole_columns(lines: Lines, poles) -> Float[np.ndarray, "row column"]:
+    """Columns whose combinations are the derivatives of the responses by the poles.
 
-    Those of the responses (row, part, output) are with residues eliminated; those of the
-    coefficients (column, part, output) are by which they are so.
+    They are 1 / (i w - p)^2, and the same of the transients, times the signals.
     """
-    residues, transients = split_coefficients(fit.found, lines, poles.size)
-    own, other = resonances_of(lines, poles[moving])
-    first = _along(own**2, lines.inputs, residues[moving])
-    second = _along(other**2, lines.inputs, residues[moving].conj())
-    own, other = transients_of(lines, poles[moving])
-    factor = lines.step * np.exp(poles[moving] * lines.step)
-    first += _along(factor * own**2, lines.unforced, transients[moving])
-    second += _along(factor.conj() * other**2, lines.unforced, transients[moving].conj())
-    both = np.concatenate([first + second, 1j * (first - second)])  # part, line, output
-    rows = np.concatenate([both.real, both.imag], axis=1).transpose(1, 0, 2)
-    flat = rows.reshape(len(rows), -1)
-    by_poles = fit.inverse @ flat
-    projected = (flat - fit.columns @ by_poles).reshape(rows.shape)
-    return projected, by_poles.reshape(len(by_poles), *rows.shape[1:])
+    step = lines.step
+    factor = step * np.exp(poles * step)
+    (own, other), (free, mirrored) = resonances_of(lines, poles), transients_of(lines, poles)
+    transients = factor * free**2, factor.conj() * mirrored**2
+    return both_parts(
+        np.concatenate(_by_coefficients(lines, (own**2, other**2), transients), axis=1)
+    )
 
 
-def _along(terms, signals, coefficients):
-    """Terms (line, mode) times the signals with their coefficients: (mode, line, output)."""
-    return terms.T[:, :, None] * np.einsum("ls,mso->mlo", signals, coefficients)
+def _pole_directions(lines: Lines, fit: LinearFit, modes: int, moving):
+    """Combinations (column, part, output) of the columns of the poles.
+
+    They are derivatives of the responses by real, then imaginary parts of moving poles: with the
+    real part a and the imaginary part b of a coefficient, and its two columns c and d, these are
+    a c + b d, and a d - b c.
+    """
+    size, parts = moving.size, []
+    for coefficients in split_coefficients(fit.found, lines, modes):
+        own = coefficients[moving]  # mode, signal, output
+        spread = np.zeros((size, own.shape[1], size, own.shape[2]), complex)
+        spread[np.arange(size), :, np.arange(size)] = own
+        flat = spread.reshape(size * own.shape[1], size, own.shape[2])
+        parts += [
+            np.concatenate([flat.real, -flat.imag], axis=1),
+            np.concatenate([flat.imag, flat.real], axis=1),
+        ]
+    return np.concatenate(parts)

@@ -24,7 +24,7 @@ from tuning.modal.forced.common_denominator import (
     products,
     transforms,
 )
-from tuning.modal.forced.likelihood import fit_modal_model
+from tuning.modal.forced.likelihood import fit_modal_model, linear_fit
 from tuning.modal.forced.modal_model import damping_doubts, modes_of_model, unexplained
 from tuning.modal.forced.significance import (
     criterion,
@@ -192,7 +192,8 @@ def _completed(lines, model, scale, part):
         if new[0] > 0:
             poles = split_pole(model, int(model.moving[new[0] - 1]))
         other, _ = _refined(lines, poles, scale, part)
-        if criterion(model.lines, other.poles) < criterion(model.lines, model.poles):
+        fit = linear_fit(model.lines, other.poles)
+        if criterion(fit, other.poles.size) < criterion(model.fit, model.poles.size):
             model = other
     return model
 

@@ -14,7 +14,9 @@ from scipy.stats import f as fisher
 from tuning.modal.forced.common_denominator import Lines
 from tuning.modal.forced.likelihood import (
     FittedModel,
+    LinearFit,
     both_parts,
+    coefficient_places,
     linear_fit,
     refined_poles,
     resonances_of,
@@ -24,6 +26,7 @@ from tuning.modal.forced.likelihood import (
 from tuning.modal.forced.uncertainty import NEIGHBOURS, line_means
 
 DAMPING_RATIOS = (0.004, 0.016, 0.064)  # of poles that are tried
+NEAR_LINES, NEAR_WIDTHS = 32, 16.0  # about a pole that is tried: lines, and decay rates
 MOST_PROMISING = 3  # of them, whose probabilities are computed
 SPLITS = 0.5 * np.array([1j, 1.0, 3j, 1 + 1j, 1 - 1j])  # of a pole, over its decay rate
 
@@ -35,10 +38,14 @@ def mode_chances(model: FittedModel) -> Float[np.ndarray, " mode"]:
     """
     outputs, found = model.fit.errors.shape[1], []
     variance = _local_variance(model.fit.errors, model.free.free)
+    covariance = model.fit.inverse_factor @ model.fit.inverse_factor.T
     for k in range(model.poles.size):
-        without = linear_fit(model.lines, np.delete(model.poles, k))
-        gains = np.sum(without.errors**2, axis=0) - np.sum(model.fit.errors**2, axis=0)
-        count = (model.fit.columns.shape[1] - without.columns.shape[1]) * outputs
+        # Without its coefficients x the sum of squared errors is more by x^T C^-1 x.
+        own = coefficient_places(model.lines, model.poles.size, k)
+        coefficients = model.fit.found[own]
+        inverse = np.linalg.pinv(covariance[np.ix_(own, own)], hermitian=True)
+        gains = np.einsum("po,pq,qo->o", coefficients, inverse, coefficients)
+        count = own.size * outputs
         statistic = np.sum(gains / variance[model.peak(k)]) / count
         chance = fisher.sf(statistic, count, model.freedom(k) * outputs)
         found.append(len(model.lines.z) * chance)
@@ -74,11 +81,14 @@ def missing_pole(model: FittedModel, band: tuple[float, float]) -> tuple[complex
 
 def _least_statistic(model: FittedModel, pole) -> float:
     """What 1 / (s - p) explains of the errors, over their variance, if the model keeps its own."""
-    columns = _columns_of(model.lines, pole, 1)
-    along = np.linalg.qr(columns)[0].T @ model.fit.errors
-    peak = model.peak_at(pole)
+    count, peak = len(model.lines.z), model.peak_at(pole)
+    near = NEAR_LINES * model.lines.spacing + NEAR_WIDTHS * abs(pole.real)
+    lines = np.abs(np.angle(model.lines.z) / model.lines.step - pole.imag) < near
+    columns = _columns_of(model.lines.part(lines), pole, 1)
+    errors = model.fit.errors.reshape(2, count, -1)[:, lines]
+    along = np.linalg.qr(columns)[0].T @ errors.reshape(len(columns), -1)
     rows = slice(max(peak - NEIGHBOURS, 0), peak + NEIGHBOURS + 1)
-    variance = np.mean(model.fit.errors[: len(model.lines.z)][rows] ** 2, axis=0)
+    variance = np.mean(model.fit.errors[:count][rows] ** 2, axis=0)
     return float(np.sum(np.sum(along**2, axis=0) / np.maximum(variance, 1e-300)))
 
 
@@ -98,7 +108,7 @@ def _columns_of(lines: Lines, pole, power):
 def _chance(model: FittedModel, pole: complex, freedom: float, power: int) -> float:
     """Probability by noise of what 1 / (s - p)^power explains of the errors."""
     fit, columns = model.fit, _columns_of(model.lines, pole, power)
-    basis = np.linalg.qr(columns - fit.columns @ (fit.inverse @ columns))[0]
+    basis = np.linalg.qr(columns - fit.basis @ (fit.basis.T @ columns))[0]
     along = basis.T @ fit.errors
     variance = _without(model, basis, along, model.peak_at(pole))
     # Errors are already least along two directions for each pole, its own change.
@@ -118,14 +128,13 @@ def _without(model: FittedModel, basis, along, peak):
     return np.sum(errors**2, axis=0) / np.maximum(np.sum(free, axis=0), 1e-3 * rows.size)
 
 
-def criterion(lines: Lines, poles: Complex[np.ndarray, " mode"]) -> float:
-    """Bayesian information criterion (Schwarz 1978) of poles for lines with errors of one level.
+def criterion(fit: LinearFit, modes: int) -> float:
+    """Bayesian information criterion (Schwarz 1978) of a fit to lines with errors of one level.
 
     It is less for the better model.
     """
-    fit = linear_fit(lines, poles)
     rows, outputs = fit.errors.shape
-    parameters = outputs * fit.columns.shape[1] + 2 * poles.size
+    parameters = outputs * fit.columns.shape[1] + 2 * modes
     size = np.sum(np.log(np.maximum(np.mean(fit.errors**2, axis=0), 1e-300)))
     return float(rows * size + parameters * np.log(rows))
 

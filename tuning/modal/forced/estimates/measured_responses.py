@@ -110,7 +110,7 @@ def measured_responses(
     windows = Windows(exponential, force_window)
     check_windows(windows)
     logs = [log] if isinstance(log, Log) else list(log)
-    names = force_names(logs[0], force)
+    names = force_names(logs, force)
     if not names:
         raise ValueError(f"{logs[0].source}: no channel is a force in N; name it by force")
     if estimator != "H1" and len(names) > 1:

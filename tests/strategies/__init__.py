@@ -81,12 +81,15 @@ def inner_loops(draw) -> AbstractInnerLoop:
     return ForceLoop(None, draw(numbers(0.1, 9.0)), draw(maybe(numbers(1.0, 9.0))), lag, limits)
 
 
+ACTUATORS = ("point", "shaker", "electrodynamic", "patch", "spring")
+
+
 @st.composite
 def actuators(draw, length: float):
     """An actuator of any kind."""
     position = numbers(0.0, length)
     limits = maybe(st.tuples(numbers(-10.0, -1.0), numbers(0.0, 10.0)).map(list))
-    kind = draw(st.sampled_from(["point", "shaker", "electrodynamic", "patch", "spring"]))
+    kind = draw(st.sampled_from(ACTUATORS))
     if kind == "point":
         return PointForce(position=draw(position), limits=draw(limits))
     if kind == "shaker":

@@ -1,0 +1,1 @@
+"""Random valid cases under stress: stated errors and verdicts beside independent integrations."""

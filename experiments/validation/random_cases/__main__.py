@@ -1,0 +1,110 @@
+"""Check random valid cases; exit with 1 if a law of them does not hold.
+
+    python -m experiments.validation.random_cases 10000 --seed 3
+
+Laws: no number is NaN unless the verdict says why, no verdict is wrong, and the stated error is at
+least the true one in 99.9 % of the cases. The true error of each is that beside a run of tighter
+tolerance, of a random sample (500 of 10 000) also that beside the modal equations integrated by
+scipy. Each outcome is a line of `out/random_cases_SEED.jsonl`: an interrupted check continues, and
+`--anew` begins again. Nothing is compiled.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from experiments.benchmarks.common import print_row, print_table
+from experiments.validation.random_cases.checks import Outcome, check
+
+SHARE = 0.999  # of the cases whose true error is at most the stated one
+QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
+OUT = Path(__file__).parents[3] / "out"
+
+
+def known_outcomes(file: Path) -> dict[int, Outcome]:
+    """Outcomes in a file, by index; a last line that is cut off is left out."""
+    outcomes = {}
+    for line in file.read_text(encoding="utf-8").splitlines() if file.exists() else []:
+        try:
+            outcome = Outcome(**json.loads(line))
+        except ValueError:
+            continue
+        outcomes[outcome.index] = outcome._replace(faults=tuple(outcome.faults))
+    return outcomes
+
+
+def outcomes_of(seed: int, count: int, file: Path, seconds: float = np.inf) -> list[Outcome]:
+    """Outcomes of the first `count` cases, or of as many as are checked in some seconds."""
+    outcomes, start = known_outcomes(file), time.perf_counter()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("a", encoding="utf-8") as lines:
+        for index in range(count):
+            if index in outcomes:
+                continue
+            if time.perf_counter() - start > seconds:
+                break
+            outcomes[index] = check(seed, index)
+            lines.write("\n" + json.dumps(outcomes[index]._asdict()))
+            lines.flush()
+    return [outcomes[index] for index in sorted(outcomes) if index < count]
+
+
+def broken_laws(outcomes: Sequence[Outcome]) -> list[str]:
+    """What is not as it must be: a line for each fault, and one for errors above the stated."""
+    lines = [f"case {one.index}: {fault}" for one in outcomes for fault in one.faults]
+    above = [one.index for one in outcomes if one.exceeds]
+    if len(above) > (1 - SHARE) * len(outcomes):
+        lines.append(f"the true error exceeds the stated one in cases {', '.join(map(str, above))}")
+    return lines
+
+
+def print_outcomes(outcomes: Sequence[Outcome]) -> None:
+    """Print counts, and a table of the quantiles of errors."""
+    refused = [o for o in outcomes if o.refusal]
+    by_scipy = [o for o in outcomes if o.by_scipy is not None]
+    print(f"{len(outcomes)} cases, {len(by_scipy)} of them by scipy, {len(refused)} refused:")
+    for message in sorted({one.refusal for one in refused}):
+        print(f"- {sum(one.refusal == message for one in refused)}: {message}")
+    ratios = [max(o.true, o.by_scipy or 0.0) / max(o.stated, 1e-16) for o in outcomes]
+    rows = {
+        "stated error": [o.stated for o in outcomes],
+        "true error": [o.true for o in outcomes],
+        "true error, scipy": [o.by_scipy for o in by_scipy],
+        "true over stated, above rounding": [
+            r if max(o.true, o.by_scipy or 0.0) > 1e-9 else 0.0
+            for o, r in zip(outcomes, ratios, strict=True)
+        ],
+        "processor time (s)": [o.seconds for o in outcomes],
+    }
+    print_table(("quantile", *(f"{100 * q:g} %" for q in QUANTILES)))
+    for name, values in rows.items():
+        print_row((name, *(f"{x:.1e}" for x in np.quantile(values or [np.nan], QUANTILES))))
+
+
+def main() -> int:
+    """Check the cases; return 1 if a law does not hold, else 0."""
+    options = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    options.add_argument("count", type=int, nargs="?", default=10_000)
+    options.add_argument("--seed", type=int, default=0)
+    options.add_argument("--seconds", type=float, default=np.inf, help="end after so many")
+    options.add_argument("--anew", action="store_true", help="forget the outcomes of before")
+    arguments = options.parse_args()
+    file = OUT / f"random_cases_{arguments.seed}.jsonl"
+    if arguments.anew:
+        file.unlink(missing_ok=True)
+    outcomes = outcomes_of(arguments.seed, arguments.count, file, arguments.seconds)
+    print_outcomes(outcomes)
+    broken = broken_laws(outcomes)
+    print("\n".join(broken))
+    return 1 if broken else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,128 @@
+"""Controller of a case, step by step from readings to commands, for co-simulation."""
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.case.controller import Measurement
+from jaxbeam.case.validation import check_case
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.sensing.sensor_signals import (
+    filtered_reading,
+    initial_filter_state,
+    sensor_sections,
+)
+from jaxbeam.model.state_space import state_space
+from jaxbeam.runtime.arrays import known
+from jaxbeam.simulation.commands.path import command_path
+
+CLOCK_TOLERANCE = 1e-6  # of a period, by which a time may miss a sample
+
+
+class ControllerSteps:
+    """Law of a case at its samples, with estimator, filters, limits and delay.
+
+    Readings are those of ideal sensors in SI units; offset, range, resolution and digital filter
+    are part of it, noise is not. A command is held until the next one begins.
+
+    Raises ValueError for an invalid case, one without a controller that samples, sensors with an
+    analogue filter, a delay or a sampling period of their own, and a law that uses the true state.
+
+    >>> import jaxbeam as jb
+    >>> from jaxbeam.fmi import ControllerSteps
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=2),
+    ...     actuators=[jb.PointForce(0.3, limits=[-1.0, 1.0])],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     controller=jb.Feedback([2e3], period=0.005),
+    ... )
+    >>> law = ControllerSteps(case)
+    >>> print(law.step(0.0, [-1e-4]), law.step(0.0025, [-3e-4]), law.step(0.005, [-9e-4]))
+    [0.2] [0.2] [1.]
+    """
+
+    def __init__(self, case: Case):
+        check_case(case)
+        case = concrete_case(case)
+        controller = case.controller
+        if controller is None or controller.period is None:
+            raise ValueError("the exported controller needs a period: it acts at samples")
+        self._check_sensors(case)
+        self._sensors = case.sensors
+        self._period = float(controller.period)
+        self._delay = 0.0 if controller.delay is None else float(controller.delay)
+        plant = state_space(case, layout=mesh_layout(case))
+        self._law = known(controller.law(plant))
+        self._sections = [sensor_sections(sensor, self._period) for sensor in case.sensors]
+        self._filters = [
+            initial_filter_state(sensor, part, np.zeros(()))
+            for sensor, part in zip(case.sensors, self._sections, strict=True)
+        ]
+        self._path = command_path(case)
+        self._memory = self._path.start(1, round(np.ceil(self._delay / self._period)))
+        self._state = self._law.initial_state()
+        self._unknown = np.full(len(plant.states), np.nan)
+        self._sample = 0
+        self._waiting: list[tuple[float, np.ndarray]] = []
+        self.commands = np.zeros(len(case.actuators))
+        self._check_state()
+
+    def step(self, time: float, readings: ArrayLike) -> Float[np.ndarray, " actuator"]:
+        """Commands that act from a time (s) on, with a sample of the readings if one is due then.
+
+        Times do not fall. Raises ValueError if a sample was passed over.
+        """
+        due, tolerance = self._sample * self._period, CLOCK_TOLERANCE * self._period
+        if time > due + tolerance:
+            raise ValueError(
+                f"the sample at {due:.6g} s was passed over: take communication steps that divide"
+                f" the period of the controller, {self._period:g} s"
+            )
+        if time > due - tolerance:
+            self._take_sample(due, np.asarray(readings, float))
+        while self._waiting and self._waiting[0][0] <= time + tolerance:
+            self.commands = self._waiting.pop(0)[1]
+            self._memory = self._path.begin(self._memory, len(self._waiting))
+        return self.commands
+
+    def _take_sample(self, due: float, readings) -> None:
+        """Step of the law at a sample, whose commands wait for the delay."""
+        filtered = []
+        for i, (sensor, part) in enumerate(zip(self._sensors, self._sections, strict=True)):
+            reading, self._filters[i] = filtered_reading(
+                sensor, part, self._filters[i], readings[i]
+            )
+            filtered.append(reading)
+        known_commands = self._path.known_to_law(self._memory)[:, 0]
+        measurement = Measurement(np.array(filtered), self._unknown, known_commands)
+        found = self._law.step(self._state, measurement, np.asarray(due))
+        self._state = found.state
+        self._memory = self._path.send(self._memory, np.asarray(found.command)[:, None])
+        self._waiting.append((due + self._delay, np.array(self._memory.queue[0][:, 0])))
+        self._sample += 1
+
+    def _check_state(self) -> None:
+        """Raise ValueError if the first command depends on the true state."""
+        zero = np.zeros(len(self._sensors))
+        measurement = Measurement(zero, self._unknown, np.zeros_like(self.commands))
+        found = self._law.step(self._state, measurement, np.zeros(()))
+        if not np.all(np.isfinite(np.asarray(found.command))):
+            raise ValueError(
+                "the law uses the true state, which no sensor gives: give controller.estimator"
+            )
+
+    @staticmethod
+    def _check_sensors(case: Case) -> None:
+        for i, sensor in enumerate(case.sensors):
+            analogue = sensor.filter is not None and not sensor.has_digital_filter
+            for name, given in (
+                ("an analogue filter", analogue),
+                ("a delay", sensor.delay is not None),
+                ("a sampling period", sensor.sampling_period is not None),
+            ):
+                if given:
+                    raise ValueError(
+                        f"sensors.{i} has {name} of its own, which belongs to the other unit:"
+                        " leave it out of the controller that is exported"
+                    )

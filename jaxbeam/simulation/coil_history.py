@@ -1,0 +1,78 @@
+"""Histories of the coil of an electrodynamic shaker: its current, and the voltage across it.
+
+With an inner loop the amplifier sets the voltage, which nothing bounds in the model; here it can be
+compared with what the amplifier has.
+"""
+
+from typing import NamedTuple
+
+from jaxtyping import Float
+
+from jaxbeam.case.actuators.electrodynamic import Electrodynamic
+from jaxbeam.case.actuators.inner_loops import PortSignal
+from jaxbeam.case.case import Case
+from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
+from jaxbeam.simulation.simulate import run_integration
+
+
+class CoilHistory(NamedTuple):
+    """Current (A), voltage (V), and force on the beam (N) at times (s)."""
+
+    times: Float[Array, " time"]
+    current: Float[Array, " time"]
+    voltage: Float[Array, " time"]
+    force: Float[Array, " time"]
+
+
+def coil_history(
+    case: Case,
+    actuator: int = 0,
+    times: Float[Array, " time"] | None = None,
+    tolerance: float = TOLERANCE,
+) -> CoilHistory:
+    """Current and voltage of the shaker with an index, and its force on the beam, over a run.
+
+    At the sample times of the run, or at others (s), ascending; the run is simulated anew. Between
+    samples of a controller the voltage may be larger: sample finely enough.
+
+    Raises ValueError as `simulate` does, and if the actuator is no electrodynamic shaker.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.2, modes=2),
+    ...     actuators=[
+    ...         jb.Electrodynamic(0.3, 3.0, 1e-3, 8.0, inner_loop=jb.CurrentLoop(bandwidth=2e3))
+    ...     ],
+    ...     controller=jb.Prescribed(offsets=[0.5], period=0.01),
+    ...     run=jb.Run(1.0, sample_rate=200.0),
+    ... )
+    >>> coil = jb.coil_history(case)
+    >>> print(f"{coil.current[-1]:.3f} A, {coil.voltage[-1]:.2f} V, {coil.force[-1]:.2f} N")
+    0.500 A, 1.50 V, 4.00 N
+    """
+    device = case.actuators[actuator] if actuator < len(case.actuators) else None
+    if not isinstance(device, Electrodynamic):
+        raise ValueError(f"actuators.{actuator} is no electrodynamic shaker, and has no coil")
+    times = sample_times(case) if times is None else xp.asarray(times, float)
+    integration = run_integration(case, integration_plan(case, times, tolerance), times, None)
+    motion, model, port = integration.outputs.motion, integration.model, device.coil_port()
+    sizes = [one.attachment().state_matrix.shape[0] for one in case.actuators]
+    first = 2 * model.mode_count + sum(sizes[:actuator])
+    states = integration.sampled_states[:, first : first + sizes[actuator]]
+    shape = model.modes.fields(device.position, (0,))[0]
+    at_port = xp.stack(
+        [part @ shape for part in (motion.coordinates, motion.rates, motion.accelerations)], axis=-1
+    )
+
+    def history(signal: PortSignal):
+        return (
+            states @ signal.states
+            + signal.command * motion.command[:, actuator]
+            + at_port @ signal.port
+        )
+
+    current = history(port.current)
+    suspension = xp.stack([device.stiffness, device.damping, device.mass])
+    force = device.force_constant * current - at_port @ suspension
+    return CoilHistory(times, current, history(port.voltage), force)

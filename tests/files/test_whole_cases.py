@@ -1,0 +1,75 @@
+"""Random whole cases of every kind: files, JSON Schema and the commands `check`, `describe`."""
+
+import contextlib
+import dataclasses
+import io
+import tomllib
+
+import equinox as eqx
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+
+from jaxbeam.case.case import part_classes
+from jaxbeam.case.estimator import AbstractEstimator
+from jaxbeam.case.validation import check_case
+from jaxbeam.cli import main
+from jaxbeam.files.case_file import case_from_dict, case_to_dict, load_case, save_case
+from jaxbeam.files.json_schema import json_schema
+from tests.fuzzing import examples
+from tests.strategies import ACTUATORS
+from tests.strategies.examples import (
+    CONTROLLED,
+    LOADS,
+    PROFILES,
+    kinds_of_examples,
+    kinds_of_jaxbeam,
+)
+from tests.strategies.whole_cases import is_valid, whole_cases
+
+SCHEMA = json_schema()
+UNFILTERED = [HealthCheck.filter_too_much, HealthCheck.too_slow, HealthCheck.data_too_large]
+
+
+def test_every_kind_is_drawn():
+    """Whoever adds a kind adds an example of it."""
+    drawn = {"loads": set(LOADS), "profile": set(PROFILES), "actuators": set(ACTUATORS)}
+    drawn |= kinds_of_examples()
+    families = {name: part_classes()[name].part_class for name in drawn if name != "estimator"}
+    families["estimator"] = AbstractEstimator
+    assert {name: kinds_of_jaxbeam(family) for name, family in families.items()} == drawn
+
+
+@pytest.mark.parametrize("name", [*LOADS, *PROFILES])
+def test_examples_are_valid(name):
+    case = CONTROLLED["feedback"]
+    part = {"loads": (LOADS[name],)} if name in LOADS else {"profile": PROFILES[name]}
+    check_case(dataclasses.replace(case, **part))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("whole")
+
+
+@settings(max_examples=examples(2), suppress_health_check=UNFILTERED)
+@given(whole_cases())
+def test_files_schema_and_commands(folder, case):
+    assume(is_valid(case))
+    path = folder / "case.toml"
+    save_case(case, path, overwrite=True)
+    assert eqx.tree_equal(load_case(path), case)
+    assert eqx.tree_equal(case_from_dict(case_to_dict(case)), case)
+    jsonschema = pytest.importorskip("jsonschema")
+    content = tomllib.loads(path.read_text(encoding="utf-8"))
+    errors = jsonschema.Draft202012Validator(SCHEMA).iter_errors(content)
+    assert [error.message for error in errors] == []
+    for command in ("check", "describe"):
+        printed, said = io.StringIO(), io.StringIO()
+        with (
+            contextlib.redirect_stdout(printed),
+            contextlib.redirect_stderr(said),
+            pytest.raises(SystemExit) as ended,
+        ):
+            main([command, str(path)])
+        assert ended.value.code == 0 and printed.getvalue(), said.getvalue()
+        assert all(line.startswith("jaxbeam: ") for line in said.getvalue().splitlines())

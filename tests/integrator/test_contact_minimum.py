@@ -1,0 +1,77 @@
+"""Smallest contact forces and first losses within steps: of polynomials, and beside scipy."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.case.trajectory import NEVER
+from jaxbeam.integrator.peaks.contact_minimum import contact_minimum
+from jaxbeam.integrator.propagators import GAUSS_NODES
+from jaxbeam.simulation.simulate import ContactLossWarning
+from tests.oracles import modal_equations
+from tests.oracles.loads import Load
+
+NODES = np.asarray(GAUSS_NODES)
+START, LENGTH = np.array([0.0, 2.0]), np.array([2.0, 1.0])
+SPAN = modal_equations.Span(2.0, 50.0, 1.5, modes=4, damping_ratio=0.01)
+
+
+def minimum(force, lowest=np.inf):
+    """Smallest value and first loss of a force that is a function of time, over both steps."""
+    times = START[:, None] + LENGTH[:, None] * NODES
+    found = contact_minimum(
+        np.array([[lowest]]),
+        np.array([[NEVER]]),
+        -force(times)[..., None],
+        np.ones((2, 1, 1), bool),
+        START,
+        LENGTH,
+    )
+    return float(found[0][0, 0]), float(found[1][0, 0])
+
+
+@pytest.mark.parametrize(
+    ("force", "lowest", "lost"),
+    [
+        (lambda t: 1.0 + (t - 1.37) ** 2, 1.0, NEVER),
+        (lambda t: (t - 2.41) ** 2 - 0.0625, -0.0625, 2.16),
+        (lambda t: 3.0 - t, 0.0, NEVER),  # at the end of the last step
+        (lambda t: t - 0.1, -0.1, 0.0),  # at the start of the first
+        (lambda t: (t - 1.0) ** 2 - 1e-6, -1e-6, 1.0),  # pulls between two fractions only
+    ],
+)
+def test_smallest_force_of_polynomials(force, lowest, lost):
+    found, at = minimum(force)
+    assert_allclose(found, lowest, rtol=1e-10, atol=1e-12)
+    assert_allclose(at, lost, atol=2e-2)
+
+
+def test_a_bound_skips_no_smaller_force():
+    """Random polynomials: a smallest force so far changes nothing but what is above it."""
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        curve = np.polynomial.Polynomial(rng.normal(size=6))
+        alone = minimum(curve)[0]
+        assert minimum(curve, alone + 1e-9)[0] == alone
+        assert minimum(curve, alone - 1e-9)[0] == alone - 1e-9
+
+
+@pytest.mark.parametrize(("mass", "speed"), [(3.0, 15.0), (3.0, -30.0)])
+def test_few_samples_give_the_smallest_force_of_scipy(mass, speed):
+    """Steps are long, and forces change much within them."""
+    load = Load(mass, speed)
+    end = load.time_at(SPAN.length)
+    fine = np.linspace(0.0, end, 4001)[:-1]
+    force = modal_equations.respond(SPAN, [load], [1.0], fine).contact_force[:, 0]
+    case = jb.Case(
+        jb.Beam(2.0, 50.0, 1.5, damping_ratio=0.01, modes=4),
+        sensors=[jb.Sensor(1.0)],
+        loads=[jb.MovingMass(mass=mass, speed=speed)],
+        run=jb.Run(end, sample_rate=5 / end),
+    )
+    with pytest.warns(ContactLossWarning):
+        record = jb.simulate(case)
+    size = np.abs(force).max()
+    assert_allclose(record.lowest_contact_force[0], force.min(), atol=1e-5 * size)
+    assert_allclose(record.contact_lost_time[0], fine[np.argmax(force < 0)], atol=5e-4 * end)
