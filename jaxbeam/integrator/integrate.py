@@ -20,6 +20,7 @@ from jaxbeam.integrator.discrete_model import DiscreteModel
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.input_steps import advance_known_with_inputs, step_with_inputs
 from jaxbeam.integrator.kinks.steps import weights_with_impulses, with_impulses
+from jaxbeam.integrator.load_path import LoadPath, load_path
 from jaxbeam.integrator.peaks.end_forces import END_FRACTIONS, end_forces
 from jaxbeam.integrator.peaks.monitored_rows import energies
 from jaxbeam.integrator.peaks.running_peaks import RunningPeaks, initial_peaks, update_peaks
@@ -28,7 +29,7 @@ from jaxbeam.integrator.step import (
     CHECKPOINT_NAME,
     advance_unforced,
 )
-from jaxbeam.integrator.step_matrices import LoadPath, chunk_length, load_path, step_matrices
+from jaxbeam.integrator.step_matrices import chunk_length, step_matrices
 from jaxbeam.integrator.vehicles.propagators import vehicle_state_norm
 from jaxbeam.integrator.vehicles.steps import (
     StepInput,

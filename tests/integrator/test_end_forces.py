@@ -7,9 +7,9 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import _step_inputs, _weights, integrate_history
+from jaxbeam.integrator.load_path import load_path
 from jaxbeam.integrator.peaks.end_forces import END_FRACTIONS, end_forces
 from jaxbeam.integrator.propagators import GAUSS_NODES
-from jaxbeam.integrator.step_matrices import load_path
 from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.contact import contact_at
 from jaxbeam.model.load_set import load_set

@@ -1,4 +1,4 @@
-/* Load path over a step: integrator/step_matrices.py, `load_path`. */
+/* Load path over a step: integrator/load_path.py. */
 
 #pragma once
 
