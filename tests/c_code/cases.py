@@ -22,6 +22,7 @@ from jaxbeam.control.predictive.preview import Preview
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.scheduled_feedback import ScheduledFeedback
 from jaxbeam.control.state_law import SampledStateLaw, TrueState
+from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.numerics.gain_table import GainTable
 
 PERIOD = 5e-3
@@ -293,6 +294,18 @@ class GivenTables(AbstractController):
         return GainSchedule(table, final, weights, *times, self.family)
 
 
+class FollowedPositions(GivenTables):
+    """Random tables that are read at the positions which an extended Kalman filter follows."""
+
+    def design_law(self, plant):
+        # Known numbers: those that are estimated are differences, which multiply rounding.
+        estimator = jb.ExtendedKalman(0.02, 1e-4, mass_deviation=0.0, speed_deviation=0.0)
+        filter = estimator.sampled_filter(plant, sample_timing(self))
+        law = GivenTables(family=True, period=self.period).design_law(plant).law
+        gains = lambda x: (x.schedules.table.coefficients, x.schedules.final_gain)  # noqa: E731
+        return SampledStateLaw(eqx.tree_at(gains, law, replace_fn=lambda x: 0.02 * x), filter)
+
+
 class VaryingPlants(Preview):
     """Stands for the preview of a crossing, which takes a compilation: plants that vary in time."""
 
@@ -326,6 +339,13 @@ GATES = LoadIdentification(gates=[-0.05, 0.05])
 CASES["table"] = rig(GivenTables(period=PERIOD))
 CASES["family"] = rig(GivenTables(family=True, identification=GATES, period=3 * PERIOD))
 CASES["position"] = rig(GivenTables(family=True, period=3 * PERIOD), loads=TWO_LOADS)
+CASES["position-followed"] = rig(
+    FollowedPositions(period=3 * PERIOD),
+    loads=[
+        jb.MovingMass(mass=0.4, speed=2.4, entry_time=0.021),
+        jb.MovingMass(mass=0.2, speed=2.9, entry_time=0.1),
+    ],
+)
 CASES["nearest"] = rig(
     GivenTables(family=True, nearest=True, identification=GATES, period=3 * PERIOD)
 )
