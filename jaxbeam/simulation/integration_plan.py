@@ -277,8 +277,7 @@ def _halve_until_converged(
     """Number of halvings of a step until one more changes the response within half the tolerance.
 
     Returns it with twice that change (see `UNSAMPLED`), relative to the largest response, or to
-    `least` where that is
-    larger. Raises RuntimeError if no number up to `max_halvings` suffices.
+    `least` where that is larger. Raises RuntimeError if no number up to `max_halvings` suffices.
     """
     coarse = response(0)
     for halvings in range(max_halvings):
