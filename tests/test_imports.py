@@ -34,7 +34,8 @@ tuning.fit
 tuning.weighing  tuning.control
 tuning
 experiments.thesis  experiments.demo
-experiments.studies  experiments.benchmarks
+experiments.studies
+experiments.benchmarks
 experiments.validation  experiments
 jaxbeam.cli
 jaxbeam.__main__
