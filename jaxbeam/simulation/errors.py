@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from jaxbeam.case.case import Case
 from jaxbeam.case.quantities import QUANTITIES, quantity_of
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.integrator.step_size import StepTrial
+from jaxbeam.integrator.step_size import UNSAMPLED, StepTrial
 from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
@@ -30,8 +30,8 @@ def chosen_samples(count: int) -> Int[np.ndarray, " sample"]:
 def step_errors(case: Case, model: ModalModel, trial: StepTrial) -> Float[Array, " sensor"]:
     """Estimated error of the time steps in the quantity of each sensor, relative to its largest.
 
-    Largest change of the quantity as the steps of a trial are halved, under the same commands. NaN
-    for a run that diverges.
+    Twice the largest change of the quantity as the steps of a trial are halved, under the same
+    commands: it is larger at other times. NaN for a run that diverges.
     """
     chosen, loads = chosen_samples(trial.times.size), load_set(case, model.modes.layout)
     times = trial.times[chosen]
@@ -42,7 +42,8 @@ def step_errors(case: Case, model: ModalModel, trial: StepTrial) -> Float[Array,
     errors = []
     for sensor in case.sensors:
         known, better = (sensor_history(case, model.modes, m, sensor) for m in (coarse, fine))
-        errors.append(_ratio(xp.max(xp.abs(better - known)), xp.max(xp.abs(better))))
+        change = UNSAMPLED * xp.max(xp.abs(better - known))
+        errors.append(_ratio(change, xp.max(xp.abs(better))))
     return xp.array(errors).reshape(-1)
 
 

@@ -24,6 +24,7 @@ from jaxbeam.integrator.step_size import (
     MAX_DIVERGED_HALVINGS,
     MAX_STEPS,
     NO_STEP,
+    UNSAMPLED,
     StepTrial,
     check_step_count,
     choose_step_size,
@@ -273,15 +274,15 @@ _compiled_trial_run = compiled(_closed_loop_trial_run)
 def _halve_until_converged(
     response: Callable[[int], np.ndarray], tolerance: float, max_halvings: int, least: float
 ) -> tuple[int, float]:
-    """Number of halvings of a step until one more changes the response within the tolerance.
+    """Number of halvings of a step until one more changes the response within half the tolerance.
 
-    Returns it with that change, relative to the largest response, or to `least` where that is
-    larger. Raises RuntimeError if no number up to `max_halvings` suffices.
+    Returns it with twice that change (see `UNSAMPLED`), relative to the largest response, or to
+    `least` where that is larger. Raises RuntimeError if no number up to `max_halvings` suffices.
     """
     coarse = response(0)
     for halvings in range(max_halvings):
         fine = response(halvings + 1)
-        error = largest_change(coarse, fine, least)
+        error = UNSAMPLED * largest_change(coarse, fine, least)
         if error <= tolerance:
             return halvings, error
         if halvings >= MAX_DIVERGED_HALVINGS and not np.isfinite(fine).all():
