@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbeam.c_code.compensation import Compensation
 from jaxbeam.c_code.recorded_loop import (
     RecordedLoop,
     command_lag,
@@ -62,13 +63,6 @@ def export_c(case: Case, name: str) -> CProgram:
     if not (name.isidentifier() and name.isascii()):
         raise ValueError(f"{name!r} cannot be the name of functions in C: take letters, digits, _")
     check_case(case)
-    for i, actuator in enumerate(case.actuators):
-        for key, effect in (("compensation", "hysteresis"), ("creep_compensation", "creep")):
-            if getattr(actuator, key) is not None:
-                raise ValueError(
-                    f"actuators.{i}.{key} cannot be exported as C: leave it out, and apply the"
-                    f" inverse of its {effect} to the commands"
-                )
     controller = case.controller
     if controller is None:
         raise ValueError("controller is missing: there is nothing to export; add one to the case")
@@ -148,6 +142,8 @@ def _write_limits(case: Case, code: CSource) -> None:
     actuators, lag = code.actuators, command_lag(case)
     low, high, rate = (np.asarray(part) for part in command_ranges(case))
     latest = code.state("sent", np.zeros(actuators * lag), "last commands, the latest first")
+    compensation = Compensation(case, code)
+    compensation.write_inverse()
     code.add("/* Commands as the actuators receive them */")
     if case.controller.resolution is not None:
         step = f"(real){float(concrete(case.controller.resolution))!r}"
@@ -168,15 +164,22 @@ def _write_limits(case: Case, code: CSource) -> None:
                 f"{code.output}[{i}] = clamp({code.output}[{i}], {lower}, {upper});", operations
             )
     code.add(f"copy(commands, {code.output}, {actuators});")
-    if lag > 1:
-        code.add(
-            f"for (i = {actuators * lag - 1}; i >= {actuators}; i--)"
-            f" {latest}[i] = {latest}[i - {actuators}];"
+    queues, known_queue = [(latest, code.output)], latest
+    if compensation.operators:
+        known_queue = code.state(
+            "known", np.zeros(actuators * lag), "what acts of them, the latest first"
         )
-    code.add(
-        f"copy({latest}, {code.output}, {actuators});\n"
-        f"copy({code.command}, {latest} + {actuators * (lag - 1)}, {actuators});"
-    )
+        acting = code.work("acts", actuators, "what acts of the commands")
+        compensation.write_model(acting)
+        queues.append((known_queue, acting))
+    for queue, newest in queues:
+        if lag > 1:
+            code.add(
+                f"for (i = {actuators * lag - 1}; i >= {actuators}; i--)"
+                f" {queue}[i] = {queue}[i - {actuators}];"
+            )
+        code.add(f"copy({queue}, {newest}, {actuators});")
+    code.add(f"copy({code.command}, {known_queue} + {actuators * (lag - 1)}, {actuators});")
 
 
 def _given_states(law, loop: RecordedLoop, code: CSource) -> np.ndarray:

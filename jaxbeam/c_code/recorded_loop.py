@@ -175,7 +175,7 @@ def _longest_step(case: Case, layout: Layout) -> Array:
 
 
 def _run_loop(case: Case, plan: IntegrationPlan, times) -> tuple[Array, Array, Array]:
-    """Readings, states of the plant and acting commands at the samples."""
+    """Readings, states of the plant and commands sent to the actuators at the samples."""
     discrete, loads, policy, sample_steps, steps = integration_setup(case, plan, times, None)
     _, states, commands, observed, _ = integrate_history(
         discrete, loads, max_loads=plan.shapes.max_loads, steps=steps, policy=policy
@@ -184,7 +184,8 @@ def _run_loop(case: Case, plan: IntegrationPlan, times) -> tuple[Array, Array, A
     states = states[sample_steps, : plant.modal_model.state_count, 0]
     held = commands[..., 0].reshape(commands.shape[0], NODE_COUNT, -1)
     sample_steps = xp.minimum(sample_steps, held.shape[0] - 1)
-    return observed[0][sample_steps, ..., 0], vmap(plant.from_modal)(states), held[sample_steps, 0]
+    sent = held[:, 0] if observed[2] is None else observed[2][..., 0]
+    return observed[0][sample_steps, ..., 0], vmap(plant.from_modal)(states), sent[sample_steps]
 
 
 _run = compiled_if_traced(_run_loop)

@@ -18,8 +18,8 @@ class NoCCodeError(ValueError):
 class EstimateCode(NamedTuple):
     """C expressions of an estimate: state, weights of the wheels, states of vehicles, or None.
 
-    `states` and `wheels` are numbers of entries. With `followed_loads` the estimate has masses and
-    motion of the loads, too, which no law of C code takes.
+    `states` and `wheels` are numbers of entries. `loads` are positions (m), then speeds (m/s), then
+    masses (kg) of loads that are followed.
     """
 
     state: str
@@ -27,7 +27,7 @@ class EstimateCode(NamedTuple):
     weights: str | None = None
     wheels: int = 0
     vehicles: str | None = None
-    followed_loads: bool = False
+    loads: str | None = None
 
 
 class LoadCode(NamedTuple):

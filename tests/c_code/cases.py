@@ -1,41 +1,29 @@
 """Small cases, one for each kind of controller and estimator, whose C code is tested."""
 
-import dataclasses
-
-import equinox as eqx
-import jax
 import numpy as np
 
 import jaxbeam as jb
 from jaxbeam.case.case import Run
-from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.feedback import Feedback
 from jaxbeam.control.load_identification import LoadIdentification
 from jaxbeam.control.optimal.crossing_lqr import FiniteLQR
-from jaxbeam.control.optimal.gain_schedules import GainSchedule
-from jaxbeam.control.optimal.position_lqr import PositionGainLaw
 from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
-from jaxbeam.control.optimal.scheduled_lqr import ScheduledGainLaw, ScheduledLQR
+from jaxbeam.control.optimal.scheduled_lqr import ScheduledLQR
 from jaxbeam.control.output_feedback import OutputFeedback
-from jaxbeam.control.predictive.prediction import SampledPlant
-from jaxbeam.control.predictive.preview import Preview
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.scheduled_feedback import ScheduledFeedback
-from jaxbeam.control.state_law import SampledStateLaw, TrueState
-from jaxbeam.numerics.gain_table import GainTable
-
-PERIOD = 5e-3
+from tests.c_code.given_laws import PERIOD, FollowedPositions, GivenTables, VaryingMPC
 
 
 def rig(controller, **changes):
     """Beam with two shakers, three sensors and a mass that crosses in 0.25 s."""
     parts = {
+        "beam": jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2),
         "actuators": [jb.Shaker(0.2, 2000.0, 5.0, limits=(-4.0, 4.0)), jb.PointForce(0.45)],
         "sensors": [jb.Sensor(0.2), jb.Sensor(0.4), jb.Sensor(0.3, "velocity")],
         "loads": [jb.MovingMass(mass=0.4, speed=2.4, entry_time=0.02)],
         "run": Run(duration=0.3),
     }
-    parts["beam"] = jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2)
     return jb.Case(controller=controller, **(parts | changes))
 
 
@@ -51,6 +39,12 @@ WEIGHTS = {
     "period": PERIOD,
 }
 WEAK = WEIGHTS | {"command_weight": [1e-2, 1e-1]}
+OPERATORS = {
+    "hysteresis": jb.Hysteresis([0.0, 0.2, 0.5], [0.7, 0.2, 0.2]),
+    "compensation": jb.Hysteresis([0.0, 0.3], [0.75, 0.3]),
+    "creep": jb.Creep([9.0], [0.1]),
+    "creep_compensation": jb.Creep([10.0, 1.0], [0.06, 0.05]),
+}
 KALMAN = jb.Kalman(0.02, 1e-5)
 TWO_LOADS = [
     jb.MovingMass(mass=0.4, speed=2.4, entry_time=0.02),
@@ -148,6 +142,22 @@ CASES = {
         jb.GPC(
             6, 2, 1e-8, output_weight=[1.0, 1.0, 1e-5], reference=[1e-4, 0.0, 0.0], period=PERIOD
         )
+    ),
+    "compensation": rig(
+        Feedback([2000.0, 2000.0], period=PERIOD, delay=1.5 * PERIOD),
+        actuators=[
+            jb.Patch(0.2, 0.3, 0.15, limits=[-0.5, 1.0], **OPERATORS),
+            jb.PointForce(0.45),
+        ],
+    ),
+    "compensation-kalman": rig(
+        DiscreteLQR(
+            [1e4, 1e2, 1.0, 0.1], [1e-2, 1e-2], period=PERIOD, delay=2e-3, estimator=KALMAN
+        ),
+        actuators=[
+            jb.Patch(0.2, 0.3, 0.15, compensation=jb.Hysteresis([0.0, 0.1], [0.8, 0.3])),
+            jb.PointForce(0.45),
+        ],
     ),
     "h-infinity": rig(jb.HInfinity(2e-4, 2.0, 1.0, [1e-5, 1e-5, 1e-3], period=PERIOD)),
     "gpc-adaptive": rig(
@@ -260,72 +270,17 @@ CASES = {
 }
 
 
-class GivenTables(AbstractController):
-    """Random tables of gains over the crossing, for the true state of the beam."""
-
-    family: bool = eqx.field(static=True, default=False)
-    nearest: bool = eqx.field(static=True, default=False)
-    identification: LoadIdentification | None = None
-
-    def design_law(self, plant):
-        if not self.family:
-            return SampledStateLaw(self.random_schedule(), TrueState(np.eye(5)))
-        schedules = [self.random_schedule() for _ in range(6)]
-        grid = jax.tree.map(lambda *x: np.reshape(np.stack(x), (2, 3, *x[0].shape)), *schedules)
-        grids = np.array([0.3, 0.5]), np.array([1.0, 2.0, 3.0])
-        if self.identification is None:
-            weights = plant.weights
-            law = PositionGainLaw(grid, *grids, weights / 9.81, weights, plant.loads)
-            return SampledStateLaw(law, TrueState(np.eye(5)))
-        numbers = plant.case.beam.length, np.array(2.4)
-        source = self.identification.identifier(plant, plant)
-        law = ScheduledGainLaw(grid, *grids, *numbers, source, self.nearest, 1)
-        return SampledStateLaw(law, TrueState(np.eye(5)))
-
-    def random_schedule(self) -> GainSchedule:
-        """Table of five cubics from 0.02 to 0.2 s, then a gain that fades."""
-        weights = np.array([2.9, 1.0] if self.family else [])
-        columns, inner = 5 + weights.size, np.sort(RANDOM.uniform(size=4))
-        coefficients = 20.0 * RANDOM.normal(size=(5, 4, 2, columns))
-        table = GainTable(np.concatenate([[0.0], inner, [1.0]]), coefficients)
-        final = 20.0 * RANDOM.normal(size=(2, columns))
-        times = np.array(0.02), np.array(0.2), np.array(0.03)
-        return GainSchedule(table, final, weights, *times, self.family)
-
-
-class VaryingPlants(Preview):
-    """Stands for the preview of a crossing, which takes a compilation: plants that vary in time."""
-
-    sampled: SampledPlant | None = None
-
-    def sampled_plants(self, t, first, count):
-        periods = np.floor(t / PERIOD + 0.5) + first + np.arange(count)
-        share = np.where(periods < 9, 0.2 * np.sin(0.5 * periods), 0.1)[:, None, None]
-        assert self.sampled is not None
-        A, B, _ = self.sampled
-        E = 1e-4 * np.ones((count, A.shape[0], self.plant.augmented_start.shape[0]))
-        return SampledPlant(A * (1 + 0.1 * share), B * (1 - share), E * (1 + share))
-
-
-class VaryingMPC(AbstractController):
-    """MPC with tables over time: of its settings, for plants that vary, with known weights."""
-
-    settings: jb.MPC | None = None
-
-    def design_law(self, plant):
-        settings = dataclasses.replace(self.settings, period=self.period, delay=self.delay)
-        law = settings.law(plant)
-        none = np.zeros(1), (), np.zeros(0, int), np.zeros((0, 1, 1))
-        plants = VaryingPlants(plant, self.period, self.delay, *none, law.law.sampled_plant)
-        law = eqx.tree_at(lambda s: s.law.preview, law, plants, is_leaf=lambda x: x is None)
-        return dataclasses.replace(law, law=dataclasses.replace(law.law, known_weights=True))
-
-
-RANDOM = np.random.default_rng(0)
 GATES = LoadIdentification(gates=[-0.05, 0.05])
 CASES["table"] = rig(GivenTables(period=PERIOD))
 CASES["family"] = rig(GivenTables(family=True, identification=GATES, period=3 * PERIOD))
 CASES["position"] = rig(GivenTables(family=True, period=3 * PERIOD), loads=TWO_LOADS)
+CASES["position-followed"] = rig(
+    FollowedPositions(period=3 * PERIOD),
+    loads=[
+        jb.MovingMass(mass=0.4, speed=2.4, entry_time=0.021),
+        jb.MovingMass(mass=0.2, speed=2.9, entry_time=0.1),
+    ],
+)
 CASES["nearest"] = rig(
     GivenTables(family=True, nearest=True, identification=GATES, period=3 * PERIOD)
 )

@@ -14,9 +14,7 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.cli import main
 from jaxbeam.cli.commands.export import PROGRAM_FILES
 from jaxbeam.control.feedback import Feedback
-from jaxbeam.control.state_law import SampledStateLaw
-from jaxbeam.estimation.sampled_plant import sample_timing
-from tests.c_code.cases import CASES, PERIOD, GivenTables, rig
+from tests.c_code.cases import CASES, PERIOD, rig
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 FEEDFORWARD = CASES["feedforward"]
@@ -78,15 +76,6 @@ class Unknown(AbstractController):
         return self
 
 
-class FollowingPositions(AbstractController):
-    """Tables read at the positions that an extended Kalman filter follows."""
-
-    def design_law(self, plant):
-        law = GivenTables(family=True, period=PERIOD).law(plant).law
-        estimator = jb.ExtendedKalman(0.02, 1e-5, mass_deviation=0.1, speed_deviation=0.1)
-        return SampledStateLaw(law, estimator.sampled_filter(plant, sample_timing(self)))
-
-
 REFUSED = {
     "controller is missing": dataclasses.replace(FEEDFORWARD, controller=None),
     "controller.period is missing": rig(Feedback([1.0, 1.0])),
@@ -95,9 +84,6 @@ REFUSED = {
     ),
     "no code for 'kalman-extended' with delays or digital filters of sensors": rig(
         CASES["kalman-extended"].controller, sensors=[jb.Sensor(0.2), jb.Sensor(0.4, delay=1e-3)]
-    ),
-    "no code for 'lqr-position' at the positions of 'kalman-extended'": rig(
-        FollowingPositions(period=PERIOD)
     ),
     "the closed loop diverges": rig(jb.OutputFeedback([[0, 0, 1e6], [0, 0, 1e6]], period=PERIOD)),
 }

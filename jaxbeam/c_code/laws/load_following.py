@@ -183,7 +183,7 @@ copy({last}, {code.command}, {commands});
         f"        ? (real){gravity!r} * {x}[{first + 2 * loads} + i] : 0;",
         3 * loads,
     )
-    return EstimateCode(x, filter.plant_states, weights, loads, None, followed_loads=True)
+    return EstimateCode(x, filter.plant_states, weights, loads, None, f"({x} + {first})")
 
 
 def _parts(timing) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -8,7 +8,6 @@ from jaxbeam.c_code.source import CSource, search_operations
 from jaxbeam.c_code.tables import at_samples
 from jaxbeam.c_code.writers import (
     EstimateCode,
-    NoCCodeError,
     write_filter,
     write_law,
     write_load_source,
@@ -57,10 +56,9 @@ def _(law: SlidingModeLaw, code: CSource, estimate: EstimateCode) -> None:
 
 @write_state_law.register
 def _(law: PositionGainLaw, code: CSource, estimate: EstimateCode) -> None:
-    if estimate.followed_loads:
-        raise NoCCodeError(
-            "there is no code for 'lqr-position' at the positions of 'kalman-extended'"
-        )
+    if estimate.loads is not None:
+        _write_followed(law, code, estimate)
+        return
     known = at_samples(lambda t: law.combined(law.loads_at(t)), code)
     gains, forward = (np.asarray(part) for part in known)
     code.add("/* u = f - K x, with K and f along the known ways of the loads */")
@@ -79,8 +77,10 @@ def _fed_back(code: CSource, schedule: GainSchedule, estimate: EstimateCode, wei
     return x
 
 
-def _command_text(code, schedule: GainSchedule, x: str, columns: int, design: str) -> str:
-    """Statement that adds the command of one design of a table, times a `weight`."""
+def _command_text(
+    code, schedule: GainSchedule, x: str, columns: int, design: str, time: str = "t"
+) -> str:
+    """Statement that adds the command of one design of a table at a time, times a `weight`."""
     intervals, powers = schedule.table.coefficients.shape[-4:-2]
     size = code.actuators * columns
     breakpoints = code.constant("breakpoints", schedule.table.breakpoints)
@@ -91,11 +91,11 @@ def _command_text(code, schedule: GainSchedule, x: str, columns: int, design: st
         polynomials += f" + {intervals * powers * size} * {design}"
         final_gain += f" + {size} * {design}"
     return f"""
-if (t >= start && t < end)
+if ({time} >= start && {time} < end)
     add_scheduled_command({code.output}, weight, {breakpoints},
                           {polynomials}, {intervals}, {powers},
-                          (t - start) / (end - start), {x}, {code.actuators}, {columns});
-else if (t >= end)
+                          ({time} - start) / (end - start), {x}, {code.actuators}, {columns});
+else if ({time} >= end)
     multiply_add({code.output}, -weight * decay, {final_gain}, {x}, {code.actuators}, {columns});
 """.strip()
 
@@ -107,12 +107,12 @@ def _command_operations(code: CSource, schedule: GainSchedule, columns: int) -> 
     return 14 + search_operations(intervals + 1) + entries * (2 * powers + 1) + 2 * code.actuators
 
 
-def _decay(schedule: GainSchedule) -> str:
-    """Factor of the final gain."""
+def _decay(schedule: GainSchedule, time: str = "t") -> str:
+    """Factor of the final gain at a time."""
     if schedule.fade_time is None:
         return "1"
     fade = float(np.ravel(schedule.fade_time)[0])
-    return f"t > end ? exp((end - t) / (real){fade!r}) : 1"
+    return f"{time} > end ? exp((end - {time}) / (real){fade!r}) : 1"
 
 
 @write_state_law.register
@@ -183,4 +183,69 @@ if ({load.speed_identified}) {{
         + 6 * (masses + speeds)
         + 4 * weights
         + 4 * (_command_operations(code, schedules, columns) + 2),
+    )
+
+
+def _write_followed(law: PositionGainLaw, code: CSource, estimate: EstimateCode) -> None:
+    """Command of the tables that followed loads read at their positions."""
+    schedules, path = law.schedules, law.load_set.trajectories[0]
+    masses, speeds, loads = len(law.masses), len(law.speeds), np.size(law.load_masses)
+    columns, states = np.shape(schedules.final_gain)[-1], estimate.states
+    grids = code.constant("masses", law.masses), code.constant("speeds", law.speeds)
+    per_mass = np.asarray(law.load_weights) / np.asarray(law.load_masses)
+    gravity = code.constant("weight_of_mass", per_mass)
+    x = code.work("fed_back", columns, "share of the state, and weight, that a load feeds back")
+    clock = code.work("clock", loads, "share travelled, then 1 + s since the exit; -1 before")
+    share = code.work("load_share", loads, "share of each load in the gain of the state")
+    length, backward = float(path.length), bool(np.asarray(path.direction()) < 0)
+    travelled = f"1 - {estimate.loads}[l] / (real){length!r}" if backward else ""
+    travelled = travelled or f"{estimate.loads}[l] / (real){length!r}"
+    weight = f"on_beam ? {gravity}[l] * mass : 0" if schedules.load_feedforward else "0"
+    command = _command_text(code, schedules, x, columns, "design", "at")
+    code.add(
+        f"""
+/* u = f - K x: the gains that the loads read at their positions, with their masses as weights */
+for (i = 0; i < {code.actuators}; i++) {code.output}[i] = 0;
+{{
+    real total = 0;
+    int l, any = 0;
+    for (l = 0; l < {loads}; l++) {{
+        const real along = {travelled}, speed = fabs({estimate.loads}[{loads} + l]);
+        const real after = along > 1 && speed > 0 ? (along - 1) * (real){length!r} / speed : 0;
+        {clock}[l] = along < 0 ? -1 : (along < 1 ? along : 1) + after;
+        if (along >= 0 && along < 1) any = 1;
+    }}
+    for (l = 0; l < {loads}; l++) {{
+        const int counts = any ? {clock}[l] >= 0 && {clock}[l] < 1 : {clock}[l] >= 1;
+        {share}[l] = counts ? {estimate.loads}[{2 * loads} + l] : 0;
+        total += {share}[l];
+    }}
+    for (l = 0; l < {loads}; l++) {{
+        const real at = {clock}[l], start = 0, end = 1, decay = {_decay(schedules, "at")};
+        const real speed = fabs({estimate.loads}[{loads} + l]);
+        const real mass = {estimate.loads}[{2 * loads} + l];
+        const int on_beam = at >= 0 && at < 1;
+        int mass_index[2], speed_index[2];
+        real mass_weight[2], speed_weight[2];
+        for (i = 0; i < {states}; i++)
+            {x}[i] = {share}[l] / (total > 0 ? total : 1) * {estimate.state}[i];
+        for (i = {states}; i < {columns}; i++) {x}[i] = 0;
+        if ({int(columns > states)}) {x}[{min(states, columns - 1)}] = {weight};
+        grid_weights({grids[0]}, {masses}, mass, 0, mass_index, mass_weight);
+        grid_weights({grids[1]}, {speeds}, speed, 0, speed_index, speed_weight);
+        for (i = 0; i < 4; i++) {{
+            const real weight = mass_weight[i / 2] * speed_weight[i % 2];
+            const int design = {speeds} * mass_index[i / 2] + speed_index[i % 2];
+            if (!(weight > 0)) continue;
+{indent(command, "            ")}
+        }}
+    }}
+}}""",
+        loads
+        * (
+            40
+            + 3 * states
+            + 6 * (masses + speeds)
+            + 4 * (_command_operations(code, schedules, columns) + 2)
+        ),
     )

@@ -159,20 +159,23 @@ class HInfinity(AbstractController):
         return least_level(self.game(plant))
 
     def design_law(self, plant):
+        """Law for a plant; raises ValueError for an attenuation that no law has."""
         game = self.game(plant)
-        level = self.attenuation
-        if level is None:
-            level = EXCESS * least_level(game)
-        else:
-            attained = is_attained(game, level)
-            if is_concrete(attained) and not concrete(attained):
-                raise ValueError(
-                    f"controller.attenuation is {concrete(level):g}, but no law has a worst gain"
-                    f" below {concrete(least_level(game)):.6g}: raise it, or leave it out"
-                )
-        law = minimax_law(game, level)
+        law = minimax_law(game, self._level(game))
         noise_size = xp.broadcast_to(self.noise_size, (game.C.shape[0],))
         return HInfinityLaw(law.F, law.G / noise_size, game.B, law.K, law.D / noise_size)
+
+    def _level(self, game: Game) -> Float[Array, ""]:
+        """Level of the design, given or 1.05 times the least; ValueError if no law has it."""
+        if self.attenuation is None:
+            return EXCESS * least_level(game)
+        attained = is_attained(game, self.attenuation)
+        if is_concrete(attained) and not concrete(attained):
+            raise ValueError(
+                f"controller.attenuation is {concrete(self.attenuation):g}, but no law has a worst"
+                f" gain below {concrete(least_level(game)):.6g}: raise it, or leave it out"
+            )
+        return self.attenuation
 
 
 class PredictedState(NamedTuple):

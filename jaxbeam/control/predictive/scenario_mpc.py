@@ -18,7 +18,7 @@ from jaxbeam.control.predictive.mpc_law import MPCLaw, rows_within
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.model.modal_model import assemble_modal_model
 from jaxbeam.model.state_space import Plant, build_plant
-from jaxbeam.numerics.optimisation.quadratic_program import first_move
+from jaxbeam.numerics.optimisation.quadratic_program import QuadraticProgram, first_move
 from jaxbeam.runtime.arrays import Array, xp
 
 
@@ -162,10 +162,12 @@ class ScenarioLaw(AbstractStateLaw):
             prediction, initial, after = law.conditions(state, own, command, t)
             parts.append((law, prediction, initial))
         first = self.laws[0]
-        move, solved = first_move(self._program(parts, command), first.move_maps, first.solver)
+        move, solved = first_move(
+            self.quadratic_program(parts, command), first.move_maps, first.solver
+        )
         return ControlStep(command + xp.where(solved, move, 0.0), after, solved)
 
-    def _program(self, parts, command):
+    def quadratic_program(self, parts, command) -> QuadraticProgram:
         """One program from the law, the prediction and the initial conditions of each scenario."""
         first, share = self.laws[0], 1 / len(parts)
         if self.worst:

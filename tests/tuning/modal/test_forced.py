@@ -90,7 +90,7 @@ def test_a_hammer_that_strikes_another_place_in_each_log():
     logs = []
     for place in range(2):
         turned = structure._replace(inputs=np.roll(structure.inputs, -place, axis=1))
-        one = measured(turned, "blows", place, 0.05)
+        one = measured(turned, "blows", place, 0.05, 30.0)
         names = (f"at {place}", *one.names[1:])
         logs.append(Log(one.times, one.values, names, one.quantities, one.units, one.source))
     fit = identify_modes(logs, band=(2.0, 11.0))

@@ -155,7 +155,7 @@ def test_modes_do_not_depend_on_how_strong_others_are():
 
 def test_a_strong_line_does_not_end_the_band_below_resonances():
     """Steady shaking at 2 Hz with a hundred times the amplitude of modes at 3 Hz and 7 Hz."""
-    quiet = ambient(0)
+    quiet = ambient(0, duration=100.0)
     line = 100 * np.cos(2 * np.pi * 2.0 * quiet.times)[:, None]
     fit = identify_modes(make_log(quiet.values + line, 40.0, "deflection"))
     assert fit.lines[0].frequency == pytest.approx(2.0, abs=0.01) and "steady shaking" in str(fit)

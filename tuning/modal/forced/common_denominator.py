@@ -58,13 +58,12 @@ class Lines(NamedTuple):
 class Products(NamedTuple):
     """Products (signal, power, signal, power) of z^j and z^m times signals, summed over lines.
 
-    Signals are outputs, inputs, and one for each record.
+    Signals are outputs, inputs, and one for each record, of the `lines`.
     """
 
     gram: Float[np.ndarray, "signal power signal power"]
     outputs: int
-    inputs: int
-    step: float
+    lines: Lines
 
 
 class CommonDenominator(NamedTuple):
@@ -119,12 +118,16 @@ def products(
     # Products depend on the difference of the powers only.
     shift = np.arange(degree + 1) - np.arange(degree + 1)[:, None] + degree
     gram = sums.reshape(count, count, -1)[:, :, shift].transpose(0, 2, 1, 3)
-    return Products(gram, lines.outputs.shape[1], lines.inputs.shape[1], lines.step)
+    return Products(gram, lines.outputs.shape[1], lines)
 
 
 def fit_common_denominator(system: Products, degree: int) -> CommonDenominator:
-    """Polynomials of a degree, at most that of the products."""
-    size, outputs, inputs = degree + 1, system.outputs, system.inputs
+    """Polynomials of a degree, at most that of the products.
+
+    A shape is what all numerators at a root make of the signals at the line nearest to it: how much
+    is forced and how much free, which one blow leaves open, does not matter.
+    """
+    size, outputs = degree + 1, system.outputs
     part = system.gram[:, :size, :, :size]
     driving = part[outputs:, :, outputs:].reshape(-1, (part.shape[0] - outputs) * size)
     crossed = part[outputs:, :, :outputs].reshape(len(driving), -1)
@@ -136,7 +139,21 @@ def fit_common_denominator(system: Products, degree: int) -> CommonDenominator:
     denominator = np.concatenate([[1.0], free])
     roots = np.roots(denominator[::-1])
     roots = roots[(roots.imag > 0) & (np.abs(roots) < 1e6)]
-    numerators = (gains @ denominator).reshape(-1, size, outputs)[:inputs]
+    numerators = (gains @ denominator).reshape(-1, size, outputs)
     at_roots = roots[:, None] ** np.arange(size)
-    shapes = np.linalg.svd(np.einsum("rp,xpo->rox", at_roots, numerators))[0][:, :, 0]
-    return CommonDenominator(denominator, np.log(roots) / system.step, shapes)
+    responses = np.einsum(
+        "rp,xpo,rkx->rok", at_roots, numerators, _signals_at(system.lines, roots), optimize=True
+    )
+    shapes = np.linalg.svd(responses)[0][:, :, 0]
+    return CommonDenominator(denominator, np.log(roots) / system.lines.step, shapes)
+
+
+def _signals_at(lines: Lines, roots):
+    """Inputs and unforced terms (root, record, signal) at the lines nearest to roots."""
+    signals = np.concatenate([lines.inputs, lines.unforced], axis=1)
+    found = []
+    for record in range(int(lines.record.max()) + 1):
+        own = np.flatnonzero(lines.record == record)
+        distance = np.abs(np.angle(lines.z[own])[:, None] - np.angle(roots))
+        found.append(signals[own[np.argmin(distance, axis=0)]])
+    return np.stack(found, axis=1)
