@@ -43,6 +43,7 @@ BENCHMARKS = {
         "--runs 4096 40000",
         "--runs 4096 40000 400000 2000000",
     ),
+    "dimensions": Benchmark("samples, modes, loads and supports of a run, as they grow", "--quick"),
     "identification": Benchmark("identification: scipy's least squares"),
     "regulator_designs": Benchmark("designs of regulators, many at once"),
     "quadratic_programs": Benchmark("programs of predictive control: OSQP"),

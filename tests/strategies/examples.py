@@ -1,8 +1,7 @@
 """One part of every kind, from whose numbers random ones are made; a test finds missing kinds."""
 
 import jaxbeam as jb
-from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.kinds import kinds
+from jaxbeam.case.kinds import kind_of, kinds
 from tests.c_code import cases as controlled
 
 PROFILES = {
@@ -122,9 +121,9 @@ def kinds_of_jaxbeam(family: type) -> set[str]:
 
 def kinds_of_examples() -> dict[str, set[str]]:
     """Kinds of controllers and estimators that have an example."""
-    laws: list[AbstractController] = [case.controller for case in CONTROLLED.values()]
+    laws = [case.controller for case in CONTROLLED.values()]
     estimators = [getattr(law, "estimator", None) for law in laws]
     return {
-        "controller": {law.kind for law in laws},
-        "estimator": {one.kind for one in estimators if one is not None},
+        name: {kind for part in parts if (kind := kind_of(type(part))) is not None}
+        for name, parts in (("controller", laws), ("estimator", estimators))
     }

@@ -1,0 +1,1 @@
+"""Time and memory of single runs as each of their dimensions grows."""
