@@ -86,6 +86,20 @@ def values_at(case: Case, batches: Batches, address: str) -> Float[np.ndarray, "
     return np.full(batches.shared_values.shape[0], float(value_at(case, address)))
 
 
+def swept_masses(case: Case, batches: Batches) -> Float[np.ndarray, " path"]:
+    """Sum of the swept masses of loads (kg) in each batch, of its run with the largest."""
+    total = np.zeros(batches.run_index.shape)
+    parts = (
+        (batches.shared_addresses, batches.shared_values[:, None]),
+        (batches.batched_addresses, batches.batched_values),
+    )
+    for addresses, values in parts:
+        for i, address in enumerate(addresses):
+            if address.startswith("loads.") and unit_at(case, address) == "kg":
+                total = total + values[..., i]
+    return total.max(axis=1)
+
+
 def common_layout(case: Case, batches: Batches) -> Layout:
     """Layout of all batches: the common order of positions, with the largest degrees of any.
 

@@ -18,7 +18,7 @@ from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import sample_times, steps_per_interval
 from jaxbeam.sweeps import programs
-from jaxbeam.sweeps.batches import Batches, common_layout, values_at
+from jaxbeam.sweeps.batches import Batches, common_layout, swept_masses, values_at
 from jaxbeam.sweeps.step_size import (
     choose_step_sizes,
     initial_share,
@@ -31,6 +31,7 @@ MAX_BLOCK_RUNS = 512  # about; a block is one call of the compiled program and o
 MIN_BLOCKS = 8  # of a large sweep, to use all cores
 MAX_TRIAL_RUNS = 256  # about; runs per call while step sizes are measured
 MIN_TRIAL_BATCHES = 4  # for which step sizes are measured
+MAX_CHECKED_RUNS = 256  # of paths of their own: to check all takes three times as long
 MAX_TRIAL_BATCHES = 16  # more of one run each cost more than the steps that they would save
 
 
@@ -179,8 +180,12 @@ class Runner:
             found = [one["peak_deflection"] for one in results]
             return self._compared_by_quantity(np.concatenate(found))
 
-        search = self.crossing_rates, self.initial_steps, self.max_steps, count, self.tolerance
-        steps, error = choose_step_sizes(peaks, *search, self.pool.map)
+        masses, checked = swept_masses(self.case, self.batches), None
+        batches, runs = self.batches.run_index.shape
+        if runs == 1 and batches <= MAX_CHECKED_RUNS:
+            checked = np.arange(batches)
+        search = self.crossing_rates, masses, self.initial_steps, self.max_steps, count
+        steps, error = choose_step_sizes(peaks, *search, self.tolerance, self.pool.map, checked)
         if self.single:
             sample = stratified_sample(self.crossing_rates, count)
             error += rounding_error(

@@ -55,19 +55,25 @@ def initial_share(quantities: Iterable[str]) -> float:
 
 
 def log_spaced_sample(
-    crossing_rates: Float[np.ndarray, " path"], count: int
+    crossing_rates: Float[np.ndarray, " path"], masses: Float[np.ndarray, " path"], count: int
 ) -> Int[np.ndarray, " sample"]:
-    """Indices of `count` batches, spaced evenly in the logarithm of the crossing rate.
+    """Indices of `count` batches: of those near each of evenly spaced log rates the heaviest.
 
-    The fastest is among them, the slowest are not: they take longest, and their errors are least
-    like those of others. An index may occur twice.
+    Errors grow with the masses of loads. Among equal ones it is the nearest; then the fastest is
+    among them, the slowest are not: they take longest, and their errors are least like those of
+    others. An index may occur twice.
     """
     order = np.argsort(crossing_rates, kind="stable")
     logs = np.log(crossing_rates[order])
     targets = np.linspace(logs[0] + (logs[-1] - logs[0]) / (2 * count), logs[-1], count)
     if logs[-1] - logs[0] < 1e-9:
         return order[np.linspace(0, order.size - 1, count).astype(int)]
-    return order[np.abs(logs[:, None] - targets).argmin(axis=0)]
+    distances = np.abs(logs[:, None] - targets)
+    near = distances <= distances.min(axis=1, keepdims=True)
+    near[distances.argmin(axis=0), np.arange(count)] = True  # one at least
+    heaviest = np.where(near, masses[order, None], -np.inf)
+    heaviest = near & (heaviest >= heaviest.max(axis=0))
+    return order[np.where(heaviest, distances, np.inf).argmin(axis=0)]
 
 
 def step_errors(
@@ -130,11 +136,13 @@ def relative_changes(coarse, fine):
 def choose_step_sizes(
     peaks: PeaksFunction,
     crossing_rates: Float[np.ndarray, " path"],
+    masses: Float[np.ndarray, " path"],
     initial_steps: Float[np.ndarray, " path"],
     max_steps: Float[np.ndarray, " path"],
     count: int,
     tolerance: float,
     map_function: Callable = map,
+    checked: Int[np.ndarray, " checked"] | None = None,
 ) -> tuple[Float[np.ndarray, " path"], float]:
     """Longest steps (s) of all batches for a tolerance, and the estimated error of their runs.
 
@@ -142,11 +150,12 @@ def choose_step_sizes(
     and two spans and all quantities, 0.02 % of the runs had larger true errors, at most twice.
 
     `peaks` is called, through `map_function`, with indices of batches. The search over
-    `crossing_rates` (1/s) starts from `initial_steps` (s) and is limited by `max_steps` (s). Raises
-    RuntimeError if no step meets the tolerance.
+    `crossing_rates` (1/s), among the batches of the largest `masses` (kg), starts from
+    `initial_steps` (s) and is limited by `max_steps` (s). The steps are then checked on the batches
+    `checked`, by default a stratified sample. Raises RuntimeError if no step meets the tolerance.
     """
     target_error = tolerance / SAFETY_FACTOR
-    chosen = log_spaced_sample(crossing_rates, count)
+    chosen = log_spaced_sample(crossing_rates, masses, count)
     valid_steps, succeeds = _search_step_sizes(
         peaks, chosen, initial_steps[chosen], max_steps[chosen], target_error, map_function
     )
@@ -160,9 +169,10 @@ def choose_step_sizes(
         crossing_rates, crossing_rates[chosen], valid_steps / start[chosen]
     )  # to the initial step
     steps = np.minimum(start * step_ratio, max_steps)
-    sample = stratified_sample(
-        crossing_rates, count * max(1, round(np.sqrt(crossing_rates.size / count) / SAMPLE_DIVISOR))
-    )
+    sample = checked
+    if sample is None:
+        groups = max(1, round(np.sqrt(crossing_rates.size / count) / SAMPLE_DIVISOR))
+        sample = stratified_sample(crossing_rates, count * groups)
     error, fails = np.full(sample.size, np.nan), np.ones(sample.size, bool)
     for _ in range(MAX_ROUNDS):
         found = step_errors(peaks, sample[fails], steps[sample[fails]], map_function)

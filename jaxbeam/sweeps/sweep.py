@@ -52,7 +52,8 @@ def sweep(
     relative errors of peaks are below `tolerance`. Errors are measured on a stratified random
     sample of the runs, where they are at most a sixth of the tolerance; `error_estimate` is six
     times the largest of these, as errors of other runs may be larger: one run in thousands exceeds
-    it, near the critical speed of a heavy mass.
+    it, near the critical speed of a heavy mass. Of at most 256 runs with paths of their own (random
+    speeds) all are measured; of more, single heavy and fast loads may have larger errors.
 
     In `precision` "single" models and propagators are made in float64 and runs are integrated in
     float32, which is faster where arithmetic dominates, as on a GPU. Results are then float32, and

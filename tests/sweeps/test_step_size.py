@@ -35,7 +35,7 @@ def test_steps_are_near_the_longest_within_tolerance(off):
     tolerance = 1e-7
     longest = best * tolerance ** (1 / ORDER)
     steps, error = choose_step_sizes(
-        peaks_with_error(best), rates, off * longest, np.full(50, np.inf), 8, tolerance
+        peaks_with_error(best), rates, np.ones(50), off * longest, np.full(50, np.inf), 8, tolerance
     )
     assert np.all(steps <= longest * 1.05)
     assert np.all(steps > 0.5 * longest)
@@ -46,7 +46,7 @@ def test_steps_stay_below_their_limits():
     rates = np.geomspace(1, 10, 20)
     limits = np.linspace(0.01, 0.02, 20)
     steps, _ = choose_step_sizes(
-        peaks_with_error(np.ones(20)), rates, np.full(20, 5.0), limits, 4, 1e-6
+        peaks_with_error(np.ones(20)), rates, np.ones(20), np.full(20, 5.0), limits, 4, 1e-6
     )
     assert np.all(steps <= limits) and np.all(steps > 0.95 * limits)
 
@@ -61,7 +61,9 @@ def test_steps_at_their_limit_are_checked_without_search(best):
         measured.append(steps.max())
         return peaks(chosen, steps)
 
-    steps, error = choose_step_sizes(recorded_peaks, rates, LIMIT_RATIO * limits, limits, 4, 1e-6)
+    steps, error = choose_step_sizes(
+        recorded_peaks, rates, np.ones(rates.size), LIMIT_RATIO * limits, limits, 4, 1e-6
+    )
     assert error <= 1e-6
     if best == 1.0:
         assert np.all(steps == limits) and len(measured) == 2  # coarse and fine, of the check
@@ -73,7 +75,7 @@ def test_failed_runs_are_left_out():
     rates = np.geomspace(1, 10, 20)
     all_succeed = peaks_with_error(np.ones(20) * 0.1)
     some_fail = peaks_with_error(np.ones(20) * 0.1, failing=(0, 7))
-    settings = (rates, np.full(20, 0.02), np.full(20, 1.0), 8, 1e-6)
+    settings = (rates, np.ones(20), np.full(20, 0.02), np.full(20, 1.0), 8, 1e-6)
     np.testing.assert_allclose(
         choose_step_sizes(some_fail, *settings)[0], choose_step_sizes(all_succeed, *settings)[0]
     )
@@ -85,10 +87,10 @@ def test_failed_runs_are_left_out():
 def test_sample_shortens_steps_that_are_too_long():
     """Steps meet the tolerance at the rates of the search, not between them."""
     rates = np.geomspace(1, 10, 64)
-    measured = np.unique(log_spaced_sample(rates, 4))
+    measured = np.unique(log_spaced_sample(rates, np.ones(64), 4))
     best = np.where(np.isin(np.arange(64), measured), 0.5, 0.25)
     steps, error = choose_step_sizes(
-        peaks_with_error(best), rates, np.full(64, 0.1), np.full(64, np.inf), 4, 1e-6
+        peaks_with_error(best), rates, np.ones(64), np.full(64, 0.1), np.full(64, np.inf), 4, 1e-6
     )
     assert error <= 1e-6
     assert np.all((steps / best) ** ORDER <= 1e-5)
@@ -105,7 +107,9 @@ def test_settled_batches_are_not_measured_again():
 
     initial_steps = np.full(4, 0.9 * 0.1 * (1e-7 / SAFETY_FACTOR) ** (1 / ORDER))
     initial_steps[-1] *= 2
-    choose_step_sizes(recorded_peaks, rates, initial_steps, np.ones(4), 4, 1e-7)
+    choose_step_sizes(
+        recorded_peaks, rates, np.ones(rates.size), initial_steps, np.ones(4), 4, 1e-7
+    )
     # Fine and coarse steps each: of all, of the fastest, and of the sample.
     assert measured == [{0, 1, 2, 3}] * 2 + [{3}] * 2 + [{0, 1, 2, 3}] * 2
 
@@ -114,7 +118,7 @@ def test_short_initial_steps_are_lengthened():
     rates, best = np.geomspace(1, 10, 20), np.full(20, 0.1)
     longest = 0.1 * (1e-7 / SAFETY_FACTOR) ** (1 / ORDER)
     steps, error = choose_step_sizes(
-        peaks_with_error(best), rates, np.full(20, 0.7 * longest), np.ones(20), 4, 1e-7
+        peaks_with_error(best), rates, np.ones(20), np.full(20, 0.7 * longest), np.ones(20), 4, 1e-7
     )
     assert np.all(steps > 0.9 * longest) and error <= 1e-7
 
@@ -125,7 +129,7 @@ def test_no_step_meets_the_tolerance():
 
     rates = np.geomspace(1, 10, 8)
     with pytest.raises(RuntimeError, match="no time step makes the peaks agree to 1e-06"):
-        choose_step_sizes(measure, rates, np.full(8, 0.1), np.full(8, 1.0), 4, 1e-6)
+        choose_step_sizes(measure, rates, np.ones(8), np.full(8, 0.1), np.full(8, 1.0), 4, 1e-6)
 
 
 def test_error_is_the_largest_of_a_batch():
@@ -141,8 +145,18 @@ def test_error_is_the_largest_of_a_batch():
 def test_sample_is_even_in_log_crossing_rate():
     """From half a spacing above the slowest to the fastest."""
     rates = np.geomspace(1, 1e7, 71)[np.random.default_rng(1).permutation(71)]
-    np.testing.assert_allclose(np.log10(rates[log_spaced_sample(rates, 3)]), [1.2, 4.1, 7.0])
-    assert len(log_spaced_sample(np.ones(5), 3)) == 3
+    np.testing.assert_allclose(
+        np.log10(rates[log_spaced_sample(rates, np.ones(71), 3)]), [1.2, 4.1, 7.0]
+    )
+    assert len(log_spaced_sample(np.ones(5), np.ones(5), 3)) == 3
+
+
+def test_sample_takes_the_heaviest_batches():
+    """Of runs of random masses and speeds, whose errors follow the masses."""
+    rates, masses = np.geomspace(1, 1e3, 30), np.random.default_rng(2).uniform(size=30)
+    groups = np.digitize(np.log10(rates), [1.1667, 2.3333])  # nearest to 0.5, 1.75 and 3
+    expected = [np.flatnonzero(groups == i)[masses[groups == i].argmax()] for i in range(3)]
+    assert log_spaced_sample(rates, masses, 3).tolist() == expected
 
 
 @given(st.integers(1, 200), st.integers(1, 30), st.integers(0, 2**32 - 1))
@@ -163,18 +177,22 @@ def test_sample_grows_with_the_number_of_batches():
             asked.append(len(chosen))
             return measure(chosen, steps)
 
-        choose_step_sizes(recorded, rates, np.full(batches, 0.01), np.ones(batches), 4, 1e-7)
+        choose_step_sizes(
+            recorded, rates, np.ones(batches), np.full(batches, 0.01), np.ones(batches), 4, 1e-7
+        )
         assert asked[-1] == sample_size
 
 
 def test_between_two_rates_the_shorter_step_holds():
     """Errors in between may be larger than at both rates, so steps are not interpolated."""
     rates = np.geomspace(1, 10, 41)
-    measured = np.sort(log_spaced_sample(rates, 4))
+    measured = np.sort(log_spaced_sample(rates, np.ones(41), 4))
     best = np.full(41, 0.2)
     best[measured[2]] = 0.1
     guesses = np.full(41, 0.02)
-    steps, _ = choose_step_sizes(peaks_with_error(best), rates, guesses, np.ones(41), 4, 1e-7)
+    steps, _ = choose_step_sizes(
+        peaks_with_error(best), rates, np.ones(41), guesses, np.ones(41), 4, 1e-7
+    )
     near = np.arange(measured[1] + 1, measured[3])
     np.testing.assert_allclose(steps[near], steps[measured[2]])
     assert np.all(steps[[measured[1], measured[3]]] > 1.4 * steps[measured[2]])
