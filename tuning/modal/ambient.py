@@ -113,7 +113,6 @@ def _modes_of_band(prepared: Prepared, whole, data_driven, order, refine):
         mode if reason else with_usual_spread(mode, poles, chain, spread_of)
         for mode, reason, chain in zip(modes, reasons, diagram.chains, strict=True)
     ]
-    reasons = [rejection_reason(mode, duration, whole) for mode in modes]
     if refine and any(reasons):
         modes, reasons = _decided(modes, reasons, records, prepared.rate, scale, duration, whole)
     candidates = [Candidate(*found) for found in zip(modes, reasons, lengths, strict=True)]
