@@ -4,6 +4,7 @@ A unit holds the case file and a script; where it runs, the Python of its host n
 """
 
 import os
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.files.case_file import save_case
 from jaxbeam.fmi.beam_steps import BeamSteps
 from jaxbeam.fmi.controller_steps import ControllerSteps
+from jaxbeam.runtime.whole_file import whole_file
 
 PARTS = {"beam": BeamSteps, "controller": ControllerSteps}
 
@@ -89,8 +91,8 @@ def write_fmu(case: Case, path: str | os.PathLike, part: str = "beam", overwrite
         ) from None
     PARTS[part](case)  # its errors, before anything is written
     with tempfile.TemporaryDirectory() as folder:
-        beside = Path(folder)
-        save_case(case, beside / "case.toml")
+        scratch = Path(folder)
+        save_case(case, scratch / "case.toml")
         period = 0.0 if case.controller is None else float(case.controller.period or 0.0)
         text = SCRIPT.format(
             part=part,
@@ -99,8 +101,10 @@ def write_fmu(case: Case, path: str | os.PathLike, part: str = "beam", overwrite
             inputs=INPUTS[part],
             step_text=STEPS[part],
         )
-        script = beside / f"{path.stem}_unit.py"
-        script.write_text(text, encoding="utf-8")
-        built = FmuBuilder.build_FMU(script, beside / "out", [beside / "case.toml"])
-        path.write_bytes(Path(built).read_bytes())
+        script = scratch / f"{path.stem}_unit.py"
+        with open(script, "w", encoding="utf-8") as file:
+            file.write(text)
+        built = FmuBuilder.build_FMU(script, scratch / "out", [scratch / "case.toml"])
+        with whole_file(path, overwrite) as beside:
+            shutil.copy(built, beside)
     return path
