@@ -27,6 +27,7 @@ from tuning.modal.forced.uncertainty import NEIGHBOURS, line_means
 
 DAMPING_RATIOS = (0.004, 0.016, 0.064)  # of poles that are tried
 NEAR_LINES, NEAR_WIDTHS = 32, 16.0  # about a pole that is tried: lines, and decay rates
+MIN_SIZE = 1e-12  # of the largest; directions below it were left out of the fit
 MOST_PROMISING = 3  # of them, whose probabilities are computed
 SPLITS = 0.5 * np.array([1j, 1.0, 3j, 1 + 1j, 1 - 1j])  # of a pole, over its decay rate
 
@@ -38,13 +39,14 @@ def mode_chances(model: FittedModel) -> Float[np.ndarray, " mode"]:
     """
     outputs, found = model.fit.errors.shape[1], []
     variance = _local_variance(model.fit.errors, model.free.free)
-    covariance = model.fit.inverse_factor @ model.fit.inverse_factor.T
     for k in range(model.poles.size):
-        # Without its coefficients x the sum of squared errors is more by x^T C^-1 x.
+        # Without its coefficients x the sum of squared errors is more by x^T (F F^T)^-1 x. After a
+        # blow at the start forced and free ones are nearly one: F F^T would lose what is known.
         own = coefficient_places(model.lines, model.poles.size, k)
-        coefficients = model.fit.found[own]
-        inverse = np.linalg.pinv(covariance[np.ix_(own, own)], hermitian=True)
-        gains = np.einsum("po,pq,qo->o", coefficients, inverse, coefficients)
+        directions, sizes, _ = np.linalg.svd(model.fit.inverse_factor[own], full_matrices=False)
+        kept = sizes > MIN_SIZE * sizes[0]
+        along = directions.T[kept] @ model.fit.found[own] / sizes[kept, None]
+        gains = np.sum(along**2, axis=0)
         count = own.size * outputs
         statistic = np.sum(gains / variance[model.peak(k)]) / count
         chance = fisher.sf(statistic, count, model.freedom(k) * outputs)
