@@ -1,4 +1,4 @@
-"""Frequency responses against the thesis's own formulas, matrices of the states, and finite elements."""
+"""Frequency responses against the thesis's formulas, matrices of the states, finite elements."""
 
 import equinox as eqx
 import jax
