@@ -73,10 +73,7 @@ def end_forces(
         return extrapolated.reshape(steps, -1, batch)
     mass = inertia.reshape(by_load)[:, None, :, 0]  # step, 1, load, batch
     # Products and sums in one loop: for a library's product the states would be copied.
-    both = [
-        rows.accelerations[:, end] @ at_end
-        for end, at_end in enumerate(states)
-    ]
+    both = [rows.accelerations[:, end] @ at_end for end, at_end in enumerate(states)]
     acceleration = xp.stack(both, axis=1)
     if rows.surface is not None:
         acceleration = acceleration + rows.surface[..., None]
