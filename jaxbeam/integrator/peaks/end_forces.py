@@ -72,9 +72,9 @@ def end_forces(
         extrapolated = xp.einsum("tlfb,fe->tleb", forces.reshape(by_load), end_weights())
         return extrapolated.reshape(steps, -1, batch)
     mass = inertia.reshape(by_load)[:, None, :, 0]  # step, 1, load, batch
-    # Products and sums in one loop: for a library's product the states would be copied.
-    both = [rows.accelerations[:, end] @ at_end for end, at_end in enumerate(states)]
-    acceleration = xp.stack(both, axis=1)
+    # One product for each end: for both in one, the states would be copied.
+    products = [rows.accelerations[:, end] @ at_end for end, at_end in enumerate(states)]
+    acceleration = xp.stack(products, axis=1)
     if rows.surface is not None:
         acceleration = acceleration + rows.surface[..., None]
     right = xp.swapaxes(weight, 1, 2) + mass * acceleration
