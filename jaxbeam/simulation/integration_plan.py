@@ -25,8 +25,10 @@ from jaxbeam.integrator.step_size import (
     MAX_STEPS,
     NO_STEP,
     UNSAMPLED,
+    ErrorFloor,
     StepTrial,
     check_step_count,
+    check_tolerance,
     choose_step_size,
     largest_change,
     longest_trial_step,
@@ -86,6 +88,7 @@ def integration_plan(
     run of a controlled case that is not compiled. Raises ValueError for an invalid case,
     RuntimeError if no time step meets the tolerance.
     """
+    check_tolerance(tolerance)
     check_case(case)
     case = concrete_case(case)
     shapes = static_shapes(case)
@@ -279,12 +282,13 @@ def _halve_until_converged(
     Returns it with twice that change (see `UNSAMPLED`), relative to the largest response, or to
     `least` where that is larger. Raises RuntimeError if no number up to `max_halvings` suffices.
     """
-    coarse = response(0)
+    coarse, floor = response(0), ErrorFloor(tolerance)
     for halvings in range(max_halvings):
         fine = response(halvings + 1)
         error = UNSAMPLED * largest_change(coarse, fine, least)
         if error <= tolerance:
             return halvings, error
+        floor.check(error, 0.5**halvings)
         if halvings >= MAX_DIVERGED_HALVINGS and not np.isfinite(fine).all():
             break
         coarse = fine
