@@ -41,12 +41,15 @@ TRIAL_POSITIONS = (0.13, 0.29, 0.47, 0.62, 0.88)  # x / length at which errors a
 class StepTrial(NamedTuple):
     """States of two trial runs at the same `times` (s): with some steps, and with half of them.
 
-    Those of the beam's modal model, then those of vehicles.
+    Those of the beam's modal model, then those of vehicles. Errors are at least the `share` of
+    those of the `former` trial, if there was one.
     """
 
     times: Float[np.ndarray, " time"]
     coarse: Float[np.ndarray, "time state batch"]
     fine: Float[np.ndarray, "time state batch"]
+    former: "StepTrial | None" = None
+    share: float = 0.0
 
 
 def check_step_count(count: float, step: float) -> None:
@@ -107,7 +110,9 @@ def choose_step_size(
     The step is shortened until dividing it by two changes no deflection at the ends of its steps by
     more than half the tolerance, relative to the largest; the error is twice that change, as it is
     larger at other positions and times. Peaks alone would hide errors, as the deflection is
-    stationary there. Raises RuntimeError if no step meets it.
+    stationary there. The error is at least that of the former trial times the ratio of the steps to
+    the power of CONVERGENCE_ORDER: where forces change sharply, a single change may be far smaller
+    than the error of a run whose steps begin elsewhere. Raises RuntimeError if no step meets it.
     """
     case = concrete_case(case)
     step = longest_trial_step(case, shapes)
@@ -115,21 +120,26 @@ def choose_step_size(
     model = modal_model(case, shapes.layout, shapes.coupled)
     case, loads = without_later_vibration(case, model), load_set(case, shapes.layout)
     halvings, least, floor = 0, rounding_deflection(case, model), ErrorFloor(tolerance)
+    former, former_error, shrink = None, 0.0, 0.0
     for _ in range(MAX_TRIALS):
         (times, coarse), (_, fine) = (
             trial_run(case, model, loads, shapes.max_loads, step, divided) for divided in (1, 2)
         )
         deflections = (trial_deflections(case, model, states) for states in (coarse, fine))
-        error = UNSAMPLED * largest_change(*deflections, least)
+        change, share = UNSAMPLED * largest_change(*deflections, least), shrink**CONVERGENCE_ORDER
+        error = max(change, share * former_error)
+        trial = StepTrial(times, coarse, fine, former, share)
         if error <= tolerance:
-            return step, error, StepTrial(times, coarse, fine)
-        shrink = 0.5
-        floor.check(error, step)
+            return step, error, trial
+        floor.check(change, step)
+        shrink, former, former_error = 0.5, None, 0.0
         if np.isfinite(error):
             shrink = np.clip(0.9 * (tolerance / error) ** (1 / CONVERGENCE_ORDER), 0.2, 0.8)
+            former, former_error = trial._replace(former=None), change
         elif (halvings := halvings + 1) > MAX_DIVERGED_HALVINGS:
             break
-        step = step * float(shrink)
+        shrink = float(shrink)
+        step = step * shrink
     raise RuntimeError(NO_STEP.format(tolerance))
 
 

@@ -46,6 +46,9 @@ from jaxbeam.simulation.errors import step_errors
 TOLERANCE = 1e-7  # relative to the largest deflection
 MAX_STEPS_PER_SAMPLE = 10**5  # time steps between samples of a controlled run
 MAX_KNOWN_EVENTS = 10000  # of a run without compilation, which would take less time beyond
+# Steps between samples over those of the trials, which begin at load events: where forces change
+# sharply, errors were up to fourteen times as large with steps that begin elsewhere.
+SHARE_OF_TRIAL_STEP = 0.8
 SPACING_TOLERANCE = 1e-6  # largest deviation of equally spaced samples, relative to the spacing
 
 
@@ -110,6 +113,7 @@ def integration_plan(
         substeps, error, trial = _choose_substeps(case, shapes, schedule, tolerance, by_first_run)
         return plan(substeps, error, _sensor_errors(case, shapes, trial))
     step, error, trial = choose_step_size(case, shapes, tolerance)
+    step *= SHARE_OF_TRIAL_STEP
     intervals = np.diff(samples)
     equally_spaced = bool(
         np.all(np.abs(intervals - intervals.mean()) < SPACING_TOLERANCE * intervals.mean())
@@ -231,7 +235,10 @@ def _sensor_errors(case: Case, shapes: StaticShapes, trial: StepTrial | None) ->
     if trial is None:
         return (np.nan,) * len(case.sensors)
     model = modal_model(case, shapes.layout, shapes.coupled)
-    return tuple(map(float, step_errors(case, model, trial)))
+    errors = step_errors(case, model, trial)
+    if trial.former is not None:
+        errors = np.maximum(errors, trial.share * step_errors(case, model, trial.former))
+    return tuple(map(float, errors))
 
 
 def runs_compiled(case: Case, schedule: EventSchedule) -> bool:
