@@ -14,7 +14,14 @@ from tuning.modal.ambient import (
     without_duplicates,
 )
 from tuning.modal.decay.fit import fit_decay
-from tuning.modal.decay.stretches import Stretch, excited_samples, free_decays, stacked
+from tuning.modal.decay.leaving import end_of_excitation
+from tuning.modal.decay.stretches import (
+    Stretch,
+    excited_samples,
+    free_decays,
+    prediction_errors,
+    stacked,
+)
 from tuning.modal.preprocessing import prepare, strongest_frequency
 from tuning.modal.result import IdentifiedMode, rejection_reason
 from tuning.modal.samples import MIN_SAMPLES, Samples
@@ -42,19 +49,31 @@ class Decays(NamedTuple):
 def excited(
     samples: Samples, derivatives: tuple[int, ...], band: tuple[float, float]
 ) -> tuple[Bool[np.ndarray, " time"], ...]:
-    """Samples of each record at which the structure is struck, at the rate of the log.
+    """Samples of each record at which the structure is excited, at the rate of the log.
+
+    They are those struck by blows, and all until a crossing load has left (`leaving`).
 
     Below half the band (Hz) drift is removed; above it all frequencies count.
     """
     prepared = prepare(samples.records, samples.starts, samples.rate, band)
     frequency = strongest_frequency(prepared.records, prepared.rate, derivatives, band)
     sos = butter(2, band[0] / 2, "highpass", fs=samples.rate, output="sos")
-    return tuple(
-        excited_samples(
-            sosfiltfilt(sos, detrend(record, axis=0), axis=0), samples.rate, 1 / frequency
-        )
-        for record in samples.records
-    )
+    found = []
+    for record, own in zip(samples.records, prepared.records, strict=True):
+        values = sosfiltfilt(sos, detrend(record, axis=0), axis=0)
+        marks = excited_samples(values, samples.rate, 1 / frequency)
+        found.append(_with_excitation(marks, own, max(int(prepared.rate / frequency), 4)))
+    return tuple(found)
+
+
+def _with_excitation(marks, record, size) -> Bool[np.ndarray, " time"]:
+    """Struck samples, with all before the end of a lasting excitation of the record in the band."""
+    ratio = marks.size / len(record)
+    coarse = np.zeros(len(record), bool)
+    coarse[np.minimum((np.flatnonzero(marks) / ratio).astype(int), len(record) - 1)] = True
+    errors = np.stack([prediction_errors(v, np.ones(v.size)) for v in record.T], axis=1)
+    ends = end_of_excitation(errors, record, coarse, size)
+    return marks | (np.arange(marks.size) < ends * ratio)
 
 
 def free_decay_modes(
