@@ -9,6 +9,9 @@ until an instant that of the forces may be added,
 
 if the likelihood of the errors' mean squares, block by block, gains by it more than by chance, and
 more than by a decay c exp(-t / T) in its place, which modes have that decay faster than most.
+
+A load that excites little while it leaves shows in the fit: decaying modes leave the noise alone,
+which is the same throughout, but more where forces act.
 """
 
 import numpy as np
@@ -23,6 +26,31 @@ MAX_TRIED = 60  # instants
 ITERATIONS = 8
 DECAY_TIMES = 2.0 ** -np.arange(7)  # T, over the duration
 MAX_PARTS = 4  # that are searched one after another, as a load may shake less towards its end
+PARTS = 10  # of a decay, whose errors are compared
+MIN_RATIO, RATIO_SDS = 2.0, 5.0  # of errors of a part to the median; or deviations of the ratio
+MIN_UNEXPLAINED = 0.05  # of the energy of a part; less may be nonlinearity
+
+
+def shaken_until(
+    measured: Float[np.ndarray, "sample channel"],
+    fitted: Float[np.ndarray, "sample channel"],
+    independent: float,
+) -> int:
+    """Sample of a fitted decay up to which errors are more than elsewhere; 0 if they are not.
+
+    `independent` is the share of samples that are, in the band of the fit.
+    """
+    scale = np.maximum(np.mean(measured**2, axis=0), 1e-300)
+    errors, energy = (
+        np.array([np.mean(part) for part in np.array_split(squares / scale, PARTS)])
+        for squares in ((measured - fitted) ** 2, measured**2)
+    )
+    freedom = max(independent * measured.size / PARTS, 1.0)
+    ratio = max(MIN_RATIO, 1 + RATIO_SDS * np.sqrt(2 / freedom))
+    more = (errors > ratio * np.median(errors)) & (errors > MIN_UNEXPLAINED * energy)
+    if not more.any():
+        return 0
+    return len(measured) * (int(np.flatnonzero(more)[-1]) + 1) // PARTS
 
 
 def end_of_excitation(

@@ -14,7 +14,7 @@ from tuning.modal.ambient import (
     without_duplicates,
 )
 from tuning.modal.decay.fit import fit_decay
-from tuning.modal.decay.leaving import end_of_excitation
+from tuning.modal.decay.leaving import end_of_excitation, shaken_until
 from tuning.modal.decay.stretches import (
     Stretch,
     excited_samples,
@@ -32,6 +32,7 @@ MIN_DECAY_ENERGY = 0.3  # share of the energy of a log in its decays, if they ar
 LONG_FALL_NEPERS = 2.0  # or fall of the energy; 95 % of that of an exponential falls by 3
 MIN_START_LEVEL = 0.2  # energy at the start of such a decay over the mean energy of the log
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
+MAX_CUTS = 3  # of a decay in which the structure is found to be excited
 NOT_REPRODUCED = "not the same in parts of the window"
 NONLINEAR_DECAY = 2.5, 4.5  # decay rates over that of a mode, of what its nonlinearity adds to it
 NONLINEAR_MAC = 0.95
@@ -103,9 +104,35 @@ def free_decay_modes(
         kind or given or _dominate(decays, prepared.records, ratio, prepared.rate / frequency)
     ):
         return None
-    windows, used = stacked(samples.records, decays)
-    if len(windows) < MIN_SAMPLES // 2:
+    for _ in range(MAX_CUTS + 1):
+        windows, used = stacked(samples.records, decays)
+        if len(windows) < MIN_SAMPLES // 2:
+            return None
+        fits, diagrams = _fits(windows, used, samples, band, order)
+        if not fits:
+            return None
+        measured, fitted = (
+            sum(_within(getattr(fit, name), samples.rate, part) for part, fit in fits)
+            for name in ("measured", "fitted")
+        )
+        shaken = 0 if given or len(used) > 1 else shaken_until(
+            measured, fitted, 2 * (band[1] - band[0]) / samples.rate
+        )  # fmt: skip
+        if not shaken:
+            break
+        decays = (used[0]._replace(start=used[0].start + shaken),)
+    channels = samples.records[0].shape[1]
+    energy = np.sum(measured**2, axis=0)
+    limit = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_ENERGY
+    found = _candidates(fits, channels, len(windows) / samples.rate, band)
+    good = any(not one.reason for one in found)
+    if kind is None and not (good and np.sum((measured - fitted) ** 2) < limit * energy.sum()):
         return None
+    return found, diagrams, Decays(used, measured[:, :channels], fitted[:, :channels])
+
+
+def _fits(windows, used, samples: Samples, band, order):
+    """Fits of decays side by side in each part of a band (Hz), and stabilisation diagrams."""
     channels = samples.records[0].shape[1]
     pieces = tuple(windows[:, i : i + channels] for i in range(0, windows.shape[1], channels))
     starts = tuple(one.start / samples.rate for one in used)
@@ -118,19 +145,7 @@ def free_decay_modes(
         for part in divided_band(band)
         if (fit := fit_decay(windows, samples.rate, overlapping(part, band), channels, poles))
     ]
-    if not fits:
-        return None
-    measured, fitted = (
-        sum(_within(getattr(fit, name), samples.rate, part) for part, fit in fits)
-        for name in ("measured", "fitted")
-    )
-    energy = np.sum(measured**2, axis=0)
-    limit = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_ENERGY
-    found = _candidates(fits, channels, len(windows) / samples.rate, band)
-    good = any(not one.reason for one in found)
-    if kind is None and not (good and np.sum((measured - fitted) ** 2) < limit * energy.sum()):
-        return None
-    return found, diagrams, Decays(used, measured[:, :channels], fitted[:, :channels])
+    return fits, diagrams
 
 
 def _within(values, rate, part):
