@@ -103,6 +103,7 @@ from .control.receptance import (
     receptances as receptances,
 )
 from .control.scheduled_feedback import ScheduledFeedback as ScheduledFeedback
+from .control.scheduled_internal_model import ScheduledInternalModel as ScheduledInternalModel
 from .control.sliding_mode import SlidingMode as SlidingMode
 from .control.state_feedback import StateFeedback as StateFeedback
 from .estimation.extended_kalman import ExtendedKalman as ExtendedKalman
