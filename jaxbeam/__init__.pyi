@@ -71,7 +71,8 @@ from .control.compensators import (
 )
 from .control.feedback import Feedback as Feedback
 from .control.feedforward import Feedforward as Feedforward
-from .control.internal_model import InternalModel as InternalModel
+from .control.internal_model.scheduled import ScheduledInternalModel as ScheduledInternalModel
+from .control.internal_model.table import InternalModel as InternalModel
 from .control.load_identification import (
     LoadIdentification as LoadIdentification,
     identified_load as identified_load,
@@ -103,7 +104,6 @@ from .control.receptance import (
     receptances as receptances,
 )
 from .control.scheduled_feedback import ScheduledFeedback as ScheduledFeedback
-from .control.scheduled_internal_model import ScheduledInternalModel as ScheduledInternalModel
 from .control.sliding_mode import SlidingMode as SlidingMode
 from .control.state_feedback import StateFeedback as StateFeedback
 from .estimation.extended_kalman import ExtendedKalman as ExtendedKalman

@@ -4,8 +4,8 @@ import numpy as np
 
 from jaxbeam.c_code.source import CSource, interpolation_operations
 from jaxbeam.c_code.writers import write_law
-from jaxbeam.control.internal_model import InternalModelLaw
-from jaxbeam.control.scheduled_internal_model import ScheduledInternalModelLaw
+from jaxbeam.control.internal_model.scheduled import ScheduledInternalModelLaw
+from jaxbeam.control.internal_model.table import InternalModelLaw
 
 
 @write_law.register
