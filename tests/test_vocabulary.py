@@ -6,12 +6,12 @@ import re
 
 import pytest
 
-import jaxbeam.files.case_file  # noqa: F401  (imports every kind of part)
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Run
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.estimator import AbstractEstimator
+from jaxbeam.case.kinds import PACKAGES, import_modules
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.loads.planar.sensors import VehicleSensor
 from jaxbeam.case.profiles.base import AbstractProfile
@@ -64,6 +64,8 @@ def test_case_files_have_these_entries(address):
     if not table:
         assert key in PARTS
         return
+    for package in PACKAGES:
+        import_modules(package)
     fields = {f.name for one in subclasses(PARTS[table]) for f in dataclasses.fields(one)}
     assert key in fields | {"kind"}
 
