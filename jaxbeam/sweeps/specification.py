@@ -26,7 +26,7 @@ from jaxbeam.integrator.step_size import check_tolerance
 from jaxbeam.sweeps import MAX_RUNS
 from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, Batches, addresses_within_batches, make_batches
 from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner
-from jaxbeam.sweeps.force_runner import ForceRunner, force_runner
+from jaxbeam.sweeps.force_runner import FORCE_BLOCK_RUNS, ForceRunner, force_runner
 from jaxbeam.sweeps.truncation import is_corrected
 
 # Positions and list entries, whose values are valid only in combination.
@@ -143,7 +143,12 @@ class SweepSpecification:
     def fingerprint(self) -> str:
         """SHA-256 of all that determines the results: case, values, settings and versions."""
         content = self.to_dict() | {
-            "blocks": [MAX_BLOCK_RUNS, MAX_BATCH_SIZE, len(jax.local_devices())],
+            "blocks": [
+                MAX_BLOCK_RUNS,
+                FORCE_BLOCK_RUNS,
+                MAX_BATCH_SIZE,
+                len(jax.local_devices()),
+            ],
             "versions": [_version(), jax.__version__],
         }
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
