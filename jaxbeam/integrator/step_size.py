@@ -31,7 +31,7 @@ NO_STEP = (
 )
 ROUNDING = 1e-9  # of the deflection under all loads; below it, deflections are not compared
 SMALLEST_TOLERANCE = 1e-14  # some fifty units in the last place of double precision
-LARGEST_ROUNDING = 1e-4  # an error that shorter steps do not lessen, and that may be rounding
+LARGEST_ROUNDING = 1e-9  # an error that shorter steps do not lessen, and that may be rounding
 # Errors at all positions and times over the largest of those compared. Of random cases up to 1.24:
 # experiments/validation/random_cases.
 UNSAMPLED = 2.0
@@ -42,7 +42,8 @@ class StepTrial(NamedTuple):
     """States of two trial runs at the same `times` (s): with some steps, and with half of them.
 
     Those of the beam's modal model, then those of vehicles. Errors are at least the `share` of
-    those of the `former` trial, if there was one.
+    those of the `former` trial, if there was one. `shortest` is the step (s) between those load
+    events that several lie between: a run of longer ones there may have larger errors.
     """
 
     times: Float[np.ndarray, " time"]
@@ -50,6 +51,7 @@ class StepTrial(NamedTuple):
     fine: Float[np.ndarray, "time state batch"]
     former: "StepTrial | None" = None
     share: float = 0.0
+    shortest: float = np.inf
 
 
 def check_step_count(count: float, step: float) -> None:
@@ -83,11 +85,12 @@ class ErrorFloor:
     def check(self, error: float, step: float) -> None:
         """Take note of the error of a step (s).
 
-        Raises RuntimeError if a quarter of the step of a small error has not halved it.
+        Raises RuntimeError if a sixteenth of the step of a small error has not halved it. (Between
+        close load events there is one step, and an error that falls only when it is divided.)
         """
         if error < 0.5 * self._best:
             self._best, self._step = error, step
-        elif self._best < LARGEST_ROUNDING and step <= 0.25 * self._step:
+        elif self._best < LARGEST_ROUNDING and step <= self._step / 16:
             raise RuntimeError(
                 f"no time step makes the response agree to {self._tolerance:g}: in double precision"
                 f" it agrees to {self._best:.1e}; give a tolerance of {4 * self._best:.0e} or more"
@@ -130,7 +133,7 @@ def choose_step_size(
         error = max(change, share * former_error)
         trial = StepTrial(times, coarse, fine, former, share)
         if error <= tolerance:
-            return step, error, trial
+            return step, error, trial._replace(shortest=_shortest_step(case, model, step))
         floor.check(change, step)
         shrink, former, former_error = 0.5, None, 0.0
         if np.isfinite(error):
@@ -141,6 +144,16 @@ def choose_step_size(
         shrink = float(shrink)
         step = step * shrink
     raise RuntimeError(NO_STEP.format(tolerance))
+
+
+def _shortest_step(case: Case, model: ModalModel, step: float) -> float:
+    """Shortest step (s) among those between load events that are longer than a `step` (s).
+
+    Equal steps between two events may be little longer than half of it.
+    """
+    grid = grid_by_step_length(case, model, np.asarray(step))
+    several = (np.asarray(grid.counts) > 1) & np.any(grid.loads_on_beam, axis=1)
+    return float(np.min(np.asarray(grid.lengths)[:-1][several], initial=step))
 
 
 def without_later_vibration(case: Case, model: ModalModel) -> Case:

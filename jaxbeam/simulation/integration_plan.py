@@ -22,6 +22,7 @@ from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_at_events
 from jaxbeam.integrator.static_shapes import StaticShapes, static_shapes
 from jaxbeam.integrator.step_size import (
+    CONVERGENCE_ORDER,
     MAX_DIVERGED_HALVINGS,
     MAX_STEPS,
     NO_STEP,
@@ -116,7 +117,7 @@ def integration_plan(
         substeps, error, trial = _choose_substeps(case, shapes, schedule, tolerance, by_first_run)
         return plan(substeps, error, _sensor_errors(case, shapes, trial))
     step, error, trial = choose_step_size(case, shapes, tolerance)
-    step *= SHARE_OF_TRIAL_STEP
+    step = SHARE_OF_TRIAL_STEP * trial.shortest
     intervals = np.diff(samples)
     equally_spaced = bool(
         np.all(np.abs(intervals - intervals.mean()) < SPACING_TOLERANCE * intervals.mean())
@@ -124,14 +125,16 @@ def integration_plan(
     lead_samples = max(0, int(np.ceil(samples[0] / intervals.mean() - SPACING_TOLERANCE)))
     check_step_count(samples.size * (intervals.max() / step), step)
     substeps = steps_per_interval(intervals.max(), step)
+    # Whole numbers of steps between samples may make them shorter still.
+    share = float((intervals.max() / substeps / step) ** CONVERGENCE_ORDER)
     return IntegrationPlan(
         shapes,
         substeps,
         lead_samples,
         equally_spaced,
-        error,
+        share * error,
         to_duration=to_duration,
-        sensor_errors=_sensor_errors(case, shapes, trial),
+        sensor_errors=tuple(share * each for each in _sensor_errors(case, shapes, trial)),
     )
 
 

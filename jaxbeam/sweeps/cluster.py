@@ -5,8 +5,11 @@ specification and step sizes in the store, and writes each block as a chunk of i
 unfinished blocks of workers that die to other workers, which skip the blocks written already.
 """
 
+import contextlib
 import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +21,8 @@ if TYPE_CHECKING:
     import distributed  # comes with the extra `cluster` only
 
 MAX_BUNDLE = 16  # blocks sent at once; they take some tenths of a second
+LONELY = 60.0  # s without any worker after which a sweep ends
+CHECK = 5.0  # s, between two looks at the workers
 BUNDLES_PER_THREAD = 4  # least number of bundles per thread, so that all threads end together
 
 
@@ -45,9 +50,10 @@ def compute_blocks(
 ) -> Iterator[int]:
     """Numbers of blocks as the workers of a cluster have computed and stored them.
 
-    Raises RuntimeError without workers or if they keep dying, and the errors of workers.
+    Raises RuntimeError without workers, if they keep dying, if none is left for LONELY seconds, or
+    if the scheduler is lost; and the errors of workers.
     """
-    from distributed import KilledWorker, as_completed
+    from distributed import KilledWorker
 
     threads = sum(client.nthreads().values())
     if not threads:
@@ -56,15 +62,44 @@ def compute_blocks(
     bundles = [blocks[i : i + size] for i in range(0, len(blocks), size)]
     futures = client.map(compute_and_store, bundles, fingerprint=fingerprint, path=path, pure=False)
     try:
-        for future in as_completed(futures, loop=client.loop):
+        for future in _completed(client, futures):
             yield from future.result()
+    except CancelledError:
+        raise RuntimeError(
+            "the connection to the scheduler of the cluster is lost; finished blocks are kept:"
+            " start it, then resume"
+        ) from None
     except KilledWorker:
         raise RuntimeError(
             "workers keep dying (too little memory for each?); finished blocks are kept:"
             " mend this, then resume"
         ) from None
     finally:
-        client.cancel(futures)
+        with contextlib.suppress(CancelledError, OSError, TimeoutError):
+            client.cancel(futures)
+
+
+def _completed(client: "distributed.Client", futures: list) -> Iterator:
+    """Futures as they end. Raises RuntimeError when no worker has been there for LONELY seconds."""
+    from distributed import as_completed
+
+    completed, last_seen = as_completed(futures, loop=client.loop), time.monotonic()
+    next_check = last_seen + CHECK
+    while not completed.is_empty():
+        now = time.monotonic()
+        if completed.has_ready():
+            yield next(completed)
+        elif now < next_check:
+            time.sleep(0.005)
+        else:
+            next_check = now + CHECK
+            if client.status != "running" or client.nthreads():
+                last_seen = time.monotonic()  # without a scheduler the futures are cancelled
+            elif now - last_seen > LONELY:
+                raise RuntimeError(
+                    f"the cluster has had no workers for {LONELY:.0f} s; finished blocks are kept:"
+                    " start some, then resume"
+                )
 
 
 def compute_and_store(blocks: list[int], fingerprint: str, path: Path) -> list[int]:

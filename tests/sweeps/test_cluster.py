@@ -110,3 +110,57 @@ def test_workers_refuse_missing_stores_and_other_versions(tmp_path, monkeypatch)
 def test_missing_scheduler_is_named():
     with pytest.raises(ConnectionError, match="no Dask scheduler answers at nowhere"):
         cluster.connect("nowhere://1")
+
+
+BEGUN, GO_ON = threading.Event(), threading.Event()
+
+
+def compute_nothing(blocks, fingerprint, path):
+    """What a worker does that never ends."""
+    BEGUN.set()
+    GO_ON.wait(30)
+    return blocks
+
+
+@pytest.fixture
+def stuck(monkeypatch, tmp_path):
+    """A cluster of one worker, which ends no block, and the computation of two blocks."""
+    BEGUN.clear()
+    GO_ON.clear()
+    monkeypatch.setattr(cluster, "compute_and_store", compute_nothing)
+    monkeypatch.setattr(cluster, "LONELY", 0.3)
+    monkeypatch.setattr(cluster, "CHECK", 0.05)
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+        ) as machines,
+        distributed.Client(machines, timeout="2s", set_as_default=False) as client,
+    ):
+        yield machines, lambda: list(cluster.compute_blocks(client, "f", tmp_path, [0, 1]))
+        GO_ON.set()
+
+
+@pytest.mark.filterwarnings("default")  # of Dask
+@pytest.mark.parametrize(
+    ("lost", "message"),
+    [
+        ("workers", "has had no workers for 0 s; finished"),
+        ("scheduler", "the scheduler .* is lost"),
+    ],
+)
+def test_lost_workers_and_schedulers_end_a_sweep_in_a_sentence(stuck, lost, message):
+    """It had waited for ever for workers, and ended in Dask's own words without a scheduler."""
+    machines, compute = stuck
+
+    def lose():
+        BEGUN.wait(30)
+        if lost == "workers":
+            machines.scale(0)
+        else:
+            machines.sync(machines.scheduler.close)
+
+    thread = threading.Thread(target=lose)
+    thread.start()
+    with pytest.raises(RuntimeError, match=message):
+        compute()
+    thread.join()

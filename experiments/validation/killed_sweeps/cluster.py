@@ -25,17 +25,16 @@ class Cluster:
         """Start all processes that do not run, and wait for the scheduler; returns its address."""
         if self.scheduler is None or self.scheduler.poll() is not None:
             self._file.unlink(missing_ok=True)
-            self.scheduler = self._process("dask_scheduler", "--port", "0")
+            self.scheduler = self._process("distributed.cli.dask_scheduler", "--port", "0")
         end = time.monotonic() + START
         while not self._file.exists() or not self._file.read_text():
             if time.monotonic() > end or self.scheduler.poll() is not None:
                 raise RuntimeError(f"no scheduler started: see {self._log.name}")
             time.sleep(0.05)
-        preload = "experiments.validation.killed_sweeps.disk"
-        options = "--nthreads", "1", "--no-nanny", "--preload", preload
+        module = "experiments.validation.killed_sweeps.disk"
         for i, worker in enumerate(self.workers):
             if worker is None or worker.poll() is not None:
-                self.workers[i] = self._process("dask_worker", *options)
+                self.workers[i] = self._process(module, "--nthreads", "1", "--no-nanny")
         return json.loads(self._file.read_text())["address"]
 
     def close(self) -> None:
@@ -45,8 +44,8 @@ class Cluster:
                 kill(process)
         self._log.close()
 
-    def _process(self, name: str, *options: str) -> subprocess.Popen:
-        command = [sys.executable, "-m", f"distributed.cli.{name}", "--no-dashboard"]
+    def _process(self, module: str, *options: str) -> subprocess.Popen:
+        command = [sys.executable, "-m", module, "--no-dashboard"]
         return subprocess.Popen(
             [*command, "--scheduler-file", str(self._file), *options],
             cwd=self._folder,

@@ -1,6 +1,6 @@
-"""Preload of a Dask worker: its disk is slow, or full now and then, and its clock is wrong.
+"""A Dask worker whose disk is slow, or full now and then, and whose clock is wrong.
 
-    dask worker --preload experiments.validation.killed_sweeps.disk
+    python -m experiments.validation.killed_sweeps.disk ADDRESS ...  # as `dask worker`
 
 The environment has the numbers: KILLED_SWEEPS_SLOW, the mean time (s) of a write;
 KILLED_SWEEPS_FULL, the share of writes that find no space; KILLED_SWEEPS_CLOCK, the seconds by
@@ -12,15 +12,16 @@ import os
 import random
 import time
 
-from jaxbeam.sweeps.store import ZarrStore
+CLOCK = time.time
+AHEAD = float(os.environ.get("KILLED_SWEEPS_CLOCK", "0"))
 
 
-def dask_setup(worker) -> None:
-    """Change writes and clock of a worker."""
-    slow, full, ahead = (
-        float(os.environ.get(f"KILLED_SWEEPS_{name}", "0")) for name in ("SLOW", "FULL", "CLOCK")
-    )
-    draws, clock, result_array = random.Random(os.getpid()), time.time, ZarrStore._result_array
+def change_writes() -> None:
+    """Have blocks written slowly, and without space for some."""
+    from jaxbeam.sweeps.store import ZarrStore
+
+    slow, full = (float(os.environ.get(f"KILLED_SWEEPS_{name}", "0")) for name in ("SLOW", "FULL"))
+    draws, result_array = random.Random(os.getpid()), ZarrStore._result_array
 
     def array(self, name, values):
         """The array of a result, just before a block is written to it."""
@@ -30,4 +31,11 @@ def dask_setup(worker) -> None:
         return result_array(self, name, values)
 
     ZarrStore._result_array = array
-    time.time = lambda: clock() + ahead
+
+
+if __name__ == "__main__":
+    time.time = lambda: CLOCK() + AHEAD  # before Dask looks at it: a clock that jumps stops it
+    from distributed.cli.dask_worker import main
+
+    change_writes()
+    main()
