@@ -38,7 +38,7 @@ CASE = jb.Case(
 )
 
 
-class Outcome(NamedTuple):
+class KilledSweep(NamedTuple):
     """Of one sweep: what was killed, what clients said, and the laws that it broke."""
 
     killed: Counter
@@ -81,7 +81,9 @@ class Sweep:
         )
 
 
-def run(seed: int, workers: int, sweep: Sweep, expected: dict[str, bytes], folder: Path) -> Outcome:
+def run(
+    seed: int, workers: int, sweep: Sweep, expected: dict[str, bytes], folder: Path
+) -> KilledSweep:
     """Kill processes of a sweep at random until it has survived, then let it end."""
     draws, store = random.Random(seed), folder / "runs.zarr"
     environment = {
@@ -89,7 +91,7 @@ def run(seed: int, workers: int, sweep: Sweep, expected: dict[str, bytes], folde
         "KILLED_SWEEPS_FULL": str(draws.choice([0.0, 0.02])),
         "KILLED_SWEEPS_CLOCK": str(draws.choice([-7200, 3600])),
     }
-    outcome, cluster = Outcome(Counter(), Counter(), []), Cluster(folder, workers, environment)
+    outcome, cluster = KilledSweep(Counter(), Counter(), []), Cluster(folder, workers, environment)
     begun, limit = time.monotonic(), 10 * LONGEST
     try:
         while True:
@@ -120,7 +122,7 @@ def run(seed: int, workers: int, sweep: Sweep, expected: dict[str, bytes], folde
     return outcome
 
 
-def _wait(client: subprocess.Popen, store: Path, outcome: Outcome) -> str:
+def _wait(client: subprocess.Popen, store: Path, outcome: KilledSweep) -> str:
     """What a client said when it has ended; it is killed if no block is finished for LONGEST."""
     done, last = finished(store), time.monotonic()
     while True:
@@ -135,7 +137,9 @@ def _wait(client: subprocess.Popen, store: Path, outcome: Outcome) -> str:
                 kill(client)
 
 
-def _kill_later(draws, victims, cluster: Cluster, client, store: Path, outcome: Outcome) -> None:
+def _kill_later(
+    draws, victims, cluster: Cluster, client, store: Path, outcome: KilledSweep
+) -> None:
     """Kill some processes at random times once the client has begun to write blocks, if it does."""
     start = len(finished(store))
     while victims and client.poll() is None and len(finished(store)) <= start:

@@ -112,7 +112,7 @@ def free_decay_modes(
         if not fits:
             return None
         measured, fitted = (
-            sum(_within(getattr(fit, name), samples.rate, part) for part, fit in fits)
+            np.sum([_within(getattr(fit, name), samples.rate, part) for part, fit in fits], axis=0)
             for name in ("measured", "fitted")
         )
         shaken = 0 if given or len(used) > 1 else shaken_until(
