@@ -185,9 +185,9 @@ def _choose_substeps(
 ) -> tuple[int, float, StepTrial | None]:
     """Number of steps between events of a schedule, relative error of the deflection, and trial.
 
-    A `first_run` takes the smallest number of steps. If steps of half the length change its response
-    to the same commands by rounding only, no further run closes the loop: its steps have no error
-    that the law could amplify. There is no trial of a run that diverges.
+    A `first_run` takes the smallest number of steps. If steps of half the length change its
+    response to the same commands by rounding only, no further run closes the loop: its steps have
+    no error that the law could amplify. There is no trial of a run that diverges.
     """
     step, interval = longest_trial_step(case, shapes), float(schedule.lengths.max())
     if interval / step > MAX_STEPS_PER_SAMPLE:
