@@ -6,12 +6,12 @@ import re
 
 import pytest
 
-import jaxbeam.files.case_file  # noqa: F401  (imports every kind of part)
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Run
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.estimator import AbstractEstimator
+from jaxbeam.case.kinds import PACKAGES, import_modules
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.loads.planar.sensors import VehicleSensor
 from jaxbeam.case.profiles.base import AbstractProfile
@@ -34,6 +34,10 @@ LINES = (ROOT / "docs" / "vocabulary.md").read_text(encoding="utf-8").splitlines
 ROWS = [re.split(r"(?<!\\)\|", line)[1:-1] for line in LINES if line.startswith("| ")][2:]
 ADDRESSES = sorted({name for row in ROWS for name in re.findall(r"`([^`]+)`", row[4])})
 NAMES = sorted({name for row in ROWS for name in re.findall(r"`([^`]+)`", row[5])})
+
+
+for _package in PACKAGES:
+    import_modules(_package)
 
 
 def subclasses(base: type) -> set[type]:

@@ -121,9 +121,9 @@ def _first_run(case: Case, times, records: dict[int, Record]) -> FirstRun | None
 
     def run(plan, policy):
         samples = sample_times(case) if times is None else xp.asarray(times, float)
-        record, *at_events = _simulate_first(case, plan, samples, policy)
+        record, states, commands = _simulate_first(case, plan, samples, policy)
         records[plan.substeps] = record
-        return at_events
+        return states, commands
 
     return run
 
