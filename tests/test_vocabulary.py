@@ -36,6 +36,10 @@ ADDRESSES = sorted({name for row in ROWS for name in re.findall(r"`([^`]+)`", ro
 NAMES = sorted({name for row in ROWS for name in re.findall(r"`([^`]+)`", row[5])})
 
 
+for _package in PACKAGES:
+    import_modules(_package)
+
+
 def subclasses(base: type) -> set[type]:
     """A class and all classes derived from it."""
     return {base}.union(*map(subclasses, base.__subclasses__()))

@@ -64,8 +64,10 @@ class StabilityMargin(NamedTuple):
         )
 
 
-def stability_margin(case: Case) -> StabilityMargin:
+def stability_margin(case: Case, verdict_only: bool = False) -> StabilityMargin:
     """Stability margin of the closed loop of a case, the smallest along the crossing.
+
+    With `verdict_only` the margins of a stable loop are NaN: they take longer than its poles.
 
     Stationary loads lack the velocity terms of moving ones, which act as damping of either sign;
     `stability.growth` includes these.
@@ -97,6 +99,8 @@ def stability_margin(case: Case) -> StabilityMargin:
         return StabilityMargin(
             0.0, 0.0, "", UnstableInterval(unstable[0][0], unstable[-1][0], rate, frequency)
         )
+    if verdict_only:
+        return StabilityMargin(np.nan, np.nan)
     with np.errstate(divide="ignore"):  # infinite margin of a loop without gain
         margins_found = [margins(one, i) for one in loops for i in range(len(case.actuators))]
     return StabilityMargin(

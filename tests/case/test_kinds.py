@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, part_classes
 from jaxbeam.case.fields import POSITIVE, number
-from jaxbeam.case.kinds import import_modules, kind_of, kinds
+from jaxbeam.case.kinds import find_kind, import_modules, kind_of, kinds
 from jaxbeam.files.case_file import read_part
 from jaxbeam.runtime.arrays import Array
 
@@ -41,6 +41,8 @@ class Untuned(Tuned):
 
 def test_class_is_found_by_its_kind():
     assert kinds(AbstractMassDamper) == {"tuned": Tuned}
+    assert find_kind(AbstractMassDamper, "tuned") is Tuned
+    assert find_kind(AbstractMassDamper, "point") is None
     damper = read_part("dampers.0", {"kind": "tuned", "tuning": 3}, AbstractMassDamper)
     assert type(damper) is Tuned and damper.tuning == 3.0
     with pytest.raises(ValueError, match=r"dampers.0.kind cannot be 'tund'; did you mean 'tuned'"):
@@ -102,6 +104,7 @@ def test_every_class_of_a_case_has_a_kind(key):
     import_modules("jaxbeam.c_code")  # has a private member of a family
     family = part_classes()[key].part_class
     found = {each for each in kinds(family).values() if each.__module__.startswith("jaxbeam.")}
+    assert all(find_kind(family, kind) is each for kind, each in kinds(family).items())
     public = {
         each
         for each in _subclasses(family)

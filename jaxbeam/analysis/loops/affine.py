@@ -1,5 +1,6 @@
 """Derivatives of functions that are affine, by their values: known numbers need no compiler."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -50,6 +51,12 @@ def is_affine(
 
     Two affine functions agree there if and only if, but for rounding, they are the same.
     """
-    trial = scale * np.random.default_rng(0).standard_normal(matrix.shape[1])
+    trial = scale * _random_argument(matrix.shape[1])
     terms = np.abs(matrix) @ np.abs(trial) + np.abs(start)
     return bool(np.all(np.abs(function(trial) - start - matrix @ trial) <= ROUNDING * terms))
+
+
+@functools.cache
+def _random_argument(size: int) -> Float[np.ndarray, " argument"]:
+    """Numbers of a normal distribution, always the same."""
+    return np.random.default_rng(0).standard_normal(size)

@@ -2,7 +2,9 @@
 
 import re
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import check_suffix
@@ -72,22 +74,29 @@ def simulate(
         write_animation(record, animate, overwrite=options.overwrite, **look)
     from jaxbeam.analysis.sections.record_amplification import record_amplification
 
-    amplification = record_amplification(record)
-    content = _to_dict(record, amplification) | {"plausibility": plausibility}
-    lines = _lines(record, amplification)
+    derived = _Derived(record_amplification(record), _truncation_errors(record))
+    content = _to_dict(record, derived) | {"plausibility": plausibility}
+    lines = _lines(record, derived)
     for words in settlement_words(parsed_case):
         lines.append(f"{words}; sensors read changes from there")
     controller = parsed_case.controller
     if controller is not None and not controller.open_loop:
         from jaxbeam.analysis.crossing_margin import stability_margin
 
-        margin = stability_margin(parsed_case)
+        margin = stability_margin(parsed_case, verdict_only=True)
         content["stability"] = margin.verdict
         lines.append(f"the loop is {margin}")
     options.report(content, lines, output, picture, animate)
 
 
-def _to_dict(record: "jb.Record", amplification: "list[float | None]") -> dict:
+class _Derived(NamedTuple):
+    """What is computed from a record, by sensor; None where it is not known."""
+
+    amplification: Sequence[float | None]
+    truncation_errors: Sequence[float | None]
+
+
+def _to_dict(record: "jb.Record", derived: _Derived) -> dict:
     """Numbers of a record by their names in JSON (SI units)."""
     from jaxbeam.case.sensors import sensor_labels
 
@@ -102,9 +111,9 @@ def _to_dict(record: "jb.Record", amplification: "list[float | None]") -> dict:
                 sensor_labels(sensors),
                 sensors,
                 _extremes_of_sensors(record),
-                amplification,
+                derived.amplification,
                 _known(record.step_errors),
-                _truncation_errors(record),
+                derived.truncation_errors,
                 strict=True,
             )
         ],
@@ -224,7 +233,7 @@ def _ride(record: "jb.Record") -> "jb.RideMeasures | None":
     return jb.ride_measures(record)
 
 
-def _lines(record: "jb.Record", amplification: "list[float | None]") -> list[str]:
+def _lines(record: "jb.Record", derived: _Derived) -> list[str]:
     sensors = record.case.sensors
     rows = [
         (
@@ -241,16 +250,16 @@ def _lines(record: "jb.Record", amplification: "list[float | None]") -> list[str
     header = ("sensor", "position (m)", "quantity", "smallest", "at (s)", "largest", "at (s)")
     errors = {
         "error of steps": _known(record.step_errors),
-        "error of truncation": _truncation_errors(record),
+        "error of truncation": derived.truncation_errors,
     }
     for name, shares in errors.items():
         if any(share is not None for share in shares):
             header = (*header, name)
             words = ("-" if share is None else f"{share:.1e}" for share in shares)
             rows = [(*row, word) for row, word in zip(rows, words, strict=True)]
-    if any(factor is not None for factor in amplification):
+    if any(factor is not None for factor in derived.amplification):
         header = (*header, "dynamic amplification")
-        factors = ("-" if factor is None else f"{factor:.4g}" for factor in amplification)
+        factors = ("-" if factor is None else f"{factor:.4g}" for factor in derived.amplification)
         rows = [(*row, factor) for row, factor in zip(rows, factors, strict=True)]
     lines = [
         record.verdict,
