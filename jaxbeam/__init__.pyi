@@ -71,7 +71,8 @@ from .control.compensators import (
 )
 from .control.feedback import Feedback as Feedback
 from .control.feedforward import Feedforward as Feedforward
-from .control.internal_model import InternalModel as InternalModel
+from .control.internal_model.scheduled import ScheduledInternalModel as ScheduledInternalModel
+from .control.internal_model.table import InternalModel as InternalModel
 from .control.load_identification import (
     LoadIdentification as LoadIdentification,
     identified_load as identified_load,

@@ -1,12 +1,12 @@
 """Static output feedback through a table on the patch rigs, from sensors alone; held-out loads.
 
-One table of commands over the deflection under the load (`jaxbeam.control.internal_model`) serves
-all masses and speeds. It is tuned by `experiments.studies.tune_sensor_feedback` on the bench: noise
-of 4 um, filters of tenth order at 10 Hz (one span) and 20 Hz (two), a command every 10 ms in steps
-of 10 mV, 20 ms late. There are no gates, and neither mass nor speed is given. It is compared with
-the least achievable peak on loads, entries and noise that it was not tuned on; then also 10 ms
-later, on a beam that is 10 % stiffer or softer than its design model, with a command every 15 ms,
-and with the filter of the other rig. A table drawn by hand stands beside it.
+One table of commands over the deflection under the load (`jaxbeam.control.internal_model.table`)
+serves all masses and speeds. It is tuned by `experiments.studies.tune_sensor_feedback` on the
+bench: noise of 4 um, filters of tenth order at 10 Hz (one span) and 20 Hz (two), a command every 10
+ms in steps of 10 mV, 20 ms late. There are no gates, and neither mass nor speed is given. It is
+compared with the least achievable peak on loads, entries and noise that it was not tuned on; then
+also 10 ms later, on a beam that is 10 % stiffer or softer than its design model, with a command
+every 15 ms, and with the filter of the other rig. A table drawn by hand stands beside it.
 
 Its stability: the largest real part of the frozen poles along all these crossings, 10 ms later and
 with the beam as designed for, stiffer and softer, beside that of the beams without control.

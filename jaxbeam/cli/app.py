@@ -1,6 +1,7 @@
 """Application: the commands, the old words of renamed ones, and the process that runs them."""
 
 import atexit
+import functools
 import gc
 import os
 import sys
@@ -8,7 +9,14 @@ import warnings
 from collections.abc import Iterator, Sequence
 from typing import NoReturn
 
-from cyclopts import App, CycloptsError, Group, Parameter, UnusedCliTokensError
+from cyclopts import (
+    App,
+    CycloptsError,
+    Group,
+    MissingArgumentError,
+    Parameter,
+    UnusedCliTokensError,
+)
 
 from jaxbeam.cli.commands.compare import compare
 from jaxbeam.cli.commands.describe import describe
@@ -108,10 +116,28 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         words, what = " ".join(error.unused_tokens or ()), " ".join(error.command_chain or ())
         print_message(f"{what} takes no further {words!r}; see jaxbeam {what} --help")
         sys.exit(1)
+    except MissingArgumentError as error:
+        print_message(_missing(error))
+        sys.exit(1)
     except (ValueError, OSError, RuntimeError, ImportError, CycloptsError) as error:
         print_message(" ".join(str(error).split()))
         sys.exit(1)
     sys.exit(0)
+
+
+def _missing(error: MissingArgumentError) -> str:
+    """Sentence that names an argument without a value, and says what it is."""
+    argument, chain = error.argument, error.command_chain or ()
+    if argument is None:
+        return " ".join(str(error).split())
+    command = functools.reduce(App.__getitem__, chain, app)
+    described = command.assemble_argument_collection(parse_docstring=True)
+    helps = (one.parameter.help for one in described if one.name == argument.name)
+    meaning = " ".join((next(helps, None) or argument.name).split()).split(". ")[0].rstrip(".")
+    what, name = " ".join(chain), max(argument.names, key=len)
+    if error.keyword is not None or argument.tokens:
+        return f"{error.keyword or name} needs a value: {meaning}"
+    return f"{what} needs {name}: {meaning}; see jaxbeam {what} --help"
 
 
 def current_words(arguments: Sequence[str]) -> Iterator[str]:

@@ -162,7 +162,7 @@ def _chunk_function(
                     path.ends,
                     steps.inertia,
                     _weights(loads, path, END_FRACTIONS),
-                    xp.stack([before, after], axis=1),
+                    (before, after),
                     forces,
                 )
             inputs = [before, forces, ends, commands]

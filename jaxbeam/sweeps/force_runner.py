@@ -35,7 +35,9 @@ LEAST_TOLERANCE = 1e-8  # above the error of the eigenvectors
 # Numbers on which the model does not depend, and with which forces keep constant speeds.
 ADDRESS = re.compile(r"loads\.(\d+|\*)\.(speed|entry_time|start_position|spacing)|run\.duration")
 OF_BEAM = "beam", "supports", "actuators", "sensors"  # the keys on which the model depends
-BLOCK_RUNS, BLOCK_PAIRS = 32, 4e6  # runs of a block at most; and pairs of its wheels at most
+# Runs of a block at most, and pairs of its wheels at most. Twice as many runs as before took 12 %
+# less time for ten trains at 101 speeds: threads wait for each other between NumPy's short calls.
+FORCE_BLOCK_RUNS, BLOCK_PAIRS = 64, 4e6
 TRIAL_RUNS = 4  # in which the error of the peaks is measured
 PHASE = 1.6  # rad of the fastest pole in a step of the search
 
@@ -47,7 +49,7 @@ class ForceRunner:
         self.case, self.batches, self.system = case, batches, system
         self.pool = ThreadPoolExecutor(os.cpu_count())
         self.wheels, count = force_wheels(case), len(batches.run_index)
-        most = max(1, min(BLOCK_RUNS, int(BLOCK_PAIRS / self.wheels.force.size**2)))
+        most = max(1, min(FORCE_BLOCK_RUNS, int(BLOCK_PAIRS / self.wheels.force.size**2)))
         # As equal as can be: cores wait for the last block.
         self.block_runs = -(-count // -(-count // most))
         self.block_count = -(-count // self.block_runs)

@@ -22,10 +22,11 @@ from jaxbeam.case.reading.units import in_si
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
+from jaxbeam.integrator.step_size import check_tolerance
 from jaxbeam.sweeps import MAX_RUNS
 from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, Batches, addresses_within_batches, make_batches
 from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner
-from jaxbeam.sweeps.force_runner import ForceRunner, force_runner
+from jaxbeam.sweeps.force_runner import FORCE_BLOCK_RUNS, ForceRunner, force_runner
 from jaxbeam.sweeps.truncation import is_corrected
 
 # Positions and list entries, whose values are valid only in combination.
@@ -142,7 +143,12 @@ class SweepSpecification:
     def fingerprint(self) -> str:
         """SHA-256 of all that determines the results: case, values, settings and versions."""
         content = self.to_dict() | {
-            "blocks": [MAX_BLOCK_RUNS, MAX_BATCH_SIZE, len(jax.local_devices())],
+            "blocks": [
+                MAX_BLOCK_RUNS,
+                FORCE_BLOCK_RUNS,
+                MAX_BATCH_SIZE,
+                len(jax.local_devices()),
+            ],
             "versions": [_version(), jax.__version__],
         }
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
@@ -169,9 +175,10 @@ def sweep_specification(
 ) -> SweepSpecification:
     """Specification of a sweep of a case, checked before compilation.
 
-    Raises ValueError for an unknown address, invalid or too many values, a case without sensors, or
-    an unknown precision.
+    Raises ValueError for an unknown address, invalid or too many values, a case without sensors,
+    an unknown precision, or a tolerance below that of double precision.
     """
+    check_tolerance(tolerance)
     check_case(case)
     if precision not in PRECISIONS:
         raise ValueError(

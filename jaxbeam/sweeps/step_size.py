@@ -19,9 +19,12 @@ REFINEMENT = 1.25  # ratio of a step to the finer step with which its error is m
 MAX_ROUNDS = 12
 SAFETY_FACTOR = 6  # tolerance / largest error allowed in the sample
 TARGET_ERROR = 0.6  # aim of a longer step, relative to the error allowed
-MIN_USEFUL_ERROR = 3e-3  # relative to the error allowed; below, extrapolated steps are measured
+# Errors relative to the error allowed from which steps are extrapolated unmeasured: the sample
+# checks them.
+MIN_USEFUL_ERROR, MAX_USEFUL_ERROR = 3e-3, 10
 LIMIT_RATIO = 1.3  # initial step / longest step from which on the longest is taken unmeasured
 SAMPLE_DIVISOR = 4  # the sample grows with the square root of the number of batches over this
+SMALL_TOLERANCE = 1e-10  # below it, rounding in double precision may be what no step lessens
 NEGLIGIBLE_PEAK = 1e-6  # of a run's largest peak; errors of smaller peaks are relative to this
 
 # Peaks (path, batch, sensor) of batches for their steps (s) and a number of extra steps per event.
@@ -214,15 +217,17 @@ def _search_step_sizes(
     for _ in range(0 if settled.all() else MAX_ROUNDS):
         left = ~settled
         error[left] = step_errors(peaks, batches[left], steps[left], map_function)
-        meets_tolerance = ~(error > tolerance)
-        longest_valid = np.where(meets_tolerance, np.maximum(longest_valid, steps), longest_valid)
-        shortest_invalid = np.where(
-            meets_tolerance, shortest_invalid, np.minimum(shortest_invalid, steps)
-        )
         with np.errstate(divide="ignore"):
             step_factor = np.clip(
                 (TARGET_ERROR * tolerance / error) ** (1 / CONVERGENCE_ORDER), 0.5, 1.5
             )
+        meets_tolerance = ~(error > tolerance)
+        is_useful = ~(error > tolerance * MAX_USEFUL_ERROR)
+        valid = steps * np.where(meets_tolerance, 1.0, is_useful * step_factor)
+        longest_valid = np.maximum(longest_valid, valid)
+        shortest_invalid = np.where(
+            meets_tolerance, shortest_invalid, np.minimum(shortest_invalid, steps)
+        )
         # A step is settled if its error is useful, a longer one fails, or it is the longest.
         limit_known = (
             ~(error < tolerance * MIN_USEFUL_ERROR)
@@ -241,8 +246,9 @@ def _search_step_sizes(
 
 
 def _no_step_error(tolerance: float) -> RuntimeError:
+    rounding = "; rounding is larger, or " if tolerance < SMALL_TOLERANCE else "; "
     return RuntimeError(
-        f"no time step makes the peaks agree to {tolerance:g}; the responses are unstable, "
-        "or the frequencies are too far apart: check stiffnesses, masses and damping, "
-        "or keep fewer modes (beam.modes)"
+        f"no time step makes the peaks agree to {tolerance:g}{rounding}the responses are unstable, "
+        "or the frequencies are too far apart: give a larger tolerance, check stiffnesses, masses "
+        "and damping, or keep fewer modes (beam.modes)"
     )

@@ -110,6 +110,14 @@ CASES = {
         ),
         sensors=FILTERED,
     ),
+    "internal-model-scheduled": rig(
+        jb.ScheduledInternalModel(period=PERIOD, delay=1.5 * PERIOD),
+        actuators=[jb.Patch(0.1, 0.3, 0.15, limits=[-0.5, 4.0]), jb.PointForce(0.45, [-4.0, 1.0])],
+        sensors=[
+            jb.Sensor(0.2, filter=jb.Filter(20.0, 5), delay=7e-3),
+            jb.Sensor(0.4, offset=1e-4),
+        ],
+    ),
     "feedback-scheduled": rig(
         ScheduledFeedback(
             [0.2, 0.5],

@@ -23,7 +23,7 @@ def frequency(n: int, rigidity: float = 11.68) -> float:
 REFUSED = [
     ("simulat case.toml", 'Unknown command "simulat". Did you mean "simulate"?'),
     ("simulate case.toml more", "simulate takes no further 'more'; see jaxbeam simulate --help"),
-    ("simulate", "requires an argument"),
+    ("simulate", "simulate needs CASE: Case file, TOML; see jaxbeam simulate --help"),
     ("simulate case.toml --plott", "--plott"),
     ("simulate none.toml", "cannot read the case file none.toml: no such file or directory"),
     ("simulate case.toml -o out.txt", "a record is written to a .nc file; call it out.nc"),
@@ -44,7 +44,7 @@ REFUSED = [
     ("simulate case.toml --set loads.0.speed=fast", "must be one number, not 'fast'"),
     ("simulate case.toml --set beam.length=-1", "beam.length must be positive; it is -1 m"),
     ("modes case.toml --set beam.ends=pinned-fre", "no end is called 'fre'; did you mean 'free'?"),
-    ("sweep case.toml", "requires an argument"),
+    ("sweep case.toml", "sweep needs --over: ADDRESS=START"),
     ("sweep case.toml --over loads.0.speed=1:2", "a range is START:STOP:COUNT, such as 0.3:10:64"),
     ("sweep case.toml --over loads.0.speed=1:2:0.5", "a range is START:STOP:COUNT"),
     ("sweep case.toml --over loads.0.speed=1,x", "--over loads.0.speed=1,x: 'x' is not a number"),

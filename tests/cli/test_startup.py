@@ -16,7 +16,7 @@ LINES = {
     "tune --help": "--pareto",
     "simulat case.toml": 'Unknown command "simulat"',
     "simulate case.toml --plott": "--plott",
-    "simulate": "requires an argument",
+    "simulate": "needs CASE",
     "simulate none.toml": "cannot read the case file none.toml",
     "simulate broken.toml": "not valid TOML",
     "simulate case.toml -o out.txt": "a record is written to a .nc file",

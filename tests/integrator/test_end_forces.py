@@ -58,7 +58,7 @@ def test_forces_at_ends_follow_from_the_states(name):
 
     discrete, path, states = run(1)
     steps = _step_inputs(discrete, loads, path)
-    both = np.stack([states[:-1], states[1:]], axis=1)
+    both = states[:-1], states[1:]
     at_nodes = _forces_at_nodes(model, loads, path, states, steps)
     weight = _weights(loads, path, END_FRACTIONS)
     found = end_forces(path.ends, steps.inertia, weight, both, at_nodes)

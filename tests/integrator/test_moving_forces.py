@@ -64,7 +64,7 @@ def test_peaks_equal_those_of_the_integrator(case):
 
 
 def test_stored_sweeps_whose_last_block_is_short_have_every_run_in_its_place(tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxbeam.sweeps.force_runner.BLOCK_RUNS", 4)
+    monkeypatch.setattr("jaxbeam.sweeps.force_runner.FORCE_BLOCK_RUNS", 4)
     speeds = {"loads.0.speed": [20.0, 22.0, 24.0, 26.0, 28.0, 30.0]}
     case = dataclasses.replace(TWO_SPANS, sensors=[jb.Sensor(8.0)])
     in_memory = jb.sweep(case, speeds, progress=False)

@@ -1,10 +1,11 @@
-"""C code of internal-model control: static lift behind the sensors' filters, notches, table."""
+"""C code of internal-model control, with its own filters or those of the plant: lift, table."""
 
 import numpy as np
 
 from jaxbeam.c_code.source import CSource, interpolation_operations
 from jaxbeam.c_code.writers import write_law
-from jaxbeam.control.internal_model import InternalModelLaw
+from jaxbeam.control.internal_model.scheduled import ScheduledInternalModelLaw
+from jaxbeam.control.internal_model.table import InternalModelLaw
 
 
 @write_law.register
@@ -40,4 +41,49 @@ for (i = 0; i < {actuators}; i++) {{
     {code.output}[i] = interpolate(y, {readings}, {values} + {points} * i, {points});
 }}""",
         actuators * (2 + interpolation_operations(points)),
+    )
+
+
+@write_law.register
+def _(law: ScheduledInternalModelLaw, code: CSource) -> None:
+    sensors, actuators = np.shape(law.static_lift)
+    count, points, commands = len(law.reference), len(law.shares), code.command
+    if max(law.late):
+        held = actuators * (max(law.late) + 1)
+        commands = code.state("acting", np.zeros(held), "acting commands, the latest first")
+        code.add(
+            f"""
+/* Readings come late: keep the commands that they show */
+for (i = {held - 1}; i >= {actuators}; i--) {commands}[i] = {commands}[i - {actuators}];
+for (i = 0; i < {actuators}; i++) {commands}[i] = {code.command}[i];""",
+            held,
+        )
+    lift = code.work("lift", sensors, "deflections due to the commands (m)")
+    rows = code.constant("static_lift", law.static_lift)
+    late = code.constant("late", np.asarray(law.late) * actuators)
+    reference = code.constant("reference", law.reference)
+    equalisers = code.constant("equalisers", np.stack(law.equalisers))
+    states = code.state("filters", np.zeros(4 * count * sensors), "states of the filters")
+    shares, values = code.constant("shares", law.shares), code.constant("values", law.values)
+    limits = [
+        code.constant(name, numbers)
+        for name, numbers in (("full", law.full), ("opposite", law.opposite))
+    ]
+    own_lift, offsets = (
+        code.constant("own_lift", law.own_lift),
+        code.constant("offset", law.offsets),
+    )
+    code.add(
+        f"""
+/* Lift and readings behind the reference filter: the table turns their difference into commands */
+for (i = 0; i < {sensors}; i++) {{
+    real *lift_states = {states} + {4 * count} * i, *reading_states = lift_states + {2 * count};
+    real y = {code.readings}[i] - {offsets}[i];
+    multiply({lift} + i, {rows} + {actuators} * i, {commands} + {late}[i], 1, {actuators});
+    {lift}[i] = filter_sample({reference}, {count}, lift_states, {lift}[i]);
+    y = filter_sample({equalisers} + {6 * count} * i, {count}, reading_states, y);
+    y = interpolate(({lift}[i] - y) / {own_lift}[i], {shares}, {values}, {points});
+    {code.output}[i] = y > 0 ? y * {limits[0]}[i] : -y * {limits[1]}[i];
+}}""",
+        sensors * (2 * actuators + 18 * count + 6 + interpolation_operations(points)),
     )

@@ -5,6 +5,8 @@ extrapolation of the forces at the Gauss nodes is the least accurate there; the 
 accurate, of order 12, and so are the forces that the contact law gives for them.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -56,7 +58,7 @@ def end_forces(
     rows: EndRows | None,
     inertia: Float[Array, "step row batch"],
     weight: Float[Array, "step load end batch"],
-    states: Float[Array, "step end state batch"],
+    states: Sequence[Float[Array, "step state batch"]],
     forces: Float[Array, "step row batch"],
 ) -> Float[Array, "step row_end batch"]:
     """Contact forces (N) of wheels at the ends of steps, from the states there.
@@ -70,7 +72,9 @@ def end_forces(
         extrapolated = xp.einsum("tlfb,fe->tleb", forces.reshape(by_load), end_weights())
         return extrapolated.reshape(steps, -1, batch)
     mass = inertia.reshape(by_load)[:, None, :, 0]  # step, 1, load, batch
-    acceleration = rows.accelerations @ states
+    # One product for each end: for both in one, the states would be copied.
+    products = [rows.accelerations[:, end] @ at_end for end, at_end in enumerate(states)]
+    acceleration = xp.stack(products, axis=1)
     if rows.surface is not None:
         acceleration = acceleration + rows.surface[..., None]
     right = xp.swapaxes(weight, 1, 2) + mass * acceleration

@@ -76,8 +76,10 @@ def update_peaks(
     states, forces, *_ = inputs
     steps, batch_size = states.shape[0], states.shape[-1]
     start, length = path.start, path.length
-    given = [part for part in inputs if part is not None]
-    deflections = matrices.monitored @ xp.concatenate(given, axis=1)
+    # Two products: the states, by far the largest part, are not copied.
+    others = xp.concatenate([part for part in inputs[1:] if part is not None], axis=1)
+    on_states, on_others = xp.split(matrices.monitored, [states.shape[1]], axis=2)
+    deflections = on_states @ states + on_others @ others
     samples = deflections.reshape(steps, len(PEAK_NODES), -1, batch_size)
     samples = optimization_barrier(samples)
 

@@ -1,0 +1,144 @@
+"""Internal-model control that follows its plant: scipy's filters, other rigs, the bound."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.signal
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.case.controller import Measurement
+from jaxbeam.case.validation import check_case
+from tests.differences import central
+
+PERIOD = 0.01
+LAW = jb.ScheduledInternalModel(period=PERIOD, delay=0.02)
+
+
+def rig(controller=LAW, cutoff: float | None = 5.0, rigidity=13.2, order=10, **sensor):
+    """One span with a patch and a midspan sensor, and a load that crosses in 0.75 s."""
+    digital = None if cutoff is None else jb.Filter(cutoff, order)
+    patch = jb.Patch(
+        0.2575, 0.3425, 8.3e-4, correction=0.32, amplifier_gain=200.0, limits=[-2.5, 7.5]
+    )
+    return jb.Case(
+        jb.Beam(0.6, rigidity, 0.81, 0.03, modes=2),
+        actuators=[patch],
+        sensors=[jb.Sensor(0.3, filter=digital, **sensor)],
+        loads=[jb.MovingMass(mass=0.42, speed=0.8, entry_time=0.054)],
+        controller=controller,
+        run=jb.Run(duration=0.9, sample_rate=100.0),
+    )
+
+
+def lift():
+    """Static midspan deflection (m/V): sum over two sine modes of the moments at the patch ends."""
+    k = np.arange(1, 3) * np.pi / 0.6
+    moments = k * (np.cos(k * 0.2575) - np.cos(k * 0.3425))
+    moment = 8.3e-4 * 0.32 * 200
+    return np.sum(moment * moments * np.sin(k * 0.3) * 2 / (0.6 * 13.2 * k**4))
+
+
+@pytest.mark.parametrize(("cutoff", "order", "late"), [(5.0, 10, 0), (8.0, 3, 1), (None, 2, 0)])
+def test_commands_by_the_table_behind_the_reference_filter(cutoff, order, late):
+    """Computed from the record of a run, with scipy's filters and the lift in closed form."""
+    delay = late * PERIOD if late else None
+    record = jb.simulate(rig(cutoff=cutoff, order=order, noise=4e-6, offset=1e-4, delay=delay))
+    commands, readings = np.asarray(record.command)[:, 0], np.asarray(record.measured)[:, 0]
+    acting = np.concatenate([np.zeros(1 + late), commands])[: len(commands)]
+    frequency = np.pi**2 / 0.6**2 * np.sqrt(13.2 / 0.81) / (2 * np.pi)
+    stated = LAW.order, float(LAW.reference) * frequency
+    zeros, poles, gain = scipy.signal.butter(*stated, fs=1 / PERIOD, output="zpk")
+    more = max(0, 2 * -(-order // 2) - LAW.order) if cutoff else 0
+    if more:
+        fast = scipy.signal.butter(more, 0.4 / PERIOD, fs=1 / PERIOD, output="zpk")
+        zeros, poles, gain = np.append(zeros, fast[0]), np.append(poles, fast[1]), gain * fast[2]
+    reference = scipy.signal.zpk2sos(zeros, poles, gain)
+    if cutoff:  # zeros at half the sampling frequency cancel
+        _, filter_poles, filter_gain = scipy.signal.butter(
+            order, cutoff, fs=1 / PERIOD, output="zpk"
+        )
+        zeros = np.append(filter_poles, zeros[order:])
+        gain = gain / filter_gain
+    equaliser = scipy.signal.zpk2sos(zeros, poles, gain)
+    shares = scipy.signal.sosfilt(reference, lift() * acting)
+    shares = (shares - scipy.signal.sosfilt(equaliser, readings - 1e-4)) / (7.5 * lift())
+    values = np.interp(shares, LAW.shares, LAW.values)
+    expected = np.where(values > 0, 7.5 * values, 2.5 * values)
+    assert commands.max() > 7.0
+    # The command of a sample begins two samples later.
+    assert_allclose(commands[2:], expected[:-2], atol=1e-6)
+
+
+def test_the_loop_is_the_same_behind_any_filter():
+    """Commands behind filters of tenth order at 5 and 40 Hz differ by rounding alone."""
+    found = [np.asarray(jb.simulate(rig(cutoff=cutoff)).command) for cutoff in (5.0, 40.0)]
+    assert np.max(found[0]) > 7.0
+    assert_allclose(found[0], found[1], atol=1e-6)
+
+
+@pytest.mark.parametrize(("cutoff", "delay", "rigidity"), [(5.0, 0.04, 0.8), (40.0, 0.0, 1.2)])
+def test_share_of_the_attainable_on_one_span(cutoff, delay, rigidity):
+    """At least 85 % where the published cubic law attains a fifth, and below the bound."""
+    law = dataclasses.replace(LAW, delay=delay)
+    case = rig(law, cutoff, 13.2 * rigidity, noise=4e-6)
+    assert 0.85 < jb.bound(case).share(jb.simulate(case)) < 1.0
+
+
+def test_a_patch_that_presses_down_is_commanded_the_other_way():
+    upright = rig()
+    (patch,) = upright.actuators
+    turned = dataclasses.replace(
+        patch, correction=-patch.correction, limits=[-7.5, 2.5], depolarisation=[-1500.0, 500.0]
+    )
+    mirrored = dataclasses.replace(upright, actuators=(turned,))
+    found = [np.asarray(jb.simulate(case).command) for case in (upright, mirrored)]
+    assert_allclose(found[1], -found[0], atol=1e-9)
+
+
+def test_derivatives_of_commands():
+    """By a value, a share, the cutoffs of filter and reference, and the rigidity."""
+    reading = jnp.linspace(0, -4e-4, 4)
+
+    def commands(logarithms):
+        value, share, reference, cutoff, rigidity = jnp.exp(logarithms)
+        table = {"shares": jnp.stack([0.0, share]), "values": jnp.stack([0.0, value])}
+        law = jb.ScheduledInternalModel(**table, reference=reference, period=PERIOD)
+        law = law.design_law(jb.state_space(rig(law, cutoff, rigidity, order=2)))
+        state, found = law.initial_state(), []
+        for one in reading:
+            measurement = Measurement(one[None], jnp.zeros(4), jnp.ones(1))
+            command, state, _ = law.step(state, measurement, jnp.zeros(()))
+            found.append(command[0])
+        return jnp.stack(found)
+
+    numbers = jnp.log(jnp.array([0.9, 2.0, 0.5, 9.0, 13.2]))
+    found, expected = jax.jacfwd(commands)(numbers), central(commands, numbers, 1e-2)
+    assert np.all(np.max(np.abs(expected), axis=0) > 1e-2)
+    assert_allclose(found, expected, atol=1e-7)
+
+
+ERRORS = [
+    ({"period": None, "delay": None}, {}, "period must be given"),
+    ({"values": np.ones(3)}, {}, "values must have as many entries as shares, 11, not 3"),
+    ({"order": 3}, {}, "order must be even"),
+    ({}, {"quantity": "velocity"}, "kind needs a sensor of deflection for each of 1 actuators"),
+    ({}, {"sampling_period": 0.02}, "kind samples all sensors itself"),
+]
+
+
+@pytest.mark.parametrize(("changes", "sensor", "message"), ERRORS)
+def test_errors_of_settings(changes, sensor, message):
+    with pytest.raises(ValueError, match=message):
+        check_case(rig(dataclasses.replace(LAW, **changes), cutoff=None, **sensor))
+
+
+def test_errors_of_filters_and_limits():
+    analogue = jb.Sensor(0.3, filter=jb.Filter(5.0, realisation="analogue"))
+    with pytest.raises(ValueError, match=r"digital filters, .* sensors.0.filter is analogue"):
+        check_case(dataclasses.replace(rig(), sensors=(analogue,)))
+    with pytest.raises(ValueError, match=r"kind needs limits.* give actuators.0.limits"):
+        check_case(dataclasses.replace(rig(), actuators=(jb.PointForce(0.3),)))
