@@ -113,7 +113,7 @@ def prediction_errors(
         gram = past.T @ weighted
         coefficients = np.linalg.lstsq(gram, weighted.T @ target, rcond=1e-14)[0]
         weight = 1 / (scale * np.maximum(np.abs(target - past @ coefficients), least))
-    errors = lfilter(np.concatenate([[1.0], -coefficients[::-1]]), [1.0], values)
+    errors = np.asarray(lfilter(np.concatenate([[1.0], -coefficients[::-1]]), [1.0], values))
     errors[:order] = 0.0
     return errors
 

@@ -200,7 +200,7 @@ def triangular_factor(
     except np.linalg.LinAlgError:
         factor = np.zeros_like(products)
     if np.min(np.diag(factor)) < MIN_PIVOT:
-        return np.linalg.qr(rows.T, mode="r")
+        return np.asarray(np.linalg.qr(rows.T, mode="r"))
     return factor * size
 
 
