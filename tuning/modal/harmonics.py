@@ -27,7 +27,7 @@ RAYLEIGH_RATIO = 0.5227  # deviation over mean of the envelope of a random vibra
 RATIO_SD, STEADY_SDS = 0.23, 4.0  # deviation of its estimate from one value, and limit in these
 STEADY_RATIO = 0.35  # of the envelope of a line in noise of a tenth of its power
 HALF_POWER_WIDTHS = 4.0  # half width of the filter around a pole
-MAX_LINES = 30
+MAX_LINES = 100
 MIN_SERIES = 3  # lines that are multiples of one frequency
 
 

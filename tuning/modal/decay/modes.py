@@ -115,12 +115,13 @@ def free_decay_modes(
             np.sum([_within(getattr(fit, name), samples.rate, part) for part, fit in fits], axis=0)
             for name in ("measured", "fitted")
         )
-        shaken = 0 if given or len(used) > 1 else shaken_until(
-            measured, fitted, 2 * (band[1] - band[0]) / samples.rate
-        )  # fmt: skip
+        first, *others = used
+        if given or others:
+            break
+        shaken = shaken_until(measured, fitted, 2 * (band[1] - band[0]) / samples.rate)
         if not shaken:
             break
-        decays = (used[0]._replace(start=used[0].start + shaken),)
+        decays = (first._replace(start=first.start + shaken),)
     channels = samples.records[0].shape[1]
     energy = np.sum(measured**2, axis=0)
     limit = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_ENERGY

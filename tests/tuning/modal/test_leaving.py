@@ -1,0 +1,58 @@
+"""When the excitation of a log ends: random forces on planted modes, then none."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from tuning.modal.decay.leaving import end_of_excitation, shaken_until
+
+RATE, SIZE = 40.0, 10
+
+
+def shaken(until, count=2400, noise=0.1, seed=0):
+    """Two channels of a mode of 4 Hz, 1 %, under white forces to a sample, with white noise."""
+    random = np.random.default_rng(seed)
+    pole = np.exp(2 * np.pi * 4 * (-0.01 + 1j) / RATE)
+    forces = random.normal(size=count) * (np.arange(count) < until)
+    forces[0] = 5.0
+    clean = np.real(lfilter([1.0], [1.0, -pole], forces))[:, None] * [1.0, 0.6]
+    values = clean + noise * clean.std() * random.normal(size=clean.shape)
+    # The best predictor of a mode, which the noise makes worse.
+    recursion = [1.0, -2 * pole.real, abs(pole) ** 2]
+    return lfilter(recursion, [1.0], values, axis=0), values, clean
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_end_of_random_forces_is_found(seed):
+    errors, values, _ = shaken(1200, seed=seed)
+    found = end_of_excitation(errors, values, np.zeros(2400, bool), SIZE)
+    assert 1200 - SIZE <= found <= 1200 + 8 * SIZE
+
+
+@pytest.mark.parametrize(("until", "seed"), [(1, 0), (1, 1), (2400, 0), (2400, 1)])
+def test_a_decay_and_lasting_forces_have_no_end(until, seed):
+    errors, values, _ = shaken(until, seed=seed)
+    assert end_of_excitation(errors, values, np.zeros(2400, bool), SIZE) == 0
+
+
+def test_fast_modes_that_are_not_predicted_are_no_forces():
+    """Errors that decay with a mode, whose energy is little of the whole."""
+    random = np.random.default_rng(2)
+    slow, fast = (np.exp(-np.arange(2400) / length) for length in (900.0, 150.0))
+    values = (10 * slow + fast)[:, None] * random.normal(size=(2400, 2))
+    errors = (1 + 3 * fast[:, None]) * random.normal(size=(2400, 2))
+    assert end_of_excitation(errors, values, np.zeros(2400, bool), SIZE) == 0
+
+
+def test_a_part_with_more_than_noise_ends_the_excitation():
+    """Noise all along, and a third of the energy of the fourth part by forces."""
+    random = np.random.default_rng(1)
+    fitted = np.exp(-np.arange(2000) / 800)[:, None] * np.ones((1, 2))
+    noise = 0.05 * random.normal(size=fitted.shape)
+    assert shaken_until(fitted + noise, fitted, 0.5) == 0
+    noise[600:800] += 0.4 * fitted[600:800]
+    assert shaken_until(fitted + noise, fitted, 0.5) == 800
+    # What is little of a part's energy may be nonlinearity.
+    noise[:200] += 0.15 * fitted[:200]
+    noise[600:800] = noise[800:1000]
+    assert shaken_until(fitted + noise, fitted, 0.5) == 0
