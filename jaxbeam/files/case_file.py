@@ -18,7 +18,7 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.declared_checks import describe_value, suggestion
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.joint_addresses import each_address
-from jaxbeam.case.kinds import import_modules, kind_of
+from jaxbeam.case.kinds import kind_of
 from jaxbeam.case.loads.planar.files import is_path
 from jaxbeam.case.loads.vehicle import IMPLIED
 from jaxbeam.case.reading.parts import read_part, read_parts
@@ -27,9 +27,6 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.files.kind_changes import change_kind
 from jaxbeam.files.profile_file import with_profile_file
 from jaxbeam.runtime.whole_file import whole_file
-
-for package in ("jaxbeam.case", "jaxbeam.control", "jaxbeam.estimation"):
-    import_modules(package)
 
 
 def load_case(path: str | os.PathLike) -> Case:

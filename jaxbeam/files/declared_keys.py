@@ -8,7 +8,6 @@ from jaxbeam.case.aliases import FILE_KEYS
 from jaxbeam.case.case import part_classes
 from jaxbeam.case.fields import describe_shape
 from jaxbeam.case.kinds import kinds
-from jaxbeam.files import case_file  # noqa: F401  (imports every kind of part)
 
 
 class Key(NamedTuple):

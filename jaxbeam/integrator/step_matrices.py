@@ -29,7 +29,8 @@ from jaxbeam.runtime.arrays import (
 )
 
 CHUNK_STEPS = 16  # steps whose matrices a compiled program computes together
-KNOWN_CHUNK_ENTRIES = 2**22  # of matrices that NumPy computes together
+MANY_STATES = 48  # of which NumPy makes no matrix a step
+KNOWN_CHUNK_ENTRIES = 2**19  # of matrices that NumPy computes together, so that caches hold them
 
 
 class CommandMatrices(eqx.Module):
@@ -85,10 +86,18 @@ class StepMatrices(eqx.Module):
         return self.transition.shape[-3] * self.transition.shape[-2]
 
 
+def advances_by_forces(states: int) -> bool:
+    """Whether NumPy propagates so many states by the contact forces, not by one matrix a step.
+
+    A step takes more operations then, whose sizes grow with the number of states, not its square.
+    """
+    return states >= MANY_STATES
+
+
 def chunk_length(discrete: DiscreteModel, loads: LoadSet, max_loads: int) -> int:
     """Number of steps whose matrices are computed together.
 
-    In NumPy, where each operation takes microseconds to begin, as many as memory allows.
+    In NumPy, where each operation takes microseconds to begin, as many as caches hold.
     """
     if any_jax(discrete, loads):
         return CHUNK_STEPS
@@ -97,7 +106,11 @@ def chunk_length(discrete: DiscreteModel, loads: LoadSet, max_loads: int) -> int
     if loads.wheels.vehicles:
         rows = loads.wheel_count * NODE_COUNT
     compliance = rows * min(rows, NODE_COUNT * discrete.model.mode_count)
-    entries = loads.inertia.shape[1] * max(compliance, rows * states, states**2)
+    transition = states**2
+    plain = discrete.modal_command_matrix is None and not loads.wheels.vehicles
+    if plain and advances_by_forces(states):
+        transition = discrete.model.state_matrix.size
+    entries = loads.inertia.shape[1] * max(compliance, rows * states, transition)
     return int(max(1, min(discrete.grid.step_count, KNOWN_CHUNK_ENTRIES // entries)))
 
 

@@ -30,6 +30,8 @@ NO_STEP = (
     " continuous time switches too often: give it a period, or a larger tolerance"
 )
 ROUNDING = 1e-9  # of the deflection under all loads; below it, deflections are not compared
+SMALLEST_TOLERANCE = 1e-14  # some fifty units in the last place of double precision
+LARGEST_ROUNDING = 1e-4  # an error that shorter steps do not lessen, and that may be rounding
 # Errors at all positions and times over the largest of those compared. Of random cases up to 1.24:
 # experiments/validation/random_cases.
 UNSAMPLED = 2.0
@@ -39,12 +41,15 @@ TRIAL_POSITIONS = (0.13, 0.29, 0.47, 0.62, 0.88)  # x / length at which errors a
 class StepTrial(NamedTuple):
     """States of two trial runs at the same `times` (s): with some steps, and with half of them.
 
-    Those of the beam's modal model, then those of vehicles.
+    Those of the beam's modal model, then those of vehicles. Errors are at least the `share` of
+    those of the `former` trial, if there was one.
     """
 
     times: Float[np.ndarray, " time"]
     coarse: Float[np.ndarray, "time state batch"]
     fine: Float[np.ndarray, "time state batch"]
+    former: "StepTrial | None" = None
+    share: float = 0.0
 
 
 def check_step_count(count: float, step: float) -> None:
@@ -55,6 +60,38 @@ def check_step_count(count: float, step: float) -> None:
             " check stiffnesses, masses and damping, shorten the run, or keep fewer modes"
             " (beam.modes)"
         )
+
+
+def check_tolerance(tolerance: float) -> None:
+    """Raises ValueError for a tolerance that is no share, or below double precision."""
+    if not SMALLEST_TOLERANCE <= tolerance < 1:
+        raise ValueError(
+            f"tolerance must be at least {SMALLEST_TOLERANCE:g} and below 1, as a share of the"
+            f" largest deflection in double precision; it is {tolerance:g}"
+        )
+
+
+class ErrorFloor:
+    """Notices that errors of ever shorter steps no longer fall: they are rounding then.
+
+    The order of the integrator divides an error by 512 at least as steps are halved.
+    """
+
+    def __init__(self, tolerance: float):
+        self._tolerance, self._best, self._step = tolerance, np.inf, np.inf
+
+    def check(self, error: float, step: float) -> None:
+        """Take note of the error of a step (s).
+
+        Raises RuntimeError if a quarter of the step of a small error has not halved it.
+        """
+        if error < 0.5 * self._best:
+            self._best, self._step = error, step
+        elif self._best < LARGEST_ROUNDING and step <= 0.25 * self._step:
+            raise RuntimeError(
+                f"no time step makes the response agree to {self._tolerance:g}: in double precision"
+                f" it agrees to {self._best:.1e}; give a tolerance of {4 * self._best:.0e} or more"
+            )
 
 
 def longest_trial_step(case: Case, shapes: StaticShapes) -> float:
@@ -72,29 +109,37 @@ def choose_step_size(
 
     The step is shortened until dividing it by two changes no deflection at the ends of its steps by
     more than half the tolerance, relative to the largest; the error is twice that change, as it is
-    larger at other positions and times. Peaks alone would
-    hide errors, as the deflection is stationary there. Raises RuntimeError if no step meets it.
+    larger at other positions and times. Peaks alone would hide errors, as the deflection is
+    stationary there. The error is at least that of the former trial times the ratio of the steps to
+    the power of CONVERGENCE_ORDER: where forces change sharply, a single change may be far smaller
+    than the error of a run whose steps begin elsewhere. Raises RuntimeError if no step meets it.
     """
     case = concrete_case(case)
     step = longest_trial_step(case, shapes)
     check_step_count(float(concrete(case.run.duration)) / step, step)
     model = modal_model(case, shapes.layout, shapes.coupled)
     case, loads = without_later_vibration(case, model), load_set(case, shapes.layout)
-    halvings, least = 0, rounding_deflection(case, model)
+    halvings, least, floor = 0, rounding_deflection(case, model), ErrorFloor(tolerance)
+    former, former_error, shrink = None, 0.0, 0.0
     for _ in range(MAX_TRIALS):
         (times, coarse), (_, fine) = (
             trial_run(case, model, loads, shapes.max_loads, step, divided) for divided in (1, 2)
         )
         deflections = (trial_deflections(case, model, states) for states in (coarse, fine))
-        error = UNSAMPLED * largest_change(*deflections, least)
+        change, share = UNSAMPLED * largest_change(*deflections, least), shrink**CONVERGENCE_ORDER
+        error = max(change, share * former_error)
+        trial = StepTrial(times, coarse, fine, former, share)
         if error <= tolerance:
-            return step, error, StepTrial(times, coarse, fine)
-        shrink = 0.5
+            return step, error, trial
+        floor.check(change, step)
+        shrink, former, former_error = 0.5, None, 0.0
         if np.isfinite(error):
             shrink = np.clip(0.9 * (tolerance / error) ** (1 / CONVERGENCE_ORDER), 0.2, 0.8)
+            former, former_error = trial._replace(former=None), change
         elif (halvings := halvings + 1) > MAX_DIVERGED_HALVINGS:
             break
-        step = step * float(shrink)
+        shrink = float(shrink)
+        step = step * shrink
     raise RuntimeError(NO_STEP.format(tolerance))
 
 

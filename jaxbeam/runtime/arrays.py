@@ -302,10 +302,14 @@ def solve_triangular(matrix, right, lower: bool, transposed: bool = False) -> An
     """Solution of a triangular system, or of that with the transposed matrix."""
     if is_jax(matrix) or is_jax(right):
         return lapack.solve_triangular(matrix, right, lower, transposed)
-    from scipy.linalg import lapack as scipy_lapack  # 0.1 s, which compiled programs do not wait
-
     if not right.size:
         return np.zeros_like(right)
+    if right.ndim > 1:  # without scipy, which takes 0.1 s to import
+        matrix, lower = (matrix.T, not lower) if transposed else (matrix, lower)
+        # Reversed, a lower triangle is an upper one, of which elimination changes nothing.
+        return solve(matrix[::-1, ::-1], right[::-1])[::-1] if lower else solve(matrix, right)
+    from scipy.linalg import lapack as scipy_lapack
+
     # LAPACK itself: the function of scipy takes ten times as long as a small system. In the order
     # of Fortran its matrix is the transposed one.
     solution, singular = scipy_lapack.dtrtrs(matrix.T, right, not lower, not transposed)
@@ -326,11 +330,6 @@ def cholesky(matrix) -> Any:
     """Lower triangular factor of a matrix; nan where it is not positive definite."""
     if is_jax(matrix):
         return lapack.cholesky(matrix)
-    if matrix.ndim == 2 and matrix.size:
-        from scipy.linalg import lapack as scipy_lapack
-
-        upper, failure = scipy_lapack.dpotrf(matrix.T, False, True)
-        return np.tril(np.full_like(matrix, np.nan)) if failure else upper.T
     try:
         return np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:

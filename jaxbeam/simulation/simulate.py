@@ -121,28 +121,29 @@ def _first_run(case: Case, times, records: dict[int, Record]) -> FirstRun | None
 
     def run(plan, policy):
         samples = sample_times(case) if times is None else xp.asarray(times, float)
-        record, states = _simulate_first(case, plan, samples, policy)
+        record, *at_events = _simulate_first(case, plan, samples, policy)
         records[plan.substeps] = record
-        return states
+        return at_events
 
     return run
 
 
 @compiled_if_traced
 def _simulate_first(case: Case, plan: IntegrationPlan, times, policy):
-    """Record of a run without its errors, and its states at all events."""
+    """Record of a run without its errors, and its states and commands at all events."""
     monitored = monitored_sensors(case.sensors)
     integration = run_integration(case, plan, times, monitored, policy=policy)
     event = integration.grid.event_at(np.arange(integration.steps))
-    states = integration.states[:-1]
-    at_events = put(
-        xp.zeros((plan.schedule.times.shape[0], *states.shape[1:])),
-        xp.where(event < 0, plan.schedule.times.shape[0], event),
-        states,
-    )
+    events = plan.schedule.times.shape[0]
+
+    def at_events(part):
+        none = xp.zeros((events, *part.shape[1:]))
+        return put(none, xp.where(event < 0, events, event), part)
+
     no_errors = xp.zeros(()), xp.zeros(len(case.sensors))
     record = _record(case, integration, times, no_errors)
-    return record, beam_and_vehicles(case, plan.shapes, policy, at_events)
+    states = beam_and_vehicles(case, plan.shapes, policy, at_events(integration.states[:-1]))
+    return record, states, at_events(integration.commands)
 
 
 def _simulate_record(case: Case, plan: IntegrationPlan, times, errors) -> Record:
@@ -306,7 +307,8 @@ def integration_setup(
 class Integration(NamedTuple):
     """Running peaks, outputs at the sample times, model, grid, states (boundary, state, batch).
 
-    `sampled_states` (time, state) are those at the sample times.
+    `sampled_states` (time, state) are those at the sample times, `commands` (step, command, batch)
+    those at the nodes of each step.
     """
 
     running_peaks: Any
@@ -315,6 +317,7 @@ class Integration(NamedTuple):
     grid: TimeGrid
     states: Array
     sampled_states: Array
+    commands: Array | None
     steps: int
 
 
@@ -324,7 +327,7 @@ def run_integration(case: Case, plan: IntegrationPlan, times, monitored, noisy=T
         case, plan, times, monitored, noisy, policy
     )
     model = discrete.model
-    running_peaks, all_states, commands, observed, _ = integrate_history(
+    running_peaks, all_states, node_commands, observed, _ = integrate_history(
         discrete, loads, max_loads=plan.shapes.max_loads, steps=steps, policy=policy
     )
     states = all_states[sample_steps]
@@ -332,18 +335,26 @@ def run_integration(case: Case, plan: IntegrationPlan, times, monitored, noisy=T
     def at_samples(part):
         return None if part is None else part[sample_steps, ..., 0]
 
+    commands = None
     readings, failures, sent = (None,) * 3 if observed is None else tuple(map(at_samples, observed))
     if policy is not None:
         # In continuous time from the law itself: extrapolation from the Gauss nodes is less exact.
         commands = (
             policy.commands_at(states[..., 0], times)
             if policy.implicit
-            else _commands_at_steps(case, commands, sample_steps)
+            else _commands_at_steps(case, node_commands, sample_steps)
         )
     motion, vehicles = motion_at(case, model, loads, times, states, commands)
     outputs = Outputs(motion, vehicles, readings, failures, sent)
     return Integration(
-        running_peaks, outputs, model, discrete.grid, all_states, states[..., 0], steps
+        running_peaks,
+        outputs,
+        model,
+        discrete.grid,
+        all_states,
+        states[..., 0],
+        node_commands,
+        steps,
     )
 
 

@@ -22,6 +22,7 @@ from jaxbeam.case.reading.units import in_si
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
+from jaxbeam.integrator.step_size import check_tolerance
 from jaxbeam.sweeps import MAX_RUNS
 from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, Batches, addresses_within_batches, make_batches
 from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner
@@ -174,9 +175,10 @@ def sweep_specification(
 ) -> SweepSpecification:
     """Specification of a sweep of a case, checked before compilation.
 
-    Raises ValueError for an unknown address, invalid or too many values, a case without sensors, or
-    an unknown precision.
+    Raises ValueError for an unknown address, invalid or too many values, a case without sensors,
+    an unknown precision, or a tolerance below that of double precision.
     """
+    check_tolerance(tolerance)
     check_case(case)
     if precision not in PRECISIONS:
         raise ValueError(

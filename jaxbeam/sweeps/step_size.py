@@ -24,6 +24,7 @@ TARGET_ERROR = 0.6  # aim of a longer step, relative to the error allowed
 MIN_USEFUL_ERROR, MAX_USEFUL_ERROR = 3e-3, 10
 LIMIT_RATIO = 1.3  # initial step / longest step from which on the longest is taken unmeasured
 SAMPLE_DIVISOR = 4  # the sample grows with the square root of the number of batches over this
+SMALL_TOLERANCE = 1e-10  # below it, rounding in double precision may be what no step lessens
 NEGLIGIBLE_PEAK = 1e-6  # of a run's largest peak; errors of smaller peaks are relative to this
 
 # Peaks (path, batch, sensor) of batches for their steps (s) and a number of extra steps per event.
@@ -245,8 +246,9 @@ def _search_step_sizes(
 
 
 def _no_step_error(tolerance: float) -> RuntimeError:
+    rounding = "; rounding is larger, or " if tolerance < SMALL_TOLERANCE else "; "
     return RuntimeError(
-        f"no time step makes the peaks agree to {tolerance:g}; the responses are unstable, "
-        "or the frequencies are too far apart: check stiffnesses, masses and damping, "
-        "or keep fewer modes (beam.modes)"
+        f"no time step makes the peaks agree to {tolerance:g}{rounding}the responses are unstable, "
+        "or the frequencies are too far apart: give a larger tolerance, check stiffnesses, masses "
+        "and damping, or keep fewer modes (beam.modes)"
     )

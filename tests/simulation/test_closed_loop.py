@@ -15,14 +15,18 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.integrator.held_commands import HeldCommands
+from jaxbeam.model.load_set import load_set
+from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.sensor_signals import noise_samples
-from jaxbeam.simulation.closed_loop import loop_schedule
+from jaxbeam.model.state_space import state_space
+from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
 from jaxbeam.simulation.integration_plan import (
     IntegrationPlan,
     integration_plan,
     static_shapes,
 )
-from jaxbeam.simulation.simulate import simulate_readings
+from jaxbeam.simulation.simulate import run_integration, simulate_readings
 from tests.loop_as_oracle import expected, span_of
 
 TIMES = np.linspace(0.0, 0.4, 81)
@@ -165,6 +169,25 @@ def test_first_trial_run_is_the_run_by_its_plan(quantity):
         np.testing.assert_array_equal(ours, theirs)
     np.testing.assert_array_equal(record.deflection, again.deflection)
     np.testing.assert_array_equal(record.command, again.command)
+
+
+def test_run_under_its_own_commands_is_the_same_run(monkeypatch):
+    """So the law is asked once a sample, and not again to find the error of the steps."""
+    controller = jb.Feedback([500.0], period=2e-3, delay=1e-3)
+    case, asked = loop([PATCH], [SENSOR], controller, duration=0.2), []
+    times, law = TIMES[:41], type(controller.law(state_space(case)))
+    step = law.step
+    monkeypatch.setattr(law, "step", lambda *args: asked.append(0) or step(*args))
+    record = jb.simulate(case, times)
+    assert len(asked) == 101 and record.error_estimate < 1e-11
+    plan, layout = plan_with_substeps(case, times, 2), mesh_layout(case)
+    policy = closed_loop(case, layout, load_set(case, layout), plan.schedule)
+    closed = run_integration(case, plan, times, None, policy=policy)
+    events = closed.grid.event_at(np.arange(closed.steps)) >= 0
+    held = HeldCommands(policy.model, closed.commands[events], policy.state_bound)
+    found = run_integration(case, plan, times, None, policy=held)
+    assert len(asked) == 202 and events.sum() > 200
+    assert_allclose(found.states, closed.states, rtol=0, atol=1e-14)
 
 
 def test_readings_for_fits_have_no_noise():

@@ -84,6 +84,46 @@ def test_stated_errors_are_no_smaller_than_the_true_ones(seed):
     assert np.median(stated / np.maximum(found, TIGHT)) < 1e3
 
 
+# Heavy masses that enter at 15 times the critical speed and brake to a stop on the beam.
+SHARP = {
+    "span": jb.Case(
+        jb.Beam(2.0, 50.0, 1.5, damping_ratio=0.1, modes=2),
+        sensors=[jb.Sensor(1.0)],
+        loads=[
+            jb.MovingForce(
+                mass=73.6230365, speed=7.66807974, entry_time=0.0441063116, deceleration=29.3997234
+            ),
+            jb.MovingMass(mass=18.2445724, speed=-83.7432456, deceleration=3506.46559),
+        ],
+        run=jb.Run(0.5576913, sample_rate=107.58),
+    ),
+    "free beam": jb.Case(
+        jb.Beam(2.0, 50.0, 1.5, damping_ratio=0.01, modes=4, ends="free-free"),
+        sensors=[jb.Sensor(1.94)],
+        loads=[
+            jb.MovingMass(mass=14.4509708, speed=-1.67806957, deceleration=2.3465979),
+            jb.MovingForce(mass=0.382539621, speed=-1.67806957, deceleration=1.40795874),
+            jb.MovingMass(
+                mass=179.594903, speed=-81.3974196, entry_time=0.308744181, deceleration=1840.42775
+            ),
+        ],
+        run=jb.Run(1.235952, sample_rate=48.54),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SHARP)
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+def test_a_change_that_is_small_by_chance_is_not_the_stated_error(name):
+    """The last trial changes by a fifth of the error of the run, whose steps begin elsewhere."""
+    record, exact = (jb.simulate(SHARP[name], tolerance=t) for t in (1e-7, 1e-10))
+    found = true_errors(record, exact)
+    assert found[0] > 1e-9  # the last changes are 3.2e-9 and 3.3e-9
+    assert np.all(found <= record.error_estimate)
+    assert np.all(found <= record.step_errors)
+    assert record.error_estimate <= 1e-7
+
+
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 def test_accelerations_have_larger_errors_than_deflections():
     errors = dict(

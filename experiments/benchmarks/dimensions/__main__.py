@@ -3,8 +3,11 @@
     python -m experiments.benchmarks.dimensions [--quick]
 
 Moving masses on a beam, one dimension at a time, each size in a process of its own; runs of a sweep
-are in `growth`. The last column is the ratio of seconds to those of the size before, over the ratio
-of the sizes: 1 where time is proportional.
+are in `growth`. Seconds are of the processor; memory is what
+the run adds to the peak of its process. In the columns "over proportional" time and memory are
+divided by those of the smallest size, and by the ratio of the sizes: 1 where they are proportional.
+Frequencies grow with the square of the number of modes, and so does the number of steps; time is
+per step there.
 """
 
 import argparse
@@ -51,14 +54,15 @@ def sized_case(samples: int, modes: int, loads: int, supports: int) -> jb.Case:
 
 
 def measure(dimension: str, size: int) -> dict[str, float]:
-    """Wall time (s) of a run, the peak memory (MiB) of the process, and that before the run."""
+    """Processor time (s) and steps of a run, and peak memory (MiB) with it and before it."""
     case = sized_case(**BASE | {dimension: size})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)
         jb.simulate(sized_case(**BASE))  # imports
-        before, start = peak_memory(), time.perf_counter()
-        jb.simulate(case)
-    return {"run": time.perf_counter() - start, "before": before, "peak": peak_memory()}
+        before, start = peak_memory(), time.process_time()
+        record = jb.simulate(case)
+    seconds = time.process_time() - start
+    return {"run": seconds, "steps": record.steps, "before": before, "peak": peak_memory()}
 
 
 def main() -> None:
@@ -71,16 +75,25 @@ def main() -> None:
         dimension, size = arguments.measure
         print(json.dumps(measure(dimension, int(size))))
         return
-    print_table(("dimension", "size", "seconds", "MiB", "seconds, over proportional"))
+    header = "dimension", "size", "steps", "seconds", "us a step", "over proportional"
+    print_table((*header, "MiB", "over proportional"))
     for dimension, sizes in SIZES.items():
-        former: tuple[int, float] | None = None
+        first: tuple[float, float] | None = None
         for size in sizes[:1] if arguments.quick else sizes:
             module = "experiments.benchmarks.dimensions"
             found = measure_in_subprocess(module, dimension, size, environment={})
-            seconds, memory = found["run"], found["peak"] - found["before"]
-            ratio = "" if former is None else f"{seconds / former[1] / (size / former[0]):.2f}"
-            print_row((dimension, str(size), f"{seconds:.2f}", f"{memory:.0f}", ratio))
-            former = size, seconds
+            memory, a_step = found["peak"] - found["before"], 1e6 * found["run"] / found["steps"]
+            # Samples are the steps of a run; modes shorten steps.
+            amount = found["run"] if dimension == "samples" else a_step
+            first = first or (amount, memory)
+            grown = size / sizes[0]
+            print_row(
+                (
+                    *(dimension, str(size), str(found["steps"])),
+                    *(f"{found['run']:.2f}", f"{a_step:.0f}", f"{amount / first[0] / grown:.2f}"),
+                    *(f"{memory:.0f}", f"{memory / first[1] / grown:.2f}"),
+                )
+            )
 
 
 if __name__ == "__main__":

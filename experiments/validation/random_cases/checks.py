@@ -1,8 +1,11 @@
 """What a random case is checked for: finite numbers, true verdicts, stated errors that hold."""
 
+import contextlib
 import dataclasses
+import signal
 import time
 import warnings
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
@@ -10,6 +13,7 @@ import numpy as np
 
 import jaxbeam as jb
 from experiments.validation.random_cases.drawing import LENGTH, SENSORS, Drawn, draw
+from jaxbeam.simulation.integration_plan import TOLERANCE
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.oracles import modal_equations
@@ -34,6 +38,8 @@ class Outcome(NamedTuple):
     faults: tuple[str, ...] = ()
     refusal: str = ""  # message of a case that no step integrates
     seconds: float = 0.0  # of the processor
+    force: float = 0.0  # error of the lowest contact forces, relative to the largest force
+    unfinished: bool = False  # whether it took too long, and was left
 
     @property
     def exceeds(self) -> bool:
@@ -41,30 +47,67 @@ class Outcome(NamedTuple):
         return max(self.true, self.by_scipy or 0.0) > max(self.stated, ROUNDING)
 
 
-def check(seed: int, index: int) -> Outcome:
-    """Draw a case and check it."""
+class TooLongError(Exception):
+    """A case took longer than it may."""
+
+
+@contextlib.contextmanager
+def at_most(seconds: float) -> Iterator[None]:
+    """Raise TooLongError after some processor time (s) of this process; never if it is infinite."""
+
+    def stop(*_):
+        raise TooLongError
+
+    former = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, seconds if np.isfinite(seconds) else 0.0)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.signal(signal.SIGPROF, former)
+
+
+def check(seed: int, index: int, longest: float = np.inf, plain: bool = False) -> Outcome:
+    """Draw a case and check it, for some processor time (s) at most.
+
+    A `plain` check is of one run: finite numbers, and a verdict that agrees with them.
+    """
     start, drawn = time.process_time(), draw(seed, index)
     outcome = Outcome(index, drawn.case.beam.modes)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)
         try:
-            record = jb.simulate(drawn.case)
-        except RuntimeError as error:
-            return outcome._replace(refusal=str(error), seconds=time.process_time() - start)
-        faults = nan_faults(record)
-        tight = _tight(drawn.case)
-    true, by_scipy = 0.0, None
+            with at_most(longest):
+                outcome = _checked(seed, outcome, drawn, plain)
+        except TooLongError:
+            outcome = outcome._replace(unfinished=True)
+    return outcome._replace(seconds=time.process_time() - start)
+
+
+def _checked(seed: int, outcome: Outcome, drawn: Drawn, plain: bool) -> Outcome:
+    """Outcome of a case, but for the time it takes."""
+    try:
+        record = jb.simulate(drawn.case)
+    except RuntimeError as error:
+        return outcome._replace(refusal=str(error))
+    faults = [*nan_faults(record), *consistency_faults(drawn, record)]
+    outcome = outcome._replace(steps=record.steps, stated=float(record.error_estimate))
+    tight = None if plain else _tight(drawn.case)
     if tight is not None:
-        true = relative_error(*(_along(each) for each in (record, tight)))
+        outcome = outcome._replace(
+            true=relative_error(*(_along(each) for each in (record, tight))),
+            force=relative_error(
+                *(np.nan_to_num(each.lowest_contact_force, posinf=0.0) for each in (record, tight)),
+                size=largest_force(tight),
+            ),
+        )
         faults += verdict_faults(record, tight)
-    sampled = np.random.default_rng([seed, index, 1]).random() < SCIPY_SHARE
-    if sampled and highest_phase(drawn) < MAX_PHASE:
+    sampled = np.random.default_rng([seed, outcome.index, 1]).random() < SCIPY_SHARE
+    if sampled and not plain and highest_phase(drawn) < MAX_PHASE:
         by_scipy, wrong = beside_scipy(drawn, record)
+        outcome = outcome._replace(by_scipy=by_scipy)
         faults += wrong
-    stated = float(record.error_estimate)
-    outcome = outcome._replace(steps=record.steps, stated=stated, true=true, by_scipy=by_scipy)
-    seconds = time.process_time() - start
-    return outcome._replace(faults=tuple(faults), seconds=seconds)
+    return outcome._replace(faults=tuple(faults))
 
 
 def _tight(case: jb.Case) -> Record | None:
@@ -96,15 +139,53 @@ def nan_faults(record: Record) -> list[str]:
     return faults
 
 
-def relative_error(found, expected) -> float:
-    """Largest difference relative to the largest of the expected numbers."""
-    size = np.abs(expected).max()
+def consistency_faults(drawn: Drawn, record: Record) -> list[str]:
+    """Numbers of a record that contradict each other, or its verdict."""
+    if "diverges" in record.verdict:
+        return []
+    faults, scale = [], FORCE_ERROR * largest_force(record)
+    if not record.error_estimate <= TOLERANCE:
+        faults.append(f"the stated error is {record.error_estimate:.1e}")
+    deflection = np.abs(record.deflection).max(axis=0)
+    rounding = ROUNDING * np.abs(_along(record)).max()
+    if (deflection > record.peak_deflection + rounding).any():
+        faults.append(f"a sample of {deflection} m exceeds the peaks {record.peak_deflection} m")
+    extremes = np.maximum(-np.asarray(record.smallest), record.largest)
+    if not np.allclose(extremes, record.peak_deflection, rtol=0.0, atol=rounding):
+        faults.append(f"peaks are {record.peak_deflection}, extremes {extremes} m")
+    lost, lowest = np.asarray(record.contact_lost_time), np.asarray(record.lowest_contact_force)
+    forces, on_beam = np.asarray(record.contact_force), np.isfinite(record.load_position)
+    for i, load in enumerate(drawn.loads):
+        leaves = min(load.time_at(drawn.span.length), drawn.duration)
+        pulls = on_beam[:, i] & (forces[:, i] < -scale)
+        if np.isfinite(lost[i]) != (lowest[i] < 0):
+            faults.append(f"the lowest force of load {i} is {lowest[i]:.6g} N: {record.verdict}")
+        if np.isfinite(lost[i]) and not load.entry_time <= lost[i] <= leaves * (1 + 1e-9):
+            faults.append(f"load {i} leaves at {leaves:.6g} s: {record.verdict}")
+        if (np.asarray(record.times)[pulls] < np.nan_to_num(lost[i], nan=np.inf)).any():
+            faults.append(f"load {i} pulls before its contact is lost: {record.verdict}")
+        if forces[on_beam[:, i], i].min(initial=np.inf) < lowest[i] - scale:
+            faults.append(f"load {i} has forces below the lowest, {lowest[i]:.6g} N")
+    if ("loses contact" in record.verdict) != np.isfinite(lost).any():
+        faults.append(f"contact is lost at {lost} s: {record.verdict}")
+    return faults
+
+
+def largest_force(record: Record) -> float:
+    """Largest contact force (N) of a run, at its samples or the lowest of a load."""
+    lowest = np.nan_to_num(record.lowest_contact_force, posinf=0.0)
+    return max(np.abs(part).max(initial=0.0) for part in (record.contact_force, lowest))
+
+
+def relative_error(found, expected, size: float | None = None) -> float:
+    """Largest difference relative to a size, by default the largest of the expected numbers."""
+    size = np.abs(expected).max() if size is None else size
     return float(np.abs(np.asarray(found) - expected).max() / size) if size else 0.0
 
 
 def verdict_faults(record: Record, tight: Record) -> list[str]:
     """Smallest contact forces in which two runs differ."""
-    scale = FORCE_ERROR * np.abs(tight.contact_force).max(initial=0.0)
+    scale = FORCE_ERROR * largest_force(tight)
     lowest, exact = (np.asarray(each.lowest_contact_force) for each in (record, tight))
     wrong = (np.abs(lowest - exact) > scale) & ~np.isnan(exact)
     return [
@@ -130,7 +211,7 @@ def beside_scipy(drawn: Drawn, record: Record) -> tuple[float, list[str]]:
     at_samples = np.searchsorted(times, samples)
     error = relative_error(_along(record), found.deflection[at_samples])
     forces = found.contact_force
-    scale = FORCE_ERROR * np.abs(forces).max(initial=0.0)
+    scale = FORCE_ERROR * max(largest_force(record), np.abs(forces).max(initial=0.0))
     faults = []
     for i, (force, lost_time) in enumerate(zip(forces.T, lost, strict=True)):
         # With a first time of negative force, no force is negative before, and one is after.

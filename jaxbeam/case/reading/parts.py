@@ -8,7 +8,7 @@ from typing import Any
 from jaxbeam.case.aliases import current_keys, current_kind
 from jaxbeam.case.declared_checks import check_field, describe_value, missing_error, suggestion
 from jaxbeam.case.fields import describe_shape, fits_shape
-from jaxbeam.case.kinds import kinds
+from jaxbeam.case.kinds import find_kind, kinds
 from jaxbeam.case.quantities import OF_QUANTITY, unit_of
 from jaxbeam.case.reading.units import in_si
 
@@ -59,15 +59,15 @@ def read_parts(address: str, tables: Any, part_class: type) -> tuple[Any, ...]:
 
 
 def _class_of_kind(address: str, kind: Any, family: type) -> type:
+    if isinstance(kind, str):
+        found = find_kind(family, kind) or find_kind(family, current_kind(address, kind))
+        if found is not None:
+            return found
     classes = kinds(family)
     if kind is None:
         raise ValueError(f"{address}.kind is missing; it may be {', '.join(classes)}")
-    if isinstance(kind, str) and kind not in classes:
-        kind = current_kind(address, kind)
-    if not isinstance(kind, str) or kind not in classes:
-        hint = suggestion(str(kind), classes)
-        raise ValueError(f"{address}.kind cannot be {describe_value(kind)}; {hint}")
-    return classes[kind]
+    hint = suggestion(str(kind), classes)
+    raise ValueError(f"{address}.kind cannot be {describe_value(kind)}; {hint}")
 
 
 def _in_si(address: str, value: Any, unit: str) -> Any:

@@ -8,6 +8,7 @@ from tests.oracles.planted_structures import FINER, coloured_noise, response
 from tests.tuning.modal.test_subspace import small_structure
 from tuning import Log, identify_modes
 from tuning.modal.forced.common_denominator import fit_common_denominator, products, transforms
+from tuning.modal.forced.likelihood import triangular_factor
 from tuning.modal.shapes import mac_matrix
 
 RATE = 40.0
@@ -161,3 +162,17 @@ def test_mistakes(arguments, message):
     )
     with pytest.raises(ValueError, match=message):
         identify_modes(log, band=(2.0, 11.0), **arguments)
+
+
+def test_steps_by_products_are_those_of_orthogonal_columns():
+    """The factor of the products is that of QR, also where products would lose it (one blow)."""
+    random = np.random.default_rng(3)
+    columns = random.normal(size=(400, 5)) + 1j * random.normal(size=(400, 5))
+    other = random.normal(size=400)
+    for apart in (1.0, 1e-5):
+        columns[:, 3] = columns[:, 1] + apart * other
+        rows = np.concatenate([columns.real, columns.imag])
+        expected = np.linalg.qr(rows, mode="r")
+        found = triangular_factor(columns)
+        signs = np.sign(np.diag(found) / np.diag(expected))
+        np.testing.assert_allclose(signs[:, None] * found, expected, atol=1e-9, rtol=1e-9)

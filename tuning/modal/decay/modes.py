@@ -14,7 +14,14 @@ from tuning.modal.ambient import (
     without_duplicates,
 )
 from tuning.modal.decay.fit import fit_decay
-from tuning.modal.decay.stretches import Stretch, excited_samples, free_decays, stacked
+from tuning.modal.decay.leaving import end_of_excitation, shaken_until
+from tuning.modal.decay.stretches import (
+    Stretch,
+    excited_samples,
+    free_decays,
+    prediction_errors,
+    stacked,
+)
 from tuning.modal.preprocessing import prepare, strongest_frequency
 from tuning.modal.result import IdentifiedMode, rejection_reason
 from tuning.modal.samples import MIN_SAMPLES, Samples
@@ -25,6 +32,7 @@ MIN_DECAY_ENERGY = 0.3  # share of the energy of a log in its decays, if they ar
 LONG_FALL_NEPERS = 2.0  # or fall of the energy; 95 % of that of an exponential falls by 3
 MIN_START_LEVEL = 0.2  # energy at the start of such a decay over the mean energy of the log
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
+MAX_CUTS = 3  # of a decay in which the structure is found to be excited
 NOT_REPRODUCED = "not the same in parts of the window"
 NONLINEAR_DECAY = 2.5, 4.5  # decay rates over that of a mode, of what its nonlinearity adds to it
 NONLINEAR_MAC = 0.95
@@ -42,19 +50,31 @@ class Decays(NamedTuple):
 def excited(
     samples: Samples, derivatives: tuple[int, ...], band: tuple[float, float]
 ) -> tuple[Bool[np.ndarray, " time"], ...]:
-    """Samples of each record at which the structure is struck, at the rate of the log.
+    """Samples of each record at which the structure is excited, at the rate of the log.
+
+    They are those struck by blows, and all until a crossing load has left (`leaving`).
 
     Below half the band (Hz) drift is removed; above it all frequencies count.
     """
     prepared = prepare(samples.records, samples.starts, samples.rate, band)
     frequency = strongest_frequency(prepared.records, prepared.rate, derivatives, band)
     sos = butter(2, band[0] / 2, "highpass", fs=samples.rate, output="sos")
-    return tuple(
-        excited_samples(
-            sosfiltfilt(sos, detrend(record, axis=0), axis=0), samples.rate, 1 / frequency
-        )
-        for record in samples.records
-    )
+    found = []
+    for record, own in zip(samples.records, prepared.records, strict=True):
+        values = sosfiltfilt(sos, detrend(record, axis=0), axis=0)
+        marks = excited_samples(values, samples.rate, 1 / frequency)
+        found.append(_with_excitation(marks, own, max(int(prepared.rate / frequency), 4)))
+    return tuple(found)
+
+
+def _with_excitation(marks, record, size) -> Bool[np.ndarray, " time"]:
+    """Struck samples, with all before the end of a lasting excitation of the record in the band."""
+    ratio = marks.size / len(record)
+    coarse = np.zeros(len(record), bool)
+    coarse[np.minimum((np.flatnonzero(marks) / ratio).astype(int), len(record) - 1)] = True
+    errors = np.stack([prediction_errors(v, np.ones(v.size)) for v in record.T], axis=1)
+    ends = end_of_excitation(errors, record, coarse, size)
+    return marks | (np.arange(marks.size) < ends * ratio)
 
 
 def free_decay_modes(
@@ -84,9 +104,35 @@ def free_decay_modes(
         kind or given or _dominate(decays, prepared.records, ratio, prepared.rate / frequency)
     ):
         return None
-    windows, used = stacked(samples.records, decays)
-    if len(windows) < MIN_SAMPLES // 2:
+    for _ in range(MAX_CUTS + 1):
+        windows, used = stacked(samples.records, decays)
+        if len(windows) < MIN_SAMPLES // 2:
+            return None
+        fits, diagrams = _fits(windows, used, samples, band, order)
+        if not fits:
+            return None
+        measured, fitted = (
+            sum(_within(getattr(fit, name), samples.rate, part) for part, fit in fits)
+            for name in ("measured", "fitted")
+        )
+        shaken = 0 if given or len(used) > 1 else shaken_until(
+            measured, fitted, 2 * (band[1] - band[0]) / samples.rate
+        )  # fmt: skip
+        if not shaken:
+            break
+        decays = (used[0]._replace(start=used[0].start + shaken),)
+    channels = samples.records[0].shape[1]
+    energy = np.sum(measured**2, axis=0)
+    limit = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_ENERGY
+    found = _candidates(fits, channels, len(windows) / samples.rate, band)
+    good = any(not one.reason for one in found)
+    if kind is None and not (good and np.sum((measured - fitted) ** 2) < limit * energy.sum()):
         return None
+    return found, diagrams, Decays(used, measured[:, :channels], fitted[:, :channels])
+
+
+def _fits(windows, used, samples: Samples, band, order):
+    """Fits of decays side by side in each part of a band (Hz), and stabilisation diagrams."""
     channels = samples.records[0].shape[1]
     pieces = tuple(windows[:, i : i + channels] for i in range(0, windows.shape[1], channels))
     starts = tuple(one.start / samples.rate for one in used)
@@ -99,19 +145,7 @@ def free_decay_modes(
         for part in divided_band(band)
         if (fit := fit_decay(windows, samples.rate, overlapping(part, band), channels, poles))
     ]
-    if not fits:
-        return None
-    measured, fitted = (
-        sum(_within(getattr(fit, name), samples.rate, part) for part, fit in fits)
-        for name in ("measured", "fitted")
-    )
-    energy = np.sum(measured**2, axis=0)
-    limit = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_ENERGY
-    found = _candidates(fits, channels, len(windows) / samples.rate, band)
-    good = any(not one.reason for one in found)
-    if kind is None and not (good and np.sum((measured - fitted) ** 2) < limit * energy.sum()):
-        return None
-    return found, diagrams, Decays(used, measured[:, :channels], fitted[:, :channels])
+    return fits, diagrams
 
 
 def _within(values, rate, part):

@@ -58,8 +58,8 @@ def excited_samples(
         around = np.sqrt(_moving_mean(values**2, span)) + 1e-12 * np.abs(values).max() + 1e-300
         forward, backward = np.ones((2, values.size), bool)
         for scale in (around, np.ones(values.size)):
-            forward &= _is_large(_prediction_errors(values, scale), around, span)
-            errors = _prediction_errors(values[::-1], scale[::-1])[::-1]
+            forward &= _is_large(prediction_errors(values, scale), around, span)
+            errors = prediction_errors(values[::-1], scale[::-1])[::-1]
             backward &= _is_large(errors, around, span)
         struck |= _widened(forward) & _widened(backward)
     return struck
@@ -94,7 +94,9 @@ def _widened(samples):
     return np.convolve(samples, np.ones(2 * CONTACT_SAMPLES + 1), "same") > 0.5
 
 
-def _prediction_errors(values, scale):
+def prediction_errors(
+    values: Float[np.ndarray, " time"], scale: Float[np.ndarray, " time"]
+) -> Float[np.ndarray, " time"]:
     """Errors of an autoregressive model, zero where the past is too short.
 
     The model has the least sum of absolute errors over a scale (by iteratively reweighted least

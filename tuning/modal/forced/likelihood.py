@@ -10,9 +10,15 @@ are the residues by least squares (LSFD), of rank one: shape times participation
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int, Shaped
+from jaxtyping import Complex, Float, Int
 
 from tuning.modal.forced.common_denominator import Lines
+from tuning.modal.forced.terms import (
+    both_parts,
+    columns_of_model,
+    columns_of_poles,
+    pole_directions,
+)
 from tuning.modal.forced.uncertainty import (
     FreeErrors,
     degrees_of_freedom,
@@ -25,6 +31,9 @@ FEWER_REST_POWERS = (0, 1)  # with which poles are compared
 STEPS = 12
 WIDE = 16  # lines on either side whose errors tell the level of a line
 MIN_SPREAD = 1e-3  # of errors, over that of all lines
+MIN_PIVOT = (
+    1e-4  # of Cholesky's factor, whose relative errors are those of rounding over its square
+)
 MAX_STEP = 0.5  # of a pole, over its decay rate
 CONVERGED = 1e-4  # step over the decay rate; what is left after it is of the order of its square
 MAX_SHIFT = 3.0  # from the start, over the decay rate; beyond, a pole is none of the data
@@ -110,11 +119,13 @@ def fit_modal_model(
     fewer = refined_poles(lines, poles, moving, FEWER_REST_POWERS)
     others = fewer[moving] - poles[moving]
     fit = linear_fit(lines, poles)
-    columns = _pole_columns(lines, poles[moving])
-    inside, directions = fit.basis.T @ columns, _pole_directions(lines, fit, poles.size, moving)
+    columns = both_parts(columns_of_poles(lines, poles[moving]))
+    inside = fit.basis.T @ columns
+    directions = pole_directions(lines, fit.found, poles.size, moving)
     slopes = np.einsum("rc,cko->rko", columns - fit.basis @ inside, directions, optimize=True)
     by_poles = np.tensordot(fit.inverse_factor @ inside, directions, axes=1)
-    weight, normal, _ = _normal_equations(fit, columns, directions)
+    weight = 1 / np.maximum(np.mean(fit.errors**2, axis=0), 1e-300)
+    normal = _normal(columns.T @ columns - inside.T @ inside, directions, weight)
     free = free_errors(fit.errors, fit.columns, fit.inverse, slopes, normal, weight)
     return FittedModel(
         plain, lines, poles, moving, fit, slopes, by_poles, weight, normal, free,
@@ -122,17 +133,13 @@ def fit_modal_model(
     )  # fmt: skip
 
 
-def _normal_equations(fit: LinearFit, columns, directions):
-    """Weights of the outputs; matrix and right-hand side of the normal equations of the poles.
+def _normal(gram, directions, weight):
+    """Matrix of the normal equations of the poles.
 
-    Slopes by the poles are `columns` in some `directions`, less what residues make up for.
+    Slopes by the poles are columns in some `directions`; `gram` has their products, less what
+    residues make up for.
     """
-    weight = 1 / np.maximum(np.mean(fit.errors**2, axis=0), 1e-300)
-    inside = fit.basis.T @ columns
-    gram = columns.T @ columns - inside.T @ inside
-    matrix = np.einsum("cko,cd,dlo,o->kl", directions, gram, directions, weight, optimize=True)
-    right = np.einsum("cko,co,o->k", directions, columns.T @ fit.errors, weight, optimize=True)
-    return weight, matrix, right
+    return np.einsum("cko,cd,dlo,o->kl", directions, gram, directions, weight, optimize=True)
 
 
 def refined_poles(
@@ -144,10 +151,11 @@ def refined_poles(
     """Poles after Gauss-Newton steps; those that leave their surroundings return to the start."""
     poles = starts.astype(complex)
     for _ in range(STEPS if moving.size else 0):
-        fit = linear_fit(lines, poles, powers)
-        directions = _pole_directions(lines, fit, poles.size, moving)
-        _, normal, right = _normal_equations(fit, _pole_columns(lines, poles[moving]), directions)
-        step = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
+        found, gram, along, squares = _reduced(lines, poles, moving, powers)
+        directions = pole_directions(lines, found, poles.size, moving)
+        weight = 2 * len(lines.z) / np.maximum(squares, 1e-300)
+        right = np.einsum("cko,co,o->k", directions, along, weight, optimize=True)
+        step = np.linalg.lstsq(_normal(gram, directions, weight), right, rcond=1e-12)[0]
         change = step[: moving.size] + 1j * step[moving.size :]
         limit = MAX_STEP * np.abs(poles[moving].real)
         change *= np.minimum(1, limit / np.maximum(np.abs(change), 1e-300))
@@ -158,6 +166,42 @@ def refined_poles(
         if np.all(np.abs(change) < CONVERGED * np.abs(poles[moving].real)):
             break
     return poles
+
+
+def _reduced(lines: Lines, poles, moving, powers):
+    """What a step of Gauss-Newton needs of all lines.
+
+    These are the coefficients (column, output), the products of the columns of the moving poles,
+    less what residues make up for, their products with the errors (column, output), and the sums of
+    squared errors. All follow from the triangular factor of the columns and outputs side by side.
+    """
+    columns, slopes = columns_of_model(lines, poles, powers), columns_of_poles(lines, poles[moving])
+    factor = triangular_factor(np.concatenate([columns, slopes, lines.outputs], axis=1))
+    first, second = columns.shape[1], columns.shape[1] + slopes.shape[1]
+    found = np.linalg.lstsq(factor[:first, :first], factor[:first, second:], rcond=1e-15)[0]
+    own, errors = factor[first:second, first:second], factor[first:, second:]
+    along = own.T @ errors[: second - first]
+    return found, own.T @ own, along, np.sum(errors**2, axis=0)
+
+
+def triangular_factor(
+    columns: Complex[np.ndarray, "line column"],
+) -> Float[np.ndarray, "column column"]:
+    """Upper triangular R of the QR decomposition of real and imaginary parts of columns.
+
+    It is Cholesky's factor of the products of all columns, which costs half as much, unless columns
+    of unit size depend on those before them but for MIN_PIVOT: products lose their difference.
+    """
+    rows = np.ascontiguousarray(columns.T).view(float)
+    products = rows @ rows.T
+    size = np.sqrt(np.maximum(np.diag(products), 1e-300))
+    try:
+        factor = np.linalg.cholesky(products / np.multiply.outer(size, size)).T
+    except np.linalg.LinAlgError:
+        factor = np.zeros_like(products)
+    if np.min(np.diag(factor)) < MIN_PIVOT:
+        return np.linalg.qr(rows.T, mode="r")
+    return factor * size
 
 
 def whitened(lines: Lines, poles: Complex[np.ndarray, " mode"]) -> Lines:
@@ -176,120 +220,10 @@ def linear_fit(
 ) -> LinearFit:
     """Residues, transients and rest by least squares, for poles (1/s) and `powers` of z."""
     target = both_parts(lines.outputs)
-    columns = _columns(lines, poles, powers)
+    columns = both_parts(columns_of_model(lines, poles, powers))
     basis, factor = np.linalg.qr(columns)
     inside = basis.T @ target
     inverse_factor = np.linalg.pinv(factor)
     return LinearFit(
         columns, basis, inverse_factor, inverse_factor @ inside, target - basis @ inside
     )
-
-
-def _columns(lines: Lines, poles, powers):
-    """Real parts above imaginary parts of the columns: residues, transients, rest."""
-    columns = _by_coefficients(lines, resonances_of(lines, poles), transients_of(lines, poles))
-    signals = np.concatenate([lines.inputs, lines.unforced], axis=1)
-    return both_parts(np.concatenate([*columns, times_signals(_rest(lines, powers), signals)], 1))
-
-
-def _by_coefficients(lines: Lines, resonances, transients):
-    """Columns by real, then imaginary parts of residues, and likewise of transients."""
-    columns = []
-    for signals, first, second in ((lines.inputs, *resonances), (lines.unforced, *transients)):
-        columns += [
-            times_signals(first + second, signals),
-            times_signals(1j * (first - second), signals),
-        ]
-    return columns
-
-
-def _rest(lines: Lines, powers):
-    """Terms (line, term) for modes outside of the band: above it powers of z, below it of 1 / w."""
-    angles = np.angle(lines.z)
-    below = 1j * angles / np.exp(np.mean(np.log(angles)))
-    return np.concatenate([lines.z[:, None] ** np.array(powers), 1 / below[:, None] ** [1, 2]], 1)
-
-
-def both_parts(values: Complex[np.ndarray, "line column"]) -> Float[np.ndarray, "row column"]:
-    """Real parts above imaginary parts."""
-    return np.concatenate([values.real, values.imag])
-
-
-def resonances_of(
-    lines: Lines, poles: Complex[np.ndarray, " mode"]
-) -> tuple[Complex[np.ndarray, "line mode"], Complex[np.ndarray, "line mode"]]:
-    """1 / (i w - p) and the same of the conjugate poles (line, mode)."""
-    s = 1j * np.angle(lines.z)[:, None] / lines.step
-    return 1 / (s - poles), 1 / (s - poles.conj())
-
-
-def transients_of(
-    lines: Lines, poles: Complex[np.ndarray, " mode"]
-) -> tuple[Complex[np.ndarray, "line mode"], Complex[np.ndarray, "line mode"]]:
-    """1 / (z - exp(p T)) and the same of the conjugate poles (line, mode)."""
-    roots = np.exp(poles * lines.step)
-    return 1 / (lines.z[:, None] - roots), 1 / (lines.z[:, None] - roots.conj())
-
-
-def times_signals(
-    terms: Complex[np.ndarray, "line term"], signals: Shaped[np.ndarray, "line signal"]
-) -> Complex[np.ndarray, "line column"]:
-    """Products of all terms and signals, the signals of a term side by side."""
-    return (terms[:, :, None] * signals[:, None, :]).reshape(len(terms), -1)
-
-
-def coefficient_places(lines: Lines, modes: int, k: int) -> Int[np.ndarray, " place"]:
-    """Rows of the coefficients that are those of the k-th of some modes, forced and free."""
-    places, first = [], 0
-    for signals in (lines.inputs.shape[1], lines.unforced.shape[1]):
-        for _ in range(2):  # real parts, imaginary parts
-            places.append(first + k * signals + np.arange(signals))
-            first += modes * signals
-    return np.concatenate(places)
-
-
-def split_coefficients(
-    found: Float[np.ndarray, "column output"], lines: Lines, modes: int
-) -> list[Complex[np.ndarray, "mode signal output"]]:
-    """Complex residues (mode, input, output) and transients (mode, record, output)."""
-    parts, first = [], 0
-    for signals in (lines.inputs.shape[1], lines.unforced.shape[1]):
-        half = modes * signals
-        both = found[first : first + half] + 1j * found[first + half : first + 2 * half]
-        parts.append(both.reshape(modes, signals, both.shape[1]))
-        first += 2 * half
-    return parts
-
-
-def _pole_columns(lines: Lines, poles) -> Float[np.ndarray, "row column"]:
-    """Columns whose combinations are the derivatives of the responses by the poles.
-
-    They are 1 / (i w - p)^2, and the same of the transients, times the signals.
-    """
-    step = lines.step
-    factor = step * np.exp(poles * step)
-    (own, other), (free, mirrored) = resonances_of(lines, poles), transients_of(lines, poles)
-    transients = factor * free**2, factor.conj() * mirrored**2
-    return both_parts(
-        np.concatenate(_by_coefficients(lines, (own**2, other**2), transients), axis=1)
-    )
-
-
-def _pole_directions(lines: Lines, fit: LinearFit, modes: int, moving):
-    """Combinations (column, part, output) of the columns of the poles.
-
-    They are derivatives of the responses by real, then imaginary parts of moving poles: with the
-    real part a and the imaginary part b of a coefficient, and its two columns c and d, these are
-    a c + b d, and a d - b c.
-    """
-    size, parts = moving.size, []
-    for coefficients in split_coefficients(fit.found, lines, modes):
-        own = coefficients[moving]  # mode, signal, output
-        spread = np.zeros((size, own.shape[1], size, own.shape[2]), complex)
-        spread[np.arange(size), :, np.arange(size)] = own
-        flat = spread.reshape(size * own.shape[1], size, own.shape[2])
-        parts += [
-            np.concatenate([flat.real, -flat.imag], axis=1),
-            np.concatenate([flat.imag, flat.real], axis=1),
-        ]
-    return np.concatenate(parts)

@@ -12,13 +12,10 @@ from jaxtyping import Complex, Float
 from scipy.stats import f as fisher
 
 from tuning.modal.forced.common_denominator import Lines
-from tuning.modal.forced.likelihood import (
-    FittedModel,
-    LinearFit,
+from tuning.modal.forced.likelihood import FittedModel, LinearFit, linear_fit, refined_poles
+from tuning.modal.forced.terms import (
     both_parts,
     coefficient_places,
-    linear_fit,
-    refined_poles,
     resonances_of,
     times_signals,
     transients_of,
@@ -75,23 +72,28 @@ def missing_pole(model: FittedModel, band: tuple[float, float]) -> tuple[complex
         for angular in np.geomspace(low, high, int(np.log(high / low) / (2 * ratio)) + 2).tolist()
     ]
     # Without the terms of the model in them, columns explain less than they could: a first choice.
-    best = sorted(tried, key=lambda pole: -_least_statistic(model, pole))[:MOST_PROMISING]
+    least = _least_statistics(model, tried)
+    best = [tried[k] for k in np.argsort(-least, kind="stable")[:MOST_PROMISING]]
     chances = [_chance(model, pole, model.freedom_at(pole), 1) for pole in best]
     least = int(np.argmin(chances))
     return best[least], len(tried) * chances[least]
 
 
-def _least_statistic(model: FittedModel, pole) -> float:
+def _least_statistics(model: FittedModel, tried) -> Float[np.ndarray, " tried"]:
     """What 1 / (s - p) explains of the errors, over their variance, if the model keeps its own."""
-    count, peak = len(model.lines.z), model.peak_at(pole)
-    near = NEAR_LINES * model.lines.spacing + NEAR_WIDTHS * abs(pole.real)
-    lines = np.abs(np.angle(model.lines.z) / model.lines.step - pole.imag) < near
-    columns = _columns_of(model.lines.part(lines), pole, 1)
-    errors = model.fit.errors.reshape(2, count, -1)[:, lines]
-    along = np.linalg.qr(columns)[0].T @ errors.reshape(len(columns), -1)
-    rows = slice(max(peak - NEIGHBOURS, 0), peak + NEIGHBOURS + 1)
-    variance = np.mean(model.fit.errors[:count][rows] ** 2, axis=0)
-    return float(np.sum(np.sum(along**2, axis=0) / np.maximum(variance, 1e-300)))
+    count = len(model.lines.z)
+    angular = np.angle(model.lines.z) / model.lines.step
+    errors = model.fit.errors.reshape(2, count, -1)
+    variance = line_means(model.fit.errors**2, NEIGHBOURS)
+    reach = NEAR_LINES * model.lines.spacing
+    found = []
+    for pole in tried:
+        near = np.abs(angular - pole.imag) < reach + NEAR_WIDTHS * abs(pole.real)
+        columns = _columns_of(model.lines.part(near), pole, 1)
+        along = np.linalg.qr(columns)[0].T @ errors[:, near].reshape(len(columns), -1)
+        own = variance[np.argmin(np.abs(angular - pole.imag))]
+        found.append(np.sum(np.sum(along**2, axis=0) / np.maximum(own, 1e-300)))
+    return np.array(found)
 
 
 def _columns_of(lines: Lines, pole, power):

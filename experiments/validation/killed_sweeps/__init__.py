@@ -1,0 +1,1 @@
+"""Sweeps on a cluster whose processes are killed at random, on disks that are slow or full."""
