@@ -43,10 +43,9 @@ def lift():
     return np.sum(moment * moments * np.sin(k * 0.3) * 2 / (0.6 * 13.2 * k**4))
 
 
-def _butterworth(order, cutoff) -> tuple[np.ndarray, np.ndarray, float]:
-    """Zeros, poles and gain of a sampled Butterworth filter of a cut-off frequency (Hz)."""
-    found: Any = scipy.signal.butter(order, cutoff, fs=1 / PERIOD, output="zpk")
-    return found
+def butterworth(order, cutoff) -> Any:
+    """Zeros, poles and gain of a filter at the sampling period."""
+    return scipy.signal.butter(order, cutoff, fs=1 / PERIOD, output="zpk")
 
 
 @pytest.mark.parametrize(("cutoff", "order", "late"), [(5.0, 10, 0), (8.0, 3, 1), (None, 2, 0)])
@@ -57,15 +56,14 @@ def test_commands_by_the_table_behind_the_reference_filter(cutoff, order, late):
     commands, readings = np.asarray(record.command)[:, 0], np.asarray(record.measured)[:, 0]
     acting = np.concatenate([np.zeros(1 + late), commands])[: len(commands)]
     frequency = np.pi**2 / 0.6**2 * np.sqrt(13.2 / 0.81) / (2 * np.pi)
-    stated = LAW.order, float(LAW.reference) * frequency
-    zeros, poles, gain = _butterworth(*stated)
+    zeros, poles, gain = butterworth(LAW.order, float(LAW.reference) * frequency)
     more = max(0, 2 * -(-order // 2) - LAW.order) if cutoff else 0
     if more:
-        fast = _butterworth(more, 0.4 / PERIOD)
+        fast = butterworth(more, 0.4 / PERIOD)
         zeros, poles, gain = np.append(zeros, fast[0]), np.append(poles, fast[1]), gain * fast[2]
     reference = scipy.signal.zpk2sos(zeros, poles, gain)
     if cutoff:  # zeros at half the sampling frequency cancel
-        _, filter_poles, filter_gain = _butterworth(order, cutoff)
+        _, filter_poles, filter_gain = butterworth(order, cutoff)
         zeros = np.append(filter_poles, zeros[order:])
         gain = gain / filter_gain
     equaliser = scipy.signal.zpk2sos(zeros, poles, gain)
