@@ -43,7 +43,8 @@ class StepTrial(NamedTuple):
 
     Those of the beam's modal model, then those of vehicles. Errors are at least the `share` of
     those of the `former` trial, if there was one. `shortest` is the step (s) between those load
-    events that several lie between: a run of longer ones there may have larger errors.
+    events that several lie between: a run of longer ones there may have larger errors. Errors of a
+    run whose law is not asked in the trial are the `amplification` of those of the trial.
     """
 
     times: Float[np.ndarray, " time"]
@@ -52,6 +53,7 @@ class StepTrial(NamedTuple):
     former: "StepTrial | None" = None
     share: float = 0.0
     shortest: float = np.inf
+    amplification: float = 1.0
 
 
 def check_step_count(count: float, step: float) -> None:

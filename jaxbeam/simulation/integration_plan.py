@@ -48,7 +48,9 @@ from jaxbeam.simulation.errors import step_errors
 TOLERANCE = 1e-7  # relative to the largest deflection
 MAX_STEPS_PER_SAMPLE = 10**5  # time steps between samples of a controlled run
 MAX_KNOWN_EVENTS = 10000  # of a run without compilation, which would take less time beyond
-ROUNDING = 1e-11  # relative change of a response that is none of the steps
+# Errors of a closed loop over those under its commands, at most: predictive control, whose programs
+# are ill-conditioned, raised them 5000 times.
+AMPLIFICATION = 1e4
 # Steps between samples over those of the trials, which begin at load events: where forces change
 # sharply, errors were up to fourteen times as large with steps that begin elsewhere.
 SHARE_OF_TRIAL_STEP = 0.8
@@ -196,8 +198,8 @@ def _choose_substeps(
     """Number of steps between events of a schedule, relative error of the deflection, and trial.
 
     A `first_run` takes the smallest number of steps. If steps half as long change its response
-    to the same commands by rounding only, no further run closes the loop: its steps have no error
-    that the law could amplify. There is no trial of a run that diverges.
+    to the same commands so little that a law could not amplify it to the tolerance, no further run
+    closes the loop; stated is the amplified error. There is no trial of a run that diverges.
     """
     step, interval = longest_trial_step(case, shapes), float(schedule.lengths.max())
     if interval / step > MAX_STEPS_PER_SAMPLE:
@@ -229,8 +231,10 @@ def _choose_substeps(
             held = HeldCommands(policy.model, commands, policy.state_bound)
             fine = np.asarray(trial_run(case, shapes, schedule, np.asarray(2 * min_substeps), held))
             change = largest_change(deflections(first_states), deflections(fine), least)
-            if UNSAMPLED * change <= min(ROUNDING, tolerance):
-                return min_substeps, UNSAMPLED * change, trial(first_states, fine)
+            error = AMPLIFICATION * UNSAMPLED * change
+            if error <= tolerance:
+                amplified = trial(first_states, fine)._replace(amplification=AMPLIFICATION)
+                return min_substeps, error, amplified
 
     @functools.cache
     def states(halvings):
@@ -257,7 +261,7 @@ def _sensor_errors(case: Case, shapes: StaticShapes, trial: StepTrial | None) ->
     if trial is None:
         return (np.nan,) * len(case.sensors)
     model = modal_model(case, shapes.layout, shapes.coupled)
-    errors = step_errors(case, model, trial)
+    errors = trial.amplification * step_errors(case, model, trial)
     if trial.former is not None:
         errors = np.maximum(errors, trial.share * step_errors(case, model, trial.former))
     return tuple(map(float, errors))

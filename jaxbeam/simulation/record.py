@@ -41,10 +41,9 @@ class Record(RecordViews):
     change, the one just after. `failures` counts the steps of the controller so far without a
     solution of its optimisation. If the closed loop diverges the samples are NaN from then on, and
     so are the peaks. `error_estimate` of the time steps is relative to the largest deflection,
-    `step_errors` to the largest value of what each sensor measures, both for given commands where
-    the steps are exact to rounding. `controller_readings`
-    are the readings that a sampled controller has received, None without one; `acting_command` are
-    the commands behind hysteresis and creep of the actuators, None if no actuator has any.
+    `step_errors` to the largest value of what each sensor measures. `controller_readings` are the
+    readings that a sampled controller has received, None without one; `acting_command` are the
+    commands behind hysteresis and creep of the actuators, None if no actuator has any.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
