@@ -9,8 +9,8 @@ Beside it stand the table tuned for each rig (with 10 or 20 Hz, 20 ms and the ri
 and the one drawn by hand, which know their plant, too. The worst and mean of the shares of the
 attainable reduction (linear program, full knowledge) are over all rigidities and loads.
 
-A last row gives the scheduled law wrong numbers of its plant: the filter 5 % off, a delay of half a
-period more, and the rigidity 10 % off.
+A last row gives the scheduled law wrong numbers of its plant: the filter 5 % off, and the rigidity
+10 % off, with commands that come half a period later.
 """
 
 import dataclasses
