@@ -35,7 +35,7 @@ def probed(case: jb.Case, delay: float) -> jb.Case:
     bits[:SAMPLES_PER_BIT] = 0
     times = PERIOD * np.arange(PROBE_SAMPLES)
     controller = jb.Prescribed(
-        [0.0], times=times, values=[PROBE * bits], period=PERIOD, delay=delay
+        offsets=[0.0], times=times, values=[PROBE * bits], period=PERIOD, delay=delay
     )
     run = jb.Run(PROBE_SAMPLES * PERIOD, sample_rate=1 / PERIOD)
     return dataclasses.replace(case, loads=(), controller=controller, run=run)
