@@ -73,7 +73,7 @@ def search(start: np.ndarray, generations: int, merit_of, seed: int = 0) -> np.n
         covariance = (1 - RATE) * covariance + RATE * (scaled.T * weights) @ scaled
         covariance += 1e-6 * np.eye(len(start))
         mean, size = mean + weights @ (points[order] - mean), size * SHRINKING
-        print(generation, round(best_merit, 4), np.round(best, 3).tolist(), flush=True)
+        print(generation, f"{best_merit:.4f}", np.round(best, 3).tolist(), flush=True)
     return best
 
 
