@@ -70,7 +70,10 @@ def table(count: int, kinds: Sequence[str] = tuple(WORDS)) -> ReportTable:
 
 
 def main(arguments: list[str]) -> None:
-    """Write the rows for a number of structures (10), of all kinds or of some; others stay."""
+    """Write the rows for a number of structures (10), of all kinds or of some; others stay.
+
+    Raises SystemExit for an unknown kind.
+    """
     kinds = arguments[1:] or list(WORDS)
     unknown = [kind for kind in kinds if kind not in WORDS]
     if unknown:

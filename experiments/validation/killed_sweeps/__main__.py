@@ -169,7 +169,10 @@ def _one_sentence(said: str, faults: list[str]) -> str:
 
 
 def main() -> int:
-    """Run the sweeps of some seeds; return 1 if a law does not hold, else 0."""
+    """Run the sweeps of some seeds; return 1 if a law does not hold, else 0.
+
+    Raises RuntimeError if the first sweep, of which no process is killed, does not end.
+    """
     options = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -22,7 +22,10 @@ class Cluster:
         self.workers: list[subprocess.Popen | None] = [None] * workers
 
     def start(self) -> str:
-        """Start all processes that do not run, and wait for the scheduler; returns its address."""
+        """Start all processes that do not run, and wait for the scheduler; returns its address.
+
+        Raises RuntimeError if no scheduler starts.
+        """
         if self.scheduler is None or self.scheduler.poll() is not None:
             self._file.unlink(missing_ok=True)
             self.scheduler = self._process("distributed.cli.dask_scheduler", "--port", "0")

@@ -53,7 +53,7 @@ class TooLongError(Exception):
 
 @contextlib.contextmanager
 def at_most(seconds: float) -> Iterator[None]:
-    """Raise TooLongError after some processor time (s) of this process; never if it is infinite."""
+    """Raises TooLongError after some processor time (s) of this process; never if it is infinite."""
 
     def stop(*_):
         raise TooLongError
