@@ -53,7 +53,10 @@ class TooLongError(Exception):
 
 @contextlib.contextmanager
 def at_most(seconds: float) -> Iterator[None]:
-    """Raises TooLongError after some processor time (s) of this process; never if it is infinite."""
+    """A context that ends after some processor time (s) of this process; never if it is infinite.
+
+    Raises TooLongError then.
+    """
 
     def stop(*_):
         raise TooLongError
