@@ -17,17 +17,14 @@ AHEAD = float(os.environ.get("KILLED_SWEEPS_CLOCK", "0"))
 
 
 def change_writes() -> None:
-    """Have blocks written slowly, and without space for some.
-
-    Raises OSError in the writing of those.
-    """
+    """Have blocks written slowly, and without space for some."""
     from jaxbeam.sweeps.store import ZarrStore
 
     slow, full = (float(os.environ.get(f"KILLED_SWEEPS_{name}", "0")) for name in ("SLOW", "FULL"))
     draws, result_array = random.Random(os.getpid()), ZarrStore._result_array
 
     def array(self, name, values):
-        """The array of a result, just before a block is written to it."""
+        """The array of a result, just before a block is written to it; raises OSError at times."""
         time.sleep(draws.expovariate(1 / slow) if slow else 0.0)
         if draws.random() < full:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

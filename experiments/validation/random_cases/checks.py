@@ -59,6 +59,7 @@ def at_most(seconds: float) -> Iterator[None]:
     """
 
     def stop(*_):
+        """Handler of the signal; raises TooLongError."""
         raise TooLongError
 
     former = signal.signal(signal.SIGPROF, stop)
