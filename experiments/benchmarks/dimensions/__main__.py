@@ -29,7 +29,7 @@ from jaxbeam.simulation.simulate import ContactLossWarning
 
 SIZES = {
     "samples": (10_000, 100_000, 1_000_000),
-    "modes": (50, 100, 200),
+    "modes": (25, 50, 100),
     "loads": (15, 30, 60),
     "supports": (7, 15, 30),
 }
