@@ -33,7 +33,8 @@ def checked(*, typechecker):
         annotations = getattr(decorated, "__annotations__", None)
         if not annotations:
             return decorated
-        if "{" in str([*annotations.values()]):  # a size that is computed from the arguments
+        computed = "{" in str([*annotations.values()])  # a size, from the arguments
+        if computed or inspect.isgeneratorfunction(decorated):
             return _decorated(decorated, typechecker=typechecker)
         return _with_names(typechecker(decorated), decorated)
 
