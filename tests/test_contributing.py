@@ -71,7 +71,6 @@ def test_pytest_accepts_its_options(command):
         "pytest",
         *options,
         "--collect-only",
-        "-q",
         "tests/test_layers.py",
     ]
     ended = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)

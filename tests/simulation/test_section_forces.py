@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.case import replace
+from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.integration_plan import integration_plan
 from tests.differences import central
 from tests.modules import ROOT
