@@ -9,6 +9,7 @@ are, and the others are checked once by beartype, with names of axes of each cal
 import dataclasses
 import functools
 import inspect
+import typing
 
 import jaxtyping
 
@@ -30,15 +31,29 @@ def checked(*, typechecker):
             return property(*(part and decorate(part) for part in parts))
         if isinstance(decorated, classmethod | staticmethod):
             return type(decorated)(decorate(decorated.__func__))
-        annotations = getattr(decorated, "__annotations__", None)
+        annotations = [*getattr(decorated, "__annotations__", {}).values()]
         if not annotations:
             return decorated
-        computed = "{" in str([*annotations.values()])  # a size, from the arguments
-        if computed or inspect.isgeneratorfunction(decorated):
+        # Generators, sizes computed from arguments, and names of types that are imported later.
+        if (
+            inspect.isgeneratorfunction(decorated)
+            or "{" in str(annotations)
+            or any(map(_names_a_type, annotations))
+        ):
             return _decorated(decorated, typechecker=typechecker)
         return _with_names(typechecker(decorated), decorated)
 
     return decorate
+
+
+def _names_a_type(annotation) -> bool:
+    """Whether an annotation is, or has in its brackets, a type by its name."""
+    if isinstance(annotation, list | tuple):
+        return any(map(_names_a_type, annotation))
+    if isinstance(annotation, str | typing.ForwardRef):
+        return True
+    literal = typing.get_origin(annotation) is typing.Literal
+    return not literal and any(map(_names_a_type, typing.get_args(annotation)))
 
 
 def _with_names(function, original):

@@ -30,28 +30,19 @@ def raised(function: ast.FunctionDef) -> set[str]:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_modules_functions_and_classes_are_documented(name):
-    tree = parse(FILES[name])
+def test_what_is_public_is_documented_with_what_it_raises(name):
+    """Modules, functions, classes and methods; a method may inherit its docstring."""
+    tree, module = parse(FILES[name]), None
     assert not tree.body or ast.get_docstring(tree), f"{name} has no docstring"
     for node in public(tree.body, ast.FunctionDef, ast.ClassDef):
         overloaded = any(ast.unparse(one) == "overload" for one in node.decorator_list)
         assert overloaded or ast.get_docstring(node), f"{name}.{node.name} has no docstring"
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_methods_are_documented_where_they_are_declared(name):
-    """A method that implements an interface inherits its docstring."""
-    module = None
-    for node in public(parse(FILES[name]).body, ast.ClassDef):
+    for node in public(tree.body, ast.ClassDef):
         for method in public(node.body, ast.FunctionDef):
             module = module or importlib.import_module(name.removesuffix(".__init__"))
             attribute = getattr(getattr(module, node.name), method.name)
             assert inspect.getdoc(attribute), f"{name}.{node.name}.{method.name}: no docstring"
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_docstrings_say_what_is_raised(name):
-    for function in public(ast.walk(parse(FILES[name])), ast.FunctionDef):
+    for function in public(ast.walk(tree), ast.FunctionDef):
         text = ast.get_docstring(function) or ""
         for error in raised(function):
             assert "aises" in text and error in text, (

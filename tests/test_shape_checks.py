@@ -70,3 +70,15 @@ def test_computed_sizes_are_checked():
     assert "{" in str(
         LoadSet.passages.__annotations__["return"]
     )  # else the library needs none of this
+
+
+def test_types_by_name_may_be_unknown():
+    """Of those that are imported for type checkers only, nothing is checked."""
+
+    @checked
+    def one(a: "Later", b: list["Later"]) -> Float[Array, " n"]:  # pyright: ignore
+        return a
+
+    assert one(jnp.ones(3), [1]).shape == (3,)
+    with pytest.raises(Exception, match="return value"):
+        one(jnp.ones((3, 3)), [1])

@@ -1,5 +1,6 @@
 """Commands: results printed and files written; one sentence for a command line that is wrong."""
 
+import functools
 import itertools
 import json
 import math
@@ -108,10 +109,18 @@ def test_modes(run, folder):
     assert (folder / "case_modes.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_simulate_prints_and_writes_the_same(run, folder):
+def films_of(frames: int, monkeypatch) -> None:
+    """Let commands write films of few frames."""
+    from jaxbeam import plot
+
+    monkeypatch.setattr(plot, "animate", functools.partial(plot.animate, frames=frames))
+
+
+def test_simulate_prints_and_writes_the_same(run, folder, monkeypatch):
     import jaxbeam as jb
     from jaxbeam.files.case_file import load_case
 
+    films_of(3, monkeypatch)
     record = jb.simulate(load_case(folder / "case.toml"))
     found = run("simulate case.toml --json")
     np.testing.assert_array_equal(found["peak_deflection"], record.peak_deflection)
@@ -176,9 +185,10 @@ def test_film_needs_ffmpeg(run, refused, folder, monkeypatch):
     script += "open(sys.argv[-1], 'w').write(f'{sys.argv[1:]} {len(sys.stdin.buffer.read())}')\n"
     (folder / "ffmpeg").write_text(script)
     (folder / "ffmpeg").chmod(0o755)
+    films_of(4, monkeypatch)
     run("simulate case.toml --animate out.mp4 --size 2x2in --set run.duration=0.1")
     written = (folder / "out.mp4").read_text()
-    assert "'180x180'" in written and written.endswith(str(120 * 180 * 180 * 3))
+    assert "'180x180'" in written and written.endswith(str(4 * 180 * 180 * 3))
 
 
 def test_what_looks_wrong_is_said_before_a_run(run, folder, capsys):

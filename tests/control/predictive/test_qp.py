@@ -76,7 +76,7 @@ def test_solutions_by_optimality_conditions_and_against_clarabel(kind, size, sol
     assert np.min(slack) > -1e-9 * scale
     assert_allclose(np.minimum(slack, multipliers), 0, atol=1e-9 * scale)
     unsolved = 0  # by Clarabel, where limits are degenerate
-    for i in range(0, COUNT, 2):
+    for i in range(0, COUNT, 5):
         other = by_clarabel(H[i], f[i], M[i], gamma[i])
         if str(other.status) not in ("Solved", "AlmostSolved"):
             unsolved += 1
@@ -85,7 +85,7 @@ def test_solutions_by_optimality_conditions_and_against_clarabel(kind, size, sol
         assert_allclose(least, other.obj_val, rtol=1e-8, atol=1e-8)
         # Its gap of 1e-8 determines x to sqrt(2 gap / least eigenvalue of H).
         assert_allclose(x[i], other.x, rtol=0, atol=(2e-8 / np.linalg.eigvalsh(H[i])[0]) ** 0.5)
-    assert unsolved <= COUNT // 100
+    assert unsolved <= COUNT // 250
 
 
 @pytest.mark.parametrize("kind", FEASIBLE)
