@@ -9,26 +9,19 @@ import dataclasses
 from typing import NamedTuple
 
 import jaxbeam as jb
-from experiments.thesis.cases import data_physics_v4
+from experiments.thesis.cases import data_physics_v4, plan_with_steps
 from experiments.thesis.chapter5.regulator_limits import TimeVaryingLoops
 from experiments.thesis.verdicts import LITERAL
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import (
-    IntegrationPlan,
-    integration_plan,
-    sample_times,
-    static_shapes,
-)
+from jaxbeam.simulation.integration_plan import IntegrationPlan
 
 MASSES, SPEEDS = (0.261, 0.371, 0.509), (0.3, 0.55)  # kg, m/s
 STATE_WEIGHTS = [1000.0, 100.0, 10.0, 0.1, 0.01, 0.01, 0.0]  # of q, its rate, and the shaker
 COMMAND_WEIGHT = 9e-5  # R
 PRINTED_STATES = [1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0]  # share of each state that is fed back
 ALL_STATES, FIRST_MODE = [1.0] * 7, [1.0, 0, 0, 0, 0, 0, 0]
-TOLERANCE = 1e-4  # relative, of peaks
 STEPS_PER_SAMPLE = {jb.Shaker: 2, jb.Electrodynamic: 12}
 SENSOR = 1  # at 0.25 m
 NO_CONTROL = "no control"
@@ -154,10 +147,8 @@ def _regulated_plan(case: jb.Case) -> IntegrationPlan:
     """Integration plan of a run, with the steps of its shaker in each sample.
 
     Far fewer than the search takes for the time constant of a coil, which it follows, though the
-    steps are exact for the shaker: they agree to ten digits. Without it, no trial is compiled.
+    steps are exact for the shaker: they agree to ten digits.
     """
     steps = STEPS_PER_SAMPLE[type(case.actuators[0])]
-    if case.controller is None:
-        return dataclasses.replace(integration_plan(case, None, TOLERANCE), substeps=steps)
-    schedule = loop_schedule(case, sample_times(case), float(case.run.duration))
-    return IntegrationPlan(static_shapes(case), steps, 0, False, TOLERANCE, schedule, True)
+    plan = plan_with_steps(case, steps)
+    return dataclasses.replace(plan, substeps=steps)
