@@ -48,10 +48,9 @@ class StepTrial(NamedTuple):
 
     Those of the beam's modal model, then those of vehicles. Errors are at least the `share` of
     those of the `former` trial, if there was one. Steps are so many `substeps` of the intervals of
-    a schedule, if that is not zero; else they begin at load events, and `shortest` is the step (s)
-    between those that several lie between: a run of longer ones there may have larger errors.
-    Errors of a run whose law is not asked in the trial are the `amplification` of those of the
-    trial.
+    a schedule, if that is not zero; else they begin at load events, and the `panels` are the times
+    (s) between those with loads on the beam, and the steps there. Errors of a run whose law is not
+    asked in the trial are the `amplification` of those of the trial.
     """
 
     times: Float[np.ndarray, " time"]
@@ -60,7 +59,7 @@ class StepTrial(NamedTuple):
     former: "StepTrial | None" = None
     share: float = 0.0
     substeps: int = 0
-    shortest: float = np.inf
+    panels: Float[np.ndarray, "2 panel"] = np.zeros((2, 0))
     amplification: float = 1.0
 
 
@@ -150,8 +149,8 @@ def choose_step_size(
         if not substeps:
             error, trial = max(change, share * former_error), trial._replace(former=former)
         if error <= tolerance:
-            shortest = step if substeps else _shortest_step(case, model, step)
-            return step, error, trial._replace(share=share, shortest=shortest)
+            panels = _loaded_panels(case, model, step)
+            return step, error, trial._replace(share=share, panels=panels)
         floor.check(change, step)
         shrink, former, former_error = 0.5, None, 0.0
         if np.isfinite(error):
@@ -199,14 +198,11 @@ def _grids(
     return [grid_by_schedule(case, model, schedule, n * substeps) for n in (1, 2)]
 
 
-def _shortest_step(case: Case, model: ModalModel, step: float) -> float:
-    """Shortest step (s) among those between load events that are longer than a `step` (s).
-
-    Equal steps between two events may be little longer than half of it.
-    """
+def _loaded_panels(case: Case, model: ModalModel, step: float) -> Float[np.ndarray, "2 panel"]:
+    """Times (s) between load events with loads on the beam, and steps there of at most a `step`."""
     grid = grid_by_step_length(case, model, np.asarray(step))
-    several = (np.asarray(grid.counts) > 1) & np.any(grid.loads_on_beam, axis=1)
-    return float(np.min(np.asarray(grid.lengths)[:-1][several], initial=step))
+    loaded = (np.asarray(grid.counts) > 0) & np.any(grid.loads_on_beam, axis=1)
+    return np.stack([np.diff(grid.boundaries), np.asarray(grid.lengths)[:-1]])[:, loaded]
 
 
 def without_later_vibration(case: Case, model: ModalModel) -> Case:

@@ -125,14 +125,11 @@ def integration_plan(
     )
     lead_samples = max(0, int(np.ceil(samples[0] / intervals.mean() - SPACING_TOLERANCE)))
     schedule = run_schedule(case, samples, equally_spaced, lead_samples, to_duration)
-    _, error, trial = choose_step_size(case, shapes, tolerance, schedule)
+    step, error, trial = choose_step_size(case, shapes, tolerance, schedule)
     substeps, share = trial.substeps, 1.0
     if not substeps:
-        step = SHARE_OF_TRIAL_STEP * trial.shortest
-        check_step_count(samples.size * (intervals.max() / step), step)
-        substeps = steps_per_interval(intervals.max(), step)
-        # Whole numbers of steps between samples may make them shorter still.
-        share = float((intervals.max() / substeps / step) ** CONVERGENCE_ORDER)
+        substeps, share = _substeps_and_share(trial, step, intervals.max())
+        check_step_count(float(samples.size * substeps), intervals.max() / substeps)
     return IntegrationPlan(
         shapes,
         substeps,
@@ -142,6 +139,21 @@ def integration_plan(
         to_duration=to_duration,
         sensor_errors=tuple(share * each for each in _sensor_errors(case, shapes, trial)),
     )
+
+
+def _substeps_and_share(trial: StepTrial, step: float, interval: float) -> tuple[int, float]:
+    """Steps in each interval (s) between samples, and their error over that of a trial.
+
+    Steps of the trial are at most a `step` (s). Those of the run are SHARE_OF_TRIAL_STEP of them or
+    shorter, but where there is only one between two load events: that may be the same in both.
+    """
+    times, steps = trial.panels
+    several = steps < times
+    longest = SHARE_OF_TRIAL_STEP * np.min(steps[several], initial=step)
+    substeps = steps_per_interval(interval, longest)
+    of_run = np.minimum(times, interval) / substeps
+    ratios = np.minimum(of_run / (SHARE_OF_TRIAL_STEP * steps), 1.0)
+    return substeps, float(np.max(ratios, initial=0.0)) ** CONVERGENCE_ORDER
 
 
 def run_schedule(

@@ -128,6 +128,13 @@ SHARP = {
         ],
         run=jb.Run(1.12616635, sample_rate=53.278),
     ),
+    # One step between entry and stop, in the trial as in the run, whose other steps are shorter.
+    "one step for both": jb.Case(
+        jb.Beam(2.0, 50.0, 1.5, modes=1, ends="free-free"),
+        sensors=[jb.Sensor(1.0)],
+        loads=[jb.MovingMass(mass=18.2395, speed=-84.4264, deceleration=5939.85)],
+        run=jb.Run(4.636, sample_rate=12.943),
+    ),
 }
 
 
