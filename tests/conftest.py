@@ -95,6 +95,11 @@ def pytest_collection_modifyitems(config, items):
     items.sort(key=lambda item: -slow[item.path])
 
 
+def pytest_collection_finish():
+    """Garbage collection passes over what was imported: modules, and the tests themselves."""
+    gc.freeze()
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _sweeps_in_xla():
     """No large sweep of a test compiles the C integrator, which rounds otherwise, for later ones.

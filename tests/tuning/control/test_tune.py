@@ -84,18 +84,25 @@ def test_metrics_are_those_of_the_simulated_runs(metrics):
 
 
 def test_gradients_of_the_objectives(run_set):
-    """Gradient of a sum of all, so that they share a compiled program."""
+    """Of a sum of all: in forward mode, and from the metrics in reverse; see the next test."""
     weights = {"peak": 1.0, "rms": 0.3, "effort": 0.1, "contact": 0.2}
     objectives = [tuning.Objective(weights, over) for over in ("mean", "worst", "cvar")]
 
-    @jax.jit
-    def value(gain):
-        metrics = run_set.metrics({GAIN: gain}, 80.0)
+    def value(metrics):
         parts = [each.aggregate(each.weighted_metrics(metrics), 80.0) for each in objectives]
         return parts[0] + 0.7 * parts[1] + 0.4 * parts[2]
 
-    expected = central(lambda point: value(point[0]), [4000.0], step=1.0)[0]
-    assert jax.jit(jax.grad(value))(4000.0) == pytest.approx(expected, rel=1e-6)
+    @jax.jit
+    def metrics_and_slopes(gain):
+        along = lambda gain: run_set.metrics({GAIN: gain}, 80.0)  # noqa: E731
+        return jax.jvp(along, (gain,), (jnp.ones(()),))
+
+    metrics, slopes = metrics_and_slopes(4000.0)
+    expected = central(lambda point: value(metrics_and_slopes(point[0])[0]), [4000.0], step=1.0)[0]
+    assert jax.jvp(value, (metrics,), (slopes,))[1] == pytest.approx(expected, rel=1e-6)
+    by_metric = jax.grad(value)(metrics)
+    in_reverse = sum(jnp.vdot(by_metric[name], slopes[name]) for name in metrics)
+    assert in_reverse == pytest.approx(expected, rel=1e-6)
 
 
 def test_forward_and_reverse_gradients_are_equal(run_set, monkeypatch):
