@@ -143,7 +143,7 @@ def test_derivatives_of_a_peak_in_the_loop():
         return 1e3 * jb.simulate(jb.replace(case, changed), plan=plan).peak_deflection[0]
 
     point = np.ones(len(names) + 1)
-    found = jax.jacfwd(peak)(jax.numpy.asarray(point))
+    found = jax.jit(jax.jacfwd(peak))(jax.numpy.asarray(point))
     assert_allclose(found, central(peak, point, 1e-3), rtol=1e-6, atol=1e-8)
     assert np.all(np.abs(found) > 1e-6)
 

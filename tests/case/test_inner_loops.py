@@ -203,7 +203,7 @@ def test_derivatives_of_the_model_by_the_numbers_of_a_loop():
         return xp.concatenate([xp.ravel(leaf) for leaf in found]) / 1e3
 
     point = np.array([0.4, 9.0, 20.0, 0.5, 0.3, 9.0])
-    found = jax.jacfwd(numbers)(jax.numpy.asarray(point))
+    found = jax.jit(jax.jacfwd(numbers))(jax.numpy.asarray(point))
     assert_allclose(found, central(numbers, point), rtol=1e-7, atol=1e-8)
 
 
@@ -218,7 +218,7 @@ def test_derivatives_of_a_peak():
         changed = jb.replace(case, dict(zip(names, shares * point, strict=True)))
         return 1e3 * jb.simulate(changed, plan=plan).peak_deflection[0]
 
-    found = jax.jacfwd(peak)(jax.numpy.ones(3))
+    found = jax.jit(jax.jacfwd(peak))(jax.numpy.ones(3))
     assert_allclose(found, central(peak, np.ones(3), 0.01), rtol=1e-6)
 
 

@@ -93,7 +93,7 @@ def test_sweeps_and_gradients_reach_its_numbers():
         return jb.simulate(changed, plan=plan).deflection[-1, 0]
 
     point = np.array([0.7])
-    assert_allclose(jax.grad(last)(point), central(last, point), rtol=1e-6)
+    assert_allclose(jax.jit(jax.grad(last))(point), central(last, point), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -233,7 +233,7 @@ def test_gradient_of_the_cost_by_the_suspension():
         P = finite_horizon_gains(law, plant)[1][0]
         return START @ P @ START
 
-    found = jax.grad(cost)(jax.numpy.zeros(2))
+    found = jax.jit(jax.grad(cost))(jax.numpy.zeros(2))
     expected = central(jax.jit(cost), np.zeros(2), 1e-2)
     assert np.all(np.abs(expected) > 0)
     assert_allclose(found, expected, rtol=1e-5)
