@@ -11,6 +11,7 @@ import pytest
 import tuning
 from tests.tuning.small_rig import GAIN, rig
 from tests.tuning.stand_in import fit, least_squares
+from tuning import checkpoint
 from tuning.checkpoint import Checkpoint
 from tuning.fit.multi_start import multi_start
 from tuning.fit.uncertainty.posterior import sample
@@ -57,11 +58,30 @@ def tuned(file, **options):
     )  # fmt: skip
 
 
-def test_a_killed_tuning_is_resumed(tmp_path):
-    killed(TUNE, tmp_path / "search.npz")
-    resumed, whole = tuned(tmp_path / "search.npz", resume=True), tuned(None)
+def assert_resumed(file):
+    """Check that a tuning that ended after its first checkpoint is resumed to the same result."""
+    resumed, whole = tuned(file, resume=True), tuned(None)
     np.testing.assert_array_equal(resumed.history, whole.history)
     np.testing.assert_array_equal(resumed.values, whole.values)
+
+
+def test_a_killed_tuning_is_resumed(tmp_path):
+    killed(TUNE, tmp_path / "search.npz")
+    assert_resumed(tmp_path / "search.npz")
+
+
+def test_a_stopped_tuning_is_resumed(tmp_path, monkeypatch):
+    """In one process, which compiles once."""
+    save = checkpoint.save
+
+    def save_and_stop(*arguments):
+        save(*arguments)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(checkpoint, "save", save_and_stop)
+        tuned(tmp_path / "search.npz")
+    assert_resumed(tmp_path / "search.npz")
 
 
 def test_a_killed_multi_start_search_is_resumed(tmp_path):

@@ -10,7 +10,6 @@ import pytest
 import jaxbeam as jb
 import tuning
 from tests.tuning.small_rig import GAIN, rig
-from tuning import checkpoint
 from tuning.control.integer_choices import with_integers
 from tuning.control.objective import METRICS
 from tuning.control.run_set import make_run_set
@@ -70,21 +69,10 @@ def test_lexicographic_order(swept):
     assert 0.99 * least <= second.run_sets[0].metrics["effort"] <= 1.02 * most
 
 
-def test_mini_batches(swept, tmp_path, monkeypatch):
-    """Steps on two of four runs reach the same objective; from a checkpoint, the same steps."""
+def test_mini_batches(swept):
+    """Steps on two of four runs reach the same objective, and repeat with the same seed."""
     options = OPTIONS | {"batch": 2}
-    saved = OPTIONS | {"batch": 2, "seed": 1, "checkpoint": tmp_path / "search.npz"}
-    first = tuning.tune(rig(), FREE, CASES, seed=1, **options)
-    save = checkpoint.save
-
-    def save_and_stop(*arguments):
-        save(*arguments)
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(checkpoint, "save", save_and_stop)
-        tuning.tune(rig(), FREE, CASES, **saved)
-    again = tuning.tune(rig(), FREE, CASES, resume=True, **saved)
+    first, again = (tuning.tune(rig(), FREE, CASES, seed=1, **options) for _ in range(2))
     assert first.run_sets[0].objective[1] <= swept["peak"].min() * 1.01
     np.testing.assert_array_equal(first.history, again.history)
     other = tuning.tune(rig(), FREE, CASES, seed=2, **options)
