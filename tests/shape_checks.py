@@ -24,7 +24,7 @@ def checked(*, typechecker):
         if inspect.isclass(decorated):
             init = vars(decorated).get("__init__")
             if dataclasses.is_dataclass(decorated) and init and not hasattr(init, "__wrapped__"):
-                decorated.__init__ = decorate(init)
+                decorated.__init__ = decorate(init)  # type: ignore[attr-defined]
             return decorated
         if isinstance(decorated, property):
             parts = (decorated.fget, decorated.fset, decorated.fdel)
