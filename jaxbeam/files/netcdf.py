@@ -1,7 +1,8 @@
 """Writer of labelled variables to netCDF files, as xarray writes them, without importing xarray.
 
 The format is the classic one with offsets of 64 bits: NetCDF Classic and 64-bit Offset Format (OGC
-11-038), in big-endian numbers. The writer of scipy takes a tenth of the time of a command to import.
+11-038), in big-endian numbers. To import the writer of scipy takes a tenth of the time of a
+command.
 """
 
 import os

@@ -86,8 +86,8 @@ class LeastSquares:
             return xp.stack([p.prior.prior_residual(values[i]) for i, p in enumerate(parameters)])
 
         def linearised(values):
-            # One pass gives samples and derivatives (see `Dataset.predictor`); half as long to trace
-            # as with `jax.linearize`.
+            # One pass gives samples and derivatives (see `Dataset.predictor`). `jax.linearize`
+            # would take half as long again to trace.
             def along(direction):
                 return jax.jvp(predict, (values,), (direction,))
 
