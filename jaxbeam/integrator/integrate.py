@@ -157,12 +157,12 @@ def _chunk_function(
             count = discrete.model.state_count
             before, ends = states[:, :count], None
             if path.influence is not None:
-                after = xp.concatenate([before[1:], state[None, :count]])
                 ends = end_forces(
                     path.ends,
                     steps.inertia,
                     _weights(loads, path, END_FRACTIONS),
-                    (before, after),
+                    before,
+                    state[:count],
                     forces,
                 )
             inputs = [before, forces, ends, commands]

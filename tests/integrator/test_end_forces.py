@@ -58,11 +58,11 @@ def test_forces_at_ends_follow_from_the_states(name):
 
     discrete, path, states = run(1)
     steps = _step_inputs(discrete, loads, path)
-    both = states[:-1], states[1:]
+    both = states[:-1], states[-1]
     at_nodes = _forces_at_nodes(model, loads, path, states, steps)
     weight = _weights(loads, path, END_FRACTIONS)
-    found = end_forces(path.ends, steps.inertia, weight, both, at_nodes)
-    extrapolated = end_forces(None, steps.inertia, weight, both, at_nodes)
+    found = end_forces(path.ends, steps.inertia, weight, *both, at_nodes)
+    extrapolated = end_forces(None, steps.inertia, weight, *both, at_nodes)
     _, fine, fine_states = run(8)
     here = fine.length > 0
     exact = contact_at(model, loads, fine.start[here], fine_states[:-1][here]).force[..., 0]

@@ -5,8 +5,6 @@ extrapolation of the forces at the Gauss nodes is the least accurate there; the 
 accurate, of order 12, and so are the forces that the contact law gives for them.
 """
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -58,12 +56,14 @@ def end_forces(
     rows: EndRows | None,
     inertia: Float[Array, "step row batch"],
     weight: Float[Array, "step load end batch"],
-    states: Sequence[Float[Array, "step state batch"]],
+    before: Float[Array, "step state batch"],
+    last: Float[Array, "state batch"],
     forces: Float[Array, "step row batch"],
 ) -> Float[Array, "step row_end batch"]:
     """Contact forces (N) of wheels at the ends of steps, from the states there.
 
-    Without `rows` they are extrapolated from those at the Gauss nodes.
+    States are those `before` each step, and the `last` after all of them. Without `rows`
+    forces are extrapolated from those at the Gauss nodes.
     """
     steps, count, batch = forces.shape
     nodes = end_weights().shape[0]
@@ -72,9 +72,7 @@ def end_forces(
         extrapolated = xp.einsum("tlfb,fe->tleb", forces.reshape(by_load), end_weights())
         return extrapolated.reshape(steps, -1, batch)
     mass = inertia.reshape(by_load)[:, None, :, 0]  # step, 1, load, batch
-    # One product for each end: for both in one, the states would be copied.
-    products = [rows.accelerations[:, end] @ at_end for end, at_end in enumerate(states)]
-    acceleration = xp.stack(products, axis=1)
+    acceleration = _at_ends(rows.accelerations, before, last)
     if rows.surface is not None:
         acceleration = acceleration + rows.surface[..., None]
     right = xp.swapaxes(weight, 1, 2) + mass * acceleration
@@ -82,3 +80,20 @@ def end_forces(
     matrix = np.eye(mass.shape[2])[..., None] + mass[:, :, :, None] * compliance[..., None]
     found = -solve_at_instants(matrix, right)
     return xp.swapaxes(found, 1, 2).reshape(steps, -1, batch)
+
+
+def _at_ends(
+    rows: Float[Array, "step end load state"],
+    before: Float[Array, "step state batch"],
+    last: Float[Array, "state batch"],
+) -> Float[Array, "step end load batch"]:
+    """Products of rows at the two ends of steps with the states there.
+
+    Where a step ends the next one begins, so that both rows act on the states before the steps:
+    these, by far the largest part, are read once and not copied.
+    """
+    at_end = rows[:, 1]
+    of_former = xp.concatenate([xp.zeros_like(at_end[:1]), at_end[:-1]])
+    starts, ends = xp.split(xp.concatenate([rows[:, 0], of_former], axis=1) @ before, 2, axis=1)
+    ends = xp.concatenate([ends[1:], (at_end[-1] @ last)[None]])
+    return xp.stack([starts, ends], axis=1)
