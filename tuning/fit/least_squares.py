@@ -86,9 +86,12 @@ class LeastSquares:
             return xp.stack([p.prior.prior_residual(values[i]) for i, p in enumerate(parameters)])
 
         def linearised(values):
-            # One pass gives samples and derivatives (see `Dataset.predictor`).
-            samples, push = jax.linearize(predict, values)
-            return samples, jax.vmap(push, out_axes=-1)(jnp.eye(values.shape[0]))
+            # One pass gives samples and derivatives (see `Dataset.predictor`). `jax.linearize`
+            # would take half as long again to trace.
+            def along(direction):
+                return jax.jvp(predict, (values,), (direction,))
+
+            return jax.vmap(along, out_axes=(None, -1))(jnp.eye(values.shape[0]))
 
         self.from_unbounded, self.prior_residuals = values_at, prior_residuals
         self.weak_prior_widths = weak_prior_widths

@@ -111,10 +111,10 @@ def sweep(
         look = {"title": pictures.title, "labels": labels}
         figure = plot_sweep(results, ax=pictures.page(), **look)
         pictures.save(figure, picture)
-    values = {address: results[address].to_numpy().tolist() for address in values}  # in SI units
+    values = {address: results[address].values.tolist() for address in values}  # in SI units
     peaks = {str(name): results[name] for name in results if str(name).startswith("peak_")}
     del peaks["peak_time"]
-    numbers = {name: found.to_numpy() for name, found in peaks.items()}
+    numbers = {name: found.values for name, found in peaks.items()}
     dimensions = results["peak_time"].dims
     options.report(
         {
