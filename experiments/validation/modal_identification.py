@@ -26,7 +26,7 @@ MIN_ENERGY = 0.05  # energy share of the modes that must be found
 DURATIONS = {
     "ambient": 300.0,
     "motor": 300.0,
-    "shaken": 60.0,
+    "shaken": 300.0,
     "blows": 60.0,
     "decay": 20.0,
     "crossing": 60.0,

@@ -1,11 +1,11 @@
 """Table of what is found of planted structures, for each kind of excitation, unknown or measured.
 
-    python -m experiments.validation.planted_modes 10
-    python -m experiments.validation.planted_modes 10 crossing shaken
+    python -m experiments.validation.planted_modes 30
+    python -m experiments.validation.planted_modes 30 crossing shaken
 
-Ten random structures by finite elements for each kind, the same as in `modal_identification` and
+Thirty random structures by finite elements for each kind, the same as in `modal_identification` and
 `measured_forces`, with other seeds than those from which rules were chosen. The table is written
-for the page on logs; it takes some minutes on one core.
+for the page on logs; it takes half an hour on one core.
 """
 
 import sys
@@ -70,7 +70,7 @@ def table(count: int, kinds: Sequence[str] = tuple(WORDS)) -> ReportTable:
 
 
 def main(arguments: list[str]) -> None:
-    """Write the rows for a number of structures (10), of all kinds or of some; others stay.
+    """Write the rows for a number of structures (30), of all kinds or of some; others stay.
 
     Raises SystemExit for an unknown kind.
     """
@@ -78,7 +78,7 @@ def main(arguments: list[str]) -> None:
     unknown = [kind for kind in kinds if kind not in WORDS]
     if unknown:
         raise SystemExit(f"unknown excitation {unknown[0]!r}; known are {', '.join(WORDS)}")
-    result = table(int(arguments[0]) if arguments else 10, kinds)
+    result = table(int(arguments[0]) if arguments else 30, kinds)
     old = TABLE_FILE.read_text(encoding="utf-8").splitlines()[2:] if TABLE_FILE.exists() else []
     rows = {line.split(" | ")[0].removeprefix("| "): line for line in old}
     rows |= {row[0]: "| " + " | ".join(row) + " |" for row in result.rows}

@@ -53,6 +53,29 @@ def test_exact_responses_have_exact_poles():
     np.testing.assert_allclose(found[np.argsort(np.abs(found))], poles, rtol=1e-6)
 
 
+def test_shapes_of_an_early_blow_do_not_depend_on_the_degree():
+    """The spectrum of a blow early in a record is nearly a sum of powers of z, as a transient is.
+
+    Of high degrees both gains had been large and of opposite sign, and shapes arbitrary.
+    """
+    random = np.random.default_rng(0)
+    poles = 2 * np.pi * np.array([3.0, 3.1, 9.0]) * (-np.array([0.004, 0.01, 0.005]) + 1j)
+    shapes, force = random.normal(size=(3, 4)), np.zeros(3000)
+    force[30:34] = np.sin(np.pi * (np.arange(4) + 0.5) / 4)
+    values = np.zeros((3000, 4))
+    for root, shape in zip(np.exp(poles / RATE), shapes, strict=True):
+        one = lfilter([1.0], [1.0, -root], force + 0j)
+        values += np.real(np.multiply.outer(one, shape))
+    values += 0.01 * values.std() * random.normal(size=values.shape)
+    lines = transforms((values,), (force[:, None],), RATE, (1.0, 12.0))
+    system = products(lines, 40)
+    for degree in (20, 30, 40):
+        found = fit_common_denominator(system, degree)
+        nearest = np.argmin(np.abs(found.poles[:, None] - poles), axis=0)
+        mac = np.diag(mac_matrix(found.shapes[nearest], shapes + 0j))
+        assert np.all(mac > 0.95), (degree, mac)
+
+
 @pytest.mark.parametrize("kind", ["blows", "shaker"])
 def test_modes_are_found_within_their_intervals(kind):
     structure = small_structure(0)

@@ -19,6 +19,10 @@ from jaxtyping import Bool, Complex, Float, Int
 
 MAX_ANGLE = 2.8  # of z on the circle, of a band from 0
 PART_LINES = 4096  # lines whose products are formed at once
+# Products of driving signals over the largest, below which they are none: a thousandth of the
+# signals, less than noise. Early blows are nearly powers of z; a shape would be a difference of
+# large gains of them and of the transient, whatever their sum fits.
+MIN_DRIVING = 1e-6
 
 
 class Lines(NamedTuple):
@@ -131,7 +135,7 @@ def fit_common_denominator(system: Products, degree: int) -> CommonDenominator:
     part = system.gram[:, :size, :, :size]
     driving = part[outputs:, :, outputs:].reshape(-1, (part.shape[0] - outputs) * size)
     crossed = part[outputs:, :, :outputs].reshape(len(driving), -1)
-    gains = np.linalg.lstsq(driving, crossed, rcond=1e-14)[0]
+    gains = np.linalg.lstsq(driving, crossed, rcond=MIN_DRIVING)[0]
     crossed, gains = (one.reshape(len(driving), outputs, size) for one in (crossed, gains))
     matrix = np.einsum("ojok->jk", part[:outputs, :, :outputs])
     matrix = matrix - np.tensordot(crossed, gains, axes=((0, 1), (0, 1)))
