@@ -5,6 +5,15 @@ import dataclasses
 import numpy as np
 
 import jaxbeam as jb
+from jaxbeam.simulation.closed_loop import loop_schedule
+from jaxbeam.simulation.integration_plan import (
+    IntegrationPlan,
+    integration_plan,
+    sample_times,
+    static_shapes,
+)
+
+PEAK_TOLERANCE = 1e-4  # relative, of peaks
 
 
 def one_span(load_rig) -> jb.Case:
@@ -51,6 +60,18 @@ def with_sensors(case: jb.Case, *positions: float, duration: float) -> jb.Case:
     """The case with deflection sensors at positions (m), for a duration (s)."""
     sensors = tuple(jb.Sensor(position) for position in positions)
     return with_duration(dataclasses.replace(case, sensors=sensors), duration)
+
+
+def plan_with_steps(case: jb.Case, steps: int) -> IntegrationPlan:
+    """Plan of a controlled run with a number of steps from event to event, known to suffice.
+
+    That of a run without control is searched for. A search in a loop that is compiled compiles it
+    once more, and numbers of steps that differ do.
+    """
+    if case.controller is None:
+        return integration_plan(case, None, PEAK_TOLERANCE)
+    schedule = loop_schedule(case, sample_times(case), float(case.run.duration))
+    return IntegrationPlan(static_shapes(case), steps, 0, False, PEAK_TOLERANCE, schedule, True)
 
 
 def critical_speed(case: jb.Case) -> float:

@@ -17,6 +17,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw, Measurement
 from jaxbeam.case.filters import filter_step
 from jaxbeam.case.trajectory import NEVER, AbstractTrajectory
+from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import compiled_modal_model
 from jaxbeam.model.modes import Layout
@@ -85,12 +86,14 @@ class LoopDynamics(Module):
         frozen = frozen_loads(self.augmented_plant.loads, self.plant.case.beam.length, t)
         return eqx.tree_at(lambda loop: loop.augmented_plant.loads, self, frozen)
 
-    def continuous_dynamics(self, t):
+    def continuous_dynamics(self, t, system: StateSpace | None = None):
         """A, B, rates due to the weights, and the commands as a function of the state, at t (s).
 
-        The last states are those of the law, about their values at the start of a run.
+        The last states are those of the law, about their values at the start of a run. `system` is
+        the augmented plant at that time, if known.
         """
-        system, command_count = self.augmented_plant.at(t), len(self.plant.case.actuators)
+        system = self.augmented_plant.at(t) if system is None else system
+        command_count = len(self.plant.case.actuators)
         size, zero_command = system.A.shape[0], xp.zeros(command_count)
 
         def measure(state):

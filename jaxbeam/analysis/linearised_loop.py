@@ -191,8 +191,10 @@ def affine_linearisations(
     """
     times, parts = np.asarray(times, float), []
     if timing is None:
-        for t in times:
-            A, B, _, command = loop.continuous_dynamics(t)
+        systems = loop.augmented_plant.at(times)
+        for i, t in enumerate(times):
+            system = jax.tree.map(lambda part, i=i: part[i], systems)
+            A, B, _, command = loop.continuous_dynamics(t, system)
             parts.append((A, B, affine_jacobian(command, np.zeros(A.shape[0]))))
     else:
         linear, plant = (

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from jaxbeam.numerics.matrices import InputWeight, Square
 from jaxbeam.numerics.riccati import lqr
 from jaxbeam.numerics.stages import GAUSS_NODES
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, take, xp
 from jaxbeam.runtime.module import Module
 
 END_OFFSET = 1e-9  # of an interval: ends are evaluated so far inside, as the plant may jump there
@@ -27,12 +27,13 @@ class GainTable(Module):
 
     def __call__(self, fraction: Float[Array, ""]) -> Float[Array, "input state"]:
         """Gain at a fraction of the time span; held before 0 and after 1."""
-        i = jnp.searchsorted(self.breakpoints, fraction, side="right") - 1
-        i = jnp.clip(i, 0, self.coefficients.shape[0] - 1)
-        length = self.breakpoints[i + 1] - self.breakpoints[i]
-        interval_fraction = (fraction - self.breakpoints[i]) / jnp.where(length > 0, length, 1.0)
-        powers = jnp.clip(interval_fraction, 0.0, 1.0) ** np.arange(self.coefficients.shape[1])
-        return jnp.tensordot(powers, self.coefficients[i], axes=1)
+        i = xp.searchsorted(self.breakpoints, fraction, side="right") - 1
+        i = xp.clip(i, 0, self.coefficients.shape[0] - 1)
+        start = take(self.breakpoints, i)
+        length = take(self.breakpoints, i + 1) - start
+        interval_fraction = (fraction - start) / xp.where(length > 0, length, 1.0)
+        powers = xp.clip(interval_fraction, 0.0, 1.0) ** np.arange(self.coefficients.shape[1])
+        return xp.tensordot(powers, take(self.coefficients, i), axes=1)
 
 
 def breakpoints_between(

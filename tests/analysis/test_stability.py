@@ -3,17 +3,22 @@
 import dataclasses
 import json
 
+import equinox as eqx
 import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
 
 import jaxbeam as jb
-from jaxbeam.analysis.linearised_loop import linearised_loop
+from jaxbeam.analysis.frozen_loop import loop_dynamics
+from jaxbeam.analysis.linearised_loop import affine_linearisations, linearised_loop
 from jaxbeam.analysis.margins import margins
 from jaxbeam.analysis.stability import _tracked_branches, frozen_poles, growth, stream
 from jaxbeam.analysis.stability_limits import stability_limit
 from jaxbeam.control.design_model import DesignModel
+from jaxbeam.control.optimal.gain_schedules import GainSchedule
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.numerics.gain_table import GainTable
 from tests.modules import DATA
 
 REFERENCE = json.loads((DATA / "optimal_control.json").read_text())
@@ -96,6 +101,28 @@ def test_frozen_poles_of_published_regulator():
     printed = np.array([complex(*pole) for pole in printed])
     np.testing.assert_allclose(np.sort_complex(found.poles[1]), np.sort_complex(printed), rtol=1e-6)
     assert found.largest_real_part[2] == pytest.approx(found.poles[2].real.max())
+
+
+def test_frozen_poles_with_a_gain_that_varies_compile_nothing():
+    """The commands of known gain tables are known, so that no frozen position is compiled."""
+    case = shaker_case(regulator())
+    loop = loop_dynamics(case, mesh_layout(case))
+    coefficients = np.random.default_rng(0).normal(size=(3, 4, 1, 7))
+    breakpoints, none, end = np.array([0.0, 0.2, 0.7, 1.0]), np.zeros((1, 7)), LENGTH / SPEED
+    table = GainTable(breakpoints, coefficients)
+    schedule = GainSchedule(table, none, np.zeros(0), np.array(0.0), np.array(end))
+    loop = eqx.tree_at(lambda x: x.law.law, loop, schedule)
+    times = np.array([0.1, 0.5, 0.9]) * end
+    frozen = affine_linearisations(loop, None, times)
+    for i, (t, found) in enumerate(zip(times, frozen, strict=True)):
+        A, B = state_matrices(SPEED * t, SPEED, MASS, 4.6)
+        start, length = breakpoints[i], breakpoints[i + 1] - breakpoints[i]
+        gain = np.polyval(coefficients[i, ::-1], (t / end - start) / length)
+        gain[:, -1] /= 4.6  # of the force of the shaker, not of its voltage
+        expected = np.linalg.eigvals(A - B @ gain)
+        np.testing.assert_allclose(
+            np.sort_complex(found.poles()), np.sort_complex(expected), rtol=1e-7
+        )
 
 
 def test_pole_of_published_loop_with_filter():

@@ -42,12 +42,12 @@ class LoopGains(NamedTuple):
 
 
 def sampled(A, B, period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Matrices of a system whose inputs are held over a period (s)."""
-    states, inputs = B.shape
-    both = np.zeros((states + inputs, states + inputs))
-    both[:states] = np.hstack([A, B])
+    """Matrices of a system, or of each of several, whose inputs are held over a period (s)."""
+    *systems, states, inputs = B.shape
+    both = np.zeros((*systems, states + inputs, states + inputs))
+    both[..., :states, :] = np.concatenate([A, B], axis=-1)
     exponential = expm(period * both)
-    return exponential[:states, :states], exponential[:states, states:]
+    return exponential[..., :states, :states], exponential[..., :states, states:]
 
 
 def design(case: jb.Case, period: float, state_weights, command_weight: float) -> LoopGains:
@@ -114,5 +114,6 @@ def simulate_observed(
 
 def _sampled_at(plant, times, period: float) -> list[tuple[np.ndarray, np.ndarray]]:
     """Sampled matrices of the plant with its load frozen at some times (s)."""
-    systems = [plant.at(t) for t in times]
-    return [sampled(np.asarray(one.A), np.asarray(one.B), period) for one in systems]
+    systems = plant.at(np.array(times))
+    pairs = sampled(np.asarray(systems.A), np.asarray(systems.B), period)
+    return list(zip(*pairs, strict=True))

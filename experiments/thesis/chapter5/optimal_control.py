@@ -1,5 +1,6 @@
 """Optimal control of one span with a shaker, by several interpretations: Tables 5.1 to 5.4."""
 
+import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
@@ -100,7 +101,9 @@ def run(load_rig) -> ExperimentResult:
     undamped = time_varying_loops(rigs[WEAK_SHAKER], 3e-4, damping=0.0)
     loops |= {
         UNDAMPED_DESIGN: undamped,
-        f"{UNDAMPED_DESIGN}, but for the last tenth": undamped._replace(crossing_share=0.9),
+        f"{UNDAMPED_DESIGN}, but for the last tenth": dataclasses.replace(
+            undamped, crossing_share=0.9
+        ),
     }
     findings = (
         *table_findings,

@@ -6,7 +6,6 @@ Frozen poles are no stability criterion for a time-varying loop; the thesis publ
 import dataclasses
 import itertools
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -128,7 +127,8 @@ def _instability(case: jb.Case, period: float, gain: np.ndarray) -> str:
     )
 
 
-class TimeVaryingLoops(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class TimeVaryingLoops:
     """The time-varying loop with few states fed back, and with all.
 
     Frozen poles are computed over `crossing_share` of the crossing: towards its end finite-horizon
@@ -138,26 +138,35 @@ class TimeVaryingLoops(NamedTuple):
     partial_feedback: jb.Case
     full_feedback: jb.Case
     crossing_share: float = 1.0
+    _known: dict[tuple[float, float], float] = dataclasses.field(default_factory=dict, init=False)
+
+    def largest_real_part(self, case: jb.Case) -> float:
+        """`largest_real_part` of the loop with few states, once for each speed and mass."""
+        load = case.loads[0]
+        key = float(load.speed), float(load.mass)
+        if key not in self._known:
+            self._known[key] = largest_real_part(case, self.crossing_share)
+        return self._known[key]
 
 
 def frozen_pole_findings(interpretations: Mapping[str, TimeVaryingLoops]) -> list[Finding]:
     """Stability by frozen poles, of loops by interpretation."""
-    slow, fast = {"loads.0.speed": SPEEDS[0]}, {"loads.0.speed": SPEEDS[1]}
     unstable, limits = {}, {}
     for name, loops in interpretations.items():
-
-        def real_part(case, share=loops.crossing_share):
-            return largest_real_part(case, share)
-
-        partial, full = (
-            jb.replace(case, slow | {"loads.0.mass": MASSES[0]})
-            for case in (loops.partial_feedback, loops.full_feedback)
-        )
-        fast_cases = jb.replace(partial, fast), jb.replace(full, fast)
-        unstable[name] = np.array([real_part(case) for case in (partial, *fast_cases)]) > 0
+        slow, fast = ({"loads.0.speed": speed, "loads.0.mass": MASSES[0]} for speed in SPEEDS)
+        partial = jb.replace(loops.partial_feedback, slow)
+        rates = [
+            loops.largest_real_part(partial),
+            loops.largest_real_part(jb.replace(partial, fast)),
+            largest_real_part(jb.replace(loops.full_feedback, fast), loops.crossing_share),
+        ]
+        unstable[name] = np.array(rates) > 0
         searches = ("loads.0.speed", SPEEDS), ("loads.0.mass", MASSES)
         limits[name] = np.array(
-            [_stability_limit(partial, address, bounds, real_part) for address, bounds in searches]
+            [
+                _stability_limit(partial, address, bounds, loops.largest_real_part)
+                for address, bounds in searches
+            ]
         )
     literal, *others = interpretations
     return [
@@ -185,9 +194,9 @@ def growth_remark(interpretations: Mapping[str, TimeVaryingLoops]) -> str:
         for speed in SPEEDS:
             changes = {"loads.0.speed": speed, "loads.0.mass": MASSES[0]}
             case = jb.replace(loops.partial_feedback, changes)
-            factors = growth(case).factor
+            rate, factors = loops.largest_real_part(case), growth(case).factor
             parts.append(
-                f"{name}, {speed:g} m/s: frozen poles up to {largest_real_part(case):+.2g} 1/s,"
+                f"{name}, {speed:g} m/s: frozen poles up to {rate:+.2g} 1/s,"
                 f" deviations grow to at most {factors.max():.3g} times, {factors[-1]:.1g} at the"
                 " exit"
             )

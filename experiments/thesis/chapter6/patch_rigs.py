@@ -8,19 +8,12 @@ from typing import Any
 import numpy as np
 
 import jaxbeam as jb
-from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import (
-    IntegrationPlan,
-    integration_plan,
-    sample_times,
-    static_shapes,
-)
+from experiments.thesis.cases import plan_with_steps
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 MASSES = (0.261, 0.322, 0.371, 0.509)  # kg
 GAIN, PERIOD = 2.0, 0.002  # V per mm or mm^3; s, not printed
 ONE_SPAN_CUTOFF, TWO_SPAN_CUTOFF = 10.0, 20.0  # Hz
-TOLERANCE = 1e-4  # relative, of peaks
 
 
 def with_feedback(
@@ -42,15 +35,11 @@ def with_feedback(
 def simulate_changes(case: jb.Case, changes: Sequence[Mapping[str, Any]]) -> list[jb.Record]:
     """Records of a case with several changes of its numbers, by one integration plan.
 
-    A sampled loop takes one step in each of its periods: that meets TOLERANCE, as its search finds.
+    A sampled loop takes one step in each of its periods: that meets the tolerance, as its search
+    finds.
     """
     cases = [jb.replace(case, change) for change in changes]
-    last = cases[-1]
-    if last.controller is None:
-        plan = integration_plan(last, None, TOLERANCE)
-    else:
-        schedule = loop_schedule(last, sample_times(last), float(last.run.duration))
-        plan = IntegrationPlan(static_shapes(last), 1, 0, False, TOLERANCE, schedule, True)
+    plan = plan_with_steps(cases[-1], 1)
     with warnings.catch_warnings():
         # With too high gains the contact force becomes negative; the peaks show it.
         warnings.simplefilter("ignore", ContactLossWarning)
