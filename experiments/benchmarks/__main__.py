@@ -43,6 +43,9 @@ BENCHMARKS = {
         "--runs 4096 40000",
         "--runs 4096 40000 400000 2000000",
     ),
+    "stored_runs": Benchmark(
+        "ten million runs in a store: time, memory, disk", "--runs 40000 100000"
+    ),
     "dimensions": Benchmark("samples, modes, loads and supports of a run, as they grow", "--quick"),
     "identification": Benchmark("identification: scipy's least squares"),
     "regulator_designs": Benchmark("designs of regulators, many at once"),

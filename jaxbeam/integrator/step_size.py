@@ -5,7 +5,7 @@ least CONVERGENCE_ORDER, so that the next trial is close to the longest step tha
 
 Where forces change sharply, the error depends on where in a step they do: the forces that Gauss
 nodes integrate worst are those with a singularity near the middle of a step, beside the real axis
-(Trefethen 2008, "Is Gauss quadrature better than Clenshaw-Curtis?", theorem 4.5). Errors of equal
+(Trefethen 2008, "Is Gauss quadrature better than Clenshaw-Curtis?"). Errors of equal
 steps that begin elsewhere have differed by a factor of five hundred. So wherever samples are no
 closer than steps, the steps of the trials are those of the run itself, between its samples.
 """

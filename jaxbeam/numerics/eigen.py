@@ -1,6 +1,11 @@
 """Generalised symmetric eigenvalue problem, with derivatives valid at repeated eigenvalues too."""
 
-from jaxbeam.runtime.arrays import custom_jvp, solve_triangular, xp
+import functools
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxbeam.runtime.arrays import any_jax, custom_jvp, solve_triangular, xp
 
 REPEATED_EIGENVALUE_TOLERANCE = 1e-6  # relative: closer eigenvalues are treated as repeated
 MASSLESS = 1e-20  # share of the mass in a vector: of less, there is only rounding
@@ -15,6 +20,39 @@ def eigen(stiffness, mass):
     rotate them. The coupling, the off-diagonal part of X' K X, is zero and carries the derivative
     instead; a model that includes it has exact derivatives of its response.
     """
+    if any_jax(stiffness, mass):
+        return _solution(stiffness, mass)
+    return _known_solution(*(_Known.of(np.asarray(matrix)) for matrix in (stiffness, mass)))
+
+
+class _Known(NamedTuple):
+    """A matrix of known numbers that has a hash."""
+
+    content: bytes
+    dtype: str
+    rows: int
+
+    @classmethod
+    def of(cls, matrix: np.ndarray) -> "_Known":
+        """From an array."""
+        return cls(matrix.tobytes(), matrix.dtype.str, len(matrix))
+
+    def array(self) -> np.ndarray:
+        """The array."""
+        return np.frombuffer(self.content, self.dtype).reshape(self.rows, -1)
+
+
+@functools.lru_cache(maxsize=2)  # a run asks some five times for the modes of one beam
+def _known_solution(stiffness: _Known, mass: _Known) -> tuple[Any, ...]:
+    """`eigen` of known numbers; read-only arrays."""
+    parts = _solution(stiffness.array(), mass.array())
+    for part in parts:
+        part.setflags(write=False)
+    return parts
+
+
+def _solution(stiffness, mass):
+    """`eigen` without its derivative."""
     factor = xp.linalg.cholesky(stiffness + mass)  # shifted: rigid-body modes are not singular
     mass_half_solved = solve_triangular(factor, mass, lower=True)
     flexibility = solve_triangular(factor, mass_half_solved.T, lower=True)

@@ -6,7 +6,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import chebyshev, legendre
 
-from jaxbeam.runtime.arrays import Array, custom_jvp, optimization_barrier, slice_in_dim, take, xp
+from jaxbeam.runtime.arrays import (
+    Array,
+    any_jax,
+    custom_jvp,
+    optimization_barrier,
+    slice_in_dim,
+    take,
+    xp,
+)
 from jaxbeam.runtime.compiling import compiled_if_traced
 
 
@@ -49,6 +57,8 @@ def slope_jumps(nodes, series) -> Float[Array, "inner column"]:
 @custom_jvp
 def _evaluate_series(series, local, segment):
     """Values of the series at local positions, -1 to 1, in their segments."""
+    if not any_jax(series, local, segment):
+        return _known_values(series, local, segment)
     return _sum_series(_segment_polynomials(series, local, segment), series)
 
 
@@ -63,6 +73,15 @@ def _evaluate_series_jvp(primals, tangents):
         _sum_series(table, xp.concatenate([series, derivative_series], axis=2)), 2, -1
     )
     return values, _sum_series(table, series_tangent) + slopes * local_tangent[..., None]
+
+
+def _known_values(series, local, segment) -> np.ndarray:
+    """`_evaluate_series` of known numbers: of the positions in a segment by its series alone."""
+    values = np.empty((*local.shape, series.shape[2]))
+    for s in np.unique(segment):
+        here = segment == s
+        values[here] = chebyshev_polynomials(local[here], series.shape[1]) @ series[s]
+    return values
 
 
 def _sum_series(table, series):

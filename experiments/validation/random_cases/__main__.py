@@ -8,10 +8,13 @@ tolerance, of a random sample (500 of 10 000) also that beside the modal equatio
 scipy. With `--plain` there is only that: numbers are finite, and verdicts agree with them and with
 scipy. Each outcome is a line of `random_cases_SEED.jsonl` in `--folder`: an interrupted check
 continues, and `--anew` begins again. Cases that take longer than `--longest` are left and counted;
-a later check with a longer limit takes them up again. Nothing is compiled.
+a later check with a longer limit takes them up again. Nothing is compiled. With `--page` what is
+printed is written to `docs/_static`, too, which a page of the site shows.
 """
 
 import argparse
+import contextlib
+import io
 import json
 import sys
 import time
@@ -26,6 +29,7 @@ from experiments.validation.random_cases.checks import ROUNDING, Outcome, check
 SHARE = 0.999  # of the cases whose true error is at most the stated one
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 OUT = Path(__file__).parents[3] / "out"
+PAGE = Path(__file__).parents[3] / "docs" / "_static" / "random_cases.md"
 
 
 def known_outcomes(file: Path) -> dict[int, Outcome]:
@@ -79,31 +83,47 @@ def broken_laws(outcomes: Sequence[Outcome]) -> list[str]:
 def print_outcomes(outcomes: Sequence[Outcome]) -> None:
     """Print counts, and a table of the quantiles of errors."""
     refused = [o for o in outcomes if o.refusal]
+    left = [o for o in outcomes if o.unfinished]
     by_scipy = [o for o in outcomes if o.by_scipy is not None]
-    left = [one.modes for one in outcomes if one.unfinished]
-    above = sum(one.exceeds for one in outcomes)
+    compared = [o for o in outcomes if o.largest is not None]
+    above = sum(one.exceeds for one in compared)
+    faults = sum(len(one.faults) for one in outcomes)
+    modes = [one.modes for one in left] or [0]
+    too_long = sum(one.left_by_scipy for one in outcomes)
     print(
-        f"{len(outcomes)} cases, {len(left)} of them left as they took too long, with"
-        f" {min(left, default=0)} to {max(left, default=0)} modes; {len(by_scipy)} by scipy;"
-        f" {above} errors above the stated ones; {len(refused)} refused:"
+        f"{len(outcomes)} random cases, of which {len(left)} took too long and were left"
+        f" ({min(modes)} to {max(modes)} modes): {faults} faults of numbers or verdicts,"
+        f" {len(refused)} refused. {len(by_scipy)} were integrated by scipy, too, and {too_long}"
+        f" took too long there. The true error exceeds the stated one in {above} of {len(compared)}"
+        " cases.\n"
     )
-    outcomes = [one for one in outcomes if not one.unfinished]
     for message in sorted({one.refusal for one in refused}):
         print(f"- {sum(one.refusal == message for one in refused)}: {message}")
-    compared = [o for o in outcomes if o.largest is not None]
+    finished = [one for one in outcomes if not one.unfinished]
+    known = [o for o in outcomes if o.true is not None]
     rows = {
-        "stated error": [o.stated for o in outcomes],
-        "true error": [o.true for o in outcomes if o.true is not None],
-        "true error, scipy": [o.by_scipy for o in by_scipy],
-        "true over stated, above rounding": [
-            o.largest / max(o.stated, 1e-16) if o.largest > ROUNDING else 0.0 for o in compared
+        "stated error": [o.stated for o in finished],
+        "true error, by shorter steps": [o.true for o in known],
+        "true error, by scipy": [o.by_scipy for o in by_scipy],
+        "true over stated error, above rounding": [
+            o.largest / max(o.stated, 1e-16) for o in compared if o.largest > ROUNDING
         ],
-        "error of the lowest contact force": [o.force for o in outcomes if o.true is not None],
-        "processor time (s)": [o.seconds for o in outcomes],
+        "error of the lowest contact force": [o.force for o in known],
+        "processor time (s)": [o.seconds for o in finished],
     }
-    print_table(("quantile", *(f"{100 * q:g} %" for q in QUANTILES)))
+    print_table(("quantile", "cases", *(f"{100 * q:g} %" for q in QUANTILES)))
     for name, values in rows.items():
-        print_row((name, *(f"{x:.1e}" for x in np.quantile(values or [np.nan], QUANTILES))))
+        if values:
+            quantiles = (f"{x:.1e}" for x in np.quantile(values, QUANTILES))
+            print_row((name, str(len(values)), *quantiles))
+
+
+def write_page(outcomes: Sequence[Outcome]) -> None:
+    """Write what is printed of the outcomes for a page of the site."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        print_outcomes(outcomes)
+    PAGE.write_text(printed.getvalue(), encoding="utf-8")
 
 
 def main() -> int:
@@ -117,6 +137,7 @@ def main() -> int:
     options.add_argument("--longest", type=float, default=np.inf, help="seconds of a case")
     options.add_argument("--plain", action="store_true", help="no tighter run beside each")
     options.add_argument("--folder", type=Path, default=OUT, help="of the outcomes")
+    options.add_argument("--page", action="store_true", help="write what is printed to the docs")
     options.add_argument("--anew", action="store_true", help="forget the outcomes of before")
     arguments = options.parse_args()
     name = f"random_cases_{arguments.seed}{'_plain' if arguments.plain else ''}.jsonl"
@@ -126,6 +147,8 @@ def main() -> int:
     limits = arguments.seconds, arguments.longest
     outcomes = outcomes_of(arguments.seed, arguments.count, file, *limits, arguments.plain)
     print_outcomes(outcomes)
+    if arguments.page:
+        write_page(outcomes)
     broken = broken_laws(outcomes)
     print("\n".join(broken))
     return 1 if broken else 0

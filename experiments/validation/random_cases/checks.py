@@ -5,22 +5,23 @@ import dataclasses
 import signal
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 import jaxbeam as jb
 from experiments.validation.random_cases.drawing import LENGTH, SENSORS, Drawn, draw
-from jaxbeam.simulation.integration_plan import TOLERANCE
+from jaxbeam.integrator.step_size import UNSAMPLED
+from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.oracles import modal_equations
 
 TIGHT = 1e-10  # tolerance of the run beside which the errors of each case are measured
 ROUNDING = 1e-9  # of the largest deflection; neither scipy nor the tight run are more accurate
-FORCE_ERROR = 5e-3  # of the largest contact force, which follows accelerations, not deflections
 PLACES = np.linspace(0.0, LENGTH, 34)[1:-1]  # m
 SCIPY_SHARE = 0.08  # of the cases that scipy integrates in seconds: 500 of 10 000
 MAX_PHASE = 3000.0  # rad; scipy takes seconds for as much of the highest mode, loads on the beam
@@ -109,7 +110,10 @@ def _checked(outcome: Outcome, drawn: Drawn, plain: bool) -> tuple[Outcome, Reco
         record = jb.simulate(drawn.case)
     except RuntimeError as error:
         return outcome._replace(refusal=str(error)), None
-    faults = [*nan_faults(record), *consistency_faults(drawn, record)]
+    faults = [
+        *nan_faults(record),
+        *beyond_errors(lambda scale: consistency_faults(drawn, record, scale), drawn, record),
+    ]
     outcome = outcome._replace(steps=record.steps, stated=float(record.error_estimate))
     tight = None if plain else _tight(drawn.case)
     if tight is not None:
@@ -120,7 +124,7 @@ def _checked(outcome: Outcome, drawn: Drawn, plain: bool) -> tuple[Outcome, Reco
                 size=largest_force(tight),
             ),
         )
-        faults += verdict_faults(record, tight)
+        faults += beyond_errors(lambda scale: verdict_faults(record, tight, scale), drawn, record)
     return outcome._replace(faults=tuple(faults)), record
 
 
@@ -166,11 +170,37 @@ def nan_faults(record: Record) -> list[str]:
     return faults
 
 
-def consistency_faults(drawn: Drawn, record: Record) -> list[str]:
-    """Numbers of a record that contradict each other, or its verdict."""
+def beyond_errors(
+    faults_of: Callable[[float], list[str]], drawn: Drawn, record: Record
+) -> list[str]:
+    """Faults of a run at a difference of contact forces (N) that is no error of its steps.
+
+    Those beyond rounding are looked at again with the error of the forces, estimated by a run with
+    steps half as long.
+    """
+    faults = faults_of(ROUNDING * largest_force(record))
+    return faults_of(force_error(drawn, record)) if faults else []
+
+
+def force_error(drawn: Drawn, record: Record) -> float:
+    """Twice the largest change (N) of contact forces as the steps of a run are halved.
+
+    Of the samples, and of the lowest force of each load.
+    """
+    plan = integration_plan(drawn.case)
+    finer = jb.simulate(drawn.case, plan=dataclasses.replace(plan, substeps=2 * plan.substeps))
+    change = max(
+        np.abs(np.nan_to_num(getattr(record, name) - getattr(finer, name))).max(initial=0.0)
+        for name in ("contact_force", "lowest_contact_force")
+    )
+    return max(UNSAMPLED * float(change), ROUNDING * largest_force(finer))
+
+
+def consistency_faults(drawn: Drawn, record: Record, scale: float) -> list[str]:
+    """Numbers of a record that contradict each other, or its verdict; forces by a `scale` (N)."""
     if "diverges" in record.verdict:
         return []
-    faults, scale = [], FORCE_ERROR * largest_force(record)
+    faults = []
     if not record.error_estimate <= TOLERANCE:
         faults.append(f"the stated error is {record.error_estimate:.1e}")
     deflection = np.abs(record.deflection).max(axis=0)
@@ -210,9 +240,8 @@ def relative_error(found, expected, size: float | None = None) -> float:
     return float(np.abs(np.asarray(found) - expected).max() / size) if size else 0.0
 
 
-def verdict_faults(record: Record, tight: Record) -> list[str]:
-    """Smallest contact forces in which two runs differ."""
-    scale = FORCE_ERROR * largest_force(tight)
+def verdict_faults(record: Record, tight: Record, scale: float) -> list[str]:
+    """Smallest contact forces in which two runs differ by more than a `scale` (N)."""
     lowest, exact = (np.asarray(each.lowest_contact_force) for each in (record, tight))
     wrong = (np.abs(lowest - exact) > scale) & ~np.isnan(exact)
     return [
@@ -237,9 +266,21 @@ def beside_scipy(drawn: Drawn, record: Record) -> tuple[float, list[str]]:
     found = modal_equations.respond(span, loads, np.concatenate([SENSORS, PLACES]), times)
     at_samples = np.searchsorted(times, samples)
     error = relative_error(_along(record), found.deflection[at_samples])
-    forces = found.contact_force
-    scale = FORCE_ERROR * max(largest_force(record), np.abs(forces).max(initial=0.0))
-    faults = []
+
+    def faults_of(scale):
+        return contact_faults(record, times, found.contact_force, scale)
+
+    return error, beyond_errors(faults_of, drawn, record)
+
+
+def contact_faults(
+    record: Record,
+    times: Float[np.ndarray, " time"],
+    forces: Float[np.ndarray, "time load"],
+    scale: float,
+) -> list[str]:
+    """Verdicts that contradict forces (N) at times (s) by another integrator, beyond a `scale`."""
+    faults, lost = [], np.asarray(record.contact_lost_time)
     for i, (force, lost_time) in enumerate(zip(forces.T, lost, strict=True)):
         # With a first time of negative force, no force is negative before, and one is after.
         before = force[times < lost_time] if np.isfinite(lost_time) else force
@@ -251,4 +292,4 @@ def beside_scipy(drawn: Drawn, record: Record) -> tuple[float, list[str]]:
         pressing = force[force != 0.0]  # on the beam
         if pressing.min(initial=np.inf) < record.lowest_contact_force[i] - scale:
             faults.append(f"load {i} has a force of {force.min():.6g} N: {record.verdict}")
-    return error, faults
+    return faults

@@ -1,0 +1,54 @@
+"""Checks of random cases: what is left is taken up again, and what is wrong is told."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+from experiments.validation.random_cases import __main__ as random_cases
+from experiments.validation.random_cases.checks import Outcome, beside_scipy
+from experiments.validation.random_cases.drawing import draw
+
+
+def test_cases_that_took_too_long_are_taken_up_again_with_a_longer_limit(tmp_path, monkeypatch):
+    """Case i takes i seconds."""
+    asked = []
+
+    def check(seed, index, longest, plain):
+        asked.append(index)
+        seconds = min(index, longest)
+        return Outcome(index, modes=3, seconds=seconds, unfinished=index > longest)
+
+    monkeypatch.setattr(random_cases, "check", check)
+    file = tmp_path / "outcomes.jsonl"
+    for longest, new in ((1.0, [0, 1, 2, 3]), (1.0, []), (2.5, [2, 3])):
+        asked.clear()
+        outcomes = random_cases.outcomes_of(1, 4, file, longest=longest)
+        assert asked == new
+    assert [one.unfinished for one in outcomes] == [False, False, False, True]
+
+
+def test_an_error_above_the_stated_one_is_told(capsys):
+    good = [Outcome(i, modes=2, stated=4e-8, true=2e-8, by_scipy=2e-8) for i in range(5)]
+    bad = Outcome(5, modes=2, stated=4e-8, true=2e-8, by_scipy=5e-8)
+    assert not random_cases.broken_laws(good)
+    assert random_cases.broken_laws([*good, bad]) == [
+        "the true error exceeds the stated one in cases 5"
+    ]
+    assert random_cases.broken_laws([bad._replace(true=None, by_scipy=None)]) == []
+    random_cases.print_outcomes([*good, bad])
+    assert "exceeds the stated one in 1 of 6 cases" in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+def test_a_wrong_verdict_is_found():
+    """A mass that leaves the beam, as it is told and as if it left later."""
+    drawn = draw(5, 16)
+    record = jb.simulate(drawn.case)
+    assert np.isfinite(record.contact_lost_time).any()
+    later = dataclasses.replace(record, contact_lost_time=record.contact_lost_time + 0.05)
+    (error, right), (_, wrong) = (beside_scipy(drawn, each) for each in (record, later))
+    assert error <= record.error_estimate
+    assert right == []
+    assert any("pulls by" in fault for fault in wrong)
