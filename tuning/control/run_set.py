@@ -15,7 +15,7 @@ from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, least_achievable_peak
 from jaxbeam.case.case import Case, crossing_times, replace, stack_cases, value_at
 from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime.arrays import Array
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.integration_plan import (
     IntegrationPlan,
     common_plan,
@@ -29,6 +29,7 @@ from tuning.control.load_cases import PLANT_PREFIXES, AddressValues, run_cases
 from tuning.control.objective import Sharpness, run_metrics
 
 PEAK_TOLERANCE = 1e-4  # of the largest deflection
+MAX_KNOWN_RUNS = 100  # without control, of a batch that is not compiled, which takes less time
 
 
 class RunSet(eqx.Module):
@@ -185,8 +186,14 @@ def _uncontrolled_histories(cases: list[Case], times, positions, quantities) -> 
     """Histories of runs without their controllers, along a first axis."""
     without_controller = [dataclasses.replace(case, controller=None) for case in cases]
     plan, _ = _integration_plan(without_controller)
-    stacked = stack_cases(without_controller)
-    return jax.tree.map(np.asarray, _histories(stacked, times, plan, positions, quantities))
+    wanted = times, plan, positions, quantities
+    if len(cases) <= MAX_KNOWN_RUNS:
+        found = [_known_histories(case, *wanted) for case in without_controller]
+        return jax.tree.map(lambda *runs: np.stack(runs), *found)
+    return jax.tree.map(np.asarray, _histories(stack_cases(without_controller), *wanted))
+
+
+_known_histories = compiled_if_traced(simulate_histories)
 
 
 @compiled
