@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Arc
 
 from jaxbeam.plot.style import COLOURS, INK, use_style
-from tests.test_imports import FILES, IMPORTS, RANKS, package
+from tests.test_imports import FILES, RANKS, imports, package
 
 PICTURE = Path(__file__).with_name("rooms.svg")
 COLOUR = {"jaxbeam": COLOURS[0], "tuning": COLOURS[2], "experiments": COLOURS[1]}
@@ -27,7 +27,7 @@ def package_imports() -> Graph:
     """Imported packages of every package, the packages from the first to the last level."""
     packages = [name for name in RANKS if f"{name}.__init__" in FILES]
     found: Graph = {name: set() for name in sorted(packages, key=lambda name: RANKS[name])}
-    for module, imported in IMPORTS.items():
+    for module, imported in imports().items():
         if package(module) in found:
             found[package(module)] |= {package(name) for name in imported} & found.keys()
     return {name: imported - {name} for name, imported in found.items()}

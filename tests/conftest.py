@@ -41,8 +41,11 @@ os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 import hypothesis
 import pytest
 
+from tests import shape_checks
 from tests.fuzzing import FACTOR
 from tests.layers.selection import layers, matches
+
+shape_checks.use()
 
 # Tracing makes millions of small objects that live long: with Python's own thresholds, garbage
 # collection takes up to a tenth of the time and frees next to nothing.

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
+from jaxbeam.analysis.bound.bound import run_peaks
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.filters import Filter
 from jaxbeam.case.quantities import QUANTITIES
@@ -22,7 +23,6 @@ from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import max_stable_step
 from jaxbeam.integrator.propagators import propagators
 from jaxbeam.integrator.static_shapes import static_shapes
-from jaxbeam.integrator.step_size import run_peaks
 from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.contact import contact_at
 from jaxbeam.model.flexibility import flexibility

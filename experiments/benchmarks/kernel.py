@@ -29,6 +29,8 @@ from experiments.benchmarks.rivals.pinned_beam import GRAVITY, PinnedBeam
 from experiments.benchmarks.sweep import MASSES, SPEEDS, TOLERANCE, sweep_peaks
 from jaxbeam.integrator.propagators import GAUSS_NODES, PEAK_NODES
 from jaxbeam.numerics.peak_search import interpolation_matrix, newton_step_limit
+from jaxbeam.runtime.cache_folder import write_file
+from jaxbeam.runtime.trusted_code import loaded_library
 from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.specification import sweep_specification
 
@@ -46,7 +48,11 @@ def build(modes: int, folder: Path) -> Library:
     source, target = Path(__file__).with_name("kernel.c"), folder / f"kernel{modes}.so"
     command = [compiler(), str(source), f"-DMODES={modes}", *FLAGS, "-o", str(target)]
     subprocess.run(command, check=True)  # type: ignore[arg-type]
-    return ctypes.CDLL(str(target)).crossing
+    stored = write_file(target.stem, target.read_bytes())
+    try:
+        return loaded_library(stored.name).crossing
+    finally:
+        stored.unlink()
 
 
 def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:

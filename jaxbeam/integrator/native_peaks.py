@@ -3,7 +3,7 @@
 XLA splits a step into some forty loops over the runs of a batch; in C it is one, and so are all
 steps of all tasks. It serves sweeps of peaks of all quantities (not of histories) without a
 controller, in double precision, on CPUs. The first large sweep compiles it, once for a machine: in
-2.4 s of processor time, of which each new structure regains 1.2 s, as XLA has less to compile, and
+1.7 s of processor time, of which each new structure regains 1.2 s, as XLA has less to compile, and
 4096 crossings 0.05 (3 modes) to 0.27 s (12 modes), measured in the benchmark `sweep`.
 """
 

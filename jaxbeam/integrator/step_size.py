@@ -2,6 +2,12 @@
 
 A run of the case is compared with one whose steps are half as long. The order of the error is at
 least CONVERGENCE_ORDER, so that the next trial is close to the longest step that suffices.
+
+Where forces change sharply, the error depends on where in a step they do: the forces that Gauss
+nodes integrate worst are those with a singularity near the middle of a step, beside the real axis
+(Trefethen 2008, "Is Gauss quadrature better than Clenshaw-Curtis?", theorem 4.5). Errors of equal
+steps that begin elsewhere have differed by a factor of five hundred. So wherever samples are no
+closer than steps, the steps of the trials are those of the run itself, between its samples.
 """
 
 from typing import NamedTuple
@@ -12,17 +18,17 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, concrete_case, replace
 from jaxbeam.case.fields import concrete
 from jaxbeam.integrator.discrete_model import discrete_model
-from jaxbeam.integrator.integrate import integrate_history, integrate_peaks
-from jaxbeam.integrator.peaks.running_peaks import RunningPeaks
+from jaxbeam.integrator.events import EventSchedule
+from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.static_shapes import StaticShapes, model_limits
-from jaxbeam.integrator.time_grid import grid_by_step_length
+from jaxbeam.integrator.time_grid import TimeGrid, grid_by_schedule, grid_by_step_length
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
-from jaxbeam.runtime.arrays import Array, xp
 
 MAX_STEPS = 10**8  # samples or time steps of a run; more exceed memory or take days
 MAX_TRIALS = 40  # step sizes tried
 CONVERGENCE_ORDER = 9  # assumed order of the error in the step; the true order is higher
+CLOSE_SAMPLES = 0.5  # share of a step; closer ones need no trial with their own steps
 MAX_DIVERGED_HALVINGS = 6  # halvings of the step after which a run that overflows is given up
 NO_STEP = (
     "no time step makes the response agree to {:g}; it is unstable, or its frequencies are too far"
@@ -32,19 +38,19 @@ NO_STEP = (
 ROUNDING = 1e-9  # of the deflection under all loads; below it, deflections are not compared
 SMALLEST_TOLERANCE = 1e-14  # some fifty units in the last place of double precision
 LARGEST_ROUNDING = 1e-9  # an error that shorter steps do not lessen, and that may be rounding
-# Errors at all positions and times over the largest of those compared. Of random cases up to 1.24:
-# experiments/validation/random_cases.
-UNSAMPLED = 2.0
-TRIAL_POSITIONS = (0.13, 0.29, 0.47, 0.62, 0.88)  # x / length at which errors are measured
+UNSAMPLED = 2.0  # errors at all positions and times over the largest of those compared
+LEAST_TRIAL_POSITIONS = 8  # at which errors are measured
+TRIAL_CHUNK = 2048  # times of a trial whose deflections are compared at once
 
 
 class StepTrial(NamedTuple):
     """States of two trial runs at the same `times` (s): with some steps, and with half of them.
 
     Those of the beam's modal model, then those of vehicles. Errors are at least the `share` of
-    those of the `former` trial, if there was one. `shortest` is the step (s) between those load
-    events that several lie between: a run of longer ones there may have larger errors. Errors of a
-    run whose law is not asked in the trial are the `amplification` of those of the trial.
+    those of the `former` trial, if there was one. Steps are so many `substeps` of the intervals of
+    a schedule, if that is not zero; else they begin at load events, and the `panels` are the times
+    (s) between those with loads on the beam, and the steps there. Errors of a run whose law is not
+    asked in the trial are the `amplification` of those of the trial.
     """
 
     times: Float[np.ndarray, " time"]
@@ -52,7 +58,8 @@ class StepTrial(NamedTuple):
     fine: Float[np.ndarray, "time state batch"]
     former: "StepTrial | None" = None
     share: float = 0.0
-    shortest: float = np.inf
+    substeps: int = 0
+    panels: Float[np.ndarray, "2 panel"] = np.zeros((2, 0))
     amplification: float = 1.0
 
 
@@ -106,56 +113,96 @@ def longest_trial_step(case: Case, shapes: StaticShapes) -> float:
 
 @np.errstate(all="ignore")  # of extreme numbers, and of runs that diverge
 def choose_step_size(
-    case: Case, shapes: StaticShapes, tolerance: float
+    case: Case, shapes: StaticShapes, tolerance: float, schedule: EventSchedule | None = None
 ) -> tuple[float, float, StepTrial]:
-    """Longest step (s) whose deflections at TRIAL_POSITIONS meet the `tolerance`, and their error.
+    """Longest step (s) whose deflections meet the `tolerance`, and their error.
 
-    The last is the trial from which the error is known.
+    The last is the trial from which the error is known. With a `schedule` of samples its steps are
+    those of a run that is sampled so, unless samples are closer than CLOSE_SAMPLES of a step.
 
-    The step is shortened until dividing it by two changes no deflection at the ends of its steps by
-    more than half the tolerance, relative to the largest; the error is twice that change, as it is
-    larger at other positions and times. Peaks alone would hide errors, as the deflection is
-    stationary there. The error is at least that of the former trial times the ratio of the steps to
-    the power of CONVERGENCE_ORDER: where forces change sharply, a single change may be far smaller
-    than the error of a run whose steps begin elsewhere. Raises RuntimeError if no step meets it.
+    The step is shortened until dividing it by two changes no deflection at the trial positions and
+    the ends of its steps by more than half the tolerance, relative to the largest; the error is
+    twice that change, as it is larger at other positions and times. Peaks alone would hide errors,
+    as the deflection is stationary there. The error of steps between load events is at least that
+    of the former trial times the ratio of the steps to the power of CONVERGENCE_ORDER: a single
+    change may be far smaller than that of a run whose steps begin elsewhere.
+
+    Raises RuntimeError if no step meets the tolerance.
     """
     case = concrete_case(case)
     step = longest_trial_step(case, shapes)
     check_step_count(float(concrete(case.run.duration)) / step, step)
     model = modal_model(case, shapes.layout, shapes.coupled)
     case, loads = without_later_vibration(case, model), load_set(case, shapes.layout)
+    schedule = None if schedule is None else _until(schedule, float(case.run.duration))
     halvings, least, floor = 0, rounding_deflection(case, model), ErrorFloor(tolerance)
     former, former_error, shrink = None, 0.0, 0.0
     for _ in range(MAX_TRIALS):
+        step, substeps = _step_and_substeps(schedule, step)
         (times, coarse), (_, fine) = (
-            trial_run(case, model, loads, shapes.max_loads, step, divided) for divided in (1, 2)
+            run_of_grid(grid, model, loads, shapes.max_loads)
+            for grid in _grids(case, model, step, schedule, substeps)
         )
-        deflections = (trial_deflections(case, model, states) for states in (coarse, fine))
-        change, share = UNSAMPLED * largest_change(*deflections, least), shrink**CONVERGENCE_ORDER
-        error = max(change, share * former_error)
-        trial = StepTrial(times, coarse, fine, former, share)
+        trial = StepTrial(times, coarse, fine[::2], substeps=substeps)
+        change = UNSAMPLED * _largest_deflection_change(case, model, trial, least)
+        error, share = change, shrink**CONVERGENCE_ORDER
+        if not substeps:
+            error, trial = max(change, share * former_error), trial._replace(former=former)
         if error <= tolerance:
-            return step, error, trial._replace(shortest=_shortest_step(case, model, step))
+            panels = _loaded_panels(case, model, step)
+            return step, error, trial._replace(share=share, panels=panels)
         floor.check(change, step)
         shrink, former, former_error = 0.5, None, 0.0
         if np.isfinite(error):
-            shrink = np.clip(0.9 * (tolerance / error) ** (1 / CONVERGENCE_ORDER), 0.2, 0.8)
+            shrink = 0.9 * (tolerance / error) ** (1 / CONVERGENCE_ORDER)
+            shrink = float(np.clip(shrink, 0.2, 0.8))
             former, former_error = trial._replace(former=None), change
         elif (halvings := halvings + 1) > MAX_DIVERGED_HALVINGS:
             break
-        shrink = float(shrink)
-        step = step * shrink
+        step *= shrink
     raise RuntimeError(NO_STEP.format(tolerance))
 
 
-def _shortest_step(case: Case, model: ModalModel, step: float) -> float:
-    """Shortest step (s) among those between load events that are longer than a `step` (s).
+def steps_per_interval(interval: float, max_step: float) -> int:
+    """Smallest number of equal steps of at most `max_step` (s) in an interval (s)."""
+    return max(1, int(np.ceil(interval / max_step)))
 
-    Equal steps between two events may be little longer than half of it.
+
+def _until(schedule: EventSchedule, end: float) -> EventSchedule:
+    """The schedule of samples without those after the first one that is not before an end (s)."""
+    count = max(2, int(np.searchsorted(schedule.times, end)) + 1)
+    times, index = schedule.times[:count], schedule.length_index[: count - 1]
+    return EventSchedule(times, index, schedule.lengths, np.arange(len(times)))
+
+
+def _step_and_substeps(schedule: EventSchedule | None, step: float) -> tuple[float, int]:
+    """The longest of equal steps (s) in the intervals of a schedule, and their number in each.
+
+    The step itself and zero where intervals are shorter than CLOSE_SAMPLES of it.
     """
+    interval = 0.0 if schedule is None else float(np.max(schedule.lengths))
+    if interval < CLOSE_SAMPLES * step:
+        return step, 0
+    substeps = steps_per_interval(interval, step)
+    return interval / substeps, substeps
+
+
+def _grids(
+    case: Case, model: ModalModel, step: float, schedule: EventSchedule | None, substeps: int
+) -> list[TimeGrid]:
+    """Grids of a trial: of steps (s), or so many in each interval, and of steps half as long."""
+    if schedule is None or not substeps:
+        max_step = np.asarray(step)
+        return [grid_by_step_length(case, model, max_step, refinement=n) for n in (1, 2)]
+    check_step_count(float(schedule.times.size * substeps), step)
+    return [grid_by_schedule(case, model, schedule, n * substeps) for n in (1, 2)]
+
+
+def _loaded_panels(case: Case, model: ModalModel, step: float) -> Float[np.ndarray, "2 panel"]:
+    """Times (s) between load events with loads on the beam, and steps there of at most a `step`."""
     grid = grid_by_step_length(case, model, np.asarray(step))
-    several = (np.asarray(grid.counts) > 1) & np.any(grid.loads_on_beam, axis=1)
-    return float(np.min(np.asarray(grid.lengths)[:-1][several], initial=step))
+    loaded = (np.asarray(grid.counts) > 0) & np.any(grid.loads_on_beam, axis=1)
+    return np.stack([np.diff(grid.boundaries), np.asarray(grid.lengths)[:-1]])[:, loaded]
 
 
 def without_later_vibration(case: Case, model: ModalModel) -> Case:
@@ -170,54 +217,62 @@ def without_later_vibration(case: Case, model: ModalModel) -> Case:
 
 
 def trial_run(
-    case: Case,
-    model: ModalModel,
-    loads: LoadSet,
-    max_loads: int,
-    max_step: float,
-    divided: int = 1,
+    case: Case, model: ModalModel, loads: LoadSet, max_loads: int, max_step: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Boundaries of steps of at most `max_step` (s), and states there (boundary, state, batch).
 
-    Of a run without controller, with at most `max_loads` on the beam at once. Each step is
-    `divided` into so many.
+    Of a run without controller, with at most `max_loads` on the beam at once.
     """
-    grid = grid_by_step_length(case, model, np.asarray(max_step), refinement=divided)
+    grid = grid_by_step_length(case, model, np.asarray(max_step))
+    return run_of_grid(grid, model, loads, max_loads)
+
+
+def run_of_grid(
+    grid: TimeGrid, model: ModalModel, loads: LoadSet, max_loads: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Boundaries of the steps of a grid (s), and states there (boundary, state, batch)."""
     discrete, steps = discrete_model(model, grid, None), int(grid.step_count)
     _, states, *_ = integrate_history(discrete, loads, max_loads=max_loads, steps=steps)
-    _, starts, _ = grid.locate_steps(np.arange(0, steps, divided))
-    return np.append(starts, grid.boundaries[-1]), np.asarray(states[::divided])
+    _, starts, _ = grid.locate_steps(np.arange(steps))
+    return np.append(starts, grid.boundaries[-1]), np.asarray(states)
+
+
+def trial_positions(case: Case) -> Float[np.ndarray, " position"]:
+    """Positions (m) at which errors are measured: twice as many as modes, lest some are missed."""
+    count = max(LEAST_TRIAL_POSITIONS, 2 * case.beam.modes)
+    return float(concrete(case.beam.length)) * (np.arange(count) + 0.5) / count
 
 
 def trial_deflections(case: Case, model: ModalModel, states):
-    """Deflections (m) at TRIAL_POSITIONS from states (boundary, state, batch)."""
-    rows = model.shapes(case.beam.length * xp.array(TRIAL_POSITIONS), (0,))[0]
+    """Deflections (m) at the trial positions from states (boundary, state, batch)."""
+    rows = model.shapes(trial_positions(case), (0,))[0]
     deflections = rows @ states[:, 0 : 2 * case.beam.modes : 2]
     return deflections.reshape(-1, deflections.shape[-1])
 
 
-def run_peaks(
-    case: Case,
-    shapes: StaticShapes,
-    max_step: Float[Array, ""],
-    positions: Float[Array, " sensor"],
-) -> RunningPeaks:
-    """Running peaks of an uncontrolled run at positions (m), in steps of at most `max_step` (s)."""
-    model = modal_model(case, shapes.layout, shapes.coupled)
-    grid = grid_by_step_length(case, model, max_step)
-    discrete = discrete_model(model, grid, positions)
-    return integrate_peaks(discrete, load_set(case, shapes.layout), max_loads=shapes.max_loads)[0]
+def _largest_deflection_change(
+    case: Case, model: ModalModel, trial: StepTrial, least: float
+) -> float:
+    """`largest_change` of the deflections of a trial, of some times after others."""
+    rows, own = model.shapes(trial_positions(case), (0,))[0], np.s_[:, 0 : 2 * case.beam.modes : 2]
+    coarse, fine = trial.coarse[own], trial.fine[own]
+    change = largest = np.zeros(coarse.shape[2])
+    for i in range(0, len(coarse), TRIAL_CHUNK):
+        deflections, exact = (rows @ part[i : i + TRIAL_CHUNK] for part in (coarse, fine))
+        change = np.maximum(change, np.max(np.abs(deflections - exact), axis=(0, 1)))
+        largest = np.maximum(largest, np.max(np.abs(exact), axis=(0, 1)))
+    return _relative(change, largest, least)
 
 
 def rounding_deflection(case: Case, model: ModalModel) -> float:
-    """Deflection (m) that may be all rounding: a share of that of all loads at TRIAL_POSITIONS.
+    """Deflection (m) that may be all rounding: a share of that of all loads at the trial positions.
 
     Loads that stand on supports deflect nothing, and rounding falls with no step.
     """
     loads = load_set(case)
     times = np.linspace(0.0, float(concrete(case.run.duration)), 100)
     weight = np.max(np.sum(np.abs(loads.varying_weight(times)), axis=1), initial=0.0)
-    rows = model.shapes(case.beam.length * xp.array(TRIAL_POSITIONS), (0,))[0]
+    rows = model.shapes(trial_positions(case), (0,))[0]
     stiffness = np.where(model.modes.stiffness > 0, model.modes.stiffness, np.inf)
     return ROUNDING * float(weight * np.max(np.sum(rows**2 / stiffness, axis=1)))
 
@@ -227,8 +282,15 @@ def largest_change(coarse: np.ndarray, fine: np.ndarray, least: float = 0.0) -> 
 
     Relative to `least` where no value is larger.
     """
-    if not np.any(fine):
+    with np.errstate(invalid="ignore"):
+        return _relative(np.max(np.abs(coarse - fine), axis=0), np.max(np.abs(fine), axis=0), least)
+
+
+def _relative(
+    change: Float[np.ndarray, " batch"], largest: Float[np.ndarray, " batch"], least: float
+) -> float:
+    """Largest of changes relative to the largest values, or to `least` where that is larger."""
+    if not np.any(largest):
         return 0.0
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        largest = np.maximum(np.max(np.abs(fine), axis=0), least)
-        return float(np.max(np.abs(coarse - fine) / largest, initial=0.0))
+        return float(np.max(change / np.maximum(largest, least), initial=0.0))

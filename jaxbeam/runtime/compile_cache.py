@@ -2,8 +2,8 @@
 
 JAX's own cache finds a program after tracing and lowering, which take longer than loading it. Here
 its name is a hash known before (`program_key`), in a folder private to the user (`cache_folder`).
-Programs are for one CPU device. Loading unpickles, here and within JAX, so it is done only after
-`cache_folder.read_file` has verified the file's HMAC.
+Programs are for one CPU device. Loading unpickles, here and within JAX: `trusted_code` does so once
+the file's HMAC is verified.
 
 The README ("Speed") says how scripts switch it on and commands off.
 """
@@ -11,7 +11,6 @@ The README ("Speed") says how scripts switch it on and commands off.
 import contextlib
 import functools
 import os
-import pickle
 import threading
 import warnings
 from typing import Any
@@ -21,7 +20,8 @@ from jax.experimental import serialize_executable
 
 from jaxbeam.runtime import cache_folder
 from jaxbeam.runtime.cache_folder import CacheError
-from jaxbeam.runtime.program_key import SERIALISATION_ERRORS, serialise
+from jaxbeam.runtime.program_key import serialise
+from jaxbeam.runtime.trusted_code import PICKLING_ERRORS, loaded_program, unpickled
 
 SIZE_VARIABLE = "JAXBEAM_CACHE_SIZE"  # MiB; 0 switches the cache off
 DEFAULT_SIZE = 512  # MiB, some 500 programs
@@ -77,7 +77,7 @@ def save_program(name: str, program: jax.stages.Compiled, outputs: Any) -> None:
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), outputs)
     try:
         content = serialise((serialize_executable.serialize(program)[0], shapes))
-    except (*SERIALISATION_ERRORS, ValueError, NotImplementedError):
+    except (*PICKLING_ERRORS, ValueError, NotImplementedError):
         return
     try:
         cache_folder.write_file(name, content)
@@ -92,22 +92,20 @@ def read_program(name: str) -> tuple[bytes, Any] | None:
     A file that is refused makes a warning; it is replaced when the program has been compiled.
     """
     try:
-        content = cache_folder.read_file(name)
+        stored = unpickled(name)
     except CacheError as error:
         _warn(error)
         return None
-    if content is None:
-        return None
-    cache_folder.mark_used(name)
-    return pickle.loads(content)
+    if stored is not None:
+        cache_folder.mark_used(name)
+    return stored
 
 
 def load_program(code: bytes, arguments: Any, outputs: Any) -> jax.stages.Compiled:
     """Program from its code, for arguments and outputs with the tree structure of these."""
     if b"lapack" in code:  # only then, as it takes as long as loading all the rest
         _load_lapack()
-    trees = jax.tree.structure((arguments, {})), jax.tree.structure(outputs)
-    return serialize_executable.deserialize_and_load(code, *trees)
+    return loaded_program(code, arguments, outputs)
 
 
 @functools.cache

@@ -8,16 +8,14 @@ function that depends on other code, whose changes no version tells, has no key.
 import functools
 import hashlib
 import importlib.metadata
-import io
 import os
 import pathlib
-import pickle
 import sys
-import types
 
 import jax
 
 from jaxbeam.runtime.cache_folder import machine_description
+from jaxbeam.runtime.trusted_code import PICKLING_ERRORS, pickled
 
 OWN_PACKAGES = ("jaxbeam", "tuning")  # whose source is hashed
 # Packages whose functions may be compiled; a test compares them with the declared dependencies.
@@ -44,7 +42,7 @@ def program_name(function, identity: tuple) -> str | None:
     key = function.__module__, function.__name__, function.settings, identity, _jax_settings()
     try:
         serialised_key = serialise(key)
-    except SERIALISATION_ERRORS:
+    except PICKLING_ERRORS:
         return None
     digest = hashlib.sha256(environment_hash() + serialised_key).hexdigest()[:32]
     return f"program-{function.__name__}-{digest}"
@@ -58,40 +56,9 @@ def _is_cacheable(function) -> bool:
     return found is function or found is function.__wrapped__
 
 
-class ExternalCode(Exception):
-    """A key depends on code of a package whose version is not part of it."""
-
-
-SERIALISATION_ERRORS = (ExternalCode, pickle.PicklingError, AttributeError, TypeError)
-
-
-class _Pickler(pickle.Pickler):
-    """Pickler whose bytes are equal in every process, for objects of versioned packages only."""
-
-    def reducer_override(self, obj):
-        """Classes and functions by name, sentinels by the name of their module's constant.
-
-        Raises ExternalCode for what another package defines.
-        """
-        named = isinstance(obj, type | types.FunctionType | types.BuiltinFunctionType)
-        if str((obj if named else type(obj)).__module__).split(".")[0] not in VERSIONED_PACKAGES:
-            raise ExternalCode(obj)
-        if named:
-            return NotImplemented
-        # Sentinels, such as equinox has for a missing value, are compared by identity.
-        if type(obj).__reduce__ is object.__reduce__:
-            constants = vars(sys.modules[type(obj).__module__]).items()
-            return next((name for name, value in constants if value is obj), NotImplemented)
-        return NotImplemented
-
-
 def serialise(obj) -> bytes:
-    """Pickle of an object. Raises one of SERIALISATION_ERRORS if it has none."""
-    file = io.BytesIO()
-    pickler = _Pickler(file, protocol=5)
-    pickler.fast = True  # without a memo, equal objects give equal bytes, identical or not
-    pickler.dump(obj)
-    return file.getvalue()
+    """Pickle of an object of versioned packages. Raises one of PICKLING_ERRORS if it has none."""
+    return pickled(obj, VERSIONED_PACKAGES)
 
 
 def _jax_settings() -> list[tuple[str, str]]:

@@ -45,7 +45,7 @@ def coil_history(
     ...         jb.Electrodynamic(0.3, 3.0, 1e-3, 8.0, inner_loop=jb.CurrentLoop(bandwidth=2e3))
     ...     ],
     ...     controller=jb.Prescribed(offsets=[0.5], period=0.01),
-    ...     run=jb.Run(1.0, sample_rate=200.0),
+    ...     run=jb.Run(0.4, sample_rate=200.0),
     ... )
     >>> coil = jb.coil_history(case)
     >>> print(f"{coil.current[-1]:.3f} A, {coil.voltage[-1]:.2f} V, {coil.force[-1]:.2f} N")

@@ -16,7 +16,7 @@ from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.discrete_model import discrete_model
-from jaxbeam.integrator.events import EventSchedule
+from jaxbeam.integrator.events import EventSchedule, sample_schedule
 from jaxbeam.integrator.held_commands import HeldCommands
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_at_events
@@ -35,6 +35,7 @@ from jaxbeam.integrator.step_size import (
     largest_change,
     longest_trial_step,
     rounding_deflection,
+    steps_per_interval,
     trial_deflections,
 )
 from jaxbeam.integrator.time_grid import grid_by_schedule
@@ -118,17 +119,17 @@ def integration_plan(
         by_first_run = None if first_run is None else run_first
         substeps, error, trial = _choose_substeps(case, shapes, schedule, tolerance, by_first_run)
         return plan(substeps, error, _sensor_errors(case, shapes, trial))
-    step, error, trial = choose_step_size(case, shapes, tolerance)
-    step = SHARE_OF_TRIAL_STEP * trial.shortest
     intervals = np.diff(samples)
     equally_spaced = bool(
         np.all(np.abs(intervals - intervals.mean()) < SPACING_TOLERANCE * intervals.mean())
     )
     lead_samples = max(0, int(np.ceil(samples[0] / intervals.mean() - SPACING_TOLERANCE)))
-    check_step_count(samples.size * (intervals.max() / step), step)
-    substeps = steps_per_interval(intervals.max(), step)
-    # Whole numbers of steps between samples may make them shorter still.
-    share = float((intervals.max() / substeps / step) ** CONVERGENCE_ORDER)
+    schedule = run_schedule(case, samples, equally_spaced, lead_samples, to_duration)
+    step, error, trial = choose_step_size(case, shapes, tolerance, schedule)
+    substeps, share = trial.substeps, 1.0
+    if not substeps:
+        substeps, share = _substeps_and_share(trial, step, intervals.max())
+        check_step_count(float(samples.size * substeps), intervals.max() / substeps)
     return IntegrationPlan(
         shapes,
         substeps,
@@ -140,9 +141,34 @@ def integration_plan(
     )
 
 
-def steps_per_interval(interval: float, max_step: float) -> int:
-    """Smallest number of equal steps of at most `max_step` (s) in an interval (s)."""
-    return max(1, int(np.ceil(interval / max_step)))
+def _substeps_and_share(trial: StepTrial, step: float, interval: float) -> tuple[int, float]:
+    """Steps in each interval (s) between samples, and their error over that of a trial.
+
+    Steps of the trial are at most a `step` (s). Those of the run are SHARE_OF_TRIAL_STEP of them or
+    shorter, but where there is only one between two load events: that may be the same in both.
+    """
+    times, steps = trial.panels
+    several = steps < times
+    longest = SHARE_OF_TRIAL_STEP * np.min(steps[several], initial=step)
+    substeps = steps_per_interval(interval, longest)
+    of_run = np.minimum(times, interval) / substeps
+    ratios = np.minimum(of_run / (SHARE_OF_TRIAL_STEP * steps), 1.0)
+    return substeps, float(np.max(ratios, initial=0.0)) ** CONVERGENCE_ORDER
+
+
+def run_schedule(
+    case: Case, times, equally_spaced: bool, lead_samples: int, to_duration: bool
+) -> EventSchedule:
+    """Schedule of a run without controller that is sampled at ascending times (s).
+
+    From rest at t = 0 to the first sample in steps as those between samples; the run ends with the
+    last, or `to_duration` at that of the case.
+    """
+    spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
+    lead_times = times[0] - spacing * xp.arange(lead_samples, 0, -1)
+    all_times = xp.concatenate([lead_times, times])
+    end = case.run.duration if to_duration else None
+    return sample_schedule(all_times, equally_spaced, lead_samples, end)
 
 
 def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> IntegrationPlan:

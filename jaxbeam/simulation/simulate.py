@@ -12,7 +12,6 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.discrete_model import DiscreteModel, discrete_model, signed_both_ways
-from jaxbeam.integrator.events import sample_schedule
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.peaks.running_peaks import Peaks
@@ -36,6 +35,7 @@ from jaxbeam.simulation.integration_plan import (
     IntegrationPlan,
     beam_and_vehicles,
     integration_plan,
+    run_schedule,
     runs_compiled,
     sample_times,
 )
@@ -276,15 +276,8 @@ def integration_setup(
     loads = load_set(case, layout)
     if case.controller is None:
         model, policy = modal_model(case, layout, plan.shapes.coupled), None
-        # From rest at t = 0 to the first sample in steps as those between samples.
-        spacing = (times[-1] - times[0]) / (times.shape[0] - 1)
-        lead_times = times[0] - spacing * xp.arange(plan.lead_samples, 0, -1)
-        schedule = sample_schedule(
-            xp.concatenate([lead_times, times]),
-            plan.equally_spaced,
-            plan.lead_samples,
-            case.run.duration if plan.to_duration else None,
-        )
+        choices = plan.equally_spaced, plan.lead_samples, plan.to_duration
+        schedule = run_schedule(case, times, *choices)
     else:
         schedule = plan.schedule
         policy = policy or closed_loop(case, layout, loads, schedule, noisy)

@@ -20,6 +20,7 @@ from jaxbeam.sweeps.store import ZarrStore, create_store
 from tests.sweeps.test_store import files_of
 from tests.sweeps.test_sweep import CASE
 
+dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
 
 OVER = {"loads.0.mass": np.linspace(0.1, 0.9, 64), "loads.0.speed": np.linspace(1, 4, 48)}
@@ -131,6 +132,8 @@ def stuck(monkeypatch, tmp_path):
     monkeypatch.setattr(cluster, "LONELY", 0.3)
     monkeypatch.setattr(cluster, "CHECK", 0.05)
     with (
+        # A worker tells its scheduler that it ends; one that is lost would be waited for 30 s.
+        dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
         distributed.LocalCluster(
             n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
         ) as machines,

@@ -26,7 +26,7 @@ CASE = jb.Case(
     ],
     run=jb.Run(duration=0.1, sample_rate=150),
 )
-RUNS = 12
+RUNS = 6
 TOLERANCE = 1e-6  # of peaks; both ways of computing have errors of some 1e-7
 
 # Runs that end while the beam is deflected more and more, as often as not, and 5 to 100 samples.

@@ -24,6 +24,7 @@ FORCE_ERROR = 5e-3  # of the largest contact force, which follows accelerations,
 PLACES = np.linspace(0.0, LENGTH, 34)[1:-1]  # m
 SCIPY_SHARE = 0.08  # of the cases that scipy integrates in seconds: 500 of 10 000
 MAX_PHASE = 3000.0  # rad; scipy takes seconds for as much of the highest mode, loads on the beam
+SCIPY_LONGEST = 10.0  # s of the processor, of an integration by scipy
 
 
 class Outcome(NamedTuple):
@@ -33,18 +34,29 @@ class Outcome(NamedTuple):
     modes: int
     steps: int = 0
     stated: float = 0.0  # error
-    true: float = 0.0  # error beside a run of tighter tolerance
+    true: float | None = None  # error beside a run of tighter tolerance, None where there is none
     by_scipy: float | None = None  # error beside scipy, None where that was not asked
     faults: tuple[str, ...] = ()
     refusal: str = ""  # message of a case that no step integrates
     seconds: float = 0.0  # of the processor
     force: float = 0.0  # error of the lowest contact forces, relative to the largest force
     unfinished: bool = False  # whether it took too long, and was left
+    left_by_scipy: bool = False  # whether scipy took too long
+
+    @property
+    def tried(self) -> float:
+        """Processor time (s) after which it was left; infinite if it was not."""
+        return self.seconds if self.unfinished else np.inf
+
+    @property
+    def largest(self) -> float | None:
+        """Largest true error; None where nothing was compared."""
+        return max((e for e in (self.true, self.by_scipy) if e is not None), default=None)
 
     @property
     def exceeds(self) -> bool:
         """Whether a true error is larger than the stated one, and than rounding."""
-        return max(self.true, self.by_scipy or 0.0) > max(self.stated, ROUNDING)
+        return (self.largest or 0.0) > max(self.stated, ROUNDING)
 
 
 class TooLongError(Exception):
@@ -74,7 +86,8 @@ def at_most(seconds: float) -> Iterator[None]:
 def check(seed: int, index: int, longest: float = np.inf, plain: bool = False) -> Outcome:
     """Draw a case and check it, for some processor time (s) at most.
 
-    A `plain` check is of one run: finite numbers, and a verdict that agrees with them.
+    A `plain` check has no run of tighter tolerance: numbers are finite, the verdict agrees with
+    them, and the sample that is integrated by scipy agrees with that.
     """
     start, drawn = time.process_time(), draw(seed, index)
     outcome = Outcome(index, drawn.case.beam.modes)
@@ -82,18 +95,20 @@ def check(seed: int, index: int, longest: float = np.inf, plain: bool = False) -
         warnings.simplefilter("ignore", ContactLossWarning)
         try:
             with at_most(longest):
-                outcome = _checked(seed, outcome, drawn, plain)
+                outcome, record = _checked(outcome, drawn, plain)
         except TooLongError:
-            outcome = outcome._replace(unfinished=True)
+            outcome, record = outcome._replace(unfinished=True), None
+        if record is not None:
+            outcome = _beside_scipy(seed, outcome, drawn, record)
     return outcome._replace(seconds=time.process_time() - start)
 
 
-def _checked(seed: int, outcome: Outcome, drawn: Drawn, plain: bool) -> Outcome:
-    """Outcome of a case, but for the time it takes."""
+def _checked(outcome: Outcome, drawn: Drawn, plain: bool) -> tuple[Outcome, Record | None]:
+    """Outcome of a case without scipy and its time, and its run unless that is refused."""
     try:
         record = jb.simulate(drawn.case)
     except RuntimeError as error:
-        return outcome._replace(refusal=str(error))
+        return outcome._replace(refusal=str(error)), None
     faults = [*nan_faults(record), *consistency_faults(drawn, record)]
     outcome = outcome._replace(steps=record.steps, stated=float(record.error_estimate))
     tight = None if plain else _tight(drawn.case)
@@ -106,12 +121,20 @@ def _checked(seed: int, outcome: Outcome, drawn: Drawn, plain: bool) -> Outcome:
             ),
         )
         faults += verdict_faults(record, tight)
+    return outcome._replace(faults=tuple(faults)), record
+
+
+def _beside_scipy(seed: int, outcome: Outcome, drawn: Drawn, record: Record) -> Outcome:
+    """Outcome of a case with that of scipy, if it is in the sample."""
     sampled = np.random.default_rng([seed, outcome.index, 1]).random() < SCIPY_SHARE
-    if sampled and not plain and highest_phase(drawn) < MAX_PHASE:
-        by_scipy, wrong = beside_scipy(drawn, record)
-        outcome = outcome._replace(by_scipy=by_scipy)
-        faults += wrong
-    return outcome._replace(faults=tuple(faults))
+    if not sampled or highest_phase(drawn) >= MAX_PHASE:
+        return outcome
+    try:
+        with at_most(SCIPY_LONGEST):
+            by_scipy, wrong = beside_scipy(drawn, record)
+    except TooLongError:
+        return outcome._replace(left_by_scipy=True)
+    return outcome._replace(by_scipy=by_scipy, faults=(*outcome.faults, *wrong))
 
 
 def _tight(case: jb.Case) -> Record | None:

@@ -30,16 +30,21 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.prescribed import Prescribed
-from jaxbeam.integrator.static_shapes import static_shapes
-from jaxbeam.integrator.step_size import choose_step_size, run_peaks
+from jaxbeam.integrator.discrete_model import discrete_model
+from jaxbeam.integrator.integrate import integrate_peaks
+from jaxbeam.integrator.peaks.running_peaks import RunningPeaks
+from jaxbeam.integrator.static_shapes import StaticShapes, static_shapes
+from jaxbeam.integrator.step_size import choose_step_size
+from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.channels import accepts_commands
+from jaxbeam.model.load_set import load_set
+from jaxbeam.model.modal_model import modal_model
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.simulation.commands.limits import acting_ranges
 from jaxbeam.simulation.record import Record
 
 DEFAULT_PERIOD = 0.01  # s, over which commands are held without a sampled controller
-
-_run_peaks = compiled_if_traced(run_peaks)
 
 
 class ActiveConstraints(NamedTuple):
@@ -233,7 +238,7 @@ def _uncontrolled_peak(case: Case, positions) -> float:
     uncontrolled_case = dataclasses.replace(case, controller=None)
     shapes = static_shapes(uncontrolled_case)
     step, *_ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
-    running_peaks = _run_peaks(uncontrolled_case, shapes, np.asarray(step), positions)
+    running_peaks = run_peaks(uncontrolled_case, shapes, np.asarray(step), positions)
     return float(np.max(running_peaks.refined_peak()[0]))
 
 
@@ -241,3 +246,17 @@ def held_command_limits(case: Case, period: float) -> tuple[Float[np.ndarray, " 
     """Lowest and highest command that acts, and its largest change from hold to hold."""
     low, high, rate = (np.asarray(part) for part in acting_ranges(case))
     return low, high, rate * period
+
+
+@compiled_if_traced
+def run_peaks(
+    case: Case,
+    shapes: StaticShapes,
+    max_step: Float[Array, ""],
+    positions: Float[Array, " sensor"],
+) -> RunningPeaks:
+    """Running peaks of an uncontrolled run at positions (m), in steps of at most `max_step` (s)."""
+    model = modal_model(case, shapes.layout, shapes.coupled)
+    grid = grid_by_step_length(case, model, max_step)
+    discrete = discrete_model(model, grid, positions)
+    return integrate_peaks(discrete, load_set(case, shapes.layout), max_loads=shapes.max_loads)[0]

@@ -34,7 +34,8 @@ def affine_jacobian(
         raise NotAffineError
     size = point.shape[0]
     if not start.size:
-        return np.zeros((0, size))
+        none: Any = np.zeros((0, size))
+        return none
     with np.errstate(all="ignore"):
         columns: list[Any] = [(function(STEP * unit) - start) / STEP for unit in np.eye(size)]
         matrix: Any = np.stack(columns, axis=1) if size else np.zeros((start.shape[0], 0))

@@ -12,17 +12,13 @@ static inline ALWAYS_INLINE void add_tile(Register *sums, const Register *left, 
     for (int i = 0; i < rows; i++)
 #pragma GCC unroll 4
         for (int j = 0; j < columns; j++) sum[i * 4 + j] = sums[i * width + j];
-    for (int k = 0; k < terms; k++) {
-        Register factor[4];
+    for (int k = 0; k < terms; k++)
 #pragma GCC unroll 4
-        for (int j = 0; j < columns; j++) factor[j] = right[k * width + j];
+        for (int j = 0; j < columns; j++) {
+            const Register factor = right[k * width + j];
 #pragma GCC unroll 4
-        for (int i = 0; i < rows; i++) {
-            const Register one = left[i * terms + k];
-#pragma GCC unroll 4
-            for (int j = 0; j < columns; j++) sum[i * 4 + j] += one * factor[j];
+            for (int i = 0; i < rows; i++) sum[i * 4 + j] += left[i * terms + k] * factor;
         }
-    }
 #pragma GCC unroll 4
     for (int i = 0; i < rows; i++)
 #pragma GCC unroll 4

@@ -63,9 +63,12 @@ static inline void store(double *to, Register values, int count) {
 static inline ALWAYS_INLINE void add_rows(Register *sums, const double *table, int stride,
                                           const Register *values, int size, int rows) {
     Register sum[8];
+#pragma GCC unroll 8
     for (int r = 0; r < rows; r++) sum[r] = sums[r];
     for (int k = 0; k < size; k++, table += stride)
+#pragma GCC unroll 8
         for (int r = 0; r < rows; r++) sum[r] += table[r] * values[k];
+#pragma GCC unroll 8
     for (int r = 0; r < rows; r++) sums[r] = sum[r];
 }
 
