@@ -136,8 +136,9 @@ def stability(
     )  # fmt: skip
     if crossing_growth is not None:
         lines += [
-            f"with the loads frozen where they are worst, at {poles.times[worst]:.4g} s, the"
-            f" largest real part of a pole is {poles.largest_real_part[worst]:.4g} 1/s",
+            f"with the loads frozen where they are worst, at {poles.times[worst]:.4g} s, but with"
+            " their speed, the largest real part of a pole is"
+            f" {poles.largest_real_part[worst]:.4g} 1/s",
             "over the crossing a small deviation from rest grows at most by a factor of"
             f" {crossing_growth.factor.max():.4g}, to {crossing_growth.factor[-1]:.3g} at its end",
         ]
