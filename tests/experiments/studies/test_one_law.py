@@ -5,17 +5,17 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from experiments.studies import one_law, tune_one_law
+from experiments.studies.one_law import plants, tune
 from jaxbeam.control.internal_model.scheduled import REFERENCE, VALUES
 from tests.modules import ROOT
 
 
 def test_a_plant_and_its_wrong_numbers():
-    case = one_law.plant_case("C", one_law.ONE_LAW, 5.0, 0.04, 0.8)
+    case = plants.plant_case("C", plants.ONE_LAW, 5.0, 0.04, 0.8)
     assert isinstance(case.controller, jb.ScheduledInternalModel)
     assert [s.filter.cutoff for s in case.sensors if s.filter is not None] == [5.0, 5.0]
     assert float(case.beam.flexural_rigidity) == pytest.approx(0.8 * 12.277)
-    told = one_law.misinformed(case, -1)
+    told = plants.misinformed(case, -1)
     assert told.controller is not None and told.controller.delay is not None
     assert float(told.controller.delay) == pytest.approx(0.045)
     nominal, plant = told.controller.law(None), case.controller.law(jb.state_space(case))
@@ -24,22 +24,22 @@ def test_a_plant_and_its_wrong_numbers():
 
 
 def test_cells_and_the_table_of_the_page():
-    assert one_law.cell(np.array([0.9, 1.0])) == "90.0 % (95.0 %)"
-    assert one_law.cell(np.array([-0.1, 1.0])) == one_law.NO_GAIN
-    table = one_law.TABLE_FILE.read_text("utf-8").splitlines()
+    assert plants.cell(np.array([0.9, 1.0])) == "90.0 % (95.0 %)"
+    assert plants.cell(np.array([-0.1, 1.0])) == plants.NO_GAIN
+    table = plants.TABLE_FILE.read_text("utf-8").splitlines()
     page = (ROOT / "docs" / "explanation" / "results.md").read_text("utf-8")
     assert "_static/one_law.md" in page
     # What the guide says of the law: no less than 85 %, on both rigs.
-    plants = [line.strip("| ").split(" | ") for line in table[2:] if " ms |" in line]
-    assert len(plants) >= 11
-    assert min(float(cells[i].split()[0]) for cells in plants for i in (1, 4)) >= 85.0
+    rows = [line.strip("| ").split(" | ") for line in table[2:] if " ms |" in line]
+    assert len(rows) >= 11
+    assert min(float(cells[i].split()[0]) for cells in rows for i in (1, 4)) >= 85.0
 
 
 def test_search_starts_from_the_table_of_the_law_and_finds_a_peak():
-    start = tune_one_law.numbers_of(VALUES, REFERENCE)
-    made = tune_one_law.law(start)
+    start = tune.numbers_of(VALUES, REFERENCE)
+    made = tune.law(start)
     assert_allclose(made.values, VALUES)
     assert_allclose(made.reference, REFERENCE)
     target = np.linspace(0.3, 0.8, len(start))
-    found = tune_one_law.search(start, 60, lambda x: -float(np.sum((x - target) ** 2)))
+    found = tune.search(start, 60, lambda x: -float(np.sum((x - target) ** 2)))
     assert np.max(np.abs(found - target)) < 0.1 * np.max(np.abs(start - target))

@@ -1,6 +1,6 @@
 """What the law for all rigs must know, identified by a probe before the load enters.
 
-    python -m experiments.studies.identified_plant
+    python -m experiments.studies.one_law.identified_plant
 
 A pseudorandom command of 0 or 1 V for 1.5 s on the unloaded one-span rig; from the reading follow
 the share of the patch's moment that reaches the beam, hence the lift, and the cutoff of the filter
@@ -15,7 +15,7 @@ import numpy as np
 import jaxbeam as jb
 import tuning
 from experiments.studies.loads import PERIOD, held_out_loads
-from experiments.studies.one_law import ONE_LAW, Shares, plant_case
+from experiments.studies.one_law.plants import ONE_LAW, Shares, plant_case
 from jaxbeam.model.modes import mesh_layout
 from tuning.control.fixed_design import with_fixed_design
 

@@ -1,6 +1,6 @@
 """Search for the table of the scheduled internal model on both patch rigs at once.
 
-    python -m experiments.studies.tune_one_law [generations]    # an hour for 40
+    python -m experiments.studies.one_law.tune [generations]    # an hour for 40
 
 A law for all rigs has one table and one reference filter. They are sought by an evolution strategy
 with a covariance matrix (rank-mu update; Hansen and Ostermeier, Evolutionary Computation 9, 2001),
@@ -18,7 +18,7 @@ import numpy as np
 
 import jaxbeam as jb
 from experiments.studies.loads import training_loads
-from experiments.studies.one_law import ONE_LAW, Shares, plant_case
+from experiments.studies.one_law.plants import ONE_LAW, Shares, plant_case
 from jaxbeam.control.internal_model.scheduled import ORDER, REFERENCE, SHARES, VALUES
 
 SPEEDS = {"B": (0.35, 0.6, 1.0), "C": (0.5, 1.0)}  # m/s
@@ -40,22 +40,31 @@ def numbers_of(values, reference) -> np.ndarray:
     return np.concatenate([np.abs(np.delete(values, 3)), [reference]])
 
 
+def with_numbers(case: jb.Case, numbers: np.ndarray) -> jb.Case:
+    """The case under the law with the numbers searched for, and the timing of its own."""
+    timing = {name: getattr(case.controller, name) for name in ("period", "delay", "resolution")}
+    return dataclasses.replace(case, controller=dataclasses.replace(law(numbers), **timing))
+
+
+def mean_and_worst(shares: np.ndarray) -> float:
+    """Weighted worst, worst few and mean of shares."""
+    found = np.sort(shares)
+    return float(0.6 * found[0] + 0.4 * found[:WORST_RUNS].mean() + MEAN_WEIGHT * found.mean())
+
+
 def merit(numbers: np.ndarray, shares: Shares, rigs=("B", "C")) -> float:
     """Weighted worst, worst few and mean of the shares of all runs."""
     found = []
     for rig, delay, factor in itertools.product(rigs, DELAYS, FACTORS):
-        case = plant_case(rig, ONE_LAW, CUTOFF, delay, factor)
-        timing = {
-            name: getattr(case.controller, name) for name in ("period", "delay", "resolution")
-        }
-        case = dataclasses.replace(case, controller=dataclasses.replace(law(numbers), **timing))
+        case = with_numbers(plant_case(rig, ONE_LAW, CUTOFF, delay, factor), numbers)
         found.append(shares(rig, case, training_loads(SPEEDS[rig])))
-    found = np.sort(np.concatenate(found))
-    return float(0.6 * found[0] + 0.4 * found[:WORST_RUNS].mean() + MEAN_WEIGHT * found.mean())
+    return mean_and_worst(np.concatenate(found))
 
 
-def search(start: np.ndarray, generations: int, merit_of, seed: int = 0) -> np.ndarray:
-    """The best numbers found by the evolution strategy."""
+def search(
+    start: np.ndarray, generations: int, merit_of, seed: int = 0, quiet: bool = False
+) -> np.ndarray:
+    """The best numbers found by the evolution strategy, which prints them unless it is `quiet`."""
     rng = np.random.default_rng(seed)
     weights = np.log(PARENTS + 0.5) - np.log(np.arange(1, PARENTS + 1))
     weights /= weights.sum()
@@ -73,7 +82,8 @@ def search(start: np.ndarray, generations: int, merit_of, seed: int = 0) -> np.n
         covariance = (1 - RATE) * covariance + RATE * (scaled.T * weights) @ scaled
         covariance += 1e-6 * np.eye(len(start))
         mean, size = mean + weights @ (points[order] - mean), size * SHRINKING
-        print(generation, f"{best_merit:.4f}", np.round(best, 3).tolist(), flush=True)
+        if not quiet:
+            print(generation, f"{best_merit:.4f}", np.round(best, 3).tolist(), flush=True)
     return best
 
 

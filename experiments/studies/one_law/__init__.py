@@ -1,0 +1,1 @@
+"""One law from the sensors alone for all rigs: its plants, its numbers, and what it loses."""
