@@ -79,14 +79,22 @@ def at_most(seconds: float) -> Iterator[None]:
     Raises TooLongError then.
     """
 
+    expired = False
+
     def stop(*_):
         """Handler of the signal; raises TooLongError."""
+        nonlocal expired
+        expired = True
         raise TooLongError
 
     former = signal.signal(signal.SIGPROF, stop)
     signal.setitimer(signal.ITIMER_PROF, seconds if np.isfinite(seconds) else 0.0)
     try:
         yield
+    except Exception:
+        if expired:  # code that catches what it does not know may raise something else instead
+            raise TooLongError from None
+        raise
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.signal(signal.SIGPROF, former)
