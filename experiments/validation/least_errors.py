@@ -101,7 +101,7 @@ def _stacked(structure: Structure, shapes, inputs):
 def _responses(unknowns, channels, angles, rate) -> Complex[np.ndarray, "bin channel input"]:
     """Transfer functions of the recursion of velocities (`planted_structures.response`)."""
     z = np.exp(-1j * angles)
-    found = 0.0
+    found = np.zeros((len(angles), channels, unknowns.shape[1] - 2 - channels), complex)
     for frequency, damping, *others in unknowns:
         pole = 2 * np.pi * frequency * (-damping + 1j * np.sqrt(1 - damping**2))
         root, residue = np.exp(pole / rate), -1j * pole / pole.imag

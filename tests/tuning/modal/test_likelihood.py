@@ -4,15 +4,8 @@ import numpy as np
 import pytest
 
 from tests.tuning.modal.test_modal import ambient
-from tuning.modal.likelihood.model import (
-    BACKGROUND_ORDER,
-    SpectralModel,
-    Window,
-    _moved,
-    expectation,
-    information,
-    with_cost,
-)
+from tuning.modal.likelihood.fit import _moved, information
+from tuning.modal.likelihood.model import SpectralModel, Window, expectation, with_cost
 from tuning.modal.likelihood.refine import Start, refine_modes
 
 
@@ -23,13 +16,14 @@ def two_modes():
     spectra = np.einsum("bcn,bdn->bcd", values, values.conj()) / 2
     frequencies = np.linspace(2, 4, bins)
     window = Window(frequencies, np.full(bins, 60.0), spectra, np.eye(rows), 2, 0.1)
-    background = np.zeros((BACKGROUND_ORDER + 1, rows, rows))
+    background = np.zeros((3, rows, rows))
     background[0], background[1] = np.linalg.cholesky(np.eye(rows) + 0.2), 0.1 * np.eye(rows)
     model = SpectralModel(
         2 * np.pi * np.array([2.8 * (-0.02 + 1j), 3.1 * (-0.03 + 1j)]),
         random.normal(size=(2, rows)),
         np.array([[0.3, 0.0], [0.1, 0.2]]),
         0.2 * random.normal(size=(2, rows)),
+        np.array([0.01, -0.02]),
         background,
         window.step,
     )

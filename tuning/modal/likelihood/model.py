@@ -5,16 +5,17 @@ expectation, independently from bin to bin (Whittle 1953). The covariance of a s
 shapes f_k under white forces, whose modal forces have the spectral matrix S, is a sum over modes,
 
     R(l) = 2 Re(sum_k f_k c_k^T exp(p_k l h)),   l >= 0,
-    c_k = -sum_j S_kj f_j / (p_k + p_j*) + i sqrt(h) L K_k,   S = C C^T + K K^T,
+    c_k = -(1 + i b_k) sum_j S_kj f_j / (p_k + p_j*) + i sqrt(h) L K_k,   S = C C^T + K K^T,
 
 where K_k is the part of the force of mode k that acts on the background B = L L^T, too: flanks of
-modes outside the window, and of the mode itself at negative frequencies, are a quarter of a period
-behind. The expectation over N samples is, with the truncation at their ends (Sykulski et al. 2019),
+modes outside the window are a quarter of a period behind. The flank of a mode itself at negative
+frequencies skews its peak by b_k = -z_k, z_k or 3 z_k in displacement, velocity or acceleration.
+The expectation over N samples is, with the truncation at their ends (Sykulski et al. 2019),
 
     E(w) = G(w) + G(w)^H + B(w),   G = sum_k f_k (c_k g(p_k) + c_k* g(p_k*) - Re c_k)^T,
     g = sum_l (1 - l / N) z^l = 1 / (1 - z) - z (1 - z^N) / (N (1 - z)^2),   z = exp((p - i w) h),
 
-with R(0) made symmetric. L is lower triangular and linear in log w (in c_k its mean), so that E is
+with R(0) made symmetric. L is lower triangular and a polynomial in log w (in c_k its mean); E is
 positive definite whatever the noise. Shapes tell close modes apart that no single channel does.
 """
 
@@ -22,14 +23,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
-
-BACKGROUND_ORDER = 1  # of its factor across a window
-MAX_ITERATIONS = 40
-TOLERANCE = 5e-2  # of the logarithm of the likelihood, at which the search ends
-MAX_TRIES, MIN_DAMPING = 10, 1e-6  # of a step, whose damping grows by eight each time
-PART_BINS = 256  # whose derivatives are formed at once
-UNKNOWN = 1e100
-MIN_DIRECTION = 1e-10  # of the scaled information; the scales of shapes have none
 
 
 class Window(NamedTuple):
@@ -48,16 +41,17 @@ class Window(NamedTuple):
 
 
 class SpectralModel(NamedTuple):
-    """Poles p (1/s), shapes f, factor C of the forces, shared forces K, factor L of the background.
+    """Poles p (1/s), shapes f, factor C of the forces, shared forces K, skewness b.
 
-    L is a polynomial. `step` (s) is that of sampling; `cost` is the negative logarithm of the
-    likelihood in a window.
+    The factor L of the background is a polynomial. `step` (s) is that of sampling; `cost` is the
+    negative logarithm of the likelihood in a window.
     """
 
     poles: Complex[np.ndarray, " mode"]
     shapes: Float[np.ndarray, "mode row"]
     forces: Float[np.ndarray, "mode mode"]
     shared: Float[np.ndarray, "mode row"]
+    skewness: Float[np.ndarray, " mode"]
     background: Float[np.ndarray, "power row row"]
     step: float
     cost: float = np.inf
@@ -72,7 +66,8 @@ class SpectralModel(NamedTuple):
     def by_forces(self) -> Complex[np.ndarray, "mode mode"]:
         """Factors -S_kj / (p_k + p_j*) of the shapes."""
         spectrum = self.forces @ self.forces.T + self.shared @ self.shared.T
-        return -spectrum / np.add.outer(self.poles, self.poles.conj())
+        sums = np.add.outer(self.poles, self.poles.conj())
+        return -spectrum * (1 + 1j * self.skewness[:, None]) / sums
 
     @property
     def amplitude_slopes(self) -> Complex[np.ndarray, "unknown mode row"]:
@@ -89,8 +84,10 @@ class SpectralModel(NamedTuple):
             for factor, places in ((self.forces, low), (self.shared, all_of_shared))
         )
         by_factors = np.concatenate([forces, shared])
-        by_factors = -(by_factors + by_factors.transpose(0, 2, 1)) / sums
-        through = np.concatenate([poles.reshape(2 * count, count, count), by_factors])
+        skew = 1 + 1j * self.skewness[:, None]
+        by_factors = -(by_factors + by_factors.transpose(0, 2, 1)) * skew / sums
+        by_skewness = first * (1j * own / skew)
+        through = np.concatenate([poles.reshape(2 * count, count, count), by_skewness, by_factors])
         through = through @ self.shapes
         flank = 1j * np.sqrt(self.step)
         k, m = all_of_shared
@@ -104,11 +101,11 @@ class SpectralModel(NamedTuple):
         return np.concatenate([through, shapes, by_mean, others])
 
 
-def _across(window: Window):
+def across(window: Window, count: int) -> Float[np.ndarray, "power bin"]:
     """Powers (power, bin) of the place in a window, on a logarithmic scale from -1 to 1."""
     level = np.log(window.frequencies)
     place = 2 * (level - level.min()) / max(np.ptp(level), 1e-300) - 1
-    return place ** np.arange(BACKGROUND_ORDER + 1)[:, None]
+    return place ** np.arange(count)[:, None]
 
 
 def kernel(
@@ -125,17 +122,19 @@ def kernel(
 
 def expectation(model: SpectralModel, window: Window) -> Complex[np.ndarray, "bin row row"]:
     """Expected periodogram matrices of a model."""
-    own = np.einsum("kc,bkd->bcd", model.shapes, _spectra_of(model, window))
-    noise = _noise_factors(model, _across(window))
+    own = np.einsum("kc,bkd->bcd", model.shapes, spectra_of(model, window))
+    noise = noise_factors(model, across(window, len(model.background)))
     return own + own.conj().transpose(0, 2, 1) + noise @ noise.transpose(0, 2, 1)
 
 
-def _noise_factors(model: SpectralModel, across):
+def noise_factors(
+    model: SpectralModel, powers: Float[np.ndarray, "power bin"]
+) -> Float[np.ndarray, "bin row row"]:
     """Factors L of the background (bin, row, row)."""
-    return np.einsum("qcd,qb->bcd", model.background, across)
+    return np.einsum("qcd,qb->bcd", model.background, powers)
 
 
-def _spectra_of(model: SpectralModel, window: Window):
+def spectra_of(model: SpectralModel, window: Window) -> Complex[np.ndarray, "bin mode row"]:
     """Vectors (bin, mode, row) whose products with the shapes are the sum G."""
     above, below = kernel(model.poles, window)[0], kernel(model.poles.conj(), window)[0]
     c = model.amplitudes
@@ -154,149 +153,3 @@ def with_cost(model: SpectralModel, window: Window) -> SpectralModel:
     level = 2 * np.sum(np.log(np.einsum("bcc->bc", factors).real))
     fit = np.sum(np.linalg.solve(expected, window.spectra).trace(axis1=1, axis2=2).real)
     return model._replace(cost=float(window.count * (level + fit)))
-
-
-def information(
-    model: SpectralModel, window: Window
-) -> tuple[Float[np.ndarray, " unknown"], Float[np.ndarray, "unknown unknown"]]:
-    """Gradient of the cost, and Fisher's information, by all unknowns.
-
-    These are decay rates and angular frequencies (1/s), pole by pole, forces (lower triangle),
-    shared forces, shapes, and factors of the background (lower triangles).
-    """
-    gradient, fisher = 0.0, 0.0
-    for first in range(0, len(window.frequencies), PART_BINS):
-        slopes, errors = _derivatives(model, window, slice(first, first + PART_BINS))
-        gradient = gradient + slopes @ errors
-        fisher = fisher + slopes @ slopes.T
-    return window.count * gradient, window.count * fisher
-
-
-def _derivatives(model: SpectralModel, window: Window, part: slice):
-    """L^-1 dE L^-H (unknown, entry) of some bins and I - L^-1 S L^-H, where E = L L^H.
-
-    Entries are real and imaginary parts of all bins and places.
-    """
-    across = _across(window)[:, part]
-    window = window._replace(
-        frequencies=window.frequencies[part],
-        lengths=window.lengths[part],
-        spectra=window.spectra[part],
-    )
-    count, rows = model.shapes.shape
-    vectors = _spectra_of(model, window)
-    expected = np.einsum("kc,bkd->bcd", model.shapes, vectors)
-    expected = expected + expected.conj().transpose(0, 2, 1)
-    factors = _noise_factors(model, across)
-    expected = expected + factors @ factors.transpose(0, 2, 1)
-    inverse = np.linalg.inv(np.linalg.cholesky(expected))
-    white = inverse @ model.shapes.T  # bin, row, mode
-    (above, d_above), (below, d_below) = (
-        kernel(poles, window) for poles in (model.poles, model.poles.conj())
-    )
-    c, slopes = model.amplitudes, model.amplitude_slopes
-    both, apart = (d_above + d_below)[..., None], (d_above - d_below)[..., None]
-    real, imaginary = c.real[:, None], c.imag[:, None]  # mode, bin, row
-    by_decay = -real * both - 1j * imaginary * apart
-    by_frequency = 1j * real * apart - imaginary * both
-    changes = np.einsum("ukd,kb->ukbd", slopes.real, above + below - 1)
-    changes = changes + np.einsum("ukd,kb->ukbd", 1j * slopes.imag, above - below)
-    for k in range(count):
-        changes[2 * k, k] += by_decay[k]
-        changes[2 * k + 1, k] += by_frequency[k]
-    turned = np.einsum("ukbd,bed->ukbe", changes, inverse.conj(), optimize=True)
-    through = np.einsum("bck,ukbe->ubce", white, turned, optimize=True)
-    direct = np.einsum("bcr,bed,bkd->krbce", inverse, inverse.conj(), vectors, optimize=True)
-    direct = direct.reshape(count * rows, *direct.shape[2:])
-    low = np.tril_indices(rows)
-    turned = inverse.conj() @ factors
-    noise = np.einsum("bci,bdi->ibcd", inverse[:, :, low[0]], turned[:, :, low[1]])
-    noise = np.einsum("qb,ibcd->qibcd", across, noise)
-    size = (-1, len(expected), rows, rows)
-    halves = through
-    noise = noise.reshape(size)
-    halves[len(halves) - len(noise) - len(direct) : len(halves) - len(noise)] += direct
-    halves[len(halves) - len(noise) :] += noise
-    whole = (halves + halves.conj().swapaxes(2, 3)).reshape(len(halves), -1)
-    errors = np.eye(rows) - inverse @ window.spectra @ inverse.conj().transpose(0, 2, 1)
-    errors = errors.reshape(-1)
-    return (
-        np.concatenate([whole.real, whole.imag], axis=1),
-        np.concatenate([errors.real, errors.imag]),
-    )
-
-
-def _moved(model: SpectralModel, step) -> SpectralModel:
-    """The model with a step of its unknowns."""
-    count, rows = model.shapes.shape
-    sizes = np.cumsum([2 * count, count * (count + 1) // 2, count * rows, count * rows])
-    poles, forces, shared, shapes, background = np.split(step, sizes)
-    low, own = np.tril_indices(rows), np.tril_indices(count)
-    change, by_force = np.zeros_like(model.background), np.zeros((count, count))
-    change[:, low[0], low[1]] = background.reshape(len(change), -1)
-    by_force[own] = forces
-    return SpectralModel(
-        model.poles - poles[::2] + 1j * poles[1::2],
-        model.shapes + shapes.reshape(model.shapes.shape),
-        model.forces + by_force,
-        model.shared + shared.reshape(model.shapes.shape),
-        model.background + change,
-        model.step,
-    )
-
-
-def _largest_steps(model: SpectralModel, size: int):
-    """Largest steps of the unknowns: of forces their size, of others none.
-
-    Where forces are fully correlated the diagonal of their factor is zero, and the cost flat in it.
-    """
-    rows, first = np.tril_indices(model.poles.size)[0], 2 * model.poles.size
-    found = np.full(size, np.inf)
-    found[first : first + rows.size] = np.linalg.norm(model.forces, axis=1)[rows]
-    return found
-
-
-def maximise(model: SpectralModel, window: Window) -> SpectralModel:
-    """The model of the largest likelihood near a model, by damped Fisher scoring.
-
-    Poles stay in the window and damped.
-    """
-    low, high = 2 * np.pi * window.frequencies.min(), 2 * np.pi * window.frequencies.max()
-    model, damping = with_cost(model, window), 1e-3
-    for _ in range(MAX_ITERATIONS):
-        gradient, fisher = information(model, window)
-        scale = np.minimum(
-            1 / np.sqrt(np.diag(fisher) + 1e-300), _largest_steps(model, len(fisher))
-        )
-        scaled = fisher * np.multiply.outer(scale, scale)
-        for _ in range(MAX_TRIES):
-            matrix = scaled + damping * np.eye(len(scaled))
-            other = _moved(model, -scale * np.linalg.solve(matrix, scale * gradient))
-            inside = (other.poles.imag > low) & (other.poles.imag < high)
-            if np.all(inside & (other.poles.real < 0)):
-                other = with_cost(other, window)
-            if other.cost < model.cost:
-                break
-            damping *= 8
-        else:
-            break
-        gain, damping = model.cost - other.cost, max(damping / 4, MIN_DAMPING)
-        model = other
-        if gain < TOLERANCE:
-            break
-    return model
-
-
-def covariance(model: SpectralModel, window: Window) -> Float[np.ndarray, "unknown unknown"]:
-    """Covariance of all unknowns, in the order of `information`.
-
-    It is `UNKNOWN` on the diagonal where more than the scales of the shapes is left open.
-    """
-    fisher = information(model, window)[1]
-    scale = 1 / np.sqrt(np.diag(fisher) + 1e-300)
-    sizes, vectors = np.linalg.eigh(fisher * np.multiply.outer(scale, scale))
-    known = sizes > MIN_DIRECTION * sizes[-1]
-    if np.sum(~known) > model.poles.size:
-        return UNKNOWN * np.eye(len(fisher))
-    found = (vectors[:, known] / sizes[known]) @ vectors[:, known].T
-    return found * np.multiply.outer(scale, scale)

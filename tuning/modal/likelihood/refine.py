@@ -14,21 +14,19 @@ from jaxtyping import Bool, Complex, Float
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
-from tuning.modal.likelihood.model import (
-    BACKGROUND_ORDER,
-    SpectralModel,
-    Window,
-    covariance,
-    maximise,
-)
+from tuning.modal.likelihood.fit import covariance, maximise
+from tuning.modal.likelihood.model import SpectralModel, Window
 
 WINDOW_WIDTHS = 8.0  # half width of the window around a pole over its half-power width
 WINDOW_SHARES = 0.1, 0.3  # of the frequency, at least and at most
 MIN_WINDOW_BINS = 16.0  # likewise in bins of the records
 MAX_GROUP = 6  # poles that are fitted together, the best determined ones
 MAX_ROWS = 4  # combinations of channels
+MIN_POWER = 1e-10  # of the strongest combination; less is rounding
 WIDTH_OVER_BINS = 3.0  # half-power width of the narrowest pole over the bins that are averaged
 FALSE_ALARM_PROBABILITY = 1e-4  # of a mode in a window that the likelihood gains from by chance
+BACKGROUND_ORDERS = 1, 2  # of its factor across a window
+SAME_POLE = 0.5  # distance of certain poles over the smaller decay rate, below which they are one
 START_SHARE = 0.02  # of the power of the window, of a mode to begin with, at least
 
 
@@ -81,7 +79,7 @@ def refine_modes(
         members = np.union1d(group, np.flatnonzero(inside))[:MAX_GROUP]
         count = max(int(widths[members].min() / resolution / WIDTH_OVER_BINS), 1)
         window = _window(transforms, [len(r) for r in records], rate, (low, high), count)
-        if window.frequencies.size * count >= MIN_WINDOW_BINS:
+        if window.frequencies.size * count >= MIN_WINDOW_BINS and window.weights.size:
             some = Start(*(field[members] for field in start))
             for index, one in zip(members, _select(window, some), strict=True):
                 found[index] = found[index] or one
@@ -113,8 +111,8 @@ def _window(transforms, sizes, rate, limits, count) -> Window:
         values.append(transform[keep])
     values = np.concatenate(values)  # bin, neighbour, channel
     flat = values.reshape(-1, values.shape[2])
-    rows = min(MAX_ROWS, flat.shape[1])
-    weights = np.linalg.eigh((flat.conj().T @ flat).real)[1][:, ::-1][:, :rows]
+    powers, directions = np.linalg.eigh((flat.conj().T @ flat).real)
+    weights = directions[:, powers > MIN_POWER * powers[-1]][:, ::-1][:, :MAX_ROWS]
     combined = values @ weights
     spectra = np.einsum("bnc,bnd->bcd", combined, combined.conj()) / count
     return Window(
@@ -124,18 +122,19 @@ def _window(transforms, sizes, rate, limits, count) -> Window:
 
 def _select(window: Window, start: Start) -> list[RefinedMode | None]:
     """Modes that the likelihood needs, refined."""
-    best, kept = _background(window), []
-    for k in range(start.poles.size):
+    order = _order(window, start)
+    best, kept = _certain(window, start, order)
+    for k in np.flatnonzero(~start.certain).tolist():
         trial = maximise(_with_pole(best, start, k, window), window)
         if best.cost - trial.cost > _least_gain(trial, window, start.poles.size):
             best, kept = trial, [*kept, k]
     # One that filled the place of a later one is not needed any more.
     for k in [k for k in kept if not start.certain[k]][:-1]:
-        trial, others = _background(window), [one for one in kept if one != k]
-        for one in others:
+        (trial, others), rest = _certain(window, start, order), [one for one in kept if one != k]
+        for one in rest[len(others) :]:
             trial = maximise(_with_pole(trial, start, one, window), window)
         if trial.cost - best.cost < _least_gain(best, window, start.poles.size):
-            best, kept = trial, others
+            best, kept = trial, rest
     found: list[RefinedMode | None] = [None] * start.poles.size
     if kept:
         refined = _refined(best, window)
@@ -145,16 +144,37 @@ def _select(window: Window, start: Start) -> list[RefinedMode | None]:
     return found
 
 
+def _order(window: Window, start: Start) -> int:
+    """Order of the background that Schwarz's criterion prefers beside the best determined modes."""
+    some = start._replace(certain=start.certain | (np.arange(start.poles.size) == 0))
+    rows = len(window.weights.T)
+    more = rows * (rows + 1) / 2 * np.log(len(window.frequencies) * window.count) / 2
+    costs = [_certain(window, some, order)[0].cost + order * more for order in BACKGROUND_ORDERS]
+    return BACKGROUND_ORDERS[int(np.argmin(costs))]
+
+
+def _certain(window: Window, start: Start, order: int) -> tuple[SpectralModel, list[int]]:
+    """The model of certain modes, all at once, and which they are; one of two at one place."""
+    model, kept = _background(window, order), []
+    for k in np.flatnonzero(start.certain).tolist():
+        apart = np.abs(start.poles[kept] - start.poles[k])
+        if np.all(apart > SAME_POLE * np.minimum(-start.poles[kept].real, -start.poles[k].real)):
+            model, kept = _with_pole(model, start, k, window), [*kept, k]
+    return maximise(model, window), kept
+
+
 def _least_gain(model: SpectralModel, window: Window, trials: int) -> float:
     """Logarithm of the likelihood that one more mode gains by chance, seldom.
 
     It may settle on any chance peak in the window, about two for each half-power width.
     """
     count, rows = model.shapes.shape
-    unknowns = 2 + 2 * rows + count - 1  # pole, shared forces, shape but for its scale, forces
+    unknowns = (
+        3 + 2 * rows + count - 1
+    )  # pole, skewness, shared forces, shape but for its scale, forces
     narrowest = np.min(-model.poles.real) / (2 * np.pi)
-    trials *= max(2 * np.ptp(window.frequencies) / narrowest, 1.0)
-    return float(chi2.isf(FALSE_ALARM_PROBABILITY / trials, unknowns) / 2)
+    places = max(2 * np.ptp(window.frequencies) / narrowest, 1.0)
+    return float(chi2.isf(FALSE_ALARM_PROBABILITY / (trials * places), unknowns) / 2)
 
 
 def _places(starts, poles) -> list[int]:
@@ -163,21 +183,21 @@ def _places(starts, poles) -> list[int]:
     return linear_sum_assignment(distance)[1].tolist()
 
 
-def _background(window: Window) -> SpectralModel:
-    """The model without modes."""
+def _background(window: Window, order: int) -> SpectralModel:
+    """A model without modes, to begin with."""
     level = window.spectra.mean(axis=0).real
     rows = len(level)
-    background = np.zeros((BACKGROUND_ORDER + 1, rows, rows))
+    background = np.zeros((order + 1, rows, rows))
     background[0] = np.linalg.cholesky(level)
-    none = np.zeros((0, rows)), np.zeros((0, 0)), np.zeros((0, rows))
-    return maximise(SpectralModel(np.zeros(0, complex), *none, background, window.step), window)
+    none = np.zeros((0, rows)), np.zeros((0, 0)), np.zeros((0, rows)), np.zeros(0)
+    return SpectralModel(np.zeros(0, complex), *none, background, window.step)
 
 
 def _with_pole(model: SpectralModel, start: Start, k, window: Window) -> SpectralModel:
     """The model with one more pole, of an amplitude by the share of its energy."""
     count = model.poles.size
     shape = start.shapes[k] @ window.weights
-    shape = shape / np.linalg.norm(shape)
+    shape = shape / max(float(np.linalg.norm(shape)), 1e-300)
     forces = np.zeros((count + 1, count + 1))
     forces[:count, :count] = model.forces
     power = np.mean(window.spectra.trace(axis1=1, axis2=2).real / window.lengths)
@@ -189,6 +209,7 @@ def _with_pole(model: SpectralModel, start: Start, k, window: Window) -> Spectra
         np.vstack([model.shapes, shape]),
         forces,
         np.vstack([model.shared, np.zeros(len(shape))]),
+        np.append(model.skewness, 0.0),
         model.background,
         window.step,
     )
@@ -201,7 +222,7 @@ def _refined(model: SpectralModel, window: Window) -> list[RefinedMode]:
     for k, pole in enumerate(model.poles):
         physical = window.weights @ model.shapes[k]
         largest = int(np.argmax(np.abs(physical)))
-        first = 2 * count + count * (count + 1) // 2 + (count + k) * rows
+        first = 3 * count + count * (count + 1) // 2 + (count + k) * rows
         own = slice(first, first + rows)
         unit = physical / physical[largest]
         by_shape = (window.weights - np.outer(unit, window.weights[largest])) / physical[largest]
