@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from tests.tuning.modal.test_modal import ambient
 from tuning.modal.likelihood.fit import _moved, information
@@ -89,3 +90,26 @@ def test_what_the_likelihood_does_not_need_is_left_out():
     found = found_in(ambient(0), poles, np.array([[1, 0.7]] * 4))
     assert [one is not None for one in found] == [True, False, False, False]
     assert found[0].pole.imag == pytest.approx(w * 3.0, rel=0.01)
+
+
+def test_modes_within_a_bandwidth_are_told_by_their_shapes():
+    """Two modes 2 % apart, damped by 2 %, which no spectrum shows as two peaks."""
+    random, rate, finer, count = np.random.default_rng(4), 20.0, 4, 6000
+    truth = 2 * np.pi * np.array([3.0, 3.06]) * (-0.02 + 1j)
+    shapes = np.array([[1.0, 0.6, -0.4], [0.7, -1.0, 0.3]])
+    forces = random.normal(size=(count * finer, 2)) @ np.array([[1.0, 0.5], [0.0, 1.0]])
+    values = 0.0
+    for pole, shape, force in zip(truth, shapes, forces.T, strict=True):
+        z = np.exp(pole / rate / finer)
+        motion = lfilter([1.0, -z.real], [1, -2 * z.real, abs(z) ** 2], force)[::finer]
+        values = values + np.outer(motion, shape)
+    values = values + 0.2 * values.std() * random.normal(size=values.shape)
+    starts = 2 * np.pi * np.array([2.99, 3.1]) * (-0.012 + 1j)
+    start = Start(starts, shapes + 0.2, values.var() * np.ones(2), np.array([False, False]))
+    found = refine_modes([values], rate, start)
+    for one, pole, shape in zip(found, truth, shapes, strict=True):
+        assert one is not None
+        deviations = np.sqrt(np.diag(one.covariance))
+        error = np.array([one.pole.real - pole.real, one.pole.imag - pole.imag])
+        assert np.all(np.abs(error) < 3 * deviations) and deviations[1] < 0.01 * pole.imag
+        np.testing.assert_allclose(one.shape, shape / shape[np.argmax(np.abs(shape))], atol=0.25)
