@@ -69,7 +69,7 @@ def forced_log(
         (*["N"] * inputs, *["m/s"] * channels),
         "planted",
     )
-    return log, Planted(structure, values, rate, energies)
+    return log, Planted(structure, values, rate, energies, noise=noise)
 
 
 def assess(excitation: str, seeds: Iterable[int]) -> list[PlantedComparison]:

@@ -31,6 +31,20 @@ DURATIONS = {
     "decay": 20.0,
     "crossing": 60.0,
 }  # s
+FIRST_SEED = 930  # of structures from which no rule was chosen
+WORDS = {
+    "ambient": "ambient",
+    "motor": "ambient, and a motor with its harmonic",
+    "shaken": "shaker with four harmonics, unmeasured",
+    "blows": "blows, unmeasured",
+    "decay": "one free decay",
+    "crossing": "load that crosses and leaves",
+    "1 blow": "one blow, measured",
+    "3 blows": "three blows, measured",
+    "10 blows": "ten blows, measured",
+    "random force": "random force, measured",
+    "two random forces": "two random forces, measured",
+}
 
 
 class PlantedComparison(NamedTuple):

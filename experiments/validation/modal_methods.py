@@ -24,12 +24,13 @@ from jaxtyping import Float
 from experiments.validation.measured_forces import EXCITATIONS as MEASURED, forced_log
 from experiments.validation.modal_identification import (
     DURATIONS,
+    FIRST_SEED,
     MATCH_SHARE,
     MIN_ENERGY,
+    WORDS,
     compare,
     log_of,
 )
-from experiments.validation.planted_modes import FIRST_SEED, WORDS
 from jaxbeam.files.report import ReportTable
 from tests.oracles.planted_structures import Planted, random_structure, sampled
 from tuning.logs.log import Log

@@ -5,7 +5,8 @@
 
 Thirty random structures by finite elements for each kind, the same as in `modal_identification` and
 `measured_forces`, with other seeds than those from which rules were chosen. The table is written
-for the page on logs; it takes half an hour on one core.
+for the page on logs; it takes half an hour on one core. A second table lists the strong modes that
+were missed, and whether any method could find them (`missed_modes`).
 """
 
 import sys
@@ -15,29 +16,17 @@ from pathlib import Path
 import numpy as np
 
 from experiments.validation import measured_forces, modal_identification
-from experiments.validation.modal_identification import PlantedComparison
+from experiments.validation.missed_modes import HEADER as MISSED_HEADER, missed_rows
+from experiments.validation.modal_identification import FIRST_SEED, WORDS, PlantedComparison
 from jaxbeam.files.report import ReportTable
 
 TABLE_FILE = Path(__file__).parents[2] / "docs" / "_static" / "planted_modes.md"
-FIRST_SEED = 930
+MISSED_FILE = TABLE_FILE.with_name("planted_missed.md")
 HEADER = (
     "excitation", "strong modes found", "modes found", "95 % intervals that hold the frequency",
     "the damping ratio", "false modes", "error of frequency, median", "90 %",
     "error of damping ratio, median", "90 %",
 )  # fmt: skip
-WORDS = {
-    "ambient": "ambient",
-    "motor": "ambient, and a motor with its harmonic",
-    "shaken": "shaker with four harmonics, unmeasured",
-    "blows": "blows, unmeasured",
-    "decay": "one free decay",
-    "crossing": "load that crosses and leaves",
-    "1 blow": "one blow, measured",
-    "3 blows": "three blows, measured",
-    "10 blows": "ten blows, measured",
-    "random force": "random force, measured",
-    "two random forces": "two random forces, measured",
-}
 
 
 def row(excitation: str, found: Sequence[PlantedComparison]) -> tuple[str, ...]:
@@ -57,16 +46,33 @@ def row(excitation: str, found: Sequence[PlantedComparison]) -> tuple[str, ...]:
     )
 
 
-def table(count: int, kinds: Sequence[str] = tuple(WORDS)) -> ReportTable:
-    """Rows for some kinds of excitation, of so many structures each."""
+def table(
+    count: int, kinds: Sequence[str] = tuple(WORDS)
+) -> tuple[ReportTable, list[tuple[str, ...]]]:
+    """Rows for some kinds of excitation, of so many structures each, and rows of missed modes."""
     seeds = range(FIRST_SEED, FIRST_SEED + count)
-    rows = []
+    rows, missed = [], []
     for kind in kinds:
         forced = kind in measured_forces.EXCITATIONS
         assess = measured_forces.assess if forced else modal_identification.assess
-        rows.append(row(kind, assess(kind, seeds)))
+        found = assess(kind, seeds)
+        rows.append(row(kind, found))
+        for seed, one in zip(seeds, found, strict=True):
+            missed += missed_rows(kind, WORDS[kind], seed, one)
         print(" | ".join(rows[-1]), flush=True)
-    return ReportTable(HEADER, rows)
+    return ReportTable(HEADER, rows), missed
+
+
+def _written(path: Path, header, rows, kinds) -> None:
+    """Write a table with new rows for some kinds; those of others stay."""
+    old = path.read_text(encoding="utf-8").splitlines()[2:] if path.exists() else []
+    words = [WORDS[kind] for kind in kinds]
+    kept = [line for line in old if line.split(" | ")[0].removeprefix("| ") not in words]
+    lines = kept + ["| " + " | ".join(row) + " |" for row in rows]
+    order = list(WORDS.values())
+    lines.sort(key=lambda line: order.index(line.split(" | ")[0].removeprefix("| ")))
+    head = ["| " + " | ".join(one) + " |" for one in (header, ["---"] * len(header))]
+    path.write_text("\n".join([*head, *lines]) + "\n", encoding="utf-8")
 
 
 def main(arguments: list[str]) -> None:
@@ -78,13 +84,9 @@ def main(arguments: list[str]) -> None:
     unknown = [kind for kind in kinds if kind not in WORDS]
     if unknown:
         raise SystemExit(f"unknown excitation {unknown[0]!r}; known are {', '.join(WORDS)}")
-    result = table(int(arguments[0]) if arguments else 30, kinds)
-    old = TABLE_FILE.read_text(encoding="utf-8").splitlines()[2:] if TABLE_FILE.exists() else []
-    rows = {line.split(" | ")[0].removeprefix("| "): line for line in old}
-    rows |= {row[0]: "| " + " | ".join(row) + " |" for row in result.rows}
-    head = ["| " + " | ".join(one) + " |" for one in (result.header, ["---"] * len(result.header))]
-    lines = [*head, *(rows[words] for words in WORDS.values() if words in rows)]
-    TABLE_FILE.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    result, missed = table(int(arguments[0]) if arguments else 30, kinds)
+    _written(TABLE_FILE, result.header, result.rows, kinds)
+    _written(MISSED_FILE, MISSED_HEADER, missed, kinds)
 
 
 if __name__ == "__main__":

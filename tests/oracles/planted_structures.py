@@ -13,6 +13,8 @@ from scipy.linalg import eigh
 from scipy.signal import lfilter
 
 FINER = 4
+RED = 0.95  # of coloured noise, from sample to sample
+WEAK = 0.1  # random forces beside those of a shaker
 ELEMENTS = 16
 
 
@@ -99,18 +101,25 @@ def response(structure: Structure, forces, rate: float):
 def coloured_noise(random, shape):
     """Noise of unit rms whose spectrum falls with frequency, beside white noise."""
     white = random.normal(size=shape)
-    red = lfilter([1.0], [1.0, -0.95], random.normal(size=shape), axis=0)
+    red = lfilter([1.0], [1.0, -RED], random.normal(size=shape), axis=0)
     return (white / white.std() + red / red.std()) / np.sqrt(2)
 
 
 class Planted(NamedTuple):
-    """Samples of a log with what was planted in it."""
+    """Samples of a log with what was planted in it; `noise` is the rms of the coloured noise."""
 
     structure: Structure
     values: np.ndarray
     rate: float
     energies: np.ndarray  # share of each mode in the variance of the response (after a crossing)
     lines: tuple[float, ...] = ()
+    noise: float = 0.0
+
+
+def noise_spectrum(angles):
+    """Spectral density (variance times sampling step) of coloured noise of unit rms; angles w h."""
+    red = (1 - RED**2) / np.abs(1 - RED * np.exp(-1j * np.asarray(angles))) ** 2
+    return (1 + red) / 2
 
 
 def _finished(structure, clean, rate, random, lines=(), cycles=None):
@@ -121,14 +130,14 @@ def _finished(structure, clean, rate, random, lines=(), cycles=None):
         size = clean.std() * random.uniform(0.3, 1.0)
         values = values + size * np.cos(2 * np.pi * line * times + 1.0)[:, None]
     drift = clean.std() * (random.uniform(0.5, 2) * times / times[-1])
-    return values + 5 * clean.std() + drift[:, None]
+    return values + 5 * clean.std() + drift[:, None], noise
 
 
 def _shaken(forces, structure, random, fine):
     """Fill in a shaker's force with four harmonics and weak ambient forces; the harmonics (Hz)."""
     speed = structure.frequencies[0] * random.uniform(0.8, 1.2)
     turns = speed * np.arange(len(forces)) / fine
-    forces[:] = 0.1 * random.normal(size=forces.shape)
+    forces[:] = WEAK * random.normal(size=forces.shape)
     for harmonic, size in ((1, 1.0), (2, 0.4), (3, 0.3), (4, 0.1)):
         forces[:, 0] += size * np.cos(2 * np.pi * harmonic * turns + harmonic)
     return tuple(speed * harmonic for harmonic in (1, 2, 3, 4))
@@ -171,5 +180,5 @@ def sampled(structure: Structure, kind: str, seed: int, duration: float) -> Plan
     clean = parts.sum(axis=0)
     free = slice(len(clean) // 2 + 1, None) if kind == "crossing" else slice(None)
     energies = np.mean(parts[:, free].var(axis=1) / clean[free].var(axis=0), axis=1)
-    values = _finished(structure, clean, rate, random, lines)
-    return Planted(structure, values, rate, energies, lines)
+    values, noise = _finished(structure, clean, rate, random, lines)
+    return Planted(structure, values, rate, energies, lines, noise)

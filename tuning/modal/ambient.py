@@ -9,11 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy import linalg
 from scipy.stats import norm, t as student
 
-from tuning.modal.likelihood import refine_poles
+from tuning.modal.likelihood.refine import Start, refine_modes
 from tuning.modal.preprocessing import Prepared, prepare
-from tuning.modal.result import IdentifiedMode, frequency_and_damping, rejection_reason
+from tuning.modal.result import (
+    MIN_ENERGY_SHARE,
+    IdentifiedMode,
+    frequency_and_damping,
+    rejection_reason,
+)
 from tuning.modal.shapes import mac_matrix
 from tuning.modal.stabilisation import Chain, Diagram, stabilise
 from tuning.modal.subspace import (
@@ -28,7 +34,6 @@ from tuning.modal.subspace import (
 MAX_ORDER = 60
 MAX_BAND_RATIO = 8.0  # upper over lower end of the bands that are identified one by one
 BAND_OVERLAP = 1.1  # by which such bands exceed their part
-MAX_SHIFT = 2.0  # of a pole by its likelihood, over its decay rate
 DUPLICATE_SDS = 2.0  # standard deviations within which two poles are one
 DUPLICATE_MAC = 0.9
 
@@ -113,6 +118,7 @@ def _modes_of_band(prepared: Prepared, whole, data_driven, order, refine):
         mode if reason else with_usual_spread(mode, poles, chain, spread_of)
         for mode, reason, chain in zip(modes, reasons, diagram.chains, strict=True)
     ]
+    reasons = [rejection_reason(mode, duration, whole) for mode in modes]
     if refine and any(reasons):
         modes, reasons = _decided(modes, reasons, records, prepared.rate, scale, duration, whole)
     candidates = [Candidate(*found) for found in zip(modes, reasons, lengths, strict=True)]
@@ -120,26 +126,38 @@ def _modes_of_band(prepared: Prepared, whole, data_driven, order, refine):
 
 
 def _decided(modes, reasons, records, rate, scale, duration, whole):
-    """Modes and reasons with those rejected modes accepted that the likelihood needs."""
+    """Modes and reasons with those rejected modes accepted that the likelihood needs.
+
+    Modes without energy would not be accepted.
+    """
     order = sorted(
-        range(len(modes)),
+        (k for k, mode in enumerate(modes) if mode.energy_share > MIN_ENERGY_SHARE),
         key=lambda k: (bool(reasons[k]), modes[k].damping_sd / modes[k].damping_ratio),
     )
-    poles = np.array([modes[k].pole for k in order], complex)
-    shapes = np.array([modes[k].shape.real / scale for k in order])
-    certain = np.array([not reasons[k] for k in order])
+    start = Start(
+        np.array([modes[k].pole for k in order], complex),
+        np.array([modes[k].shape.real / scale for k in order]).reshape(-1, scale.size),
+        np.array([modes[k].energy_share * scale.size for k in order]),
+        np.array([not reasons[k] for k in order], bool),
+    )
     modes, reasons = list(modes), list(reasons)
-    found = refine_poles(records, rate, poles, shapes, certain)
-    for k, one in zip(order, found, strict=True):
-        mode = modes[k]
-        if not reasons[k] or one is None or abs(one.pole - mode.pole) > MAX_SHIFT * -mode.pole.real:
+    for k, one in zip(order, refine_modes(records, rate, start), strict=True):
+        if one is None:
             continue
-        frequency, frequency_sd, damping, damping_sd = frequency_and_damping(*one)
-        better = mode._replace(
+        frequency, frequency_sd, damping, damping_sd = frequency_and_damping(
+            one.pole, one.covariance
+        )
+        physical = one.shape * scale
+        largest = int(np.argmax(np.abs(physical)))
+        spread = linalg.block_diag(one.shape_covariance, np.zeros_like(one.shape_covariance))
+        better = IdentifiedMode(
             frequency=frequency,
             frequency_sd=frequency_sd,
             damping_ratio=damping,
             damping_sd=damping_sd,
+            energy_share=one.variance,
+            shape=(physical / physical[largest]).astype(complex),
+            shape_covariance=_rescaled(one.shape, spread, scale, largest),
             quantile=float(norm.ppf(0.975)),
         )
         if not rejection_reason(better, duration, whole):
@@ -186,10 +204,10 @@ def with_usual_spread(
 ) -> IdentifiedMode:
     """The mode with the uncertainty of the lower eighth of its chain, and that of the order.
 
-    The pole of least uncertainty decides whether there is a mode; but that it is the least makes it
-    too small by chance. A model of low order, in which close or weak modes are one, has poles that
-    vary little from block to block, and are biased: what the less uncertain half of the chain
-    differs from the pole adds to its variance.
+    That the uncertainty of a pole is the least of a chain makes it too small by chance. A model of
+    low order, in which close or weak modes are one, has poles that vary little from block to block,
+    and are biased: what the less uncertain half of the chain differs from the pole adds to its
+    variance.
     """
     ranked = sorted(chain.members.tolist(), key=lambda k: np.linalg.det(found[k].covariance))
     usual, least = (np.diag(found[k].covariance) for k in (ranked[len(ranked) // 8], ranked[0]))

@@ -48,8 +48,9 @@ def kinetic_band(
 
     Resonances are where the spectrum exceeds its background (lower quartile over an octave) by
     8 dB; their excess is converted to velocities by `derivatives`, the order of each channel as a
-    time derivative. Drift and noise, however strong, are background. Without resonances the band is
-    all that the log can show.
+    time derivative. Drift and noise, however strong, are background. Its share in the power of a
+    channel, averaged over channels, is what counts, as a sensor near a node shows little of one
+    mode and much of another. Without resonances the band is all that the log can show.
     """
     longest = max(len(record) for record in records)
     lowest = MIN_CYCLES * rate / longest
@@ -58,11 +59,9 @@ def kinetic_band(
     bins, power = bins[keep], power[keep]
     excess = resonance_excess(bins, power)
     exponents = 2.0 * (1 - np.asarray(derivatives))
-    kinetic = excess * (2 * np.pi * bins[:, None]) ** exponents
-    # Channels of one quantity are added as they are; different quantities have equal weights.
-    kinds = np.asarray(derivatives)
-    scale = np.array([kinetic[:, kinds == kind].sum() for kind in derivatives])
-    kinetic = np.sum(kinetic / np.where(scale > 0, scale, 1.0), axis=1)
+    weights = (2 * np.pi * bins[:, None]) ** exponents
+    whole = np.sum(power * weights, axis=0)
+    kinetic = np.mean(excess * weights / np.where(whole > 0, whole, 1.0), axis=1)
     if not kinetic.any():
         return lowest, 0.4 * rate
     share = np.cumsum(kinetic) / kinetic.sum()

@@ -21,6 +21,7 @@ from scipy.fft import next_fast_len
 
 LOWEST_CYCLES = 8.0  # cycles of the lowest frequency of the band in the lags of half a matrix
 MAX_ROWS = 240  # rows of half a Hankel matrix: block rows times channels
+MIN_ROWS = 24  # likewise; two thirds of them are the highest order, of which half are even
 MIN_BLOCK_ROWS = 8
 MAX_BLOCKS = 24  # blocks of the records for the covariance of the covariances
 MIN_BLOCK_LAGS = 2  # length of a block over the largest lag
@@ -83,10 +84,12 @@ def block_rows(rate: float, lowest: float, channels: int, samples: int) -> int:
     """Block rows of half a Hankel matrix: lags of eight cycles of the lowest frequency (Hz).
 
     At most 240 rows with all channels, and so many that a record holds twelve blocks of twice all
-    lags.
+    lags; but of one or two channels so many that models have orders enough for modes to be stable
+    in, if the record holds three such blocks.
     """
     wanted = int(np.ceil(LOWEST_CYCLES * rate / lowest))
-    return max(min(wanted, MAX_ROWS // channels, samples // 48), MIN_BLOCK_ROWS)
+    fewest = min(-(-MIN_ROWS // channels), samples // 12)
+    return max(min(wanted, MAX_ROWS // channels, samples // 48), fewest, MIN_BLOCK_ROWS)
 
 
 def block_covariances(

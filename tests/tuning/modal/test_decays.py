@@ -138,3 +138,11 @@ def test_all_of_many_decays_are_used():
     np.testing.assert_allclose(columns, fitted, atol=1e-9)
     energy, whole = np.sum(columns**2), sum(np.sum(record**2) for record in records)
     assert 0.95 * whole < energy <= 1.001 * whole
+
+
+def test_a_decay_after_a_strong_excitation_counts():
+    """One channel of a planted structure, whose decay holds a tenth of the energy of the log."""
+    planted = sampled(random_structure(933), "crossing", 933, 60.0)
+    fit = identify_modes(log_of(planted))
+    assert fit.kind == "free decay", str(fit)
+    np.testing.assert_allclose(fit.frequencies, planted.structure.frequencies[:2], rtol=2e-3)

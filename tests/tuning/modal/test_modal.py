@@ -195,6 +195,16 @@ def test_the_band_holds_broad_resonances_of_ragged_spectra():
     assert 25 < high < 40
 
 
+def test_the_band_holds_what_is_strong_in_a_quiet_channel():
+    """A mode at 9 Hz in a channel near a node of the mode at 3 Hz, which shakes the other."""
+    random, times = np.random.default_rng(0), np.arange(4000) / 50
+    loud, quiet = (np.exp(-0.02 * f * times) * np.cos(2 * np.pi * f * times) for f in (3.0, 9.0))
+    values = np.stack([loud, 0.03 * quiet], axis=1)
+    values = values + 0.01 * values.std(axis=0) * random.normal(size=values.shape)
+    assert kinetic_band((values[:, :1],), 50.0, (1,))[1] < 6.0
+    assert 9.5 < kinetic_band((values,), 50.0, (1, 1))[1] < 15.0
+
+
 def test_samples_are_left_out_while_a_sensor_settles():
     """Saturated for a second after it is switched on, then an exponential, as AC coupling has."""
     quiet = ambient(0, duration=60.0)

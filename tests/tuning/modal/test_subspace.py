@@ -12,8 +12,8 @@ from tuning.modal.ambient import Candidate, mode_of_chain, with_usual_spread, wi
 from tuning.modal.harmonics import Line, fundamental, harmonic_lines, is_steady, without_lines
 from tuning.modal.result import IdentifiedMode
 from tuning.modal.shapes import mac_matrix, normalised, phase_collinearity
-from tuning.modal.stabilisation import Chain
-from tuning.modal.subspace import Poles, Spread, decompose, poles_of_order, spreads
+from tuning.modal.stabilisation import MIN_CHAIN_ORDERS, Chain
+from tuning.modal.subspace import Poles, Spread, block_rows, decompose, poles_of_order, spreads
 
 
 def free_response(times):
@@ -219,3 +219,10 @@ def test_poles_that_are_not_told_apart_are_one_mode(first, second, kept):
     assert len(found) == kept
     if kept == 1:
         assert found[0].mode.frequency == 154.92, "that of the smaller uncertainty of damping"
+
+
+def test_one_channel_has_orders_enough_to_be_stable():
+    """Two thirds of the rows are the highest order, every second one is tried, six make a chain."""
+    assert 2 * block_rows(13.7, 1.8, 1, 823) // 3 // 2 > MIN_CHAIN_ORDERS
+    assert block_rows(13.7, 1.8, 1, 64) == 8
+    assert block_rows(100.0, 2.0, 8, 30_000) == 30

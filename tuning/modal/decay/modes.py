@@ -16,6 +16,7 @@ from tuning.modal.ambient import (
 from tuning.modal.decay.fit import fit_decay
 from tuning.modal.decay.leaving import end_of_excitation, shaken_until
 from tuning.modal.decay.stretches import (
+    MIN_DECAY_CYCLES,
     Stretch,
     excited_samples,
     free_decays,
@@ -101,7 +102,9 @@ def free_decay_modes(
         decays = tuple(Stretch(i, 0, len(r), 0.0) for i, r in enumerate(samples.records))
     ratio = prepared.rate / samples.rate
     if not decays or not (
-        kind or given or _dominate(decays, prepared.records, ratio, prepared.rate / frequency)
+        kind
+        or given
+        or _dominate(decays, struck, prepared.records, ratio, prepared.rate / frequency)
     ):
         return None
     for _ in range(MAX_CUTS + 1):
@@ -195,11 +198,12 @@ def _is_cube(mode: IdentifiedMode, other: IdentifiedMode) -> bool:
     return bool(near and alike and NONLINEAR_DECAY[0] < rate < NONLINEAR_DECAY[1])
 
 
-def _dominate(decays, records, ratio, cycle) -> bool:
+def _dominate(decays, struck, records, ratio, cycle) -> bool:
     """Whether decays hold much of the energy of a log, or one falls far from a level like its own.
 
     `cycle` is that of the strongest vibration in samples. A decay that begins far below the level
-    of the log, long after blows, lacks the modes that were gone by then.
+    of the log, long after blows, lacks the modes that were gone by then; one that begins where a
+    lasting excitation ends has them all, however much stronger the excitation was.
     """
     inside = sum(
         np.sum(records[d.record][int(d.start * ratio) : int(d.stop * ratio)] ** 2) for d in decays
@@ -209,6 +213,14 @@ def _dominate(decays, records, ratio, cycle) -> bool:
     longest = max(decays, key=lambda d: d.fall)
     start = int(np.ceil(longest.start * ratio))
     first = records[longest.record][start : start + int(2 * cycle) + 1]
-    begins = np.sum(first**2) / len(first)
-    falls = longest.fall > LONG_FALL_NEPERS and begins > MIN_START_LEVEL * level
+    begins = np.sum(first**2) / len(first) > MIN_START_LEVEL * level
+    falls = longest.fall > LONG_FALL_NEPERS and (
+        begins or _follows(longest, struck[longest.record], cycle / ratio)
+    )
     return bool(inside > MIN_DECAY_ENERGY * whole or falls)
+
+
+def _follows(decay: Stretch, struck, cycle) -> bool:
+    """Whether a decay begins where the structure was excited for five cycles (samples) or more."""
+    before = struck[: max(decay.start - 2, 0)][-int(MIN_DECAY_CYCLES * cycle) :]
+    return bool(before.size and before.all())

@@ -1,0 +1,152 @@
+"""Least errors that modes of a planted structure can have, whatever the method.
+
+No unbiased method has smaller variances than the inverse of Fisher's information (Rao 1945, Cramer
+1946). It is computed for a method that knows all that one can know: the noise, the strengths of
+random forces and the frequencies of lines, the number of modes, and that shapes are real. Unknown
+are frequencies, damping ratios, shapes and, of random forces, their places.
+
+A log does not tell a mode if the interval of its damping ratio holds zero all the same, if that of
+its frequency holds a neighbour within its half-power bandwidth, or if it is nearer to a harmonic
+of a machine than the resolution of the log: a harmonic of fluctuating amplitude and phase responds
+like the mode.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from tests.oracles.planted_structures import FINER, WEAK, Planted, Structure, noise_spectrum
+
+QUANTILE = 1.96
+WIDTHS = 10.0  # half-power widths around a mode in which every bin counts; else one of some
+SPARSE = 3000  # bins in all, about
+STEP = 1e-4  # relative, of differences
+MIN_DIRECTION = 1e-10  # of the scaled information; scales of shapes have none
+
+
+class LeastErrors(NamedTuple):
+    """Least standard deviations of the frequencies (Hz) and damping ratios of all modes."""
+
+    frequencies: Float[np.ndarray, " mode"]
+    damping_ratios: Float[np.ndarray, " mode"]
+
+
+def least_errors(planted: Planted, duration: float, shaken: bool = False) -> LeastErrors:
+    """Least errors under random forces, from the distribution of spectra (Whittle 1953).
+
+    `shaken` tells that the random forces are those beside a shaker; lines are left out.
+    """
+    structure, rate = planted.structure, planted.rate
+    bins, weights = _bins(planted, duration)
+    inputs = structure.inputs * (WEAK if shaken else 1.0)
+    unknowns = _stacked(structure, structure.shapes, inputs)
+    channels = structure.shapes.shape[1]
+    angles = 2 * np.pi * bins / rate
+    noise = planted.noise**2 * noise_spectrum(angles)[:, None, None] * np.eye(channels)
+
+    def spectra(values):
+        found = noise.astype(complex)
+        for alias in range(FINER):  # of samples at FINER times the rate
+            one = _responses(values, channels, (angles + 2 * np.pi * alias) / FINER, FINER * rate)
+            found = found + one @ one.conj().transpose(0, 2, 1) / FINER
+        return found
+
+    inverse = np.linalg.inv(spectra(unknowns))
+    relative = [inverse @ slope for slope in _slopes(spectra, unknowns)]
+    left = np.array([(one * weights[:, None, None]).ravel() for one in relative])
+    right = np.array([one.transpose(0, 2, 1).ravel() for one in relative])
+    return _of_information((left @ right.T).real, unknowns)
+
+
+def least_errors_of_forced(
+    planted: Planted, forces: Float[np.ndarray, "time input"]
+) -> LeastErrors:
+    """Least errors of the response to measured forces, in noise."""
+    structure, rate = planted.structure, planted.rate
+    spectrum = np.fft.rfft(forces, axis=0) / np.sqrt(len(forces))
+    bins = np.fft.rfftfreq(len(forces), 1 / rate)
+    keep = (bins > 0.5 * structure.frequencies[0]) & (bins < 1.3 * structure.frequencies[-1])
+    angles, channels = 2 * np.pi * bins[keep] / rate, structure.shapes.shape[1]
+    unknowns = _stacked(structure, structure.shapes, structure.inputs[:, : forces.shape[1]])
+    deviation = planted.noise * np.sqrt(noise_spectrum(angles))[:, None]
+
+    def outputs(values):
+        one = _responses(values, channels, angles, rate)
+        return np.einsum("bci,bi->bc", one, spectrum[keep]) / deviation
+
+    slopes = np.array([slope.ravel() for slope in _slopes(outputs, unknowns)])
+    return _of_information(2 * (slopes.conj() @ slopes.T).real, unknowns)
+
+
+def _bins(planted: Planted, duration):
+    """Bins (Hz) without lines, all near modes and some elsewhere, and how many each stands for."""
+    structure = planted.structure
+    highest = min(1.3 * structure.frequencies[-1], 0.49 * planted.rate)
+    bins = np.arange(1, int(duration * highest)) / duration
+    for line in planted.lines:
+        bins = bins[np.abs(bins - line) > 1.01 / duration]
+    widths = structure.damping_ratios * structure.frequencies
+    near = np.any(np.abs(bins[:, None] - structure.frequencies) < WIDTHS * widths, axis=1)
+    every = max(bins.size // SPARSE, 1)
+    keep = near | (np.arange(bins.size) % every == 0)
+    return bins[keep], np.where(near, 1.0, every)[keep]
+
+
+def _stacked(structure: Structure, shapes, inputs):
+    """Unknowns (mode, unknown): frequency, damping ratio, shape at the channels, at the inputs."""
+    return np.column_stack([structure.frequencies, structure.damping_ratios, shapes, inputs])
+
+
+def _responses(unknowns, channels, angles, rate) -> Complex[np.ndarray, "bin channel input"]:
+    """Transfer functions of the recursion of velocities (`planted_structures.response`)."""
+    z = np.exp(-1j * angles)
+    found = np.zeros((len(angles), channels, unknowns.shape[1] - 2 - channels), complex)
+    for frequency, damping, *others in unknowns:
+        pole = 2 * np.pi * frequency * (-damping + 1j * np.sqrt(1 - damping**2))
+        root, residue = np.exp(pole / rate), -1j * pole / pole.imag
+        above = residue.real - (residue * np.conj(root)).real * z
+        own = above / (1 - 2 * root.real * z + abs(root) ** 2 * z**2)
+        found = found + own[:, None, None] * np.outer(others[:channels], others[channels:])
+    return found
+
+
+def _slopes(function, unknowns):
+    """Derivatives of a function by all unknowns, by central differences."""
+    sizes = np.abs(unknowns)
+    sizes[:, 2:] = sizes[:, 2:].max(axis=1, keepdims=True)
+    for place in np.ndindex(unknowns.shape):
+        change = np.zeros_like(unknowns)
+        # A lightly damped mode is narrow: its damping ratio is the scale of its frequency.
+        change[place] = STEP * sizes[place] * (unknowns[place[0], 1] if place[1] == 0 else 1.0)
+        yield (function(unknowns + change) - function(unknowns - change)) / (2 * change[place])
+
+
+def _of_information(information, unknowns) -> LeastErrors:
+    scale = 1 / np.sqrt(np.diag(information) + 1e-300)
+    product = np.outer(scale, scale)
+    inverse = np.linalg.pinv(information * product, rcond=MIN_DIRECTION, hermitian=True)
+    deviations = np.sqrt(np.diag(inverse * product)).reshape(unknowns.shape)
+    return LeastErrors(deviations[:, 0], deviations[:, 1])
+
+
+def why_untold(planted: Planted, mode: int, errors: LeastErrors, duration: float) -> str:
+    """Why a log of a duration (s) does not tell a mode; empty if it may."""
+    structure = planted.structure
+    frequency, damping = structure.frequencies[mode], structure.damping_ratios[mode]
+    lines = [line for line in planted.lines if abs(line - frequency) < 1 / duration]
+    if lines:
+        return (
+            f"{abs(lines[0] - frequency):.2g} Hz from a harmonic, resolution {1 / duration:.2g} Hz"
+        )
+    if QUANTILE * errors.damping_ratios[mode] > damping:
+        return (
+            f"damping ratio {damping:.2g} +- {QUANTILE * errors.damping_ratios[mode]:.2g} at best"
+        )
+    half = QUANTILE * errors.frequencies[mode]
+    widths = structure.damping_ratios * structure.frequencies
+    for other in np.flatnonzero(np.arange(widths.size) != mode):
+        apart = abs(structure.frequencies[other] - frequency)
+        if apart < min(half, widths[mode] + widths[other]):
+            return f"{apart:.2g} Hz from another, +- {half:.2g} Hz at best"
+    return ""

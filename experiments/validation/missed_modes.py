@@ -1,0 +1,75 @@
+"""Rows of a table of strong planted modes that were missed: whether any method could find them.
+
+Written by `planted_modes`, beside its table. The least 95 % intervals are those of an unbiased
+method that knows the noise, the number of modes, and more (`least_errors`); whether pyOMA-2 finds
+the mode stable, told where to look, is in the last column.
+"""
+
+import numpy as np
+
+from experiments.validation import measured_forces, modal_identification
+from experiments.validation.least_errors import (
+    QUANTILE,
+    LeastErrors,
+    least_errors,
+    least_errors_of_forced,
+    why_untold,
+)
+from experiments.validation.modal_identification import PlantedComparison
+from experiments.validation.modal_methods import pyoma
+from tests.oracles.planted_structures import Planted, random_structure, sampled
+
+HEADER = (
+    "excitation", "structure", "frequency", "damping ratio", "energy", "least error of frequency",
+    "of damping ratio", "why the log does not tell it", "pyOMA-2, SSI-COV",
+)  # fmt: skip
+RANDOM = ("ambient", "motor", "shaken")
+
+
+def missed_rows(kind: str, words: str, seed: int, found: PlantedComparison) -> list[tuple]:
+    """A row for each strong mode of a structure that was missed; `words` name the excitation."""
+    if not found.missed:
+        return []
+    planted, errors, duration = _planted(kind, seed)
+    theirs = pyoma(planted).errors[:, 0]
+    structure, rows = planted.structure, []
+    for frequency in found.missed:
+        mode = int(np.argmin(np.abs(structure.frequencies - frequency)))
+        least = ("", "")
+        reason = ""
+        if errors is not None:
+            reason = why_untold(planted, mode, errors, duration)
+            least = (
+                f"{QUANTILE * errors.frequencies[mode]:.2g} Hz",
+                f"{QUANTILE * errors.damping_ratios[mode]:.2g}",
+            )
+        rows.append(
+            (
+                words,
+                str(seed),
+                f"{frequency:.3f} Hz",
+                f"{structure.damping_ratios[mode]:.4f}",
+                f"{100 * planted.energies[mode]:.0f} %",
+                *least,
+                reason or "it may",
+                "not found" if np.isnan(theirs[mode]) else "stable",
+            )
+        )
+    return rows
+
+
+def _planted(kind, seed) -> tuple[Planted, LeastErrors | None, float]:
+    """What was planted, least errors if they were derived for the excitation, and duration (s)."""
+    structure = random_structure(seed)
+    if kind in measured_forces.EXCITATIONS:
+        log, planted = measured_forces.forced_log(structure, kind, seed)
+        inputs = log.values.shape[1] - planted.values.shape[1]
+        return (
+            planted,
+            least_errors_of_forced(planted, log.values[:, :inputs]),
+            measured_forces.DURATION,
+        )
+    duration = modal_identification.DURATIONS[kind]
+    planted = sampled(structure, kind, seed, duration)
+    errors = least_errors(planted, duration, kind == "shaken") if kind in RANDOM else None
+    return planted, errors, duration

@@ -1,0 +1,54 @@
+"""Least errors of planted modes against the law of long data, and what logs do not tell."""
+
+import numpy as np
+import pytest
+
+from experiments.validation.least_errors import least_errors, least_errors_of_forced, why_untold
+from tests.oracles.planted_structures import Planted, Structure, noise_spectrum
+
+RATE = 20.0
+
+
+def planted(frequencies, damping, noise=1e-3, lines=()):
+    """A structure of two channels and two exciters; samples do not matter."""
+    count = len(frequencies)
+    shapes = np.array([[1.0, 0.5], [0.5, -1.0]])[:count]
+    structure = Structure(np.array(frequencies), np.array(damping), shapes, shapes)
+    return Planted(structure, np.zeros((1, 2)), RATE, np.ones(count), lines, noise)
+
+
+@pytest.mark.parametrize("damping", [0.005, 0.02])
+def test_least_errors_of_one_mode_are_those_of_long_data(damping):
+    """Au (2014), uncertainty law of ambient modal identification, long data and a wide band."""
+    frequency, duration = 4.0, 2000.0
+    found = least_errors(planted([frequency], [damping]), duration)
+    cycles = frequency * duration
+    expected = frequency * np.sqrt(damping / (2 * np.pi * cycles))
+    assert found.frequencies[0] == pytest.approx(expected, rel=0.1)
+    expected = damping / np.sqrt(2 * np.pi * damping * cycles)
+    assert found.damping_ratios[0] == pytest.approx(expected, rel=0.1)
+
+
+def test_least_errors_of_measured_forces_fall_with_the_noise():
+    forces = np.random.default_rng(0).normal(size=(2000, 1))
+    errors = [
+        least_errors_of_forced(planted([4.0, 4.5], [0.01, 0.02], noise), forces).damping_ratios
+        for noise in (1.0, 0.1)
+    ]
+    np.testing.assert_allclose(errors[0], 10 * errors[1], rtol=1e-3)
+
+
+def test_why_a_log_does_not_tell_a_mode():
+    def why(frequencies, damping, noise=1e-3, lines=(), duration=300.0):
+        one = planted(frequencies, damping, noise, lines)
+        return why_untold(one, 0, least_errors(one, duration), duration)
+
+    assert why([4.0, 6.0], [0.01, 0.01]) == ""
+    assert "damping ratio" in why([4.0, 6.0], [0.01, 0.01], noise=1e4)
+    assert "from a harmonic" in why([4.0, 6.0], [0.01, 0.01], lines=(4.001,))
+    assert "from another" in why([4.0, 4.02], [0.05, 0.05], noise=0.3, duration=60.0)
+
+
+def test_noise_has_unit_variance():
+    angles = np.linspace(-np.pi, np.pi, 20_001)
+    assert np.mean(noise_spectrum(angles)) == pytest.approx(1.0, rel=1e-2)

@@ -1,0 +1,1 @@
+"""Modes that a subspace method leaves uncertain, decided by the likelihood of spectra."""
