@@ -1,6 +1,8 @@
 """Computation of a sweep of numbers, block by block, into a store and a labelled dataset."""
 
+import importlib
 import json
+import threading
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -73,6 +75,8 @@ def _computed(
         steps, error = block_store.steps[:-1], float(block_store.steps[-1])
     else:
         progress_bar.set_description("compiling")
+        # Compilers leave a core free, on which to import what the dataset needs.
+        threading.Thread(target=importlib.import_module, args=["xarray"]).start()
         native = specification.uses_c()
         runner = specification.runner(native)
         steps, error = runner.choose_step_sizes()

@@ -38,11 +38,12 @@ class RunSet(eqx.Module):
     """Runs of one case, simulated as a batch with one integration plan.
 
     `stacked` is the case with the numbers of all runs along a first axis, `error` the relative
-    error of their peaks with the `plan`. `uncontrolled` holds, by run, the peak and RMS deflection
-    (m) without control ("peak", "rms"), the least achievable peak ("least", m; NaN if not
-    computed), and the largest absolute value of each of the `quantities` of sensors. `positions`
-    (m) are where deflections count; `nominal` has the parameters of the plant, by address, that
-    controllers are designed for where those of the runs differ.
+    error of their peaks with the `plan`, `sensor_errors` those at each sensor. `uncontrolled`
+    holds, by run, the peak and RMS deflection (m) without control ("peak", "rms"), the least
+    achievable peak ("least", m; NaN if not computed), and the largest absolute value of each of the
+    `quantities` of sensors. `positions` (m) are where deflections count; `nominal` has the
+    parameters of the plant, by address, that controllers are designed for where those of the runs
+    differ.
 
     Pass a run set as an argument to compiled functions, never by closure: its arrays would become
     constants that XLA works on for seconds.
@@ -52,6 +53,7 @@ class RunSet(eqx.Module):
     stacked: Case
     plan: IntegrationPlan
     error: Float[np.ndarray, ""]
+    sensor_errors: Float[np.ndarray, " sensor"]
     times: Float[Array, " time"]
     positions: Float[Array, " position"]
     uncontrolled: dict[str, Float[np.ndarray, " run"]]
@@ -63,7 +65,7 @@ class RunSet(eqx.Module):
     @property
     def cases(self) -> list[Case]:
         """The cases of the runs, one by one."""
-        leaves, treedef = jax.tree.flatten(jax.tree.map(jnp.asarray, self.stacked))
+        leaves, treedef = jax.tree.flatten(jax.tree.map(np.asarray, self.stacked))
         return [jax.tree.unflatten(treedef, row) for row in zip(*leaves, strict=True)]
 
     def histories(self, values: Mapping[str, Any]) -> Histories:
@@ -96,7 +98,8 @@ class RunSet(eqx.Module):
 
     def records(self, values: Mapping[str, Any]) -> list[Record]:
         """Records of all runs, with peaks between samples, too."""
-        plan = dataclasses.replace(self.plan, error=float(self.error))
+        errors = float(self.error), tuple(self.sensor_errors.tolist())
+        plan = dataclasses.replace(self.plan, error=errors[0], sensor_errors=errors[1])
         return [simulate(self._case_with_values(case, values), plan=plan) for case in self.cases]
 
     def subset(self, rows: Int[Array, " some"]) -> "RunSet":
@@ -146,7 +149,7 @@ def make_run_set(
         wanted = times, positions, tuple(quantities)
         uncontrolled_future = pool.submit(_uncontrolled_histories, cases, *wanted)
         least_future = pool.submit(_least_peaks, cases, positions) if least_peaks else None
-    plan, error = plan_future.result()
+    plan = plan_future.result()
     uncontrolled = uncontrolled_future.result()
     deflection = uncontrolled.deflection
     varied = dict.fromkeys(a for run in runs for a in run if a.startswith(PLANT_PREFIXES))
@@ -155,8 +158,9 @@ def make_run_set(
     return RunSet(
         runs=runs,
         stacked=stack_cases(cases),
-        plan=plan,
-        error=np.asarray(error),
+        plan=_without_errors(plan),
+        error=np.asarray(plan.error),
+        sensor_errors=np.array(plan.sensor_errors),
         times=times,
         positions=positions,
         uncontrolled={
@@ -174,20 +178,20 @@ def make_run_set(
     )
 
 
-def _integration_plan(cases: list[Case]) -> tuple[IntegrationPlan, float]:
-    """Integration plan of all cases, without its error, and the error.
+def _integration_plan(cases: list[Case]) -> IntegrationPlan:
+    """Integration plan of all cases."""
+    return common_plan([integration_plan(case, tolerance=PEAK_TOLERANCE) for case in cases], "runs")
 
-    The error is static data of compiled programs, so that plans without it share programs.
-    """
-    plans = [integration_plan(case, tolerance=PEAK_TOLERANCE) for case in cases]
-    plan = common_plan(plans, "runs")
-    return dataclasses.replace(plan, error=0.0), plan.error
+
+def _without_errors(plan: IntegrationPlan) -> IntegrationPlan:
+    """The plan without its errors: static data of compiled programs, which other runs share."""
+    return dataclasses.replace(plan, error=0.0, sensor_errors=())
 
 
 def _uncontrolled_histories(cases: list[Case], times, positions, quantities) -> Histories:
     """Histories of runs without their controllers, along a first axis."""
     without_controller = [dataclasses.replace(case, controller=None) for case in cases]
-    plan, _ = _integration_plan(without_controller)
+    plan = _without_errors(_integration_plan(without_controller))
     wanted = times, plan, positions, quantities
     if len(cases) <= MAX_KNOWN_RUNS:
         found = [_known_histories(case, *wanted) for case in without_controller]

@@ -83,6 +83,17 @@ def test_metrics_are_those_of_the_simulated_runs(metrics):
         assert metrics["contact"][i] == pytest.approx(change, rel=1e-3)
 
 
+def test_other_runs_share_the_programs(run_set):
+    """Run sets are arguments of programs, which are compiled for their structure."""
+    heavier = tuning.full_grid({"loads.0.mass": [0.32, 0.55], "loads.0.speed": [1.5]})
+    other = make_run_set(rig(), heavier)
+    unnamed = [dataclasses.replace(each, runs=()) for each in (run_set, other)]
+    assert jax.tree.structure(unnamed[0]) == jax.tree.structure(unnamed[1])
+    assert run_set.error != other.error
+    record = other.records({})[0]
+    assert np.array_equal(record.step_errors, other.sensor_errors)
+
+
 def test_gradients_of_the_objectives(run_set):
     """Of a sum of all: in forward mode, and from the metrics in reverse; see the next test."""
     weights = {"peak": 1.0, "rms": 0.3, "effort": 0.1, "contact": 0.2}
