@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.analysis.loops.affine import affine_jacobian
+from jaxbeam.analysis.loops.affine import affine_jacobian, apply
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw, Measurement
 from jaxbeam.case.filters import filter_step
@@ -179,7 +179,7 @@ class LoopDynamics(Module):
 
         `transitions` are those of the plant over the period, of its state and inputs, or of its
         deviations, without the weights. `command_given` replaces the commands of the law. All may
-        be columns (entry, column) if the law takes them.
+        be columns (entry, column) if the law takes them, the same number of each of several times.
         """
         plant_state, filters, signal_history, law_state, command_queue = state
         case, signal_history, states, readings = self.plant.case, list(signal_history), [], []
@@ -210,8 +210,8 @@ class LoopDynamics(Module):
         change = share * timing.period
         for (_, end), transition in zip(_intervals(timing), transitions, strict=True):
             command = command_queue[whole_periods + (end <= change)]
-            inputs = self._inputs(command)[: transition.shape[1] - plant_state.shape[0]]
-            plant_state = transition @ xp.concatenate([plant_state, inputs])
+            inputs = self._inputs(command)[: transition.shape[-1] - plant_state.shape[0]]
+            plant_state = apply(transition, xp.concatenate([plant_state, inputs]))
             for i in delayed_samples.get(end, ()):
                 signal = self._sensor_inputs(plant_state, command, t + end)[i : i + 1]
                 signal_history[i] = xp.concatenate([signal, signal_history[i]])[
@@ -233,7 +233,7 @@ class LoopDynamics(Module):
         if not has_feedthrough.any():
             return signals
         system = self.augmented_plant.at(t)
-        accelerations = system.C @ state + system.D @ self._inputs(command)
+        accelerations = apply(system.C, state) + apply(system.D, self._inputs(command))
         has_feedthrough = has_feedthrough.reshape(-1, *(1,) * (signals.ndim - 1))
         return xp.where(has_feedthrough, accelerations, signals)
 

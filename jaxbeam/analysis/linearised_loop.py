@@ -197,13 +197,9 @@ def affine_linearisations(
             A, B, _, command = loop.continuous_dynamics(t, system)
             parts.append((A, B, affine_jacobian(command, np.zeros(A.shape[0]))))
     else:
-        linear, plant = (
-            linear_loop(loop, times[0]),
-            loop.plant_transitions(timing, times, weights=False),
-        )
-        for i, t in enumerate(times):
-            linear = linear_loop(loop, t, linear)
-            parts.append(sampled_matrices(linear, timing, t, [part[i] for part in plant]))
+        linear = linear_loop(loop, times)
+        plant = linear.plant_transitions(timing, times, weights=False)
+        parts = zip(*sampled_matrices(linear, timing, times, plant), strict=True)
     period = None if timing is None else timing.period
     modal_states = 2 * loop.plant.coordinate_scale.shape[0]
     return [LinearisedLoop(A, B, K, period, modal_states) for A, B, K in parts]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import scipy
+import scipy  # loads its parts on first use
 from jaxtyping import Float
 
 from jaxbeam.analysis.linearised_loop import LinearisedLoop
@@ -15,6 +15,8 @@ from jaxbeam.case.fields import concrete
 
 POINTS_PER_POLE = 400  # frequencies around each pole
 MAX_CONDITION = 1e12  # condition of the eigenvectors above which the matrix counts as defective
+BISECTIONS = 50  # of the intervals between frequencies, down to rounding
+REFINEMENTS, REFINED_POINTS = 8, 21  # of the frequencies beside the smallest distance
 LOWEST_FREQUENCY = 1e-3  # lowest frequency of the grid, relative to that of the lowest pole
 
 
@@ -45,37 +47,33 @@ def margins(loop: LinearisedLoop, actuator: int = 0) -> Margins:
     curve = response(omega)
 
     def crossings(function):
-        def value(w):
-            return function(response(w))[0]
-
         signs = np.sign(function(curve))
-        for i in np.flatnonzero(signs[:-1] * signs[1:] < 0):
-            ends = omega[i : i + 2]
-            if np.sign(value(ends[0])) == np.sign(value(ends[1])):  # zero but for rounding
-                yield min(ends, key=lambda w: abs(value(w)))
-            else:
-                yield scipy.optimize.brentq(value, *ends, rtol=1e-13)
+        before = np.flatnonzero(signs[:-1] * signs[1:] < 0)
+        low, high = omega[before], omega[before + 1]
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2
+            below = np.sign(function(response(middle))) == signs[before]
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        return (low + high) / 2
 
-    gains = [1 / response(w)[0].real for w in crossings(np.imag)]
+    gains = [1 / value.real for value in response(crossings(np.imag))]
     ends = (value for value in (curve[0], curve[-1]) if abs(value.imag) < 1e-9)
     gains += [1 / value.real for value in ends if value.real != 0]
-    phases, delays = [np.inf], [np.inf]
-    for w in crossings(lambda z: np.abs(z) - 1):
-        # Additional lag that turns the response onto the critical point, at angle zero.
-        lag = np.angle(response(w)[0]) % (2 * np.pi)
-        phases.append(min(lag, 2 * np.pi - lag))
-        delays.append(lag / w)
-    nearest = int(np.argmin(np.abs(1 - curve)))
-    bracket = omega[max(nearest - 1, 0)], omega[min(nearest + 1, omega.size - 1)]
-    least = scipy.optimize.minimize_scalar(
-        lambda w: abs(1 - response(w)[0]), bounds=bracket, options={"xatol": 1e-9 * bracket[1]}
-    )
+    at_unity = crossings(lambda z: np.abs(z) - 1)
+    # Additional lags that turn the response onto the critical point, at angle zero.
+    lags = np.angle(response(at_unity)) % (2 * np.pi)
+    grid, distance = omega, np.abs(1 - curve)
+    for _ in range(REFINEMENTS):
+        nearest = int(np.argmin(distance))
+        low, high = grid[max(nearest - 1, 0)], grid[min(nearest + 1, grid.size - 1)]
+        grid = np.union1d(np.linspace(low, high, REFINED_POINTS), grid[nearest])
+        distance = np.abs(1 - response(grid))
     found = Margins(
         gain=min((g for g in gains if g > 1), default=np.inf),
         lower_gain=max((g for g in gains if 0 < g < 1), default=0.0),
-        phase=min(phases),
-        delay=min(delays),
-        modulus_margin=min(least.fun, abs(1 - curve[nearest])),
+        phase=np.min(np.minimum(lags, 2 * np.pi - lags), initial=np.inf),
+        delay=np.min(lags / at_unity, initial=np.inf),
+        modulus_margin=np.min(distance),
     )
     return Margins(*map(float, found))
 

@@ -13,13 +13,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-import scipy
+import scipy  # loads its parts on first use
 from jaxtyping import Complex, Float
 
 from jaxbeam.analysis.frozen_loop import LoopDynamics, LoopTiming, loop_dynamics
 from jaxbeam.analysis.linearised_loop import linearise_each, loop_timing
 from jaxbeam.analysis.loops.affine import NotAffineError
-from jaxbeam.analysis.loops.affine_loop import linear_loop, ravel_columns
+from jaxbeam.analysis.loops.affine_loop import linear_loop, sampled_matrices
 from jaxbeam.case.case import Case, concrete_case, crossing_times
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.trajectory import NEVER
@@ -28,7 +28,7 @@ from jaxbeam.numerics.discretisation import propagate
 from jaxbeam.runtime.arrays import known, ravel_pytree, scan, xp
 from jaxbeam.runtime.compiling import compiled
 
-MAX_PHASE_PER_STEP = 0.15  # rad: phase of the fastest mode per step of the transition matrix
+MAX_PHASE_PER_STEP = 0.4  # rad: phase of the fastest mode per step of the transition matrix
 SAMPLES_AT_ONCE = 2048  # of which the plant is propagated together
 
 
@@ -191,19 +191,15 @@ def _affine_transitions(loop: LoopDynamics, timing: LoopTiming, times, substeps:
 
     The law may change from sample to sample.
     """
-    linear = linear_loop(loop, times[0])
-    start, unpack = linear.rest_state(timing)
-    columns = unpack(np.eye(len(start)))
-    transitions, product = [np.eye(len(start))], np.eye(len(start))
+    transitions: list[np.ndarray] = []
     for first in range(0, len(times) - 1, SAMPLES_AT_ONCE):
         chunk = times[:-1][first : first + SAMPLES_AT_ONCE]
+        linear = linear_loop(loop, chunk)
         plant = linear.plant_transitions(timing, chunk, substeps, weights=False)
-        for i, t in enumerate(chunk):
-            linear = linear_loop(loop, t, linear)
-            after, _ = linear.sampling_step(timing, columns, t, [part[i] for part in plant])
-            product = ravel_columns(after) @ product
-            transitions.append(product)
-    return np.stack(transitions)
+        A, B, K = sampled_matrices(linear, timing, chunk, plant)
+        for matrix in A + B @ K:
+            transitions.append(matrix @ transitions[-1] if transitions else matrix)
+    return np.stack([np.eye(len(transitions[0])), *transitions])
 
 
 def _energy_matrix(loop: LoopDynamics) -> Float[np.ndarray, "state state"]:
@@ -266,6 +262,17 @@ def _tracked_branches(
     for i in range(1, len(ordered)):
         # Linear extrapolation tells branches apart where they cross.
         predicted = ordered[i - 1] if i == 1 else 2 * ordered[i - 1] - ordered[i - 2]
-        distances = np.abs(predicted[:, None] - poles[i][None])
-        ordered[i] = poles[i][scipy.optimize.linear_sum_assignment(distances)[1]]
+        ordered[i] = poles[i][_assignment(np.abs(predicted[:, None] - poles[i][None]))]
     return ordered
+
+
+def _assignment(distances: Float[np.ndarray, "branch pole"]) -> list[int]:
+    """Poles of the branches, one each, with the smallest sum of distances."""
+    found: list[int] = []
+    for to_poles in distances:
+        left = to_poles.copy()
+        left[found] = np.inf
+        found.append(int(np.argmin(left)))
+        if left[found[-1]] > np.min(to_poles):  # nearest to two branches
+            return scipy.optimize.linear_sum_assignment(distances)[1].tolist()
+    return found

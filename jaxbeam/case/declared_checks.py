@@ -181,7 +181,7 @@ def _check_number(address: str, value: Any, field: dataclasses.Field) -> None:
 
 
 def _check_increasing(names: list[str], numbers: np.ndarray, unit: str) -> None:
-    not_increasing = np.flatnonzero(np.diff(numbers) <= 0)
+    not_increasing = np.flatnonzero(numbers[1:] <= numbers[:-1])  # differences may overflow
     if not_increasing.size:
         i = not_increasing[0] + 1
         raise ValueError(

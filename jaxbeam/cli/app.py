@@ -161,5 +161,5 @@ def _relax_garbage_collection() -> None:
 
     Tracing makes millions of objects that live on; this saves about a second a command.
     """
-    gc.set_threshold(50_000, 20, 100)
+    gc.set_threshold(500_000, 20, 100)
     atexit.register(gc.freeze)

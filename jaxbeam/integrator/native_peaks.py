@@ -22,6 +22,8 @@ from jaxbeam.integrator.integrate import integrate_peaks as integrate_peaks_in_j
 from jaxbeam.integrator.kinks.passages import may_have_kinks
 from jaxbeam.integrator.peaks.contact_minimum import (
     FORCE_FRACTIONS,
+    FORCE_GAP,
+    ZERO_ITERATIONS,
     force_weights_at_fractions,
     spread_factor,
 )
@@ -65,6 +67,8 @@ C_MACROS = {
     "DOUBLINGS": DOUBLINGS,
     "PEAK_POINTS": len(PEAK_NODES),
     "FORCE_POINTS": len(FORCE_FRACTIONS),
+    "FORCE_GAP": FORCE_GAP,
+    "ZERO_ITERATIONS": ZERO_ITERATIONS,
     "SPREAD_FACTOR": spread_factor(),
     "PEAK_MARGIN": PEAK_MARGIN,
     "END_PEAK_MARGIN": (PEAK_MARGIN - 1)

@@ -7,6 +7,8 @@ deflections at monitored positions.
 """
 
 import math
+import operator
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -110,6 +112,8 @@ def chunk_length(discrete: DiscreteModel, loads: LoadSet, max_loads: int) -> int
     plain = discrete.modal_command_matrix is None and not loads.wheels.vehicles
     if plain and advances_by_forces(states):
         transition = discrete.model.state_matrix.size
+        if discrete.monitored_transition is not None:
+            transition = max(transition, discrete.monitored_transition[0].size)
     entries = loads.inertia.shape[1] * max(compliance, rows * states, transition)
     return int(max(1, min(discrete.grid.step_count, KNOWN_CHUNK_ENTRIES // entries)))
 
@@ -148,19 +152,24 @@ def _with_influence(discrete: DiscreteModel, monitored, path: LoadPath):
 
 def _matrices_by_length(discrete: DiscreteModel, path: LoadPath):
     """Matrices of the steps of a chunk of known lengths: those of one length together."""
-    indices = [np.flatnonzero(path.length_index == kind) for kind in set(path.length_index)]
-    parts = [
-        _matrices_of_one_length(
-            discrete,
-            _propagators_of(discrete, path.length_index[index[0]]),
-            jax.tree.map(lambda part, index=index: part[index], path.rows),
-        )
-        for index in indices
-    ]
-    if len(parts) == 1:
-        return parts[0]
-    order = np.argsort(np.concatenate(indices))
-    return jax.tree.map(lambda *matrices: xp.concatenate(matrices)[order], *parts)
+    steps = np.arange(len(path.length_index))
+    indices = [steps[path.length_index == kind] for kind in set(path.length_index)]
+
+    def matrices_of(index):
+        rows = jax.tree.map(lambda part: part[index], path.rows)
+        kind = path.length_index[index[0]]
+        return _matrices_of_one_length(discrete, _propagators_of(discrete, kind), rows)
+
+    if len(indices) == 1:
+        return matrices_of(steps)
+    # Written one length after the other into the place of all: concatenated, they take thrice it.
+    whole: Any = None
+    for index in indices:
+        part = matrices_of(index)
+        if whole is None:
+            whole = jax.tree.map(lambda one: np.empty((len(steps), *one.shape[1:])), part)
+        jax.tree.map(lambda all_, one, index=index: operator.setitem(all_, index, one), whole, part)
+    return whole
 
 
 def _matrices_by_branch(discrete: DiscreteModel, path: LoadPath):

@@ -199,10 +199,13 @@ def _grids(
 
 
 def _loaded_panels(case: Case, model: ModalModel, step: float) -> Float[np.ndarray, "2 panel"]:
-    """Times (s) between load events with loads on the beam, and steps there of at most a `step`."""
+    """Times (s) between load events with loads on the beam, and steps there of at most a `step`.
+
+    Without those of no length, between events at one time.
+    """
     grid = grid_by_step_length(case, model, np.asarray(step))
-    loaded = (np.asarray(grid.counts) > 0) & np.any(grid.loads_on_beam, axis=1)
-    return np.stack([np.diff(grid.boundaries), np.asarray(grid.lengths)[:-1]])[:, loaded]
+    times, loaded = np.diff(grid.boundaries), np.any(grid.loads_on_beam, axis=1)
+    return np.stack([times, np.asarray(grid.lengths)[:-1]])[:, loaded & (times > 0)]
 
 
 def without_later_vibration(case: Case, model: ModalModel) -> Case:

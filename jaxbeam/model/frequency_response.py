@@ -25,6 +25,7 @@ from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.runtime.arrays import Array, add_at, set_at, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
+from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -91,11 +92,9 @@ class FrequencyResponse(TableViews, eqx.Module):
 
     def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units, of real variables that every file format can hold."""
-        import xarray
-
         dims = ("frequency", "pair")
         values = np.asarray(self.values)
-        return xarray.Dataset(
+        return labelled_dataset(
             {
                 "magnitude": (dims, np.asarray(self.magnitude), {"units": "that of the pair"}),
                 "phase": (dims, np.asarray(self.phase), {"units": "degree"}),

@@ -37,6 +37,7 @@ from jaxbeam.model.theory.sections import Sections, sections
 from jaxbeam.numerics.eigen import REPEATED_EIGENVALUE_TOLERANCE, eigen
 from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, add_at, set_at, stop_gradient, xp
+from jaxbeam.runtime.dataset import labelled_dataset
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -100,17 +101,15 @@ class Modes(TableViews, eqx.Module):
 
     def to_xarray(self, positions: int = 101) -> "xarray.Dataset":
         """Frequencies, damping ratios, and shapes at equally spaced positions, with units."""
-        import xarray
-
         heads = self.columns
         x = np.linspace(float(self.nodes[0]), float(self.nodes[-1]), positions)
-        return xarray.Dataset(
+        return labelled_dataset(
             {
                 "frequency": ("mode", heads["frequency (Hz)"], {"units": "Hz"}),
                 "damping_ratio": ("mode", heads["damping ratio"], {"units": "1"}),
                 "shape": (("position", "mode"), np.asarray(self.shapes(x)), {"units": "kg^-0.5"}),
             },
-            {"mode": heads["mode"], "position": ("position", x, {"units": "m"})},
+            {"mode": ("mode", heads["mode"]), "position": ("position", x, {"units": "m"})},
         )
 
     def lowest(self, count: int) -> "Modes":

@@ -65,7 +65,7 @@ def _solution(stiffness, mass):
     # The error of Rayleigh's quotient is that of the vector squared.
     values = xp.sum(vectors * (stiffness @ vectors), axis=0)
     values = xp.where(values > RIGID_BODY_EIGENVALUE, values, 0.0)
-    return values, vectors, xp.zeros_like(mass)
+    return values, vectors, xp.broadcast_to(xp.zeros((), mass.dtype), mass.shape)
 
 
 @eigen.defjvp

@@ -12,6 +12,7 @@ from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, take, xp
+from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.simulation.section_forces import SIDES, history, shear_force
 
 if TYPE_CHECKING:
@@ -60,8 +61,6 @@ class RecordEnvelope(TableViews, eqx.Module):
 
     def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units."""
-        import xarray
-
         unit, words = QUANTITIES[self.quantity].unit, self.quantity
         variables = {}
         for side in ("smallest", "largest"):
@@ -80,7 +79,7 @@ class RecordEnvelope(TableViews, eqx.Module):
                 }
                 variables[f"{side}_coincident"] = ("position", other, attributes)
         x = ("position", np.asarray(self.positions), {"units": "m"})
-        return xarray.Dataset(variables, {"position": x}, {"quantity": self.quantity})
+        return labelled_dataset(variables, {"position": x}, {"quantity": self.quantity})
 
 
 def _head(quantity: str) -> str:

@@ -1,6 +1,7 @@
 """Runner of a sweep: its batches in blocks of equal shape, compiled once."""
 
 import contextlib
+import functools
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -76,7 +77,7 @@ class Runner:
         # Compilation of the programs for one load need not wait for its entry and exit times.
         max_loads = load_set(case).wheel_count
         if max_loads > 1:
-            max_loads = max(max_concurrent_loads(times) for times in self._entry_exit_times()[0])
+            max_loads = max(max_concurrent_loads(times) for times in self._entry_exit_times[0])
         self.shapes = StaticShapes(layout, has_coupling(case), max_loads, native)
         # The C library makes its own step matrices.
         self.discretise_separately = case.controller is None and not native
@@ -103,6 +104,7 @@ class Runner:
         )
         self.block_count = -(-count // self.batches_per_block)
 
+    @functools.cached_property
     def _entry_exit_times(self) -> tuple[np.ndarray, np.ndarray]:
         """Entry and exit times (path, wheel, 2), and longest steps of forces (path,), in s."""
         times, steps = programs.entry_exit_times(
@@ -133,7 +135,7 @@ class Runner:
             self.pool.submit(compiled_program.precompile(*arguments))
             for compiled_program, arguments in self._programs_to_compile(program, first_values)
         ]
-        times, self.force_steps = self._entry_exit_times()
+        times, self.force_steps = self._entry_exit_times
         entries, exits = np.moveaxis(times, 2, 0)
         for compilation in compilations:
             compilation.result()  # raises its error, if any
@@ -229,7 +231,7 @@ class Runner:
         else:
             models = self._models_without_controller(models)
         yield (
-            programs.integrate_block,
+            programs.block_program(program, single=False),
             (program, self.devices, mask, models, *self._values_of(indices), step_size),
         )
         if self.discretise_separately:
@@ -254,12 +256,13 @@ class Runner:
             models = self._models_without_controller(models)
         arguments = program, self.devices, mask, models, shared_values, batched_values, step_size
         arguments = jax.tree.map(_to_single_precision, arguments) if single else arguments
+        integrate = programs.block_program(program, single)
         with jax.enable_x64(False) if single else contextlib.nullcontext():
             with self._compile_lock:  # other threads wait instead of compiling the same variant
                 if (substeps, single) not in self._compiled_variants:
-                    programs.integrate_block.precompile(*arguments)()
+                    integrate.precompile(*arguments)()
                     self._compiled_variants.add((substeps, single))
-            results = programs.integrate_block(*arguments)
+            results = integrate(*arguments)
         arrays = {name: np.asarray(values) for name, values in results.items()}
         # Histories are large: a full block is not copied.
         return arrays if mask.all() else {name: values[rows] for name, values in arrays.items()}
@@ -271,7 +274,7 @@ class Runner:
         return jax.tree.map(lambda leaf: leaf[batch_indices], self.models)
 
     def _models_without_controller(self, models):
-        """Models for `programs.integrate_block`: None with a controller, whose loop has its own."""
+        """Models for the program of a block: None with a controller, whose loop has its own."""
         return models if self.case.controller is None else None
 
     def _values_of(self, batch_indices):

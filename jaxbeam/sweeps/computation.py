@@ -12,6 +12,7 @@ from tqdm import tqdm
 from jaxbeam.case.case import Case, unit_at
 from jaxbeam.case.display.addresses import address_words
 from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.simulation.integration_plan import sample_times
 from jaxbeam.simulation.result_variables import SWEEP_VARIABLES, sensor_coordinates
 from jaxbeam.sweeps import cluster, store as sweep_store
@@ -124,8 +125,6 @@ def _to_dataset(
     specification: SweepSpecification, batches: Batches, results: dict[str, np.ndarray]
 ) -> "xarray.Dataset":
     """Results of all batches as a dataset with a dimension per address, or `run`."""
-    import xarray
-
     case, dims, shape = specification.case, specification.dims, specification.shape
     mask = batches.run_index >= 0
     flat = {}
@@ -165,7 +164,7 @@ def _to_dataset(
         "title": case.title,
         "case": json.dumps(specification.case_dict),
     }
-    return xarray.Dataset(variables, coordinates, attributes)
+    return labelled_dataset(variables, coordinates, attributes)
 
 
 def worst_runs(specification: SweepSpecification, dataset) -> dict[str, WorstRun]:

@@ -37,9 +37,13 @@ from jaxbeam.model.sensing.output_rows import OutputRows, sensor_rows
 from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,
     PARALLEL_COMPILATION,
+    Compiled,
     compiled,
+    compiled_if_traced,
 )
 from jaxbeam.simulation.closed_loop import closed_loop
+
+MAX_KNOWN_WHEELS = 200  # of all paths; their times take as long as compiling the program for more
 
 # Rows of what the sensors measure, and their static correction.
 Outputs = tuple[OutputRows, StaticCorrection | None]
@@ -121,16 +125,24 @@ def model_and_limit(program: Program, shared_values):
     return model, max_stable_step(model, load_set(varied, program.shapes.layout))
 
 
-@compiled
 def entry_exit_times(case, addresses, shared_values):
     """Entry and exit times (path, wheel, 2), and longest steps of forces (path,), in s."""
+    if shared_values.shape[0] * load_set(case).wheel_count > MAX_KNOWN_WHEELS:
+        return _compiled_entry_exit_times(case, addresses, shared_values)
+    found = [_entry_exit_times(case, addresses, values) for values in shared_values]
+    return tuple(np.stack(parts) for parts in zip(*found, strict=True))
 
-    def entry_exit_times_of(values):
-        varied = replace(case, dict(zip(addresses, values, strict=True)))
-        loads = load_set(varied)
-        return loads.entry_exit_times(), longest_force_step(varied, loads)
 
-    return jax.vmap(entry_exit_times_of)(shared_values)
+@compiled_if_traced
+def _entry_exit_times(case, addresses, values):
+    varied = replace(case, dict(zip(addresses, values, strict=True)))
+    loads = load_set(varied)
+    return loads.entry_exit_times(), longest_force_step(varied, loads)
+
+
+@compiled
+def _compiled_entry_exit_times(case, addresses, shared_values):
+    return jax.vmap(lambda values: _entry_exit_times(case, addresses, values))(shared_values)
 
 
 @compiled(**PARALLEL_COMPILATION)
@@ -151,6 +163,12 @@ def discrete_models(program: Program, mask, models, shared_values, step_size):
     return _with_model(discretised, models)
 
 
+def block_program(program: Program, single: bool) -> Compiled:
+    """The program of the results of a block: that with steps in C, or `integrate_block`."""
+    native = program.shapes.native and program.substeps is None and not single
+    return integrate_native_block if native else integrate_block
+
+
 @compiled
 def integrate_block(
     program: Program, devices: int, mask, models, shared_values, batched_values, step_size
@@ -160,18 +178,27 @@ def integrate_block(
     `models` are discrete models, or modal models, which are discretised here; None with a
     controller, whose closed loop has a model of its own.
     """
-    if program.shapes.native and program.substeps is None and batched_values.dtype == jnp.float64:
-        integrate = functools.partial(_native_results, program)
-    else:
-        integrate = functools.partial(_compiled_results, program)
-        if isinstance(models, ModalModel):
-            models = discrete_models(program, mask, models, shared_values, step_size)
-    if devices > 1:
-        mesh, spec = Mesh(np.array(jax.local_devices()), ("device",)), PartitionSpec("device")
-        integrate = jax.shard_map(
-            integrate, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
-        )
-    return integrate(mask, models, shared_values, batched_values, step_size)
+    if isinstance(models, ModalModel):
+        models = discrete_models(program, mask, models, shared_values, step_size)
+    values = mask, models, shared_values, batched_values, step_size
+    return _on_devices(functools.partial(_compiled_results, program), devices)(*values)
+
+
+@compiled(**LOW_OPTIMISATION)
+def integrate_native_block(
+    program: Program, devices: int, mask, models, shared_values, batched_values, step_size
+):
+    """Results of a block by name, from modal models; steps are taken by the C library."""
+    values = mask, models, shared_values, batched_values, step_size
+    return _on_devices(functools.partial(_native_results, program), devices)(*values)
+
+
+def _on_devices(integrate, devices: int):
+    """A function of arrays of batches, each device computing its part of them."""
+    if devices == 1:
+        return integrate
+    mesh, spec = Mesh(np.array(jax.local_devices()), ("device",)), PartitionSpec("device")
+    return jax.shard_map(integrate, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
 
 
 def _native_results(program: Program, mask, models, shared_values, batched_values, step_size):

@@ -8,6 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from jaxbeam.runtime.dataset import labelled_dataset
+
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
     import zarr  # takes long to import; only stored sweeps need it
@@ -88,6 +92,10 @@ def new_store(path: Path, fingerprint: str) -> Iterator[Any]:
         temporary_path.rename(path)
 
 
+def _of_any_length(values: np.ndarray) -> np.ndarray:
+    return values.astype(np.dtypes.StringDType()) if values.dtype.kind == "U" else values
+
+
 def replace_blocks(path: Path, dataset: xarray.Dataset) -> None:
     """Replace the blocks of a store by the labelled dataset of the sweep.
 
@@ -104,12 +112,11 @@ def replace_blocks(path: Path, dataset: xarray.Dataset) -> None:
             if folder.is_dir() and folder.name != BLOCKS_GROUP:
                 shutil.rmtree(folder)
         # Zarr specifies strings of variable length, not of fixed length.
-        labels = {
-            name: (values.dims, values.values.astype(object), values.attrs)
-            for name, values in dataset.coords.items()
-            if values.dtype.kind == "U"
-        }
-        dataset.assign_coords(labels).to_zarr(
+        variables, coordinates = (
+            {name: (one.dims, _of_any_length(one.values), one.attrs) for name, one in part.items()}
+            for part in (dataset.data_vars, dataset.coords)
+        )
+        labelled_dataset(variables, coordinates, dataset.attrs).to_zarr(
             path,
             mode="a",
             consolidated=False,

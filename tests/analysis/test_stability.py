@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
+import scipy.optimize
 
 import jaxbeam as jb
+from jaxbeam.analysis import stability
 from jaxbeam.analysis.frozen_loop import loop_dynamics
-from jaxbeam.analysis.linearised_loop import affine_linearisations, linearised_loop
+from jaxbeam.analysis.linearised_loop import affine_linearisations, linearised_loop, loop_timing
 from jaxbeam.analysis.margins import margins
-from jaxbeam.analysis.stability import _tracked_branches, frozen_poles, growth, stream
+from jaxbeam.analysis.stability import _assignment, _tracked_branches, frozen_poles, growth, stream
 from jaxbeam.analysis.stability_limits import stability_limit
+from jaxbeam.case.controller import AbstractSampledLaw, ControlStep
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.control.optimal.gain_schedules import GainSchedule
 from jaxbeam.model.modes import mesh_layout
@@ -148,6 +151,52 @@ def test_crossing_branches_are_tracked():
     sorted_by_size = np.sort(np.stack([up, down], axis=1), axis=1)
     followed = _tracked_branches(sorted_by_size)
     np.testing.assert_array_equal(followed[:, 0], np.where(followed[0, 0] == up[0], up, down))
+
+
+@pytest.mark.parametrize("spread", [1.0, 0.01])
+def test_branches_have_the_poles_of_the_smallest_sum(spread):
+    """Poles that coincide, as those of delays, and poles nearest to two branches at once."""
+    rng = np.random.default_rng(3)
+    poles = np.append(rng.standard_normal(6), [0.5, 0.5])
+    branches = np.append(rng.permutation(poles[:6]) + spread * rng.standard_normal(6), [0.5, 0.5])
+    distances = np.abs(branches[:, None] - poles)
+    found, expected = _assignment(distances), scipy.optimize.linear_sum_assignment(distances)[1]
+    assert sorted(found) == list(range(8))
+    rows = np.arange(8)
+    assert distances[rows, found].sum() == pytest.approx(distances[rows, expected].sum(), rel=1e-12)
+
+
+class GrowingGain(AbstractSampledLaw):
+    """Feedback whose gain grows in time."""
+
+    def step(self, state, measurement, t):
+        return ControlStep(-1e3 * t * measurement.readings, state)
+
+
+def test_several_times_at_once_are_those_of_each():
+    """The gain varies; delays of parts of a period, and an accelerometer under a moving mass."""
+    case = shaker_case(jb.Feedback([1.0], period=0.004, delay=0.006), modes=2)
+    sensors = [jb.Sensor(0.25, "acceleration", delay=0.001, filter=jb.Filter(cutoff=60.0, order=2))]
+    case = dataclasses.replace(case, sensors=tuple(sensors))
+    timing, times = loop_timing(case), np.array([0.2, 0.5, 0.9])
+    loop = loop_dynamics(case, mesh_layout(case))
+    loop = eqx.tree_at(lambda x: x.law, loop, GrowingGain())
+    together = affine_linearisations(loop, timing, times)
+    for found, t in zip(together, times, strict=True):
+        (alone,) = affine_linearisations(loop, timing, [t])
+        for part in ("A", "B", "K"):
+            expected = getattr(alone, part)
+            size = np.abs(expected).max()
+            np.testing.assert_allclose(getattr(found, part), expected, atol=1e-12 * size)
+    assert not np.allclose(together[0].K, together[2].K, rtol=1e-2)
+
+
+def test_growth_of_a_sampled_loop_needs_no_finer_steps(monkeypatch):
+    case = shaker_case(jb.Feedback([900.0], period=0.004, delay=0.006), modes=3)
+    found = growth(jb.replace(case, {"loads.0.speed": 4.0})).factor
+    monkeypatch.setattr(stability, "MAX_PHASE_PER_STEP", stability.MAX_PHASE_PER_STEP / 4)
+    finer = growth(jb.replace(case, {"loads.0.speed": 4.0})).factor
+    np.testing.assert_allclose(found, finer, atol=1e-6 * finer.max())
 
 
 def test_sampled_poles_match_simulated_decay():

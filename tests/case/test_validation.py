@@ -70,6 +70,7 @@ NUMBERS = [
     ("actuators.0.position", -0.1, "actuators.0.position must lie on the beam"),
     ("actuators.0.bandwidth", 0.0, "actuators.0.bandwidth must be positive; it is 0 1/s"),
     ("actuators.0.limits", [10.0, -10.0], "actuators.0.limits.1 must be above the entry before"),
+    ("actuators.0.limits", [1e308, -1e308], "actuators.0.limits.1 must be above the entry before"),
     ("actuators.1.end", 0.2, "actuators.1.end must lie to the right of actuators.1.start; 0.2 m"),
     ("actuators.1.end", 0.65, "actuators.1.end must lie on the beam"),
     ("actuators.1.amplifier_gain", 0.0, "actuators.1.amplifier_gain must be positive; it is 0"),

@@ -38,13 +38,19 @@ def minimum(force, lowest=np.inf):
         (lambda t: (t - 2.41) ** 2 - 0.0625, -0.0625, 2.16),
         (lambda t: 3.0 - t, 0.0, NEVER),  # at the end of the last step
         (lambda t: t - 0.1, -0.1, 0.0),  # at the start of the first
-        (lambda t: (t - 1.0) ** 2 - 1e-6, -1e-6, 1.0),  # pulls between two fractions only
+        (lambda t: (t - 1.1) ** 2 - 1e-6, -1e-6, 1.099),  # pulls between two fractions only
+        (lambda t: (1.3 - t) * (t**4 + 1.0), -139.4, 1.3),  # not straight between fractions
     ],
 )
 def test_smallest_force_of_polynomials(force, lowest, lost):
     found, at = minimum(force)
     assert_allclose(found, lowest, rtol=1e-10, atol=1e-12)
-    assert_allclose(at, lost, atol=2e-2)
+    assert_allclose(at, lost, rtol=1e-9)
+
+
+def test_a_graze_at_a_fraction_is_lost_nearby():
+    """Newton's method goes astray from a top that hardly pulls: its start is kept."""
+    assert_allclose(minimum(lambda t: (t - 1.0) ** 2 - 1e-6), (-1e-6, 0.999), rtol=1e-3)
 
 
 def test_a_bound_skips_no_smaller_force():
@@ -74,4 +80,6 @@ def test_few_samples_give_the_smallest_force_of_scipy(mass, speed):
         record = jb.simulate(case)
     size = np.abs(force).max()
     assert_allclose(record.lowest_contact_force[0], force.min(), atol=1e-5 * size)
-    assert_allclose(record.contact_lost_time[0], fine[np.argmax(force < 0)], atol=5e-4 * end)
+    loss = np.argmax(force < 0)
+    lost = np.interp(0.0, -force[loss - 1 : loss + 1], fine[loss - 1 : loss + 1])
+    assert_allclose(record.contact_lost_time[0], lost, atol=1e-6 * end)

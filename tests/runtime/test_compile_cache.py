@@ -481,7 +481,7 @@ def test_sweeps_of_the_next_process_compile_nothing_and_are_the_same(tmp_path):
         )
         compiled_names.append(process.stdout.split())
         assert not process.stderr
-    expected = {"integrate_block", "discrete_models", "entry_exit_times"}
+    expected = {"integrate_block", "discrete_models"}
     assert expected <= set(compiled_names[0]) and not compiled_names[1]
     first, second = (np.load(tmp_path / name) for name in ("first.npy", "second.npy"))
     assert np.array_equal(first, second) and np.all(np.isfinite(first))

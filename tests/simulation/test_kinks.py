@@ -332,3 +332,11 @@ def side(motion):
     """1 where the load stays to the left of the kink, -1 where to its right."""
     places = motion.get("positions", [0.0])
     return 1.0 if min(places) < 0.4 else -1.0
+
+
+def test_errors_of_close_samples_are_stated():
+    """A passage over a hinge is a step of no length, which has no error."""
+    case = jb.Case(HINGED, loads=[mass(0.4, speed=0.7)], sensors=[jb.Sensor(0.5)], run=jb.Run(1.5))
+    record, rare = (jb.simulate(replace(case, {"run.sample_rate": rate})) for rate in (1000, 20))
+    assert 0 < record.error_estimate < 1e-7
+    assert_allclose(record.peak_deflection, rare.peak_deflection, rtol=1e-7)

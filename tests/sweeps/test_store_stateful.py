@@ -23,13 +23,17 @@ EXPECTED: dict[int, xarray.Dataset] = {}
 
 
 class Store(RuleBasedStateMachine):
-    """Two sweeps of equal shape and one path; `complete` is the one whose results it holds."""
+    """Two sweeps of equal shape and one path.
+
+    `begun` is the one it holds, `complete` the one whose results it holds, and `beside` the one
+    that was stopped while it overwrote another, which it continues beside it.
+    """
 
     @initialize()
     def start(self):
         self.folder = Path(tempfile.mkdtemp())
         self.path = self.folder / "runs.zarr"
-        self.begun, self.complete = None, None
+        self.begun = self.complete = self.beside = None
         for i, case in enumerate(CASES):
             if i not in EXPECTED:
                 EXPECTED[i] = jb.sweep(case, OVER, progress=False)
@@ -64,20 +68,29 @@ class Store(RuleBasedStateMachine):
             try:
                 found = jb.sweep(CASES[sweep], OVER, store=self.path, progress=False, **options)
             except KeyboardInterrupt:
-                assert how == "overwrite" or self.begun in (None, sweep)
-                self.begun = sweep if self.begun is None else self.begun
+                assert how == "overwrite" or self.may_go_on(sweep)
+                if self.begun is None:
+                    self.begun = sweep
+                elif how == "overwrite":
+                    self.beside = sweep
                 return
             except FileExistsError as error:
                 assert how == "new" and self.begun is not None
                 assert "resume it, overwrite it, or choose" in str(error)
                 return
             except ValueError as error:
-                assert how == "resume" and self.begun == 1 - sweep
+                assert how == "resume" and not self.may_go_on(sweep)
                 assert "another case, other values or settings" in str(error)
                 return
         xarray.testing.assert_identical(found, EXPECTED[sweep])
-        assert how == "overwrite" or self.begun in (None, sweep)
+        assert how == "overwrite" or self.may_go_on(sweep)
+        if how == "overwrite" or self.begun == 1 - sweep:
+            self.beside = None
         self.begun = self.complete = sweep
+
+    def may_go_on(self, sweep):
+        """Whether a sweep can be begun or resumed: no other is in its place."""
+        return self.begun in (None, sweep) or self.beside == sweep
 
     @rule(which=st.integers(0, 10**6), damage=st.sampled_from(["truncate", "delete"]))
     def damage_an_unfinished_block(self, which, damage):

@@ -15,6 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.model.statics import static_peak
+from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.batches import make_batches
 from jaxbeam.sweeps.blocks import Runner
 
@@ -52,6 +53,15 @@ def test_grid_is_labelled_by_address_and_agrees_with_single_runs(grid_dataset):
             found = grid_dataset.peak_deflection.sel({"loads.0.mass": mass, "loads.0.speed": speed})
             expected = single_run_peaks({"loads.0.mass": mass, "loads.0.speed": speed})
             assert_allclose(found, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("count", [3, programs.MAX_KNOWN_WHEELS + 1])
+def test_loads_cross_in_length_over_speed(count):
+    """Times of few paths are computed at once, those of many by a program."""
+    speeds = np.linspace(1.0, 4.0, count)
+    times, steps = programs.entry_exit_times(CASE, ("loads.0.speed",), speeds[:, None])
+    assert_allclose(times[:, 0, 1], 0.6 / speeds, rtol=1e-13)
+    assert np.all(times[:, 0, 0] == 0) and np.all(np.isinf(steps))
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import signal
 import time
 import warnings
@@ -60,6 +61,13 @@ class Outcome(NamedTuple):
         return (self.largest or 0.0) > max(self.stated, ROUNDING)
 
 
+class Errors(NamedTuple):
+    """Differences that are errors of the steps: of forces (N), and of times of loss (s)."""
+
+    force: float
+    time: float
+
+
 class TooLongError(Exception):
     """A case took longer than it may."""
 
@@ -71,14 +79,22 @@ def at_most(seconds: float) -> Iterator[None]:
     Raises TooLongError then.
     """
 
+    expired = False
+
     def stop(*_):
         """Handler of the signal; raises TooLongError."""
+        nonlocal expired
+        expired = True
         raise TooLongError
 
     former = signal.signal(signal.SIGPROF, stop)
     signal.setitimer(signal.ITIMER_PROF, seconds if np.isfinite(seconds) else 0.0)
     try:
         yield
+    except Exception:
+        if expired:  # code that catches what it does not know may raise something else instead
+            raise TooLongError from None
+        raise
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.signal(signal.SIGPROF, former)
@@ -112,7 +128,7 @@ def _checked(outcome: Outcome, drawn: Drawn, plain: bool) -> tuple[Outcome, Reco
         return outcome._replace(refusal=str(error)), None
     faults = [
         *nan_faults(record),
-        *beyond_errors(lambda scale: consistency_faults(drawn, record, scale), drawn, record),
+        *beyond_errors(lambda errors: consistency_faults(drawn, record, errors), drawn, record),
     ]
     outcome = outcome._replace(steps=record.steps, stated=float(record.error_estimate))
     tight = None if plain else _tight(drawn.case)
@@ -124,7 +140,7 @@ def _checked(outcome: Outcome, drawn: Drawn, plain: bool) -> tuple[Outcome, Reco
                 size=largest_force(tight),
             ),
         )
-        faults += beyond_errors(lambda scale: verdict_faults(record, tight, scale), drawn, record)
+        faults += beyond_errors(lambda errors: verdict_faults(record, tight, errors), drawn, record)
     return outcome._replace(faults=tuple(faults)), record
 
 
@@ -171,33 +187,39 @@ def nan_faults(record: Record) -> list[str]:
 
 
 def beyond_errors(
-    faults_of: Callable[[float], list[str]], drawn: Drawn, record: Record
+    faults_of: Callable[[Errors], list[str]], drawn: Drawn, record: Record
 ) -> list[str]:
-    """Faults of a run at a difference of contact forces (N) that is no error of its steps.
+    """Faults of a run at differences of contact forces and their losses that no steps explain.
 
-    Those beyond rounding are looked at again with the error of the forces, estimated by a run with
-    steps half as long.
+    Those beyond rounding are looked at again with the errors of the steps.
     """
-    faults = faults_of(ROUNDING * largest_force(record))
-    return faults_of(force_error(drawn, record)) if faults else []
+    return faults_of(step_errors(drawn)) if faults_of(rounding(drawn, record)) else []
 
 
-def force_error(drawn: Drawn, record: Record) -> float:
-    """Twice the largest change (N) of contact forces as the steps of a run are halved.
+def rounding(drawn: Drawn, record: Record) -> Errors:
+    """Differences that are rounding."""
+    return Errors(ROUNDING * largest_force(record), ROUNDING * drawn.duration)
 
-    Of the samples, and of the lowest force of each load.
+
+def step_errors(drawn: Drawn) -> Errors:
+    """Twice the largest change of contact forces, and of losses, as steps of a run are halved.
+
+    Of the forces at samples and the lowest of each load, of losses in both runs.
     """
     plan = integration_plan(drawn.case)
+    coarse = jb.simulate(drawn.case, plan=plan)
     finer = jb.simulate(drawn.case, plan=dataclasses.replace(plan, substeps=2 * plan.substeps))
-    change = max(
-        np.abs(np.nan_to_num(getattr(record, name) - getattr(finer, name))).max(initial=0.0)
-        for name in ("contact_force", "lowest_contact_force")
-    )
-    return max(UNSAMPLED * float(change), ROUNDING * largest_force(finer))
+
+    def change(name):
+        difference = np.nan_to_num(getattr(coarse, name) - getattr(finer, name))
+        return UNSAMPLED * float(np.abs(difference).max(initial=0.0))
+
+    force = max(change("contact_force"), change("lowest_contact_force"))
+    return Errors(*map(max, (force, change("contact_lost_time")), rounding(drawn, finer)))
 
 
-def consistency_faults(drawn: Drawn, record: Record, scale: float) -> list[str]:
-    """Numbers of a record that contradict each other, or its verdict; forces by a `scale` (N)."""
+def consistency_faults(drawn: Drawn, record: Record, errors: Errors) -> list[str]:
+    """Numbers of a record that contradict each other, or its verdict, beyond its errors."""
     if "diverges" in record.verdict:
         return []
     faults = []
@@ -214,14 +236,15 @@ def consistency_faults(drawn: Drawn, record: Record, scale: float) -> list[str]:
     forces, on_beam = np.asarray(record.contact_force), np.isfinite(record.load_position)
     for i, load in enumerate(drawn.loads):
         leaves = min(load.time_at(drawn.span.length), drawn.duration)
-        pulls = on_beam[:, i] & (forces[:, i] < -scale)
+        pulls = on_beam[:, i] & (forces[:, i] < -errors.force)
         if np.isfinite(lost[i]) != (lowest[i] < 0):
             faults.append(f"the lowest force of load {i} is {lowest[i]:.6g} N: {record.verdict}")
         if np.isfinite(lost[i]) and not load.entry_time <= lost[i] <= leaves * (1 + 1e-9):
             faults.append(f"load {i} leaves at {leaves:.6g} s: {record.verdict}")
-        if (np.asarray(record.times)[pulls] < np.nan_to_num(lost[i], nan=np.inf)).any():
+        first = np.nan_to_num(lost[i], nan=np.inf) - errors.time
+        if (np.asarray(record.times)[pulls] < first).any():
             faults.append(f"load {i} pulls before its contact is lost: {record.verdict}")
-        if forces[on_beam[:, i], i].min(initial=np.inf) < lowest[i] - scale:
+        if forces[on_beam[:, i], i].min(initial=np.inf) < lowest[i] - errors.force:
             faults.append(f"load {i} has forces below the lowest, {lowest[i]:.6g} N")
     if ("loses contact" in record.verdict) != np.isfinite(lost).any():
         faults.append(f"contact is lost at {lost} s: {record.verdict}")
@@ -240,10 +263,10 @@ def relative_error(found, expected, size: float | None = None) -> float:
     return float(np.abs(np.asarray(found) - expected).max() / size) if size else 0.0
 
 
-def verdict_faults(record: Record, tight: Record, scale: float) -> list[str]:
-    """Smallest contact forces in which two runs differ by more than a `scale` (N)."""
+def verdict_faults(record: Record, tight: Record, errors: Errors) -> list[str]:
+    """Smallest contact forces in which two runs differ by more than the errors."""
     lowest, exact = (np.asarray(each.lowest_contact_force) for each in (record, tight))
-    wrong = (np.abs(lowest - exact) > scale) & ~np.isnan(exact)
+    wrong = (np.abs(lowest - exact) > errors.force) & ~np.isnan(exact)
     return [
         f"the lowest force of load {i} is {lowest[i]:.6g} N, not {exact[i]:.6g}"
         for i in np.flatnonzero(wrong)
@@ -259,16 +282,22 @@ def highest_phase(drawn: Drawn) -> float:
 
 def beside_scipy(drawn: Drawn, record: Record) -> tuple[float, list[str]]:
     """Error of the deflections beside scipy, and verdicts that are wrong."""
-    span, loads, duration = drawn.span, drawn.loads, drawn.duration
     samples, lost = np.asarray(record.times), np.asarray(record.contact_lost_time)
-    marks = [t + side * 1e-9 * duration for t in lost[np.isfinite(lost)] for side in (-1, 1)]
-    times = np.unique(np.clip([*samples, *marks], 0.0, samples[-1]))
-    found = modal_equations.respond(span, loads, np.concatenate([SENSORS, PLACES]), times)
-    at_samples = np.searchsorted(times, samples)
-    error = relative_error(_along(record), found.deflection[at_samples])
+    places = np.concatenate([SENSORS, PLACES])
 
-    def faults_of(scale):
-        return contact_faults(record, times, found.contact_force, scale)
+    @functools.cache
+    def found(margin):
+        """Times of samples, and those before and after each loss, and the run there."""
+        sides = [t + side * margin for t in lost[np.isfinite(lost)] for side in (-1, 1)]
+        times = np.unique(np.clip([*samples, *sides], 0.0, samples[-1]))
+        return times, modal_equations.respond(drawn.span, drawn.loads, places, times)
+
+    times, run = found(rounding(drawn, record).time)
+    error = relative_error(_along(record), run.deflection[np.searchsorted(times, samples)])
+
+    def faults_of(errors):
+        times, run = found(errors.time)
+        return contact_faults(record, times, run.contact_force, errors)
 
     return error, beyond_errors(faults_of, drawn, record)
 
@@ -277,19 +306,19 @@ def contact_faults(
     record: Record,
     times: Float[np.ndarray, " time"],
     forces: Float[np.ndarray, "time load"],
-    scale: float,
+    errors: Errors,
 ) -> list[str]:
-    """Verdicts that contradict forces (N) at times (s) by another integrator, beyond a `scale`."""
+    """Verdicts that contradict forces (N) at times (s) by another integrator, beyond errors."""
     faults, lost = [], np.asarray(record.contact_lost_time)
     for i, (force, lost_time) in enumerate(zip(forces.T, lost, strict=True)):
         # With a first time of negative force, no force is negative before, and one is after.
-        before = force[times < lost_time] if np.isfinite(lost_time) else force
-        after = force[times > lost_time][:1]
-        if before.min(initial=0.0) < -scale:
+        before = force[times <= np.nan_to_num(lost_time, nan=np.inf) - errors.time]
+        after = force[times >= lost_time + errors.time][:1]
+        if before.min(initial=0.0) < -errors.force:
             faults.append(f"load {i} pulls by {-before.min():.6g} N: {record.verdict}")
-        if after.size and after[0] > scale:
+        if after.size and after[0] > errors.force:
             faults.append(f"load {i} presses with {after[0]:.6g} N: {record.verdict}")
         pressing = force[force != 0.0]  # on the beam
-        if pressing.min(initial=np.inf) < record.lowest_contact_force[i] - scale:
+        if pressing.min(initial=np.inf) < record.lowest_contact_force[i] - errors.force:
             faults.append(f"load {i} has a force of {force.min():.6g} N: {record.verdict}")
     return faults

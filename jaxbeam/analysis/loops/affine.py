@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.runtime.arrays import Array, any_jax
+from jaxbeam.runtime.arrays import Array, any_jax, xp
 
 STEP = 2.0**20  # of each argument; exact in floating point, and far above the value at zero
 TRIAL_SIZES = 1e-6, 1.0, 1e6  # of random arguments at which an affine function is one
@@ -54,12 +54,24 @@ def is_affine(
 
     Two affine functions agree there if and only if, but for rounding, they are the same.
     """
-    trial = scale * _random_argument(matrix.shape[1])
+    trial = scale * random_argument(matrix.shape[1])
     terms = np.abs(matrix) @ np.abs(trial) + np.abs(start)
     return bool(np.all(np.abs(function(trial) - start - matrix @ trial) <= ROUNDING * terms))
 
 
 @functools.cache
-def _random_argument(size: int) -> Float[np.ndarray, " argument"]:
+def random_argument(size: int) -> Float[np.ndarray, " argument"]:
     """Numbers of a normal distribution, always the same."""
     return np.random.default_rng(0).standard_normal(size)
+
+
+def apply(
+    matrix: Float[Array, "*time after before"], values: Float[Array, "before *column"]
+) -> Float[Array, "after *column"]:
+    """Product of a matrix and a vector or columns; of one matrix for each time, and the columns of
+    the first time, those of the second and so on."""
+    if matrix.ndim == 2:
+        return matrix @ values
+    groups = values.reshape(values.shape[0], matrix.shape[0], -1)
+    products = matrix @ xp.moveaxis(groups, 1, 0)
+    return xp.moveaxis(products, 0, 1).reshape(matrix.shape[1], -1)

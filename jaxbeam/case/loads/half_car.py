@@ -86,7 +86,7 @@ class HalfCar(AbstractVehicleLoad):
         if not is_concrete(self.axle_positions):
             return None
         positions = concrete(self.axle_positions)
-        wrong = np.flatnonzero(np.diff(positions) >= 0)
+        wrong = np.flatnonzero(positions[1:] >= positions[:-1])
         if not wrong.size:
             return None
         i = int(wrong[0]) + 1

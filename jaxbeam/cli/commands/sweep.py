@@ -26,6 +26,7 @@ from jaxbeam.cli.options import (
 from jaxbeam.files.endings import RESULTS
 
 if TYPE_CHECKING:
+    import numpy as np
     import xarray
 
 
@@ -145,17 +146,18 @@ def _print_plausibility(case: "jb.Case", values, options: CaseOptions) -> dict:
 
 def _lines(case: "jb.Case", results: "xarray.Dataset", addresses: Sequence[str]) -> list[str]:
     """Number of runs, and of each sensor the largest and the smallest peak with its run."""
-    rows = []
+    rows, failed = [], results["failed"].values
     for i, sensor in enumerate(case.sensors):
-        peaks = results[f"peak_{sensor.quantity}"].isel(sensor=i)
+        peaks, times = (
+            results[f"peak_{sensor.quantity}"].values[..., i],
+            results["peak_time"].values[..., i],
+        )
         unit = f" ({sensor.unit})" if sensor.unit != "1" else ""
-        for words, missing, sign in (("largest", -1.0, 1.0), ("smallest", math.inf, -1.0)):
-            place = (sign * peaks.fillna(missing)).argmax(...)
-            run, time = peaks.isel(place), results["peak_time"].isel(sensor=i).isel(place)
-            row = (sensor.name or i, f"{sensor.quantity}{unit}", words, f"{float(run):.6g}")
-            rows.append((*row, f"{float(time):.6g}", *_swept_values(run, addresses)))
-    failed = results["failed"]
-    runs = f"{failed.size} runs, {int(failed.sum())} failed"
+        for words, sign in (("largest", 1.0), ("smallest", -1.0)):
+            run = _run_of_largest(sign * peaks)
+            row = (sensor.name or i, f"{sensor.quantity}{unit}", words, f"{peaks[run]:.6g}")
+            rows.append((*row, f"{times[run]:.6g}", *_swept_values(results, run, addresses)))
+    runs = f"{failed.size} runs, {failed.sum()} failed"
     header = ("sensor", "quantity", "peak", "size", "time (s)")
     names = [_head(results[address]) for address in addresses]
     lines = [f"{runs}; peaks are largest absolute values:", *table((*header, *names), rows)]
@@ -179,24 +181,41 @@ def _head(values: "xarray.DataArray") -> str:
     return words if unit == "1" else f"{words} ({unit})"
 
 
-def _swept_values(run: "xarray.DataArray", addresses: Sequence[str]) -> list[str]:
-    values = [run[address].item() for address in addresses]
-    return [value if isinstance(value, str) else f"{value:.6g}" for value in values]
+def _run_of_largest(values: "np.ndarray") -> tuple[int, ...]:
+    """Index of the run of the largest of some values (*run,); that of a failed run is NaN."""
+    import numpy as np
+
+    largest = np.argmax(np.where(np.isnan(values), -math.inf, values))
+    return tuple(map(int, np.unravel_index(largest, values.shape)))
+
+
+def _swept_values(
+    results: "xarray.Dataset", run: tuple[int, ...], addresses: Sequence[str]
+) -> list[str]:
+    """Values at addresses of a run, an index along the dimensions of the sweep."""
+    place, words = dict(zip(results["failed"].dims, run, strict=True)), []
+    for address in addresses:
+        along = results[address]
+        value = along.values[tuple(place[dim] for dim in along.dims)]
+        words.append(value if isinstance(value, str) else f"{value:.6g}")
+    return words
 
 
 def _contact_lines(results: "xarray.Dataset", addresses: Sequence[str]) -> list[str]:
     """Smallest contact force of all runs, where it is, and how many runs lose contact."""
+    import numpy as np
+
     forces = results.get("lowest_contact_force")
-    if forces is None or not forces.size or not bool(forces.notnull().any()):
+    if forces is None or not forces.size or np.isnan(forces.values).all():
         return []
-    least = forces.fillna(math.inf).min("load")
-    run, lost = least.isel(least.argmin(...)), int((least < 0).sum())
+    least = np.fmin.reduce(forces.values, axis=-1)
+    run, lost = _run_of_largest(-least), int((least < 0).sum())
     where = []
-    for address, value in zip(addresses, _swept_values(run, addresses), strict=True):
+    for address, value in zip(addresses, _swept_values(results, run, addresses), strict=True):
         words, _, unit = _head(results[address]).partition(" (")
         where.append(f"{words} {value} {unit.rstrip(')')}".rstrip())
     words = f"contact is lost in {lost} runs" if lost else "no run loses contact"
-    return [f"smallest contact force {float(run):.6g} N, at {', '.join(where)}; {words}"]
+    return [f"smallest contact force {least[run]:.6g} N, at {', '.join(where)}; {words}"]
 
 
 def native(*, remove: bool = False, options: PrintOptions = PrintOptions()) -> None:

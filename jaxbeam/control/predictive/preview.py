@@ -7,6 +7,8 @@ period, so that a load event, at which forces have a kink, always divides the sa
 such cells are computed once.
 """
 
+import math
+
 import jax
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,6 +16,7 @@ from jaxtyping import Float, Int
 from jaxbeam.control.optimal.crossing_plant import crossing_plant
 from jaxbeam.control.predictive.prediction import SampledPlant
 from jaxbeam.model.state_space import Plant
+from jaxbeam.model.vehicles.contact_rows import vehicle_system
 from jaxbeam.numerics.coupled_stages import (
     ConstantPlant,
     StageResponse,
@@ -22,10 +25,20 @@ from jaxbeam.numerics.coupled_stages import (
 )
 from jaxbeam.numerics.finite_horizon import MAX_HALVINGS
 from jaxbeam.numerics.stages import GAUSS_NODES, NODE_COUNT
-from jaxbeam.runtime.arrays import Array, map_elements, scan, searchsorted, take, xp
+from jaxbeam.runtime.arrays import (
+    Array,
+    any_jax,
+    map_elements,
+    scan,
+    searchsorted,
+    take,
+    xp,
+)
 from jaxbeam.runtime.module import Module
 
-CELLS = 8  # of a period, or of each part before and after a delayed command begins
+# Cells of a period, or of each part before and after a delayed command begins, at most; and phase
+# of the fastest mode, or of a vehicle, in one, with which fewer have maps exact to about 1e-9.
+CELLS, MAX_PHASE_PER_CELL = 8, 1.7
 
 # State at the end of a cell from the state at its start and the held commands.
 CellMap = Float[Array, "*cell all all_and_command"]
@@ -55,16 +68,17 @@ class Preview(Module):
         """
         constant_plant, coupling_at = crossing_plant(self.plant, with_weights=True)
         explicit, cells = self.plant.loads.massless, self.edges.shape[0] - 1
+        per_part = cells // len(self.responses)
         periods = self.sample_at(t) + first + np.arange(count)
         starts = (periods * self.period)[:, None] + self.edges[:-1]
         lengths = xp.diff(self.edges)
         parts = []
         for i, response in enumerate(self.responses):
-            own = slice(i * CELLS, (i + 1) * CELLS)
+            own = slice(i * per_part, (i + 1) * per_part)
             times = starts[:, own, None] + lengths[own, None] * GAUSS_NODES
             coupling = coupling_at(times.reshape(-1, NODE_COUNT))
             maps = cell_maps(constant_plant, response, coupling, explicit)
-            parts.append(maps.reshape(count, CELLS, *maps.shape[1:]))
+            parts.append(maps.reshape(count, per_part, *maps.shape[1:]))
         maps = xp.concatenate(parts, axis=1)
         if self.event_cells.shape[0]:
             index = periods[:, None] * cells + np.arange(cells)
@@ -83,7 +97,7 @@ class Preview(Module):
         size, commands = maps.shape[2], maps.shape[3] - maps.shape[2]
         states = self.plant.modal_model.state_count + self.plant.vehicle_states
         delayed = self.delay is not None
-        previous = np.arange(maps.shape[1]) < (CELLS if delayed else 0)
+        previous = np.arange(maps.shape[1]) < (maps.shape[1] // 2 if delayed else 0)
 
         def advance(total, part):
             cell, before = part
@@ -116,12 +130,13 @@ class Preview(Module):
 def preview(plant: Plant, period: Float[Array, ""], delay: Float[Array, ""] | None) -> Preview:
     """Preview of a plant with its loads for commands held over a period, after a delay (s)."""
     constant_plant, coupling_at = crossing_plant(plant, with_weights=True)
-    explicit, shares = plant.loads.massless, np.arange(CELLS) / CELLS
+    explicit, per_part = plant.loads.massless, _cell_count(plant, period)
+    shares = np.arange(per_part) / per_part
     marks = [xp.zeros(()), *([] if delay is None else [delay]), period]
     parts = list(zip(marks[:-1], marks[1:], strict=True))
     edges = [start + (end - start) * shares for start, end in parts]
     edges = xp.concatenate([*edges, xp.reshape(period, 1)])
-    responses = tuple(_response(constant_plant, (end - start) / CELLS) for start, end in parts)
+    responses = tuple(_response(constant_plant, (end - start) / per_part) for start, end in parts)
 
     def piece(part):
         start, end = part
@@ -156,6 +171,16 @@ def preview(plant: Plant, period: Float[Array, ""], delay: Float[Array, ""] | No
     start = xp.eye(size, size + constant_plant.B.shape[1])
     _, maps = scan(advance, start, (follows, *pieces))
     return Preview(plant, period, delay, edges, responses, index, maps)
+
+
+def _cell_count(plant: Plant, period: Float[Array, ""]) -> int:
+    """Cells of a period (s), or of each of its two parts."""
+    rates = plant.modal_model.modes.angular_frequencies
+    if any_jax(plant, period):
+        return CELLS
+    if plant.vehicle_states:
+        rates = np.append(rates, np.abs(np.linalg.eigvals(vehicle_system(plant.loads)[0])))
+    return min(CELLS, math.ceil(period * np.max(rates) / MAX_PHASE_PER_CELL))
 
 
 def cell_maps(

@@ -5,18 +5,22 @@ compared at fractions of the step, the ends among them, and at the vertices of t
 three of these. `runtime/native/steps.h` does the same in C.
 """
 
+import functools
+
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES
 from jaxbeam.numerics.gauss import lagrange_coefficients
-from jaxbeam.runtime.arrays import Array, cond, xp
+from jaxbeam.runtime.arrays import Array, cond, fori_loop, xp
 
+ZERO_ITERATIONS = 4  # of Newton's method for the time of a loss
 # Peak nodes, and the middles between them.
 FORCE_FRACTIONS = np.interp(
     np.arange(2 * len(PEAK_NODES) - 1) / 2, np.arange(len(PEAK_NODES)), PEAK_NODES
 )
+FORCE_GAP = float(np.diff(FORCE_FRACTIONS).max())
 
 
 def force_weights_at_fractions() -> Float[np.ndarray, "fraction node"]:
@@ -44,8 +48,8 @@ def contact_minimum(
     """Smallest forces (N, positive where a load presses) and times of the first loss (s), updated.
 
     `forces` are those on the beam at the Gauss nodes of steps, positive upwards; `is_load` says
-    which load a row is. Times are NEVER without a loss, which is where the line between two
-    fractions is zero, or at a vertex.
+    which load a row is. Times are NEVER without a loss, which is the first zero of the polynomial,
+    or the start of a step with a pull.
     """
     steps, batch_size = forces.shape[0], forces.shape[-1]
     by_row = forces.reshape(steps, -1, NODE_COUNT, batch_size)
@@ -57,10 +61,11 @@ def contact_minimum(
 
     def refined(earlier):
         pulls = xp.einsum("slnb,fn->slfb", by_row, force_weights_at_fractions())
-        vertex, at = _vertices(pulls)
+        vertex, rising = _vertices(pulls)
         pull = xp.maximum(xp.max(pulls, axis=2), xp.max(vertex, axis=2))
         force = xp.where(is_load[..., None], -pull[:, :, None], xp.inf)
-        fraction = _first_loss(pulls, vertex, at)
+        powers = xp.einsum("slnb,nk->kslb", by_row, lagrange_coefficients(NODE_COUNT))
+        fraction = _zero_nearby(powers, _first_loss(pulls, vertex, rising))
         time = start[:, None, None] + length[:, None, None] * fraction
         time = xp.where(fraction < NEVER, time, NEVER)
         time = xp.where(is_load[..., None], time[:, :, None], NEVER)
@@ -73,7 +78,7 @@ def contact_minimum(
 
 
 def _vertices(pulls: Float[Array, "step row fraction batch"]):
-    """Tops of the parabolas through three fractions, and where they are; -inf without one."""
+    """Tops of the parabolas through three fractions, -inf without one, and zeros before them."""
     gaps = np.diff(FORCE_FRACTIONS)[:, None]
     slopes = xp.diff(pulls, axis=2) / gaps
     rise, fall = slopes[:, :, :-1], slopes[:, :, 1:]
@@ -82,16 +87,48 @@ def _vertices(pulls: Float[Array, "step row fraction batch"]):
     slope = rise + curvature * gaps[:-1]
     top = pulls[:, :, 1:-1] - slope**2 / (4 * curvature)
     at = FORCE_FRACTIONS[1:-1, None] - slope / (2 * curvature)
-    return xp.where(inside, top, -xp.inf), at
+    top = xp.where(inside, top, -xp.inf)
+    return top, at - xp.sqrt(xp.where(top > 0, top, 1.0) / -curvature)
 
 
-def _first_loss(pulls, vertex, at) -> Float[Array, "step row batch"]:
-    """First fraction of each step with a pull, NEVER without one."""
+def _first_loss(pulls, vertex, rising) -> Float[Array, "step row batch"]:
+    """First fraction of each step with a pull, NEVER without one.
+
+    By the line between two fractions, or by the parabola if there is a pull only between them.
+    """
     before, after = pulls[:, :, :-1], pulls[:, :, 1:]
     rises = (before <= 0) & (after > 0)
     share = before / xp.where(rises, before - after, 1.0)
     crossing = FORCE_FRACTIONS[:-1, None] + np.diff(FORCE_FRACTIONS)[:, None] * share
     first = xp.min(xp.where(rises, crossing, NEVER), axis=2)
     touching = (vertex > 0) & (pulls[:, :, 1:-1] <= 0)
-    first = xp.minimum(first, xp.min(xp.where(touching, at, NEVER), axis=2))
+    first = xp.minimum(first, xp.min(xp.where(touching, rising, NEVER), axis=2))
     return xp.where(pulls[:, :, 0] > 0, 0.0, first)
+
+
+def _zero_nearby(
+    powers: Float[Array, "power step row batch"], start: Float[Array, "step row batch"]
+) -> Float[Array, "step row batch"]:
+    """Zero of a polynomial within a gap of FORCE_FRACTIONS of its start; starts 0 and NEVER stay.
+
+    By Newton's method; a start stays, too, if that ends farther from zero. The line between two
+    fractions misses the zero by up to 1e-3 of the step.
+    """
+    inside = (start > 0) & (start < NEVER)
+    first = xp.where(inside, start, 0.5)
+    low, high = xp.maximum(first - FORCE_GAP, 0.0), xp.minimum(first + FORCE_GAP, 1.0)
+    slopes = [k * power for k, power in enumerate(powers)][1:]
+
+    def newton(_, x):
+        slope = _horner(slopes, x)
+        step = _horner(powers, x) / xp.where(slope == 0, 1.0, slope)
+        return xp.clip(x - step, low, high)
+
+    found = fori_loop(0, ZERO_ITERATIONS, newton, first)
+    nearer = xp.abs(_horner(powers, found)) <= xp.abs(_horner(powers, first))
+    return xp.where(inside & nearer, found, start)
+
+
+def _horner(coefficients, x):
+    """Value of a polynomial, coefficients with the lowest power first."""
+    return functools.reduce(lambda total, c: c + x * total, reversed(list(coefficients)))

@@ -8,6 +8,27 @@
 #include "step_matrices.h"
 #include "vehicles.h"
 
+/* Zero of the polynomial through the forces of a load at the Gauss nodes, near a start, which stays
+ * if it is 0 or infinite: peaks/contact_minimum.py. */
+static Register zero_nearby(const double *lagrange, const Register *forces, Register start) {
+    Register powers[NODES] = {{0}}, slopes[NODES - 1];
+    add_product(powers, lagrange, NODES, forces, NODES);
+    for (int k = 1; k < NODES; k++) slopes[k - 1] = k * powers[k];
+    const Mask inside = (start > 0) & (start <= 1);
+    const Register first = choose(inside, start, broadcast(0.5));
+    const Register low = maximum(first - FORCE_GAP, broadcast(0)),
+                   high = minimum(first + FORCE_GAP, broadcast(1));
+    Register x = first;
+    for (int r = 0; r < ZERO_ITERATIONS; r++) {
+        const Register slope = polynomial(slopes, NODES - 1, x);
+        const Register divisor = choose(slope == 0, broadcast(1), slope);
+        x = minimum(maximum(x - polynomial(powers, NODES, x) / divisor, low), high);
+    }
+    const Register left = absolute(polynomial(powers, NODES, x)),
+                   before = absolute(polynomial(powers, NODES, first));
+    return choose(inside & (left <= before), x, start);
+}
+
 /* Largest pull of a load in a step, from its forces at fractions of it, and the first fraction with
  * a pull, infinite without one: peaks/contact_minimum.py. */
 static Register largest_pull(const double *fractions, const Register *pulls, Register *first) {
@@ -28,9 +49,13 @@ static Register largest_pull(const double *fractions, const Register *pulls, Reg
         if (!any(inside)) continue;
         const Register curvature = (fall - rise) / (gap + next_gap), slope = rise + curvature * gap;
         const Register top = here - slope * slope / (4 * curvature);
-        const Register vertex = fractions[p] - slope / (2 * curvature);
+        const Mask touches = inside & (top > 0) & (here <= 0);
         most = choose(inside, maximum(top, most), most);
-        at = choose(inside & (top > 0) & (here <= 0), minimum(vertex, at), at);
+        if (!any(touches)) continue;
+        const Register square = choose(touches, top / -curvature, broadcast(0));
+        Register rising = fractions[p] - slope / (2 * curvature);
+        for (int l = 0; l < REGISTER_WIDTH; l++) rising[l] -= sqrt(square[l]);
+        at = choose(touches, minimum(rising, at), at);
     }
     *first = at;
     return most;
@@ -55,6 +80,7 @@ static void update_contact_minimum(const Workspace *w, const Step *step, const G
         most = largest_pull(w->inputs[FORCE_FRACTIONS], pulls, &first);
         store(w->lowest_force + at, minimum(-most, lowest), g->count);
         if (!any(first <= 1)) continue;
+        first = zero_nearby(w->inputs[LAGRANGE_COEFFICIENTS], forces, first);
         store(w->contact_loss_time + at, minimum(step->start + step->length * first, loss_time),
               g->count);
     }

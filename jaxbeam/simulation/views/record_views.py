@@ -16,6 +16,7 @@ from jaxbeam.files.netcdf import write_netcdf
 from jaxbeam.files.tables import write_result
 from jaxbeam.model.modes import Modes
 from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.whole_file import whole_file
 from jaxbeam.simulation.extremes import Extremes
 from jaxbeam.simulation.views.dataset import dataset_parts
@@ -79,9 +80,7 @@ class RecordViews(TableViews, eqx.Module):
 
     def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units; `record_from_xarray` restores the record exactly."""
-        import xarray
-
-        return xarray.Dataset(*self._dataset_parts())
+        return labelled_dataset(*self._dataset_parts())
 
     def plot(self, quantity: str | None = None, **options: Any) -> "Figure | SubFigure":
         """Figure of the record, or of one quantity of its sensors; see `jaxbeam.plot.plot_record`.

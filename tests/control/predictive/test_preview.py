@@ -15,22 +15,21 @@ from tests.oracles.held_period import over_period
 PERIOD, DELAY, FIRST, COUNT = exact.PERIOD, 0.0037, 0, 3
 
 
-def found_plants(case, period, delay, first):
-    @eqx.filter_jit
+def found_plants(case, period, delay, first, traced):
     def plants(plant):
         return preview(plant, np.asarray(period), delay).sampled_plants(
             np.asarray(first * period), 0, COUNT
         )
 
-    return plants(jb.state_space(case))
+    return (eqx.filter_jit(plants) if traced else plants)(jb.state_space(case))
 
 
-@pytest.mark.parametrize("speed", [1.0, 10.0])
-def test_a_mass_that_enters_within_a_period_and_a_delayed_command(speed):
+@pytest.mark.parametrize(("speed", "traced"), [(1.0, False), (10.0, False), (10.0, True)])
+def test_a_mass_that_enters_within_a_period_and_a_delayed_command(speed, traced):
     case = exact.beam_case(speed=speed)
     span = span_of(case)
     events = exact.ENTRY, exact.ENTRY + span.length / speed
-    found = found_plants(case, PERIOD, np.asarray(DELAY), FIRST)
+    found = found_plants(case, PERIOD, np.asarray(DELAY), FIRST, traced)
 
     def matrices_at(t):
         return exact.matrices(span, t, exact.MASS, speed)
@@ -50,9 +49,10 @@ def test_a_mass_that_enters_within_a_period_and_a_delayed_command(speed):
         assert_allclose(found.E[i, :4, 0], weight, atol=1e-8 * np.abs(weight).max())
 
 
-def test_a_vehicle_on_a_rough_surface():
+@pytest.mark.parametrize("traced", [False, True])
+def test_a_vehicle_on_a_rough_surface(traced):
     period, first = 0.02, 11
-    found = found_plants(crossing.beam_case(), period, None, first)
+    found = found_plants(crossing.beam_case(), period, None, first, traced)
     for i in range(COUNT):
         start = (first + i) * period
         A, B = over_period(crossing.plant, start, start + period)

@@ -7,7 +7,7 @@ import pytest
 
 import jaxbeam as jb
 from experiments.validation.random_cases import __main__ as random_cases
-from experiments.validation.random_cases.checks import Outcome, beside_scipy
+from experiments.validation.random_cases.checks import Outcome, TooLongError, at_most, beside_scipy
 from experiments.validation.random_cases.drawing import draw
 
 
@@ -27,6 +27,16 @@ def test_cases_that_took_too_long_are_taken_up_again_with_a_longer_limit(tmp_pat
         outcomes = random_cases.outcomes_of(1, 4, file, longest=longest)
         assert asked == new
     assert [one.unfinished for one in outcomes] == [False, False, False, True]
+
+
+def test_time_is_over_where_the_code_raises_something_else():
+    """As code does that catches all there is."""
+    with pytest.raises(TooLongError), at_most(0.01):
+        try:
+            while True:
+                pass
+        except Exception:
+            raise UnboundLocalError from None
 
 
 def test_an_error_above_the_stated_one_is_told(capsys):

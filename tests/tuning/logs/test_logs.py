@@ -112,6 +112,8 @@ def test_mistakes_beside_the_log(tmp_path, text, message):
         ("", "run.csv: the log is empty"),
         ("# only a comment\n", "the log is empty"),
         ("t [s],d [mm]\n", "the log is empty: there are column names but no rows"),
+        ("# a comment\ntime [s],", "the log is empty: it has no row of numbers"),
+        ("***End_of_Header***\t\nt", "the log is empty: it has no row of numbers"),
         ("t [s],d [mm]\n0,1\n", "at least two samples"),
         ("0,1\n1,2\n", "line 1: the file has no headings"),
         ("t [s],d [mm]\n0,1\n1,x\n", "line 3, column 'd': 'x' is no number"),

@@ -1,5 +1,7 @@
 """LabVIEW measurement files, written by the tests after the published format."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -118,6 +120,14 @@ def test_mistakes(tmp_path, old, new, message):
     assert old in text
     with pytest.raises(ValueError, match=message):
         read_log(write(tmp_path, text.replace(old, new)))
+
+
+def test_a_key_without_a_value_counts_as_empty(tmp_path):
+    text = lvm("No").replace("Separator,.", "Separator")
+    assert "Decimal_Separator\n" in text
+    assert len(read_log(write(tmp_path, text)).times) > 1
+    with pytest.raises(ValueError, match="nor a Delta_X"):
+        read_log(write(tmp_path, re.sub("Delta_X,.*", "Delta_X", text)))
 
 
 def test_mistakes_between_segments(tmp_path):

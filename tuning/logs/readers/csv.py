@@ -30,7 +30,7 @@ def read_csv(path: Path) -> dict[str, LogTable]:
     Units stand in brackets or parentheses after names, or in the line below.
 
     Raises ValueError, naming file and line, for a row of another length, a cell that is no number,
-    and numbers with both decimal commas and decimal points.
+    numbers with both decimal commas and decimal points, and for a file without numbers.
     """
     numbered = [
         (number, line)
@@ -43,8 +43,10 @@ def read_csv(path: Path) -> dict[str, LogTable]:
     separator = _separator(lines)
     top, _ = _rows(path, lines[: 2 * MAX_HEADING_ROWS], numbers, separator)
     headings = find_headings(top)
-    width = len(headings.names) or (len(top[headings.first_row]) if top else 0)
     first = headings.first_row
+    if not headings.names and first >= len(top):
+        raise ValueError(f"{path}: the log is empty: it has no row of numbers")
+    width = len(headings.names) or len(top[first])
     values, numbers = _numbers(path, lines[first:], numbers[first:], separator, headings, width)
     has_headings = bool(headings.names)
     names = headings.names or tuple(f"column {i + 1}" for i in range(values.shape[1]))

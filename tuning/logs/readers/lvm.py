@@ -70,7 +70,7 @@ def _file_header(path, lines):
             return header, i + 1
         # With a decimal comma the file is separated by tabs, so this splits no number.
         key, *cells = line.split(separator)
-        header[key.strip()] = [cell.strip() for cell in cells]
+        header[key.strip()] = [cell.strip() for cell in cells] or [""]
     raise ValueError(f"{path}: the header has no end, {_END}")
 
 
@@ -92,7 +92,7 @@ def _segments(path, lines, first, separator, file_header) -> list[_Segment]:
                 segments.append(_Segment(header))
                 header = None
             else:
-                header[cells[0]] = cells[1:]
+                header[cells[0]] = cells[1:] or [""]
         elif not segments:
             segments.append(_Segment(file_header, headings=cells))
         elif not segments[-1].headings:
@@ -141,9 +141,9 @@ def _columns(path, segment: _Segment, decimal_comma: bool):
 
 def _implicit_times(path, segment: _Segment, decimal_comma: bool):
     """Times (s) of a segment without a column of times, from X0 and Delta_X."""
-    if "Delta_X" not in segment.header:
+    if not segment.header.get("Delta_X", [""])[0]:
         raise ValueError(f"{path}: the log has neither a column of times (X_Value) nor a Delta_X")
-    cells = [segment.header.get("X0", ["0"])[0], segment.header["Delta_X"][0]]
+    cells = [segment.header.get("X0", [""])[0] or "0", segment.header["Delta_X"][0]]
     line = segment.lines[0]
     start, step = parse_numbers(path, ["X0", "Delta_X"], [cells], [line], decimal_comma)[0]
     return (start + step * np.arange(len(segment.rows)))[:, None]

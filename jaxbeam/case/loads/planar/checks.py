@@ -87,7 +87,7 @@ def _order_errors(prefix: str, axles: Axles) -> Iterator[str]:
     if not all(map(is_concrete, positions)):
         return
     numbers = np.array([float(concrete(position)) for position in positions])
-    for i in np.flatnonzero(np.diff(numbers) >= 0) + 1:
+    for i in np.flatnonzero(numbers[1:] >= numbers[:-1]) + 1:
         yield (
             f"{prefix}axles.{i}.position must be below that of the axle before it,"
             f" {numbers[i - 1]:g} m; it is {numbers[i]:g} m: list the axles front first"
