@@ -13,7 +13,7 @@ import pytest
 
 from tests.layers.selection import FOLDER, layers, matches
 
-SLOW = 0.5  # s of processor time, child processes included, from which on a test is slow
+SLOW = 0.4  # s of processor time, child processes included, from which on a test is slow
 
 
 def processor_seconds() -> float:

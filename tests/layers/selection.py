@@ -1,7 +1,7 @@
 """Which tests are slow, and which run at night only.
 
 `nightly.txt` is written by hand, `slow.txt` by `python -m tests.layers.measure`: tests that took
-more than half a second of processor time. A line is a file, a test of it, or a test with its
+more than 0.4 s of processor time. A line is a file, a test of it, or a test with its
 parameters; those that begin with # are comments.
 """
 
