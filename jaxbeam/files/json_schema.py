@@ -62,17 +62,25 @@ def _of_class(part_class: type, kind: str, definitions: dict[str, Any]) -> dict[
     keys = table_keys(part_class)
     properties: dict[str, Any] = {"kind": {"const": kind}} if kind else {}
     properties |= {key.name: _value(key, definitions) for key in keys}
-    required = [key.name for key in keys if key.default is dataclasses.MISSING]
+    needed = [key for key in keys if key.default is dataclasses.MISSING]
+    required = [key.name for key in needed if key.name == key.field.name]
+    # A key whose word no attribute can have may have that of the attribute, as in saved cases.
+    properties |= {key.field.name: properties[key.name] for key in keys}
+    either = [
+        {"anyOf": [{"required": [word]} for word in (key.name, key.field.name)]}
+        for key in needed
+        if key.name != key.field.name
+    ]
     if part_class is TableProfile:  # the points may be in a file of their own
         properties["file"] = {"type": "string", "description": "file of positions and heights"}
-        required = []
+        required, either = [], []
     return {
         "type": "object",
         "description": (part_class.__doc__ or "").strip().split("\n\n")[0],
         "additionalProperties": False,
         "properties": properties,
         "required": ["kind"] * bool(kind) + required,
-    }
+    } | ({"allOf": either} if either else {})
 
 
 def _value(key: Key, definitions: dict[str, Any]) -> dict[str, Any]:

@@ -174,7 +174,8 @@ def _make_log(
             f"{path}: the column of times, {time_column!r}, has the unit {column_units[0][0]!r}"
         )
     values = table.values[:, [names.index(name) for name in (time_column, *channels)]]
-    values = values * np.array([unit.factor for _, unit in column_units])
+    with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is looked for below
+        values = values * np.array([unit.factor for _, unit in column_units])
     valid, notes = np.isfinite(values), list(table.notes)
     if missing == "mask":
         values[:, 1:] = interpolate_invalid(values[:, 0], values[:, 1:], valid[:, 1:])

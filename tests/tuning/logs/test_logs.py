@@ -112,6 +112,7 @@ def test_mistakes_beside_the_log(tmp_path, text, message):
         ("", "run.csv: the log is empty"),
         ("# only a comment\n", "the log is empty"),
         ("t [s],d [mm]\n", "the log is empty: there are column names but no rows"),
+        ("t [s],d [mm]\n0,1\n1," + 50 * "x", f"line 3, column 'd': '{37 * 'x'}...' is no number"),
         ("# a comment\ntime [s],", "the log is empty: it has no row of numbers"),
         ("***End_of_Header***\t\nt", "the log is empty: it has no row of numbers"),
         ("t [s],d [mm]\n0,1\n", "at least two samples"),
@@ -175,3 +176,11 @@ def test_inconsistent_times_and_names_are_refused():
         make([0, 1, 0.5])
     with pytest.raises(ValueError, match="2 names for 1 channels"):
         Log(np.arange(3.0), np.zeros((3, 1)), ("a", "b"), ("deflection",), ("m",))
+
+
+def test_numbers_too_large_for_their_unit_are_missing_samples(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("t [s],a [g]\n" + "".join(f"{t},{1e308 if t == 7 else t}\n" for t in range(20)))
+    assert "1 missing samples of a are left out" in read_log(path, missing="mask").notes
+    with pytest.raises(ValueError, match="line 9, column 'a'"):
+        read_log(path)

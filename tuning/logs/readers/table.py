@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
+MAX_SHOWN = 40  # characters of a cell in a message
 TIME_NAMES = ("time", "t", "zeit", "temps", "x_value")
 
 
@@ -186,6 +187,12 @@ def _bad_cell(path, names, rows, lines) -> ValueError:
             try:
                 float(cell)
             except ValueError:
-                what = f"{cell.strip()!r} is no number"
-                return ValueError(f"{path}, line {line}, column {name!r}: {what}")
+                place = f"{path}, line {line}, column {_shown(name)}"
+                return ValueError(f"{place}: {_shown(cell)} is no number")
     raise AssertionError("numpy refused what Python reads as numbers")
+
+
+def _shown(text: str) -> str:
+    """A text in quotes, of at most MAX_SHOWN characters: a quote that is open swallows lines."""
+    text = text.strip()
+    return repr(text if len(text) <= MAX_SHOWN else f"{text[: MAX_SHOWN - 3]}...")
