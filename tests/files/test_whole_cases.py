@@ -51,6 +51,8 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("whole")
 
 
+# A case may warn, as of slow sampling.
+@pytest.mark.filterwarnings("ignore::UserWarning")
 # Libraries that a case needs first while it is drawn may take random numbers as they are imported.
 @pytest.mark.filterwarnings("ignore:Do not use the .random. module")
 @settings(max_examples=examples(2), suppress_health_check=UNFILTERED)
