@@ -47,8 +47,8 @@ def _interpolate(samples: Float[Array, "point *rest"], points: tuple[float, ...]
     return Curve(rows[:count], rows[count : 2 * count - 1], rows[2 * count - 1 :])
 
 
-def _horner(coefficients: list, position):
-    """Value of a polynomial by Horner's rule."""
+def horner(coefficients: list, position):
+    """Value of a polynomial by Horner's rule; coefficients with the lowest power first."""
     value = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
         value = coefficient + position * value
@@ -59,12 +59,12 @@ def _newton_stationary_point(curve: Curve, start, step_limit: float, iterations:
     """Stationary point near the start, by Newton's method with limited steps."""
 
     def newton_step(_, position):
-        second_derivative = _horner(curve.curvature, position)
+        second_derivative = horner(curve.curvature, position)
         singular = second_derivative == 0
         step = xp.where(
             singular,
             0.0,
-            _horner(curve.slope, position) / xp.where(singular, 1.0, second_derivative),
+            horner(curve.slope, position) / xp.where(singular, 1.0, second_derivative),
         )
         return xp.clip(position - xp.clip(step, -step_limit, step_limit), -1.0, 1.0)
 
@@ -98,7 +98,7 @@ def estimate_peak(
     position = _newton_stationary_point(
         curve, start, newton_step_limit(points), iterations=ESTIMATE_ITERATIONS
     )
-    return xp.maximum(magnitude(_horner(curve.value, position)), largest)
+    return xp.maximum(magnitude(horner(curve.value, position)), largest)
 
 
 @jax.named_scope("peaks")
@@ -113,7 +113,7 @@ def locate_peak(
     positions = xp.concatenate(
         [starts, _newton_stationary_point(curve, starts, 2 / START_POINTS, NEWTON_ITERATIONS)]
     )
-    _, ties = max_with_ties(magnitude(_horner(curve.value, positions)))
+    _, ties = max_with_ties(magnitude(horner(curve.value, positions)))
     position = xp.max(xp.where(ties, positions, -1.0), axis=0)
     # The magnitude is accurate to nearly rounding by now, the position to the square root of that:
     # further iterations improve it, unless the peak is at an end without stationary point nearby.
@@ -121,7 +121,7 @@ def locate_peak(
         curve, position, 2 / START_POINTS, NEWTON_ITERATIONS
     )
     _, ties_of_two = max_with_ties(
-        magnitude(_horner(curve.value, xp.stack([stationary_point, position])))
+        magnitude(horner(curve.value, xp.stack([stationary_point, position])))
     )
     return xp.where(ties_of_two[0], stationary_point, position)
 
@@ -136,4 +136,4 @@ def refine_peak(
     """
     position = locate_peak(stop_gradient(samples), points, magnitude)
     position = optimization_barrier(stop_gradient(position))
-    return magnitude(_horner(_interpolate(samples, points).value, position)), (position + 1) / 2
+    return magnitude(horner(_interpolate(samples, points).value, position)), (position + 1) / 2

@@ -5,14 +5,13 @@ compared at fractions of the step, the ends among them, and at the vertices of t
 three of these. `runtime/native/steps.h` does the same in C.
 """
 
-import functools
-
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES
 from jaxbeam.numerics.gauss import lagrange_coefficients
+from jaxbeam.numerics.peak_search import horner
 from jaxbeam.runtime.arrays import Array, cond, fori_loop, xp
 
 ZERO_ITERATIONS = 4  # of Newton's method for the time of a loss
@@ -120,15 +119,10 @@ def _zero_nearby(
     slopes = [k * power for k, power in enumerate(powers)][1:]
 
     def newton(_, x):
-        slope = _horner(slopes, x)
-        step = _horner(powers, x) / xp.where(slope == 0, 1.0, slope)
+        slope = horner(slopes, x)
+        step = horner(list(powers), x) / xp.where(slope == 0, 1.0, slope)
         return xp.clip(x - step, low, high)
 
     found = fori_loop(0, ZERO_ITERATIONS, newton, first)
-    nearer = xp.abs(_horner(powers, found)) <= xp.abs(_horner(powers, first))
+    nearer = xp.abs(horner(list(powers), found)) <= xp.abs(horner(list(powers), first))
     return xp.where(inside & nearer, found, start)
-
-
-def _horner(coefficients, x):
-    """Value of a polynomial, coefficients with the lowest power first."""
-    return functools.reduce(lambda total, c: c + x * total, reversed(list(coefficients)))
