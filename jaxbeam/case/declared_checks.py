@@ -32,6 +32,8 @@ from jaxbeam.runtime.arrays import Array
 SHORT_REPR = reprlib.Repr()  # shortens wrong values, which error messages quote
 SHORT_REPR.maxstring, SHORT_REPR.maxlist, SHORT_REPR.maxdict = 80, 10, 10
 
+# Sizes of numbers: products and quotients of three do not overflow. What must be positive divides.
+SMALLEST, LARGEST = 1e-100, 1e100
 POSITION_TOLERANCE = 1e-9  # of the length: 3 * 0.2 is still on a beam of 0.6 m
 
 
@@ -176,6 +178,9 @@ def _check_number(address: str, value: Any, field: dataclasses.Field) -> None:
             raise ValueError(f"{name} must be a finite number; it is {x}")
         if (constraint == POSITIVE and x <= 0) or (constraint == NOT_NEGATIVE and x < 0):
             raise ValueError(f"{name} must {constraint}; it is {x:g}{unit}")
+        if abs(x) > LARGEST or (constraint == POSITIVE and x < SMALLEST):
+            bound = f"at most {LARGEST:g}" if abs(x) > LARGEST else f"at least {SMALLEST:g}"
+            raise ValueError(f"the size of {name} must be {bound}{unit}; it is {x:g}{unit}")
     if constraint == INCREASING:
         _check_increasing(names, numbers, unit)
 

@@ -269,8 +269,19 @@ def _results(program: Program, discrete, varied: Case, loads: LoadSet, policy=No
     return running_peaks.peaks()._asdict() | history
 
 
+def in_sequence() -> bool:
+    """Whether the batches of a block are integrated one after the other.
+
+    On a CPU, whose cache holds one of them. An accelerator takes all at once: an H100 4096 runs of
+    three modes in 0.13 s, in sequence in 0.31 s.
+    """
+    return jax.default_backend() == "cpu"
+
+
 def _map_masked(function, mask, values):
-    """Values of a function for each marked batch in sequence; zeros for the others."""
+    """Values of a function for each marked batch; any for the others."""
+    if not in_sequence():
+        return jax.vmap(function)(values)
     function = jax.jit(function)  # traced once
     shapes = jax.eval_shape(function, jax.tree.map(lambda leaf: leaf[0], values))
 

@@ -147,6 +147,7 @@ class SweepSpecification:
                 MAX_BLOCK_RUNS,
                 FORCE_BLOCK_RUNS,
                 MAX_BATCH_SIZE,
+                jax.default_backend(),
                 len(jax.local_devices()),
             ],
             "versions": [_version(), jax.__version__],

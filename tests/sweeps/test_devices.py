@@ -5,11 +5,14 @@ import os
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from experiments.benchmarks.common import without_native
+from jaxbeam.sweeps import programs
 
 CASE = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3),
@@ -41,6 +44,20 @@ def test_single_precision_meets_its_error_estimate():
     assert_allclose(
         np.abs(with_histories.deflection).max("time") <= double.peak_deflection * 1.00002, True
     )
+
+
+@pytest.mark.parametrize("option", ["double", "single", "histories"])
+def test_batches_at_once_as_on_accelerators(monkeypatch, option):
+    options = {"histories": True} if option == "histories" else {"precision": option}
+    expected = jb.sweep(CASE, OVER, progress=False, **options)
+    monkeypatch.setattr(programs, "in_sequence", lambda: False)
+    jax.clear_caches()
+    with without_native():
+        found = jb.sweep(CASE, OVER, progress=False, **options)
+    tolerance = 2e-5 if option == "single" else 1e-10
+    assert_allclose(found.peak_deflection, expected.peak_deflection, rtol=tolerance)
+    if option == "histories":
+        assert_allclose(found.deflection, expected.deflection, rtol=1e-9, atol=1e-16)
 
 
 def test_unknown_precisions_are_refused():

@@ -39,6 +39,8 @@ from tuning.logs.quality import interpolate_invalid
 from tuning.logs.readers import LogTable, is_time_name, read_tables
 from tuning.logs.units import UNITS, transducer_unit, unit
 
+MAX_TEXT = 120  # characters of the name or the unit of a column, as messages quote it
+
 
 def read_log(
     path: str | Path,
@@ -107,6 +109,7 @@ def read_logs(
     path = Path(path)
     tables = {}
     for name, table in read_tables(path).items():
+        _check_texts(path, table)
         table, channels, declared = with_named_columns(path, table, columns)
         table = with_times(path, table, rate, time)
         for part, rows in _split_runs(name, table).items():
@@ -201,6 +204,17 @@ def _make_log(
         valid=valid[:, 1:],
         notes=tuple(notes),
     )
+
+
+def _check_texts(path, table: LogTable) -> None:
+    """Validate that names and units are short: messages quote them, and damaged files have any."""
+    for what, texts in (("name", table.names), ("unit", table.units)):
+        for i, text in enumerate(texts):
+            if text is not None and len(repr(text)) > MAX_TEXT:
+                raise ValueError(
+                    f"{path}: the {what} of column {i + 1} has {len(text)} characters,"
+                    f" {text[:20]!r}...; the file is damaged, or give it a shorter one"
+                )
 
 
 def _check_names(path, names):

@@ -184,3 +184,13 @@ def test_numbers_too_large_for_their_unit_are_missing_samples(tmp_path):
     assert "1 missing samples of a are left out" in read_log(path, missing="mask").notes
     with pytest.raises(ValueError, match="line 9, column 'a'"):
         read_log(path)
+
+
+def test_long_names_and_units_are_refused_in_a_sentence(tmp_path):
+    """Found by fuzzing: a damaged length of a text makes it a name or unit of a thousand bytes."""
+    path = tmp_path / "run.csv"
+    for what, heading in (("name", "a" * 500 + " [mm]"), ("unit", f"a [{'m' * 500}]")):
+        path.write_text(f"t [s],{heading}\n" + "".join(f"{t},0\n" for t in range(20)))
+        with pytest.raises(ValueError, match=f"the {what} of column 2 has 500 characters") as error:
+            read_log(path)
+        assert len(str(error.value)) < 300
