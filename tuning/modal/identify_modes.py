@@ -26,7 +26,7 @@ from tuning.modal.arguments import (
     check_band,
     check_force,
 )
-from tuning.modal.decay.modes import Decays, excited, free_decay_modes
+from tuning.modal.decay.modes import Decays, band_of_ends, excited, free_decay_modes
 from tuning.modal.fit import Choice, ModalFit
 from tuning.modal.forced.blows import force_at_blows
 from tuning.modal.forced.forces import force_names, force_records, without_forces
@@ -37,14 +37,13 @@ from tuning.modal.harmonics import (
     subtract_lines,
     wandering_lines,
 )
-from tuning.modal.preprocessing import kinetic_band, prepare
+from tuning.modal.preprocessing import HALF_POWER, kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels
 from tuning.modal.spectral.efdd_modes import SingularValues, efdd_modes
 from tuning.modal.spectral.plscf_modes import plscf_modes
 from tuning.modal.stabilisation import Diagram
 
 FORCED = "measured force"
-HALF_POWER = 2.0  # dip between resonances of the band in which decays are sought again
 NARROW = 0.005  # damping ratio of a mode below which it may be a harmonic
 TRANSIENT_SHARE = 0.01  # struck samples of a log with transients of crossing loads
 
@@ -142,10 +141,12 @@ def identify_modes(
         if found is None and band is None:
             # A decay drowns sooner in the noise of a wide band.
             lower = kinetic_band(samples.records, samples.rate, derivatives, HALF_POWER)
-            found = free_decay_modes(
-                samples, excited(samples, derivatives, lower), derivatives, lower, **how
-            )
-            used_band = used_band if found is None else lower
+            for narrower in (lower, band_of_ends(samples, derivatives, lower)):
+                marks = excited(samples, derivatives, narrower)
+                found = free_decay_modes(samples, marks, derivatives, narrower, **how)
+                if found is not None:
+                    used_band = narrower
+                    break
     if kind == "free decay" and found is None:
         raise ValueError(f"{logs[0].source}: no free decay found; give its window, or kind ambient")
     used_method = "decay"

@@ -17,6 +17,7 @@ BACKGROUND_OCTAVES = 1.0  # width of the running quantile that is the background
 BACKGROUND_PERCENT = 25  # below the peaks of a pair of modes, however much of an octave they fill
 RESONANCE_RATIO = 6.0  # of the spectrum over its background: 8 dB
 BAND_ENERGY_SHARE = 0.99  # of the kinetic energy of resonances, below the upper end of the band
+HALF_POWER = 2.0  # dip between resonances of the band in which decays are sought again
 MAX_RESONANCES = 12  # in the band: the lowest, which a model of the structure has
 BAND_MARGIN = 1.3  # of the ends of the band beyond the outermost resonances
 MIN_CYCLES = 8.0  # cycles of the lowest frequency in the longest record

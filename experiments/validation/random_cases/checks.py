@@ -287,8 +287,8 @@ def beside_scipy(drawn: Drawn, record: Record) -> tuple[float, list[str]]:
 
     @functools.cache
     def found(margin):
-        """Times of samples, and those before and after each loss, and the run there."""
-        sides = [t + side * margin for t in lost[np.isfinite(lost)] for side in (-1, 1)]
+        """Times of samples, and those of each loss, before it and after it, and the run there."""
+        sides = [t + side * margin for t in lost[np.isfinite(lost)] for side in (-1, 0, 1)]
         times = np.unique(np.clip([*samples, *sides], 0.0, samples[-1]))
         return times, modal_equations.respond(drawn.span, drawn.loads, places, times)
 
@@ -311,13 +311,14 @@ def contact_faults(
     """Verdicts that contradict forces (N) at times (s) by another integrator, beyond errors."""
     faults, lost = [], np.asarray(record.contact_lost_time)
     for i, (force, lost_time) in enumerate(zip(forces.T, lost, strict=True)):
-        # With a first time of negative force, no force is negative before, and one is after.
+        # At a first time of negative force one is, within errors; before it none is.
         before = force[times <= np.nan_to_num(lost_time, nan=np.inf) - errors.time]
-        after = force[times >= lost_time + errors.time][:1]
+        last = np.searchsorted(times, lost_time + errors.time)
+        about = force[: last + 1][times[: last + 1] >= lost_time - errors.time]
         if before.min(initial=0.0) < -errors.force:
             faults.append(f"load {i} pulls by {-before.min():.6g} N: {record.verdict}")
-        if after.size and after[0] > errors.force:
-            faults.append(f"load {i} presses with {after[0]:.6g} N: {record.verdict}")
+        if about.size and about.min() > errors.force:
+            faults.append(f"load {i} presses with {about.min():.6g} N: {record.verdict}")
         pressing = force[force != 0.0]  # on the beam
         if pressing.min(initial=np.inf) < record.lowest_contact_force[i] - errors.force:
             faults.append(f"load {i} has a force of {force.min():.6g} N: {record.verdict}")

@@ -1,13 +1,21 @@
 """Checks of random cases: what is left is taken up again, and what is wrong is told."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import jaxbeam as jb
 from experiments.validation.random_cases import __main__ as random_cases
-from experiments.validation.random_cases.checks import Outcome, TooLongError, at_most, beside_scipy
+from experiments.validation.random_cases.checks import (
+    Errors,
+    Outcome,
+    TooLongError,
+    at_most,
+    beside_scipy,
+    contact_faults,
+)
 from experiments.validation.random_cases.drawing import draw
 
 
@@ -62,3 +70,16 @@ def test_a_wrong_verdict_is_found():
     assert error <= record.error_estimate
     assert right == []
     assert any("pulls by" in fault for fault in wrong)
+
+
+def test_a_dip_within_the_errors_may_be_taken_for_the_loss():
+    """A force that only steps' errors make negative at first, and one that never is."""
+    times = np.linspace(0.0, 1.0, 101)
+    record = SimpleNamespace(
+        contact_lost_time=np.array([0.2]), lowest_contact_force=np.array([-1.0]), verdict=""
+    )
+    dips = np.where(times < 0.2, 5.0, np.where(times < 0.25, 1e-4, 5.0))[:, None]
+    wide = Errors(force=1e-3, time=0.3)
+    assert not contact_faults(record, times, dips, wide)
+    narrow = Errors(force=1e-5, time=0.01)
+    assert "presses with 0.0001 N" in contact_faults(record, times, dips, narrow)[0]

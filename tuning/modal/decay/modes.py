@@ -14,6 +14,7 @@ from tuning.modal.ambient import (
     without_duplicates,
 )
 from tuning.modal.decay.fit import fit_decay
+from tuning.modal.decay.free_end import free_end
 from tuning.modal.decay.leaving import end_of_excitation, shaken_until
 from tuning.modal.decay.stretches import (
     MIN_DECAY_CYCLES,
@@ -23,7 +24,7 @@ from tuning.modal.decay.stretches import (
     prediction_errors,
     stacked,
 )
-from tuning.modal.preprocessing import prepare, strongest_frequency
+from tuning.modal.preprocessing import HALF_POWER, kinetic_band, prepare, strongest_frequency
 from tuning.modal.result import IdentifiedMode, rejection_reason
 from tuning.modal.samples import MIN_SAMPLES, Samples
 from tuning.modal.shapes import mac_matrix
@@ -53,19 +54,42 @@ def excited(
 ) -> tuple[Bool[np.ndarray, " time"], ...]:
     """Samples of each record at which the structure is excited, at the rate of the log.
 
-    They are those struck by blows, and all until a crossing load has left (`leaving`).
+    They are those struck by blows, and all until a crossing load has left (`leaving`, `free_end`).
 
     Below half the band (Hz) drift is removed; above it all frequencies count.
     """
     prepared = prepare(samples.records, samples.starts, samples.rate, band)
     frequency = strongest_frequency(prepared.records, prepared.rate, derivatives, band)
     sos = butter(2, band[0] / 2, "highpass", fs=samples.rate, output="sos")
+    narrow = band_of_ends(samples, derivatives, band)
+    ends = prepare(samples.records, samples.starts, samples.rate, narrow)
+    cycle = ends.rate / strongest_frequency(ends.records, ends.rate, derivatives, narrow)
+    independent = min(2 * (narrow[1] - narrow[0]) / ends.rate, 1.0)
     found = []
-    for record, own in zip(samples.records, prepared.records, strict=True):
+    for record, own, end in zip(samples.records, prepared.records, ends.records, strict=True):
         values = sosfiltfilt(sos, detrend(record, axis=0), axis=0)
         marks = excited_samples(values, samples.rate, 1 / frequency)
-        found.append(_with_excitation(marks, own, max(int(prepared.rate / frequency), 4)))
+        # What follows a blow is free from the beginning.
+        start = None if marks.any() else free_end(end, cycle, independent)
+        if start is None:
+            marks = _with_excitation(marks, own, max(int(prepared.rate / frequency), 4))
+        else:
+            marks = np.arange(marks.size) * len(end) < start * marks.size
+        found.append(marks)
     return tuple(found)
+
+
+def band_of_ends(
+    samples: Samples, derivatives: tuple[int, ...], band: tuple[float, float]
+) -> tuple[float, float]:
+    """Band (Hz), within another, of the resonances in the second halves of records.
+
+    What a load excites while it crosses may be of higher frequencies than what it leaves.
+    """
+    halves = tuple(record[len(record) // 2 :] for record in samples.records)
+    low, high = kinetic_band(halves, samples.rate, derivatives, HALF_POWER)
+    low, high = max(low, band[0]), min(high, band[1])
+    return (low, high) if low < high else band
 
 
 def _with_excitation(marks, record, size) -> Bool[np.ndarray, " time"]:
@@ -214,10 +238,9 @@ def _dominate(decays, struck, records, ratio, cycle) -> bool:
     start = int(np.ceil(longest.start * ratio))
     first = records[longest.record][start : start + int(2 * cycle) + 1]
     begins = np.sum(first**2) / len(first) > MIN_START_LEVEL * level
-    falls = longest.fall > LONG_FALL_NEPERS and (
-        begins or _follows(longest, struck[longest.record], cycle / ratio)
-    )
-    return bool(inside > MIN_DECAY_ENERGY * whole or falls)
+    follows = _follows(longest, struck[longest.record], cycle / ratio)
+    falls = longest.fall > LONG_FALL_NEPERS and begins
+    return bool(inside > MIN_DECAY_ENERGY * whole or falls or follows)
 
 
 def _follows(decay: Stretch, struck, cycle) -> bool:

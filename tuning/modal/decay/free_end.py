@@ -1,0 +1,179 @@
+"""Where the free end of a record begins: a load has left, and what is left decays.
+
+From an instant t_0 on the record is a sum of few decaying vibrations and of steady noise,
+
+    y_c(t) = sum_k Re(a_kc exp(p_k (t - t_0))) + noise_c(t),   t >= t_0.
+
+Earlier instants are tried one after another, from the end of the record backwards: as long as no
+force acts after t_0, errors of the fit are as large as those of the ends before, and no larger at
+its beginning. Poles are those of the signal subspace of the record's Hankel matrix (Kung 1978),
+their number is that of least BIC. Errors of prediction (`leaving`) miss a load whose forces are
+small beside the noise within a sample; over a decay, their effect adds up.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+ORDERS = (2, 4, 6, 8, 12, 16)  # eigenvalues of the models, two for each vibration
+HANKEL_CYCLES = 3.0  # of the strongest vibration in the columns of the matrices
+MIN_ROWS, MAX_ROWS, MIN_LAGS = 60, 200, 12  # of these, in all channels; samples of each
+MAX_TRIED = 60  # instants
+MIN_CYCLES = 10  # of the strongest vibration in the shortest end
+MIN_LENGTH = 40  # samples of it
+PARTS = 10  # of an end, whose errors are compared
+MIN_RATIO, RATIO_SDS = 2.0, 3.0  # of errors, or deviations of the ratio, beyond which they differ
+MAX_DAMPING = 0.15  # ratio of a vibration
+MAX_REFUSED = 4  # instants one after another: a weak vibration is seen some cycles late
+MAX_UNEXPLAINED = 0.15  # of the energy of the first part
+MIN_FALL = 1.0  # nepers, of the energy that is explained, from the first part to the last
+SAME_RATE, FIRST_PARTS = 0.5, 3  # of the slope of the energy in these parts, to be as before them
+MAX_LEVEL_AT_END = 0.5  # of the record's mean energy; more is no decay after a load
+
+
+class _End(NamedTuple):
+    """Fit of an end: where it begins, and squares of its errors and of the samples."""
+
+    start: int
+    errors: Float[np.ndarray, " sample"]
+    energy: Float[np.ndarray, " sample"]
+    variance: float  # of the errors, which the fit makes smaller than the noise
+
+    @property
+    def explained(self) -> Float[np.ndarray, " part"]:
+        """Mean energy of each part that is explained."""
+        explained = np.maximum(_of_parts(self.energy) - _of_parts(self.errors), 0.0)
+        return explained + 1e-6 * explained.max() + 1e-300
+
+    @property
+    def is_decay(self) -> bool:
+        """Whether the beginning is explained, and falls."""
+        begins = _of_parts(self.errors)[0] < MAX_UNEXPLAINED * _of_parts(self.energy)[0]
+        return bool(begins and np.log(self.explained[0] / self.explained[-1]) > MIN_FALL)
+
+    @property
+    def slope(self) -> float:
+        """Slope of the logarithm of the explained energy at the beginning, for a sample."""
+        return _slope(self.explained[:FIRST_PARTS], len(self.errors) * FIRST_PARTS // PARTS)
+
+
+def free_end(
+    record: Float[np.ndarray, "sample channel"], cycle: float, independent: float
+) -> int | None:
+    """Sample from which on a record decays freely; None where that is not clear.
+
+    `cycle` is that of the strongest vibration in samples, `independent` the share of samples that
+    are, in the band of the record.
+    """
+    values = record / np.maximum(record.std(axis=0), 1e-300)
+    count, channels = values.shape
+    lags = np.clip(int(HANKEL_CYCLES * cycle), MIN_ROWS // channels, MAX_ROWS // channels)
+    lags = min(max(int(lags), MIN_LAGS), count // 8)
+    shortest = max(int(MIN_CYCLES * cycle), MIN_LENGTH, 2 * lags)
+    last = values[-max(count // PARTS, 1) :]
+    if count < 2 * shortest or np.mean(last**2) > MAX_LEVEL_AT_END * np.mean(values**2):
+        return None
+    step = max(int(2 * cycle), count // MAX_TRIED)
+    ends = _Ends(values, lags, independent)
+    starts = range(count - shortest, -1, -step)
+    accepted = later = ends.fit(starts[0])
+    refused, previous = [], True
+    for start in starts[1:]:
+        end = ends.fit(start)
+        alike = ends.are_alike(end, accepted)
+        if alike and previous:  # one alone, after refusals, may be so by chance
+            accepted, later, refused = end, accepted, []
+        else:
+            refused.append(start)
+        previous = alike
+        if len(refused) == MAX_REFUSED:
+            break
+    if not (refused and later.is_decay):
+        return None
+    # What decays from the beginning, but not quite linearly, has no forces before the end, either.
+    before = _slope(_of_parts(np.mean(values[: later.start] ** 2, axis=1)), later.start)
+    if before < SAME_RATE * later.slope:
+        return None
+    # Forces that end within a step show little: the end begins one step after the earliest.
+    return later.start
+
+
+class _Ends:
+    """Fits of ends of values (sample, channel), and the products of their Hankel matrices."""
+
+    def __init__(self, values, lags: int, independent: float):
+        self.values, self.independent = values, independent
+        windows = np.lib.stride_tricks.sliding_window_view(values, lags, axis=0)
+        self.rows = windows.transpose(0, 2, 1).reshape(len(windows), -1)
+        self.products = {len(self.rows): np.zeros((self.rows.shape[1],) * 2)}
+
+    def product(self, start: int):
+        """Product of the Hankel matrix of an end with itself, from that of a shorter one."""
+        later = min(known for known in self.products if known >= start)
+        part = self.rows[start:later]
+        self.products[start] = self.products[later] + part.T @ part
+        return self.products[start]
+
+    def fit(self, start: int) -> _End:
+        """Fit of the model of least BIC to the end from a sample on."""
+        values = self.values[start:]
+        count, channels = values.shape
+        basis = np.linalg.eigh(self.product(start))[1][:, ::-1]
+        best, errors, parameters = np.inf, values, 0
+        for order in ORDERS:
+            if order > basis.shape[1] - channels or 8 * order > len(values):
+                break
+            roots = _roots(basis[:, :order], channels)
+            if not roots.size:
+                continue
+            powers = roots ** np.arange(count)[:, None]
+            columns = np.hstack([powers.real, powers.imag])
+            left = values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
+            numbers = columns.shape[1] * (channels + 1)
+            cost = count * np.sum(np.log(np.mean(left**2, axis=0) + 1e-300))
+            cost += numbers * np.log(count * channels)
+            if cost < best:
+                best, errors, parameters = cost, left, numbers
+        squares = np.mean(errors**2, axis=1)
+        freedom = max(count - parameters / (channels * self.independent), count / 4)
+        energy = np.mean(values**2, axis=1)
+        return _End(start, squares, energy, float(squares.sum() / freedom))
+
+    def are_alike(self, end: _End, shorter: _End) -> bool:
+        """Whether errors of an end are as large as those of a shorter one, and before it, too."""
+        parts, channels = _of_parts(end.errors), self.values.shape[1]
+        before = end.errors[: shorter.start - end.start]
+
+        def limit(samples):
+            freedom = max(self.independent * channels * samples, 1.0)
+            return max(MIN_RATIO, 1 + RATIO_SDS * np.sqrt(2 / freedom))
+
+        return bool(
+            np.mean(before) <= limit(before.size) * np.median(parts)
+            and parts[0] <= limit(end.errors.size / PARTS) * np.median(parts)
+            and end.variance <= limit(end.errors.size) * shorter.variance
+        )
+
+
+def _slope(energies, samples: int) -> float:
+    """Slope of the logarithm of energies that are evenly spread over some samples."""
+    places = np.arange(len(energies)) * samples / len(energies)
+    return float(np.polyfit(places, np.log(energies + 1e-300), 1)[0])
+
+
+def _of_parts(squares):
+    """Means of the parts of an end."""
+    return np.array([np.mean(part) for part in np.array_split(squares, PARTS)])
+
+
+def _roots(basis, channels: int):
+    """Eigenvalues of the shift of a signal subspace that are vibrations, not damped too strongly.
+
+    Others would fit what a force did just after the beginning of an end.
+    """
+    shift = np.linalg.lstsq(basis[:-channels], basis[channels:], rcond=None)[0]
+    logarithms = np.log(np.linalg.eigvals(shift).astype(complex))
+    decay = -logarithms.real
+    kept = (logarithms.imag > 0) & (decay > 0) & (decay < MAX_DAMPING * np.abs(logarithms))
+    return np.exp(logarithms[kept])
