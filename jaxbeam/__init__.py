@@ -13,7 +13,12 @@ from jaxbeam.case.aliases import NAMES, warn_renamed
 
 # Matrices are small and runs share the cores: threads of LAPACK would wait for each other, on a
 # busy machine for minutes. LAPACK reads this when it is loaded; a setting by the user prevails.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+if "OPENBLAS_NUM_THREADS" not in os.environ:
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    if "numpy" in sys.modules:
+        import threadpoolctl
+
+        threadpoolctl.threadpool_limits(1, user_api="blas")
 
 # Peaks to one part in a million need double precision. JAX reads this when it is imported; a
 # setting by the user prevails.
