@@ -25,7 +25,9 @@ MIN_LENGTH = 40  # samples of it
 PARTS = 10  # of an end, whose errors are compared
 MIN_RATIO, RATIO_SDS = 2.0, 3.0  # of errors, or deviations of the ratio, beyond which they differ
 MAX_DAMPING = 0.15  # ratio of a vibration
-MAX_REFUSED = 4  # instants one after another: a weak vibration is seen some cycles late
+# Instants one after another that end the search: some errors, as a weak vibration is seen some
+# cycles late, or clear ones.
+MAX_REFUSED, CLEAR_MISFIT = 8, 1.5
 MAX_UNEXPLAINED = 0.15  # of the energy of the first part
 MIN_FALL = 1.0  # nepers, of the energy that is explained, from the first part to the last
 SAME_RATE, FIRST_PARTS = 0.5, 3  # of the slope of the energy in these parts, to be as before them
@@ -78,18 +80,20 @@ def free_end(
     ends = _Ends(values, lags, independent)
     starts = range(count - shortest, -1, -step)
     accepted = later = ends.fit(starts[0])
-    refused, previous = [], True
+    refused, previous = 0, 0.0
     for start in starts[1:]:
         end = ends.fit(start)
-        alike = ends.are_alike(end, accepted)
-        if alike and previous:  # one alone, after refusals, may be so by chance
-            accepted, later, refused = end, accepted, []
+        misfit = ends.misfit(end, accepted)
+        alike = misfit <= 1.0
+        if alike and previous <= 1.0:  # one alone, after refusals, may be so by chance
+            accepted, later, refused = end, accepted, 0
         else:
-            refused.append(start)
-        previous = alike
-        if len(refused) == MAX_REFUSED:
+            refused += 1
+        if refused == MAX_REFUSED or min(misfit, previous) > CLEAR_MISFIT:
             break
-    if not (refused and later.is_decay):
+        previous = misfit
+    # Soon after the beginning, errors may be those of vibrations that are gone at once.
+    if later.start < count // PARTS or not (refused and later.is_decay):
         return None
     # What decays from the beginning, but not quite linearly, has no forces before the end, either.
     before = _slope(_of_parts(np.mean(values[: later.start] ** 2, axis=1)), later.start)
@@ -140,19 +144,22 @@ class _Ends:
         energy = np.mean(values**2, axis=1)
         return _End(start, squares, energy, float(squares.sum() / freedom))
 
-    def are_alike(self, end: _End, shorter: _End) -> bool:
-        """Whether errors of an end are as large as those of a shorter one, and before it, too."""
-        parts, channels = _of_parts(end.errors), self.values.shape[1]
-        before = end.errors[: shorter.start - end.start]
+    def misfit(self, end: _End, shorter: _End) -> float:
+        """How much larger the errors of an end are than those of a shorter one, over the limit.
 
-        def limit(samples):
-            freedom = max(self.independent * channels * samples, 1.0)
-            return max(MIN_RATIO, 1 + RATIO_SDS * np.sqrt(2 / freedom))
-
-        return bool(
-            np.mean(before) <= limit(before.size) * np.median(parts)
-            and parts[0] <= limit(end.errors.size / PARTS) * np.median(parts)
-            and end.variance <= limit(end.errors.size) * shorter.variance
+        In the samples before the shorter end, in the first part, and in all.
+        """
+        median, before = np.median(_of_parts(end.errors)), end.errors[: shorter.start - end.start]
+        first = end.errors[: len(end.errors) // PARTS]
+        ratios = (
+            (np.mean(before) / median, before.size),
+            (np.mean(first) / median, first.size),
+            (end.variance / shorter.variance, end.errors.size),
+        )
+        size = self.independent * self.values.shape[1]
+        return max(
+            float(ratio) / max(MIN_RATIO, 1 + RATIO_SDS * np.sqrt(2 / max(size * samples, 1.0)))
+            for ratio, samples in ratios
         )
 
 
