@@ -57,6 +57,16 @@ def test_a_decay_from_the_beginning_is_free_throughout():
     assert found is None or found < 4 * CYCLE
 
 
+def test_records_without_noise_or_vibration_are_no_trouble():
+    forces = np.zeros(COUNT)
+    forces[0] = 1.0
+    clean = forced(forces, noise=0.0)
+    assert free_end(clean, CYCLE, 1.0) is None
+    assert free_end(np.zeros((COUNT, 2)), CYCLE, 1.0) is None
+    one_dead = forced(white(1, until=600)) * [1.0, 0.0]
+    assert free_end(one_dead, CYCLE, 1.0) in range(560, 681)
+
+
 @pytest.mark.parametrize("seed", [967, 971])
 def test_close_modes_after_a_load_that_excites_little_at_a_time(seed):
     """Planted by finite elements: errors of prediction do not tell when the load has left."""

@@ -24,6 +24,7 @@ MIN_CYCLES = 10  # of the strongest vibration in the shortest end
 MIN_LENGTH = 40  # samples of it
 PARTS = 10  # of an end, whose errors are compared
 MIN_RATIO, RATIO_SDS = 2.0, 3.0  # of errors, or deviations of the ratio, beyond which they differ
+MIN_ERRORS = 1e-4  # of the energy of the first part; less may be nonlinearity, or rounding
 MAX_DAMPING = 0.15  # ratio of a vibration
 # Instants one after another that end the search: some errors, as a weak vibration is seen some
 # cycles late, or clear ones.
@@ -149,12 +150,18 @@ class _Ends:
 
         In the samples before the shorter end, in the first part, and in all.
         """
-        median, before = np.median(_of_parts(end.errors)), end.errors[: shorter.start - end.start]
-        first = end.errors[: len(end.errors) // PARTS]
+        before, first = (
+            end.errors[:size] for size in (shorter.start - end.start, len(end.errors) // PARTS)
+        )
+        least = MIN_ERRORS * np.mean(end.energy[: first.size]) + 1e-300
+        usual, all_before = (
+            max(np.median(_of_parts(end.errors)), least),
+            max(shorter.variance, least),
+        )
         ratios = (
-            (np.mean(before) / median, before.size),
-            (np.mean(first) / median, first.size),
-            (end.variance / shorter.variance, end.errors.size),
+            (np.mean(before) / usual, before.size),
+            (np.mean(first) / usual, first.size),
+            (end.variance / all_before, end.errors.size),
         )
         size = self.independent * self.values.shape[1]
         return max(
@@ -180,7 +187,8 @@ def _roots(basis, channels: int):
     Others would fit what a force did just after the beginning of an end.
     """
     shift = np.linalg.lstsq(basis[:-channels], basis[channels:], rcond=None)[0]
-    logarithms = np.log(np.linalg.eigvals(shift).astype(complex))
+    roots = np.linalg.eigvals(shift).astype(complex)
+    logarithms = np.log(roots[np.abs(roots) > 1e-6])
     decay = -logarithms.real
     kept = (logarithms.imag > 0) & (decay > 0) & (decay < MAX_DAMPING * np.abs(logarithms))
     return np.exp(logarithms[kept])
