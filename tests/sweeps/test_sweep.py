@@ -14,6 +14,7 @@ from hypothesis import given, strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
+from jaxbeam.case import declared_checks
 from jaxbeam.model.statics import static_peak
 from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.batches import make_batches
@@ -106,8 +107,9 @@ def test_histories_on_request():
     assert_allclose(found.deflection[1, 0], record.deflection, atol=1e-10)
 
 
-def test_failed_run_is_marked_and_changes_no_other():
-    """An infinite weight makes one run fail."""
+def test_failed_run_is_marked_and_changes_no_other(monkeypatch):
+    """An infinite weight, which is refused otherwise, makes one run fail."""
+    monkeypatch.setattr(declared_checks, "LARGEST", np.inf)
     masses, gravity = [*MASSES, 100.0], [9.81, 9.81, 9.81, 1e308]
     dataset = sweep({"loads.0.mass": masses, "run.gravity": gravity}, paired=True)
     assert dataset.failed.values.tolist() == [False, False, False, True]
