@@ -37,6 +37,7 @@ from tuning.logs.description import LogDescription, read_description
 from tuning.logs.log import Log, check_samples
 from tuning.logs.quality import interpolate_invalid
 from tuning.logs.readers import LogTable, is_time_name, read_tables
+from tuning.logs.readers.table import shown
 from tuning.logs.units import UNITS, transducer_unit, unit
 
 MAX_TEXT = 120  # characters of the name or the unit of a column, as messages quote it
@@ -213,7 +214,7 @@ def _check_texts(path, table: LogTable) -> None:
             if text is not None and len(repr(text)) > MAX_TEXT:
                 raise ValueError(
                     f"{path}: the {what} of column {i + 1} has {len(text)} characters,"
-                    f" {text[:20]!r}...; the file is damaged, or give it a shorter one"
+                    f" {shown(text)}; the file is damaged, or give it a shorter one"
                 )
 
 

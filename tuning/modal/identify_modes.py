@@ -141,7 +141,8 @@ def identify_modes(
         if found is None and band is None:
             # A decay drowns sooner in the noise of a wide band.
             lower = kinetic_band(samples.records, samples.rate, derivatives, HALF_POWER)
-            for narrower in (lower, band_of_ends(samples, derivatives, lower)):
+            others = dict.fromkeys((lower, band_of_ends(samples, derivatives, lower)))
+            for narrower in (one for one in others if one != used_band):
                 marks = excited(samples, derivatives, narrower)
                 found = free_decay_modes(samples, marks, derivatives, narrower, **how)
                 if found is not None:

@@ -187,12 +187,12 @@ def _bad_cell(path, names, rows, lines) -> ValueError:
             try:
                 float(cell)
             except ValueError:
-                place = f"{path}, line {line}, column {_shown(name)}"
-                return ValueError(f"{place}: {_shown(cell)} is no number")
+                place = f"{path}, line {line}, column {shown(name)}"
+                return ValueError(f"{place}: {shown(cell)} is no number")
     raise AssertionError("numpy refused what Python reads as numbers")
 
 
-def _shown(text: str) -> str:
+def shown(text: str) -> str:
     """A text in quotes, of at most MAX_SHOWN characters: a quote that is open swallows lines."""
     text = text.strip()
     return repr(text if len(text) <= MAX_SHOWN else f"{text[: MAX_SHOWN - 3]}...")

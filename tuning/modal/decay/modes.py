@@ -223,11 +223,12 @@ def _is_cube(mode: IdentifiedMode, other: IdentifiedMode) -> bool:
 
 
 def _dominate(decays, struck, records, ratio, cycle) -> bool:
-    """Whether decays hold much of the energy of a log, or one falls far from a level like its own.
+    """Whether decays hold much of the energy of a log, or one falls far, or follows a load.
 
     `cycle` is that of the strongest vibration in samples. A decay that begins far below the level
     of the log, long after blows, lacks the modes that were gone by then; one that begins where a
-    lasting excitation ends has them all, however much stronger the excitation was.
+    lasting excitation ends has them all, however much stronger the excitation was, and how far it
+    falls is of no matter.
     """
     inside = sum(
         np.sum(records[d.record][int(d.start * ratio) : int(d.stop * ratio)] ** 2) for d in decays
@@ -238,8 +239,8 @@ def _dominate(decays, struck, records, ratio, cycle) -> bool:
     start = int(np.ceil(longest.start * ratio))
     first = records[longest.record][start : start + int(2 * cycle) + 1]
     begins = np.sum(first**2) / len(first) > MIN_START_LEVEL * level
+    falls = begins and longest.fall > LONG_FALL_NEPERS
     follows = _follows(longest, struck[longest.record], cycle / ratio)
-    falls = longest.fall > LONG_FALL_NEPERS and begins
     return bool(inside > MIN_DECAY_ENERGY * whole or falls or follows)
 
 
