@@ -65,7 +65,9 @@ class RunBase(SphinxDirective):
     def page(self) -> Page:
         """The page that is read."""
         pages = self.env.temp_data.setdefault("run_pages", {})
-        return pages.setdefault(self.env.docname, Page())
+        if self.env.docname not in pages:
+            pages[self.env.docname] = Page()
+        return pages[self.env.docname]
 
     def code(self, text: str, language: str, caption: str = "") -> list[nodes.Node]:
         """A block of code."""

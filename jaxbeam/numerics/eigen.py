@@ -1,7 +1,9 @@
 """Generalised symmetric eigenvalue problem, with derivatives valid at repeated eigenvalues too."""
 
 import functools
-from typing import Any, NamedTuple
+import hashlib
+import weakref
+from typing import Any
 
 import numpy as np
 
@@ -22,30 +24,28 @@ def eigen(stiffness, mass):
     """
     if any_jax(stiffness, mass):
         return _solution(stiffness, mass)
-    return _known_solution(*(_Known.of(np.asarray(matrix)) for matrix in (stiffness, mass)))
+    stiffness, mass = (np.ascontiguousarray(matrix) for matrix in (stiffness, mass))
+    return _known_solution(_Known(stiffness), _Known(mass))
 
 
-class _Known(NamedTuple):
-    """A matrix of known numbers that has a hash."""
+class _Known:
+    """A matrix of known numbers that has a hash, and is not kept longer than by others."""
 
-    content: bytes
-    dtype: str
-    rows: int
+    def __init__(self, matrix: np.ndarray):
+        self.reference = weakref.ref(matrix)
+        self.content = matrix.dtype.str, matrix.shape, hashlib.sha256(matrix).digest()
 
-    @classmethod
-    def of(cls, matrix: np.ndarray) -> "_Known":
-        """From an array."""
-        return cls(matrix.tobytes(), matrix.dtype.str, len(matrix))
+    def __hash__(self) -> int:
+        return hash(self.content)
 
-    def array(self) -> np.ndarray:
-        """The array."""
-        return np.frombuffer(self.content, self.dtype).reshape(self.rows, -1)
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Known) and self.content == other.content
 
 
 @functools.lru_cache(maxsize=2)  # a run asks some five times for the modes of one beam
 def _known_solution(stiffness: _Known, mass: _Known) -> tuple[Any, ...]:
     """`eigen` of known numbers; read-only arrays."""
-    parts = _solution(stiffness.array(), mass.array())
+    parts = _solution(stiffness.reference(), mass.reference())
     for part in parts:
         part.setflags(write=False)
     return parts
@@ -54,9 +54,7 @@ def _known_solution(stiffness: _Known, mass: _Known) -> tuple[Any, ...]:
 def _solution(stiffness, mass):
     """`eigen` without its derivative."""
     factor = xp.linalg.cholesky(stiffness + mass)  # shifted: rigid-body modes are not singular
-    mass_half_solved = solve_triangular(factor, mass, lower=True)
-    flexibility = solve_triangular(factor, mass_half_solved.T, lower=True)
-    inverse, vectors = xp.linalg.eigh((flexibility + flexibility.T) / 2)
+    inverse, vectors = xp.linalg.eigh(_flexibility(factor, mass))
     vectors = solve_triangular(factor.T, vectors[:, ::-1], lower=False)
     inverse = xp.maximum(inverse[::-1], xp.finfo(inverse.dtype).tiny)
     squares = xp.sum(vectors * (mass @ vectors), axis=0)
@@ -66,6 +64,13 @@ def _solution(stiffness, mass):
     values = xp.sum(vectors * (stiffness @ vectors), axis=0)
     values = xp.where(values > RIGID_BODY_EIGENVALUE, values, 0.0)
     return values, vectors, xp.broadcast_to(xp.zeros((), mass.dtype), mass.shape)
+
+
+def _flexibility(factor, mass):
+    """L^-1 M L^-T of the factor L: symmetric, with the eigenvalues 1 / (1 + lambda)."""
+    half = solve_triangular(factor, mass, lower=True)
+    flexibility = solve_triangular(factor, half.T, lower=True)
+    return (flexibility + flexibility.T) / 2
 
 
 @eigen.defjvp

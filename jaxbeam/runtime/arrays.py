@@ -18,6 +18,7 @@ import numpy as np
 from jaxbeam.runtime import lapack
 
 _KNOWN = {np.ndarray, np.float64, np.int64, np.bool_, float, int, bool, str, type(None), slice}
+MAX_TRIANGLE_ROWS = 64  # of triangular systems that are solved as general ones
 
 
 def is_jax(value: Any) -> bool:
@@ -306,14 +307,28 @@ def solve_triangular(matrix, right, lower: bool, transposed: bool = False) -> An
         return np.zeros_like(right)
     if right.ndim > 1:  # without scipy, which takes 0.1 s to import
         matrix, lower = (matrix.T, not lower) if transposed else (matrix, lower)
-        # Reversed, a lower triangle is an upper one, of which elimination changes nothing.
-        return solve(matrix[::-1, ::-1], right[::-1])[::-1] if lower else solve(matrix, right)
+        return _solve_by_halves(matrix, right, lower)
     from scipy.linalg import lapack as scipy_lapack
 
     # LAPACK itself: the function of scipy takes ten times as long as a small system. In the order
     # of Fortran its matrix is the transposed one.
     solution, singular = scipy_lapack.dtrtrs(matrix.T, right, not lower, not transposed)
     return np.full_like(solution, np.nan) if singular else solution
+
+
+def _solve_by_halves(matrix, right, lower: bool):
+    """`solve_triangular` of known columns: 528 rows in half the time of a general system."""
+    rows = len(matrix)
+    if rows <= MAX_TRIANGLE_ROWS:
+        # Reversed, a lower triangle is an upper one, of which elimination changes nothing.
+        return solve(matrix[::-1, ::-1], right[::-1])[::-1] if lower else solve(matrix, right)
+    halves = [slice(rows // 2), slice(rows // 2, rows)]
+    first, last = halves if lower else halves[::-1]
+    solution = np.empty(right.shape, np.result_type(matrix, right))
+    solution[first] = _solve_by_halves(matrix[first, first], right[first], lower)
+    left = right[last] - matrix[last, first] @ solution[first]
+    solution[last] = _solve_by_halves(matrix[last, last], left, lower)
+    return solution
 
 
 def solve_tridiagonal(lower, diagonal, upper, right) -> Any:
