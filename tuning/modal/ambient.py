@@ -13,7 +13,7 @@ from scipy import linalg
 from scipy.stats import norm, t as student
 
 from tuning.modal.likelihood.refine import Start, refine_modes
-from tuning.modal.preprocessing import Prepared, prepare
+from tuning.modal.preprocessing import Prepared, check_length, prepare
 from tuning.modal.result import (
     MIN_ENERGY_SHARE,
     IdentifiedMode,
@@ -23,6 +23,7 @@ from tuning.modal.result import (
 from tuning.modal.shapes import mac_matrix
 from tuning.modal.stabilisation import Chain, Diagram, stabilise
 from tuning.modal.subspace import (
+    MIN_BLOCK_ROWS,
     Poles,
     Spread,
     block_rows,
@@ -34,6 +35,8 @@ from tuning.modal.subspace import (
 MAX_ORDER = 60
 MAX_BAND_RATIO = 8.0  # upper over lower end of the bands that are identified one by one
 BAND_OVERLAP = 1.1  # by which such bands exceed their part
+RECORD_OVER_ROWS = 4  # samples of a record over block rows, for covariances of all lags
+MIN_LENGTH = RECORD_OVER_ROWS * MIN_BLOCK_ROWS
 DUPLICATE_SDS = 2.0  # standard deviations within which two poles are one
 DUPLICATE_MAC = 0.9
 
@@ -67,19 +70,34 @@ def subspace_modes(
     """Candidate modes and the stabilisation diagram of each part of a band (Hz).
 
     Of rejected modes those are accepted that the likelihood of periodograms needs (`refine`), but
-    not in free decays, whose periodograms are not random.
+    not in free decays, whose periodograms are not random. There the modes are only those that a fit
+    starts from, and orders are at most what the records allow.
+
+    Raises ValueError for too few samples of records that are no decays.
     """
     found: list[Candidate] = []
     diagrams = []
-    parts = divided_band(band)
-    for low, high in parts:
+    # Parts of a band, the lowest, whose samples are too few are left out.
+    rows = _rows_of_order(order, records) if refine else 0
+    least = max(RECORD_OVER_ROWS * rows, MIN_LENGTH)
+    for low, high in divided_band(band):
         if progress:
             progress(f"modes from {low:.3g} Hz to {high:.4g} Hz")
         prepared = prepare(records, starts, rate, overlapping((low, high), band))
+        if max(map(len, prepared.records)) < least:
+            continue
         candidates, diagram = _modes_of_band(prepared, band, data_driven, order, refine)
         found += candidates
         diagrams.append(diagram)
+    if refine and not diagrams:
+        of_order = f"models of order {order} (lower ones need fewer)"
+        check_length(prepared, least, of_order if order else "any model")
     return without_duplicates(found), tuple(diagrams)
+
+
+def _rows_of_order(order: int | None, records) -> int:
+    """Block rows of a Hankel matrix for models of an order; 0 for none."""
+    return 0 if order is None else order // records[0].shape[1] + 1
 
 
 def overlapping(part: tuple[float, float], band: tuple[float, float]) -> tuple[float, float]:
@@ -101,7 +119,8 @@ def _modes_of_band(prepared: Prepared, whole, data_driven, order, refine):
     channels, longest = records[0].shape[1], max(map(len, records))
     rows = block_rows(prepared.rate, prepared.band[0], channels, longest)
     if order is not None:
-        rows = max(rows, order // channels + 1)
+        order = min(order, (longest // RECORD_OVER_ROWS - 1) * channels)
+        rows = max(rows, _rows_of_order(order, records))
     subspace = decompose(records, prepared.rate, rows, data_driven)
     highest = order or min(MAX_ORDER, 2 * rows * channels // 3)
     parts = [poles_of_order(subspace, n) for n in range(2, highest + 1, 2)]

@@ -2,7 +2,7 @@
 
 A line is found by the F-test of several tapers (Thomson 1982; Percival and Walden 1993, section
 10.11): its power exceeds that of the continuous spectrum within the bandwidth of the tapers. It
-must have the same amplitude and phase throughout the record, which a resonance has not, nor the
+must have the same amplitude and phase throughout the record, which a resonance has not, nor one
 decay of a lightly damped mode.
 """
 
@@ -16,6 +16,7 @@ from scipy.stats import f as f_distribution
 
 from tuning.modal.ambient import Candidate
 from tuning.modal.preprocessing import prepare
+from tuning.modal.result import IdentifiedMode
 from tuning.modal.samples import Samples
 
 TAPERS, TIME_BANDWIDTH = 7, 4.0
@@ -203,6 +204,18 @@ def subtract_lines(
     frequencies = tuple(line.frequency for line in lines) + tuple(exclude)
     centred = (record - record.mean(axis=0) for record in samples.records)
     return lines, tuple(without_lines(one, samples.rate, frequencies) for one in centred)
+
+
+def lines_besides(lines: tuple[Line, ...], modes: Sequence[IdentifiedMode]) -> tuple[Line, ...]:
+    """Lines that are no modes of free decays.
+
+    After blows at equal intervals a mode of little damping may look like a line.
+    """
+    return tuple(
+        line
+        for line in lines
+        if not any(abs(line.frequency / m.frequency - 1) < 2 * m.damping_ratio for m in modes)
+    )
 
 
 def wandering_lines(

@@ -34,6 +34,7 @@ from tuning.modal.forced.modes import forced_modes
 from tuning.modal.harmonics import (
     fundamental,
     is_multiple,
+    lines_besides,
     subtract_lines,
     wandering_lines,
 )
@@ -131,8 +132,6 @@ def identify_modes(
         low, high = kinetic_band(cleaned, samples.rate, derivatives)
         used_band = min(low, used_band[0]), max(high, used_band[1])
         lines, cleaned = subtract_lines(samples, used_band, exclude)
-    if lines:
-        choices.append(Choice(f"{len(lines)} harmonic lines subtracted", "--exclude FREQUENCY"))
     struck = excited(samples, derivatives, used_band)
     found = None
     if kind != "ambient" and method not in SPECTRAL_METHODS:
@@ -154,9 +153,12 @@ def identify_modes(
     if found is None:
         used_method = method or "covariance"
         found = _ambient_modes(cleaned, samples, used_band, used_method, order, progress)
+        if lines:
+            choices.append(Choice(f"{len(lines)} harmonic lines subtracted", "--exclude FREQUENCY"))
         lines += wandering_lines(found.candidates, cleaned, samples, used_band)
     else:
         found = _Found(*found)
+        lines = lines_besides(lines, [one.mode for one in found.candidates if not one.reason])
     if kind is None:
         says = _kind_words(found, struck, lines)
         choices.append(Choice(says, "--kind ambient, --kind 'free decay', --from and --to"))

@@ -165,3 +165,14 @@ def prepare(
             values = sosfiltfilt(sos, values, axis=0)
         found.append(values)
     return Prepared(tuple(found), starts, new_rate, band)
+
+
+def check_length(prepared: Prepared, least: int, what: str) -> None:
+    """Raise ValueError if the longest record has too few samples for a method."""
+    longest = max(map(len, prepared.records))
+    if longest < least:
+        raise ValueError(
+            f"{longest} samples, at the {prepared.rate:.4g} Hz that a band to "
+            f"{prepared.band[1]:.4g} Hz needs, are too few for {what}: at least {least} are "
+            "needed; take a longer window, or a band to higher frequencies"
+        )

@@ -146,3 +146,30 @@ def test_a_decay_after_a_strong_excitation_counts():
     fit = identify_modes(log_of(planted))
     assert fit.kind == "free decay", str(fit)
     np.testing.assert_allclose(fit.frequencies, planted.structure.frequencies[:2], rtol=2e-3)
+
+
+@pytest.mark.parametrize(("soft_blow", "stops_before"), [(5.0, 5.0), (None, 10.0)])
+def test_a_decay_ends_where_a_blow_too_soft_to_be_found_adds_to_it(soft_blow, stops_before):
+    """Neither do the beats of close modes end it, which make the energy rise ten times."""
+    times = np.arange(2000) / 200
+    decays = [
+        size * np.exp(-0.3 * times) * np.sin(2 * np.pi * f * times + 1)
+        for f, size in ((8.0, 1.0), (8.4, 0.7))
+    ]
+    record = np.sum(decays, axis=0)
+    if soft_blow is not None:
+        late = times - soft_blow
+        record += np.where(late > 0, np.exp(-0.3 * late) * np.sin(2 * np.pi * 8.0 * late), 0)
+    marks = np.zeros(times.size, bool)
+    marks[1] = True
+    (found,) = free_decays((marks,), (record[:, None],), 200.0, 8.2)
+    assert stops_before - 1.0 < found.stop / 200 <= stops_before
+
+
+def test_a_mode_of_blows_at_equal_intervals_is_no_harmonic_line():
+    """Four blows, two too soft to be found: in phase, the decays of one mode look like a line."""
+    planted = sampled(random_structure(930), "blows", 930, 60.0)
+    fit = identify_modes(log_of(planted))
+    assert not fit.lines and "subtracted" not in str(fit)
+    one = compare(fit, planted)
+    assert not one.missed and not one.false_modes

@@ -249,6 +249,27 @@ def test_mistakes(arguments, message):
         identify_modes(decay(0), **arguments)
 
 
+@pytest.mark.parametrize(
+    ("count", "arguments", "message"),
+    [
+        (
+            64,
+            {},
+            "27 samples, at the 20.48 Hz that a band to 8 Hz needs, are too few for any",
+        ),
+        (100, {"order": 60}, r"models of order 60 \(lower ones need fewer\): at least 124"),
+        (100, {"order": 60, "method": "data"}, "too few for models of order 60"),
+        (70, {"method": "plscf"}, "too few for method 'plscf': at least 96"),
+        (200, {"method": "fdd"}, "too few for method 'fdd': at least 256"),
+    ],
+)
+def test_logs_too_short_for_a_method(count, arguments, message):
+    noise = np.random.default_rng(0).normal(size=(count, 2))
+    log = Log(np.arange(count) / 50, noise, ("v1", "v2"), ("velocity",) * 2, ("m/s",) * 2)
+    with pytest.raises(ValueError, match=message):
+        identify_modes(log, kind="ambient", band=(1.0, 8.0), **arguments)
+
+
 def test_uneven_sampling_is_interpolated():
     log = decay(0, drift=0.0)
     wandering = log.times + 0.004 * np.sin(0.5 * log.times)

@@ -29,6 +29,8 @@ MAX_DAMPING = 0.15  # ratio of a vibration
 # Instants one after another that end the search: some errors, as a weak vibration is seen some
 # cycles late, or clear ones.
 MAX_REFUSED, CLEAR_MISFIT = 8, 1.5
+GOOD_FIT = 0.6  # misfit of an end without forces: errors a fifth more than noise, at most
+MARGIN_CYCLES = 1.5  # by which the end begins later, as forces just before it show little
 MAX_UNEXPLAINED = 0.15  # of the energy of the first part
 MIN_FALL = 1.0  # nepers, of the energy that is explained, from the first part to the last
 SAME_RATE, FIRST_PARTS = 0.5, 3  # of the slope of the energy in these parts, to be as before them
@@ -82,8 +84,9 @@ def free_end(
     starts = range(count - shortest, -1, -step)
     accepted = later = ends.fit(starts[0])
     refused, previous = 0, 0.0
-    for start in starts[1:]:
-        end = ends.fit(start)
+    earliest = starts[0]
+    for earliest in starts[1:]:
+        end = ends.fit(earliest)
         misfit = ends.misfit(end, accepted)
         alike = misfit <= 1.0
         if alike and previous <= 1.0:  # one alone, after refusals, may be so by chance
@@ -93,15 +96,39 @@ def free_end(
         if refused == MAX_REFUSED or min(misfit, previous) > CLEAR_MISFIT:
             break
         previous = misfit
+    if not refused:
+        return None
+    # Forces that end within a step show little: the end begins one step after the earliest, or
+    # earlier, where an end has the errors of noise.
+    compared = ends.fit(min(later.start + 2 * step, starts[0]))
+    fine = range(later.start, earliest, -max(int(cycle / 2), 2))
+    found = _earliest_good(ends, fine, compared) or later
     # Soon after the beginning, errors may be those of vibrations that are gone at once.
-    if later.start < count // PARTS or not (refused and later.is_decay):
+    if found.start < count // PARTS or not found.is_decay:
         return None
     # What decays from the beginning, but not quite linearly, has no forces before the end, either.
-    before = _slope(_of_parts(np.mean(values[: later.start] ** 2, axis=1)), later.start)
-    if before < SAME_RATE * later.slope:
+    before = _slope(_of_parts(np.mean(values[: found.start] ** 2, axis=1)), found.start)
+    if before < SAME_RATE * found.slope:
         return None
-    # Forces that end within a step show little: the end begins one step after the earliest.
-    return later.start
+    return min(found.start + int(MARGIN_CYCLES * cycle), later.start)
+
+
+def _earliest_good(ends: "_Ends", starts: range, shorter: _End) -> _End | None:
+    """The earliest end, from one backwards, whose errors are those of the noise.
+
+    Only ends that begin soon after the forces show the modes that decay first: errors of others,
+    which lack them, may be more.
+    """
+    found, previous = None, 0.0
+    for start in starts[1:]:
+        end = ends.fit(start)
+        misfit = ends.misfit(end, shorter)
+        if misfit <= GOOD_FIT:
+            found = end
+        if min(misfit, previous) > CLEAR_MISFIT:
+            break
+        previous = misfit
+    return found
 
 
 class _Ends:

@@ -28,7 +28,7 @@ DECAY_TIMES = 2.0 ** -np.arange(7)  # T, over the duration
 MAX_PARTS = 4  # that are searched one after another, as a load may shake less towards its end
 PARTS = 10  # of a decay, whose errors are compared
 MIN_RATIO, RATIO_SDS = 2.0, 5.0  # of errors of a part to the median; or deviations of the ratio
-MIN_UNEXPLAINED = 0.05  # of the energy of a part; less may be nonlinearity
+MIN_UNEXPLAINED = 0.05  # of the energy of a part, and of the mean; less may be nonlinearity
 
 
 def shaken_until(
@@ -47,7 +47,9 @@ def shaken_until(
     )
     freedom = max(independent * measured.size / PARTS, 1.0)
     ratio = max(MIN_RATIO, 1 + RATIO_SDS * np.sqrt(2 / freedom))
-    more = (errors > ratio * np.median(errors)) & (errors > MIN_UNEXPLAINED * energy)
+    # What is little of the whole decay tells little of it, and may be chance.
+    least = MIN_UNEXPLAINED * np.maximum(energy, energy.mean())
+    more = (errors > ratio * np.median(errors)) & (errors > least)
     if not more.any():
         return 0
     return len(measured) * (int(np.flatnonzero(more)[-1]) + 1) // PARTS

@@ -15,7 +15,7 @@ from tuning.modal.ambient import (
 )
 from tuning.modal.decay.fit import fit_decay
 from tuning.modal.decay.free_end import free_end
-from tuning.modal.decay.leaving import end_of_excitation, shaken_until
+from tuning.modal.decay.leaving import PARTS, end_of_excitation, shaken_until
 from tuning.modal.decay.stretches import (
     MIN_DECAY_CYCLES,
     Stretch,
@@ -150,11 +150,16 @@ def free_decay_modes(
             break
         decays = (first._replace(start=first.start + shaken),)
     channels = samples.records[0].shape[1]
-    energy = np.sum(measured**2, axis=0)
-    limit = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_ENERGY
+    explained = (
+        _unexplained(measured, fitted) < MAX_RESIDUAL_OF_WINDOW
+        if given
+        # Of a long window noise may have most of the energy: the beginning counts, too.
+        else min(_unexplained(measured, fitted), _unexplained(*_beginnings(measured, fitted)))
+        < MAX_RESIDUAL_ENERGY
+    )
     found = _candidates(fits, channels, len(windows) / samples.rate, band)
     good = any(not one.reason for one in found)
-    if kind is None and not (good and np.sum((measured - fitted) ** 2) < limit * energy.sum()):
+    if kind is None and not (good and explained):
         return None
     return found, diagrams, Decays(used, measured[:, :channels], fitted[:, :channels])
 
@@ -174,6 +179,16 @@ def _fits(windows, used, samples: Samples, band, order):
         if (fit := fit_decay(windows, samples.rate, overlapping(part, band), channels, poles))
     ]
     return fits, diagrams
+
+
+def _unexplained(measured, fitted) -> float:
+    """Share of the energy of decays that their fit does not explain."""
+    return float(np.sum((measured - fitted) ** 2) / max(np.sum(measured**2), 1e-300))
+
+
+def _beginnings(*values):
+    """The first part of each."""
+    return tuple(one[: max(len(one) // PARTS, 1)] for one in values)
 
 
 def _within(values, rate, part):

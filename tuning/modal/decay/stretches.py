@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.signal import lfilter
 
 AR_ORDER = 24
@@ -22,6 +23,7 @@ BLOW_SIGNAL_SHARE = 0.25  # of the rms of the signal around, likewise
 BLOW_LOCAL_SD = 8.0  # or of the errors before it; normal errors reach six in a day of samples
 CONTACT_SAMPLES = 4  # within which past and future fail after a blow
 MIN_ENERGY_RISE = 2.0  # energy in two cycles after a blow over that before it
+RISE_WIDTHS = 5  # of two cycles each, before such a rise
 MIN_DECAY_CYCLES = 5.0  # of the strongest vibration
 MIN_FALL_NEPERS = 1.0  # of the energy over a decay
 MIN_START_RATIO = 10.0  # energy of the first tenth over that of the second half, after a blow
@@ -104,7 +106,7 @@ def prediction_errors(
     """
     order = min(AR_ORDER, values.size // 8)
     step = max(values.size // AR_ROWS, 1)
-    past = np.lib.stride_tricks.sliding_window_view(values, order)[:-1:step]
+    past = sliding_window_view(values, order)[:-1:step]
     target, scale = values[order::step], scale[order::step]
     least = 1e-6 * values.std() + 1e-300
     weight = 1 / scale**2
@@ -160,12 +162,28 @@ def free_decays(
                 blow = _begins_high(energy[first:last])
             else:
                 blow = before < 0 or risen > MIN_ENERGY_RISE * energy[before]
+                last = first + _until_rise(energy[first:last], width)
+                stop = min(stop, int(last * ratio))
             fall = _fall_of_decay(energy[first:last], blow)
             if fall > MIN_FALL_NEPERS:
                 length = max(_length(energy[first:last], WHOLE), shortest)
                 stop = min(stop, start + int(length * ratio))
                 found.append(Stretch(number, start, stop, fall))
     return tuple(found)
+
+
+def _until_rise(energy, width):
+    """Samples before the energy rises within `width` above all of the time just before it.
+
+    That is a blow too soft to be found by its errors. Close modes make the energy rise, too, but
+    not above what it was as long before its least.
+    """
+    past = int(RISE_WIDTHS * width)
+    if energy.size < past + 2 * width:
+        return energy.size
+    before = sliding_window_view(energy, past).max(axis=-1)[: -2 * width]
+    risen = energy[past + 2 * width - 1 :][: before.size] > MIN_ENERGY_RISE * before
+    return past + int(np.argmax(risen)) if risen.any() else energy.size
 
 
 def _begins_high(energy):

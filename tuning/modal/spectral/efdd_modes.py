@@ -12,9 +12,9 @@ from jaxtyping import Float
 from scipy.stats import t as student
 
 from tuning.modal.ambient import Candidate, divided_band, overlapping, without_duplicates
-from tuning.modal.preprocessing import prepare
+from tuning.modal.preprocessing import check_length, prepare
 from tuning.modal.result import IdentifiedMode, rejection_reason
-from tuning.modal.spectral.cross_spectra import CrossSpectra, cross_spectra
+from tuning.modal.spectral.cross_spectra import MIN_SEGMENT, CrossSpectra, cross_spectra
 from tuning.modal.spectral.decomposition import (
     Bell,
     along_shape,
@@ -22,6 +22,8 @@ from tuning.modal.spectral.decomposition import (
     single_mode,
     singular_values,
 )
+
+MIN_SEGMENTS = 4  # side by side, for groups of them to be left out in turn
 
 
 class SingularValues(NamedTuple):
@@ -39,13 +41,17 @@ def efdd_modes(
     *,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[tuple[Candidate, ...], tuple[SingularValues, ...]]:
-    """Candidate modes, and the singular values of each part of a band (Hz)."""
+    """Candidate modes, and the singular values of each part of a band (Hz).
+
+    Raises ValueError for too few samples.
+    """
     found: list[Candidate] = []
     drawn = []
     for low, high in divided_band(band):
         if progress:
             progress(f"modes from {low:.3g} Hz to {high:.4g} Hz")
         prepared = prepare(records, starts, rate, overlapping((low, high), band))
+        check_length(prepared, MIN_SEGMENTS * MIN_SEGMENT, "method 'fdd'")
         spectra = cross_spectra(prepared.records, prepared.rate)
         duration = sum(map(len, prepared.records)) / prepared.rate
         inside = (spectra.bins >= low) & (spectra.bins <= high)

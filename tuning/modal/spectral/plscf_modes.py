@@ -17,7 +17,7 @@ from tuning.modal.ambient import (
     overlapping,
     without_duplicates,
 )
-from tuning.modal.preprocessing import RATE_OVER_BAND, Prepared, prepare
+from tuning.modal.preprocessing import RATE_OVER_BAND, Prepared, check_length, prepare
 from tuning.modal.result import IdentifiedMode, rejection_reason
 from tuning.modal.spectral.chains import mode_of_best_half, spread_of_changes
 from tuning.modal.spectral.impulse_responses import (
@@ -38,7 +38,7 @@ from tuning.modal.subspace import Poles, Spread
 
 LAG_CYCLES = 15.0  # cycles of the lowest frequency in the lags of correlations
 MIN_LAGS, MAX_LAGS = 32, 1000
-RECORD_OVER_LAGS = 8  # of the longest record
+RECORD_OVER_LAGS, MIN_RECORD_OVER_LAGS = 8, 3  # of the longest record; at least
 MAX_ORDER = 60
 MIN_DEGREES = 12  # degrees of the polynomials, however many channels there are
 
@@ -52,13 +52,17 @@ def plscf_modes(
     order: int | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[tuple[Candidate, ...], tuple[Diagram, ...]]:
-    """Candidate modes and the stabilisation diagram of each part of a band (Hz)."""
+    """Candidate modes and the stabilisation diagram of each part of a band (Hz).
+
+    Raises ValueError for too few samples.
+    """
     found: list[Candidate] = []
     diagrams = []
     for low, high in divided_band(band):
         if progress:
             progress(f"modes from {low:.3g} Hz to {high:.4g} Hz")
         prepared = prepare(records, starts, rate, overlapping((low, high), band))
+        check_length(prepared, MIN_RECORD_OVER_LAGS * MIN_LAGS, "method 'plscf'")
         candidates, diagram = _modes_of_band(prepared, band, order)
         found += candidates
         diagrams.append(diagram)
