@@ -5,9 +5,9 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.numerics.matrices import expm
 from jaxbeam.runtime.arrays import (
     Array,
-    expm,
     fori_loop,
     is_jax,
     scan,

@@ -370,15 +370,6 @@ def ravel_pytree(tree) -> tuple[Any, Callable]:
     return xp.concatenate([xp.zeros(0), *(xp.ravel(leaf) for leaf in leaves)]), unpack
 
 
-def expm(matrix) -> Any:
-    """Exponential of a matrix."""
-    if is_jax(matrix):
-        return lapack.expm(matrix)
-    import scipy.linalg
-
-    return scipy.linalg.expm(matrix)
-
-
 def block_diag(*blocks) -> Any:
     """Block-diagonal matrix."""
     if any(map(is_jax, blocks)):

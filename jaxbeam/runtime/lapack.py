@@ -13,29 +13,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 MAX_ELIMINATED_ROWS = 16  # of systems that a batch eliminates together
-_MAX_PADE_NORM = 5.37  # of a matrix whose exponential is its Pade approximant (13, 13), in doubles
-_PADE = np.array(
-    [
-        64764752532480000,
-        32382376266240000,
-        7771770303897600,
-        1187353796428800,
-        129060195264000,
-        10559470521600,
-        670442572800,
-        33522128640,
-        1323241920,
-        40840800,
-        960960,
-        16380,
-        182,
-        1,
-    ],
-    float,
-)
 
 
 def _one_matrix_per_call(function: Callable) -> Callable:
@@ -312,31 +291,3 @@ def _(primals, tangents):
 def norm(*args, **kwargs) -> Any:
     """`jax.numpy.linalg.norm` of vectors and Frobenius norms, which need no factorisation."""
     return jnp.linalg.norm(*args, **kwargs)
-
-
-def expm(matrix) -> Any:
-    """Exponential of a matrix by scaling, its Pade approximant (13, 13), and squaring.
-
-    Higham, SIAM J. Matrix Anal. Appl. 26 (2005). The scaling of JAX (0.10 to 0.12) leaves a norm of
-    up to twice the bound of the approximant: errors of 1e-8 where it should be 1e-15.
-    """
-    norm_of_columns = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(matrix), axis=0)))
-    squarings = jnp.maximum(jnp.ceil(jnp.log2(norm_of_columns / _MAX_PADE_NORM)), 0)
-    scaled = matrix / 2**squarings
-    identity = jnp.eye(matrix.shape[0])
-    second = scaled @ scaled
-    fourth = second @ second
-    powers = jnp.stack([identity, second, fourth, fourth @ second])
-    even, odd = _PADE[::2], _PADE[1::2]
-
-    def polynomial(terms):
-        low = jnp.tensordot(terms[:4], powers, 1)
-        return low + powers[3] @ jnp.tensordot(terms[4:], powers[1:4], 1)
-
-    half_even, half_odd = polynomial(even), scaled @ polynomial(odd)
-    root = solve(half_even - half_odd, half_even + half_odd)
-
-    def square(root, step):
-        return jax.lax.cond(step < squarings, lambda r: r @ r, lambda r: r, root), None
-
-    return jax.lax.scan(square, root, jnp.arange(40))[0]

@@ -105,18 +105,19 @@ class _LeastDistance(NamedTuple):
 
 
 def _least_distance(H, f, M, gamma) -> _LeastDistance:
-    factor = cholesky(H)
-    inverse_factor = solve_triangular(factor, xp.eye(H.shape[0]), lower=True)
+    lib = array_namespace(H, f, M, gamma)
+    inverse_factor = solve_triangular(cholesky(H), np.eye(H.shape[0]), lower=True)
     unconstrained = -inverse_factor @ f
     G = M @ inverse_factor.T
-    row_norms = xp.sqrt(xp.sum(G**2, axis=1))
-    row_norms = xp.where(row_norms > 0, row_norms, 1.0)
+    row_norms = lib.sqrt((G**2).sum(axis=1))
+    row_norms = lib.where(row_norms > 0, row_norms, 1.0)
     G = G / row_norms[:, None]
-    h = gamma / row_norms - G @ unconstrained
-    violation = xp.max(-h, initial=0.0)
-    magnitude = xp.max(xp.abs(gamma / row_norms), initial=0.0) + xp.max(xp.abs(unconstrained))
-    limits_matter = ~(violation <= LIMIT_ROUNDING * magnitude) | ~xp.isfinite(magnitude)
-    scale = xp.where(limits_matter, violation, 1.0)
+    limits = gamma / row_norms
+    h = limits - G @ unconstrained
+    violation = (-h).max(initial=0.0)
+    magnitude = abs(limits).max(initial=0.0) + abs(unconstrained).max()
+    limits_matter = ~(violation <= LIMIT_ROUNDING * magnitude) | ~lib.isfinite(magnitude)
+    scale = lib.where(limits_matter, violation, 1.0)
     return _LeastDistance(
         G, h / scale, scale, row_norms, inverse_factor, unconstrained, limits_matter
     )
@@ -207,11 +208,11 @@ def _interior_point(G, h, limits_matter):
         z, multipliers, slack, stationary, limits, _, steps = state
         scaling = 1 / (slack / multipliers + DUAL_REGULARISATION)
         factor = cholesky(identity + (G.T * scaling) @ G)
+        inverse_factor = solve_triangular(factor, identity, lower=True)
 
         def newton(product):
             rest = scaling * (limits - product / multipliers)
-            half = solve_triangular(factor, -stationary - G.T @ rest, lower=True)
-            z_change = solve_triangular(factor, half, lower=True, transposed=True)
+            z_change = -inverse_factor.T @ (inverse_factor @ (stationary + G.T @ rest))
             multiplier_change = rest + scaling * (G @ z_change)
             return z_change, multiplier_change, -(product + slack * multiplier_change) / multipliers
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from tuning.modal.decay.leaving import end_of_excitation, shaken_until
+from tuning.modal.decay.leaving import end_of_excitation, shaken_until, undisturbed
+from tuning.modal.decay.stretches import Stretch
 
 RATE, SIZE = 40.0, 10
 
@@ -56,3 +57,16 @@ def test_a_part_with_more_than_noise_ends_the_excitation():
     noise[:200] += 0.15 * fitted[:200]
     noise[600:800] = noise[800:1000]
     assert shaken_until(fitted + noise, fitted, 0.5) == 0
+
+
+def test_decays_with_more_than_noise_do_not_count():
+    """Three decays of two channels after blows of other strength; forces act in the second."""
+    random = np.random.default_rng(1)
+    fitted = np.exp(-np.arange(2000) / 800)[:, None] * np.repeat([1.0, 0.5, 3.0], 2)
+    measured = fitted + 0.05 * random.normal(size=fitted.shape)
+    decays = tuple(Stretch(0, 2000 * i, 2000 * (i + 1), 2.5) for i in range(3))
+    assert undisturbed(decays, measured, fitted, 2) == decays
+    measured[:, 2:4] += 0.3 * fitted[:, 2:4] * random.normal(size=(2000, 2))
+    assert undisturbed(decays, measured, fitted, 2) == (decays[0], decays[2])
+    # Combinations of more decays are not those of any one.
+    assert undisturbed(decays, measured, fitted, 3) == decays

@@ -64,12 +64,13 @@ class _End(NamedTuple):
 
 
 def free_end(
-    record: Float[np.ndarray, "sample channel"], cycle: float, independent: float
+    record: Float[np.ndarray, "sample channel"], cycle: float, independent: float, since: int = 0
 ) -> int | None:
     """Sample from which on a record decays freely; None where that is not clear.
 
     `cycle` is that of the strongest vibration in samples, `independent` the share of samples that
-    are, in the band of the record.
+    are, in the band of the record. The end is one of the part `since` a sample, after the last
+    blow; if it begins soon after that, nothing but the blow is known to excite the structure.
     """
     values = record / np.maximum(record.std(axis=0), 1e-300)
     count, channels = values.shape
@@ -77,11 +78,11 @@ def free_end(
     lags = min(max(int(lags), MIN_LAGS), count // 8)
     shortest = max(int(MIN_CYCLES * cycle), MIN_LENGTH, 2 * lags)
     last = values[-max(count // PARTS, 1) :]
-    if count < 2 * shortest or np.mean(last**2) > MAX_LEVEL_AT_END * np.mean(values**2):
+    if count - since < 2 * shortest or np.mean(last**2) > MAX_LEVEL_AT_END * np.mean(values**2):
         return None
     step = max(int(2 * cycle), count // MAX_TRIED)
     ends = _Ends(values, lags, independent)
-    starts = range(count - shortest, -1, -step)
+    starts = range(count - shortest, since - 1, -step)
     accepted = later = ends.fit(starts[0])
     refused, previous = 0, 0.0
     earliest = starts[0]
@@ -104,10 +105,11 @@ def free_end(
     fine = range(later.start, earliest, -max(int(cycle / 2), 2))
     found = _earliest_good(ends, fine, compared) or later
     # Soon after the beginning, errors may be those of vibrations that are gone at once.
-    if found.start < count // PARTS or not found.is_decay:
+    if found.start < since + count // PARTS or not found.is_decay:
         return None
     # What decays from the beginning, but not quite linearly, has no forces before the end, either.
-    before = _slope(_of_parts(np.mean(values[: found.start] ** 2, axis=1)), found.start)
+    squares = np.mean(values[since : found.start] ** 2, axis=1)
+    before = _slope(_of_parts(squares), squares.size)
     if before < SAME_RATE * found.slope:
         return None
     return min(found.start + int(MARGIN_CYCLES * cycle), later.start)

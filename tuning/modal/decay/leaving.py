@@ -18,6 +18,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import nnls
 
+from tuning.modal.decay.stretches import Stretch
+
 MIN_GAIN = 12.0  # of the logarithm of the likelihood: of all instants tried, one in ten thousand
 LATEST_LOSS = 2.0  # of the same, within which the latest instant is taken
 MIN_BLOCKS = 10  # before an instant and after it
@@ -53,6 +55,27 @@ def shaken_until(
     if not more.any():
         return 0
     return len(measured) * (int(np.flatnonzero(more)[-1]) + 1) // PARTS
+
+
+def undisturbed(
+    decays: tuple[Stretch, ...],
+    measured: Float[np.ndarray, "sample column"],
+    fitted: Float[np.ndarray, "sample column"],
+    channels: int,
+) -> tuple[Stretch, ...]:
+    """Those of several fitted decays that have no more errors than others.
+
+    Noise is the same in all, however hard the blows were. Columns are the channels of each decay;
+    if they are combinations of decays, all are returned.
+    """
+    if measured.shape[1] != len(decays) * channels:
+        return decays
+    errors, energy = (
+        np.sum(squares, axis=0).reshape(len(decays), -1).sum(axis=1)
+        for squares in ((measured - fitted) ** 2, measured**2)
+    )
+    more = (errors > MIN_RATIO * errors.min()) & (errors > MIN_UNEXPLAINED * energy)
+    return tuple(one for one, has in zip(decays, more, strict=True) if not has)
 
 
 def end_of_excitation(

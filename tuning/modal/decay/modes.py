@@ -15,7 +15,7 @@ from tuning.modal.ambient import (
 )
 from tuning.modal.decay.fit import fit_decay
 from tuning.modal.decay.free_end import free_end
-from tuning.modal.decay.leaving import PARTS, end_of_excitation, shaken_until
+from tuning.modal.decay.leaving import PARTS, end_of_excitation, shaken_until, undisturbed
 from tuning.modal.decay.stretches import (
     MIN_DECAY_CYCLES,
     Stretch,
@@ -34,6 +34,7 @@ MIN_DECAY_ENERGY = 0.3  # share of the energy of a log in its decays, if they ar
 LONG_FALL_NEPERS = 2.0  # or fall of the energy; 95 % of that of an exponential falls by 3
 MIN_START_LEVEL = 0.2  # energy at the start of such a decay over the mean energy of the log
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
+MIN_LEVEL_AT_START = 3.0  # energy of the first part of such a decay over the mean
 MAX_CUTS = 3  # of a decay in which the structure is found to be excited
 NOT_REPRODUCED = "not the same in parts of the window"
 NONLINEAR_DECAY = 2.5, 4.5  # decay rates over that of a mode, of what its nonlinearity adds to it
@@ -69,8 +70,8 @@ def excited(
     for record, own, end in zip(samples.records, prepared.records, ends.records, strict=True):
         values = sosfiltfilt(sos, detrend(record, axis=0), axis=0)
         marks = excited_samples(values, samples.rate, 1 / frequency)
-        # What follows a blow is free from the beginning.
-        start = None if marks.any() else free_end(end, cycle, independent)
+        last = int(np.flatnonzero(marks)[-1] * len(end) / marks.size) + 1 if marks.any() else 0
+        start = free_end(end, cycle, independent, last)
         if start is None:
             marks = _with_excitation(marks, own, max(int(prepared.rate / frequency), 4))
         else:
@@ -131,6 +132,7 @@ def free_decay_modes(
         or _dominate(decays, struck, prepared.records, ratio, prepared.rate / frequency)
     ):
         return None
+    channels = samples.records[0].shape[1]
     for _ in range(MAX_CUTS + 1):
         windows, used = stacked(samples.records, decays)
         if len(windows) < MIN_SAMPLES // 2:
@@ -143,19 +145,22 @@ def free_decay_modes(
             for name in ("measured", "fitted")
         )
         first, *others = used
-        if given or others:
+        if given:
             break
+        if others:
+            free = undisturbed(used, measured, fitted, channels)
+            if len(free) == len(used):
+                break
+            decays = free
+            continue
         shaken = shaken_until(measured, fitted, 2 * (band[1] - band[0]) / samples.rate)
         if not shaken:
             break
         decays = (first._replace(start=first.start + shaken),)
-    channels = samples.records[0].shape[1]
     explained = (
         _unexplained(measured, fitted) < MAX_RESIDUAL_OF_WINDOW
         if given
-        # Of a long window noise may have most of the energy: the beginning counts, too.
-        else min(_unexplained(measured, fitted), _unexplained(*_beginnings(measured, fitted)))
-        < MAX_RESIDUAL_ENERGY
+        else _unexplained_of_decay(measured, fitted) < MAX_RESIDUAL_ENERGY
     )
     found = _candidates(fits, channels, len(windows) / samples.rate, band)
     good = any(not one.reason for one in found)
@@ -186,9 +191,16 @@ def _unexplained(measured, fitted) -> float:
     return float(np.sum((measured - fitted) ** 2) / max(np.sum(measured**2), 1e-300))
 
 
-def _beginnings(*values):
-    """The first part of each."""
-    return tuple(one[: max(len(one) // PARTS, 1)] for one in values)
+def _unexplained_of_decay(measured, fitted) -> float:
+    """The same of a decay, or of its beginning, if most of its energy is there.
+
+    Of the rest of a long window noise may have most.
+    """
+    first = max(len(measured) // PARTS, 1)
+    whole = _unexplained(measured, fitted)
+    if np.mean(measured[:first] ** 2) < MIN_LEVEL_AT_START * np.mean(measured**2):
+        return whole
+    return min(whole, _unexplained(measured[:first], fitted[:first]))
 
 
 def _within(values, rate, part):
