@@ -42,6 +42,25 @@ def test_lasting_forces_and_noise_have_no_free_end(seed):
     assert free_end(noise, CYCLE, 1.0) is None
 
 
+def test_the_free_end_of_what_follows_a_blow():
+    """One that begins with the blow is known; forces after it are not."""
+    record = forced(white(1, until=600), seed=1)
+    step = COUNT // 60
+    for since, known in ((0, False), (200, False), (590, True)):
+        found = free_end(record, CYCLE, 1.0, since)
+        assert (found is None) == known
+        assert known or 600 - step <= found <= 600 + 2 * step
+
+
+def test_the_free_end_is_found_within_cycles():
+    """A mode that decays within four cycles, and one of half its energy that lasts."""
+    late = []
+    for seed in range(8):
+        found = free_end(forced(white(20 + seed, until=600), noise=0.03, seed=seed), CYCLE, 1.0)
+        late.append((found - 600) / CYCLE)
+    assert np.median(np.abs(late)) < 2.0, late
+
+
 def test_steady_hum_is_no_decay():
     """A load that leaves, but a hum that stays, of nearly all the energy that is left."""
     hum = np.cos(2 * np.pi * 3.3 * np.arange(COUNT) / RATE)[:, None] * [1.0, 1.0]
