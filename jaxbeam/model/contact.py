@@ -143,12 +143,27 @@ def contact_at(
     free_force = xp.where(pressing, -(weight + mass * surface_acceleration), 0.0)
     if loads.massless:
         return ContactState(free_force, modal_acceleration + shape.mT @ free_force, ())
-    # The contact law: (1 + m S S') f = -W - s - m (acceleration row) . z.
-    mass_on_beam = xp.where(on_beam, mass, 0.0)
-    identity = np.eye(position.shape[-1])[..., None]
-    matrix = identity + mass_on_beam[..., None, :] * (shape @ shape.mT)[..., None]
-    force = solve_at_instants(matrix, free_force)
+    force = _pressing_forces(shape, xp.where(on_beam, mass, 0.0), free_force)
     return ContactState(force, modal_acceleration + shape.mT @ force, vehicle_acceleration)
+
+
+def _pressing_forces(
+    shape: Float[Array, "*time load mode"],
+    mass: Float[Array, "*time load batch"],
+    free_force: Float[Array, "*time load batch"],
+) -> Float[Array, "*time load batch"]:
+    """Contact forces f of (1 + m S S') f = -W - s - m (acceleration row) . z, the free force.
+
+    Or by the generalised forces Q = S' f of (1 + S' m S) Q = S' (free force), if they are fewer.
+    """
+    loads, modes = shape.shape[-2:]
+    if loads <= modes:
+        coupling = mass[..., None, :] * (shape @ shape.mT)[..., None]
+        return solve_at_instants(np.eye(loads)[..., None] + coupling, free_force)
+    with_mass = xp.moveaxis(mass, -1, -2)[..., None] * shape[..., None, :, :]
+    coupling = xp.moveaxis(shape.mT[..., None, :, :] @ with_mass, -3, -1)
+    generalised = solve_at_instants(np.eye(modes)[..., None] + coupling, shape.mT @ free_force)
+    return free_force - mass * (shape @ generalised)
 
 
 def split_states(state_count: int, loads: LoadSet, states: Float[Array, "*time state batch"]):

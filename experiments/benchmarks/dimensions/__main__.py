@@ -3,16 +3,18 @@
     python -m experiments.benchmarks.dimensions [--quick]
 
 Moving masses on a beam, one dimension at a time, each size in a process of its own; runs of a sweep
-are in `growth` and `stored_runs`. Seconds are of the processor; memory is what the run adds to the
-peak of its process. In the columns "over proportional" time and memory are divided by those of the
-smallest size, and by the ratio of the sizes: 1 where they are proportional. Frequencies grow with
-the square of the number of modes, and so does the number of steps, of which all states are kept:
-time and memory are per step there. A beam of many supports has a mode a span at least, too.
+are in `growth` and `stored_runs`. Seconds are of the processor; memory is the most that a run takes
+at once, as traced by Python in another process, since what a process had before hides what it needs
+again. In the columns "over proportional" time and memory are divided by those of the smallest size,
+and by the ratio of the sizes: 1 where they are proportional. Frequencies grow with the square of
+the number of modes, and so does the number of steps, of which all states are kept: time and memory
+are per step there. A beam of many supports has a mode a span at least, too.
 """
 
 import argparse
 import json
 import time
+import tracemalloc
 import warnings
 
 import numpy as np
@@ -21,7 +23,6 @@ import jaxbeam as jb
 from experiments.benchmarks.common import (
     measure_in_subprocess,
     parser,
-    peak_memory,
     print_row,
     print_table,
 )
@@ -53,27 +54,30 @@ def sized_case(samples: int, modes: int, loads: int, supports: int) -> jb.Case:
     )
 
 
-def measure(dimension: str, size: int) -> dict[str, float]:
-    """Processor time (s) and steps of a run, and peak memory (MiB) with it and before it."""
+def measure(quantity: str, dimension: str, size: int) -> dict[str, float]:
+    """Processor time (s) and steps of a run, or its peak memory (MiB)."""
     case = sized_case(**BASE | {dimension: size})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)
         jb.simulate(sized_case(**BASE))  # imports
-        before, start = peak_memory(), time.process_time()
+        if quantity == "memory":
+            tracemalloc.start()
+            jb.simulate(case)
+            return {"memory": tracemalloc.get_traced_memory()[1] / 2**20}
+        start = time.process_time()
         record = jb.simulate(case)
-    seconds = time.process_time() - start
-    return {"run": seconds, "steps": record.steps, "before": before, "peak": peak_memory()}
+        return {"run": time.process_time() - start, "steps": record.steps}
 
 
 def main() -> None:
     """Print the table."""
     options = parser(__doc__)
     options.add_argument("--quick", action="store_true", help="the smallest size of each")
-    options.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
+    options.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
     arguments = options.parse_args()
     if arguments.measure is not None:
-        dimension, size = arguments.measure
-        print(json.dumps(measure(dimension, int(size))))
+        quantity, dimension, size = arguments.measure
+        print(json.dumps(measure(quantity, dimension, int(size))))
         return
     header = "dimension", "size", "steps", "seconds", "us a step", "over proportional"
     print_table((*header, "MiB", "over proportional"))
@@ -81,8 +85,10 @@ def main() -> None:
         first: tuple[float, float] | None = None
         for size in sizes[:1] if arguments.quick else sizes:
             module = "experiments.benchmarks.dimensions"
-            found = measure_in_subprocess(module, dimension, size, environment={})
-            memory, a_step = found["peak"] - found["before"], 1e6 * found["run"] / found["steps"]
+            found: dict[str, float] = {}
+            for quantity in ("time", "memory"):
+                found |= measure_in_subprocess(module, quantity, dimension, size, environment={})
+            memory, a_step = found["memory"], 1e6 * found["run"] / found["steps"]
             # Samples are the steps of a run; modes shorten steps.
             amount = found["run"] if dimension == "samples" else a_step
             kept = memory / found["steps"] if dimension == "modes" else memory
