@@ -7,7 +7,13 @@ from scipy.integrate import solve_ivp
 from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import Structure, random_structure, response, sampled
 from tuning import Log, identify_modes
-from tuning.modal.decay.stretches import Stretch, excited_samples, free_decays, stacked
+from tuning.modal.decay.stretches import (
+    Stretch,
+    excited_samples,
+    free_decays,
+    stacked,
+    until_soft_blow,
+)
 from tuning.modal.harmonics import harmonic_lines
 from tuning.modal.preprocessing import kinetic_band, prepare, strongest_frequency
 
@@ -164,6 +170,8 @@ def test_a_decay_ends_where_a_blow_too_soft_to_be_found_adds_to_it(soft_blow, st
     marks[1] = True
     (found,) = free_decays((marks,), (record[:, None],), 200.0, 8.2)
     assert stops_before - 1.0 < found.stop / 200 <= stops_before
+    until = until_soft_blow(record[:, None], 50) / 200
+    assert stops_before - 1.0 < until <= stops_before
 
 
 def test_a_mode_of_blows_at_equal_intervals_is_no_harmonic_line():
@@ -173,3 +181,12 @@ def test_a_mode_of_blows_at_equal_intervals_is_no_harmonic_line():
     assert not fit.lines and "subtracted" not in str(fit)
     one = compare(fit, planted)
     assert not one.missed and not one.false_modes
+
+
+@pytest.mark.parametrize("seed", [1114, 1126])
+def test_decays_before_a_soft_blow_count_too(seed):
+    """Of four blows one or three are too soft; the last of them is where the free end begins."""
+    planted = sampled(random_structure(seed), "blows", seed, 60.0)
+    fit = identify_modes(log_of(planted))
+    one = compare(fit, planted)
+    assert len(fit.windows) > 1 and not one.missed and not one.false_modes

@@ -23,6 +23,7 @@ from tuning.modal.decay.stretches import (
     free_decays,
     prediction_errors,
     stacked,
+    until_soft_blow,
 )
 from tuning.modal.preprocessing import HALF_POWER, kinetic_band, prepare, strongest_frequency
 from tuning.modal.result import IdentifiedMode, rejection_reason
@@ -75,7 +76,11 @@ def excited(
         if start is None:
             marks = _with_excitation(marks, own, max(int(prepared.rate / frequency), 4))
         else:
-            marks = np.arange(marks.size) * len(end) < start * marks.size
+            # Decays before it, between blows, are told from others by their errors.
+            decayed = until_soft_blow(end[last:start], max(int(2 * cycle), 4)) if last else 0
+            first = last + (decayed if decayed < start - last else 0)
+            places = np.arange(marks.size) * len(end) / marks.size
+            marks = marks | ((places >= first) & (places < start))
         found.append(marks)
     return tuple(found)
 

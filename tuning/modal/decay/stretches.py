@@ -146,8 +146,7 @@ def free_decays(
     width = max(int(2 * rate / frequency), 4)
     for number, (marks, record) in enumerate(zip(struck, records, strict=True)):
         ratio = marks.size / len(record)
-        scaled = record / np.maximum(record.std(axis=0), 1e-300)
-        energy = _moving_mean(np.sum(scaled**2, axis=1), width)
+        energy = _energy(record, width)
         edges = np.concatenate([[-1], np.flatnonzero(marks), [marks.size]])
         excited_from = 0
         for i in np.flatnonzero(np.diff(edges) >= shortest * ratio):
@@ -170,6 +169,20 @@ def free_decays(
                 stop = min(stop, start + int(length * ratio))
                 found.append(Stretch(number, start, stop, fall))
     return tuple(found)
+
+
+def _energy(record, width):
+    """Energy of a record around each sample, each channel relative to its own."""
+    scaled = record / np.maximum(record.std(axis=0), 1e-300)
+    return _moving_mean(np.sum(scaled**2, axis=1), width)
+
+
+def until_soft_blow(record: Float[np.ndarray, "sample channel"], width: int) -> int:
+    """Samples of a record before a blow too soft to be found by its errors; all if there is none.
+
+    `width` are two cycles of the strongest vibration in samples.
+    """
+    return _until_rise(_energy(record, width), width)
 
 
 def _until_rise(energy, width):
