@@ -186,7 +186,7 @@ def until_soft_blow(record: Float[np.ndarray, "sample channel"], width: int) -> 
 
 
 def _until_rise(energy, width):
-    """Samples before the energy rises within `width` above all of the time just before it.
+    """Samples before the energy rises within `width` above what it was just before.
 
     That is a blow too soft to be found by its errors. Close modes make the energy rise, too, but
     not above what it was as long before its least.
