@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from tuning.logs.log import Log
+from tuning.modal.ambient import MAX_BAND_RATIO
 from tuning.modal.harmonics import Line
 from tuning.modal.result import IdentifiedMode
 from tuning.modal.shapes import mac_matrix
@@ -114,6 +115,8 @@ class ModalFit:
             )
             lines.append(f"  harmonic lines, no modes (share of the variance): {listed}")
         if self.modes:
+            if high > MAX_BAND_RATIO * low:
+                lines.append("  energy: share of that in the three octaves around the mode")
             lines.append("  frequency (Hz)  +- 95 %    damping ratio  +- 95 %     energy")
         else:
             lines.append("  no mode is well identified")

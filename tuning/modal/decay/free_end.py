@@ -33,7 +33,7 @@ GOOD_FIT = 0.6  # misfit of an end without forces: errors a fifth more than nois
 MARGIN_CYCLES = 1.5  # by which the end begins later, as forces just before it show little
 MAX_UNEXPLAINED = 0.15  # of the energy of the first part
 MIN_FALL = 1.0  # nepers, of the energy that is explained, from the first part to the last
-SAME_RATE, FIRST_PARTS = 0.5, 3  # of the slope of the energy in these parts, to be as before them
+SAME_RATE = 0.5  # of the slope of the energy, to be as before it
 MAX_LEVEL_AT_END = 0.5  # of the record's mean energy; more is no decay after a load
 
 
@@ -59,8 +59,12 @@ class _End(NamedTuple):
 
     @property
     def slope(self) -> float:
-        """Slope of the logarithm of the explained energy at the beginning, for a sample."""
-        return _slope(self.explained[:FIRST_PARTS], len(self.errors) * FIRST_PARTS // PARTS)
+        """Slope of the logarithm of the energy, for a sample: that of an exponential of its mean.
+
+        The energy of close modes beats, so that it need not fall at the beginning.
+        """
+        places = (np.arange(PARTS) + 0.5) * len(self.errors) / PARTS
+        return -float(self.explained.sum() / (self.explained @ places))
 
 
 def free_end(

@@ -35,6 +35,7 @@ MIN_DECAY_ENERGY = 0.3  # share of the energy of a log in its decays, if they ar
 LONG_FALL_NEPERS = 2.0  # or fall of the energy; 95 % of that of an exponential falls by 3
 MIN_START_LEVEL = 0.2  # energy at the start of such a decay over the mean energy of the log
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
+MIN_SHARE_OF_MODES = 0.5  # of the energy at the beginning of decays
 MIN_LEVEL_AT_START = 3.0  # energy of the first part of such a decay over the mean
 MAX_CUTS = 3  # of a decay in which the structure is found to be excited
 NOT_REPRODUCED = "not the same in parts of the window"
@@ -168,8 +169,8 @@ def free_decay_modes(
         else _unexplained_of_decay(measured, fitted) < MAX_RESIDUAL_ENERGY
     )
     found = _candidates(fits, channels, len(windows) / samples.rate, band)
-    good = any(not one.reason for one in found)
-    if kind is None and not (good and explained):
+    damped = _share_of_modes(found, fits, len(windows) / samples.rate) > MIN_SHARE_OF_MODES
+    if kind is None and not (damped and explained):
         return None
     return found, diagrams, Decays(used, measured[:, :channels], fitted[:, :channels])
 
@@ -230,6 +231,22 @@ def _candidates(fits, channels, duration, band) -> tuple[Candidate, ...]:
                 reason = rejection_reason(mode, duration, band) or (NOT_REPRODUCED if gone else "")
                 found.append(Candidate(mode, reason, 1))
     return without_duplicates(_without_nonlinearity(found))
+
+
+def _share_of_modes(found: tuple[Candidate, ...], fits, duration: float) -> float:
+    """Share of identified modes in the energy at the beginning of decays, beside rejected ones.
+
+    The energy over all of a decay would count steady hum for more.
+    """
+    good = rejected = 0.0
+    for part, fit in fits:
+        inside = [one for one in found if len(fits) == 1 or part[0] <= one.mode.frequency < part[1]]
+        for one in inside:
+            nepers = 4 * np.pi * one.mode.frequency * one.mode.damping_ratio * duration
+            peak = nepers / -np.expm1(-nepers) if abs(nepers) > 1e-6 else 1.0
+            energy = one.mode.energy_share * peak * np.sum(fit.measured**2)
+            good, rejected = (good, rejected + energy) if one.reason else (good + energy, rejected)
+    return float(good / max(good + rejected, 1e-300))
 
 
 def _without_nonlinearity(found: list[Candidate]) -> list[Candidate]:

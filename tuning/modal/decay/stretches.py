@@ -209,10 +209,13 @@ def _fall_of_decay(energy, blow):
     """Fall in nepers of the energy of a decay; zero if it is neither after a blow nor linear.
 
     A decay that goes on to the end of a stretch has most of the energy above its least. Noise that
-    lasts long after a decay holds much energy, too, but as much below its level as above it.
+    lasts long after a decay holds much energy, too, but as much below its level as above it. What
+    holds most energy after a blow may be one beat of close modes, which does not fall.
     """
     whole = np.cumsum(energy - np.quantile(energy, NOISE_QUANTILE))
-    lengths = _length(energy, CORE), int(np.argmax(whole >= CORE * whole.max())) + 1
+    lengths = [_length(energy, CORE), int(np.argmax(whole >= CORE * whole.max())) + 1]
+    if blow:
+        lengths.append(_length(energy, WHOLE))
     falls = [_fall(energy[:length]) for length in lengths]
     return max((fall for fall, linearity in falls if blow or linearity > MIN_LINEARITY), default=0)
 
