@@ -26,8 +26,9 @@ MIN_COHERENCE = 0.9  # length of the mean of its complex amplitudes over their r
 MIN_FALL, FALL_SDS = 0.1, 4.0  # nepers over a record, and standard deviations, of a decay
 RAYLEIGH_RATIO = 0.5227  # deviation over mean of the envelope of a random vibration
 # Deviation of its estimate from one decay time, and limit in these: of 3000 random vibrations each,
-# over 12 to 100 decay times, 0.38 to 0.43 over the root of their number; half a percent are below.
-RATIO_SD, STEADY_SDS = 0.43, 2.5
+# over 12 to 100 decay times, 0.38 to 0.43 over the root of their number. Below the limit for doubt
+# are one in a hundred, below that for a line one in two thousand: a mode that is lost is worse.
+RATIO_SD, DOUBTFUL_SDS, STEADY_SDS = 0.43, 2.3, 3.3
 STEADY_RATIO = 0.35  # of the envelope of a line in noise of a tenth of its power
 HALF_POWER_WIDTHS = 4.0  # half width of the filter around a pole
 MAX_LINES = 100
@@ -159,19 +160,17 @@ def _falls(sizes):
     return slope * sizes.size < -MIN_FALL and slope < -FALL_SDS * deviation
 
 
-def is_steady(
+def steadiness(
     record: Float[np.ndarray, "time channel"], rate: float, frequency: float, damping_ratio: float
-) -> bool:
-    """Whether the vibration at a pole has the steady amplitude of a machine, though it may wander.
+) -> float:
+    """By how many standard deviations the vibration at a pole is steadier than a resonance.
 
     The envelope of a resonance under random excitation has Rayleigh's distribution, with a ratio of
     deviation to mean of 0.52 (a kurtosis of 3 of the vibration; Jacobsen, Andersen and Brincker
-    2007), estimated from as many decay times as the record has.
+    2007), estimated from as many decay times as the record has. That of a machine, though its speed
+    may wander, is steady. Zero where the ratio is above what a line in noise has.
     """
     independent = 2 * np.pi * damping_ratio * frequency * len(record) / rate
-    limit = min(STEADY_RATIO, RAYLEIGH_RATIO - STEADY_SDS * RATIO_SD / np.sqrt(independent + 1e-9))
-    if limit < 0:
-        return False
     transform = np.fft.fft(record, axis=0)
     bins = np.fft.fftfreq(len(record), 1 / rate)
     half = HALF_POWER_WIDTHS * damping_ratio * frequency
@@ -180,7 +179,10 @@ def is_steady(
     )[:, None]
     channel = int(np.argmax(np.sum(np.abs(transform) ** 2, axis=0) / record.var(axis=0)))
     envelope = np.abs(np.fft.ifft(transform[:, channel]))
-    return bool(envelope.std() < limit * envelope.mean())
+    ratio = envelope.std() / max(envelope.mean(), 1e-300)
+    if ratio > STEADY_RATIO:
+        return 0.0
+    return float((RAYLEIGH_RATIO - ratio) * np.sqrt(independent) / RATIO_SD)
 
 
 def without_lines(
@@ -218,18 +220,26 @@ def lines_besides(lines: tuple[Line, ...], modes: Sequence[IdentifiedMode]) -> t
     )
 
 
-def wandering_lines(
+def steady_candidates(
     candidates: Sequence[Candidate],
     cleaned: tuple[Float[np.ndarray, "_ channel"], ...],
     samples: Samples,
     band: tuple[float, float],
-) -> tuple[Line, ...]:
-    """Candidates of steady amplitude: lines of machines whose speed wanders."""
+) -> tuple[tuple[Line, ...], tuple[float, ...]]:
+    """Candidates that are lines of machines whose speed wanders, and frequencies (Hz) of others.
+
+    The latter may be such lines or resonances.
+    """
     record = max(prepare(cleaned, samples.starts, samples.rate, band).records, key=len)
     rate = samples.rate * len(record) / max(map(len, cleaned))
-    return tuple(
-        Line(c.mode.frequency, min(c.mode.energy_share, 1.0), c.mode.pole)
-        for c in candidates
-        if c.mode.damping_ratio > 0
-        and is_steady(record, rate, c.mode.frequency, c.mode.damping_ratio)
-    )
+    lines, doubtful = [], []
+    for candidate in candidates:
+        mode = candidate.mode
+        if mode.damping_ratio <= 0:
+            continue
+        deviations = steadiness(record, rate, mode.frequency, mode.damping_ratio)
+        if deviations > STEADY_SDS:
+            lines.append(Line(mode.frequency, min(mode.energy_share, 1.0), mode.pole))
+        elif deviations > DOUBTFUL_SDS and not candidate.reason:
+            doubtful.append(mode.frequency)
+    return tuple(lines), tuple(doubtful)

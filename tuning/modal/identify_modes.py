@@ -35,8 +35,8 @@ from tuning.modal.harmonics import (
     fundamental,
     is_multiple,
     lines_besides,
+    steady_candidates,
     subtract_lines,
-    wandering_lines,
 )
 from tuning.modal.preprocessing import HALF_POWER, kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels
@@ -155,7 +155,16 @@ def identify_modes(
         found = _ambient_modes(cleaned, samples, used_band, used_method, order, progress)
         if lines:
             choices.append(Choice(f"{len(lines)} harmonic lines subtracted", "--exclude FREQUENCY"))
-        lines += wandering_lines(found.candidates, cleaned, samples, used_band)
+        wandering, doubtful = steady_candidates(found.candidates, cleaned, samples, used_band)
+        lines += wandering
+        choices += [
+            Choice(
+                f"{frequency:.4g} Hz vibrates more steadily than 99 of 100 resonances: "
+                "a mode, if no machine drives it",
+                f"--exclude {frequency:.4g}",
+            )
+            for frequency in doubtful
+        ]
     else:
         found = _Found(*found)
         lines = lines_besides(lines, [one.mode for one in found.candidates if not one.reason])
