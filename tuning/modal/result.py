@@ -64,7 +64,12 @@ def frequency_and_damping(
     )
 
 
-def rejection_reason(mode: IdentifiedMode, duration: float, band: tuple[float, float]) -> str:
+def rejection_reason(
+    mode: IdentifiedMode,
+    duration: float,
+    band: tuple[float, float],
+    min_collinearity: float = MIN_COLLINEARITY,
+) -> str:
     """Reason why a mode found in `duration` seconds is not well identified; empty if it is."""
     half_width = max(mode.damping_ratio, 0.0) * mode.frequency  # where the power is half
     highest = min(MAX_BAND_SHARE * band[1], band[1] - half_width)
@@ -80,6 +85,6 @@ def rejection_reason(mode: IdentifiedMode, duration: float, band: tuple[float, f
         return f"frequency uncertain by {100 * mode.frequency_sd / mode.frequency:.1f} %"
     if mode.energy_share < MIN_ENERGY_SHARE:
         return f"{100 * mode.energy_share:.2f} % of the energy"
-    if mode.shape.size >= 3 and mode.collinearity < MIN_COLLINEARITY:
+    if mode.shape.size >= 3 and mode.collinearity < min_collinearity:
         return f"a complex shape (modal phase collinearity {mode.collinearity:.2f})"
     return ""

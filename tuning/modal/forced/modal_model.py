@@ -6,7 +6,7 @@ from scipy.stats import t as student
 
 from tuning.modal.forced.common_denominator import Lines
 from tuning.modal.forced.likelihood import FittedModel
-from tuning.modal.forced.terms import resonances_of, split_coefficients
+from tuning.modal.forced.terms import resonances_of, split_coefficients, transients_of
 from tuning.modal.forced.uncertainty import BLOCKS, replicates
 from tuning.modal.result import IdentifiedMode, frequency_and_damping
 
@@ -82,6 +82,11 @@ def unexplained(model: FittedModel) -> Lines:
     return model.plain._replace(outputs=(errors[:count] + 1j * errors[count:]) / level[:, None])
 
 
+def _stacked(found, lines: Lines, modes: int):
+    """Residues above transients (mode, signal, output)."""
+    return np.concatenate(split_coefficients(found, lines, modes), axis=1)
+
+
 def modes_of_model(
     model: FittedModel, scale: Float[np.ndarray, " output"]
 ) -> tuple[IdentifiedMode, ...]:
@@ -91,16 +96,21 @@ def modes_of_model(
     """
     plain, lines, poles, fit = model.plain, model.lines, model.poles, model.fit
     covariances = pole_covariances(model)
-    residues = split_coefficients(fit.found, lines, poles.size)[0]
+    coefficients = _stacked(fit.found, lines, poles.size)
     changes = _coefficient_steps(model, _steps(model))
-    changes = np.array([split_coefficients(one, lines, poles.size)[0] for one in changes])
-    resonances, mirrored = resonances_of(lines, poles)
+    changes = np.array([_stacked(one, lines, poles.size) for one in changes])
+    resonances, mirrored = resonances_of(plain, poles)
+    transients, mirrored_transients = transients_of(plain, poles)
     power = np.maximum(np.sum(np.abs(plain.outputs) ** 2, axis=0), 1e-300)
     modes = []
     for k, pole in enumerate(poles):
-        # A residue (input, output) is participation times shape.
-        along = np.linalg.svd(residues[k])[0][:, 0].conj()
-        physical = (along @ residues[k]) * scale
+        # Residues and transients are multiples of one shape. What they are together is known well,
+        # but hardly each, if one blow at the beginning is all that excites.
+        terms = resonances[:, [k]] * plain.inputs, transients[:, [k]] * plain.unforced
+        signals = np.concatenate(terms, axis=1)
+        response = signals @ coefficients[k]
+        along = np.linalg.svd(response, full_matrices=False)[0][:, 0].conj() @ signals
+        physical = (along @ coefficients[k]) * scale
         largest = int(np.argmax(np.abs(physical)))
         unit = physical / physical[largest]
         moved = (along @ changes[:, k]) * scale / physical[largest]
@@ -109,8 +119,8 @@ def modes_of_model(
         frequency, frequency_sd, damping, damping_sd = frequency_and_damping(
             complex(pole), covariances[k]
         )
-        part = resonances[:, [k]] * (plain.inputs @ residues[k])
-        part = part + mirrored[:, [k]] * (plain.inputs @ residues[k].conj())
+        terms = mirrored[:, [k]] * plain.inputs, mirrored_transients[:, [k]] * plain.unforced
+        part = response + np.concatenate(terms, axis=1) @ coefficients[k].conj()
         modes.append(
             IdentifiedMode(
                 frequency=frequency,

@@ -33,7 +33,7 @@ from tuning.modal.forced.significance import (
     single_pole_chances,
     split_pole,
 )
-from tuning.modal.result import rejection_reason
+from tuning.modal.result import MIN_COLLINEARITY, IdentifiedMode, rejection_reason
 from tuning.modal.stabilisation import Diagram, stabilise
 from tuning.modal.subspace import Poles
 
@@ -45,6 +45,9 @@ WEIGHT_DEGREE_SHARE = 0.5  # degree of the denominator that weights lines, over 
 MIN_WEIGHT = 1e-3  # size of the denominator, over its median, below which weights are equal
 CHANCE = 1e-3  # probability below which noise is no explanation
 SAME_POLE = 0.5  # distance of two poles over the smaller decay rate, below which they are one
+MAX_SHAPE_ERRORS = (
+    0.1  # variance of a shape, over its squares, beyond which it may be complex by chance
+)
 
 
 class ForcedModes(NamedTuple):
@@ -117,9 +120,9 @@ def _modes_of_lines(lines: Lines, scale, part, band, duration, order, known):
         dropped += gone
         used, rest = model.poles, unexplained(model)
     modes = [mode for mode in modes_of_model(model, scale) if part[0] <= mode.frequency <= part[1]]
-    candidates = [Candidate(mode, rejection_reason(mode, duration, band), 1) for mode in modes]
+    candidates = [Candidate(mode, _reason(mode, duration, band), 1) for mode in modes]
     candidates += [
-        Candidate(mode, rejection_reason(mode, duration, band) or reason, 1)
+        Candidate(mode, _reason(mode, duration, band) or reason, 1)
         for mode, reason in dropped
         if part[0] <= mode.frequency <= part[1]
     ]
@@ -128,6 +131,16 @@ def _modes_of_lines(lines: Lines, scale, part, band, duration, order, known):
         drawn,
         (np.sum(np.abs(rest.outputs) ** 2), np.sum(np.abs(model.plain.outputs) ** 2)),
     )
+
+
+def _reason(mode: IdentifiedMode, duration, band) -> str:
+    """Reason for rejecting a mode: a complex shape, only if errors are not what makes it complex.
+
+    Of a close pair that one force excites alike the log tells the sum of the shapes, hardly each.
+    """
+    errors = np.trace(mode.shape_covariance) / np.sum(np.abs(mode.shape) ** 2)
+    least = MIN_COLLINEARITY if errors < MAX_SHAPE_ERRORS else 0.0
+    return rejection_reason(mode, duration, band, least)
 
 
 def _diagram(lines: Lines, scale, part, order) -> Diagram:
