@@ -165,7 +165,7 @@ class _Ends:
             roots = _roots(basis[:, :order], channels)
             if not roots.size:
                 continue
-            powers = roots ** np.arange(count)[:, None]
+            powers = _powers(roots, count)
             columns = np.hstack([powers.real, powers.imag])
             left = values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
             numbers = columns.shape[1] * (channels + 1)
@@ -201,6 +201,14 @@ class _Ends:
             float(ratio) / max(MIN_RATIO, 1 + RATIO_SDS * np.sqrt(2 / max(size * samples, 1.0)))
             for ratio, samples in ratios
         )
+
+
+def _powers(roots, count: int):
+    """Powers 0 to `count` - 1 of roots (power, root), as products of those of a block."""
+    block = int(np.sqrt(count)) + 1
+    within = roots ** np.arange(block)[:, None]
+    starts = (roots**block) ** np.arange(-(-count // block))[:, None]
+    return (starts[:, None] * within).reshape(-1, roots.size)[:count]
 
 
 def _slope(energies, samples: int) -> float:

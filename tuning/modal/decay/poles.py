@@ -197,14 +197,18 @@ def _pole_transform(poles, spectrum: Spectrum):
 
 def _nuisance_columns(spectrum: Spectrum, leakage_order=LEAKAGE_ORDER):
     """Columns of a drift over the window, and of leakage from modes outside the band."""
-    time = np.linspace(-1, 1, spectrum.samples)
-    all_bins = np.fft.rfftfreq(spectrum.samples, spectrum.step)
-    first = int(np.argmin(np.abs(all_bins - spectrum.bins[0])))
+    first = round(spectrum.bins[0] * spectrum.duration)
+    return _drift_and_leakage(spectrum.samples, first, spectrum.bins.size, leakage_order)
+
+
+@functools.lru_cache(maxsize=8)  # of one window a fit asks fifty times, each four long transforms
+def _drift_and_leakage(samples: int, first: int, count: int, leakage_order: int):
+    time = np.linspace(-1, 1, samples)
     drifts = [
-        np.fft.rfft(np.polynomial.Legendre.basis(order)(time))[first : first + spectrum.bins.size]
+        np.fft.rfft(np.polynomial.Legendre.basis(order)(time))[first : first + count]
         for order in range(1, DRIFT_ORDER + 1)
     ]
-    across = np.linspace(-1, 1, spectrum.bins.size)
+    across = np.linspace(-1, 1, count)
     leakage = [across**order * unit for order in range(leakage_order + 1) for unit in (1, 1j)]
     columns = np.stack([*drifts, *leakage], axis=1)
     return columns / np.linalg.norm(columns, axis=0)
