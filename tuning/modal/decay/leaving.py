@@ -29,7 +29,7 @@ ITERATIONS = 8
 DECAY_TIMES = 2.0 ** -np.arange(7)  # T, over the duration
 MAX_PARTS = 4  # that are searched one after another, as a load may shake less towards its end
 PARTS = 10  # of a decay, whose errors are compared
-MIN_RATIO, RATIO_SDS = 2.0, 5.0  # of errors of a part to the median; or deviations of the ratio
+MIN_RATIO, RATIO_SDS = 2.5, 5.0  # of errors of a part to the median; or deviations of the ratio
 MIN_UNEXPLAINED = 0.05  # of the energy of a part, and of the mean; less may be nonlinearity
 
 

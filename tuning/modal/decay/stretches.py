@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.fft import prev_fast_len
 from scipy.signal import lfilter
 
 AR_ORDER = 24
@@ -254,7 +253,6 @@ def stacked(
         one for one, length in zip(decays, lengths, strict=True) if 2 * length >= np.median(lengths)
     )
     length = min(int(np.median(lengths)), min(one.stop - one.start for one in used))
-    length = prev_fast_len(length, real=True)  # a hundredth less at most, and transforms are fast
     parts = np.stack([records[one.record][one.start : one.start + length] for one in used])
     most = max(MAX_COLUMNS // records[0].shape[1], 1)
     if len(used) > most:
