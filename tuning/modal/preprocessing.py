@@ -168,7 +168,10 @@ def prepare(
 
 
 def check_length(prepared: Prepared, least: int, what: str) -> None:
-    """Raise ValueError if the longest record has too few samples for a method."""
+    """Check that the longest record has samples enough for a method.
+
+    Raises ValueError if it has not.
+    """
     longest = max(map(len, prepared.records))
     if longest < least:
         raise ValueError(
