@@ -13,8 +13,14 @@ METHODS = ("covariance", "data", *SPECTRAL_METHODS)
 def check_band(log: Log, rate: float, band: tuple[float, float] | None) -> None:
     """Check a band (Hz) for a log of some sampling rate (Hz).
 
-    Raises ValueError for a band not within 0 and half the sampling rate.
+    Raises ValueError for a band that ends before it begins, or that is not within 0 and half the
+    sampling rate.
     """
+    if band is not None and band[0] >= band[1]:
+        raise ValueError(
+            f"{log.source}: the band from {band[0]:g} Hz to {band[1]:g} Hz must end above where it "
+            "begins"
+        )
     if band is not None and not 0 < band[0] < band[1] <= rate / 2:
         raise ValueError(
             f"{log.source}: the band from {band[0]:g} Hz to {band[1]:g} Hz is not within 0 and "

@@ -240,6 +240,7 @@ def test_table_json_and_figures_of_a_fit(tmp_path):
         ({"window": (2.0, 20.0)}, "the window from 2 s to 20 s is not within the log, 0 s to"),
         ({"window": (3.0, 3.1)}, "10 samples are too few"),
         ({"band": (1.0, 60.0)}, "not within 0 and half the sampling rate, 50 Hz"),
+        ({"band": (20.0, 5.0)}, "the band from 20 Hz to 5 Hz must end above where it begins"),
         ({"count": 0}, "count must be at least 1"),
         ({"kind": "forced"}, "kind must be 'free decay' or 'ambient'"),
     ],
