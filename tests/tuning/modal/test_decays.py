@@ -174,6 +174,18 @@ def test_a_decay_ends_where_a_blow_too_soft_to_be_found_adds_to_it(soft_blow, st
     assert stops_before - 1.0 < until <= stops_before
 
 
+def test_noise_long_after_a_decay_is_no_part_of_it():
+    """Two modes, of which the weaker lasts longer, in noise for twenty times as long."""
+    times = np.arange(60_000) / 200
+    record = np.random.default_rng(0).normal(scale=0.03, size=(times.size, 2))
+    for frequency, rate, size in ((8.0, 1.0, 1.0), (11.0, 0.3, 0.1)):
+        record += size * (np.exp(-rate * times) * np.sin(2 * np.pi * frequency * times))[:, None]
+    marks = np.zeros(times.size, bool)
+    marks[1] = True
+    (found,) = free_decays((marks,), (record,), 200.0, 8.0)
+    assert 3 / 0.3 < found.stop / 200 < 8 / 0.3
+
+
 def test_a_mode_of_blows_at_equal_intervals_is_no_harmonic_line():
     """Four blows, two too soft to be found: in phase, the decays of one mode look like a line."""
     planted = sampled(random_structure(930), "blows", 930, 60.0)

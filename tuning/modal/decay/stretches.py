@@ -31,6 +31,7 @@ MIN_LINEARITY = 0.6  # share of the variance of the log energy that a straight l
 MAX_COLUMNS = 24  # channels times decays that are fitted together
 FALL_PARTS = 10  # parts of a decay whose mean energies tell its fall
 NOISE_QUANTILE = 0.25  # of the energy of a stretch: that of the noise, if the decay has ended
+CORES_BEFORE_NOISE = 8  # times that of 95 % of the energy above noise: 12 decay times of one mode
 CORE, WHOLE = 0.95, 0.999  # shares of the energy of a decay: for its fall, and for its end
 
 
@@ -165,7 +166,7 @@ def free_decays(
                 stop = min(stop, int(last * ratio))
             fall = _fall_of_decay(energy[first:last], blow)
             if fall > MIN_FALL_NEPERS:
-                length = max(_length(energy[first:last], WHOLE), shortest)
+                length = max(_until_noise(energy[first:last]), shortest)
                 stop = min(stop, start + int(length * ratio))
                 found.append(Stretch(number, start, stop, fall))
     return tuple(found)
@@ -218,6 +219,17 @@ def _fall_of_decay(energy, blow):
         lengths.append(_length(energy, WHOLE))
     falls = [_fall(energy[:length]) for length in lengths]
     return max((fall for fall, linearity in falls if blow or linearity > MIN_LINEARITY), default=0)
+
+
+def _until_noise(energy):
+    """Samples that hold nearly all energy above the least, without a long rest of noise.
+
+    Noise has the usual energy of the second half, if it has all of that. Weak modes may last longer
+    than what holds most of the energy above it.
+    """
+    above = np.cumsum(energy - np.median(energy[energy.size // 2 :]))
+    core = int(np.argmax(above >= CORE * above.max())) + 1
+    return min(_length(energy, WHOLE), CORES_BEFORE_NOISE * core)
 
 
 def _length(energy, share):
