@@ -133,26 +133,21 @@ def identify_modes(
         used_band = min(low, used_band[0]), max(high, used_band[1])
         lines, cleaned = subtract_lines(samples, used_band, exclude)
     struck = excited(samples, derivatives, used_band)
-    found = None
-    if kind != "ambient" and method not in SPECTRAL_METHODS:
-        how = {"kind": kind, "whole": window is not None, "order": order}
-        found = free_decay_modes(samples, struck, derivatives, used_band, **how)
-        if found is None and band is None:
-            # A decay drowns sooner in the noise of a wide band.
-            lower = kinetic_band(samples.records, samples.rate, derivatives, HALF_POWER)
-            others = dict.fromkeys((lower, band_of_ends(samples, derivatives, lower)))
-            for narrower in (one for one in others if one != used_band):
-                marks = excited(samples, derivatives, narrower)
-                found = free_decay_modes(samples, marks, derivatives, narrower, **how)
-                if found is not None:
-                    used_band = narrower
-                    break
+    how = {"kind": kind, "whole": window is not None, "order": order}
+    found, may_decay = None, kind != "ambient" and method not in SPECTRAL_METHODS
+    if may_decay:
+        found, used_band = _decays(samples, struck, derivatives, used_band, band is None, how)
     if kind == "free decay" and found is None:
         raise ValueError(f"{logs[0].source}: no free decay found; give its window, or kind ambient")
-    used_method = "decay"
+    used_method = method or "covariance"
     if found is None:
-        used_method = method or "covariance"
         found = _ambient_modes(cleaned, samples, used_band, used_method, order, progress)
+        if may_decay and window is None and all(one.reason for one in found.candidates):
+            # The energy of a short decay falls little, but damped vibrations explain all of it.
+            how["whole"] = True
+            whole, _ = _decays(samples, struck, derivatives, used_band, False, how)
+            found = whole or found
+    if found.decays is None:
         if lines:
             choices.append(Choice(f"{len(lines)} harmonic lines subtracted", "--exclude FREQUENCY"))
         wandering, doubtful = steady_candidates(found.candidates, cleaned, samples, used_band)
@@ -166,7 +161,7 @@ def identify_modes(
             for frequency in doubtful
         ]
     else:
-        found = _Found(*found)
+        used_method = "decay"
         lines = lines_besides(lines, [one.mode for one in found.candidates if not one.reason])
     if kind is None:
         says = _kind_words(found, struck, lines)
@@ -193,6 +188,21 @@ class _Found(NamedTuple):
     decays: Decays | None
     singular_values: tuple[SingularValues, ...] = ()
     kind: str = "ambient"
+
+
+def _decays(samples: Samples, struck, derivatives, band, may_narrow: bool, how):
+    """What decays in a band tell, or in a narrower one, if any; and the band that was used."""
+    found = free_decay_modes(samples, struck, derivatives, band, **how)
+    if found is None and may_narrow:
+        # A decay drowns sooner in the noise of a wide band.
+        lower = kinetic_band(samples.records, samples.rate, derivatives, HALF_POWER)
+        others = dict.fromkeys((lower, band_of_ends(samples, derivatives, lower)))
+        for narrower in (one for one in others if one != band):
+            marks = excited(samples, derivatives, narrower)
+            found = free_decay_modes(samples, marks, derivatives, narrower, **how)
+            if found is not None:
+                return _Found(*found), narrower
+    return None if found is None else _Found(*found), band
 
 
 def _add_order(choices, order, found: _Found) -> None:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from tuning.modal.result import MAX_DAMPING_RATIO
 from tuning.modal.shapes import mac_matrix
 from tuning.modal.subspace import Poles
 
@@ -22,7 +23,6 @@ MIN_MAC = 0.9
 MAX_SKIPPED_ORDERS = 3  # orders in which a chain may lack a pole
 MIN_CHAIN_SHARE = 0.4  # of the orders from its first on
 MIN_CHAIN_ORDERS = 6
-MAX_DAMPING_RATIO = 0.2
 
 
 class Chain(NamedTuple):

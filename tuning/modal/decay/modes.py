@@ -26,7 +26,7 @@ from tuning.modal.decay.stretches import (
     until_soft_blow,
 )
 from tuning.modal.preprocessing import HALF_POWER, kinetic_band, prepare, strongest_frequency
-from tuning.modal.result import IdentifiedMode, rejection_reason
+from tuning.modal.result import MAX_DAMPING_RATIO, IdentifiedMode, rejection_reason
 from tuning.modal.samples import MIN_SAMPLES, Samples
 from tuning.modal.shapes import mac_matrix
 from tuning.modal.stabilisation import Diagram
@@ -236,12 +236,15 @@ def _candidates(fits, channels, duration, band) -> tuple[Candidate, ...]:
 def _share_of_modes(found: tuple[Candidate, ...], fits, duration: float) -> float:
     """Share of identified modes in the energy at the beginning of decays, beside rejected ones.
 
-    The energy over all of a decay would count steady hum for more.
+    The energy over all of a decay would count steady hum for more. Poles damped too strongly for
+    modes, which stand for leakage into the band or the end of a blow, do not count.
     """
     good = rejected = 0.0
     for part, fit in fits:
         inside = [one for one in found if len(fits) == 1 or part[0] <= one.mode.frequency < part[1]]
         for one in inside:
+            if one.mode.damping_ratio > MAX_DAMPING_RATIO:
+                continue
             nepers = 4 * np.pi * one.mode.frequency * one.mode.damping_ratio * duration
             peak = nepers / -np.expm1(-nepers) if abs(nepers) > 1e-6 else 1.0
             energy = one.mode.energy_share * peak * np.sum(fit.measured**2)
