@@ -32,7 +32,7 @@ from tuning.modal.shapes import mac_matrix
 from tuning.modal.stabilisation import Diagram
 
 MIN_DECAY_ENERGY = 0.3  # share of the energy of a log in its decays, if they are to stand for it
-LONG_FALL_NEPERS = 2.0  # or fall of the energy; 95 % of that of an exponential falls by 3
+LONG_FALL_NEPERS = 1.5  # or fall of the energy; 95 % of that of an exponential falls by 3
 MIN_START_LEVEL = 0.2  # energy at the start of such a decay over the mean energy of the log
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
 MIN_SHARE_OF_MODES = 0.5  # of the energy at the beginning of decays
