@@ -202,3 +202,20 @@ def test_decays_before_a_soft_blow_count_too(seed):
     fit = identify_modes(log_of(planted))
     one = compare(fit, planted)
     assert len(fit.windows) > 1 and not one.missed and not one.false_modes
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed", "duration"),
+    [
+        ("decay", 1316, 20.0),  # a strongly damped pole at the edge of the band
+        ("decay", 1416, 20.0),  # its energy falls to a quarter, on the way up and down
+        ("crossing", 1411, 60.0),  # two nepers after the load has left, a quarter of the energy
+        ("blows", 1310, 60.0),  # a pair within its bandwidth, with a fifth of the energy in one
+    ],
+)
+def test_all_strong_modes_of_decays_that_fall_little_or_have_weak_partners(kind, seed, duration):
+    planted = sampled(random_structure(seed), kind, seed, duration)
+    fit = identify_modes(log_of(planted))
+    one = compare(fit, planted)
+    assert fit.kind == "free decay" and not one.missed and not one.false_modes, str(fit)
+    assert one.covered.sum() >= one.covered.size - 2

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
 NOISE_SMOOTHING_BINS = 12  # bins on either side over which the noise level is averaged
 MAX_MODES = 24
@@ -90,14 +91,10 @@ def find_poles(
     `start` are poles (1/s) to begin with; those in the band are refined, and kept if significant.
     """
     channels = spectrum.values.shape[1]
-    # Chi-square tail: half the drop in weighted squares is what the likelihood gains.
+    # Half the drop in weighted squares is what the likelihood gains: by chance half a chi-square
+    # variable of two degrees of freedom for each channel, and two for the pole.
     trials = 4 * spectrum.bins.size
-    min_gain = (
-        channels
-        + 1
-        + np.log(trials / FALSE_ALARM_PROBABILITY)
-        + np.sqrt(2 * (channels + 1) * np.log(trials))
-    )
+    min_gain = float(chi2.isf(FALSE_ALARM_PROBABILITY / trials, 2 * (channels + 1)) / 2)
     best = refine(np.zeros(0, complex), spectrum, _robust_level(spectrum.values))
     misfit_level = (
         NONLINEARITY_SHARE**2
