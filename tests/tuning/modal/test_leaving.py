@@ -4,8 +4,20 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from tuning.modal.decay.leaving import end_of_excitation, shaken_until, undisturbed
+from experiments.validation.modal_identification import compare, log_of
+from tests.oracles.planted_structures import random_structure, sampled
+from tuning import identify_modes
+from tuning.modal.decay.dominant import after_blow
+from tuning.modal.decay.earlier_start import earlier_start
+from tuning.modal.decay.leaving import (
+    PARTS,
+    end_of_excitation,
+    shaken_until,
+    undisturbed,
+    without_excitation,
+)
 from tuning.modal.decay.stretches import Stretch
+from tuning.modal.result import IdentifiedMode
 
 RATE, SIZE = 40.0, 10
 
@@ -70,3 +82,64 @@ def test_decays_with_more_than_noise_do_not_count():
     assert undisturbed(decays, measured, fitted, 2) == (decays[0], decays[2])
     # Combinations of more decays are not those of any one.
     assert undisturbed(decays, measured, fitted, 3) == decays
+
+
+def mode(frequency, shape):
+    shape = np.asarray(shape, complex)
+    return IdentifiedMode(frequency, 0.01, 0.01, 0.001, 0.3, shape, np.eye(2 * shape.size))
+
+
+@pytest.mark.parametrize(
+    ("frequencies", "third", "after", "is_cut"),
+    [
+        ((4.0, 4.2, 4.3), (1.0, 0.6), False, True),
+        ((4.0, 4.2, 4.3), (1.0, -0.6), False, False),  # modes of other shapes may be as close
+        ((4.0, 4.2, 4.5), (1.0, 0.6), False, False),
+        ((4.0, 4.2, 4.3), (1.0, 0.6), True, False),
+    ],
+)
+def test_three_close_modes_of_one_shape_are_made_by_forces(frequencies, third, after, is_cut):
+    decay = Stretch(0, 100, 2100, 2.5)
+    fitted = np.exp(-np.arange(2000) / 800)[:, None] * np.ones((1, 2))
+    measured = fitted + 0.05 * np.random.default_rng(1).normal(size=fitted.shape)
+    shapes = ((1.0, 0.6), (1.0, 0.61), third)
+    modes = [mode(one, shape) for one, shape in zip(frequencies, shapes, strict=True)]
+    (rest,) = without_excitation(
+        (decay,), measured, fitted, modes, channels=2, independent=0.5, after_blow=after
+    )
+    assert rest.start - decay.start == (2000 // PARTS if is_cut else 0)
+
+
+def test_after_a_blow_and_after_a_lasting_excitation():
+    struck = np.zeros(1000, bool)
+    struck[400:403] = True
+    decay = Stretch(0, 404, 1000, 2.5)
+    assert after_blow(decay, struck, 20.0)
+    assert not after_blow(decay._replace(start=410), struck, 20.0)
+    struck[:403] = True
+    assert not after_blow(decay, struck, 20.0)
+
+
+def test_a_smooth_load_whose_end_is_found_early_makes_no_false_modes():
+    """The free end is found six seconds early: there were eight false modes beside the three."""
+    planted = sampled(random_structure(1448), "crossing", 1448, 60.0)
+    one = compare(identify_modes(log_of(planted)), planted)
+    assert not one.missed and not one.false_modes
+
+
+def test_a_decay_begins_earlier_than_its_fast_mode_tells():
+    """Two modes under random forces until 20 s; at 22 s only the slow one is left."""
+    rate, count, until, cycle = 40.0, 2000, 800, 10.0
+    poles = np.array([-0.15 + 25j, -3.0 + 40j])
+    found = []
+    for seed in range(8):
+        random = np.random.default_rng(seed)
+        forces = random.normal(size=count) * (np.arange(count) < until)
+        clean = sum(
+            np.real(lfilter([1.0], [1.0, -np.exp(pole / rate)], forces))[:, None] * [1.0, share]
+            for pole, share in zip(poles, (0.7, -0.8), strict=True)
+        )
+        values = clean + 0.02 * np.std(clean) * random.normal(size=(count, 2))
+        found.append(earlier_start(values, until + 80, rate, (2.0, 12.0), poles[:1], cycle))
+    assert min(found) >= until
+    assert np.median(found) <= until + 40

@@ -11,7 +11,8 @@ if the likelihood of the errors' mean squares, block by block, gains by it more 
 more than by a decay c exp(-t / T) in its place, which modes have that decay faster than most.
 
 A load that excites little while it leaves shows in the fit: decaying modes leave the noise alone,
-which is the same throughout, but more where forces act.
+which is the same throughout, but more where forces act; or the fit explains these, too, by several
+modes where there is one.
 """
 
 import numpy as np
@@ -19,6 +20,8 @@ from jaxtyping import Bool, Float
 from scipy.optimize import nnls
 
 from tuning.modal.decay.stretches import Stretch
+from tuning.modal.result import IdentifiedMode
+from tuning.modal.shapes import mac_matrix
 
 MIN_GAIN = 12.0  # of the logarithm of the likelihood: of all instants tried, one in ten thousand
 LATEST_LOSS = 2.0  # of the same, within which the latest instant is taken
@@ -30,7 +33,43 @@ DECAY_TIMES = 2.0 ** -np.arange(7)  # T, over the duration
 MAX_PARTS = 4  # that are searched one after another, as a load may shake less towards its end
 PARTS = 10  # of a decay, whose errors are compared
 MIN_RATIO, RATIO_SDS = 2.5, 5.0  # of errors of a part to the median; or deviations of the ratio
+SPLIT_RATIO, SPLIT_MAC = 1.1, 0.9  # of three frequencies, and of the shapes of modes of one
 MIN_UNEXPLAINED = 0.05  # of the energy of a part, and of the mean; less may be nonlinearity
+
+
+def without_excitation(
+    decays: tuple[Stretch, ...],
+    measured: Float[np.ndarray, "sample column"],
+    fitted: Float[np.ndarray, "sample column"],
+    modes: list[IdentifiedMode],
+    *,
+    channels: int,
+    independent: float,
+    after_blow: bool,
+) -> tuple[Stretch, ...]:
+    """Those of several fitted decays that are undisturbed, or the part of one; all if nothing is.
+
+    Columns are the `channels` of each decay. `modes` are those of the fit, `independent` is the
+    share of samples that are, in its band; `after_blow` says that nothing acts from the beginning.
+    """
+    first, *others = decays
+    if others:
+        return undisturbed(decays, measured, fitted, channels)
+    shaken = shaken_until(measured, fitted, independent)
+    if not shaken and not after_blow and has_split(modes):
+        shaken = len(measured) // PARTS
+    return (first._replace(start=first.start + shaken),)
+
+
+def has_split(modes: list[IdentifiedMode]) -> bool:
+    """Whether three modes are close and alike: where forces act, the fit makes several of one."""
+    modes = sorted(modes, key=lambda mode: mode.frequency)
+    for first, second, third in zip(modes, modes[1:], modes[2:], strict=False):
+        if third.frequency < SPLIT_RATIO * first.frequency:
+            shapes = np.stack([first.shape, second.shape, third.shape])
+            if mac_matrix(shapes, shapes).min() > SPLIT_MAC:
+                return True
+    return False
 
 
 def shaken_until(

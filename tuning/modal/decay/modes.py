@@ -13,11 +13,12 @@ from tuning.modal.ambient import (
     subspace_modes,
     without_duplicates,
 )
-from tuning.modal.decay.fit import fit_decay
+from tuning.modal.decay.dominant import after_blow, dominate, follows
+from tuning.modal.decay.earlier_start import earlier_start
+from tuning.modal.decay.fit import DecayFit, fit_decay
 from tuning.modal.decay.free_end import free_end
-from tuning.modal.decay.leaving import PARTS, end_of_excitation, shaken_until, undisturbed
+from tuning.modal.decay.leaving import PARTS, end_of_excitation, without_excitation
 from tuning.modal.decay.stretches import (
-    MIN_DECAY_CYCLES,
     Stretch,
     excited_samples,
     free_decays,
@@ -31,9 +32,6 @@ from tuning.modal.samples import MIN_SAMPLES, Samples
 from tuning.modal.shapes import mac_matrix
 from tuning.modal.stabilisation import Diagram
 
-MIN_DECAY_ENERGY = 0.3  # share of the energy of a log in its decays, if they are to stand for it
-LONG_FALL_NEPERS = 1.5  # or fall of the energy; 95 % of that of an exponential falls by 3
-MIN_START_LEVEL = 0.2  # energy at the start of such a decay over the mean energy of the log
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
 MIN_SHARE_OF_MODES = 0.5  # of the energy at the beginning of decays
 MIN_LEVEL_AT_START = 3.0  # energy of the first part of such a decay over the mean
@@ -135,48 +133,52 @@ def free_decay_modes(
     if not decays or not (
         kind
         or given
-        or _dominate(decays, struck, prepared.records, ratio, prepared.rate / frequency)
+        or dominate(decays, struck, prepared.records, ratio, prepared.rate / frequency)
     ):
         return None
-    channels = samples.records[0].shape[1]
-    for _ in range(MAX_CUTS + 1):
-        windows, used = stacked(samples.records, decays)
-        if len(windows) < MIN_SAMPLES // 2:
+    cycle = samples.rate / frequency
+    one = _fitted(decays, samples, band, order)
+    for _ in range(MAX_CUTS):
+        if one is None:
             return None
-        fits, diagrams = _fits(windows, used, samples, band, order)
-        if not fits:
-            return None
-        measured, fitted = (
-            np.sum([_within(getattr(fit, name), samples.rate, part) for part, fit in fits], axis=0)
-            for name in ("measured", "fitted")
-        )
-        first, *others = used
-        if given:
+        rest = one.used if given else _rest(one, samples, struck, band, cycle)
+        if rest == one.used:
             break
-        if others:
-            free = undisturbed(used, measured, fitted, channels)
-            if len(free) == len(used):
-                break
-            decays = free
-            continue
-        shaken = shaken_until(measured, fitted, 2 * (band[1] - band[0]) / samples.rate)
-        if not shaken:
-            break
-        decays = (first._replace(start=first.start + shaken),)
+        one = _fitted(rest, samples, band, order)
+    if one is None:
+        return None
+    if not given:
+        one = _from_earlier(one, samples, struck, band, cycle, order)
     explained = (
-        _unexplained(measured, fitted) < MAX_RESIDUAL_OF_WINDOW
+        _unexplained(one.measured, one.fitted) < MAX_RESIDUAL_OF_WINDOW
         if given
-        else _unexplained_of_decay(measured, fitted) < MAX_RESIDUAL_ENERGY
+        else _unexplained_of_decay(one.measured, one.fitted) < MAX_RESIDUAL_ENERGY
     )
-    found = _candidates(fits, channels, len(windows) / samples.rate, band)
-    damped = _share_of_modes(found, fits, len(windows) / samples.rate) > MIN_SHARE_OF_MODES
+    channels = samples.records[0].shape[1]
+    found = _candidates(one.fits, channels, one.duration, band)
+    damped = _share_of_modes(found, one.fits, one.duration) > MIN_SHARE_OF_MODES
     if kind is None and not (damped and explained):
         return None
-    return found, diagrams, Decays(used, measured[:, :channels], fitted[:, :channels])
+    first = Decays(one.used, one.measured[:, :channels], one.fitted[:, :channels])
+    return found, one.diagrams, first
 
 
-def _fits(windows, used, samples: Samples, band, order):
-    """Fits of decays side by side in each part of a band (Hz), and stabilisation diagrams."""
+class _Fitted(NamedTuple):
+    """Fits of decays of one length (s) side by side, in each part of a band, and of all of it."""
+
+    used: tuple[Stretch, ...]
+    duration: float
+    fits: list[tuple[tuple[float, float], DecayFit]]
+    diagrams: tuple[Diagram, ...]
+    measured: Float[np.ndarray, "sample column"]
+    fitted: Float[np.ndarray, "sample column"]
+
+
+def _fitted(decays, samples: Samples, band, order) -> _Fitted | None:
+    """Fits of decays; None if they are too short."""
+    windows, used = stacked(samples.records, decays)
+    if len(windows) < MIN_SAMPLES // 2:
+        return None
     channels = samples.records[0].shape[1]
     pieces = tuple(windows[:, i : i + channels] for i in range(0, windows.shape[1], channels))
     starts = tuple(one.start / samples.rate for one in used)
@@ -189,7 +191,49 @@ def _fits(windows, used, samples: Samples, band, order):
         for part in divided_band(band)
         if (fit := fit_decay(windows, samples.rate, overlapping(part, band), channels, poles))
     ]
-    return fits, diagrams
+    if not fits:
+        return None
+    measured, fitted = (
+        np.sum([_within(getattr(fit, name), samples.rate, part) for part, fit in fits], axis=0)
+        for name in ("measured", "fitted")
+    )
+    return _Fitted(used, len(windows) / samples.rate, fits, diagrams, measured, fitted)
+
+
+def _rest(one: _Fitted, samples: Samples, struck, band, cycle) -> tuple[Stretch, ...]:
+    """Fitted decays, or what is left of them, in which nothing excites the structure."""
+    channels = samples.records[0].shape[1]
+    found = _candidates(one.fits, channels, one.duration, band)
+    return without_excitation(
+        one.used,
+        one.measured,
+        one.fitted,
+        [candidate.mode for candidate in found if not candidate.reason],
+        channels=channels,
+        independent=2 * (band[1] - band[0]) / samples.rate,
+        after_blow=after_blow(one.used[0], struck[one.used[0].record], cycle),
+    )
+
+
+def _from_earlier(one: _Fitted, samples: Samples, struck, band, cycle, order) -> _Fitted:
+    """The fit of a decay from where it begins, if an excitation has lasted for cycles before it."""
+    decay, *others = one.used
+    if others or not follows(decay, struck[decay.record], cycle):
+        return one
+    poles = [
+        mode.pole
+        for part, fit in one.fits
+        for mode in fit.modes
+        if len(one.fits) == 1 or part[0] <= mode.frequency < part[1]
+    ]
+    values = samples.records[decay.record][: decay.start + len(one.measured)]
+    start = earlier_start(values, decay.start, samples.rate, band, np.array(poles, complex), cycle)
+    if start == decay.start:
+        return one
+    again = _fitted((decay._replace(start=start),), samples, band, order)
+    if again is None or _rest(again, samples, struck, band, cycle) != again.used:
+        return one
+    return again
 
 
 def _unexplained(measured, fitted) -> float:
@@ -272,31 +316,3 @@ def _is_cube(mode: IdentifiedMode, other: IdentifiedMode) -> bool:
     near = abs(mode.frequency - other.frequency) < mode.damping_ratio * mode.frequency
     alike = mac_matrix(mode.shape[None], other.shape[None])[0, 0] > NONLINEAR_MAC
     return bool(near and alike and NONLINEAR_DECAY[0] < rate < NONLINEAR_DECAY[1])
-
-
-def _dominate(decays, struck, records, ratio, cycle) -> bool:
-    """Whether decays hold much of the energy of a log, or one falls far, or follows a load.
-
-    `cycle` is that of the strongest vibration in samples. A decay that begins far below the level
-    of the log, long after blows, lacks the modes that were gone by then; one that begins where a
-    lasting excitation ends has them all, however much stronger the excitation was, and how far it
-    falls is of no matter.
-    """
-    inside = sum(
-        np.sum(records[d.record][int(d.start * ratio) : int(d.stop * ratio)] ** 2) for d in decays
-    )
-    whole = sum(np.sum(record**2) for record in records)
-    level = whole / sum(map(len, records))
-    longest = max(decays, key=lambda d: d.fall)
-    start = int(np.ceil(longest.start * ratio))
-    first = records[longest.record][start : start + int(2 * cycle) + 1]
-    begins = np.sum(first**2) / len(first) > MIN_START_LEVEL * level
-    falls = begins and longest.fall > LONG_FALL_NEPERS
-    follows = _follows(longest, struck[longest.record], cycle / ratio)
-    return bool(inside > MIN_DECAY_ENERGY * whole or falls or follows)
-
-
-def _follows(decay: Stretch, struck, cycle) -> bool:
-    """Whether a decay begins where the structure was excited for five cycles (samples) or more."""
-    before = struck[: max(decay.start - 2, 0)][-int(MIN_DECAY_CYCLES * cycle) :]
-    return bool(before.size and before.all())

@@ -96,11 +96,7 @@ def find_poles(
     trials = 4 * spectrum.bins.size
     min_gain = float(chi2.isf(FALSE_ALARM_PROBABILITY / trials, 2 * (channels + 1)) / 2)
     best = refine(np.zeros(0, complex), spectrum, _robust_level(spectrum.values))
-    misfit_level = (
-        NONLINEARITY_SHARE**2
-        * _smooth(np.abs(spectrum.values) ** 2, NEARBY_BINS)
-        / (2 * NEARBY_BINS + 1)
-    )
+    misfit_level = _misfit_level(spectrum)
     nuisance = _nuisance_columns(spectrum).shape[1]
     most = max(2 * spectrum.bins.size - nuisance, 0) // 3  # a third of the numbers are left over
     if start is not None and start.size:
@@ -111,8 +107,7 @@ def find_poles(
         max_modes = min(max_modes, best.poles.size + MAX_ADDED_MODES)
     while best.poles.size < min(max_modes, most):
         level = _robust_level(best.residual) + misfit_level
-        guess = _initial_pole(spectrum, best.residual, level)
-        trial = refine(np.append(best.poles, guess), spectrum, level, COARSE_TOLERANCE)
+        trial = with_one_more(best, spectrum)
         if (
             _weighted_squares(best.residual, level) - _weighted_squares(trial.residual, level)
             < min_gain
@@ -123,6 +118,12 @@ def find_poles(
     for _ in range(2):
         best = refine(best.poles[np.argsort(best.poles.imag)], spectrum, best.noise)
     return best
+
+
+def _misfit_level(spectrum: Spectrum):
+    """Squares of what no linear structure explains of strong modes nearby."""
+    nearby = _smooth(np.abs(spectrum.values) ** 2, NEARBY_BINS) / (2 * NEARBY_BINS + 1)
+    return NONLINEARITY_SHARE**2 * nearby
 
 
 def _prune_poles(best: PoleFit, spectrum: Spectrum, misfit_level, min_gain: float) -> PoleFit:
@@ -302,6 +303,19 @@ def refine(
         poles = _poles_from_parameters((start + solved.x) / duration)
         poles = np.where(poles.imag < 0, poles.conj(), poles)
     return _fit_amplitudes(poles, spectrum, level, nuisance)
+
+
+def same_poles(poles: Complex[np.ndarray, " mode"], spectrum: Spectrum) -> PoleFit:
+    """Fit of a spectrum by given poles (1/s) as they are, weighted by its own noise level."""
+    level = _robust_level(spectrum.values)
+    return _fit_amplitudes(poles, spectrum, level, _nuisance_columns(spectrum))
+
+
+def with_one_more(fit: PoleFit, spectrum: Spectrum) -> PoleFit:
+    """Poles of a fit of a spectrum, refined beside one that explains most of its residual."""
+    level = _robust_level(fit.residual) + _misfit_level(spectrum)
+    guess = _initial_pole(spectrum, fit.residual, level)
+    return refine(np.append(fit.poles, guess), spectrum, level, COARSE_TOLERANCE)
 
 
 def _fit_amplitudes(poles, spectrum: Spectrum, level, nuisance) -> PoleFit:
