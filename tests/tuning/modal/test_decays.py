@@ -186,6 +186,16 @@ def test_noise_long_after_a_decay_is_no_part_of_it():
     assert 3 / 0.3 < found.stop / 200 < 8 / 0.3
 
 
+@pytest.mark.parametrize("rest", [0.0, 2.0])
+def test_the_rest_before_a_blow_that_was_not_found_is_no_part_of_its_decay(rest):
+    times = np.arange(6000) / 200 - rest
+    decay = np.where(times >= 0, np.exp(-0.5 * times) * np.cos(2 * np.pi * 8.0 * times), 0.0)
+    record = decay + np.random.default_rng(0).normal(scale=0.01, size=times.size)
+    # The log has twice the samples of the band.
+    (found,) = free_decays((np.zeros(2 * times.size, bool),), (record[:, None],), 200.0, 8.0)
+    assert rest <= found.start / 400 <= rest + 2 / 8.0
+
+
 def test_a_mode_of_blows_at_equal_intervals_is_no_harmonic_line():
     """Four blows, two too soft to be found: in phase, the decays of one mode look like a line."""
     planted = sampled(random_structure(930), "blows", 930, 60.0)

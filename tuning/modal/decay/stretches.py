@@ -159,6 +159,9 @@ def free_decays(
                 continue
             risen = energy[first : first + width].mean()
             if i == 0:
+                begins = first + _at_rest(energy[first:last], width)
+                if last - begins >= shortest:
+                    first, start = begins, int(np.ceil(begins * ratio))
                 blow = _begins_high(energy[first:last])
             else:
                 blow = before < 0 or risen > MIN_ENERGY_RISE * energy[before]
@@ -204,6 +207,13 @@ def _begins_high(energy):
     """Whether the energy at the start is far above the usual one of the second half."""
     start = energy[: max(energy.size // FALL_PARTS, 1)].mean()
     return start > MIN_START_RATIO * np.median(energy[energy.size // 2 :])
+
+
+def _at_rest(energy, width):
+    """Samples of the beginning of a record before a blow that was not found by its errors."""
+    if MIN_START_RATIO * energy[:width].min() > energy.max():
+        return 0
+    return int(np.argmax(2 * energy > energy.max())) + width // 2
 
 
 def _fall_of_decay(energy, blow):
