@@ -299,7 +299,8 @@ def _share_of_modes(found: tuple[Candidate, ...], fits, duration: float) -> floa
 def _without_nonlinearity(found: list[Candidate]) -> list[Candidate]:
     """Candidates; those that a nonlinear restoring force makes of others are rejected.
 
-    The cube of a decaying vibration has its frequency and shape, and three times its decay rate.
+    The cube of a decaying vibration has its frequency and shape, three times its decay rate, and
+    less energy, as what it adds is a correction.
     """
     good = [one.mode for one in found if not one.reason]
     return [
@@ -315,4 +316,5 @@ def _is_cube(mode: IdentifiedMode, other: IdentifiedMode) -> bool:
     rate = mode.pole.real / other.pole.real
     near = abs(mode.frequency - other.frequency) < mode.damping_ratio * mode.frequency
     alike = mac_matrix(mode.shape[None], other.shape[None])[0, 0] > NONLINEAR_MAC
-    return bool(near and alike and NONLINEAR_DECAY[0] < rate < NONLINEAR_DECAY[1])
+    less = mode.energy_share < other.energy_share
+    return bool(near and alike and less and NONLINEAR_DECAY[0] < rate < NONLINEAR_DECAY[1])
