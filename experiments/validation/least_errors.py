@@ -79,6 +79,46 @@ def least_errors_of_forced(
     return _of_information(2 * (slopes.conj() @ slopes.T).real, unknowns)
 
 
+def least_errors_of_decays(planted: Planted) -> LeastErrors:
+    """Least errors of free decays together, whose beginnings are known, in noise.
+
+    Unknown are frequencies, damping ratios, shapes, and size and phase of each mode in each decay.
+    Raises ValueError if nothing decays freely, or the responses of the modes are not known.
+    """
+    if planted.parts is None or not planted.decays:
+        raise ValueError(
+            "the least errors of decays need their beginnings, and the modes' responses"
+        )
+    structure, count = planted.structure, len(planted.decays)
+    modes, channels = structure.shapes.shape
+    information, size = 0.0, 2 + channels + 2 * count
+    for number, (start, stop) in enumerate(planted.decays):
+        columns = np.zeros((stop - start, channels, modes, size))
+        times = np.arange(stop - start) / planted.rate
+        for k, (frequency, damping, shape) in enumerate(
+            zip(structure.frequencies, structure.damping_ratios, structure.shapes, strict=True)
+        ):
+            root = -damping + 1j * np.sqrt(1 - damping**2)
+            decaying = np.exp(2 * np.pi * frequency * root * times)
+            basis = np.column_stack([decaying.real, -decaying.imag])
+            part = planted.parts[k, start:stop] @ shape / (shape @ shape)
+            amplitude = complex(*np.linalg.lstsq(basis, part, rcond=None)[0])
+            by_pole = amplitude * times * decaying
+            slopes = root, frequency * (-1 - 1j * damping / np.sqrt(1 - damping**2))
+            for unknown, slope in enumerate(slopes):
+                rate = (2 * np.pi * slope * by_pole).real
+                columns[:, :, k, unknown] = np.multiply.outer(rate, shape)
+            here = slice(2 + channels + 2 * number, 4 + channels + 2 * number)
+            columns[:, :, k, here] = basis[:, None] * shape[:, None]
+            columns[:, range(channels), k, range(2, 2 + channels)] = part[:, None]
+        transforms = np.fft.rfft(columns.reshape(stop - start, channels, -1), axis=0)
+        angles = 2 * np.pi * np.arange(len(transforms)) / (stop - start)
+        deviation = planted.noise * np.sqrt(noise_spectrum(angles) * (stop - start) / 2)
+        rows = (transforms / deviation[:, None, None])[1:-1].reshape(-1, modes * size)
+        information = information + (rows.conj().T @ rows).real
+    return _of_information(information, np.zeros((modes, size)))
+
+
 def _bins(planted: Planted, duration):
     """Bins (Hz) without lines, all near modes and some elsewhere, and how many each stands for."""
     structure = planted.structure

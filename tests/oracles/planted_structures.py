@@ -106,7 +106,10 @@ def coloured_noise(random, shape):
 
 
 class Planted(NamedTuple):
-    """Samples of a log with what was planted in it; `noise` is the rms of the coloured noise."""
+    """Samples of a log with what was planted in it; `noise` is the rms of the coloured noise.
+
+    `parts` are the responses of the modes, `decays` the samples (start, stop) without any force.
+    """
 
     structure: Structure
     values: np.ndarray
@@ -114,6 +117,8 @@ class Planted(NamedTuple):
     energies: np.ndarray  # share of each mode in the variance of the response (after a crossing)
     lines: tuple[float, ...] = ()
     noise: float = 0.0
+    parts: np.ndarray | None = None  # mode, sample, channel
+    decays: tuple[tuple[int, int], ...] = ()
 
 
 def noise_spectrum(angles):
@@ -181,4 +186,12 @@ def sampled(structure: Structure, kind: str, seed: int, duration: float) -> Plan
     free = slice(len(clean) // 2 + 1, None) if kind == "crossing" else slice(None)
     energies = np.mean(parts[:, free].var(axis=1) / clean[free].var(axis=0), axis=1)
     values, noise = _finished(structure, clean, rate, random, lines)
-    return Planted(structure, values, rate, energies, lines, noise)
+    # From the sample after the last force on, to the sample before the next.
+    acting = np.flatnonzero(np.any(forces, axis=1))
+    ends = np.append(acting, len(forces))
+    decays = tuple(
+        (int(start) // FINER + 1, int(stop) // FINER)
+        for start, stop in zip(ends, ends[1:], strict=False)
+        if stop - start > rate * FINER
+    )
+    return Planted(structure, values, rate, energies, lines, noise, parts, decays)

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from experiments.validation.least_errors import least_errors, least_errors_of_forced, why_untold
+from experiments.validation.least_errors import (
+    least_errors,
+    least_errors_of_decays,
+    least_errors_of_forced,
+    why_untold,
+)
 from tests.oracles.planted_structures import Planted, Structure, noise_spectrum
 
 RATE = 20.0
@@ -36,6 +41,22 @@ def test_least_errors_of_measured_forces_fall_with_the_noise():
         for noise in (1.0, 0.1)
     ]
     np.testing.assert_allclose(errors[0], 10 * errors[1], rtol=1e-3)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_least_errors_of_decays_are_those_of_a_damped_sinusoid(count):
+    """Known law: variances of s and w are 16 sigma^2 s^3 / (rate |a|^2) in each of equal decays."""
+    one = planted([4.0], [0.01])
+    pole, amplitude, samples = one.structure.poles[0], 0.3 - 0.4j, 1000
+    decay = (amplitude * np.exp(pole * np.arange(samples) / RATE)).real
+    parts = np.tile(np.multiply.outer(decay, one.structure.shapes[0]), (count, 1))[None]
+    decays = tuple((samples * i, samples * (i + 1)) for i in range(count))
+    found = least_errors_of_decays(one._replace(parts=parts, decays=decays))
+    level = 1e-6 * noise_spectrum(abs(pole) / RATE)
+    energy = count * abs(amplitude) ** 2 * np.sum(one.structure.shapes[0] ** 2)
+    expected = np.sqrt(16 * level * -(pole.real**3) / (RATE * energy))
+    assert found.frequencies[0] == pytest.approx(expected / (2 * np.pi), rel=0.03)
+    assert found.damping_ratios[0] == pytest.approx(expected / abs(pole), rel=0.03)
 
 
 def test_why_a_log_does_not_tell_a_mode():
