@@ -280,8 +280,9 @@ def _candidates(fits, channels, duration, band) -> tuple[Candidate, ...]:
 def _share_of_modes(found: tuple[Candidate, ...], fits, duration: float) -> float:
     """Share of identified modes in the energy at the beginning of decays, beside rejected ones.
 
-    The energy over all of a decay would count steady hum for more. Poles damped too strongly for
-    modes, which stand for leakage into the band or the end of a blow, do not count.
+    That is the first tenth: the energy over all of a decay would count steady hum for more, that at
+    the first sample a pole that is gone at the next. Poles damped too strongly for modes, which
+    stand for leakage into the band or the end of a blow, do not count.
     """
     good = rejected = 0.0
     for part, fit in fits:
@@ -290,8 +291,8 @@ def _share_of_modes(found: tuple[Candidate, ...], fits, duration: float) -> floa
             if one.mode.damping_ratio > MAX_DAMPING_RATIO:
                 continue
             nepers = 4 * np.pi * one.mode.frequency * one.mode.damping_ratio * duration
-            peak = nepers / -np.expm1(-nepers) if abs(nepers) > 1e-6 else 1.0
-            energy = one.mode.energy_share * peak * np.sum(fit.measured**2)
+            early = np.expm1(-nepers / PARTS) / np.expm1(-nepers) if nepers > 1e-6 else 1 / PARTS
+            energy = one.mode.energy_share * early * np.sum(fit.measured**2)
             good, rejected = (good, rejected + energy) if one.reason else (good + energy, rejected)
     return float(good / max(good + rejected, 1e-300))
 
