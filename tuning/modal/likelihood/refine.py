@@ -27,6 +27,7 @@ WIDTH_OVER_BINS = 3.0  # half-power width of the narrowest pole over the bins th
 FALSE_ALARM_PROBABILITY = 1e-4  # of a mode in a window that the likelihood gains from by chance
 BACKGROUND_ORDERS = 1, 2  # of its factor across a window
 SAME_POLE = 0.5  # distance of certain poles over the smaller decay rate, below which they are one
+CERTAIN_FIRST = 1e3  # weight of the distances of certain poles from those that the fit has moved
 START_SHARE = 0.02  # of the power of the window, of a mode to begin with, at least
 
 
@@ -138,7 +139,8 @@ def _select(window: Window, start: Start) -> list[RefinedMode | None]:
     found: list[RefinedMode | None] = [None] * start.poles.size
     if kept:
         refined = _refined(best, window)
-        for k, place in zip(kept, _places(start.poles[kept], best.poles), strict=True):
+        places = _places(start.poles[kept], start.certain[kept], best.poles)
+        for k, place in zip(kept, places, strict=True):
             if not start.certain[k]:
                 found[k] = refined[place]
     return found
@@ -177,10 +179,15 @@ def _least_gain(model: SpectralModel, window: Window, trials: int) -> float:
     return float(chi2.isf(FALSE_ALARM_PROBABILITY / (trials * places), unknowns) / 2)
 
 
-def _places(starts, poles) -> list[int]:
-    """Places of the poles that belong to starts, as poles change places on the way."""
+def _places(starts, certain, poles) -> list[int]:
+    """Places of the poles that belong to starts, as poles change places on the way.
+
+    Certain ones have the nearest: a start beside one of them may have become another mode.
+    """
     distance = np.abs(np.subtract.outer(starts, poles)) / -np.add.outer(starts.real, poles.real)
-    return linear_sum_assignment(distance)[1].tolist()
+    return linear_sum_assignment(distance * np.where(certain, CERTAIN_FIRST, 1.0)[:, None])[
+        1
+    ].tolist()
 
 
 def _background(window: Window, order: int) -> SpectralModel:
