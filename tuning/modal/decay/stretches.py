@@ -139,8 +139,9 @@ def free_decays(
     `records` are those of the band, at the `rate` (Hz) after decimation; `frequency` (Hz) is that
     of the strongest vibration. A decay lasts at least five cycles, in which the energy falls by
     one neper, along a line or after a blow that raised it; it ends when 99.9 % of the energy above
-    the least has passed. A record may begin right after a blow: its energy is then far above that
-    at its end, though close modes make it rise and fall on the way.
+    the least has passed, or sooner if a long rest is noise. A record may begin right after a blow:
+    its energy is then far above that at its end, though close modes make it rise and fall on the
+    way. What is at rest before a first blow that was not found does not count.
     """
     found = []
     shortest = int(np.ceil(MIN_DECAY_CYCLES * rate / frequency))
@@ -210,7 +211,10 @@ def _begins_high(energy):
 
 
 def _at_rest(energy, width):
-    """Samples of the beginning of a record before a blow that was not found by its errors."""
+    """Samples of the beginning of a record before a blow that was not found by its errors.
+
+    The least energy of its first cycles is then a tenth of the most in the record, or less.
+    """
     if MIN_START_RATIO * energy[:width].min() > energy.max():
         return 0
     return int(np.argmax(2 * energy > energy.max())) + width // 2
