@@ -9,6 +9,7 @@ import jaxbeam as jb
 from tuning import Log
 from tuning.fit.dataset import Dataset
 from tuning.fit.least_squares import LeastSquares
+from tuning.fit.prediction import FunctionPrediction
 from tuning.fit.result import fit_result
 from tuning.parameters.free import free_parameters
 
@@ -33,14 +34,14 @@ def formula(rigidity, damping, offset, amplitude):
 class StandIn(Dataset):
     """Logs of one channel that differ in amplitude; its free parameters are those of `TRUTH`."""
 
-    def predictor(self, addresses):
+    def prediction(self, addresses):
         def predict(values):
             by_address = TRUTH | dict(zip(addresses, values, strict=True))
             parameters = [by_address[address] for address in TRUTH]
             logs = [formula(*parameters, a) for a in AMPLITUDES[: len(self.logs)]]
             return jnp.stack(logs)[..., None]
 
-        return predict
+        return FunctionPrediction(predict)
 
     def validity_warning(self, values):
         return ""

@@ -1,24 +1,22 @@
 """Dataset: logs padded to one length, with the simulation model of each."""
 
 import dataclasses
-import re
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.case import Case, replace, stack_cases, value_at
+from jaxbeam.case.case import Case
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.events import EventSchedule, stack_schedules
 from jaxbeam.simulation.integration_plan import IntegrationPlan, common_plan, integration_plan
-from jaxbeam.simulation.simulate import simulate_readings
+from tuning.fit.prediction import LogPrediction
 from tuning.logs.log import Log
 from tuning.logs.pairing import case_of_log, check_loads, check_times, pad_cases, sensor_readings
-from tuning.parameters.free import LOG_ADDRESS, with_values
+from tuning.parameters.free import with_values
 
 SIMULATION_TOLERANCE = 1e-5  # of the largest deflection, below the resolution of logs
-OFFSET_ADDRESS = re.compile(r"(vehicle_)?sensors\.(\d+)\.offset")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,90 +37,9 @@ class Dataset:
     mask: Float[np.ndarray, "log time channel"]
     schedule: EventSchedule | None = None
 
-    def log_addresses(self, addresses: list[str]) -> tuple[list[str], np.ndarray]:
-        """Addresses within a log, and the index of the free parameter at each (log, address).
-
-        The index is -1 where the parameter belongs to another log.
-        """
-        inner = list(dict.fromkeys(LOG_ADDRESS.sub(r"\2", address) for address in addresses))
-        which = np.full((len(self.logs), len(inner)), -1)
-        for i, address in enumerate(addresses):
-            own = LOG_ADDRESS.fullmatch(address)
-            rows = slice(None) if own is None else int(own[1])
-            which[rows, inner.index(own[2] if own else address)] = i
-        return inner, which
-
-    def predictor(self, addresses: list[str]):
-        """Function from values at the addresses to all samples, with derivatives at low cost.
-
-        Each log is differentiated by its own parameters only, one log after the other: as a batch
-        they would not share what is the same at all times.
-        """
-        own_addresses, which = self.log_addresses(addresses)
-        simulated_addresses = [
-            address for address in own_addresses if not OFFSET_ADDRESS.fullmatch(address)
-        ]
-        columns = [own_addresses.index(address) for address in simulated_addresses]
-        own = jnp.array([[value_at(case, a) for a in own_addresses] for case in self.cases])
-        zero_offsets = offset_addresses(self.cases[0])
-        channels = {
-            zero_offsets.index(a): own_addresses.index(a)
-            for a in own_addresses
-            if a not in simulated_addresses
-        }
-        constant = jnp.array([[s.offset for s in case.all_sensors] for case in self.cases])
-
-        def simulated(run, values):
-            case, times, schedule = run
-            case = replace(
-                case,
-                dict(zip(simulated_addresses, values, strict=True))
-                | dict.fromkeys(zero_offsets, 0.0),
-            )
-            return simulate_readings(case, times, dataclasses.replace(self.plan, schedule=schedule))
-
-        def gather(values):
-            return jnp.where(which < 0, own, values[which])
-
-        def offsets(table):
-            rows = [
-                table[:, channels[i]] if i in channels else constant[:, i]
-                for i in range(constant.shape[1])
-            ]
-            return jnp.stack(rows, axis=1)[:, None, :]
-
-        runs = (stack_cases(self.cases), jnp.asarray(self.times), self.schedule)
-
-        @jax.custom_jvp
-        def predict(values):
-            table = gather(values)
-            samples = jax.lax.map(lambda part: simulated(*part), (runs, table[:, columns]))
-            return samples + offsets(table)
-
-        # A jitted function is traced once for all programs that it is part of.
-        @jax.jit
-        def linearised(runs, table):
-            def both(part):
-                run, values = part
-                basis = jnp.eye(len(simulated_addresses))
-
-                def along(direction):
-                    return jax.jvp(lambda v: simulated(run, v), (values,), (direction,))
-
-                return jax.vmap(along, out_axes=(None, -1))(basis)
-
-            return jax.lax.map(both, (runs, table))
-
-        @predict.defjvp
-        def _(primals, tangents):
-            table, change = jax.jvp(gather, primals, tangents)
-            samples, slopes = linearised(runs, table[:, columns])
-            moved = jnp.einsum("ltca,la->ltc", slopes, change[:, columns])
-            # Offsets only shift: their derivative is that of the shift.
-            shift = offsets(change) - offsets(jnp.zeros_like(change))
-            return samples + offsets(table), moved + shift
-
-        return predict
+    def prediction(self, addresses: list[str]) -> LogPrediction:
+        """Readings of all logs from values at the addresses, with derivatives at low cost."""
+        return LogPrediction(self.cases, self.times, self.plan, self.schedule, addresses)
 
     def validity_warning(self, values: dict[str, float]) -> str:
         """Warning that the integration plan does not hold at the fitted values; "" if it does.
@@ -144,12 +61,6 @@ class Dataset:
             if changed or plan.substeps > 2 * self.plan.substeps:
                 return ", but far from the start: fit once more with these values as the start"
         return ""
-
-
-def offset_addresses(case: Case) -> list[str]:
-    """Addresses of the offsets of all sensors, in the order of the channels."""
-    on_beam = [f"sensors.{i}.offset" for i in range(len(case.sensors))]
-    return on_beam + [f"vehicle_sensors.{i}.offset" for i in range(len(case.vehicle_sensors))]
 
 
 def make_dataset(case: Case, logs: list[Log]) -> Dataset:

@@ -20,6 +20,7 @@ from jaxbeam.model.frequency_response import StationaryMasses, frequency_respons
 from jaxbeam.model.modes import mesh_layout
 from tuning.aliases import accepts_old_arguments, has_old_attributes
 from tuning.fit.least_squares import MAX_STEPS, LeastSquares
+from tuning.fit.prediction import FunctionPrediction
 from tuning.fit.summary import parameter_table
 from tuning.fit.uncertainty.covariance import confidence_intervals
 from tuning.logs.log import Log
@@ -146,8 +147,8 @@ class _ResponseData:
     measured: Float[np.ndarray, "1 frequency part"]
     mask: Float[np.ndarray, "1 frequency part"]
 
-    def predictor(self, addresses: list[str]):
-        """Function from values at the addresses to weighted logarithms of the responses."""
+    def prediction(self, addresses: list[str]) -> FunctionPrediction:
+        """Weighted logarithms of the responses as a function of values at the addresses."""
         case, given = self.case, self.responses
         layout, weights = mesh_layout(case), _weights(given)
         frequencies, measured = jnp.asarray(given.frequencies), jnp.asarray(given.values)
@@ -162,7 +163,7 @@ class _ResponseData:
             parts = jnp.concatenate([log_ratio.real, log_ratio.imag], axis=1)
             return (_weighted_logarithms(given) + parts * weights)[None]
 
-        return predict
+        return FunctionPrediction(predict)
 
 
 @has_old_attributes(

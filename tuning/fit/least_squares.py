@@ -1,19 +1,15 @@
 """Weighted least squares over the free parameters of a dataset, with noise estimated by channel."""
 
 import dataclasses
-import functools
-from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.runtime.arrays import xp
-from jaxbeam.runtime.compiling import xla_options
 from tuning.fit.levenberg_marquardt import levenberg_marquardt
 from tuning.fit.loss import check_loss, robust_residual, robust_slope, variance_factor
+from tuning.fit.prediction import Prediction
 from tuning.fit.uncertainty.covariance import Uncertainty, autocorrelation_factor, uncertainty
 from tuning.parameters.free import FreeParameter, to_unbounded
 
@@ -34,8 +30,8 @@ class RegressionData(Protocol):
     measured: np.ndarray
     mask: np.ndarray
 
-    def predictor(self, addresses: list[str]) -> Callable:
-        """Function from values at the addresses to all samples, differentiable forward."""
+    def prediction(self, addresses: list[str]) -> Prediction:
+        """All samples as a function of values at the addresses."""
         ...
 
 
@@ -77,7 +73,6 @@ class LeastSquares:
         self.data, self.parameters, self.loss = data, parameters, loss
         self.start_point = to_unbounded(parameters, [p.start for p in parameters])
         weak_prior_widths = WEAK_PRIOR_WIDTH * np.array([p.unbounded_size for p in parameters])
-        predict = data.predictor([p.address for p in parameters])
 
         def values_at(y):
             return xp.stack([p.from_unbounded(y[i]) for i, p in enumerate(parameters)])
@@ -85,17 +80,10 @@ class LeastSquares:
         def prior_residuals(values):
             return xp.stack([p.prior.prior_residual(values[i]) for i, p in enumerate(parameters)])
 
-        def linearised(values):
-            # One pass gives samples and derivatives (see `Dataset.predictor`). `jax.linearize`
-            # would take half as long again to trace.
-            def along(direction):
-                return jax.jvp(predict, (values,), (direction,))
-
-            return jax.vmap(along, out_axes=(None, -1))(jnp.eye(values.shape[0]))
-
         self.from_unbounded, self.prior_residuals = values_at, prior_residuals
         self.weak_prior_widths = weak_prior_widths
-        self._program, self._evaluated = jax.jit(linearised), {}
+        self._prediction = data.prediction([p.address for p in parameters])
+        self._evaluated = {}
 
     def solve(
         self,
@@ -160,16 +148,11 @@ class LeastSquares:
         key = np.asarray(values, float).tobytes()
         found = self._evaluated.pop(key, None)
         if found is None:
-            found = tuple(map(np.asarray, self._compiled_program(jnp.asarray(values))))
+            found = self._prediction.linearised(np.asarray(values, float))
         self._evaluated[key] = found
         while len(self._evaluated) > KEPT_POINTS:
             del self._evaluated[next(iter(self._evaluated))]
         return found
-
-    @functools.cached_property
-    def _compiled_program(self):
-        """The compiled program of samples and derivatives."""
-        return self._program.lower(jnp.zeros(len(self.parameters))).compile(xla_options())
 
     def values_at(self, y) -> Float[np.ndarray, " parameter"]:
         """Values of the parameters at search variables."""

@@ -188,7 +188,7 @@ def predict_held_out(fit: Fit, logs: Sequence[Log]) -> list[HeldOutPrediction]:
     2.0 m/s [1.]
     """
     dataset = make_dataset(fit.case, list(logs))
-    predict = compiled(dataset.predictor(["run.gravity"]))
+    predict = compiled(dataset.prediction(["run.gravity"]).predict)
     predicted = np.asarray(predict(jnp.asarray([float(fit.case.run.gravity)])))
     noise = np.sqrt(np.nanmean(fit.noise**2, axis=0))
     return [

@@ -13,7 +13,6 @@ the derivative jumps, it is the mean of both sides; elsewhere the smoothing is n
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -51,7 +50,7 @@ DUAL_REGULARISATION = 1e-12  # of the multipliers in a step, for linearly depend
 Rows = Float[Array, "row variable"]
 
 
-class Solution(eqx.Module):
+class Solution(NamedTuple):
     """Solution x, multipliers of the limits, status (see `STATUS_TEXT`), and number of iterations.
 
     x is valid only if the status is `SOLVED`. `steps` are steps of the interior-point method or
