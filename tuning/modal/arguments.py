@@ -6,8 +6,8 @@ from tuning.logs.log import Log
 from tuning.modal.forced.blows import Windows, check_windows
 
 KINDS = ("free decay", "ambient")
-SPECTRAL_METHODS = ("fdd", "plscf")
-METHODS = ("covariance", "data", *SPECTRAL_METHODS)
+DECAY = "decay"  # the method for free decays; the others are for responses to broadband forces
+METHODS = (DECAY, "covariance", "data", "fdd", "plscf")
 
 
 def check_band(log: Log, rate: float, band: tuple[float, float] | None) -> None:
@@ -61,10 +61,12 @@ def check_arguments(
         raise ValueError(f"kind must be {' or '.join(map(repr, KINDS))}, not {kind!r}")
     if method not in (None, *METHODS):
         raise ValueError(f"method must be {' or '.join(map(repr, METHODS))}, not {method!r}")
-    if kind == "free decay" and method in SPECTRAL_METHODS:
+    if kind == "free decay" and method not in (None, DECAY):
         raise ValueError(
             f"method {method!r} takes a log for the response to broadband excitation; for kind "
             "'free decay' leave the method out"
         )
+    if kind == "ambient" and method == DECAY:
+        raise ValueError("method 'decay' fits free decays; for kind 'ambient' leave the method out")
     if order is not None and method == "fdd":
         raise ValueError("method 'fdd' has no models and no order; leave the order out")

@@ -20,8 +20,8 @@ from tuning.logs.log import Log
 from tuning.logs.units import time_derivative
 from tuning.modal.ambient import Candidate, subspace_modes
 from tuning.modal.arguments import (
+    DECAY,
     METHODS,
-    SPECTRAL_METHODS,
     check_arguments,
     check_band,
     check_force,
@@ -69,15 +69,15 @@ def identify_modes(
     `window` (s) is the part of the log to use; `band` (Hz) the range of frequencies, by default
     that of the resonances with most kinetic energy; `count` modes are kept, those with most energy;
     `kind` is "free decay" or "ambient", by default decided from the log; `channels` are the names
-    of those to use; `order` is the highest order of the stabilisation diagram; `method` is
-    "covariance" or "data" (subspace identification), "fdd" (enhanced frequency-domain
-    decomposition) or "plscf" (poly-reference least-squares complex frequency), of which the last
-    two take every log for a response to broadband excitation; `force` are the names of the channels
-    of forces that were measured, of a hammer or shaker, by default all in N: method "plscf", then
-    the default, fits the responses to them; a force that one of several logs lacks, as of a hammer
-    that strikes another place in each, is zero there. `force_window` (s) is the time after each
-    blow of a hammer from which on the force is taken for zero. `exclude` are frequencies (Hz) that
-    are no modes. `progress` is called with a few words on what is being done.
+    of those to use; `order` is the highest order of the stabilisation diagram; `method` is "decay"
+    (poles of free decays), "covariance" or "data" (subspace identification), "fdd" (enhanced
+    frequency-domain decomposition) or "plscf" (poly-reference least-squares complex frequency), of
+    which all but the first take a log for the response to broadband excitation; `force` are the
+    names of the channels of forces that were measured, of a hammer or shaker, by default all in N:
+    method "plscf", then the default, fits the responses to them; a force that one of several logs
+    lacks, as of a hammer that strikes another place in each, is zero there. `force_window` (s) is
+    the time after each blow of a hammer from which on the force is taken for zero. `exclude` are
+    frequencies (Hz) that are no modes. `progress` is called with a few words on what is being done.
 
     Raises ValueError for a log without evenly sampled records, or too short, a window outside the
     log, a band above half the sampling rate, an impossible count or order, unknown channels, kinds
@@ -133,8 +133,9 @@ def identify_modes(
         used_band = min(low, used_band[0]), max(high, used_band[1])
         lines, cleaned = subtract_lines(samples, used_band, exclude)
     struck = excited(samples, derivatives, used_band)
+    kind = "free decay" if method == DECAY else kind
     how = {"kind": kind, "whole": window is not None, "order": order}
-    found, may_decay = None, kind != "ambient" and method not in SPECTRAL_METHODS
+    found, may_decay = None, kind != "ambient" and method in (None, DECAY)
     if may_decay:
         found, used_band = _decays(samples, struck, derivatives, used_band, band is None, how)
     if kind == "free decay" and found is None:
@@ -161,7 +162,7 @@ def identify_modes(
             for frequency in doubtful
         ]
     else:
-        used_method = "decay"
+        used_method = DECAY
         lines = lines_besides(lines, [one.mode for one in found.candidates if not one.reason])
     if kind is None:
         says = _kind_words(found, struck, lines)

@@ -146,6 +146,15 @@ def test_all_of_many_decays_are_used():
     assert 0.95 * whole < energy <= 1.001 * whole
 
 
+def test_the_method_says_whether_a_log_is_a_decay():
+    log = log_of(sampled(random_structure(932), "decay", 932, 30.0))
+    chosen = identify_modes(log)
+    named, other = (identify_modes(log, method=method) for method in (chosen.method, "covariance"))
+    assert chosen.method == "decay" and named.kind == "free decay"
+    np.testing.assert_array_equal(named.frequencies, chosen.frequencies)
+    assert (other.kind, other.method) == ("ambient", "covariance")
+
+
 def test_a_decay_after_a_strong_excitation_counts():
     """One channel of a planted structure, whose decay holds a tenth of the energy of the log."""
     planted = sampled(random_structure(933), "crossing", 933, 60.0)

@@ -138,8 +138,11 @@ def test_close_modes_are_told_apart():
 
 def test_a_method_refuses_what_it_cannot_use():
     log = log_of(sampled(small_structure(0), "ambient", 0, 10.0))
-    with pytest.raises(ValueError, match="for kind 'free decay' leave the method out"):
-        identify_modes(log, method="fdd", kind="free decay")
+    for method in ("fdd", "covariance"):
+        with pytest.raises(ValueError, match="for kind 'free decay' leave the method out"):
+            identify_modes(log, method=method, kind="free decay")
+    with pytest.raises(ValueError, match="for kind 'ambient' leave the method out"):
+        identify_modes(log, method="decay", kind="ambient")
     with pytest.raises(ValueError, match="no models and no order"):
         identify_modes(log, method="fdd", order=10)
 

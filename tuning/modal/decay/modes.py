@@ -17,7 +17,12 @@ from tuning.modal.decay.dominant import after_blow, dominate, follows
 from tuning.modal.decay.earlier_start import earlier_start
 from tuning.modal.decay.fit import DecayFit, fit_decay
 from tuning.modal.decay.free_end import free_end
-from tuning.modal.decay.leaving import PARTS, end_of_excitation, without_excitation
+from tuning.modal.decay.leaving import (
+    PARTS,
+    end_of_excitation,
+    has_growth,
+    without_excitation,
+)
 from tuning.modal.decay.stretches import (
     Stretch,
     excited_samples,
@@ -157,7 +162,7 @@ def free_decay_modes(
     channels = samples.records[0].shape[1]
     found = _candidates(one.fits, channels, one.duration, band)
     damped = _share_of_modes(found, one.fits, one.duration) > MIN_SHARE_OF_MODES
-    if kind is None and not (damped and explained):
+    if kind is None and (has_growth(found, one.duration) or not (damped and explained)):
         return None
     first = Decays(one.used, one.measured[:, :channels], one.fitted[:, :channels])
     return found, one.diagrams, first
@@ -208,8 +213,9 @@ def _rest(one: _Fitted, samples: Samples, struck, band, cycle) -> tuple[Stretch,
         one.used,
         one.measured,
         one.fitted,
-        [candidate.mode for candidate in found if not candidate.reason],
+        found,
         channels=channels,
+        rate=samples.rate,
         independent=2 * (band[1] - band[0]) / samples.rate,
         after_blow=after_blow(one.used[0], struck[one.used[0].record], cycle),
     )

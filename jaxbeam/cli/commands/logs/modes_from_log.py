@@ -69,9 +69,9 @@ def modes_from_log(
     order
         Highest order of the models of the stabilisation diagram.
     method
-        covariance or data: stochastic subspace identification, covariance- or data-driven; fdd:
-        enhanced frequency-domain decomposition; plscf: poly-reference least-squares complex
-        frequency (p-LSCF).
+        decay: poles of free decays; for all else covariance or data: stochastic subspace
+        identification, covariance- or data-driven; fdd: enhanced frequency-domain decomposition;
+        plscf: poly-reference least-squares complex frequency (p-LSCF).
     force
         NAME,NAME,...: channels of measured forces (N), of a hammer or shaker; by default all in N.
         The responses to them are fitted by p-LSCF.
