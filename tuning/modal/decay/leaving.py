@@ -35,7 +35,8 @@ MAX_PARTS = 4  # that are searched one after another, as a load may shake less t
 PARTS = 10  # of a decay, whose errors are compared
 MIN_RATIO, RATIO_SDS = 2.5, 5.0  # of errors of a part to the median; or deviations of the ratio
 SPLIT_RATIO, SPLIT_MAC = 1.1, 0.9  # of three frequencies, and of the shapes of modes of one
-MIN_GROWING_SHARE, MIN_GROWTH = 0.01, 0.2  # of energy; nepers of a vibration over the decay
+MIN_GROWTH = 0.2  # nepers of a vibration over the decay
+MIN_GROWING_SHARE = 0.01  # of the energy
 MIN_UNEXPLAINED = 0.05  # of the energy of a part, and of the mean; less may be nonlinearity
 
 
@@ -57,27 +58,28 @@ def without_excitation(
     acts from the beginning.
     """
     first, *others = decays
-    grows = has_growth(candidates, len(measured) / rate)
     if others:
+        grows = growing_share(candidates, len(measured) / rate) > MIN_GROWING_SHARE
         return undisturbed(decays, measured, fitted, channels, 0.0 if grows else MIN_UNEXPLAINED)
     shaken = shaken_until(measured, fitted, independent)
     split = has_split([one.mode for one in candidates if not one.reason])
-    if not shaken and not after_blow and (split or grows):
+    if not shaken and not after_blow and split:
         shaken = len(measured) // PARTS
     return (first._replace(start=first.start + shaken),)
 
 
-def has_growth(candidates: tuple[Candidate, ...], duration: float) -> bool:
-    """Whether a vibration grows that holds energy of a fit of some `duration` (s): forces act.
+def growing_share(candidates: tuple[Candidate, ...], duration: float) -> float:
+    """Largest share in the energy of a fit, of some `duration` (s), of a vibration that grows.
 
-    Steady hum does not. Of 100 decays without forces (60 s, planted structures) none has such a
-    vibration.
+    Forces make vibrations grow; steady hum does not. Of 100 decays without forces (60 s, planted
+    structures) none has one of more than a hundredth.
     """
-    return any(
-        one.mode.energy_share > MIN_GROWING_SHARE
-        and 2 * np.pi * one.mode.frequency * -one.mode.damping_ratio * duration > MIN_GROWTH
+    growing = [
+        one.mode.energy_share
         for one in candidates
-    )
+        if 2 * np.pi * one.mode.frequency * -one.mode.damping_ratio * duration > MIN_GROWTH
+    ]
+    return max(growing, default=0.0)
 
 
 def has_split(modes: list[IdentifiedMode]) -> bool:

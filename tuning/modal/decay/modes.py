@@ -20,7 +20,7 @@ from tuning.modal.decay.free_end import free_end
 from tuning.modal.decay.leaving import (
     PARTS,
     end_of_excitation,
-    has_growth,
+    growing_share,
     without_excitation,
 )
 from tuning.modal.decay.stretches import (
@@ -40,6 +40,7 @@ from tuning.modal.stabilisation import Diagram
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
 MIN_SHARE_OF_MODES = 0.5  # of the energy at the beginning of decays
 MIN_LEVEL_AT_START = 3.0  # energy of the first part of such a decay over the mean
+MAX_GROWING_SHARE = 0.25  # of the energy, of a vibration that grows in a decay
 MAX_CUTS = 3  # of a decay in which the structure is found to be excited
 NOT_REPRODUCED = "not the same in parts of the window"
 NONLINEAR_DECAY = 2.5, 4.5  # decay rates over that of a mode, of what its nonlinearity adds to it
@@ -142,7 +143,10 @@ def free_decay_modes(
     ):
         return None
     cycle = samples.rate / frequency
+    channels = samples.records[0].shape[1]
     one = _fitted(decays, samples, band, order)
+    if one is not None and kind is None and _grows(one, channels, band):
+        return None
     for _ in range(MAX_CUTS):
         if one is None:
             return None
@@ -159,10 +163,9 @@ def free_decay_modes(
         if given
         else _unexplained_of_decay(one.measured, one.fitted) < MAX_RESIDUAL_ENERGY
     )
-    channels = samples.records[0].shape[1]
     found = _candidates(one.fits, channels, one.duration, band)
     damped = _share_of_modes(found, one.fits, one.duration) > MIN_SHARE_OF_MODES
-    if kind is None and (has_growth(found, one.duration) or not (damped and explained)):
+    if kind is None and not (damped and explained):
         return None
     first = Decays(one.used, one.measured[:, :channels], one.fitted[:, :channels])
     return found, one.diagrams, first
@@ -203,6 +206,12 @@ def _fitted(decays, samples: Samples, band, order) -> _Fitted | None:
         for name in ("measured", "fitted")
     )
     return _Fitted(used, len(windows) / samples.rate, fits, diagrams, measured, fitted)
+
+
+def _grows(one: _Fitted, channels: int, band) -> bool:
+    """Whether a strong vibration grows: then most of what was fitted is no decay."""
+    found = _candidates(one.fits, channels, one.duration, band)
+    return growing_share(found, one.duration) > MAX_GROWING_SHARE
 
 
 def _rest(one: _Fitted, samples: Samples, struck, band, cycle) -> tuple[Stretch, ...]:
