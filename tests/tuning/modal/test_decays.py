@@ -7,12 +7,12 @@ from scipy.integrate import solve_ivp
 from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import Structure, random_structure, response, sampled
 from tuning import Log, identify_modes
+from tuning.modal.decay.soft_blows import until_soft_blow
 from tuning.modal.decay.stretches import (
     Stretch,
     excited_samples,
     free_decays,
     stacked,
-    until_soft_blow,
 )
 from tuning.modal.harmonics import harmonic_lines
 from tuning.modal.preprocessing import kinetic_band, prepare, strongest_frequency
@@ -177,8 +177,11 @@ def test_a_decay_ends_where_a_blow_too_soft_to_be_found_adds_to_it(soft_blow, st
         record += np.where(late > 0, np.exp(-0.3 * late) * np.sin(2 * np.pi * 8.0 * late), 0)
     marks = np.zeros(times.size, bool)
     marks[1] = True
-    (found,) = free_decays((marks,), (record[:, None],), 200.0, 8.2)
+    found, *others = free_decays((marks,), (record[:, None],), 200.0, 8.2)
     assert stops_before - 1.0 < found.stop / 200 <= stops_before
+    # The soft blow begins another decay, a cycle or two later.
+    instants = [] if soft_blow is None else [soft_blow + 1.5 / 8.2]
+    np.testing.assert_allclose([one.start / 200 for one in others], instants, atol=1 / 8.2)
     until = until_soft_blow(record[:, None], 50) / 200
     assert stops_before - 1.0 < until <= stops_before
 
@@ -231,6 +234,7 @@ def test_decays_before_a_soft_blow_count_too(seed):
         ("crossing", 1411, 60.0),  # two nepers after the load has left, a quarter of the energy
         ("crossing", 1480, 60.0),  # 12.3 Hz, gone within 0.4 s of the end of the crossing
         ("blows", 1606, 60.0),  # a mode with three times the decay rate of a weaker one beside it
+        ("blows", 1824, 60.0),  # four blows in noise, of which the errors of one stand out
         ("blows", 1310, 60.0),  # a pair within its bandwidth, with a fifth of the energy in one
     ],
 )

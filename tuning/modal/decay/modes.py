@@ -11,8 +11,8 @@ from tuning.modal.ambient import (
     divided_band,
     overlapping,
     subspace_modes,
-    without_duplicates,
 )
+from tuning.modal.decay.candidates import decay_candidates, share_of_modes
 from tuning.modal.decay.dominant import after_blow, dominate, follows
 from tuning.modal.decay.earlier_start import earlier_start
 from tuning.modal.decay.fit import DecayFit, fit_decay
@@ -23,18 +23,16 @@ from tuning.modal.decay.leaving import (
     growing_share,
     without_excitation,
 )
+from tuning.modal.decay.soft_blows import until_soft_blow
 from tuning.modal.decay.stretches import (
     Stretch,
     excited_samples,
     free_decays,
     prediction_errors,
     stacked,
-    until_soft_blow,
 )
 from tuning.modal.preprocessing import HALF_POWER, kinetic_band, prepare, strongest_frequency
-from tuning.modal.result import MAX_DAMPING_RATIO, IdentifiedMode, rejection_reason
 from tuning.modal.samples import MIN_SAMPLES, Samples
-from tuning.modal.shapes import mac_matrix
 from tuning.modal.stabilisation import Diagram
 
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
@@ -42,9 +40,6 @@ MIN_SHARE_OF_MODES = 0.5  # of the energy at the beginning of decays
 MIN_LEVEL_AT_START = 3.0  # energy of the first part of such a decay over the mean
 MAX_GROWING_SHARE = 0.25  # of the energy, of a vibration that grows in a decay
 MAX_CUTS = 3  # of a decay in which the structure is found to be excited
-NOT_REPRODUCED = "not the same in parts of the window"
-NONLINEAR_DECAY = 2.5, 4.5  # decay rates over that of a mode, of what its nonlinearity adds to it
-NONLINEAR_MAC = 0.95
 MAX_RESIDUAL_OF_WINDOW = 0.05  # the same for a window that the user gives and that falls little
 
 
@@ -143,19 +138,16 @@ def free_decay_modes(
     ):
         return None
     cycle = samples.rate / frequency
-    channels = samples.records[0].shape[1]
     one = _fitted(decays, samples, band, order)
-    if one is not None and kind is None and _grows(one, channels, band):
+    if one is None or (kind is None and _grows(one)):
         return None
     for _ in range(MAX_CUTS):
-        if one is None:
-            return None
         rest = one.used if given else _rest(one, samples, struck, band, cycle)
         if rest == one.used:
             break
         one = _fitted(rest, samples, band, order)
-    if one is None:
-        return None
+        if one is None:
+            return None
     if not given:
         one = _from_earlier(one, samples, struck, band, cycle, order)
     explained = (
@@ -163,12 +155,12 @@ def free_decay_modes(
         if given
         else _unexplained_of_decay(one.measured, one.fitted) < MAX_RESIDUAL_ENERGY
     )
-    found = _candidates(one.fits, channels, one.duration, band)
-    damped = _share_of_modes(found, one.fits, one.duration) > MIN_SHARE_OF_MODES
+    damped = share_of_modes(one.candidates, one.fits, one.duration) > MIN_SHARE_OF_MODES
     if kind is None and not (damped and explained):
         return None
+    channels = samples.records[0].shape[1]
     first = Decays(one.used, one.measured[:, :channels], one.fitted[:, :channels])
-    return found, one.diagrams, first
+    return one.candidates, one.diagrams, first
 
 
 class _Fitted(NamedTuple):
@@ -176,6 +168,7 @@ class _Fitted(NamedTuple):
 
     used: tuple[Stretch, ...]
     duration: float
+    candidates: tuple[Candidate, ...]
     fits: list[tuple[tuple[float, float], DecayFit]]
     diagrams: tuple[Diagram, ...]
     measured: Float[np.ndarray, "sample column"]
@@ -205,25 +198,24 @@ def _fitted(decays, samples: Samples, band, order) -> _Fitted | None:
         np.sum([_within(getattr(fit, name), samples.rate, part) for part, fit in fits], axis=0)
         for name in ("measured", "fitted")
     )
-    return _Fitted(used, len(windows) / samples.rate, fits, diagrams, measured, fitted)
+    duration = len(windows) / samples.rate
+    found = decay_candidates(fits, channels, duration, band)
+    return _Fitted(used, duration, found, fits, diagrams, measured, fitted)
 
 
-def _grows(one: _Fitted, channels: int, band) -> bool:
+def _grows(one: _Fitted) -> bool:
     """Whether a strong vibration grows: then most of what was fitted is no decay."""
-    found = _candidates(one.fits, channels, one.duration, band)
-    return growing_share(found, one.duration) > MAX_GROWING_SHARE
+    return growing_share(one.candidates, one.duration) > MAX_GROWING_SHARE
 
 
 def _rest(one: _Fitted, samples: Samples, struck, band, cycle) -> tuple[Stretch, ...]:
     """Fitted decays, or what is left of them, in which nothing excites the structure."""
-    channels = samples.records[0].shape[1]
-    found = _candidates(one.fits, channels, one.duration, band)
     return without_excitation(
         one.used,
         one.measured,
         one.fitted,
-        found,
-        channels=channels,
+        one.candidates,
+        channels=samples.records[0].shape[1],
         rate=samples.rate,
         independent=2 * (band[1] - band[0]) / samples.rate,
         after_blow=after_blow(one.used[0], struck[one.used[0].record], cycle),
@@ -274,63 +266,3 @@ def _within(values, rate, part):
     bins = np.fft.rfftfreq(len(values), 1 / rate)
     transform[(bins < part[0]) | (bins >= part[1])] = 0.0
     return np.fft.irfft(transform, len(values), axis=0)
-
-
-def _candidates(fits, channels, duration, band) -> tuple[Candidate, ...]:
-    """Modes of each part of the band, with their shares in its energy of the channels."""
-    found = []
-    for part, fit in fits:
-        energy = np.sum(fit.measured**2, axis=0).reshape(-1, channels).sum(axis=0)
-        decays = fit.energies.shape[1] // channels
-        by_channel = fit.energies.reshape(-1, decays, channels).sum(axis=1)
-        shares = np.mean(by_channel / np.maximum(energy, 1e-300), axis=1)
-        for mode, share, gone in zip(fit.modes, shares.tolist(), fit.gone, strict=True):
-            if part[0] <= mode.frequency < part[1] or len(fits) == 1:
-                mode = mode._replace(energy_share=share)
-                reason = rejection_reason(mode, duration, band) or (NOT_REPRODUCED if gone else "")
-                found.append(Candidate(mode, reason, 1))
-    return without_duplicates(_without_nonlinearity(found))
-
-
-def _share_of_modes(found: tuple[Candidate, ...], fits, duration: float) -> float:
-    """Share of identified modes in the energy at the beginning of decays, beside rejected ones.
-
-    That is the first tenth: the energy over all of a decay would count steady hum for more, that at
-    the first sample a pole that is gone at the next. Poles damped too strongly for modes, which
-    stand for leakage into the band or the end of a blow, do not count.
-    """
-    good = rejected = 0.0
-    for part, fit in fits:
-        inside = [one for one in found if len(fits) == 1 or part[0] <= one.mode.frequency < part[1]]
-        for one in inside:
-            if one.mode.damping_ratio > MAX_DAMPING_RATIO:
-                continue
-            nepers = 4 * np.pi * one.mode.frequency * one.mode.damping_ratio * duration
-            early = np.expm1(-nepers / PARTS) / np.expm1(-nepers) if nepers > 1e-6 else 1 / PARTS
-            energy = one.mode.energy_share * early * np.sum(fit.measured**2)
-            good, rejected = (good, rejected + energy) if one.reason else (good + energy, rejected)
-    return float(good / max(good + rejected, 1e-300))
-
-
-def _without_nonlinearity(found: list[Candidate]) -> list[Candidate]:
-    """Candidates; those that a nonlinear restoring force makes of others are rejected.
-
-    The cube of a decaying vibration has its frequency and shape, three times its decay rate, and
-    less energy, as what it adds is a correction.
-    """
-    good = [one.mode for one in found if not one.reason]
-    return [
-        one if one.reason else one._replace(reason=next(
-            (f"what nonlinearity adds to the mode of {other.frequency:.4g} Hz" for other in good
-             if _is_cube(one.mode, other)), ""))
-        for one in found
-    ]  # fmt: skip
-
-
-def _is_cube(mode: IdentifiedMode, other: IdentifiedMode) -> bool:
-    """Whether a mode decays as the cube of another does, within its half-power bandwidth."""
-    rate = mode.pole.real / other.pole.real
-    near = abs(mode.frequency - other.frequency) < mode.damping_ratio * mode.frequency
-    alike = mac_matrix(mode.shape[None], other.shape[None])[0, 0] > NONLINEAR_MAC
-    less = mode.energy_share < other.energy_share
-    return bool(near and alike and less and NONLINEAR_DECAY[0] < rate < NONLINEAR_DECAY[1])

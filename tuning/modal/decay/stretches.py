@@ -14,6 +14,13 @@ from jaxtyping import Bool, Float
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.signal import lfilter
 
+from tuning.modal.decay.soft_blows import (
+    MIN_ENERGY_RISE,
+    between_soft_blows,
+    moving_mean,
+    vibration_energy,
+)
+
 AR_ORDER = 24
 AR_ITERATIONS = 6
 AR_ROWS = 20_000  # equations from which its coefficients are found
@@ -22,8 +29,6 @@ BLOW_SD = 10.0  # prediction errors of quiet blocks, beyond which the structure 
 BLOW_SIGNAL_SHARE = 0.25  # of the rms of the signal around, likewise
 BLOW_LOCAL_SD = 8.0  # or of the errors before it; normal errors reach six in a day of samples
 CONTACT_SAMPLES = 4  # within which past and future fail after a blow
-MIN_ENERGY_RISE = 2.0  # energy in two cycles after a blow over that before it
-RISE_WIDTHS = 5  # of two cycles each, before such a rise
 MIN_DECAY_CYCLES = 5.0  # of the strongest vibration
 MIN_FALL_NEPERS = 1.0  # of the energy over a decay
 MIN_START_RATIO = 10.0  # energy of the first tenth over that of the second half, after a blow
@@ -58,7 +63,7 @@ def excited_samples(
     for values in record.T:
         if not values.any():
             continue
-        around = np.sqrt(_moving_mean(values**2, span)) + 1e-12 * np.abs(values).max() + 1e-300
+        around = np.sqrt(moving_mean(values**2, span)) + 1e-12 * np.abs(values).max() + 1e-300
         forward, backward = np.ones((2, values.size), bool)
         for scale in (around, np.ones(values.size)):
             forward &= _is_large(prediction_errors(values, scale), around, span)
@@ -121,13 +126,6 @@ def prediction_errors(
     return errors
 
 
-def _moving_mean(values, width):
-    total = np.concatenate([[0.0], np.cumsum(values)])
-    index = np.arange(values.size)
-    low, high = np.maximum(index - width // 2, 0), np.minimum(index + width // 2 + 1, values.size)
-    return (total[high] - total[low]) / (high - low)
-
-
 def free_decays(
     struck: tuple[Bool[np.ndarray, " time"], ...],
     records: tuple[Float[np.ndarray, "sample channel"], ...],
@@ -141,16 +139,17 @@ def free_decays(
     one neper, along a line or after a blow that raised it; it ends when 99.9 % of the energy above
     the least has passed, or sooner if a long rest is noise. A record may begin right after a blow:
     its energy is then far above that at its end, though close modes make it rise and fall on the
-    way. What is at rest before a first blow that was not found does not count.
+    way. What is at rest before a first blow that was not found does not count. In a record of blows
+    the energy also tells of those too soft, or in too much noise, to be found by their errors.
     """
     found = []
     shortest = int(np.ceil(MIN_DECAY_CYCLES * rate / frequency))
     width = max(int(2 * rate / frequency), 4)
     for number, (marks, record) in enumerate(zip(struck, records, strict=True)):
         ratio = marks.size / len(record)
-        energy = _energy(record, width)
+        energy = vibration_energy(record, width)
         edges = np.concatenate([[-1], np.flatnonzero(marks), [marks.size]])
-        excited_from = 0
+        excited_from, only_blows = 0, 0 < _longest_run(marks) < shortest * ratio
         for i in np.flatnonzero(np.diff(edges) >= shortest * ratio):
             start = 0 if i == 0 else int(edges[i]) + 2
             stop = int(edges[i + 1]) - 1 if i + 2 < edges.size else marks.size
@@ -159,49 +158,30 @@ def free_decays(
             if last - first < shortest:
                 continue
             risen = energy[first : first + width].mean()
+            blow = i > 0 and (before < 0 or risen > MIN_ENERGY_RISE * energy[before])
+            begins = first
             if i == 0:
-                begins = first + _at_rest(energy[first:last], width)
-                if last - begins >= shortest:
-                    first, start = begins, int(np.ceil(begins * ratio))
-                blow = _begins_high(energy[first:last])
-            else:
-                blow = before < 0 or risen > MIN_ENERGY_RISE * energy[before]
-                last = first + _until_rise(energy[first:last], width)
-                stop = min(stop, int(last * ratio))
-            fall = _fall_of_decay(energy[first:last], blow)
-            if fall > MIN_FALL_NEPERS:
-                length = max(_until_noise(energy[first:last]), shortest)
-                stop = min(stop, start + int(length * ratio))
-                found.append(Stretch(number, start, stop, fall))
+                begins += _at_rest(energy[first:last], width)
+                begins = begins if last - begins >= shortest else first
+            parts = [(begins, last)]
+            if i > 0 or only_blows:
+                parts = list(between_soft_blows(energy, begins, last, width))
+            for begins, ends in parts if only_blows else parts[:1]:
+                part = energy[begins:ends]
+                raised = blow or begins > parts[0][0] or (i == 0 and _begins_high(part))
+                fall = _fall_of_decay(part, raised) if part.size >= shortest else 0.0
+                if fall > MIN_FALL_NEPERS:
+                    exact = start if begins == first else int(np.ceil(begins * ratio))
+                    length = max(_until_noise(part), shortest)
+                    end = min(stop, int(ends * ratio), exact + int(length * ratio))
+                    found.append(Stretch(number, exact, end, fall))
     return tuple(found)
 
 
-def _energy(record, width):
-    """Energy of a record around each sample, each channel relative to its own."""
-    scaled = record / np.maximum(record.std(axis=0), 1e-300)
-    return _moving_mean(np.sum(scaled**2, axis=1), width)
-
-
-def until_soft_blow(record: Float[np.ndarray, "sample channel"], width: int) -> int:
-    """Samples of a record before a blow too soft to be found by its errors; all if there is none.
-
-    `width` are two cycles of the strongest vibration in samples.
-    """
-    return _until_rise(_energy(record, width), width)
-
-
-def _until_rise(energy, width):
-    """Samples before the energy rises within `width` above what it was just before.
-
-    That is a blow too soft to be found by its errors. Close modes make the energy rise, too, but
-    not above what it was as long before its least.
-    """
-    past = int(RISE_WIDTHS * width)
-    if energy.size < past + 2 * width:
-        return energy.size
-    before = sliding_window_view(energy, past).max(axis=-1)[: -2 * width]
-    risen = energy[past + 2 * width - 1 :][: before.size] > MIN_ENERGY_RISE * before
-    return past + int(np.argmax(risen)) if risen.any() else energy.size
+def _longest_run(marks) -> int:
+    """Most samples one after another that are marked."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], marks, [False]])))
+    return int(np.diff(edges)[::2].max(initial=0))
 
 
 def _begins_high(energy):

@@ -1,0 +1,77 @@
+"""Modes of fitted decays as candidates, with the reasons for rejecting them, and their energies."""
+
+import numpy as np
+
+from tuning.modal.ambient import Candidate, without_duplicates
+from tuning.modal.decay.fit import DecayFit
+from tuning.modal.decay.leaving import PARTS
+from tuning.modal.result import MAX_DAMPING_RATIO, IdentifiedMode, rejection_reason
+from tuning.modal.shapes import mac_matrix
+
+NOT_REPRODUCED = "not the same in parts of the window"
+NONLINEAR_DECAY = 2.5, 4.5  # decay rates over that of a mode, of what its nonlinearity adds to it
+NONLINEAR_MAC = 0.95
+
+BandFits = list[tuple[tuple[float, float], DecayFit]]  # of parts of a band (Hz)
+
+
+def decay_candidates(
+    fits: BandFits, channels: int, duration: float, band: tuple[float, float]
+) -> tuple[Candidate, ...]:
+    """Modes of each part of the band, with their shares in its energy of the channels."""
+    found = []
+    for part, fit in fits:
+        energy = np.sum(fit.measured**2, axis=0).reshape(-1, channels).sum(axis=0)
+        decays = fit.energies.shape[1] // channels
+        by_channel = fit.energies.reshape(-1, decays, channels).sum(axis=1)
+        shares = np.mean(by_channel / np.maximum(energy, 1e-300), axis=1)
+        for mode, share, gone in zip(fit.modes, shares.tolist(), fit.gone, strict=True):
+            if part[0] <= mode.frequency < part[1] or len(fits) == 1:
+                mode = mode._replace(energy_share=share)
+                reason = rejection_reason(mode, duration, band) or (NOT_REPRODUCED if gone else "")
+                found.append(Candidate(mode, reason, 1))
+    return without_duplicates(_without_nonlinearity(found))
+
+
+def share_of_modes(found: tuple[Candidate, ...], fits: BandFits, duration: float) -> float:
+    """Share of identified modes in the energy at the beginning of decays, beside rejected ones.
+
+    That is the first tenth: the energy over all of a decay would count steady hum for more, that at
+    the first sample a pole that is gone at the next. Poles damped too strongly for modes, which
+    stand for leakage into the band or the end of a blow, do not count.
+    """
+    good = rejected = 0.0
+    for part, fit in fits:
+        inside = [one for one in found if len(fits) == 1 or part[0] <= one.mode.frequency < part[1]]
+        for one in inside:
+            if one.mode.damping_ratio > MAX_DAMPING_RATIO:
+                continue
+            nepers = 4 * np.pi * one.mode.frequency * one.mode.damping_ratio * duration
+            early = np.expm1(-nepers / PARTS) / np.expm1(-nepers) if nepers > 1e-6 else 1 / PARTS
+            energy = one.mode.energy_share * early * np.sum(fit.measured**2)
+            good, rejected = (good, rejected + energy) if one.reason else (good + energy, rejected)
+    return float(good / max(good + rejected, 1e-300))
+
+
+def _without_nonlinearity(found: list[Candidate]) -> list[Candidate]:
+    """Candidates; those that a nonlinear restoring force makes of others are rejected.
+
+    The cube of a decaying vibration has its frequency and shape, three times its decay rate, and
+    less energy, as what it adds is a correction.
+    """
+    good = [one.mode for one in found if not one.reason]
+    return [
+        one if one.reason else one._replace(reason=next(
+            (f"what nonlinearity adds to the mode of {other.frequency:.4g} Hz" for other in good
+             if _is_cube(one.mode, other)), ""))
+        for one in found
+    ]  # fmt: skip
+
+
+def _is_cube(mode: IdentifiedMode, other: IdentifiedMode) -> bool:
+    """Whether a mode decays as the cube of another does, within its half-power bandwidth."""
+    rate = mode.pole.real / other.pole.real
+    near = abs(mode.frequency - other.frequency) < mode.damping_ratio * mode.frequency
+    alike = mac_matrix(mode.shape[None], other.shape[None])[0, 0] > NONLINEAR_MAC
+    less = mode.energy_share < other.energy_share
+    return bool(near and alike and less and NONLINEAR_DECAY[0] < rate < NONLINEAR_DECAY[1])

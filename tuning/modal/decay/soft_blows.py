@@ -1,0 +1,63 @@
+"""Blows too soft, or in too much noise, to be found by their errors: the energy rises at once."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+from numpy.lib.stride_tricks import sliding_window_view
+
+MIN_ENERGY_RISE = 2.0  # energy in two cycles after a blow over that before it
+RISE_WIDTHS = 5  # of two cycles each, before such a rise
+
+
+def vibration_energy(
+    record: Float[np.ndarray, "sample channel"], width: int
+) -> Float[np.ndarray, " sample"]:
+    """Energy of a record around each sample, each channel relative to its own."""
+    scaled = record / np.maximum(record.std(axis=0), 1e-300)
+    return moving_mean(np.sum(scaled**2, axis=1), width)
+
+
+def moving_mean(values: Float[np.ndarray, " sample"], width: int) -> Float[np.ndarray, " sample"]:
+    """Means of the values around each sample; fewer at the ends."""
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    index = np.arange(values.size)
+    low, high = np.maximum(index - width // 2, 0), np.minimum(index + width // 2 + 1, values.size)
+    return (total[high] - total[low]) / (high - low)
+
+
+def until_soft_blow(record: Float[np.ndarray, "sample channel"], width: int) -> int:
+    """Samples of a record before a blow too soft to be found by its errors; all if there is none.
+
+    `width` are two cycles of the strongest vibration in samples.
+    """
+    return _until_rise(vibration_energy(record, width), width)
+
+
+def between_soft_blows(
+    energy: Float[np.ndarray, " sample"], first: int, last: int, width: int
+) -> Iterator[tuple[int, int]]:
+    """First and last samples of the parts of a stretch before and after soft blows.
+
+    Where the energy is largest after a blow, nothing acts any longer.
+    """
+    while True:
+        rise = first + _until_rise(energy[first:last], width)
+        yield first, rise
+        if rise == last:
+            return
+        first = rise + int(np.argmax(energy[rise : min(rise + 4 * width, last)]))
+
+
+def _until_rise(energy, width):
+    """Samples before the energy rises within `width` above what it was just before.
+
+    That is a blow too soft to be found by its errors. Close modes make the energy rise, too, but
+    not above what it was as long before its least.
+    """
+    past = int(RISE_WIDTHS * width)
+    if energy.size < past + 2 * width:
+        return energy.size
+    before = sliding_window_view(energy, past).max(axis=-1)[: -2 * width]
+    risen = energy[past + 2 * width - 1 :][: before.size] > MIN_ENERGY_RISE * before
+    return past + int(np.argmax(risen)) if risen.any() else energy.size
