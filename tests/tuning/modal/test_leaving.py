@@ -152,9 +152,9 @@ def test_a_smooth_load_whose_end_is_found_early_makes_no_false_modes():
     assert not one.missed and not one.false_modes
 
 
-@pytest.mark.parametrize("seed", [1412, 1508])
-def test_what_grows_before_a_load_has_left_is_no_decay(seed):
-    """The energy falls while a smooth load crosses: there were false modes of that part."""
+@pytest.mark.parametrize("seed", [1412, 1508, 1913])
+def test_what_falls_before_a_load_has_left_is_no_decay(seed):
+    """Of three smooth loads; vibrations grow in two of these parts, three are alike in one."""
     planted = sampled(random_structure(seed), "crossing", seed, 60.0)
     fit = identify_modes(log_of(planted))
     one = compare(fit, planted)

@@ -58,11 +58,12 @@ def without_excitation(
     acts from the beginning.
     """
     first, *others = decays
+    split = has_split([one.mode for one in candidates if not one.reason])
     if others:
         grows = growing_share(candidates, len(measured) / rate) > MIN_GROWING_SHARE
-        return undisturbed(decays, measured, fitted, channels, 0.0 if grows else MIN_UNEXPLAINED)
+        least = 0.0 if grows or split else MIN_UNEXPLAINED
+        return undisturbed(decays, measured, fitted, channels, least)
     shaken = shaken_until(measured, fitted, independent)
-    split = has_split([one.mode for one in candidates if not one.reason])
     if not shaken and not after_blow and split:
         shaken = len(measured) // PARTS
     return (first._replace(start=first.start + shaken),)
