@@ -234,6 +234,7 @@ def test_decays_before_a_soft_blow_count_too(seed):
         ("crossing", 1411, 60.0),  # two nepers after the load has left, a quarter of the energy
         ("crossing", 1480, 60.0),  # 12.3 Hz, gone within 0.4 s of the end of the crossing
         ("blows", 1606, 60.0),  # a mode with three times the decay rate of a weaker one beside it
+        ("decay", 2022, 20.0),  # most energy is gone within two cycles of the slowest mode
         ("blows", 1824, 60.0),  # four blows in noise, of which the errors of one stand out
         ("blows", 1310, 60.0),  # a pair within its bandwidth, with a fifth of the energy in one
     ],

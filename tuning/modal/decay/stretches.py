@@ -193,11 +193,13 @@ def _begins_high(energy):
 def _at_rest(energy, width):
     """Samples of the beginning of a record before a blow that was not found by its errors.
 
-    The least energy of its first cycles is then a tenth of the most in the record, or less.
+    The least energy of its first cycles is then a tenth of the most in the record, or less, and it
+    does not begin with much energy, as a fast decay does.
     """
-    if MIN_START_RATIO * energy[:width].min() > energy.max():
+    rises = int(np.argmax(2 * energy > energy.max()))
+    if not rises or MIN_START_RATIO * energy[:width].min() > energy.max():
         return 0
-    return int(np.argmax(2 * energy > energy.max())) + width // 2
+    return rises + width // 2
 
 
 def _fall_of_decay(energy, blow):
