@@ -9,9 +9,9 @@ import jaxbeam as jb
 from tuning import Log
 from tuning.fit.dataset import Dataset
 from tuning.fit.least_squares import LeastSquares
-from tuning.fit.prediction import FunctionPrediction
 from tuning.fit.result import fit_result
 from tuning.parameters.free import free_parameters
+from tuning.parameters.prediction import FunctionPrediction
 
 TRUTH = {"beam.flexural_rigidity": 20.0, "beam.damping_ratio": 0.03, "sensors.0.offset": 0.2}
 AMPLITUDES = (1.0, 1.6, 0.7)  # initial deflection (m) in each log

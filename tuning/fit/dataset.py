@@ -11,10 +11,10 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.events import EventSchedule, stack_schedules
 from jaxbeam.simulation.integration_plan import IntegrationPlan, common_plan, integration_plan
-from tuning.fit.prediction import LogPrediction
 from tuning.logs.log import Log
 from tuning.logs.pairing import case_of_log, check_loads, check_times, pad_cases, sensor_readings
 from tuning.parameters.free import with_values
+from tuning.parameters.prediction import LogPrediction
 
 SIMULATION_TOLERANCE = 1e-5  # of the largest deflection, below the resolution of logs
 

@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float
 from jaxbeam.runtime.arrays import xp
 from tuning.fit.levenberg_marquardt import levenberg_marquardt
 from tuning.fit.loss import check_loss, robust_residual, robust_slope, variance_factor
-from tuning.fit.prediction import Prediction
 from tuning.fit.uncertainty.covariance import Uncertainty, autocorrelation_factor, uncertainty
 from tuning.parameters.free import FreeParameter, to_unbounded
+from tuning.parameters.prediction import SamplePrediction
 
 NOISE_ITERATIONS = 2  # fits, each with the noise levels that the one before has estimated
 MAX_STEPS = 60  # steps of one fit
@@ -30,7 +30,7 @@ class RegressionData(Protocol):
     measured: np.ndarray
     mask: np.ndarray
 
-    def prediction(self, addresses: list[str]) -> Prediction:
+    def prediction(self, addresses: list[str]) -> SamplePrediction:
         """All samples as a function of values at the addresses."""
         ...
 

@@ -25,7 +25,7 @@ OFFSET_ADDRESS = re.compile(r"(vehicle_)?sensors\.\d+\.offset")
 
 
 @runtime_checkable
-class Prediction(Protocol):
+class SamplePrediction(Protocol):
     """Samples as a function of the parameters of a fit."""
 
     def predict(self, values: Float[Array, " parameter"]) -> Float[Array, "log time channel"]:
