@@ -93,13 +93,21 @@ def _completed(client: "distributed.Client", futures: list) -> Iterator:
             time.sleep(0.005)
         else:
             next_check = now + CHECK
-            if client.status != "running" or client.nthreads():
+            if _has_workers_or_no_scheduler(client):
                 last_seen = time.monotonic()  # without a scheduler the futures are cancelled
             elif now - last_seen > LONELY:
                 raise RuntimeError(
                     f"the cluster has had no workers for {LONELY:.0f} s; finished blocks are kept:"
                     " start some, then resume"
                 )
+
+
+def _has_workers_or_no_scheduler(client: "distributed.Client") -> bool:
+    """Whether a cluster has workers, or its scheduler does not answer."""
+    try:
+        return client.status != "running" or bool(client.nthreads())
+    except OSError:  # lost since the last look; Dask has not noticed
+        return True
 
 
 def compute_and_store(blocks: list[int], fingerprint: str, path: Path) -> list[int]:

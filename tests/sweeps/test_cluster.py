@@ -167,3 +167,22 @@ def test_lost_workers_and_schedulers_end_a_sweep_in_a_sentence(stuck, lost, mess
     with pytest.raises(RuntimeError, match=message):
         compute()
     thread.join()
+
+
+@pytest.mark.filterwarnings("default")  # of Dask
+def test_a_scheduler_that_is_lost_while_it_is_asked_ends_a_sweep_in_a_sentence(stuck, monkeypatch):
+    """Its client had not noticed, and the sweep ended in an OSError; seen once on a busy machine."""
+    machines, compute = stuck
+    ask, answers = distributed.Client.nthreads, []
+
+    def nthreads(client):
+        answers.append(None)
+        if len(answers) == 1:
+            return ask(client)
+        machines.sync(machines.scheduler.close)
+        raise OSError("Timed out trying to connect")
+
+    monkeypatch.setattr(distributed.Client, "nthreads", nthreads)
+    with pytest.raises(RuntimeError, match="the scheduler .* is lost"):
+        compute()
+    assert len(answers) > 1
