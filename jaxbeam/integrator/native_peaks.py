@@ -80,11 +80,11 @@ C_MACROS = {
     "TIE_TOLERANCE": TIE_ROUNDING_UNITS * sys.float_info.epsilon,
 }
 HEADERS = (
-    *("ffi", "load_path", "matrices", "peak_search", "propagators"),
-    *("registers", "step_matrices", "steps", "vehicles", "workspace"),
+    *("ffi", "load_path", "matrices", "peak_search", "preparation", "propagators", "registers"),
+    *("step_matrices", "steps", "vehicle_layout", "vehicle_propagators", "vehicles", "workspace"),
 )
 LIBRARY = Library(
-    sources=("integrate_peaks.c",),
+    sources=("integrate_peaks.c", "preparation.c"),
     headers=tuple(f"{name}.h" for name in HEADERS),
     macros=tuple(C_MACROS.items()),
     targets=("integrate_peaks",),

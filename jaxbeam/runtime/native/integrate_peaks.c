@@ -62,7 +62,7 @@ static int next_chunk(Workspace *w, int *panel, int64_t *done) {
         for (int l = 0; l < w->loads && step->loads < w->max_loads; l++)
             if (active[l]) step->load_numbers[step->loads++] = l;
         step->rows = step->loads * NODES, step->ends = w->influence_terms ? 2 * step->loads : 0;
-        step_matrices(w, step);
+        prepare_step(w, step);
     }
     return count;
 }
@@ -76,8 +76,7 @@ static double last_exit(const Workspace *w) {
 
 static void integrate_task(Workspace *w) {
     reset(w);
-    shape_series(w);
-    compute_propagators(w);
+    prepare_task(w);
     set_vehicle_times(w);
     const double exit_time = last_exit(w);
     int panel = 0;

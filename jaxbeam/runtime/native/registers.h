@@ -72,7 +72,7 @@ static inline ALWAYS_INLINE void add_rows(Register *sums, const double *table, i
     for (int r = 0; r < rows; r++) sums[r] = sum[r];
 }
 
-static inline ALWAYS_INLINE void add_product(Register *sums, const double *table, int rows,
+static void add_product(Register *sums, const double *table, int rows,
                                              const Register *values, int size) {
     int r = 0;
     for (; r + 8 <= rows; r += 8) add_rows(sums + r, table + r, rows, values, size, 8);

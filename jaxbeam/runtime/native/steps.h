@@ -3,9 +3,8 @@
 
 #pragma once
 
-#include "propagators.h"
 #include "peak_search.h"
-#include "step_matrices.h"
+#include "preparation.h"
 #include "vehicles.h"
 
 /* Zero of the polynomial through the forces of a load at the Gauss nodes, near a start, which stays
@@ -246,7 +245,7 @@ static void advance_chunk(Workspace *w, int steps, Group *groups, int group_coun
         const Step *step = w->steps + t;
         const int vehicles = vehicles_move(w, step);
         if (vehicles)
-            for (const Group *g = groups; g < end; g++) vehicle_propagators(w, step, g);
+            for (const Group *g = groups; g < end; g++) prepare_vehicles(w, step, g);
         if (step->loads) {
             for (const Group *g = groups; g < end; g++) solve_contact(w, step, g);
             for (const Group *g = groups; g < end; g++) update_contact_minimum(w, step, g);

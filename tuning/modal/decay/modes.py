@@ -148,6 +148,9 @@ def free_decay_modes(
         one = _fitted(rest, samples, band, order)
         if one is None:
             return None
+    else:
+        if kind is None and _rest(one, samples, struck, band, cycle) != one.used:
+            return None
     if not given:
         one = _from_earlier(one, samples, struck, band, cycle, order)
     explained = (

@@ -1,0 +1,24 @@
+/* Where the propagators of vehicles are in the workspace. */
+
+#pragma once
+
+#include "workspace.h"
+
+/* Propagators of a vehicle: z at the end is T z + N q; `pull` is O. */
+typedef struct {
+    Register *transition, *pull, *input, *press;
+} Vehicle;
+
+static Vehicle vehicle_at(Register *start, int states, int wheels) {
+    const int rows = wheels * NODES;
+    Vehicle vehicle = {start};
+    vehicle.pull = vehicle.transition + states * states;
+    vehicle.input = vehicle.pull + rows * states;
+    vehicle.press = vehicle.input + states * rows;
+    return vehicle;
+}
+
+/* Propagators of the vehicles of all loads for a group of runs. */
+static Register *vehicles_of(const Workspace *w, const Group *g) {
+    return w->vehicle_propagators + g->first / REGISTER_WIDTH * w->vehicle_registers;
+}
