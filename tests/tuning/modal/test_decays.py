@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import Structure, random_structure, response, sampled
 from tuning import Log, identify_modes
+from tuning.modal.decay import modes as decay_modes
 from tuning.modal.decay.soft_blows import until_soft_blow
 from tuning.modal.decay.stretches import (
     Stretch,
@@ -161,6 +162,30 @@ def test_a_decay_after_a_strong_excitation_counts():
     fit = identify_modes(log_of(planted))
     assert fit.kind == "free decay", str(fit)
     np.testing.assert_allclose(fit.frequencies, planted.structure.frequencies[:2], rtol=2e-3)
+
+
+def test_a_part_that_forces_still_act_in_after_three_cuts_is_no_decay(monkeypatch):
+    """Unless the user says that it is one."""
+    log = log_of(sampled(structure(), "decay", 0, 15.0))
+    assert identify_modes(log).kind == "free decay"
+
+    def later(decays, *_, **__):
+        cuts.append(decays[0].start)
+        return (decays[0]._replace(start=decays[0].start + 20), *decays[1:])
+
+    cuts: list[int] = []
+    monkeypatch.setattr(decay_modes, "without_excitation", later)
+    assert identify_modes(log).kind == "ambient"
+    assert cuts == [0, 20, 40, 60] * (len(cuts) // 4)  # of each band that is tried
+    assert identify_modes(log, kind="free decay").kind == "free decay"
+
+
+def test_a_mode_of_ambient_response_that_falls_by_chance_is_no_decay():
+    """Its fit had six poles without damping beside the mode, and lacked the other mode."""
+    planted = sampled(random_structure(2212), "ambient", 2212, 300.0)
+    fit = identify_modes(log_of(planted))
+    one = compare(fit, planted)
+    assert fit.kind == "ambient" and not one.missed and not one.false_modes
 
 
 @pytest.mark.parametrize(("soft_blow", "stops_before"), [(5.0, 5.0), (None, 10.0)])
