@@ -165,6 +165,7 @@ from jaxbeam.analysis.stability import frozen_poles, growth
 case = jb.load_case("{case}")
 """
 SWEPT = "loads.0.mass", "loads.0.speed"
+OVER = f"over = dict(zip({SWEPT}, (np.linspace(0.1, 0.5, 64), np.linspace(0.7, 3, 64))))"
 RECORD = ("simulate", "{case}", "-o", "run.nc", "--plot", "--overwrite")
 DEMO = """
 import tomllib, tuning
@@ -260,7 +261,15 @@ ROWS = (
         "`jb.sweep`, 4096 runs",
         1.0,
         code="jb.sweep(case, over, progress=False)",
-        setup=f"over = dict(zip({SWEPT}, (np.linspace(0.1, 0.5, 64), np.linspace(0.7, 3, 64))))",
+        setup=OVER,
+    ),
+    Row(
+        "... of another structure, C compiled",
+        1.0,
+        code="jb.sweep(case, over, progress=False)",
+        case=TWO_SPANS.replace("modes = 6", "modes = 5"),
+        setup=OVER,
+        again=True,
     ),
     Row(
         "`tuning.identify` of the demo",

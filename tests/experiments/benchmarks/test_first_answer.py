@@ -45,7 +45,7 @@ def test_calls_commands_and_errors_are_timed_and_rows_that_follow_find_the_files
 
 
 def test_a_star_marks_a_goal_missed_beyond_the_import_of_jax():
-    jax_import, row = first_answer.Seconds(0.9, 0.5), Row("name", 1.0, beyond_jax=True)
-    assert first_answer.table_line(row, first_answer.Seconds(3.0, 1.4), jax_import)[-1] == "+ 1"
-    late = first_answer.table_line(row, first_answer.Seconds(3.0, 1.6), jax_import)
-    assert late == ("name", "3.00", "1.60", "+ 1 *")
+    jax_import, row = first_answer.Seconds(0.5, 0.4), Row("name", 1.0, beyond_jax=True)
+    assert first_answer.table_line(row, first_answer.Seconds(1.4, 3.0), jax_import)[-1] == "+ 1"
+    late = first_answer.table_line(row, first_answer.Seconds(1.6, 1.2), jax_import)
+    assert late == ("name", "1.60", "1.20", "+ 1 *")
