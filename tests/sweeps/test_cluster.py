@@ -171,7 +171,7 @@ def test_lost_workers_and_schedulers_end_a_sweep_in_a_sentence(stuck, lost, mess
 
 @pytest.mark.filterwarnings("default")  # of Dask
 def test_a_scheduler_that_is_lost_while_it_is_asked_ends_a_sweep_in_a_sentence(stuck, monkeypatch):
-    """Its client had not noticed, and the sweep ended in an OSError; seen once on a busy machine."""
+    """Its client had not noticed, and the sweep ended in an OSError; seen on one core."""
     machines, compute = stuck
     ask, answers = distributed.Client.nthreads, []
 
