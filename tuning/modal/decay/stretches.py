@@ -142,40 +142,62 @@ def free_decays(
     way. What is at rest before a first blow that was not found does not count. In a record of blows
     the energy also tells of those too soft, or in too much noise, to be found by their errors.
     """
-    found = []
     shortest = int(np.ceil(MIN_DECAY_CYCLES * rate / frequency))
     width = max(int(2 * rate / frequency), 4)
+    found = []
     for number, (marks, record) in enumerate(zip(struck, records, strict=True)):
-        ratio = marks.size / len(record)
-        energy = vibration_energy(record, width)
-        edges = np.concatenate([[-1], np.flatnonzero(marks), [marks.size]])
-        excited_from, only_blows = 0, 0 < _longest_run(marks) < shortest * ratio
-        for i in np.flatnonzero(np.diff(edges) >= shortest * ratio):
-            start = 0 if i == 0 else int(edges[i]) + 2
-            stop = int(edges[i + 1]) - 1 if i + 2 < edges.size else marks.size
-            first, last = int(np.ceil(start / ratio)), int(stop / ratio)
-            before, excited_from = int(excited_from / ratio) - width, stop
-            if last - first < shortest:
-                continue
-            risen = energy[first : first + width].mean()
-            blow = i > 0 and (before < 0 or risen > MIN_ENERGY_RISE * energy[before])
-            begins = first
-            if i == 0:
-                begins += _at_rest(energy[first:last], width)
-                begins = begins if last - begins >= shortest else first
-            parts = [(begins, last)]
-            if i > 0 or only_blows:
-                parts = list(between_soft_blows(energy, begins, last, width))
-            for begins, ends in parts if only_blows else parts[:1]:
-                part = energy[begins:ends]
-                raised = blow or begins > parts[0][0] or (i == 0 and _begins_high(part))
-                fall = _fall_of_decay(part, raised) if part.size >= shortest else 0.0
-                if fall > MIN_FALL_NEPERS:
-                    exact = start if begins == first else int(np.ceil(begins * ratio))
-                    length = max(_until_noise(part), shortest)
-                    end = min(stop, int(ends * ratio), exact + int(length * ratio))
-                    found.append(Stretch(number, exact, end, fall))
+        found += _decays_of_record(number, marks, vibration_energy(record, width), shortest, width)
     return tuple(found)
+
+
+def _decays_of_record(number, marks, energy, shortest, width) -> list[Stretch]:
+    """Decays between the struck samples of a record, from the energy of its vibration."""
+    ratio = marks.size / len(energy)
+    only_blows = 0 < _longest_run(marks) < shortest * ratio
+    found, excited_from = [], 0
+    for start, stop in _free_stretches(marks, shortest * ratio):
+        first, last = int(np.ceil(start / ratio)), int(stop / ratio)
+        before, excited_from = int(excited_from / ratio) - width, stop
+        if last - first < shortest:
+            continue
+        risen = energy[first : first + width].mean()
+        blow = start > 0 and (before < 0 or risen > MIN_ENERGY_RISE * energy[before])
+        parts = _parts(energy, (first, last), start == 0, only_blows, shortest, width)
+        for begins, ends in parts:
+            part = energy[begins:ends]
+            raised = blow or begins > parts[0][0] or (start == 0 and _begins_high(part))
+            fall = _fall_of_decay(part, raised) if part.size >= shortest else 0.0
+            if fall > MIN_FALL_NEPERS:
+                exact = start if begins == first else int(np.ceil(begins * ratio))
+                length = max(_until_noise(part), shortest)
+                end = min(stop, int(ends * ratio), exact + int(length * ratio))
+                found.append(Stretch(number, exact, end, fall))
+    return found
+
+
+def _free_stretches(marks, shortest) -> list[tuple[int, int]]:
+    """First sample and end of each stretch between struck samples that is long enough."""
+    edges = np.concatenate([[-1], np.flatnonzero(marks), [marks.size]])
+    return [
+        (0 if i == 0 else int(edges[i]) + 2, int(edges[i + 1]) - (i + 2 < edges.size))
+        for i in np.flatnonzero(np.diff(edges) >= shortest).tolist()
+    ]
+
+
+def _parts(energy, stretch, is_first, only_blows, shortest, width) -> list[tuple[int, int]]:
+    """Parts of a stretch in which a decay may be: all of it, or those between soft blows.
+
+    After another excitation than a blow, that before the first soft blow.
+    """
+    first, last = stretch
+    begins = first
+    if is_first:
+        begins += _at_rest(energy[first:last], width)
+        begins = begins if last - begins >= shortest else first
+        if not only_blows:
+            return [(begins, last)]
+    parts = list(between_soft_blows(energy, begins, last, width))
+    return parts if only_blows else parts[:1]
 
 
 def _longest_run(marks) -> int:
