@@ -38,6 +38,11 @@ def test_modes_of_a_file_without_headings(run, decay_log):
     np.testing.assert_allclose(part["frequencies_hz"], [12], rtol=2e-3)
 
 
+def test_modes_that_the_user_chooses(run, decay_log):
+    found = run(f"modes-from-log node.csv {COLUMNS} --band 5:60 --choose 11.9 --json")
+    np.testing.assert_allclose(found["frequencies_hz"], [12], rtol=1e-3)
+
+
 def test_a_measured_force(run, refused, decay_log):
     """The first column is a blow of a hammer, in N by the unit given to it."""
     rows = np.loadtxt(decay_log / "node.csv", delimiter=",")
@@ -89,6 +94,9 @@ def test_a_case_is_fitted_to_the_modes(run, decay_log):
         (f"node.csv {COLUMNS} --band 5", "--band takes LOW:HIGH in Hz, such as 5:45, not '5'"),
         (f"node.csv {COLUMNS} --band 5:600", "not within 0 and half the sampling rate, 150 Hz"),
         (f"node.csv {COLUMNS} --exclude x", "--exclude takes frequencies in Hz"),
+        (f"node.csv {COLUMNS} --choose 0", "--choose takes frequencies in Hz"),
+        (f"node.csv {COLUMNS} --choose 12 --count 1", "chosen modes are all that are kept; leave"),
+        (f"node.csv {COLUMNS} --choose 90", "no pole within 2 % of the chosen 90 Hz; the nearest"),
         (f"node.csv {COLUMNS} --from 3 --to 2", "--from must be less than --to"),
         (f"node.csv {COLUMNS} --channels c", "the log has no channel 'c'; it has a, b"),
         (f"node.csv {COLUMNS} --method x", "method must be"),

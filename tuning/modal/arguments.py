@@ -70,3 +70,17 @@ def check_arguments(
         raise ValueError("method 'decay' fits free decays; for kind 'ambient' leave the method out")
     if order is not None and method == "fdd":
         raise ValueError("method 'fdd' has no models and no order; leave the order out")
+
+
+def check_choice(count: int | None, exclude: Sequence[float], choose: Sequence[float]) -> None:
+    """Check frequencies (Hz) of modes that are chosen.
+
+    Raises ValueError for frequencies that are not positive, and beside a number of modes or
+    excluded frequencies, as all modes are chosen then.
+    """
+    wrong = [frequency for frequency in choose if not 0 < frequency < float("inf")]
+    if wrong:
+        raise ValueError(f"modes are chosen by frequencies above 0 Hz, not {wrong[0]:g} Hz")
+    if len(choose) and (count is not None or len(exclude)):
+        other = "exclude" if count is None else "count"
+        raise ValueError(f"chosen modes are all that are kept; leave out {other}")

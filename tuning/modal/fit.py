@@ -127,7 +127,7 @@ class ModalFit:
                 f"{100 * mode.energy_share:5.1f} %"
             )
         if self.rejected:
-            lines.append("  not well identified:")
+            lines.append("  not well identified:  [--choose FREQUENCY]")
         for mode, reason in self.rejected:
             lines.append(f"  {mode.frequency:14.4f}  {reason}")
         return "\n".join(lines)

@@ -24,8 +24,10 @@ from tuning.modal.arguments import (
     METHODS,
     check_arguments,
     check_band,
+    check_choice,
     check_force,
 )
+from tuning.modal.chosen import chosen_modes
 from tuning.modal.decay.modes import Decays, band_of_ends, excited, free_decay_modes
 from tuning.modal.fit import Choice, ModalFit
 from tuning.modal.forced.blows import force_at_blows
@@ -62,6 +64,7 @@ def identify_modes(
     force: Sequence[str] | None = None,
     force_window: float | None = None,
     exclude: Sequence[float] = (),
+    choose: Sequence[float] = (),
     progress: Callable[[str], None] | None = None,
 ) -> ModalFit:
     """Modes from a log, or from several of the same channels, of unknown excitation.
@@ -77,12 +80,15 @@ def identify_modes(
     method "plscf", then the default, fits the responses to them; a force that one of several logs
     lacks, as of a hammer that strikes another place in each, is zero there. `force_window` (s) is
     the time after each blow of a hammer from which on the force is taken for zero. `exclude` are
-    frequencies (Hz) that are no modes. `progress` is called with a few words on what is being done.
+    frequencies (Hz) that are no modes. The modes nearest to the frequencies `choose` (Hz) are kept,
+    also those that are not well identified, and no others. `progress` is called with a few words on
+    what is being done.
 
     Raises ValueError for a log without evenly sampled records, or too short, a window outside the
     log, a band above half the sampling rate, an impossible count or order, unknown channels, kinds
     and methods, a kind or forces that the method cannot use, channels that are no forces, a force
-    window without blows, and logs that differ in channels or sampling rate.
+    window without blows, frequencies to choose that have no pole within 2 %, and logs that differ
+    in channels or sampling rate.
 
     >>> import numpy as np
     >>> import tuning
@@ -96,6 +102,8 @@ def identify_modes(
     """
     logs = [log] if isinstance(log, Log) else list(log)
     check_arguments(count, kind, order, method)
+    check_choice(count, exclude, choose)
+    keep = _Keep(count, exclude, choose)
     check_force(force, force_window, kind, method)
     measured = logs
     forces = () if kind or method not in (None, "plscf") else force_names(logs, force)
@@ -123,7 +131,7 @@ def identify_modes(
         )
         _add_order(choices, order, found)
         choices = [*_band_choice(band, used_band), *choices]
-        return _result(logs, samples, found, used_band, (), choices, "plscf", count, exclude)
+        return _result(logs, samples, found, used_band, (), choices, "plscf", keep)
     if progress:
         progress("harmonic lines and excitation")
     lines, cleaned = subtract_lines(samples, used_band, exclude)
@@ -171,7 +179,7 @@ def identify_modes(
         choices.append(Choice(f"method {used_method}", f"--method {', '.join(METHODS)}"))
     _add_order(choices, order, found)
     choices = [*_band_choice(band, used_band), *choices]
-    return _result(logs, samples, found, used_band, lines, choices, used_method, count, exclude)
+    return _result(logs, samples, found, used_band, lines, choices, used_method, keep)
 
 
 def _band_choice(band, used: tuple[float, float]) -> list[Choice]:
@@ -246,7 +254,15 @@ def _kind_words(found: _Found, struck, lines) -> str:
     return "excitation: ambient"
 
 
-def _result(logs, samples, found: _Found, band, lines, choices, method, count, exclude):
+class _Keep(NamedTuple):
+    """What the user says on which modes to keep."""
+
+    count: int | None
+    exclude: Sequence[float]
+    choose: Sequence[float]
+
+
+def _result(logs, samples, found: _Found, band, lines, choices, method, keep: _Keep):
     """The fit: candidates divided into modes and rejected ones."""
     longest = max(len(record) for record in samples.records)
     resolution = samples.rate / longest
@@ -254,7 +270,7 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, count, e
     modes, rejected = [], []
     for candidate in found.candidates:
         mode, reason = candidate.mode, candidate.reason
-        near = [f for f in exclude if abs(mode.frequency - f) < max(0.01 * f, 3 * resolution)]
+        near = [f for f in keep.exclude if abs(mode.frequency - f) < max(0.01 * f, 3 * resolution)]
         hit = [one for one in lines if abs(mode.frequency - one.frequency) < 2 * resolution]
         if near:
             reason = f"excluded, {near[0]:g} Hz"
@@ -268,10 +284,14 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, count, e
             reason = "of steady amplitude: a harmonic line that wanders"
         (rejected if reason else modes).append((mode, reason))
     modes.sort(key=lambda pair: -pair[0].energy_share)
-    if count is not None:
-        rejected += [(mode, f"not among the {count} of most energy") for mode, _ in modes[count:]]
-        modes = modes[:count]
+    if keep.count is not None:
+        reason = f"not among the {keep.count} of most energy"
+        rejected += [(mode, reason) for mode, _ in modes[keep.count :]]
+        modes = modes[: keep.count]
     notes = list(samples.notes)
+    if len(keep.choose):
+        modes, rejected, said = chosen_modes([*modes, *rejected], keep.choose, logs[0].source)
+        notes += said
     if found.decays is None:
         windows = tuple(
             (start, start + (len(record) - 1) / samples.rate)

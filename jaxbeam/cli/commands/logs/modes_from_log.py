@@ -35,6 +35,7 @@ def modes_from_log(
     exponential: float | None = None,
     kind: str | None = None,
     exclude: str | None = None,
+    choose: str | None = None,
     count: int | None = None,
     align: bool = False,
     plot: bool = False,
@@ -87,6 +88,9 @@ def modes_from_log(
         ambient or "free decay".
     exclude
         FREQUENCY,FREQUENCY,...: frequencies (Hz) of machines or hum, which are no modes.
+    choose
+        FREQUENCY,FREQUENCY,...: keep the modes nearest to these frequencies (Hz), also those that
+        are not well identified, and no others.
     count
         Number of modes to keep, those with most energy.
     align
@@ -119,7 +123,7 @@ def modes_from_log(
         exponential is not None and responses is None,
         "--exponential is for --responses; modes are found without it",
     )
-    excluded = _numbers("--exclude", exclude)
+    excluded, chosen = _numbers("--exclude", exclude), _numbers("--choose", choose)
     check_exists("log file", *logs)
     picture = figure_path(None, logs[0]) if plot else None
     drawn = None
@@ -153,6 +157,7 @@ def modes_from_log(
         force=_names(force),
         force_window=force_window,
         exclude=excluded,
+        choose=chosen,
         progress=None if options.json_ or not sys.stderr.isatty() else print_message,
     )
     if picture:
