@@ -84,7 +84,7 @@ HEADERS = (
     *("step_matrices", "steps", "vehicle_layout", "vehicle_propagators", "vehicles", "workspace"),
 )
 LIBRARY = Library(
-    sources=("integrate_peaks.c", "preparation.c"),
+    sources=("integrate_peaks.c", "preparation.c", "matrices.c"),
     headers=tuple(f"{name}.h" for name in HEADERS),
     macros=tuple(C_MACROS.items()),
     targets=("integrate_peaks",),

@@ -337,7 +337,8 @@ def test_peaks_of_curves_through_any_samples(tmp_path):
     (tmp_path / "search.c").write_text(SEARCH)
     compiler, flags = native_library.find_compiler(), native_peaks.LIBRARY.compiler_flags
     include = ["-I", str(native_library.C_FOLDER)]
-    command = [compiler, "-shared", *flags, *include, "search.c", "-o", "search.so"]
+    sources = ["search.c", str(native_library.C_FOLDER / "matrices.c")]
+    command = [compiler, "-shared", *flags, *include, *sources, "-o", "search.so"]
     subprocess.run(command, check=True, cwd=tmp_path)
     pointer = np.ctypeslib.ndpointer(float, flags="C")
     search = ctypes.CDLL(str(tmp_path / "search.so")).search

@@ -2,6 +2,7 @@
 
 #pragma once
 
+#include "matrices.h"
 #include "workspace.h"
 
 /* Chebyshev series (segment, term, derivative and mode) of mode shapes and their first two

@@ -6,7 +6,7 @@
 
 #include <math.h>
 
-#include "registers.h"
+#include "matrices.h"
 
 static inline Register polynomial(const Register *coefficients, int terms, Register x) {
     Register sum = coefficients[terms - 1];

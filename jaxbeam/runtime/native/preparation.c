@@ -1,4 +1,4 @@
-/* What is computed before runs are advanced: half of the code, which another compiler compiles
+/* What is computed before runs are advanced: a third of the code, which another compiler compiles
  * meanwhile. */
 
 #include "preparation.h"

@@ -3,6 +3,7 @@
 
 #pragma once
 
+#include "matrices.h"
 #include "peak_search.h"
 #include "preparation.h"
 #include "vehicles.h"
