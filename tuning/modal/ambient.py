@@ -138,10 +138,32 @@ def _modes_of_band(prepared: Prepared, whole, data_driven, order, refine):
         for mode, reason, chain in zip(modes, reasons, diagram.chains, strict=True)
     ]
     reasons = [rejection_reason(mode, duration, whole) for mode in modes]
-    if refine and any(reasons):
-        modes, reasons = _decided(modes, reasons, records, prepared.rate, scale, duration, whole)
+    if refine:
+        doubtful = [one or _beside(k, modes, reasons) for k, one in enumerate(reasons)]
+        if any(doubtful):
+            refined = _decided(modes, doubtful, records, prepared.rate, scale, duration, whole)
+            modes, reasons = _known(modes, reasons, *refined)
     candidates = [Candidate(*found) for found in zip(modes, reasons, lengths, strict=True)]
     return candidates, diagram
+
+
+def _beside(k, modes, reasons) -> str:
+    """Words for an accepted mode that intervals cannot tell from another accepted one."""
+    near = [
+        other.frequency
+        for j, other in enumerate(modes)
+        if j != k and not reasons[j] and _is_same(modes[k], other)
+    ]
+    return f"not told from {near[0]:.4g} Hz" if near else ""
+
+
+def _known(modes, reasons, refined, decided):
+    """Refined modes and reasons; accepted modes that are at none of their places stay as before."""
+    accepted = [mode for mode, reason in zip(refined, decided, strict=True) if not reason]
+    for k, mode in enumerate(modes):
+        if decided[k] and not reasons[k] and not any(_is_same(mode, one) for one in accepted):
+            refined[k], decided[k] = mode, ""
+    return refined, decided
 
 
 def _decided(modes, reasons, records, rate, scale, duration, whole):

@@ -196,6 +196,19 @@ def test_a_mode_that_is_steady_by_chance_is_named():
     assert f"--exclude {fit.frequencies[near[0]]:.4g}]" in str(fit)
 
 
+def test_poles_whose_intervals_overlap_are_told_apart_by_the_likelihood():
+    """A pair in one channel, 2 % apart, whose poles scatter with the order by half of that."""
+    planted = sampled(random_structure(2421), "ambient", 2421, 300.0)
+    fit = identify_modes(log_of(planted))
+    pair = zip(
+        planted.structure.frequencies[2:4], planted.structure.damping_ratios[2:4], strict=True
+    )
+    for frequency, damping in pair:
+        near = min(fit.modes, key=lambda mode: abs(mode.frequency - frequency))
+        assert abs(near.frequency - frequency) < 2 * near.frequency_sd < 0.1
+        assert abs(near.damping_ratio - damping) < 2 * near.damping_sd
+
+
 def test_what_a_pole_varies_with_the_order_adds_to_its_uncertainty():
     """Of sixteen orders the lowest vary least from block to block, and are biased."""
     frequencies = np.where(np.arange(16) < 2, 5.0, 5.1)
