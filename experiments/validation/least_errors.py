@@ -6,19 +6,25 @@ random forces and the frequencies of lines, the number of modes, and that shapes
 are frequencies, damping ratios, shapes and, of random forces, their places.
 
 A log does not tell a mode if the interval of its damping ratio holds zero all the same, if that of
-its frequency holds a neighbour within its half-power bandwidth, or if it is nearer to a harmonic
-of a machine than the resolution of the log: a harmonic of fluctuating amplitude and phase responds
-like the mode.
+its frequency holds a neighbour within its half-power bandwidth, if a model without it is expected
+to do as well (`expected_gain`), or if it is nearer to a harmonic of a machine than the resolution
+of the log: a harmonic of fluctuating amplitude and phase responds like the mode.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy.stats import norm
 
 from tests.oracles.planted_structures import FINER, WEAK, Planted, Structure, noise_spectrum
 
 QUANTILE = 1.96
+# Expected log likelihood that a mode gains, of which half of the logs tell it, if one of ten
+# thousand without it may: with both models known the gain has mean D and variance 2 D with the
+# mode, -D and 2 D without it.
+TELLING_GAIN = float(norm.isf(1e-4) ** 2 / 2)
 WIDTHS = 10.0  # half-power widths around a mode in which every bin counts; else one of some
 SPARSE = 3000  # bins in all, about
 STEP = 1e-4  # relative, of differences
@@ -32,15 +38,26 @@ class LeastErrors(NamedTuple):
     damping_ratios: Float[np.ndarray, " mode"]
 
 
-def least_errors(planted: Planted, duration: float, shaken: bool = False) -> LeastErrors:
-    """Least errors under random forces, from the distribution of spectra (Whittle 1953).
+class RandomResponse(NamedTuple):
+    """Spectral matrices (bin, channel, channel) of unknowns (mode, unknown), and their truth.
+
+    `weights` are the bins that each bin stands for. Unknown are frequencies, damping ratios, and
+    shapes at the channels and at the places of the forces.
+    """
+
+    spectra: Callable[[np.ndarray], np.ndarray]
+    weights: Float[np.ndarray, " bin"]
+    unknowns: Float[np.ndarray, "mode unknown"]
+
+
+def random_response(planted: Planted, duration: float, shaken: bool = False) -> RandomResponse:
+    """Spectra of the response to random forces in noise, and the unknowns that were planted.
 
     `shaken` tells that the random forces are those beside a shaker; lines are left out.
     """
     structure, rate = planted.structure, planted.rate
     bins, weights = _bins(planted, duration)
     inputs = structure.inputs * (WEAK if shaken else 1.0)
-    unknowns = _stacked(structure, structure.shapes, inputs)
     channels = structure.shapes.shape[1]
     angles = 2 * np.pi * bins / rate
     noise = planted.noise**2 * noise_spectrum(angles)[:, None, None] * np.eye(channels)
@@ -52,11 +69,33 @@ def least_errors(planted: Planted, duration: float, shaken: bool = False) -> Lea
             found = found + one @ one.conj().transpose(0, 2, 1) / FINER
         return found
 
-    inverse = np.linalg.inv(spectra(unknowns))
-    relative = [inverse @ slope for slope in _slopes(spectra, unknowns)]
-    left = np.array([(one * weights[:, None, None]).ravel() for one in relative])
+    return RandomResponse(spectra, weights, _stacked(structure, structure.shapes, inputs))
+
+
+def least_errors(planted: Planted, duration: float, shaken: bool = False) -> LeastErrors:
+    """Least errors under random forces, from the distribution of spectra (Whittle 1953).
+
+    `shaken` is that of `random_response`.
+    """
+    response = random_response(planted, duration, shaken)
+    truth = response.unknowns
+    fisher = information(response, response.spectra(truth), truth)[1]
+    return _of_information(fisher, truth)
+
+
+def information(response: RandomResponse, expected, unknowns):
+    """Gradient of minus the expected log likelihood by all unknowns, and Fisher's information.
+
+    `expected` are the spectra of the log.
+    """
+    inverse = np.linalg.inv(response.spectra(unknowns))
+    relative = [inverse @ slope for slope in _slopes(response.spectra, unknowns)]
+    misfit = np.eye(expected.shape[1]) - inverse @ expected
+    weights = response.weights[:, None, None]
+    left = np.array([(one * weights).ravel() for one in relative])
     right = np.array([one.transpose(0, 2, 1).ravel() for one in relative])
-    return _of_information((left @ right.T).real, unknowns)
+    gradient = left @ misfit.transpose(0, 2, 1).ravel()
+    return gradient.real, (left @ right.T).real
 
 
 def least_errors_of_forced(
@@ -170,8 +209,10 @@ def _of_information(information, unknowns) -> LeastErrors:
     return LeastErrors(deviations[:, 0], deviations[:, 1])
 
 
-def why_untold(planted: Planted, mode: int, errors: LeastErrors, duration: float) -> str:
-    """Why a log of a duration (s) does not tell a mode; empty if it may."""
+def why_untold(
+    planted: Planted, mode: int, errors: LeastErrors, duration: float, gain: float = np.inf
+) -> str:
+    """Why a log of a duration (s) does not tell a mode of an `expected_gain`; empty if it may."""
     structure = planted.structure
     frequency, damping = structure.frequencies[mode], structure.damping_ratios[mode]
     lines = [line for line in planted.lines if abs(line - frequency) < 1 / duration]
@@ -189,4 +230,8 @@ def why_untold(planted: Planted, mode: int, errors: LeastErrors, duration: float
         apart = abs(structure.frequencies[other] - frequency)
         if apart < min(half, widths[mode] + widths[other]):
             return f"{apart:.2g} Hz from another, +- {half:.2g} Hz at best"
+    if gain < TELLING_GAIN:
+        return (
+            f"a model without it is as likely but for {gain:.1f}, of {TELLING_GAIN:.1f} that tell"
+        )
     return ""

@@ -8,6 +8,7 @@ stable within 2 % of the mode, told where to look, is in the last column: it may
 import numpy as np
 
 from experiments.validation import measured_forces, modal_identification
+from experiments.validation.expected_gain import expected_gain
 from experiments.validation.least_errors import (
     QUANTILE,
     LeastErrors,
@@ -36,7 +37,10 @@ def missed_rows(kind: str, words: str, seed: int, found: PlantedComparison) -> l
     structure, rows = planted.structure, []
     for frequency in found.missed:
         mode = int(np.argmin(np.abs(structure.frequencies - frequency)))
-        reason = why_untold(planted, mode, errors, duration)
+        gain = np.inf
+        if kind in RANDOM:
+            gain = expected_gain(planted, mode, duration, kind == "shaken")
+        reason = why_untold(planted, mode, errors, duration, gain)
         least = (
             f"{QUANTILE * errors.frequencies[mode]:.2g} Hz",
             f"{QUANTILE * errors.damping_ratios[mode]:.2g}",

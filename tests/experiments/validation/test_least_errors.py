@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 
+from experiments.validation.expected_gain import expected_gain
 from experiments.validation.least_errors import (
+    TELLING_GAIN,
     least_errors,
     least_errors_of_decays,
     least_errors_of_forced,
+    random_response,
     why_untold,
 )
 from tests.oracles.planted_structures import Planted, Structure, noise_spectrum
@@ -73,3 +76,39 @@ def test_why_a_log_does_not_tell_a_mode():
 def test_noise_has_unit_variance():
     angles = np.linspace(-np.pi, np.pi, 20_001)
     assert np.mean(noise_spectrum(angles)) == pytest.approx(1.0, rel=1e-2)
+
+
+def test_the_expected_gain_is_the_mean_of_likelihood_ratios():
+    """Of a weak mode alone, whose spectra are known with and without it."""
+    one, duration = planted([4.0], [0.02], noise=0.3), 200.0
+    response = random_response(one, duration)
+    matrices = [response.spectra(unknowns) for unknowns in (response.unknowns, np.zeros((0, 6)))]
+    random = np.random.default_rng(0)
+    parts = random.normal(size=(2, 500, *matrices[0].shape[:2])) / np.sqrt(2)
+    values = np.einsum("bcd,rbd->rbc", np.linalg.cholesky(matrices[0]), parts[0] + 1j * parts[1])
+    costs = [
+        np.linalg.slogdet(matrix)[1]
+        + np.einsum("rbc,bcd,rbd->rb", values.conj(), np.linalg.inv(matrix), values).real
+        for matrix in matrices
+    ]
+    ratios = np.sum(response.weights * (costs[1] - costs[0]), axis=1)
+    error = 4 * ratios.std() / np.sqrt(len(ratios))
+    assert expected_gain(one, 0, duration) == pytest.approx(ratios.mean(), abs=error)
+    assert error < 0.1 * ratios.mean()
+
+
+def test_nothing_is_gained_from_a_mode_that_another_can_be():
+    """Two modes of one pole and one shape respond like one; a little apart, they differ."""
+    gains = []
+    for apart in (0.0, 0.01, 0.2):
+        pair = planted([4.0, 4.0 + apart], [0.02, 0.02])
+        shapes = np.tile(pair.structure.shapes[:1], (2, 1))
+        pair = pair._replace(structure=pair.structure._replace(shapes=shapes))
+        gains.append(expected_gain(pair, 1, 300.0))
+    assert abs(gains[0]) < 0.05
+    assert gains[0] < TELLING_GAIN < gains[2] and gains[1] < gains[2]
+    pair = planted([4.0, 4.2], [0.02, 0.02])
+    errors = least_errors(pair, 300.0)
+    assert not why_untold(pair, 1, errors, 300.0, gains[2])
+    told = why_untold(pair, 1, errors, 300.0, abs(gains[0]))
+    assert told.startswith("a model without it is as likely but for 0.0")
