@@ -39,8 +39,14 @@ def test_modes_of_a_file_without_headings(run, decay_log):
 
 
 def test_modes_that_the_user_chooses(run, decay_log):
-    found = run(f"modes-from-log node.csv {COLUMNS} --band 5:60 --choose 11.9 --json")
-    np.testing.assert_allclose(found["frequencies_hz"], [12], rtol=1e-3)
+    """One of two that are well identified without a choice."""
+    rows = np.loadtxt(decay_log / "node.csv", delimiter=",")
+    wave = np.exp(2 * np.pi * 21 * rows[:, 0] * (-0.01 + 1j)).real
+    rows[:, 1:] += np.multiply.outer(wave, [1.0, 0.7])
+    np.savetxt(decay_log / "two.csv", rows, delimiter=",", fmt="%.6f")
+    line = f"modes-from-log two.csv {COLUMNS} --band 5:60 --json"
+    np.testing.assert_allclose(run(line)["frequencies_hz"], [12, 21], rtol=1e-3)
+    np.testing.assert_allclose(run(f"{line} --choose 20.9")["frequencies_hz"], [21], rtol=1e-3)
 
 
 def test_a_measured_force(run, refused, decay_log):

@@ -148,7 +148,12 @@ def _modes_of_band(prepared: Prepared, whole, data_driven, order, refine):
 
 
 def _beside(k, modes, reasons) -> str:
-    """Words for an accepted mode that intervals cannot tell from another accepted one."""
+    """Words for an accepted mode of one channel that intervals cannot tell from another.
+
+    Of several channels the shapes tell whether there is another (`_is_same`).
+    """
+    if modes[k].shape.size > 1:
+        return ""
     near = [
         other.frequency
         for j, other in enumerate(modes)
