@@ -79,6 +79,11 @@ def free_response(transition: Float[Array, "block side side"], state: Float[Arra
     return next_state.reshape(state.shape)
 
 
+def advance_free(transitions: Float[Array, "step block side side"], state):
+    """Steps without forces and commands: final state, and state before each step."""
+    return scan(lambda state, one: (free_response(one, state), state), state, transitions)
+
+
 def advance_unforced(step: StepInput, state, vehicles: Vehicles | None):
     """Steps without commands: final state, state before each step, and contact forces."""
     matrices, inertia, weight = step.matrices, step.inertia, step.weight
