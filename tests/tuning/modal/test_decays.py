@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.signal import lfilter
 
 from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import Structure, random_structure, response, sampled
@@ -233,6 +234,31 @@ def test_the_rest_before_a_blow_that_was_not_found_is_no_part_of_its_decay(rest)
     assert rest <= found.start / 400 <= rest + 2 / 8.0
 
 
+def test_the_energy_tells_of_blows_but_makes_none_of_ambient_vibration():
+    """A mode of 4 Hz after three blows in noise, and under forces that make its energy rise, too."""
+    times, ratio, count = np.arange(3000) / 50, 0.01, 0
+    since = times - np.array([[4.0], [22.0], [41.0]])
+    decays = np.exp(-2 * np.pi * 4 * ratio * since) * np.sin(2 * np.pi * 4 * since)
+    random = np.random.default_rng(0)
+    noise = 0.02 * random.normal(size=times.size)
+    fit = identify_modes(one_channel(times, np.where(since > 0, decays, 0.0).sum(axis=0) + noise))
+    assert [round(start) for start, _ in fit.windows] == [4, 22, 41]
+    assert [mode.frequency for mode in fit.modes] == pytest.approx([4.0], rel=1e-3)
+    pole = np.exp(2 * np.pi * 4 * (1j - ratio) / 50)
+    for seed in range(12):
+        forces = np.random.default_rng(seed).normal(size=times.size)
+        log = one_channel(times, np.real(lfilter([1.0], [1.0, -pole], forces)))
+        unmarked = (np.zeros(times.size, bool),)
+        count += len(free_decays(unmarked, (log.values,), 50.0, 4.0)) > 1
+        assert len(identify_modes(log).windows) == 1
+    assert count  # the energy alone does not tell
+
+
+def one_channel(times, values):
+    """A log of one acceleration."""
+    return Log(times, values[:, None], ("a",), ("acceleration",), ("m/s^2",))
+
+
 def test_a_mode_of_blows_at_equal_intervals_is_no_harmonic_line():
     """Four blows, two too soft to be found: in phase, the decays of one mode look like a line."""
     planted = sampled(random_structure(930), "blows", 930, 60.0)
@@ -262,6 +288,7 @@ def test_decays_before_a_soft_blow_count_too(seed):
         ("decay", 2022, 20.0),  # most energy is gone within two cycles of the slowest mode
         ("blows", 1824, 60.0),  # four blows in noise, of which the errors of one stand out
         ("blows", 1310, 60.0),  # a pair within its bandwidth, with a fifth of the energy in one
+        ("blows", 2548, 60.0),  # four blows in noise, of which only the energy tells
     ],
 )
 def test_all_strong_modes_of_decays_that_fall_little_or_have_weak_partners(kind, seed, duration):

@@ -39,6 +39,13 @@ def dominate(
     return bool(inside > MIN_DECAY_ENERGY * whole or falls or has_followed)
 
 
+def after_soft_blows(
+    decays: tuple[Stretch, ...], struck: tuple[Bool[np.ndarray, " time"], ...]
+) -> bool:
+    """Whether there are several decays in records in which no excitation was found."""
+    return len(decays) > len(struck) and not any(marks.any() for marks in struck)
+
+
 def follows(decay: Stretch, struck: Bool[np.ndarray, " time"], cycle: float) -> bool:
     """Whether a decay begins where the structure was excited for five cycles or more.
 

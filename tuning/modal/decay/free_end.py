@@ -16,6 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from tuning.modal.decay.soft_blows import MIN_ENERGY_RISE
+
 ORDERS = (2, 4, 6, 8, 12, 16)  # eigenvalues of the models, two for each vibration
 HANKEL_CYCLES = 3.0  # of the strongest vibration in the columns of the matrices
 MIN_ROWS, MAX_ROWS, MIN_LAGS = 60, 200, 12  # of these, in all channels; samples of each
@@ -23,13 +25,13 @@ MAX_TRIED = 60  # instants
 MIN_CYCLES = 10  # of the strongest vibration in the shortest end
 MIN_LENGTH = 40  # samples of it
 PARTS = 10  # of an end, whose errors are compared
-MIN_RATIO, RATIO_SDS = 2.0, 3.0  # of errors, or deviations of the ratio, beyond which they differ
+MIN_RATIO, RATIO_SDS = 1.3, 3.0  # of errors, or deviations of the ratio, beyond which they differ
 MIN_ERRORS = 1e-4  # of the energy of the first part; less may be nonlinearity, or rounding
 MAX_DAMPING = 0.15  # ratio of a vibration
 # Instants one after another that end the search: some errors, as a weak vibration is seen some
 # cycles late, or clear ones.
-MAX_REFUSED, CLEAR_MISFIT = 8, 1.5
-GOOD_FIT = 0.6  # misfit of an end without forces: errors a fifth more than noise, at most
+MAX_REFUSED, CLEAR_MISFIT = 14, 2.3
+GOOD_FIT = 0.9  # misfit of an end without forces: errors a fifth more than noise, at most
 MARGIN_CYCLES = 1.5  # by which the end begins later, as forces just before it show little
 MAX_UNEXPLAINED = 0.15  # of the energy of the first part
 MIN_FALL = 1.0  # nepers, of the energy that is explained, from the first part to the last
@@ -106,6 +108,8 @@ def free_end(
     # Forces that end within a step show little: the end begins one step after the earliest, or
     # earlier, where an end has the errors of noise.
     compared = ends.fit(min(later.start + 2 * step, starts[0]))
+    least = min(end.variance for end in (compared, later, accepted))
+    compared = compared._replace(variance=least)  # a short end may be fitted badly
     fine = range(later.start, earliest, -max(int(cycle / 2), 2))
     found = _earliest_good(ends, fine, compared) or later
     # Soon after the beginning, errors may be those of vibrations that are gone at once.
@@ -113,8 +117,9 @@ def free_end(
         return None
     # What decays from the beginning, but not quite linearly, has no forces before the end, either.
     squares = np.mean(values[since : found.start] ** 2, axis=1)
-    before = _slope(_of_parts(squares), squares.size)
-    if before < SAME_RATE * found.slope:
+    before = _of_parts(squares)
+    rises = _of_parts(found.energy)[0] > MIN_ENERGY_RISE * before[-1]
+    if not rises and _slope(before, squares.size) < SAME_RATE * found.slope:
         return None
     return min(found.start + int(MARGIN_CYCLES * cycle), later.start)
 

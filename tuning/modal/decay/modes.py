@@ -13,14 +13,13 @@ from tuning.modal.ambient import (
     subspace_modes,
 )
 from tuning.modal.decay.candidates import decay_candidates, share_of_modes
-from tuning.modal.decay.dominant import after_blow, dominate, follows
+from tuning.modal.decay.dominant import after_blow, after_soft_blows, dominate, follows
 from tuning.modal.decay.earlier_start import earlier_start
 from tuning.modal.decay.fit import DecayFit, fit_decay
 from tuning.modal.decay.free_end import free_end
 from tuning.modal.decay.leaving import (
     PARTS,
     end_of_excitation,
-    growing_share,
     without_excitation,
 )
 from tuning.modal.decay.soft_blows import until_soft_blow
@@ -38,9 +37,11 @@ from tuning.modal.stabilisation import Diagram
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
 MIN_SHARE_OF_MODES = 0.5  # of the energy at the beginning of decays
 MIN_LEVEL_AT_START = 3.0  # energy of the first part of such a decay over the mean
-MAX_GROWING_SHARE = 0.25  # of the energy, of a vibration that grows in a decay
 MAX_CUTS = 3  # of a decay in which the structure is found to be excited
 MAX_RESIDUAL_OF_WINDOW = 0.05  # the same for a window that the user gives and that falls little
+# The same after blows that only the energy tells of: those of planted logs left 0.003 at most,
+# parts of ambient vibration of one mode 0.01 at least.
+MAX_RESIDUAL_AFTER_SOFT_BLOWS = 0.007
 
 
 class Decays(NamedTuple):
@@ -139,7 +140,7 @@ def free_decay_modes(
         return None
     cycle = samples.rate / frequency
     one = _fitted(decays, samples, band, order)
-    if one is None or (kind is None and _grows(one)):
+    if one is None:
         return None
     for _ in range(MAX_CUTS):
         rest = one.used if given else _rest(one, samples, struck, band, cycle)
@@ -153,11 +154,11 @@ def free_decay_modes(
             return None
     if not given:
         one = _from_earlier(one, samples, struck, band, cycle, order)
-    explained = (
-        _unexplained(one.measured, one.fitted) < MAX_RESIDUAL_OF_WINDOW
-        if given
-        else _unexplained_of_decay(one.measured, one.fitted) < MAX_RESIDUAL_ENERGY
-    )
+    if given or after_soft_blows(decays, struck):
+        most = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_AFTER_SOFT_BLOWS
+        explained = _unexplained(one.measured, one.fitted) < most
+    else:
+        explained = _unexplained_of_decay(one.measured, one.fitted) < MAX_RESIDUAL_ENERGY
     damped = share_of_modes(one.candidates, one.fits, one.duration) > MIN_SHARE_OF_MODES
     if kind is None and not (damped and explained):
         return None
@@ -204,11 +205,6 @@ def _fitted(decays, samples: Samples, band, order) -> _Fitted | None:
     duration = len(windows) / samples.rate
     found = decay_candidates(fits, channels, duration, band)
     return _Fitted(used, duration, found, fits, diagrams, measured, fitted)
-
-
-def _grows(one: _Fitted) -> bool:
-    """Whether a strong vibration grows: then most of what was fitted is no decay."""
-    return growing_share(one.candidates, one.duration) > MAX_GROWING_SHARE
 
 
 def _rest(one: _Fitted, samples: Samples, struck, band, cycle) -> tuple[Stretch, ...]:

@@ -34,6 +34,9 @@ MIN_FALL_NEPERS = 1.0  # of the energy over a decay
 MIN_START_RATIO = 10.0  # energy of the first tenth over that of the second half, after a blow
 MIN_LINEARITY = 0.6  # share of the variance of the log energy that a straight line explains
 MAX_COLUMNS = 24  # channels times decays that are fitted together
+# Of a record's energy, in decays after blows that the energy alone tells of. Ambient vibration
+# rises and falls, too: what falls in it held at most 0.37.
+MIN_ENERGY_AFTER_SOFT_BLOWS = 0.7
 FALL_PARTS = 10  # parts of a decay whose mean energies tell its fall
 NOISE_QUANTILE = 0.25  # of the energy of a stretch: that of the noise, if the decay has ended
 CORES_BEFORE_NOISE = 8  # times that of 95 % of the energy above noise: 12 decay times of one mode
@@ -139,8 +142,9 @@ def free_decays(
     one neper, along a line or after a blow that raised it; it ends when 99.9 % of the energy above
     the least has passed, or sooner if a long rest is noise. A record may begin right after a blow:
     its energy is then far above that at its end, though close modes make it rise and fall on the
-    way. What is at rest before a first blow that was not found does not count. In a record of blows
-    the energy also tells of those too soft, or in too much noise, to be found by their errors.
+    way. What is at rest before a first blow that was not found does not count. In a record without
+    a lasting excitation the energy also tells of blows too soft, or in too much noise, to be found
+    by their errors.
     """
     shortest = int(np.ceil(MIN_DECAY_CYCLES * rate / frequency))
     width = max(int(2 * rate / frequency), 4)
@@ -151,9 +155,25 @@ def free_decays(
 
 
 def _decays_of_record(number, marks, energy, shortest, width) -> list[Stretch]:
-    """Decays between the struck samples of a record, from the energy of its vibration."""
+    """Decays between the struck samples of a record, from the energy of its vibration.
+
+    Without struck samples the energy may tell of blows, if the decays hold most of it.
+    """
     ratio = marks.size / len(energy)
-    only_blows = 0 < _longest_run(marks) < shortest * ratio
+    only_blows = _longest_run(marks) < shortest * ratio
+    found = _decays_between(number, marks, energy, shortest, width, only_blows)
+    if marks.any():
+        return found
+    spans = [(int(one.start / ratio), int(one.stop / ratio)) for one in found]
+    held = sum(energy[start:stop].sum() for start, stop in spans)
+    if len(found) > 1 and held > MIN_ENERGY_AFTER_SOFT_BLOWS * energy.sum():
+        return found
+    return _decays_between(number, marks, energy, shortest, width, False)
+
+
+def _decays_between(number, marks, energy, shortest, width, only_blows: bool) -> list[Stretch]:
+    """Decays between struck samples, and soft blows if nothing but blows excites the record."""
+    ratio = marks.size / len(energy)
     found, excited_from = [], 0
     for start, stop in _free_stretches(marks, shortest * ratio):
         first, last = int(np.ceil(start / ratio)), int(stop / ratio)
@@ -187,7 +207,7 @@ def _free_stretches(marks, shortest) -> list[tuple[int, int]]:
 def _parts(energy, stretch, is_first, only_blows, shortest, width) -> list[tuple[int, int]]:
     """Parts of a stretch in which a decay may be: all of it, or those between soft blows.
 
-    After another excitation than a blow, that before the first soft blow.
+    After another excitation than blows, that before the first soft blow.
     """
     first, last = stretch
     begins = first
