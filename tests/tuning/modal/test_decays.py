@@ -235,7 +235,7 @@ def test_the_rest_before_a_blow_that_was_not_found_is_no_part_of_its_decay(rest)
 
 
 def test_the_energy_tells_of_blows_but_makes_none_of_ambient_vibration():
-    """A mode of 4 Hz after three blows in noise, and under forces that make its energy rise, too."""
+    """A mode of 4 Hz after three blows in noise, and under forces: its energy rises, too."""
     times, ratio, count = np.arange(3000) / 50, 0.01, 0
     since = times - np.array([[4.0], [22.0], [41.0]])
     decays = np.exp(-2 * np.pi * 4 * ratio * since) * np.sin(2 * np.pi * 4 * since)
