@@ -8,8 +8,9 @@ import numpy as np
 
 from experiments.validation.least_errors import RandomResponse, information, random_response
 from tests.oracles.planted_structures import Planted
+from tuning.modal.likelihood.scoring import damped_scoring
 
-MAX_ITERATIONS, MAX_TRIES, TOLERANCE = 60, 12, 1e-2
+TOLERANCE = 1e-2  # of the expected log likelihood, at which the search ends
 MAX_DAMPING_RATIO = 0.5
 REACH = 5.0  # half-power widths, of both together, that another mode may move to replace one
 
@@ -53,27 +54,19 @@ def _are_possible(unknowns, places) -> bool:
 
 def _least_cost(response: RandomResponse, expected, unknowns, places) -> float:
     """Least cost near a start, by damped Fisher scoring; infinite for a start out of reach."""
-    if not _are_possible(unknowns, places):
-        return np.inf
-    cost, damping = _cost(response, expected, unknowns), 1e-3
-    for _ in range(MAX_ITERATIONS):
-        gradient, fisher = information(response, expected, unknowns)
-        scale = 1 / np.sqrt(np.diag(fisher) + 1e-300)
-        scaled = fisher * np.outer(scale, scale)
-        for _ in range(MAX_TRIES):
-            matrix = scaled + damping * np.eye(len(scaled))
-            step = scale * np.linalg.solve(matrix, scale * gradient)
-            other = unknowns - step.reshape(unknowns.shape)
-            found = np.inf
-            if _are_possible(other, places):
-                found = _cost(response, expected, other)
-            if found < cost:
-                break
-            damping *= 8
-        else:
-            break
-        gain, damping = cost - found, max(damping / 4, 1e-6)
-        unknowns, cost = other, found
-        if gain < TOLERANCE:
-            break
-    return cost
+
+    def cost_at(unknowns):
+        possible = _are_possible(unknowns, places)
+        return _cost(response, expected, unknowns) if possible else np.inf
+
+    def moved(unknowns, step):
+        other = unknowns + step.reshape(unknowns.shape)
+        return other, cost_at(other)
+
+    def scored(unknowns):
+        return information(response, expected, unknowns)
+
+    cost = cost_at(unknowns)
+    if np.isinf(cost):
+        return cost
+    return damped_scoring(unknowns, cost, scored, moved, TOLERANCE)[1]

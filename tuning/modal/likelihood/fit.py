@@ -1,4 +1,6 @@
-"""The model of the largest likelihood: information, damped Fisher scoring, covariance."""
+"""The model of the largest likelihood: information, search, covariance."""
+
+import functools
 
 import numpy as np
 from jaxtyping import Float
@@ -12,10 +14,9 @@ from tuning.modal.likelihood.model import (
     spectra_of,
     with_cost,
 )
+from tuning.modal.likelihood.scoring import damped_scoring
 
-MAX_ITERATIONS = 40
 TOLERANCE = 5e-2  # of the logarithm of the likelihood, at which the search ends
-MAX_TRIES, MIN_DAMPING = 10, 1e-6  # of a step, whose damping grows by eight each time
 MAX_SKEWNESS = 3.0  # over the damping ratio
 PART_BINS = 256  # whose derivatives are formed at once
 UNKNOWN, MAX_OPEN = 1e100, 1e-6  # variance; share of a pole in such directions
@@ -130,29 +131,17 @@ def maximise(model: SpectralModel, window: Window) -> SpectralModel:
     Poles stay in the window and damped.
     """
     low, high = 2 * np.pi * window.frequencies.min(), 2 * np.pi * window.frequencies.max()
-    model, damping = with_cost(model, window), 1e-3
-    for _ in range(MAX_ITERATIONS):
-        gradient, fisher = information(model, window)
-        scale = np.minimum(
-            1 / np.sqrt(np.diag(fisher) + 1e-300), _largest_steps(model, len(fisher))
-        )
-        scaled = fisher * np.multiply.outer(scale, scale)
-        for _ in range(MAX_TRIES):
-            matrix = scaled + damping * np.eye(len(scaled))
-            other = _moved(model, -scale * np.linalg.solve(matrix, scale * gradient))
-            inside = (other.poles.imag > low) & (other.poles.imag < high)
-            if np.all(inside & (other.poles.real < 0)):
-                other = with_cost(other, window)
-            if other.cost < model.cost:
-                break
-            damping *= 8
-        else:
-            break
-        gain, damping = model.cost - other.cost, max(damping / 4, MIN_DAMPING)
-        model = other
-        if gain < TOLERANCE:
-            break
-    return model
+
+    def moved(model: SpectralModel, step):
+        other = _moved(model, step)
+        inside = (other.poles.imag > low) & (other.poles.imag < high)
+        if np.all(inside & (other.poles.real < 0)):
+            other = with_cost(other, window)
+        return other, other.cost
+
+    start = with_cost(model, window)
+    search = functools.partial(information, window=window), moved, TOLERANCE, _largest_steps
+    return damped_scoring(start, start.cost, *search)[0]
 
 
 def covariance(model: SpectralModel, window: Window) -> Float[np.ndarray, "unknown unknown"]:
