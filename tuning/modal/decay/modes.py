@@ -157,6 +157,8 @@ def free_decay_modes(
     if given or after_soft_blows(decays, struck):
         most = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_AFTER_SOFT_BLOWS
         explained = _unexplained(one.measured, one.fitted) < most
+        # Ambient vibration of one mode is explained as well, by many poles that are none.
+        explained = explained and (given or _has_few_others(one.candidates))
     else:
         explained = _unexplained_of_decay(one.measured, one.fitted) < MAX_RESIDUAL_ENERGY
     damped = share_of_modes(one.candidates, one.fits, one.duration) > MIN_SHARE_OF_MODES
@@ -205,6 +207,12 @@ def _fitted(decays, samples: Samples, band, order) -> _Fitted | None:
     duration = len(windows) / samples.rate
     found = decay_candidates(fits, channels, duration, band)
     return _Fitted(used, duration, found, fits, diagrams, measured, fitted)
+
+
+def _has_few_others(candidates: tuple[Candidate, ...]) -> bool:
+    """Whether no more candidates are rejected than are modes."""
+    rejected = sum(bool(one.reason) for one in candidates)
+    return 2 * rejected <= len(candidates)
 
 
 def _rest(one: _Fitted, samples: Samples, struck, band, cycle) -> tuple[Stretch, ...]:
