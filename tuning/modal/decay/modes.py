@@ -39,8 +39,8 @@ MIN_SHARE_OF_MODES = 0.5  # of the energy at the beginning of decays
 MIN_LEVEL_AT_START = 3.0  # energy of the first part of such a decay over the mean
 MAX_CUTS = 3  # of a decay in which the structure is found to be excited
 MAX_RESIDUAL_OF_WINDOW = 0.05  # the same for a window that the user gives and that falls little
-# The same after blows that only the energy tells of: those of planted logs left 0.003 at most,
-# parts of ambient vibration of one mode 0.01 at least.
+# The same after blows that only the energy tells of: those of three planted logs left 0.003 at
+# most, what falls in fifteen short records of ambient vibration 0.01 at least.
 MAX_RESIDUAL_AFTER_SOFT_BLOWS = 0.007
 
 
@@ -157,7 +157,7 @@ def free_decay_modes(
     if given or after_soft_blows(decays, struck):
         most = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_AFTER_SOFT_BLOWS
         explained = _unexplained(one.measured, one.fitted) < most
-        # Ambient vibration of one mode is explained as well, by many poles that are none.
+        # In a long record many poles that are no modes explain ambient vibration as well.
         explained = explained and (given or _has_few_others(one.candidates))
     else:
         explained = _unexplained_of_decay(one.measured, one.fitted) < MAX_RESIDUAL_ENERGY

@@ -35,7 +35,7 @@ MIN_START_RATIO = 10.0  # energy of the first tenth over that of the second half
 MIN_LINEARITY = 0.6  # share of the variance of the log energy that a straight line explains
 MAX_COLUMNS = 24  # channels times decays that are fitted together
 # Of a record's energy, in decays after blows that the energy alone tells of. Ambient vibration
-# rises and falls, too: what falls in it held at most 0.37.
+# rises and falls, too: what falls held as much in one of eight short records of one mode.
 MIN_ENERGY_AFTER_SOFT_BLOWS = 0.7
 FALL_PARTS = 10  # parts of a decay whose mean energies tell its fall
 NOISE_QUANTILE = 0.25  # of the energy of a stretch: that of the noise, if the decay has ended
