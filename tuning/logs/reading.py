@@ -250,9 +250,10 @@ def _time_column(path, table: LogTable, requested: str | None) -> str:
         if text in UNITS and UNITS[text].quantity == "time":
             return name
     raise ValueError(
-        f"{path}: no column is called time or has a unit of time; say which it is, e.g. "
-        f'time={table.names[0]!r}, or time = "{table.names[0]}" in {path.stem}.toml, or give the '
-        "sampling rate of a log without times (rate)"
+        f"{path}: no column is called time or has a unit of time; say which it is, "
+        f'time = "{table.names[0]}" in {path.stem}.toml, or read_log(..., '
+        f"time={table.names[0]!r}); of a log without times give the sampling rate (modes-from-log "
+        "--rate, or read_log(..., rate=))"
     )
 
 

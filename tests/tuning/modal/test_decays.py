@@ -93,8 +93,8 @@ def test_a_record_that_begins_with_a_blow_is_a_decay(seed):
     assert found.start == 0
 
 
-@pytest.mark.parametrize("shift", [0.0, 0.01])
-def test_what_nonlinearity_adds_is_no_mode(shift):
+@pytest.mark.parametrize(("shift", "blows"), [(0.0, [1.0]), (0.01, [1.0]), (0.01, [1.0, 0.7])])
+def test_what_nonlinearity_adds_is_no_mode(shift, blows):
     """Cubic stiffness raises the first frequency by 1 %: the response has a part that decays as the
     cube of the rest, three times as fast."""
     times, omega, damping = np.arange(1500) / 100, 2 * np.pi * 3.7, 0.008
@@ -103,13 +103,35 @@ def test_what_nonlinearity_adds_is_no_mode(shift):
         force = omega**2 * (state[0] + 8 / 3 * shift * state[0] ** 3)
         return [state[1], -2 * damping * omega * state[1] - force]
 
-    solved = solve_ivp(slope, (0, 15), [1.0, 0.0], t_eval=times, rtol=1e-7, atol=1e-9)
-    values = np.outer(solved.y[0], [1.0, 0.7])
+    values, state = [], np.zeros(2)
+    for blow in blows:
+        start = [state[0] + blow, state[1]]
+        solved = solve_ivp(slope, (0, 15), start, t_eval=times, rtol=1e-7, atol=1e-9)
+        state = solved.y[:, -1]
+        values.append(np.outer(solved.y[0], [1.0, 0.7]))
+    values = np.concatenate(values)
     values = values + 0.02 * np.random.default_rng(0).normal(size=values.shape)
+    times = np.arange(len(values)) / 100
     log = Log(times, values, ("d1", "d2"), ("deflection",) * 2, ("m",) * 2)
     fit = identify_modes(log, band=(1.0, 12.0))
+    assert len(fit.windows) == len(blows)
     assert fit.kind == "free decay" and fit.frequencies == pytest.approx([3.7], rel=0.005)
     assert ("nonlinearity" in str(fit)) == (shift > 0)
+
+
+@pytest.mark.parametrize(("power", "is_mode"), [(1, True), (3, False)])
+def test_a_fast_decay_beside_a_slow_one_grows_as_its_cube_or_is_a_mode(power, is_mode):
+    """After three blows of different strength at one place, close modes keep their proportion."""
+    times, random = np.arange(1500) / 100, np.random.default_rng(0)
+    slow = np.exp((-0.2 + 2j * np.pi * 3.7) * times)
+    fast = np.exp((-0.6 + 2j * np.pi * 3.76) * times + 1j)
+    blows = [1.0, 0.5, 0.7]
+    values = np.concatenate([(blow * slow + 0.4 * blow**power * fast).real for blow in blows])
+    values += 0.01 * random.normal(size=values.size)
+    fit = identify_modes(one_channel(np.arange(values.size) / 100, values), band=(1.0, 12.0))
+    assert len(fit.windows) == 3
+    assert fit.frequencies == pytest.approx([3.7, 3.76] if is_mode else [3.7], rel=0.005)
+    assert ("nonlinearity" in str(fit)) != is_mode
 
 
 def test_a_lightly_damped_decay_is_no_harmonic_line():
@@ -224,6 +246,18 @@ def test_noise_long_after_a_decay_is_no_part_of_it():
     assert 3 / 0.3 < found.stop / 200 < 8 / 0.3
 
 
+@pytest.mark.parametrize("first", [0.5, 1.0])
+def test_the_first_of_several_blows_may_be_the_softest(first):
+    """By the energy alone, which is the first to tell of a structure at rest."""
+    times = np.arange(6000) / 100
+    record = 0.01 * np.random.default_rng(0).normal(size=times.size)
+    for blow, size in ((4.0, first), (22.0, 1.0), (41.0, 1.0)):
+        since = np.maximum(times - blow, 0.0)
+        record += size * np.exp(-0.3 * since) * np.sin(2 * np.pi * 4.0 * since)
+    found = free_decays((np.zeros(times.size, bool),), (record[:, None],), 100.0, 4.0)
+    assert [one.start / 100 for one in found] == pytest.approx([4.0, 22.0, 41.0], abs=0.5)
+
+
 @pytest.mark.parametrize("rest", [0.0, 2.0])
 def test_the_rest_before_a_blow_that_was_not_found_is_no_part_of_its_decay(rest):
     times = np.arange(6000) / 200 - rest
@@ -259,6 +293,14 @@ def one_channel(times, values):
     return Log(times, values[:, None], ("a",), ("acceleration",), ("m/s^2",))
 
 
+def test_a_decay_that_is_cut_may_begin_before_the_cut():
+    """A load's forces were taken for part of it, and more was left out than they last."""
+    planted = sampled(random_structure(2819), "crossing", 2819, 60.0)
+    fit = identify_modes(log_of(planted))
+    assert np.abs(fit.frequencies / 3.690 - 1).min() < 0.01  # gone soon after the load has left
+    assert not compare(fit, planted).false_modes
+
+
 def test_a_mode_of_blows_at_equal_intervals_is_no_harmonic_line():
     """Four blows, two too soft to be found: in phase, the decays of one mode look like a line."""
     planted = sampled(random_structure(930), "blows", 930, 60.0)
@@ -289,6 +331,7 @@ def test_decays_before_a_soft_blow_count_too(seed):
         ("blows", 1824, 60.0),  # four blows in noise, of which the errors of one stand out
         ("blows", 1310, 60.0),  # a pair within its bandwidth, with a fifth of the energy in one
         ("blows", 2548, 60.0),  # four blows in noise, of which only the energy tells
+        ("blows", 2814, 60.0),  # the first with half the energy; a mode of three times the rate
     ],
 )
 def test_all_strong_modes_of_decays_that_fall_little_or_have_weak_partners(kind, seed, duration):

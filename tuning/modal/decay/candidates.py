@@ -11,26 +11,36 @@ from tuning.modal.shapes import mac_matrix
 NOT_REPRODUCED = "not the same in parts of the window"
 NONLINEAR_DECAY = 2.5, 4.5  # decay rates over that of a mode, of what its nonlinearity adds to it
 NONLINEAR_MAC = 0.95
+MAX_CUBE_SPREAD = 3.0  # of energies of several decays over what they would be of cubes
 
 BandFits = list[tuple[tuple[float, float], DecayFit]]  # of parts of a band (Hz)
 
 
 def decay_candidates(
-    fits: BandFits, channels: int, duration: float, band: tuple[float, float]
+    fits: BandFits, decays: int, channels: int, duration: float, band: tuple[float, float]
 ) -> tuple[Candidate, ...]:
-    """Modes of each part of the band, with their shares in its energy of the channels."""
-    found = []
+    """Modes of each part of the band, with their shares in its energy of the channels.
+
+    Columns of the fits are the `channels` of each of several `decays`, or of combinations of these.
+    """
+    found, by_decay = [], []
     for part, fit in fits:
-        energy = np.sum(fit.measured**2, axis=0).reshape(-1, channels).sum(axis=0)
-        decays = fit.energies.shape[1] // channels
-        by_channel = fit.energies.reshape(-1, decays, channels).sum(axis=1)
-        shares = np.mean(by_channel / np.maximum(energy, 1e-300), axis=1)
-        for mode, share, gone in zip(fit.modes, shares.tolist(), fit.gone, strict=True):
+        total = np.sum(fit.measured**2, axis=0).reshape(-1, channels).sum(axis=0)
+        parts = fit.energies.shape[1] // channels
+        columns = fit.energies.reshape(-1, parts, channels)
+        shares = np.mean(columns.sum(axis=1) / np.maximum(total, 1e-300), axis=1)
+        energies = columns.sum(axis=2)
+        if parts != decays:  # combinations of decays
+            energies = energies.sum(axis=1, keepdims=True)
+        for mode, share, gone, energy in zip(
+            fit.modes, shares.tolist(), fit.gone, energies, strict=True
+        ):
             if part[0] <= mode.frequency < part[1] or len(fits) == 1:
                 mode = mode._replace(energy_share=share)
                 reason = rejection_reason(mode, duration, band) or (NOT_REPRODUCED if gone else "")
                 found.append(Candidate(mode, reason, 1))
-    return without_duplicates(_without_nonlinearity(found))
+                by_decay.append(energy)
+    return without_duplicates(_without_nonlinearity(found, by_decay))
 
 
 def share_of_modes(found: tuple[Candidate, ...], fits: BandFits, duration: float) -> float:
@@ -53,18 +63,19 @@ def share_of_modes(found: tuple[Candidate, ...], fits: BandFits, duration: float
     return float(good / max(good + rejected, 1e-300))
 
 
-def _without_nonlinearity(found: list[Candidate]) -> list[Candidate]:
+def _without_nonlinearity(found: list[Candidate], by_decay) -> list[Candidate]:
     """Candidates; those that a nonlinear restoring force makes of others are rejected.
 
     The cube of a decaying vibration has its frequency and shape, three times its decay rate, and
-    less energy, as what it adds is a correction.
+    less energy, as what it adds is a correction; of several decays, it grows as the cube of theirs.
     """
-    good = [one.mode for one in found if not one.reason]
+    good = [(one.mode, own) for one, own in zip(found, by_decay, strict=True) if not one.reason]
     return [
         one if one.reason else one._replace(reason=next(
-            (f"what nonlinearity adds to the mode of {other.frequency:.4g} Hz" for other in good
-             if _is_cube(one.mode, other)), ""))
-        for one in found
+            (f"what nonlinearity adds to the mode of {other.frequency:.4g} Hz"
+             for other, theirs in good
+             if _is_cube(one.mode, other) and _grows_as_cube(own, theirs)), ""))
+        for one, own in zip(found, by_decay, strict=True)
     ]  # fmt: skip
 
 
@@ -75,3 +86,9 @@ def _is_cube(mode: IdentifiedMode, other: IdentifiedMode) -> bool:
     alike = mac_matrix(mode.shape[None], other.shape[None])[0, 0] > NONLINEAR_MAC
     less = mode.energy_share < other.energy_share
     return bool(near and alike and less and NONLINEAR_DECAY[0] < rate < NONLINEAR_DECAY[1])
+
+
+def _grows_as_cube(energies, others) -> bool:
+    """Whether energies of a mode in several decays are in proportion to the cubes of another's."""
+    ratios = energies / np.maximum(others, 1e-300) ** 3
+    return bool(ratios.max() < MAX_CUBE_SPREAD * ratios.min())

@@ -142,6 +142,7 @@ def free_decay_modes(
     one = _fitted(decays, samples, band, order)
     if one is None:
         return None
+    found = one.used
     for _ in range(MAX_CUTS):
         rest = one.used if given else _rest(one, samples, struck, band, cycle)
         if rest == one.used:
@@ -153,7 +154,8 @@ def free_decay_modes(
         if kind is None and _rest(one, samples, struck, band, cycle) != one.used:
             return None
     if not given:
-        one = _from_earlier(one, samples, struck, band, cycle, order)
+        cut = one.used[0].start not in {stretch.start for stretch in found}
+        one = _from_earlier(one, samples, struck, band, cycle, order, cut)
     if given or after_soft_blows(decays, struck):
         most = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_AFTER_SOFT_BLOWS
         explained = _unexplained(one.measured, one.fitted) < most
@@ -205,7 +207,7 @@ def _fitted(decays, samples: Samples, band, order) -> _Fitted | None:
         for name in ("measured", "fitted")
     )
     duration = len(windows) / samples.rate
-    found = decay_candidates(fits, channels, duration, band)
+    found = decay_candidates(fits, len(used), channels, duration, band)
     return _Fitted(used, duration, found, fits, diagrams, measured, fitted)
 
 
@@ -229,10 +231,13 @@ def _rest(one: _Fitted, samples: Samples, struck, band, cycle) -> tuple[Stretch,
     )
 
 
-def _from_earlier(one: _Fitted, samples: Samples, struck, band, cycle, order) -> _Fitted:
-    """The fit of a decay from where it begins, if an excitation has lasted for cycles before it."""
+def _from_earlier(one: _Fitted, samples: Samples, struck, band, cycle, order, cut) -> _Fitted:
+    """The fit of a decay from where it begins, if an excitation has lasted for cycles before it.
+
+    What was `cut` from a decay was such an excitation, too.
+    """
     decay, *others = one.used
-    if others or not follows(decay, struck[decay.record], cycle):
+    if others or not (cut or follows(decay, struck[decay.record], cycle)):
         return one
     poles = [
         mode.pole

@@ -8,6 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 MIN_ENERGY_RISE = 2.0  # energy in two cycles after a blow over that before it
 RISE_WIDTHS = 5  # of two cycles each, before such a rise
+MIN_START_RATIO = 10.0  # energy right after a blow over that of a structure at rest
 
 
 def vibration_energy(
@@ -31,33 +32,50 @@ def until_soft_blow(record: Float[np.ndarray, "sample channel"], width: int) -> 
 
     `width` are two cycles of the strongest vibration in samples.
     """
-    return _until_rise(vibration_energy(record, width), width)
+    return _until_blow(vibration_energy(record, width), width)
+
+
+def after_first_blow(energy: Float[np.ndarray, " sample"], width: int) -> int | None:
+    """Sample of most energy after a blow that strikes a structure at rest; None without one.
+
+    It may have a tenth of the energy of the hardest.
+    """
+    rise = _until_rise(energy, width, width, MIN_START_RATIO)
+    if rise == energy.size:
+        return None
+    highest = _highest_after(energy, rise, width)
+    return highest if MIN_START_RATIO * energy[highest] > energy.max() else None
 
 
 def between_soft_blows(
     energy: Float[np.ndarray, " sample"], first: int, last: int, width: int
 ) -> Iterator[tuple[int, int]]:
-    """First and last samples of the parts of a stretch before and after soft blows.
-
-    Where the energy is largest after a blow, nothing acts any longer.
-    """
+    """First and last samples of the parts of a stretch before and after soft blows."""
     while True:
-        rise = first + _until_rise(energy[first:last], width)
+        rise = first + _until_blow(energy[first:last], width)
         yield first, rise
         if rise == last:
             return
-        first = rise + int(np.argmax(energy[rise : min(rise + 4 * width, last)]))
+        first = _highest_after(energy[:last], rise, width)
 
 
-def _until_rise(energy, width):
-    """Samples before the energy rises within `width` above what it was just before.
+def _highest_after(energy, rise, width) -> int:
+    """Sample of most energy after a blow, where nothing acts any longer."""
+    return rise + int(np.argmax(energy[rise : rise + 4 * width]))
 
-    That is a blow too soft to be found by its errors. Close modes make the energy rise, too, but
-    not above what it was as long before its least.
+
+def _until_blow(energy, width) -> int:
+    """Samples before a blow too soft to be found by its errors.
+
+    Close modes make the energy rise, too, but not above what it was as long before its least.
     """
-    past = int(RISE_WIDTHS * width)
+    return _until_rise(energy, width, RISE_WIDTHS * width, MIN_ENERGY_RISE)
+
+
+def _until_rise(energy, width, past, ratio) -> int:
+    """Samples before the energy rises within `width` above a multiple of all in the `past`."""
     if energy.size < past + 2 * width:
         return energy.size
     before = sliding_window_view(energy, past).max(axis=-1)[: -2 * width]
-    risen = energy[past + 2 * width - 1 :][: before.size] > MIN_ENERGY_RISE * before
+    risen = energy[past + 2 * width - 1 :][: before.size] > ratio * before
     return past + int(np.argmax(risen)) if risen.any() else energy.size

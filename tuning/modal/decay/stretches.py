@@ -16,6 +16,8 @@ from scipy.signal import lfilter
 
 from tuning.modal.decay.soft_blows import (
     MIN_ENERGY_RISE,
+    MIN_START_RATIO,
+    after_first_blow,
     between_soft_blows,
     moving_mean,
     vibration_energy,
@@ -31,7 +33,6 @@ BLOW_LOCAL_SD = 8.0  # or of the errors before it; normal errors reach six in a 
 CONTACT_SAMPLES = 4  # within which past and future fail after a blow
 MIN_DECAY_CYCLES = 5.0  # of the strongest vibration
 MIN_FALL_NEPERS = 1.0  # of the energy over a decay
-MIN_START_RATIO = 10.0  # energy of the first tenth over that of the second half, after a blow
 MIN_LINEARITY = 0.6  # share of the variance of the log energy that a straight line explains
 MAX_COLUMNS = 24  # channels times decays that are fitted together
 # Of a record's energy, in decays after blows that the energy alone tells of. Ambient vibration
@@ -216,6 +217,8 @@ def _parts(energy, stretch, is_first, only_blows, shortest, width) -> list[tuple
         begins = begins if last - begins >= shortest else first
         if not only_blows:
             return [(begins, last)]
+        blow = after_first_blow(energy[first:last], width)
+        begins = begins if blow is None else min(begins, first + blow)
     parts = list(between_soft_blows(energy, begins, last, width))
     return parts if only_blows else parts[:1]
 
