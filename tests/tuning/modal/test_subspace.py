@@ -209,6 +209,14 @@ def test_poles_whose_intervals_overlap_are_told_apart_by_the_likelihood():
         assert abs(near.damping_ratio - damping) < 2 * near.damping_sd
 
 
+@pytest.mark.parametrize("kind", ["ambient", "motor"])
+def test_a_broad_mode_is_not_taken_for_the_background_of_a_narrow_one(kind):
+    """In one channel, a tenth below it; a background of second degree is nearly as likely."""
+    planted = sampled(random_structure(2820), kind, 2820, 300.0)
+    one = compare(identify_modes(log_of(planted)), planted)
+    assert not one.missed and not one.false_modes
+
+
 def test_what_a_pole_varies_with_the_order_adds_to_its_uncertainty():
     """Of sixteen orders the lowest vary least from block to block, and are biased."""
     frequencies = np.where(np.arange(16) < 2, 5.0, 5.1)
