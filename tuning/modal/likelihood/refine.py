@@ -121,23 +121,21 @@ def _window(transforms, sizes, rate, limits, count) -> Window:
     )
 
 
-class _Selection(NamedTuple):
-    """A model, the modes of the start that it has, and the price of these and its background.
-
-    That is the logarithm of the likelihood that they gain by chance, seldom.
-    """
-
-    model: SpectralModel
-    kept: list[int]
-    price: float
-
-
 def _select(window: Window, start: Start) -> list[RefinedMode | None]:
-    """Modes that the likelihood needs, refined, beside the background that leaves most to gain."""
-    best, kept, _ = min(
-        (_selected(window, start, order) for order in BACKGROUND_ORDERS),
-        key=lambda one: one.model.cost + one.price,
-    )
+    """Modes that the likelihood needs, refined."""
+    order = _order(window, start)
+    best, kept = _certain(window, start, order)
+    for k in np.flatnonzero(~start.certain).tolist():
+        trial = maximise(_with_pole(best, start, k, window), window)
+        if best.cost - trial.cost > _least_gain(trial, window, start.poles.size):
+            best, kept = trial, [*kept, k]
+    # One that filled the place of a later one is not needed any more.
+    for k in [k for k in kept if not start.certain[k]][:-1]:
+        (trial, others), rest = _certain(window, start, order), [one for one in kept if one != k]
+        for one in rest[len(others) :]:
+            trial = maximise(_with_pole(trial, start, one, window), window)
+        if trial.cost - best.cost < _least_gain(best, window, start.poles.size):
+            best, kept = trial, rest
     found: list[RefinedMode | None] = [None] * start.poles.size
     if kept:
         refined = _refined(best, window)
@@ -148,30 +146,18 @@ def _select(window: Window, start: Start) -> list[RefinedMode | None]:
     return found
 
 
-def _selected(window: Window, start: Start, order: int) -> _Selection:
-    """Modes that the likelihood needs beside a background of some order.
+def _order(window: Window, start: Start) -> int:
+    """Order of the background that Schwarz's criterion prefers beside the best determined modes.
 
-    Each unknown of the background has the price of Schwarz's criterion.
+    Those are the certain ones and the first of the others, which a background of second degree may
+    fill the place of.
     """
-    best, kept = _certain(window, start, order)
-    prices = {}
-    for k in np.flatnonzero(~start.certain).tolist():
-        trial = maximise(_with_pole(best, start, k, window), window)
-        least = _least_gain(trial, window, start.poles.size)
-        if best.cost - trial.cost > least:
-            best, kept, prices[k] = trial, [*kept, k], least
-    # One that filled the place of a later one is not needed any more.
-    for k in list(prices)[:-1]:
-        (trial, others), rest = _certain(window, start, order), [one for one in kept if one != k]
-        for one in rest[len(others) :]:
-            trial = maximise(_with_pole(trial, start, one, window), window)
-        if trial.cost - best.cost < prices[k]:
-            best, kept = trial, rest
-            del prices[k]
-    rows = window.weights.shape[1]
-    unknowns = (order + 1) * rows * (rows + 1) / 2
-    samples = len(window.frequencies) * window.count
-    return _Selection(best, kept, sum(prices.values()) + unknowns * np.log(samples) / 2)
+    first = np.arange(start.poles.size) == np.argmin(start.certain)
+    some = start._replace(certain=start.certain | first)
+    rows = len(window.weights.T)
+    more = rows * (rows + 1) / 2 * np.log(len(window.frequencies) * window.count) / 2
+    costs = [_certain(window, some, order)[0].cost + order * more for order in BACKGROUND_ORDERS]
+    return BACKGROUND_ORDERS[int(np.argmin(costs))]
 
 
 def _certain(window: Window, start: Start, order: int) -> tuple[SpectralModel, list[int]]:
@@ -185,7 +171,7 @@ def _certain(window: Window, start: Start, order: int) -> tuple[SpectralModel, l
 
 
 def _least_gain(model: SpectralModel, window: Window, trials: int) -> float:
-    """Logarithm of the likelihood that its last mode gains by chance, seldom.
+    """Logarithm of the likelihood that one more mode gains by chance, seldom.
 
     It may settle on any chance peak in the window, about two for each half-power width.
     """
@@ -193,9 +179,9 @@ def _least_gain(model: SpectralModel, window: Window, trials: int) -> float:
     unknowns = (
         3 + 2 * rows + count - 1
     )  # pole, skewness, shared forces, shape but for its scale, forces
-    width = -model.poles[-1].real / (2 * np.pi)
-    places = max(2 * np.ptp(window.frequencies) / width, trials)
-    return float(chi2.isf(FALSE_ALARM_PROBABILITY / places, unknowns) / 2)
+    narrowest = np.min(-model.poles.real) / (2 * np.pi)
+    places = max(2 * np.ptp(window.frequencies) / narrowest, 1.0)
+    return float(chi2.isf(FALSE_ALARM_PROBABILITY / (trials * places), unknowns) / 2)
 
 
 def _places(starts, certain, poles) -> list[int]:
