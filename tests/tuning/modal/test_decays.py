@@ -258,6 +258,18 @@ def test_the_first_of_several_blows_may_be_the_softest(first):
     assert [one.start / 100 for one in found] == pytest.approx([4.0, 22.0, 41.0], abs=0.5)
 
 
+def test_noise_between_hard_blows_is_no_soft_blow():
+    """Energy is that of two cycles of a fast mode, of few samples: that of noise varies."""
+    times, blows = np.arange(5000) / 80, np.array([3.0, 18.0, 33.0, 48.0])
+    since = np.maximum(times - blows[:, None], 0.0)
+    motion = np.sum(np.exp(-1.0 * since) * np.sin(2 * np.pi * 20.3 * since), axis=0)
+    marks = np.isin(np.arange(times.size), np.round(blows * 80))
+    for seed in range(6):
+        noise = 0.02 * np.random.default_rng(seed).normal(size=times.size)
+        found = free_decays((marks,), ((motion + noise)[:, None],), 80.0, 20.3)
+        assert [one.start / 80 for one in found] == pytest.approx(blows.tolist(), abs=0.1)
+
+
 @pytest.mark.parametrize("rest", [0.0, 2.0])
 def test_the_rest_before_a_blow_that_was_not_found_is_no_part_of_its_decay(rest):
     times = np.arange(6000) / 200 - rest
@@ -332,6 +344,8 @@ def test_decays_before_a_soft_blow_count_too(seed):
         ("blows", 1310, 60.0),  # a pair within its bandwidth, with a fifth of the energy in one
         ("blows", 2548, 60.0),  # four blows in noise, of which only the energy tells
         ("blows", 2814, 60.0),  # the first with half the energy; a mode of three times the rate
+        ("blows", 2929, 60.0),  # hard blows, between which the noise of a channel rises and falls
+        ("blows", 2680, 60.0),  # poles in noise that cancel each other
     ],
 )
 def test_all_strong_modes_of_decays_that_fall_little_or_have_weak_partners(kind, seed, duration):

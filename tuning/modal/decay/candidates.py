@@ -58,8 +58,12 @@ def share_of_modes(found: tuple[Candidate, ...], fits: BandFits, duration: float
                 continue
             nepers = 4 * np.pi * one.mode.frequency * one.mode.damping_ratio * duration
             early = np.expm1(-nepers / PARTS) / np.expm1(-nepers) if nepers > 1e-6 else 1 / PARTS
-            energy = one.mode.energy_share * early * np.sum(fit.measured**2)
-            good, rejected = (good, rejected + energy) if one.reason else (good + energy, rejected)
+            energy = early * np.sum(fit.measured**2)
+            if one.reason:
+                # Poles side by side may cancel each other, each with many times the energy of all.
+                rejected += min(one.mode.energy_share, 1.0) * energy
+            else:
+                good += one.mode.energy_share * energy
     return float(good / max(good + rejected, 1e-300))
 
 

@@ -36,6 +36,7 @@ from tuning.modal.stabilisation import Diagram
 
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
 MIN_SHARE_OF_MODES = 0.5  # of the energy at the beginning of decays
+SAFE_SHARE_OF_MODES = 0.9  # the same of a decay that is to begin earlier
 MIN_LEVEL_AT_START = 3.0  # energy of the first part of such a decay over the mean
 MAX_CUTS = 3  # of a decay in which the structure is found to be excited
 MAX_RESIDUAL_OF_WINDOW = 0.05  # the same for a window that the user gives and that falls little
@@ -163,7 +164,7 @@ def free_decay_modes(
         explained = explained and (given or _has_few_others(one.candidates))
     else:
         explained = _unexplained_of_decay(one.measured, one.fitted) < MAX_RESIDUAL_ENERGY
-    damped = share_of_modes(one.candidates, one.fits, one.duration) > MIN_SHARE_OF_MODES
+    damped = one.share_of_modes > MIN_SHARE_OF_MODES
     if kind is None and not (damped and explained):
         return None
     channels = samples.records[0].shape[1]
@@ -181,6 +182,11 @@ class _Fitted(NamedTuple):
     diagrams: tuple[Diagram, ...]
     measured: Float[np.ndarray, "sample column"]
     fitted: Float[np.ndarray, "sample column"]
+
+    @property
+    def share_of_modes(self) -> float:
+        """Share of the modes in the energy at the beginning."""
+        return share_of_modes(self.candidates, self.fits, self.duration)
 
 
 def _fitted(decays, samples: Samples, band, order) -> _Fitted | None:
@@ -252,7 +258,8 @@ def _from_earlier(one: _Fitted, samples: Samples, struck, band, cycle, order, cu
     again = _fitted((decay._replace(start=start),), samples, band, order)
     if again is None or _rest(again, samples, struck, band, cycle) != again.used:
         return one
-    return again
+    # Forces are explained by poles that are no modes.
+    return again if again.share_of_modes > min(one.share_of_modes, SAFE_SHARE_OF_MODES) else one
 
 
 def _unexplained(measured, fitted) -> float:

@@ -145,7 +145,7 @@ def free_decays(
     its energy is then far above that at its end, though close modes make it rise and fall on the
     way. What is at rest before a first blow that was not found does not count. In a record without
     a lasting excitation the energy also tells of blows too soft, or in too much noise, to be found
-    by their errors.
+    by their errors, down to a tenth of the highest energy.
     """
     shortest = int(np.ceil(MIN_DECAY_CYCLES * rate / frequency))
     width = max(int(2 * rate / frequency), 4)
@@ -174,7 +174,7 @@ def _decays_of_record(number, marks, energy, shortest, width) -> list[Stretch]:
 
 def _decays_between(number, marks, energy, shortest, width, only_blows: bool) -> list[Stretch]:
     """Decays between struck samples, and soft blows if nothing but blows excites the record."""
-    ratio = marks.size / len(energy)
+    ratio, highest = marks.size / len(energy), energy.max()
     found, excited_from = [], 0
     for start, stop in _free_stretches(marks, shortest * ratio):
         first, last = int(np.ceil(start / ratio)), int(stop / ratio)
@@ -185,9 +185,12 @@ def _decays_between(number, marks, energy, shortest, width, only_blows: bool) ->
         blow = start > 0 and (before < 0 or risen > MIN_ENERGY_RISE * energy[before])
         parts = _parts(energy, (first, last), start == 0, only_blows, shortest, width)
         for begins, ends in parts:
-            part = energy[begins:ends]
-            raised = blow or begins > parts[0][0] or (start == 0 and _begins_high(part))
-            fall = _fall_of_decay(part, raised) if part.size >= shortest else 0.0
+            part, after_soft_blow = energy[begins:ends], begins > parts[0][0]
+            # Noise rises and falls, too, but little beside the hardest blow.
+            if part.size < shortest or (after_soft_blow and MIN_START_RATIO * part[0] < highest):
+                continue
+            raised = blow or after_soft_blow or (start == 0 and _begins_high(part))
+            fall = _fall_of_decay(part, raised)
             if fall > MIN_FALL_NEPERS:
                 exact = start if begins == first else int(np.ceil(begins * ratio))
                 length = max(_until_noise(part), shortest)
