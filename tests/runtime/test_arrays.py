@@ -115,7 +115,7 @@ def test_known_and_traced_arrays_give_the_same(name):
 
 
 def test_every_function_of_the_module_has_its_case():
-    others = {"is_jax", "any_jax", "any_traced", "custom_jvp"}  # tested below
+    others = {"is_jax", "any_jax", "any_traced", "custom_jvp", "Array"}  # tested below
     functions = {
         name
         for name, value in vars(arrays).items()
@@ -123,6 +123,14 @@ def test_every_function_of_the_module_has_its_case():
     }
     tested = {name.replace(",", "").split()[0] for name in FUNCTIONS}
     assert functions - tested - others - {"xp"} == set()
+
+
+def test_arrays_are_those_of_either_library():
+    found = []
+    jax.jit(lambda a: found.append(isinstance(a, arrays.Array)) or a)(VECTOR)
+    known = (np.zeros(2), np.float64(1.0), jax.numpy.zeros(2))
+    assert found == [True] and all(isinstance(one, arrays.Array) for one in known)
+    assert not any(isinstance(one, arrays.Array) for one in (1.0, [1.0], None, "a"))
 
 
 def test_numbers_are_traced_in_jit_only():
