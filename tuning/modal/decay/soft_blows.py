@@ -9,6 +9,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 MIN_ENERGY_RISE = 2.0  # energy in two cycles after a blow over that before it
 RISE_WIDTHS = 5  # of two cycles each, before such a rise
 MIN_START_RATIO = 10.0  # energy right after a blow over that of a structure at rest
+MAX_HARDER = 10.0  # energy right after the hardest blow over that after the softest; less is noise
 
 
 def vibration_energy(
@@ -36,15 +37,12 @@ def until_soft_blow(record: Float[np.ndarray, "sample channel"], width: int) -> 
 
 
 def after_first_blow(energy: Float[np.ndarray, " sample"], width: int) -> int | None:
-    """Sample of most energy after a blow that strikes a structure at rest; None without one.
-
-    It may have a tenth of the energy of the hardest.
-    """
+    """Sample of most energy after a blow that strikes a structure at rest; None without one."""
     rise = _until_rise(energy, width, width, MIN_START_RATIO)
     if rise == energy.size:
         return None
     highest = _highest_after(energy, rise, width)
-    return highest if MIN_START_RATIO * energy[highest] > energy.max() else None
+    return highest if MAX_HARDER * energy[highest] > energy.max() else None
 
 
 def between_soft_blows(

@@ -15,6 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.signal import lfilter
 
 from tuning.modal.decay.soft_blows import (
+    MAX_HARDER,
     MIN_ENERGY_RISE,
     MIN_START_RATIO,
     after_first_blow,
@@ -187,7 +188,7 @@ def _decays_between(number, marks, energy, shortest, width, only_blows: bool) ->
         for begins, ends in parts:
             part, after_soft_blow = energy[begins:ends], begins > parts[0][0]
             # Noise rises and falls, too, but little beside the hardest blow.
-            if part.size < shortest or (after_soft_blow and MIN_START_RATIO * part[0] < highest):
+            if part.size < shortest or (after_soft_blow and MAX_HARDER * part[0] < highest):
                 continue
             raised = blow or after_soft_blow or (start == 0 and _begins_high(part))
             fall = _fall_of_decay(part, raised)
