@@ -78,20 +78,30 @@ def _draw_spectrum(axes, fit, channel, unit):
     for mode, reason in fit.rejected:
         if reason and fit.band[0] <= mode.frequency <= fit.band[1]:
             axes.axvline(mode.frequency, color=GREY, linewidth=0.7, linestyle=":")
-    for k, mode in enumerate(fit.modes):
+    for mode in fit.modes:
         axes.axvline(mode.frequency, color=MODE, linewidth=1.0)
+    axes.set(xlabel="frequency (Hz)", ylabel=f"amplitude ({unit})", xlim=fit.band)
+    for line in fit.lines:
+        axes.axvline(line.frequency, color=GREY, linewidth=1.2, linestyle="--")
+    above = axes
+    if fit.diagrams:
+        above = axes.twinx()
+        _draw_diagram(above, fit)
+    if fit.singular_values:
+        above = axes.twinx()
+        _draw_singular_values(above, fit)
+    _name_modes(above, fit)
+
+
+def _name_modes(axes, fit):
+    """Frequency and damping ratio beside the line of each mode, on top of all else."""
+    for k, mode in enumerate(fit.modes):
         axes.annotate(
             f"{mode.frequency:.2f} Hz\n{100 * mode.damping_ratio:.2f} %", (mode.frequency, 1.0),
             xycoords=axes.get_xaxis_transform(), xytext=(3, -2 - 24 * (k % 2)),
             textcoords="offset points", va="top", fontsize=8, color=MODE,
+            bbox={"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 0.5},
         )  # fmt: skip
-    axes.set(xlabel="frequency (Hz)", ylabel=f"amplitude ({unit})", xlim=fit.band)
-    for line in fit.lines:
-        axes.axvline(line.frequency, color=GREY, linewidth=1.2, linestyle="--")
-    if fit.diagrams:
-        _draw_diagram(axes.twinx(), fit)
-    if fit.singular_values:
-        _draw_singular_values(axes.twinx(), fit)
 
 
 def _draw_diagram(axes, fit):

@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from jaxbeam.plot.style import GREY, INK, colour
+from jaxbeam.plot.style import COLOURS, GREY, INK, colour
+
+LINES = ("-", "--", ":")  # of modes whose colours are the same
 
 
 def draw_shapes(axes, fit, length: float | None = None) -> None:
@@ -19,11 +21,12 @@ def draw_shapes(axes, fit, length: float | None = None) -> None:
     places = np.array(fit.log.positions, float) if known else np.arange(count, dtype=float)
     order = np.argsort(places)
     for k, mode in enumerate(fit.modes):
-        tint = colour(k)
+        tint, line = colour(k), LINES[k // len(COLOURS) % len(LINES)]
         deviation = np.sqrt(np.maximum(np.diag(mode.shape_covariance)[:count], 0.0))
         left.errorbar(
             places[order], mode.shape.real[order], mode.quantile * deviation[order], color=tint,
-            marker="o", markersize=4, linewidth=1.0, capsize=2, label=f"{mode.frequency:.2f} Hz",
+            marker="o", markersize=4, linewidth=1.0, linestyle=line, capsize=2,
+            label=f"{mode.frequency:.2f} Hz",
         )  # fmt: skip
         left.plot(
             places[order], mode.shape.imag[order], "o", color=tint, markersize=4, fillstyle="none"
@@ -39,6 +42,7 @@ def draw_shapes(axes, fit, length: float | None = None) -> None:
         left.set_xticks(places, fit.log.names)
     left.legend(frameon=False, fontsize=7, ncols=2)
     right.imshow(fit.mac, cmap="Blues", vmin=0.0, vmax=1.0)
+    right.grid(False)
     ticks = np.arange(len(fit.modes))
     labels = [f"{mode.frequency:.1f}" for mode in fit.modes]
     right.set_xticks(ticks, labels, rotation=90, fontsize=7)
