@@ -10,6 +10,7 @@ enter through a Cholesky factor, so neither costs accuracy. The problem is solve
 Beams that are not uniform have their elements in `model.theory`.
 """
 
+import dataclasses
 import functools
 from typing import TYPE_CHECKING
 
@@ -205,7 +206,7 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     Differentiable in every number, at repeated frequencies too. Inside `jit`, pass the `layout`
     found outside by `mesh_layout(case)`.
 
-    Raises ValueError as `check_case`, if the layout is found here.
+    Raises ValueError for an invalid case (but for its controller), if the layout is found here.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
@@ -213,7 +214,7 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     [ 20.39  81.55 183.49]
     """
     if layout is None:
-        check_case(case)
+        check_case(dataclasses.replace(case, controller=None))
         layout = mesh_layout(case)
     beam, found, to_rotation = case.beam, None, None
     if is_uniform(case):

@@ -253,8 +253,8 @@ def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = 
     between. Filters, delays and noise of the sensors are left out. Inside `jit`, pass the `layout`
     found outside by `model.modes.mesh_layout(case)`.
 
-    Raises ValueError for other coordinates, for "sine" if the modes are not such sines, and as
-    `check_case` if the layout is found here.
+    Raises ValueError for other coordinates, for "sine" if the modes are not such sines, and for an
+    invalid case (but for its controller) if the layout is found here.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
@@ -265,7 +265,7 @@ def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = 
     (6, 6)
     """
     if layout is None:
-        check_case(case)
+        check_case(dataclasses.replace(case, controller=None))
     return build_plant(case, compiled_modal_model(case, layout), coordinates)
 
 
