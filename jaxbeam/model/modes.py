@@ -10,7 +10,6 @@ enter through a Cholesky factor, so neither costs accuracy. The problem is solve
 Beams that are not uniform have their elements in `model.theory`.
 """
 
-import dataclasses
 import functools
 from typing import TYPE_CHECKING
 
@@ -23,7 +22,6 @@ from numpy.polynomial import legendre
 from jaxbeam.case.case import Case
 from jaxbeam.case.display.views import TableViews
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.case.validation import check_case
 from jaxbeam.model.layout import Layout, find_layout, is_uniform, longest_span, node_positions
 from jaxbeam.model.theory.buckling import check_buckling
 from jaxbeam.model.theory.damping import (
@@ -206,16 +204,12 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     Differentiable in every number, at repeated frequencies too. Inside `jit`, pass the `layout`
     found outside by `mesh_layout(case)`.
 
-    Raises ValueError for an invalid case (but for its controller), if the layout is found here.
-
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
     >>> print(jb.modes(jb.Case(beam)).frequencies.round(2))
     [ 20.39  81.55 183.49]
     """
-    if layout is None:
-        check_case(dataclasses.replace(case, controller=None))
-        layout = mesh_layout(case)
+    layout = mesh_layout(case) if layout is None else layout
     beam, found, to_rotation = case.beam, None, None
     if is_uniform(case):
         nodes, stiffness, mass, to_series = assemble_matrices(case, layout)

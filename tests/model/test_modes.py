@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, strategies as st
 from numpy.testing import assert_allclose
 
-import jaxbeam as jb
 from jaxbeam.case.actuators.patch import Patch
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case
@@ -134,18 +133,3 @@ def test_random_beams_have_exact_frequencies(case):
     expected = exact_frequencies(as_oracle(case), 5)
     unit = np.sqrt(float(solve(case).stiffness_unit))
     assert_allclose(solve(case).angular_frequencies, expected, rtol=1e-9, atol=1e-3 * unit)
-
-
-@pytest.mark.parametrize("function", [jb.modes, jb.state_space])
-@pytest.mark.parametrize(
-    ("rigidity", "position", "message"),
-    [
-        (-11.68, 0.3, "beam.flexural_rigidity must be positive; it is -11.68"),
-        (11.68, 2.0, "sensors.0.position must lie on the beam"),
-    ],
-)
-def test_an_invalid_case_is_refused(function, rigidity, position, message):
-    """A negative rigidity had frequencies of zero."""
-    beam = jb.Beam(length=0.6, flexural_rigidity=rigidity, mass_per_length=0.535)
-    with pytest.raises(ValueError, match=message):
-        function(jb.Case(beam, sensors=[jb.Sensor(position)]))
