@@ -34,6 +34,8 @@ from tuning.logs.reading import read_log, read_logs
 from tuning.modal.fit import ModalFit
 from tuning.modal.forced.estimates.measured_responses import MeasuredResponses, measured_responses
 from tuning.modal.identify_modes import identify_modes
+from tuning.modal.setups.fit import MultiSetupFit
+from tuning.modal.setups.merge import merge_setups
 from tuning.parameters.prior import Prior
 from tuning.weighing.axles import AxleWeighing, weigh_axles
 from tuning.weighing.influence_lines import (
@@ -52,6 +54,7 @@ __all__ = [
     "MeasuredResponses",
     "ModalFit",
     "ModalParameterFit",
+    "MultiSetupFit",
     "Objective",
     "Prior",
     "Responses",
@@ -74,6 +77,7 @@ __all__ = [
     "load_fit",
     "mask",
     "measured_responses",
+    "merge_setups",
     "model_influence_lines",
     "pareto",
     "predict_held_out",

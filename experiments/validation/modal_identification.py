@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from tests.oracles.planted_structures import Planted, random_structure, sampled
 from tuning.logs.log import Log
-from tuning.modal.fit import ModalFit
 from tuning.modal.identify_modes import identify_modes
+from tuning.modal.result import ModalEstimates
 
 KINDS = ("ambient", "motor", "shaken", "blows", "decay", "crossing")
 MATCH_SHARE = 0.02  # relative error of a frequency within which a mode is one of the structure
@@ -64,20 +64,20 @@ class PlantedComparison(NamedTuple):
     planted: tuple[int, ...] = ()
 
 
-def log_of(planted: Planted) -> Log:
-    """Log of velocities."""
+def log_of(planted: Planted, names: tuple[str, ...] = (), source: str = "planted") -> Log:
+    """Log of velocities; channels are v1, v2 ... by default."""
     channels = planted.values.shape[1]
     return Log(
         times=np.arange(len(planted.values)) / planted.rate,
         values=planted.values,
-        names=tuple(f"v{i + 1}" for i in range(channels)),
+        names=names or tuple(f"v{i + 1}" for i in range(channels)),
         quantities=("velocity",) * channels,
         units=("m/s",) * channels,
-        source="planted",
+        source=source,
     )
 
 
-def compare(fit: ModalFit, planted: Planted) -> PlantedComparison:
+def compare(fit: ModalEstimates, planted: Planted) -> PlantedComparison:
     """Pairs of identified and planted modes, each used once, the nearest poles first."""
     structure = planted.structure
     poles = 2 * np.pi * fit.frequencies * (-fit.damping_ratios + 1j)

@@ -22,6 +22,7 @@ from numpy.polynomial import legendre
 from jaxbeam.case.case import Case
 from jaxbeam.case.display.views import TableViews
 from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.validation import check_plant
 from jaxbeam.model.layout import Layout, find_layout, is_uniform, longest_span, node_positions
 from jaxbeam.model.theory.buckling import check_buckling
 from jaxbeam.model.theory.damping import (
@@ -202,14 +203,18 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     patches; suspensions of actuators and support dampers are left to the modal model. The equations
     of beams that are not uniform are in `model.theory.elements`.
     Differentiable in every number, at repeated frequencies too. Inside `jit`, pass the `layout`
-    found outside by `mesh_layout(case)`.
+    found outside by `mesh_layout(case)`, for which the case is taken as valid.
+
+    Raises ValueError for an invalid case, and for a beam that buckles under its axial force.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
     >>> print(jb.modes(jb.Case(beam)).frequencies.round(2))
     [ 20.39  81.55 183.49]
     """
-    layout = mesh_layout(case) if layout is None else layout
+    if layout is None:
+        check_plant(case)
+        layout = mesh_layout(case)
     beam, found, to_rotation = case.beam, None, None
     if is_uniform(case):
         nodes, stiffness, mass, to_series = assemble_matrices(case, layout)

@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.validation import check_plant
 from jaxbeam.model.linear_system import Signal, StateSpace
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
@@ -252,7 +253,7 @@ def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = 
     between. Filters, delays and noise of the sensors are left out. Inside `jit`, pass the `layout`
     found outside by `model.modes.mesh_layout(case)`.
 
-    Raises ValueError for other coordinates, and for "sine" if the modes are not such sines.
+    Raises ValueError for an invalid case, other coordinates, and for "sine" if the modes are not such sines.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
@@ -262,6 +263,8 @@ def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = 
     >>> print(jb.state_space(case).at(0.1).A.shape)
     (6, 6)
     """
+    if layout is None:
+        check_plant(case)
     return build_plant(case, compiled_modal_model(case, layout), coordinates)
 
 

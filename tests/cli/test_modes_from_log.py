@@ -117,3 +117,63 @@ def test_a_case_is_fitted_to_the_modes(run, decay_log):
 )
 def test_mistakes(refused, decay_log, line, message):
     assert message in refused(f"modes-from-log {line}")
+
+
+def rove(folder, name, moved, seed):
+    """Log of a decay of 12 Hz at a sensor that stays and at one that moves, of some size there."""
+    times = np.arange(1500) / 300
+    wave = np.exp(2 * np.pi * 12 * times * (-0.01 + 1j)).real
+    values = np.multiply.outer(wave, [1.0, moved])
+    values += 0.01 * np.random.default_rng(seed).normal(size=values.shape)
+    np.savetxt(
+        folder / name, np.column_stack([times, values]), delimiter=",", fmt="%.6f", comments="",
+        header="t [s],stays [g],moves [g]",
+    )  # fmt: skip
+
+
+def test_setups_of_a_sensor_that_moves(run, refused, folder):
+    rove(folder, "one.csv", 0.5, 1)
+    rove(folder, "two.csv", -0.4, 2)
+    line = "modes-from-log one.csv two.csv --band 5:60"
+    printed = run(f"{line} --references stays --plot --length 3")
+    assert "2 setups: one.csv, two.csv" in printed and "moves of two" not in printed
+    for name in ("one_setup1.png", "one_setup2.png", "one_setups.png"):
+        assert (folder / name).stat().st_size > 10_000 and f"written: {name}" in printed
+    found = run(f"{line} --references stays --json")
+    assert found["channels"] == ["stays", "moves of one", "moves of two"]
+    np.testing.assert_allclose(found["modes"][0]["shape_real"], [1, 0.5, -0.4], atol=0.01)
+    np.testing.assert_allclose(found["frequencies_hz"], [12], rtol=1e-3)
+    # Without references they are records of the same channels.
+    assert "channels" in run(f"{line} --json") and "setups" not in run(f"{line} --json")
+    # Positions of the descriptions tell the same, and where the sensors are.
+    for stem, place in (("one", 1.0), ("two", 2.5)):
+        (folder / f"{stem}.toml").write_text(
+            f"[columns]\nstays = {{ position = 0.5 }}\nmoves = {{ position = {place} }}\n"
+        )
+    told = run(f"{line} --json")
+    assert told["channels"] == ["stays", "moves at 1 m", "moves at 2.5 m"]
+    assert told["positions_m"] == [0.5, 1.0, 2.5] and told["references"] == ["stays"]
+    part = run(f"{line} --references stays --channels stays,moves --from 0.5 --json")
+    assert [one["window_s"][0] >= 0.5 for one in part["setups"]] == [True, True]
+    refused_line = refused("modes-from-log one.csv --references stays")
+    assert "references connect several setups, and this is one log" in refused_line
+    assert "no channel 'mast', which is to be a reference" in refused(f"{line} --references mast")
+    assert "exists; choose another name" in refused(f"{line} --references stays --plot")
+
+
+def test_a_case_is_fitted_to_modes_of_setups(run, folder):
+    """E I = m L^4 (2 pi f)^2 / pi^4 of the pinned beam, within its interval."""
+    for name, place, seed in (("one", 1.0, 1), ("two", 2.5, 2)):
+        rove(folder, f"{name}.csv", np.sin(np.pi * place / 3.0), seed)
+        (folder / f"{name}.toml").write_text(
+            f"[columns]\nstays = {{ position = 1.5 }}\nmoves = {{ position = {place} }}\n"
+        )
+    (folder / "beam.toml").write_text(
+        "[beam]\nlength = 3.0\nflexural_rigidity = 9e4\nmass_per_length = 20.0\nmodes = 2\n"
+    )
+    line = "modes-from-log one.csv two.csv --band 5:60 --case beam.toml"
+    found = run(f"{line} --free beam.flexural_rigidity --json")["fit"]
+    truth = 20.0 * 3.0**4 * (2 * np.pi * 12) ** 2 / np.pi**4
+    low, high = found["numbers"]["beam.flexural_rigidity"]["interval_95"]
+    assert low <= truth <= high and high - low < 0.01 * truth
+    assert found["pairs"][0]["mac"] > 0.999

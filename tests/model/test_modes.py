@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 from numpy.testing import assert_allclose
 
+import jaxbeam as jb
 from jaxbeam.case.actuators.patch import Patch
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case
@@ -133,3 +134,22 @@ def test_random_beams_have_exact_frequencies(case):
     expected = exact_frequencies(as_oracle(case), 5)
     unit = np.sqrt(float(solve(case).stiffness_unit))
     assert_allclose(solve(case).angular_frequencies, expected, rtol=1e-9, atol=1e-3 * unit)
+
+
+@pytest.mark.parametrize("solved", [jb.modes, jb.state_space])
+def test_an_invalid_case_is_refused(solved):
+    weak = jb.Beam(1.0, -11.0, 0.5)
+    with pytest.raises(ValueError, match=r"beam.flexural_rigidity must be positive"):
+        solved(Case(weak))
+    beam = jb.Beam(1.0, 11.0, 0.5)
+    with pytest.raises(ValueError, match=r"sensors.0.position .*2"):
+        solved(Case(beam, sensors=[jb.Sensor(2.0)]))
+
+
+def test_modes_of_a_case_that_only_its_controller_could_refuse():
+    """A filter that is above half the sampling rate of the controller is none of the plant's."""
+    beam, filter_ = jb.Beam(1.0, 11.0, 0.5), jb.Filter(100.0)
+    case = Case(beam, sensors=[jb.Sensor(0.5, filter=filter_)], run=jb.Run(1.0, 50.0))
+    with pytest.raises(ValueError, match=r"sensors\.0\.filter"):
+        jb.simulate(case)
+    assert jb.modes(case).frequencies.size == 3 and jb.state_space(case).at(0.0).A.shape == (6, 6)

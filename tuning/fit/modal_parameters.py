@@ -22,7 +22,7 @@ from jaxbeam.model.modes import mesh_layout, modes
 from tuning.fit.least_squares import WEAK_PRIOR_WIDTH
 from tuning.fit.summary import parameter_table
 from tuning.fit.uncertainty.covariance import t_quantile, uncertainty
-from tuning.modal.fit import ModalFit
+from tuning.modal.result import ModalEstimates
 from tuning.modal.shapes import mac_matrix
 from tuning.parameters.free import FreeParameter, free_parameters, to_unbounded
 from tuning.parameters.prior import Prior
@@ -65,7 +65,7 @@ class ModalParameterFit:
     misfit: float
     pairs: tuple[tuple[int, int, float], ...]
     frequencies: Float[np.ndarray, " pair"]
-    identified: ModalFit
+    identified: ModalEstimates
     case: Case
 
     @property
@@ -108,13 +108,14 @@ class ModalParameterFit:
 
 def identify_from_modes(
     case: Case,
-    identified: ModalFit,
+    identified: ModalEstimates,
     free: Mapping[str, tuple[float, float] | Prior | None] | Sequence[str],
 ) -> ModalParameterFit:
     """Fit parameters of a case to identified modes.
 
-    Shapes count if the log has the positions of its sensors, or says which sensors of the case they
-    are; damping ratios if a damping of the case is free.
+    Shapes count if the log has the positions of its sensors, all of one quantity, or says which
+    sensors of the case they are; `identified` may also be of several setups (`merge_setups`).
+    Damping ratios count if a damping of the case is free.
 
     Raises ValueError without identified modes, for more parameters than data, and for fewer modes
     of the case than were identified.
@@ -133,7 +134,7 @@ def identify_from_modes(
     7.97e+09 N m^2
     """
     if not identified.modes:
-        raise ValueError(f"{identified.log.source}: no mode is well identified, nothing to fit to")
+        raise ValueError(f"{identified.source}: no mode is well identified, nothing to fit to")
     bounds = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free)
     parameters = free_parameters([case], bounds, 1.0)
     places = _places(case, identified)
@@ -185,20 +186,20 @@ def identify_from_modes(
     )
 
 
-def _places(case: Case, identified: ModalFit) -> Float[np.ndarray, " channel"] | None:
-    """Positions (m) of the channels; None if they are not known or of other quantities."""
-    log, places = identified.log, []
-    for i, position in enumerate(log.positions):
-        sensor = log.sensors[i]
+def _places(case: Case, identified: ModalEstimates) -> Float[np.ndarray, " channel"] | None:
+    """Positions (m) of the channels; None if not known, or not of one quantity of motion."""
+    channels, places = identified.channels, []
+    for i, position in enumerate(channels.positions):
+        sensor = channels.sensors[i]
         if position is None and sensor is not None and sensor < len(case.sensors):
             position = float(case.sensors[sensor].position)
-        if position is None or log.quantities[i] not in ("deflection", "velocity", "acceleration"):
-            return None
         places.append(position)
-    return np.array(places) if len(places) > 1 else None
+    of_motion = set(channels.quantities) <= {"deflection", "velocity", "acceleration"}
+    alike = of_motion and len(set(channels.quantities)) == 1
+    return np.array(places) if alike and len(places) > 1 and None not in places else None
 
 
-def _paired(identified: ModalFit, frequencies, shapes, has_shapes) -> tuple:
+def _paired(identified: ModalEstimates, frequencies, shapes, has_shapes) -> tuple:
     """Pairs of identified modes and modes of the case with the least sum of distances."""
     mine = identified.frequencies
     cost = np.abs(np.log(mine[:, None] / np.maximum(frequencies, 1e-9)))
@@ -220,7 +221,7 @@ def _solve(identified, pairs, solved, parameters, y, has_shapes, with_damping):
     z = np.array([mode.damping_ratio for mode in measured])
     z_sd = np.array([mode.damping_sd for mode in measured]) / z
     z_sd = np.maximum(z_sd, MIN_RELATIVE_DAMPING_SD)
-    largest = [int(np.argmax(np.abs(mode.shape.real))) for mode in measured]
+    largest = [int(np.nanargmax(np.abs(mode.shape.real))) for mode in measured]
     whitening = [_whitening(mode, k) for mode, k in zip(measured, largest, strict=True)]
 
     def residual(values):
@@ -231,7 +232,8 @@ def _solve(identified, pairs, solved, parameters, y, has_shapes, with_damping):
         if has_shapes:
             for i, mode in enumerate(measured):
                 own = shapes[:, chosen[i]] / shapes[largest[i], chosen[i]]
-                parts.append(whitening[i] @ (own - mode.shape.real / mode.shape.real[largest[i]]))
+                known = np.nan_to_num(mode.shape.real) / mode.shape.real[largest[i]]
+                parts.append(whitening[i] @ (own - known))
         parts.append(jnp.stack([p.prior.prior_residual(values[i])
                                 for i, p in enumerate(parameters)]))  # fmt: skip
         return jnp.concatenate(parts)
@@ -260,10 +262,13 @@ def _solve(identified, pairs, solved, parameters, y, has_shapes, with_damping):
 
 
 def _whitening(mode, largest: int) -> Float[np.ndarray, "row channel"]:
-    """Matrix that makes the real parts of a shape of unit covariance; none of the component one."""
-    count = mode.shape.size
-    others = [i for i in range(count) if i != largest]
-    covariance = mode.shape_covariance[np.ix_(others, others)] + MIN_SHAPE_SD**2 * np.eye(count - 1)
-    rows = np.zeros((count - 1, count))
+    """Matrix that makes the real parts of a shape of unit covariance.
+
+    The component that is one has no row, and neither have those that were not measured.
+    """
+    others = [i for i in np.flatnonzero(np.isfinite(mode.shape)) if i != largest]
+    covariance = mode.shape_covariance[np.ix_(others, others)]
+    covariance = covariance + MIN_SHAPE_SD**2 * np.eye(len(others))
+    rows = np.zeros((len(others), mode.shape.size))
     rows[:, others] = np.linalg.inv(np.linalg.cholesky(covariance))
     return rows

@@ -4,13 +4,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 
 from tuning.logs.log import Log
 from tuning.modal.ambient import MAX_BAND_RATIO
 from tuning.modal.harmonics import Line
-from tuning.modal.result import IdentifiedMode
-from tuning.modal.shapes import mac_matrix
+from tuning.modal.result import Channels, IdentifiedMode, ModalEstimates
 from tuning.modal.spectral.efdd_modes import SingularValues
 from tuning.modal.stabilisation import Diagram
 
@@ -23,7 +22,7 @@ class Choice(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ModalFit:
+class ModalFit(ModalEstimates):
     """Modes identified from a log, ascending in frequency.
 
     `modes` are those well identified, `rejected` the others with the reason. `kind` is "free
@@ -67,38 +66,15 @@ class ModalFit:
         return self.windows[0][0], self.windows[-1][1]
 
     @property
-    def frequencies(self) -> Float[np.ndarray, " mode"]:
-        """Natural frequencies in Hz."""
-        return np.array([mode.frequency for mode in self.modes])
+    def channels(self) -> Channels:
+        """Channels of the log."""
+        log = self.log
+        return Channels(log.names, log.quantities, log.positions, log.sensors)
 
     @property
-    def damping_ratios(self) -> Float[np.ndarray, " mode"]:
-        """Damping ratios."""
-        return np.array([mode.damping_ratio for mode in self.modes])
-
-    @property
-    def frequency_intervals(self) -> Float[np.ndarray, "mode 2"]:
-        """95 % intervals of the natural frequencies in Hz."""
-        half = np.array([mode.quantile * mode.frequency_sd for mode in self.modes])
-        return self.frequencies[:, None] + np.multiply.outer(half, [-1.0, 1.0])
-
-    @property
-    def damping_intervals(self) -> Float[np.ndarray, "mode 2"]:
-        """95 % intervals of the damping ratios."""
-        half = np.array([mode.quantile * mode.damping_sd for mode in self.modes])
-        return self.damping_ratios[:, None] + np.multiply.outer(half, [-1.0, 1.0])
-
-    @property
-    def shapes(self) -> Complex[np.ndarray, "mode channel"]:
-        """Mode shapes, each with a largest component of one."""
-        return np.array([mode.shape for mode in self.modes], complex).reshape(
-            len(self.modes), len(self.log.names)
-        )
-
-    @property
-    def mac(self) -> Float[np.ndarray, "mode mode"]:
-        """Modal assurance criterion of the shapes with each other."""
-        return mac_matrix(self.shapes, self.shapes)
+    def source(self) -> str:
+        """Name of the log."""
+        return self.log.source
 
     def __str__(self) -> str:
         (start, stop), (low, high) = self.window, self.band
@@ -120,12 +96,7 @@ class ModalFit:
             lines.append("  frequency (Hz)  +- 95 %    damping ratio  +- 95 %     energy")
         else:
             lines.append("  no mode is well identified")
-        for mode in self.modes:
-            lines.append(
-                f"  {mode.frequency:14.4f}  {mode.quantile * mode.frequency_sd:7.4f}    "
-                f"{mode.damping_ratio:13.5f}  {mode.quantile * mode.damping_sd:7.5f}    "
-                f"{100 * mode.energy_share:5.1f} %"
-            )
+        lines += [str(mode) for mode in self.modes]
         if self.rejected:
             lines.append("  not well identified:  [--choose FREQUENCY]")
         for mode, reason in self.rejected:
@@ -134,7 +105,6 @@ class ModalFit:
 
     def to_dict(self) -> dict:
         """Plain numbers for JSON: modes with 95 % intervals and shapes, and what was chosen."""
-        intervals = zip(self.modes, self.frequency_intervals, self.damping_intervals, strict=True)
         return {
             "kind": self.kind,
             "method": self.method,
@@ -149,21 +119,7 @@ class ModalFit:
             ],
             "frequencies_hz": self.frequencies.tolist(),
             "damping_ratios": self.damping_ratios.tolist(),
-            "modes": [
-                {
-                    "frequency_hz": mode.frequency,
-                    "frequency_sd_hz": mode.frequency_sd,
-                    "frequency_95_hz": frequency.tolist(),
-                    "damping_ratio": mode.damping_ratio,
-                    "damping_sd": mode.damping_sd,
-                    "damping_95": damping.tolist(),
-                    "energy_share": mode.energy_share,
-                    "shape_real": mode.shape.real.tolist(),
-                    "shape_imag": mode.shape.imag.tolist(),
-                    "phase_collinearity": mode.collinearity,
-                }
-                for mode, frequency, damping in intervals
-            ],
+            "modes": [mode.to_dict() for mode in self.modes],
             "mac": self.mac.tolist(),
             "rejected": [
                 {"frequency_hz": mode.frequency, "damping_ratio": mode.damping_ratio, "why": why}

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
-from tuning.modal.shapes import phase_collinearity
+from tuning.modal.shapes import mac_matrix, phase_collinearity
 
 MAX_RELATIVE_FREQUENCY_SD = 0.02
 MAX_DAMPING_RATIO = 0.2
@@ -42,7 +42,87 @@ class IdentifiedMode(NamedTuple):
     @property
     def collinearity(self) -> float:
         """Modal phase collinearity of the shape: 1 if all channels move in phase or antiphase."""
-        return float(phase_collinearity(self.shape[None])[0])
+        measured = self.shape[np.isfinite(self.shape)]
+        return float(phase_collinearity(measured[None])[0])
+
+    def __str__(self) -> str:
+        return (
+            f"  {self.frequency:14.4f}  {self.quantile * self.frequency_sd:7.4f}    "
+            f"{self.damping_ratio:13.5f}  {self.quantile * self.damping_sd:7.5f}    "
+            f"{100 * self.energy_share:5.1f} %"
+        )
+
+    def to_dict(self) -> dict:
+        """Plain numbers for JSON: frequency, damping ratio, deviations, 95 % intervals, shape."""
+        half = self.quantile * self.frequency_sd, self.quantile * self.damping_sd
+        return {
+            "frequency_hz": self.frequency,
+            "frequency_sd_hz": self.frequency_sd,
+            "frequency_95_hz": [self.frequency - half[0], self.frequency + half[0]],
+            "damping_ratio": self.damping_ratio,
+            "damping_sd": self.damping_sd,
+            "damping_95": [self.damping_ratio - half[1], self.damping_ratio + half[1]],
+            "energy_share": self.energy_share,
+            "shape_real": _numbers(self.shape.real),
+            "shape_imag": _numbers(self.shape.imag),
+            "phase_collinearity": self.collinearity,
+        }
+
+
+def _numbers(values) -> list[float | None]:
+    """Numbers for JSON, None for those that are not known."""
+    return [value if np.isfinite(value) else None for value in values.tolist()]
+
+
+class Channels(NamedTuple):
+    """Channels of shapes: names, measured quantities, positions (m), indices of sensors."""
+
+    names: tuple[str, ...]
+    quantities: tuple[str, ...]
+    positions: tuple[float | None, ...]
+    sensors: tuple[int | None, ...]
+
+
+class ModalEstimates:
+    """Frequencies, damping ratios and shapes of modes, ascending, at the channels of a source."""
+
+    modes: tuple[IdentifiedMode, ...]
+    channels: Channels
+    source: str
+
+    @property
+    def frequencies(self) -> Float[np.ndarray, " mode"]:
+        """Natural frequencies in Hz."""
+        return np.array([mode.frequency for mode in self.modes])
+
+    @property
+    def damping_ratios(self) -> Float[np.ndarray, " mode"]:
+        """Damping ratios."""
+        return np.array([mode.damping_ratio for mode in self.modes])
+
+    @property
+    def frequency_intervals(self) -> Float[np.ndarray, "mode 2"]:
+        """95 % intervals of the natural frequencies in Hz."""
+        half = np.array([mode.quantile * mode.frequency_sd for mode in self.modes])
+        return self.frequencies[:, None] + np.multiply.outer(half, [-1.0, 1.0])
+
+    @property
+    def damping_intervals(self) -> Float[np.ndarray, "mode 2"]:
+        """95 % intervals of the damping ratios."""
+        half = np.array([mode.quantile * mode.damping_sd for mode in self.modes])
+        return self.damping_ratios[:, None] + np.multiply.outer(half, [-1.0, 1.0])
+
+    @property
+    def shapes(self) -> Complex[np.ndarray, "mode channel"]:
+        """Mode shapes, each with a largest component of one; NaN where one was not measured."""
+        return np.array([mode.shape for mode in self.modes], complex).reshape(
+            len(self.modes), len(self.channels.names)
+        )
+
+    @property
+    def mac(self) -> Float[np.ndarray, "mode mode"]:
+        """Modal assurance criterion of the shapes with each other."""
+        return mac_matrix(self.shapes, self.shapes)
 
 
 def frequency_and_damping(

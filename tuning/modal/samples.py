@@ -12,6 +12,7 @@ from tuning.logs.records import even_records
 from tuning.modal.settling import settled_from
 
 MIN_SAMPLES = 64
+MAX_RATE_CHANGE = 1e-3  # of the sampling rate, between logs that are used together
 
 
 class Samples(NamedTuple):
@@ -46,13 +47,22 @@ def samples_of(logs: Sequence[Log], window: tuple[float, float] | None) -> Sampl
             starts.append(record.start + skipped / rate)
         faults = (str(fault).removeprefix(f"{log.source}: ") for fault in find_faults(part))
         notes += [*log.notes, *said, *faults]
-        if log.names != logs[0].names or abs(rate / rates[0] - 1) > 1e-3:
+        if not same_channels(log, logs[0]) or abs(rate / rates[0] - 1) > MAX_RATE_CHANGE:
             raise ValueError(
-                f"{log.source}: logs identified together must have the same channels and sampling "
-                f"rate; {logs[0].source} has {', '.join(logs[0].names)} at {rates[0]:.6g} Hz, this "
-                f"one {', '.join(log.names)} at {rate:.6g} Hz"
+                f"{log.source}: logs identified together must have the same channels, positions "
+                f"and sampling rate; {logs[0].source} has {', '.join(logs[0].names)} at "
+                f"{rates[0]:.6g} Hz, this one {', '.join(log.names)} at {rate:.6g} Hz. Modes of "
+                "setups with other sensors are found one by one and merged by tuning.merge_setups"
             )
     return Samples(tuple(records), tuple(starts), rates[0], tuple(dict.fromkeys(notes)))
+
+
+def same_channels(a: Log, b: Log) -> bool:
+    """Whether two logs have channels of the same names, quantities and places."""
+    return all(
+        getattr(a, field) == getattr(b, field)
+        for field in ("names", "quantities", "positions", "sensors")
+    )
 
 
 def part_of_window(log: Log, window: tuple[float, float] | None) -> Log:

@@ -7,11 +7,15 @@ from jaxtyping import Complex, Float
 def mac_matrix(
     first: Complex[np.ndarray, "mode channel"], second: Complex[np.ndarray, "other channel"]
 ) -> Float[np.ndarray, "mode other"]:
-    """Modal assurance criterion |a^H b|^2 / (a^H a b^H b) of two sets of shapes (Allemang 2003)."""
+    """Modal assurance criterion |a^H b|^2 / (a^H a b^H b) of two sets of shapes (Allemang 2003).
+
+    Components that are NaN were not measured: two shapes are compared where both were, and are not
+    alike (0) if they nowhere were.
+    """
+    in_first, in_second = np.isfinite(first), np.isfinite(second)
+    first, second = np.where(in_first, first, 0), np.where(in_second, second, 0)
     products = np.abs(first.conj() @ second.T) ** 2
-    norms = np.multiply.outer(
-        np.sum(np.abs(first) ** 2, axis=1), np.sum(np.abs(second) ** 2, axis=1)
-    )
+    norms = (np.abs(first) ** 2 @ in_second.T) * (in_first @ np.abs(second.T) ** 2)
     return products / np.maximum(norms, 1e-300)
 
 

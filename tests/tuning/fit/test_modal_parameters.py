@@ -1,5 +1,6 @@
 """Parameters of a beam recovered from modes of its finite elements, with noise as they state it."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -93,6 +94,25 @@ def test_what_modes_do_not_tell_is_named():
     assert np.all(np.isinf(fit.errors)) and len(fit.unidentifiable) == 1
     ratio = fit.values[0] / fit.values[1]
     assert ratio == pytest.approx(RIGIDITY / MASS, rel=3e-3)
+
+
+def test_shapes_that_are_not_known_everywhere():
+    """As of setups, one of which does not show a mode; or none are compared, of two quantities."""
+    whole = identified(beam())
+    modes = list(whole.modes)
+    for k, place in ((0, 2), (1, 0)):
+        shape, covariance = modes[k].shape.copy(), modes[k].shape_covariance.copy()
+        shape[place] = covariance[place] = covariance[:, place] = np.nan
+        modes[k] = modes[k]._replace(shape=shape, shape_covariance=covariance)
+    part = dataclasses.replace(whole, modes=tuple(modes))
+    fit = identify_from_modes(case(), part, ["beam.flexural_rigidity"])
+    assert fit.values[0] == pytest.approx(RIGIDITY, rel=3e-3)
+    assert [pair[:2] for pair in fit.pairs] == [(0, 0), (1, 1), (2, 2), (3, 3)]
+    assert 0.99 < min(pair[2] for pair in fit.pairs) < 1.0
+    log = dataclasses.replace(whole.log, quantities=("deflection", *("acceleration",) * 4))
+    mixed = dataclasses.replace(whole, log=log)
+    fit = identify_from_modes(case(), mixed, ["beam.flexural_rigidity"])
+    assert {pair[2] for pair in fit.pairs} == {1.0}, "without shapes"
 
 
 def test_mistakes():

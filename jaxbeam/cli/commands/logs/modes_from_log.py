@@ -3,7 +3,7 @@
 import math
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
@@ -18,6 +18,9 @@ from jaxbeam.cli.arguments import (
 )
 from jaxbeam.cli.options import CaseOptions, Free, Output, print_message
 
+if TYPE_CHECKING:
+    from tuning import Log
+
 
 def modes_from_log(
     *logs: Path,
@@ -29,6 +32,7 @@ def modes_from_log(
     rate: float | None = None,
     order: int | None = None,
     method: str | None = None,
+    references: str | None = None,
     force: str | None = None,
     force_window: float | None = None,
     responses: str | None = None,
@@ -48,13 +52,15 @@ def modes_from_log(
     """Natural frequencies, damping ratios and mode shapes from logs of unknown excitation.
 
     Free decays after blows, ambient vibration, and the harmonic lines of machines in it are
-    recognised. Every choice is printed with the option that overrides it. With `--case`, parameters
-    of a case are fitted to the modes that were found, with 95 % intervals.
+    recognised. Every choice is printed with the option that overrides it. Logs whose sensors are at
+    other places are setups, whose modes are merged. With `--case`, parameters of a case are fitted
+    to the modes that were found, with 95 % intervals.
 
     Parameters
     ----------
     logs
-        LOG...: logs of the same channels, which are used together.
+        LOG...: logs of the same channels are used together; the modes of logs with other channels
+        (setups), of which some are the same (references), are merged.
     band
         LOW:HIGH: frequencies (Hz) between which modes are sought.
     from_
@@ -73,6 +79,9 @@ def modes_from_log(
         decay: poles of free decays; for all else covariance or data: stochastic subspace
         identification, covariance- or data-driven; fdd: enhanced frequency-domain decomposition;
         plscf: poly-reference least-squares complex frequency (p-LSCF).
+    references
+        NAME,NAME,...: channels that stay at their places in all logs, while sensors of the same
+        names move; by default channels of one name are one place, if positions do not differ.
     force
         NAME,NAME,...: channels of measured forces (N), of a hammer or shaker; by default all in N.
         The responses to them are fitted by p-LSCF.
@@ -97,7 +106,7 @@ def modes_from_log(
         The logs are of one experiment by loggers whose clocks differ: align them by correlation.
     plot
         Draw the log, its spectrum with the stabilisation diagram, and the shapes to a PNG named
-        after the first log.
+        after the first log; of setups LOG_setup1.png and so on, and merged LOG_setups.png.
     length
         Length (m) of the beam on which the shapes are drawn.
     case
@@ -125,61 +134,86 @@ def modes_from_log(
     )
     excluded, chosen = _numbers("--exclude", exclude), _numbers("--choose", choose)
     check_exists("log file", *logs)
-    picture = figure_path(None, logs[0]) if plot else None
-    drawn = None
-    if responses is not None:
-        drawn = figure_path(None, logs[0].with_stem(f"{logs[0].stem}_responses"))
-    options.check_outputs(output, picture, drawn)
+    options.check_outputs(output)
     if case is not None:
         options.check_case(case)
 
     import tuning
+    from tuning.modal.setups.grouping import logs_of_setups
 
     read = [tuning.read_log(path, columns=columns, rate=rate) for path in logs]
     if align:
         read = [tuning.align_logs(read)]
-    window = None
-    if from_ is not None or to is not None:
-        first, last = (float(read[0].times[i]) for i in (0, -1))
-        window = (
-            first if from_ is None else max(from_, first),
-            last if to is None else min(to, last),
-        )
-    fit = tuning.identify_modes(
-        read,
-        window=window,
-        band=limits,
-        count=count,
-        kind=kind,
-        channels=_names(channels),
-        order=order,
-        method=method,
-        force=_names(force),
-        force_window=force_window,
-        exclude=excluded,
-        choose=chosen,
-        progress=None if options.json_ or not sys.stderr.isatty() else print_message,
-    )
-    if picture:
-        fit.plot(picture, length=length)
-    if drawn is not None:
-        tuning.measured_responses(
-            read,
-            _names(force),
-            estimator=responses,
-            channels=_names(channels),
+    setups = logs_of_setups(read, _names(references))
+    several = [f"_setup{k + 1}" for k in range(len(setups))] if len(setups) > 1 else [""]
+    pictures = [_picture(logs[0], word) for word in several if plot]
+    if plot and len(setups) > 1:
+        pictures.append(_picture(logs[0], "_setups"))
+    drawn = [_picture(logs[0], f"{word}_responses") for word in several if responses]
+    options.check_outputs(*pictures, *drawn)
+    fits = []
+    for setup in setups:
+        window = _window(setup[0], from_, to)
+        of_setup = {
+            "channels": _of_setup(_names(channels), setup, read),
+            "force": _of_setup(_names(force), setup, read),
+            "force_window": force_window,
+        }
+        fit = tuning.identify_modes(
+            setup,
             window=window,
-            exponential=exponential,
-            force_window=force_window,
-        ).plot(drawn)
-    answer, lines = fit.to_dict(), [str(fit)]
+            band=limits,
+            count=count,
+            kind=kind,
+            order=order,
+            method=method,
+            exclude=excluded,
+            choose=chosen,
+            progress=None if options.json_ or not sys.stderr.isatty() else print_message,
+            **of_setup,
+        )
+        if responses:
+            tuning.measured_responses(
+                setup, window=window, estimator=responses, exponential=exponential, **of_setup
+            ).plot(drawn[len(fits)])
+        fits.append(fit)
+    found, lines = fits[0], [str(fit) for fit in fits]
+    if len(fits) > 1:
+        found = tuning.merge_setups(fits, references=_names(references))
+        lines += ["", str(found)]
+    for fit, picture in zip(dict.fromkeys([*fits, found]), pictures, strict=False):
+        fit.plot(picture, length=length)
+    answer = found.to_dict()
     if case is not None:
         model = options.read(case)
-        updated = tuning.identify_from_modes(model, fit, bounds_in_si(model, bounds))
+        updated = tuning.identify_from_modes(model, found, bounds_in_si(model, bounds))
         answer, lines = {**answer, "fit": updated.to_dict()}, [*lines, "", str(updated)]
         if output is not None:
             jb.save_case(updated.case, output, options.overwrite)
-    options.report(answer, lines, output, picture, drawn)
+    options.report(answer, lines, output, *pictures, *drawn)
+
+
+def _picture(log: Path, word: str) -> Path:
+    """File of a picture named after a log, in this folder, told from others by a word."""
+    return figure_path(None, log.with_stem(f"{log.stem}{word}"))
+
+
+def _window(log: "Log", from_: float | None, to: float | None):
+    """Part (s) of a log between two times, either of which may be left out; None for all."""
+    if from_ is None and to is None:
+        return None
+    first, last = (float(log.times[i]) for i in (0, -1))
+    return first if from_ is None else max(from_, first), last if to is None else min(to, last)
+
+
+def _of_setup(names: list[str] | None, setup: "list[Log]", read: "list[Log]"):
+    """Those of some channels that the logs of a setup have.
+
+    All, for one clear error, if no log has one of them, or this setup has none.
+    """
+    if names is None or any(all(name not in log.names for log in read) for name in names):
+        return names
+    return [name for name in names if any(name in log.names for log in setup)] or names
 
 
 def _names(text: str | None) -> list[str] | None:

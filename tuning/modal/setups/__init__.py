@@ -1,0 +1,1 @@
+"""Modes of several setups: sensors that move between records, and references that stay."""

@@ -1,0 +1,88 @@
+"""Which channels of several setups are one place of the structure, and which are others."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int
+
+from tuning.modal.result import Channels, ModalEstimates
+
+
+def merged_channels(
+    setups: Sequence[ModalEstimates], references: Sequence[str] | None
+) -> tuple[Channels, tuple[Int[np.ndarray, " channel"], ...]]:
+    """Channels of all setups, each place once, and where those of each setup are among them.
+
+    Channels of one name and quantity are one place, unless the logs tell positions (or sensors of
+    the case) that differ. With `references`, the channels of these names are, and no others.
+
+    Raises ValueError for a reference that a setup lacks, and for setups that no common channel
+    connects with the others.
+    """
+    for setup in setups:
+        lacking = set(references or ()) - set(setup.channels.names)
+        if lacking:
+            raise ValueError(
+                f"{setup.source}: no channel {sorted(lacking)[0]!r}, which is to be a reference; "
+                f"the channels are {', '.join(setup.channels.names)}"
+            )
+    known = _known_places(setups)
+    places: dict[tuple, int] = {}
+    rows, indices = [], []
+    for number, setup in enumerate(setups):
+        of_setup = []
+        for row in zip(*setup.channels, strict=True):
+            name, quantity, position, sensor = row
+            key: tuple = (name, quantity)
+            if references is not None:
+                key = key if name in references else (*key, number)
+            elif len(known[name]) > 1:
+                unknown = position is None and sensor is None
+                key = (*key, number) if unknown else (*key, position, sensor)
+            if key not in places:
+                places[key] = len(rows)
+                rows.append((row, setup.source))
+            of_setup.append(places[key])
+        indices.append(np.array(of_setup))
+    _check_connected(setups, indices)
+    names = [row[0] for row, _ in rows]
+    named = tuple(
+        row[0] if names.count(row[0]) == 1 else _full_name(row, source) for row, source in rows
+    )
+    _, quantities, positions, sensors = zip(*(row for row, _ in rows), strict=True)
+    return Channels(named, quantities, positions, sensors), tuple(indices)
+
+
+def _known_places(setups: Sequence[ModalEstimates]) -> dict[str, set]:
+    """Positions and sensors that the logs tell for each name of a channel."""
+    known: dict[str, set] = {}
+    for setup in setups:
+        for name, _, position, sensor in zip(*setup.channels, strict=True):
+            told = known.setdefault(name, set())
+            if position is not None or sensor is not None:
+                told.add((position, sensor))
+    return known
+
+
+def _full_name(row: tuple, source: str) -> str:
+    """Name of a channel that moves: with its position if it is known, else with its log."""
+    name, _, position, _ = row
+    return f"{name} at {position:g} m" if position is not None else f"{name} of {Path(source).stem}"
+
+
+def _check_connected(setups: Sequence[ModalEstimates], indices: Sequence[np.ndarray]) -> None:
+    """Check that common channels lead from the first setup to all others."""
+    joined, reached = {0}, set(indices[0].tolist())
+    while more := [k for k in range(len(setups)) if k not in joined and reached & {*indices[k]}]:
+        joined |= set(more)
+        reached |= {int(i) for k in more for i in indices[k]}
+    left = [k for k in range(len(setups)) if k not in joined]
+    if left:
+        one, first = setups[left[0]], setups[0]
+        raise ValueError(
+            f"{one.source}: no channel is common with {first.source}, by which their shapes could "
+            f"be scaled (the channels are {', '.join(one.channels.names)}; and "
+            f"{', '.join(first.channels.names)}); references have the same name, quantity and "
+            "position in both"
+        )
