@@ -4,8 +4,9 @@
     python -m experiments.validation.modal_setups 30 ambient blows
 
 Random structures by finite elements, as in `modal_identification`, those with four channels or
-more: two are references, and the others are measured in two or three setups, each excited anew. Printed are, for each kind of excitation: modes found, intervals that hold the
-truth, false modes, and the errors of merged shapes. The table is written for the page on logs.
+more: two are references, and the others are measured in two or three setups, each excited anew.
+Printed are, for each kind of excitation: modes found, intervals that hold the truth, false modes,
+and the errors of merged shapes. The table is written for the page on logs.
 """
 
 import itertools

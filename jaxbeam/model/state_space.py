@@ -253,7 +253,8 @@ def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = 
     between. Filters, delays and noise of the sensors are left out. Inside `jit`, pass the `layout`
     found outside by `model.modes.mesh_layout(case)`.
 
-    Raises ValueError for an invalid case, other coordinates, and for "sine" if the modes are not such sines.
+    Raises ValueError for an invalid case, other coordinates, and for "sine" if the modes are not
+    such sines.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
