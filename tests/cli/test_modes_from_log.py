@@ -144,7 +144,8 @@ def test_setups_of_a_sensor_that_moves(run, refused, folder):
     np.testing.assert_allclose(found["modes"][0]["shape_real"], [1, 0.5, -0.4], atol=0.01)
     np.testing.assert_allclose(found["frequencies_hz"], [12], rtol=1e-3)
     # Without references they are records of the same channels.
-    assert "channels" in run(f"{line} --json") and "setups" not in run(f"{line} --json")
+    assert "setups" not in run(f"{line} --json")
+    assert "2 logs of the same channels, used together  [--references" in run(line)
     # Positions of the descriptions tell the same, and where the sensors are.
     for stem, place in (("one", 1.0), ("two", 2.5)):
         (folder / f"{stem}.toml").write_text(
@@ -159,6 +160,10 @@ def test_setups_of_a_sensor_that_moves(run, refused, folder):
     assert "references connect several setups, and this is one log" in refused_line
     assert "no channel 'mast', which is to be a reference" in refused(f"{line} --references mast")
     assert "exists; choose another name" in refused(f"{line} --references stays --plot")
+    text = (folder / "two.csv").read_text().replace("stays", "left").replace("moves", "right")
+    (folder / "other.csv").write_text(text)
+    refused_line = refused("modes-from-log one.csv other.csv --band 1:900")
+    assert "other.csv: no channel is common with one.csv" in refused_line, "before any work"
 
 
 def test_a_case_is_fitted_to_modes_of_setups(run, folder):

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from tuning.logs.log import Log
 from tuning.modal.ambient import MAX_BAND_RATIO
 from tuning.modal.harmonics import Line
-from tuning.modal.result import Channels, IdentifiedMode, ModalEstimates
+from tuning.modal.result import Channels, IdentifiedMode, ModalEstimates, channels_of
 from tuning.modal.spectral.efdd_modes import SingularValues
 from tuning.modal.stabilisation import Diagram
 
@@ -68,8 +68,7 @@ class ModalFit(ModalEstimates):
     @property
     def channels(self) -> Channels:
         """Channels of the log."""
-        log = self.log
-        return Channels(log.names, log.quantities, log.positions, log.sensors)
+        return channels_of(self.log)
 
     @property
     def source(self) -> str:

@@ -112,7 +112,7 @@ def identify_modes(
         raise ValueError(f"{logs[0].source}: a force window is for measured forces; none is in N")
     samples = samples_of(logs, window)
     check_band(logs[0], samples.rate, band)
-    choices = []
+    choices = _together(logs)
     derivatives = tuple(time_derivative(name) for name in logs[0].quantities)
     used_band = band or kinetic_band(samples.records, samples.rate, derivatives)
     if forces:
@@ -180,6 +180,14 @@ def identify_modes(
     _add_order(choices, order, found)
     choices = [*_band_choice(band, used_band), *choices]
     return _result(logs, samples, found, used_band, lines, choices, used_method, keep)
+
+
+def _together(logs: Sequence[Log]) -> list[Choice]:
+    """That several logs are used together."""
+    if len(logs) == 1:
+        return []
+    text = f"{len(logs)} logs of the same channels, used together"
+    return [Choice(text, "--references NAME,NAME,... if other sensors moved")]
 
 
 def _band_choice(band, used: tuple[float, float]) -> list[Choice]:

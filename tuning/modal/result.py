@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float
 
+from tuning.logs.log import Log
 from tuning.modal.shapes import mac_matrix, phase_collinearity
 
 MAX_RELATIVE_FREQUENCY_SD = 0.02
@@ -81,6 +82,11 @@ class Channels(NamedTuple):
     quantities: tuple[str, ...]
     positions: tuple[float | None, ...]
     sensors: tuple[int | None, ...]
+
+
+def channels_of(log: Log) -> Channels:
+    """Channels of a log."""
+    return Channels(log.names, log.quantities, log.positions, log.sensors)
 
 
 class ModalEstimates:

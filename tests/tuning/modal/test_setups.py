@@ -254,6 +254,8 @@ def test_mistakes():
     with pytest.raises(ValueError, match="same name, quantity and position in both"):
         merge_setups([one, velocities])
     assert "no mode is well identified" in str(merge_setups([setup([], "ab"), setup([], "ac")]))
+    stranger = setup([mode(7.0, SHAPES[0][[0, 1, 4]])], "abe", "two.csv")
+    assert "no mode is common to two setups" in str(merge_setups([one, stranger]))
 
 
 def record(names, positions=(), rate=100.0, quantity="acceleration"):
@@ -270,6 +272,9 @@ def test_logs_are_grouped_by_their_channels():
     faster, placed = record("ab", rate=200.0), record("ab", (1.0, 2.0))
     assert [len(group) for group in logs_of_setups([same, faster, placed, again])] == [2, 1, 1]
     assert logs_of_setups([same, again], ["a"]) == [[same], [again]]
+    # Of the channels that are used none is common.
+    with pytest.raises(ValueError, match="no channel is common"):
+        logs_of_setups([same, other], channels=["b", "c"])
     with pytest.raises(ValueError, match="references connect several setups, and this is one log"):
         logs_of_setups([same], ["a"])
     with pytest.raises(ValueError, match=r"the same channels, positions.*merged by tuning.merge_s"):

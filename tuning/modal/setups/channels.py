@@ -6,33 +6,34 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int
 
-from tuning.modal.result import Channels, ModalEstimates
+from tuning.modal.result import Channels
 
 
 def merged_channels(
-    setups: Sequence[ModalEstimates], references: Sequence[str] | None
+    setups: Sequence[Channels], sources: Sequence[str], references: Sequence[str] | None
 ) -> tuple[Channels, tuple[Int[np.ndarray, " channel"], ...]]:
     """Channels of all setups, each place once, and where those of each setup are among them.
 
     Channels of one name and quantity are one place, unless the logs tell positions (or sensors of
     the case) that differ. With `references`, the channels of these names are, and no others.
+    `sources` are the names of the logs, for messages.
 
     Raises ValueError for a reference that a setup lacks, and for setups that no common channel
     connects with the others.
     """
-    for setup in setups:
-        lacking = set(references or ()) - set(setup.channels.names)
+    for setup, source in zip(setups, sources, strict=True):
+        lacking = set(references or ()) - set(setup.names)
         if lacking:
             raise ValueError(
-                f"{setup.source}: no channel {sorted(lacking)[0]!r}, which is to be a reference; "
-                f"the channels are {', '.join(setup.channels.names)}"
+                f"{source}: no channel {sorted(lacking)[0]!r}, which is to be a reference; "
+                f"the channels are {', '.join(setup.names)}"
             )
     known = _known_places(setups)
     places: dict[tuple, int] = {}
     rows, indices = [], []
     for number, setup in enumerate(setups):
         of_setup = []
-        for row in zip(*setup.channels, strict=True):
+        for row in zip(*setup, strict=True):
             name, quantity, position, sensor = row
             key: tuple = (name, quantity)
             if references is not None:
@@ -42,10 +43,10 @@ def merged_channels(
                 key = (*key, number) if unknown else (*key, position, sensor)
             if key not in places:
                 places[key] = len(rows)
-                rows.append((row, setup.source))
+                rows.append((row, sources[number]))
             of_setup.append(places[key])
         indices.append(np.array(of_setup))
-    _check_connected(setups, indices)
+    _check_connected(setups, sources, indices)
     names = [row[0] for row, _ in rows]
     named = tuple(
         row[0] if names.count(row[0]) == 1 else _full_name(row, source) for row, source in rows
@@ -54,11 +55,11 @@ def merged_channels(
     return Channels(named, quantities, positions, sensors), tuple(indices)
 
 
-def _known_places(setups: Sequence[ModalEstimates]) -> dict[str, set]:
+def _known_places(setups: Sequence[Channels]) -> dict[str, set]:
     """Positions and sensors that the logs tell for each name of a channel."""
     known: dict[str, set] = {}
     for setup in setups:
-        for name, _, position, sensor in zip(*setup.channels, strict=True):
+        for name, _, position, sensor in zip(*setup, strict=True):
             told = known.setdefault(name, set())
             if position is not None or sensor is not None:
                 told.add((position, sensor))
@@ -71,7 +72,7 @@ def _full_name(row: tuple, source: str) -> str:
     return f"{name} at {position:g} m" if position is not None else f"{name} of {Path(source).stem}"
 
 
-def _check_connected(setups: Sequence[ModalEstimates], indices: Sequence[np.ndarray]) -> None:
+def _check_connected(setups: Sequence[Channels], sources: Sequence[str], indices) -> None:
     """Check that common channels lead from the first setup to all others."""
     joined, reached = {0}, set(indices[0].tolist())
     while more := [k for k in range(len(setups)) if k not in joined and reached & {*indices[k]}]:
@@ -79,10 +80,9 @@ def _check_connected(setups: Sequence[ModalEstimates], indices: Sequence[np.ndar
         reached |= {int(i) for k in more for i in indices[k]}
     left = [k for k in range(len(setups)) if k not in joined]
     if left:
-        one, first = setups[left[0]], setups[0]
         raise ValueError(
-            f"{one.source}: no channel is common with {first.source}, by which their shapes could "
-            f"be scaled (the channels are {', '.join(one.channels.names)}; and "
-            f"{', '.join(first.channels.names)}); references have the same name, quantity and "
-            "position in both"
+            f"{sources[left[0]]}: no channel is common with {sources[0]}, by which their shapes "
+            f"could be scaled (the channels are {', '.join(setups[left[0]].names)}; and "
+            f"{', '.join(setups[0].names)}); references have the same name, quantity and position "
+            "in both"
         )

@@ -53,7 +53,9 @@ def merge_setups(
     setups = tuple(setups)
     if len(setups) < 2:
         raise ValueError(f"merging takes the modes of two setups or more, not {len(setups)}")
-    channels, indices = merged_channels(setups, references)
+    channels, indices = merged_channels(
+        [setup.channels for setup in setups], [setup.source for setup in setups], references
+    )
     shared = [i for i in range(len(channels.names)) if sum(i in own for own in indices) > 1]
     names = tuple(channels.names[i] for i in shared)
     groups = [
@@ -66,9 +68,12 @@ def merge_setups(
             ((own, index),) = pairs.items()
             rejected.append((setups[own].modes[index], lone[number]))
         else:
-            mode, notes = _merged(setups, indices, channels, pairs, uncertain)
-            merged.append((mode, pairs, notes))
+            mode, of_mode = _merged(setups, indices, channels, pairs, uncertain)
+            merged.append((mode, pairs, of_mode))
     merged.sort(key=lambda one: one[0].frequency)
+    notes = [note for _, _, of_mode in merged for note in of_mode]
+    if all(len(pairs) == 1 for pairs, _ in groups):
+        notes.insert(0, "no mode is common to two setups: are they of one structure?")
     chosen = f"references, the same in setups: {', '.join(names)}"
     return MultiSetupFit(
         modes=tuple(mode for mode, _, _ in merged),
@@ -78,7 +83,7 @@ def merge_setups(
         channels=channels,
         references=names,
         choices=() if references is not None else (Choice(chosen, "--references NAME,NAME,..."),),
-        notes=tuple(note for _, _, notes in merged for note in notes),
+        notes=tuple(notes),
     )
 
 

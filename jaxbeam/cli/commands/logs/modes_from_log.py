@@ -144,7 +144,7 @@ def modes_from_log(
     read = [tuning.read_log(path, columns=columns, rate=rate) for path in logs]
     if align:
         read = [tuning.align_logs(read)]
-    setups = logs_of_setups(read, _names(references))
+    setups = logs_of_setups(read, _names(references), _names(channels))
     several = [f"_setup{k + 1}" for k in range(len(setups))] if len(setups) > 1 else [""]
     pictures = [_picture(logs[0], word) for word in several if plot]
     if plot and len(setups) > 1:
