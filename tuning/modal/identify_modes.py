@@ -40,7 +40,7 @@ from tuning.modal.harmonics import (
     steady_candidates,
     subtract_lines,
 )
-from tuning.modal.preprocessing import HALF_POWER, kinetic_band, prepare
+from tuning.modal.preprocessing import HALF_POWER, energy_band, kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels
 from tuning.modal.spectral.efdd_modes import SingularValues, efdd_modes
 from tuning.modal.spectral.plscf_modes import plscf_modes
@@ -114,8 +114,8 @@ def identify_modes(
     check_band(logs[0], samples.rate, band)
     choices = _together(logs)
     derivatives = tuple(time_derivative(name) for name in logs[0].quantities)
-    used_band = band or kinetic_band(samples.records, samples.rate, derivatives)
     if forces:
+        used_band = band or energy_band(samples.records, samples.rate, derivatives)
         driving = force_records(measured, forces, window, samples)
         if force_window is not None:
             driving = tuple(force_at_blows(one, samples.rate, force_window) for one in driving)
@@ -134,18 +134,20 @@ def identify_modes(
         return _result(logs, samples, found, used_band, (), choices, "plscf", keep)
     if progress:
         progress("harmonic lines and excitation")
-    lines, cleaned = subtract_lines(samples, used_band, exclude)
-    if lines and band is None:
-        # Strong lines hold most of the kinetic energy, but resonances decide the band.
-        low, high = kinetic_band(cleaned, samples.rate, derivatives)
-        used_band = min(low, used_band[0]), max(high, used_band[1])
-        lines, cleaned = subtract_lines(samples, used_band, exclude)
+    used_band, lines, cleaned = _without_lines(samples, derivatives, exclude, band, kinetic_band)
     struck = excited(samples, derivatives, used_band)
     kind = "free decay" if method == DECAY else kind
     how = {"kind": kind, "whole": window is not None, "order": order}
     found, may_decay = None, kind != "ambient" and method in (None, DECAY)
     if may_decay:
         found, used_band = _decays(samples, struck, derivatives, used_band, band is None, how)
+    if band is None and set(derivatives) != {1}:
+        wide = _without_lines(samples, derivatives, exclude, band, energy_band)
+        if found is None:
+            used_band, lines, cleaned = wide
+        elif wide[0] != used_band:
+            more = free_decay_modes(samples, struck, derivatives, wide[0], **how)
+            found, used_band = _with_others(found, used_band, more, wide[0])
     if kind == "free decay" and found is None:
         raise ValueError(f"{logs[0].source}: no free decay found; give its window, or kind ambient")
     used_method = method or "covariance"
@@ -180,6 +182,21 @@ def identify_modes(
     _add_order(choices, order, found)
     choices = [*_band_choice(band, used_band), *choices]
     return _result(logs, samples, found, used_band, lines, choices, used_method, keep)
+
+
+def _without_lines(samples: Samples, derivatives, exclude, band, band_of):
+    """The band, the harmonic lines in it, and the records without them.
+
+    A band that is not given is that of the resonances, by `band_of`. Strong lines hold most of the
+    energy, but resonances decide the band.
+    """
+    used = band or band_of(samples.records, samples.rate, derivatives)
+    lines, cleaned = subtract_lines(samples, used, exclude)
+    if lines and band is None:
+        low, high = band_of(cleaned, samples.rate, derivatives)
+        used = min(low, used[0]), max(high, used[1])
+        lines, cleaned = subtract_lines(samples, used, exclude)
+    return used, lines, cleaned
 
 
 def _together(logs: Sequence[Log]) -> list[Choice]:
@@ -220,6 +237,22 @@ def _decays(samples: Samples, struck, derivatives, band, may_narrow: bool, how):
             if found is not None:
                 return _Found(*found), narrower
     return None if found is None else _Found(*found), band
+
+
+def _with_others(found: _Found, band, more, wide):
+    """Modes of decays in a band, with those (`more`) of a wider one outside it; the band of all.
+
+    In the wider band alone, what decays fast would end decays before slow modes are certain.
+    """
+    others = [
+        one
+        for one in (more[0] if more else ())
+        if not one.reason and not band[0] <= one.mode.frequency <= band[1]
+    ]
+    if not others:
+        return found, band
+    candidates = sorted([*found.candidates, *others], key=lambda one: one.mode.frequency)
+    return found._replace(candidates=tuple(candidates)), wide
 
 
 def _add_order(choices, order, found: _Found) -> None:

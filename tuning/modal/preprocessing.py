@@ -16,7 +16,7 @@ MIN_SEGMENTS = 8  # segments averaged for the spectrum that decides the band
 BACKGROUND_OCTAVES = 1.0  # width of the running quantile that is the background of resonances
 BACKGROUND_PERCENT = 25  # below the peaks of a pair of modes, however much of an octave they fill
 RESONANCE_RATIO = 6.0  # of the spectrum over its background: 8 dB
-BAND_ENERGY_SHARE = 0.99  # of the kinetic energy of resonances, below the upper end of the band
+BAND_ENERGY_SHARE = 0.99  # of the energy of resonances, below the upper end of the band
 HALF_POWER = 2.0  # dip between resonances of the band in which decays are sought again
 MAX_RESONANCES = 12  # in the band: the lowest, which a model of the structure has
 BAND_MARGIN = 1.3  # of the ends of the band beyond the outermost resonances
@@ -53,21 +53,34 @@ def kinetic_band(
     channel, averaged over channels, is what counts, as a sensor near a node shows little of one
     mode and much of another. Without resonances the band is all that the log can show.
     """
+    return _band_of_resonances(records, rate, (derivatives,), dip)
+
+
+def energy_band(
+    records: tuple[Float[np.ndarray, "time channel"], ...],
+    rate: float,
+    derivatives: tuple[int, ...],
+) -> tuple[float, float]:
+    """Band (Hz) as `kinetic_band`, in which resonances also have the energy of the readings.
+
+    A mode that dominates accelerations counts then, however little it moves.
+    """
+    as_read = (1,) * len(derivatives)
+    return _band_of_resonances(records, rate, (derivatives, as_read), RESONANCE_RATIO)
+
+
+def _band_of_resonances(records, rate, measures, dip: float) -> tuple[float, float]:
+    """Band (Hz) of the lowest resonances with nearly all energy by each of some `derivatives`."""
     longest = max(len(record) for record in records)
     lowest = MIN_CYCLES * rate / longest
     bins, power = _average_spectrum(records, rate)
     keep = (bins >= lowest) & (bins <= 0.45 * rate)
     bins, power = bins[keep], power[keep]
     excess = resonance_excess(bins, power)
-    exponents = 2.0 * (1 - np.asarray(derivatives))
-    weights = (2 * np.pi * bins[:, None]) ** exponents
-    whole = np.sum(power * weights, axis=0)
-    kinetic = np.mean(excess * weights / np.where(whole > 0, whole, 1.0), axis=1)
-    if not kinetic.any():
+    if not excess.any():
         return lowest, 0.4 * rate
-    share = np.cumsum(kinetic) / kinetic.sum()
-    low = bins[np.searchsorted(share, 1 - BAND_ENERGY_SHARE)]
-    high = bins[min(int(np.searchsorted(share, BAND_ENERGY_SHARE)), bins.size - 1)]
+    ends = [_ends_of_energy(bins, excess, power, derivatives) for derivatives in measures]
+    low, high = min(end[0] for end in ends), max(end[1] for end in ends)
     # Chance makes the flanks of one resonance ragged, but not by as much as a peak stands out.
     level = np.log(np.max(power / _backgrounds(bins, power), axis=1))
     least = np.log(RESONANCE_RATIO)
@@ -77,6 +90,16 @@ def kinetic_band(
         high = min(high, float(tops[MAX_RESONANCES - 1]))
     high = min(high * BAND_MARGIN, 0.4 * rate)
     return float(max(low / BAND_MARGIN**2, lowest)), float(high)
+
+
+def _ends_of_energy(bins, excess, power, derivatives) -> tuple[float, float]:
+    """Frequencies (Hz) between which resonances have nearly all of their energy."""
+    weights = (2 * np.pi * bins[:, None]) ** (2.0 * (1 - np.asarray(derivatives)))
+    whole = np.sum(power * weights, axis=0)
+    energy = np.mean(excess * weights / np.where(whole > 0, whole, 1.0), axis=1)
+    share = np.cumsum(energy) / energy.sum()
+    last = min(int(np.searchsorted(share, BAND_ENERGY_SHARE)), bins.size - 1)
+    return bins[np.searchsorted(share, 1 - BAND_ENERGY_SHARE)], bins[last]
 
 
 def strongest_frequency(

@@ -86,14 +86,12 @@ def growing_share(candidates: tuple[Candidate, ...], duration: float) -> float:
 def has_split(candidates: tuple[Candidate, ...]) -> bool:
     """Whether the fit makes several modes of one, as where forces act.
 
-    Three modes are then close and alike, or four poles are close, whether modes or not: of 100
-    decays without forces of planted structures, with pairs of modes, one has three such poles.
+    Three modes are then close and alike, or four poles are close, whether modes or not, or three in
+    two places: of 100 decays without forces of planted structures, with pairs of modes, one has
+    three such poles.
     """
-    frequencies = np.array([one.mode.frequency for one in candidates])
-    inside = (frequencies >= frequencies[:, None]) & (
-        frequencies < SPLIT_RATIO * frequencies[:, None]
-    )
-    if candidates and inside.sum(axis=1).max() >= SPLIT_POLES:
+    crowds = _crowds(sorted(one.mode.frequency for one in candidates))
+    if max(crowds, default=0) >= SPLIT_POLES or sum(n >= SPLIT_POLES - 1 for n in crowds) > 1:
         return True
     modes = [one.mode for one in candidates if not one.reason]
     modes.sort(key=lambda mode: mode.frequency)
@@ -103,6 +101,17 @@ def has_split(candidates: tuple[Candidate, ...]) -> bool:
             if mac_matrix(shapes, shapes).min() > SPLIT_MAC:
                 return True
     return False
+
+
+def _crowds(frequencies: list[float]) -> list[int]:
+    """Numbers of poles that are close, in places apart; the largest first of those that overlap."""
+    left, numbers = np.array(frequencies), []
+    while left.size:
+        inside = (left >= left[:, None]) & (left < SPLIT_RATIO * left[:, None])
+        most = int(np.argmax(inside.sum(axis=1)))
+        numbers.append(int(inside[most].sum()))
+        left = left[~inside[most]]
+    return numbers
 
 
 def shaken_until(
