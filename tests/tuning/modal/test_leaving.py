@@ -146,6 +146,16 @@ def test_many_close_poles_are_made_by_forces():
     assert not has_split(tuple(found))
 
 
+def test_three_close_poles_in_two_places_are_made_by_forces():
+    """As of 300 s of ambient vibration whose energy falls by chance for a third of them."""
+    shape = (1.0, 0.5)
+    found = [Candidate(mode(4.0, shape), "", 1)]
+    found += [Candidate(mode(f, shape), "too weak", 1) for f in (3.9, 4.1, 9.0, 9.2)]
+    assert not has_split(tuple(found))
+    found.append(Candidate(mode(9.3, shape), "", 1))
+    assert has_split(tuple(found))
+
+
 def test_after_a_blow_and_after_a_lasting_excitation():
     struck = np.zeros(1000, bool)
     struck[400:403] = True

@@ -12,7 +12,7 @@ import scipy.stats
 from scipy.signal import lfilter
 
 from tuning import Log, identify_modes
-from tuning.modal.preprocessing import kinetic_band
+from tuning.modal.preprocessing import energy_band, kinetic_band
 from tuning.modal.samples import samples_of
 
 FREQUENCIES = np.array([5.0, 12.0, 13.0])
@@ -203,6 +203,40 @@ def test_the_band_holds_what_is_strong_in_a_quiet_channel():
     values = values + 0.01 * values.std(axis=0) * random.normal(size=values.shape)
     assert kinetic_band((values[:, :1],), 50.0, (1,))[1] < 6.0
     assert 9.5 < kinetic_band((values,), 50.0, (1, 1))[1] < 15.0
+
+
+def accelerations(duration, noise, decays, rate=100.0):
+    """Accelerations of modes at 1.5 and 20 Hz, of which the second moves little."""
+    random, finer = np.random.default_rng(2), 8
+    values = 0.0
+    for frequency, damping, size in ((1.5, 0.01, 1.0), (20.0, 0.01, 0.3)):
+        pole, step = root(frequency, damping), 1 / (finer * rate)
+        force = np.zeros(int(duration * rate) * finer)
+        force[0] = decays
+        if not decays:
+            force = random.normal(size=force.size)
+        state = lfilter([1.0], [1.0, -np.exp(pole * step)], force.astype(complex))
+        one = (pole * state).imag[finer // 2 :: finer]  # in phase with the acceleration
+        values = values + size * one / one.std()
+    values = values + noise * values.std() * random.normal(size=values.size)
+    return make_log(values[:, None], rate)
+
+
+@pytest.mark.parametrize(("duration", "decays"), [(200.0, 0), (20.0, 1)])
+def test_the_band_holds_what_dominates_accelerations_and_what_moves_much(duration, decays):
+    """Of accelerations a mode at 20 Hz has a twelfth, of the kinetic energy less than a thousandth."""
+    log = accelerations(duration, 0.05, decays)
+    assert kinetic_band((log.values,), 100.0, (2,))[1] < 10.0
+    low, high = energy_band((log.values,), 100.0, (2,))
+    assert low < 1.5 and 20.0 < high < 40.0
+    fit = identify_modes(log)
+    assert fit.kind == ("free decay" if decays else "ambient")
+    np.testing.assert_allclose(fit.frequencies, [1.5, 20.0], rtol=0.01)
+    assert fit.band[1] > 20.0
+    # Of velocities both are one.
+    velocities = make_log(log.values, 100.0, "velocity")
+    assert energy_band((log.values,), 100.0, (1,)) == kinetic_band((log.values,), 100.0, (1,))
+    np.testing.assert_allclose(identify_modes(velocities).frequencies, [1.5, 20.0], rtol=0.01)
 
 
 def test_samples_are_left_out_while_a_sensor_settles():
