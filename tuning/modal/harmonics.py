@@ -6,7 +6,7 @@ must have the same amplitude and phase throughout the record, which a resonance 
 decay of a lightly damped mode.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from scipy.signal.windows import dpss
 from scipy.stats import f as f_distribution
 
 from tuning.modal.ambient import Candidate
-from tuning.modal.preprocessing import prepare
+from tuning.modal.preprocessing import energy_band, prepare
 from tuning.modal.result import IdentifiedMode
 from tuning.modal.samples import Samples
 
@@ -206,6 +206,41 @@ def subtract_lines(
     frequencies = tuple(line.frequency for line in lines) + tuple(exclude)
     centred = (record - record.mean(axis=0) for record in samples.records)
     return lines, tuple(without_lines(one, samples.rate, frequencies) for one in centred)
+
+
+def band_without_lines(
+    samples: Samples,
+    derivatives: tuple[int, ...],
+    exclude: Sequence[float],
+    band: tuple[float, float] | None,
+) -> tuple[tuple[float, float], tuple[Line, ...], tuple[Float[np.ndarray, "_ channel"], ...]]:
+    """The band (Hz), the harmonic lines in it, and the records without them.
+
+    A band that is not given is that of the energy of the readings and of the kinetic energy;
+    `derivatives` are the orders of the channels as time derivatives.
+    """
+    used = band or band_of(energy_band, samples, derivatives)
+    lines, cleaned = subtract_lines(samples, used, exclude)
+    if lines and band is None:
+        used = band_of(energy_band, samples, derivatives, cleaned)
+        lines, cleaned = subtract_lines(samples, used, exclude)
+    return used, lines, cleaned
+
+
+def band_of(
+    measure: Callable,
+    samples: Samples,
+    derivatives: tuple[int, ...],
+    cleaned: tuple[Float[np.ndarray, "_ channel"], ...] | None = None,
+) -> tuple[float, float]:
+    """Band (Hz) of resonances by a `measure`, with that of the records `cleaned` of lines, if any.
+
+    Strong lines hold most of the energy, but resonances decide the band.
+    """
+    bands = [measure(samples.records, samples.rate, derivatives)]
+    if cleaned is not None:
+        bands.append(measure(cleaned, samples.rate, derivatives))
+    return min(low for low, _ in bands), max(high for _, high in bands)
 
 
 def lines_besides(lines: tuple[Line, ...], modes: Sequence[IdentifiedMode]) -> tuple[Line, ...]:

@@ -34,11 +34,12 @@ from tuning.modal.forced.blows import force_at_blows
 from tuning.modal.forced.forces import force_names, force_records, without_forces
 from tuning.modal.forced.modes import forced_modes
 from tuning.modal.harmonics import (
+    band_of,
+    band_without_lines,
     fundamental,
     is_multiple,
     lines_besides,
     steady_candidates,
-    subtract_lines,
 )
 from tuning.modal.preprocessing import HALF_POWER, energy_band, kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels
@@ -134,20 +135,22 @@ def identify_modes(
         return _result(logs, samples, found, used_band, (), choices, "plscf", keep)
     if progress:
         progress("harmonic lines and excitation")
-    used_band, lines, cleaned = _without_lines(samples, derivatives, exclude, band, kinetic_band)
+    wide, lines, cleaned = band_without_lines(samples, derivatives, exclude, band)
+    readings_differ = band is None and set(derivatives) != {1}  # from velocities
+    used_band = wide
+    if readings_differ:
+        used_band = band_of(kinetic_band, samples, derivatives, cleaned if lines else None)
     struck = excited(samples, derivatives, used_band)
     kind = "free decay" if method == DECAY else kind
     how = {"kind": kind, "whole": window is not None, "order": order}
     found, may_decay = None, kind != "ambient" and method in (None, DECAY)
     if may_decay:
         found, used_band = _decays(samples, struck, derivatives, used_band, band is None, how)
-    if band is None and set(derivatives) != {1}:
-        wide = _without_lines(samples, derivatives, exclude, band, energy_band)
-        if found is None:
-            used_band, lines, cleaned = wide
-        elif wide[0] != used_band:
-            more = free_decay_modes(samples, struck, derivatives, wide[0], **how)
-            found, used_band = _with_others(found, used_band, more, wide[0])
+    if found is None:
+        used_band = wide
+    elif readings_differ:
+        more = free_decay_modes(samples, struck, derivatives, wide, **how)
+        found, used_band = _with_others(found, used_band, more, wide)
     if kind == "free decay" and found is None:
         raise ValueError(f"{logs[0].source}: no free decay found; give its window, or kind ambient")
     used_method = method or "covariance"
@@ -182,21 +185,6 @@ def identify_modes(
     _add_order(choices, order, found)
     choices = [*_band_choice(band, used_band), *choices]
     return _result(logs, samples, found, used_band, lines, choices, used_method, keep)
-
-
-def _without_lines(samples: Samples, derivatives, exclude, band, band_of):
-    """The band, the harmonic lines in it, and the records without them.
-
-    A band that is not given is that of the resonances, by `band_of`. Strong lines hold most of the
-    energy, but resonances decide the band.
-    """
-    used = band or band_of(samples.records, samples.rate, derivatives)
-    lines, cleaned = subtract_lines(samples, used, exclude)
-    if lines and band is None:
-        low, high = band_of(cleaned, samples.rate, derivatives)
-        used = min(low, used[0]), max(high, used[1])
-        lines, cleaned = subtract_lines(samples, used, exclude)
-    return used, lines, cleaned
 
 
 def _together(logs: Sequence[Log]) -> list[Choice]:
