@@ -224,7 +224,7 @@ def accelerations(duration, noise, decays, rate=100.0):
 
 @pytest.mark.parametrize(("duration", "decays"), [(200.0, 0), (20.0, 1)])
 def test_the_band_holds_what_dominates_accelerations_and_what_moves_much(duration, decays):
-    """Of accelerations a mode at 20 Hz has a twelfth, of the kinetic energy less than a thousandth."""
+    """A mode at 20 Hz has a twelfth of accelerations, a two-thousandth of the kinetic energy."""
     log = accelerations(duration, 0.05, decays)
     assert kinetic_band((log.values,), 100.0, (2,))[1] < 10.0
     low, high = energy_band((log.values,), 100.0, (2,))
