@@ -194,7 +194,7 @@ def test_the_shape_of_a_mode_that_is_uncertain_in_a_setup():
         other, modes=other.modes[:1], rejected=((other.modes[1], "noisy"),)
     )
     fit = merge_setups([one, uncertain])
-    assert "9 Hz: of two.csv the shape alone is used, as its mode is noisy" in str(fit)
+    assert "9 Hz: of two.csv the shape alone is used: noisy" in str(fit)
     assert fit.pairs[1] == {0: 1} and fit.modes[1].damping_sd == 0.001
     np.testing.assert_allclose(fit.shapes[1], SHAPES[1][[0, 1, 2, 4]], atol=1e-9)
     poor = other.modes[1]._replace(energy_share=0.001)

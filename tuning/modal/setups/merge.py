@@ -72,7 +72,7 @@ def merge_setups(
             merged.append((mode, pairs, of_mode))
     merged.sort(key=lambda one: one[0].frequency)
     notes = [note for _, _, of_mode in merged for note in of_mode]
-    if all(len(pairs) == 1 for pairs, _ in groups):
+    if groups and all(len(pairs) == 1 for pairs, _ in groups):
         notes.insert(0, "no mode is common to two setups: are they of one structure?")
     chosen = f"references, the same in setups: {', '.join(names)}"
     return MultiSetupFit(
@@ -144,7 +144,7 @@ def _why_lacking(setup: ModalFit, frequency: float, uncertain) -> str:
     """Why a setup does not show a mode of some frequency (Hz), in words."""
     low, high = setup.band
     if uncertain:
-        return f"of {setup.source} the shape alone is used, as its mode is {uncertain[1]}"
+        return f"of {setup.source} the shape alone is used: {uncertain[1]}"
     if not low <= frequency <= high:
         return f"not in {setup.source}, whose band is {low:.3g} Hz to {high:.4g} Hz  [--band]"
     return f"not found in {setup.source}"
