@@ -18,7 +18,7 @@ import numpy as np
 
 from tuning.logs.log import Log
 from tuning.logs.units import time_derivative
-from tuning.modal.ambient import Candidate, subspace_modes
+from tuning.modal.ambient import Candidate, subspace_modes, without_duplicates
 from tuning.modal.arguments import (
     DECAY,
     METHODS,
@@ -42,6 +42,7 @@ from tuning.modal.harmonics import (
     steady_candidates,
 )
 from tuning.modal.preprocessing import HALF_POWER, energy_band, kinetic_band, prepare
+from tuning.modal.result import is_at_edge
 from tuning.modal.samples import Samples, samples_of, with_channels
 from tuning.modal.spectral.efdd_modes import SingularValues, efdd_modes
 from tuning.modal.spectral.plscf_modes import plscf_modes
@@ -233,14 +234,11 @@ def _with_others(found: _Found, band, more, wide):
     In the wider band alone, what decays fast would end decays before slow modes are certain.
     """
     others = [
-        one
-        for one in (more[0] if more else ())
-        if not one.reason and not band[0] <= one.mode.frequency <= band[1]
+        one for one in (more[0] if more else ()) if not one.reason and is_at_edge(one.mode, band)
     ]
     if not others:
         return found, band
-    candidates = sorted([*found.candidates, *others], key=lambda one: one.mode.frequency)
-    return found._replace(candidates=tuple(candidates)), wide
+    return found._replace(candidates=without_duplicates([*found.candidates, *others])), wide
 
 
 def _add_order(choices, order, found: _Found) -> None:

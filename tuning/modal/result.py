@@ -150,6 +150,13 @@ def frequency_and_damping(
     )
 
 
+def is_at_edge(mode: IdentifiedMode, band: tuple[float, float]) -> bool:
+    """Whether a mode, with its half-power bandwidth, is not well within a band (Hz)."""
+    half_width = max(mode.damping_ratio, 0.0) * mode.frequency
+    highest = min(MAX_BAND_SHARE * band[1], band[1] - half_width)
+    return not band[0] + half_width <= mode.frequency <= highest
+
+
 def rejection_reason(
     mode: IdentifiedMode,
     duration: float,
@@ -157,9 +164,7 @@ def rejection_reason(
     min_collinearity: float = MIN_COLLINEARITY,
 ) -> str:
     """Reason why a mode found in `duration` seconds is not well identified; empty if it is."""
-    half_width = max(mode.damping_ratio, 0.0) * mode.frequency  # where the power is half
-    highest = min(MAX_BAND_SHARE * band[1], band[1] - half_width)
-    if not band[0] + half_width <= mode.frequency <= highest:
+    if is_at_edge(mode, band):
         return "at the edge of the band"
     if not mode.quantile * mode.damping_sd < mode.damping_ratio:
         return "damping not distinguishable from none: hum, or a mode too weak or too short"

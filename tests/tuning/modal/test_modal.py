@@ -13,6 +13,7 @@ from scipy.signal import lfilter
 
 from tuning import Log, identify_modes
 from tuning.modal.preprocessing import energy_band, kinetic_band
+from tuning.modal.result import IdentifiedMode, is_at_edge
 from tuning.modal.samples import samples_of
 
 FREQUENCIES = np.array([5.0, 12.0, 13.0])
@@ -237,6 +238,14 @@ def test_the_band_holds_what_dominates_accelerations_and_what_moves_much(duratio
     velocities = make_log(log.values, 100.0, "velocity")
     assert energy_band((log.values,), 100.0, (1,)) == kinetic_band((log.values,), 100.0, (1,))
     np.testing.assert_allclose(identify_modes(velocities).frequencies, [1.5, 20.0], rtol=0.01)
+
+
+def test_a_mode_at_the_edge_of_a_band():
+    """Within the half-power bandwidth of an end, or in the last 2 % of the band."""
+    mode = IdentifiedMode(9.0, 0.01, 0.02, 0.001, 0.5, np.ones(1, complex), np.zeros((2, 2)))
+    for low, high, at_edge in ((1, 10, False), (1, 9.17, True), (8.9, 20, True)):
+        assert is_at_edge(mode, (float(low), float(high))) is at_edge
+    assert not is_at_edge(mode._replace(damping_ratio=0.001), (8.9, 20.0))
 
 
 def test_samples_are_left_out_while_a_sensor_settles():
