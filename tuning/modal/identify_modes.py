@@ -18,7 +18,7 @@ import numpy as np
 
 from tuning.logs.log import Log
 from tuning.logs.units import time_derivative
-from tuning.modal.ambient import Candidate, subspace_modes, without_duplicates
+from tuning.modal.ambient import Candidate, subspace_modes
 from tuning.modal.arguments import (
     DECAY,
     METHODS,
@@ -28,7 +28,8 @@ from tuning.modal.arguments import (
     check_force,
 )
 from tuning.modal.chosen import chosen_modes
-from tuning.modal.decay.modes import Decays, band_of_ends, excited, free_decay_modes
+from tuning.modal.decay.modes import Decays, excited, free_decay_modes
+from tuning.modal.decay.whole_log import FromDecays, modes_of_decays
 from tuning.modal.fit import Choice, ModalFit
 from tuning.modal.forced.blows import force_at_blows
 from tuning.modal.forced.forces import force_names, force_records, without_forces
@@ -41,8 +42,7 @@ from tuning.modal.harmonics import (
     lines_besides,
     steady_candidates,
 )
-from tuning.modal.preprocessing import HALF_POWER, energy_band, kinetic_band, prepare
-from tuning.modal.result import is_at_edge
+from tuning.modal.preprocessing import energy_band, kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels
 from tuning.modal.spectral.efdd_modes import SingularValues, efdd_modes
 from tuning.modal.spectral.plscf_modes import plscf_modes
@@ -144,14 +144,11 @@ def identify_modes(
     struck = excited(samples, derivatives, used_band)
     kind = "free decay" if method == DECAY else kind
     how = {"kind": kind, "whole": window is not None, "order": order}
-    found, may_decay = None, kind != "ambient" and method in (None, DECAY)
+    told, may_decay = None, kind != "ambient" and method in (None, DECAY)
     if may_decay:
-        found, used_band = _decays(samples, struck, derivatives, used_band, band is None, how)
-    if found is None:
-        used_band = wide
-    elif readings_differ:
-        more = free_decay_modes(samples, struck, derivatives, wide, **how)
-        found, used_band = _with_others(found, used_band, more, wide)
+        bands, narrow = (used_band, wide), band is None
+        told = modes_of_decays(samples, struck, derivatives, bands, narrow, how)
+    found, used_band = (_of_decays(told), told.band) if told else (None, wide)
     if kind == "free decay" and found is None:
         raise ValueError(f"{logs[0].source}: no free decay found; give its window, or kind ambient")
     used_method = method or "covariance"
@@ -160,8 +157,8 @@ def identify_modes(
         if may_decay and window is None and all(one.reason for one in found.candidates):
             # The energy of a short decay falls little, but damped vibrations explain all of it.
             how["whole"] = True
-            whole, _ = _decays(samples, struck, derivatives, used_band, False, how)
-            found = whole or found
+            whole = free_decay_modes(samples, struck, derivatives, used_band, **how)
+            found = _Found(*whole) if whole else found
     if found.decays is None:
         if lines:
             choices.append(Choice(f"{len(lines)} harmonic lines subtracted", "--exclude FREQUENCY"))
@@ -204,41 +201,18 @@ def _band_choice(band, used: tuple[float, float]) -> list[Choice]:
 
 
 class _Found(NamedTuple):
-    """Candidates, diagrams, decays that were fitted if any, singular values if any, and kind."""
+    """Candidates, diagrams, decays that were fitted if any, singular values if any, kind, blows."""
 
     candidates: tuple[Candidate, ...]
     diagrams: tuple[Diagram, ...]
     decays: Decays | None
     singular_values: tuple[SingularValues, ...] = ()
     kind: str = "ambient"
+    blows: int = 0
 
 
-def _decays(samples: Samples, struck, derivatives, band, may_narrow: bool, how):
-    """What decays in a band tell, or in a narrower one, if any; and the band that was used."""
-    found = free_decay_modes(samples, struck, derivatives, band, **how)
-    if found is None and may_narrow:
-        # A decay drowns sooner in the noise of a wide band.
-        lower = kinetic_band(samples.records, samples.rate, derivatives, HALF_POWER)
-        others = dict.fromkeys((lower, band_of_ends(samples, derivatives, lower)))
-        for narrower in (one for one in others if one != band):
-            marks = excited(samples, derivatives, narrower)
-            found = free_decay_modes(samples, marks, derivatives, narrower, **how)
-            if found is not None:
-                return _Found(*found), narrower
-    return None if found is None else _Found(*found), band
-
-
-def _with_others(found: _Found, band, more, wide):
-    """Modes of decays in a band, with those (`more`) of a wider one outside it; the band of all.
-
-    In the wider band alone, what decays fast would end decays before slow modes are certain.
-    """
-    others = [
-        one for one in (more[0] if more else ()) if not one.reason and is_at_edge(one.mode, band)
-    ]
-    if not others:
-        return found, band
-    return found._replace(candidates=without_duplicates([*found.candidates, *others])), wide
+def _of_decays(told: FromDecays) -> _Found:
+    return _Found(told.candidates, told.diagrams, told.decays, blows=told.blows)
 
 
 def _add_order(choices, order, found: _Found) -> None:
@@ -269,6 +243,8 @@ def _ambient_modes(cleaned, samples: Samples, band, method, order, progress) -> 
 
 def _kind_words(found: _Found, struck, lines) -> str:
     """Sentence on the excitation."""
+    if found.blows:
+        return f"excitation: {found.blows} blows, between which records are fitted as a whole"
     if found.decays is not None:
         number = len(found.decays.stretches)
         return f"excitation: {number} free decays, used together" if number > 1 else (

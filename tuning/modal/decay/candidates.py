@@ -9,6 +9,7 @@ from tuning.modal.result import MAX_DAMPING_RATIO, IdentifiedMode, rejection_rea
 from tuning.modal.shapes import mac_matrix
 
 NOT_REPRODUCED = "not the same in parts of the window"
+NONLINEARITY = "what nonlinearity adds to the mode of"
 NONLINEAR_DECAY = 2.5, 4.5  # decay rates over that of a mode, of what its nonlinearity adds to it
 NONLINEAR_MAC = 0.95
 MAX_CUBE_SPREAD = 3.0  # of energies of several decays over what they would be of cubes
@@ -76,7 +77,7 @@ def _without_nonlinearity(found: list[Candidate], by_decay) -> list[Candidate]:
     good = [(one.mode, own) for one, own in zip(found, by_decay, strict=True) if not one.reason]
     return [
         one if one.reason else one._replace(reason=next(
-            (f"what nonlinearity adds to the mode of {other.frequency:.4g} Hz"
+            (f"{NONLINEARITY} {other.frequency:.4g} Hz"
              for other, theirs in good
              if _is_cube(one.mode, other) and _grows_as_cube(own, theirs)), ""))
         for one, own in zip(found, by_decay, strict=True)

@@ -27,6 +27,7 @@ from tuning.modal.forced.uncertainty import (
 )
 
 REST_POWERS = (-2, -1, 0, 1, 2)  # of z, for modes above the band and those not found
+REST_TERMS = len(REST_POWERS) + 2  # with those of modes below the band
 FEWER_REST_POWERS = (0, 1)  # with which poles are compared
 STEPS = 12
 WIDE = 16  # lines on either side whose errors tell the level of a line
@@ -147,10 +148,11 @@ def refined_poles(
     starts: Complex[np.ndarray, " mode"],
     moving: Int[np.ndarray, " moving"],
     powers: tuple[int, ...] = REST_POWERS,
+    steps: int = STEPS,
 ) -> Complex[np.ndarray, " mode"]:
     """Poles after Gauss-Newton steps; those that leave their surroundings return to the start."""
     poles = starts.astype(complex)
-    for _ in range(STEPS if moving.size else 0):
+    for _ in range(steps if moving.size else 0):
         found, gram, along, squares = _reduced(lines, poles, moving, powers)
         directions = pole_directions(lines, found, poles.size, moving)
         weight = 2 * len(lines.z) / np.maximum(squares, 1e-300)

@@ -88,11 +88,14 @@ def _stacked(found, lines: Lines, modes: int):
 
 
 def modes_of_model(
-    model: FittedModel, scale: Float[np.ndarray, " output"]
+    model: FittedModel,
+    scale: Float[np.ndarray, " output"],
+    bands: tuple[tuple[float, float], ...] = (),
 ) -> tuple[IdentifiedMode, ...]:
     """Modes of a fitted model with uncertainties; those of poles not refined have none.
 
-    Outputs are in units of `scale`, shapes in those of the log.
+    Outputs are in units of `scale`, shapes in those of the log. Shares in the energy are those of
+    the first of some bands (Hz) in which a mode is, by default of all lines.
     """
     plain, lines, poles, fit = model.plain, model.lines, model.poles, model.fit
     covariances = pole_covariances(model)
@@ -101,7 +104,6 @@ def modes_of_model(
     changes = np.array([_stacked(one, lines, poles.size) for one in changes])
     resonances, mirrored = resonances_of(plain, poles)
     transients, mirrored_transients = transients_of(plain, poles)
-    power = np.maximum(np.sum(np.abs(plain.outputs) ** 2, axis=0), 1e-300)
     modes = []
     for k, pole in enumerate(poles):
         # Residues and transients are multiples of one shape. What they are together is known well,
@@ -119,6 +121,7 @@ def modes_of_model(
         frequency, frequency_sd, damping, damping_sd = frequency_and_damping(
             complex(pole), covariances[k]
         )
+        power = _power(plain, [one for one in bands if one[0] <= frequency <= one[1]])
         terms = mirrored[:, [k]] * plain.inputs, mirrored_transients[:, [k]] * plain.unforced
         part = response + np.concatenate(terms, axis=1) @ coefficients[k].conj()
         modes.append(
@@ -134,3 +137,12 @@ def modes_of_model(
             )
         )
     return tuple(modes)
+
+
+def _power(lines: Lines, bands):
+    """Power of the outputs at all lines, or at those of the first of some bands (Hz)."""
+    outputs = lines.outputs
+    if bands:
+        frequencies = np.angle(lines.z) / (2 * np.pi * lines.step)
+        outputs = outputs[(frequencies >= bands[0][0]) & (frequencies <= bands[0][1])]
+    return np.maximum(np.sum(np.abs(outputs) ** 2, axis=0), 1e-300)

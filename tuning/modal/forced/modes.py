@@ -115,14 +115,14 @@ def _modes_of_lines(lines: Lines, scale, part, band, duration, order, known):
         used = _distinct(used, diagram)
         if used.size == before and drawn is not diagram:
             break
-        model, gone = _refined(lines, used, scale, part)
-        model = _completed(lines, model, scale, part)
+        model, gone = refined_model(lines, used, scale, part)
+        model = completed(lines, model, scale, part)
         dropped += gone
         used, rest = model.poles, unexplained(model)
     modes = [mode for mode in modes_of_model(model, scale) if part[0] <= mode.frequency <= part[1]]
-    candidates = [Candidate(mode, _reason(mode, duration, band), 1) for mode in modes]
+    candidates = [Candidate(mode, mode_reason(mode, duration, band), 1) for mode in modes]
     candidates += [
-        Candidate(mode, _reason(mode, duration, band) or reason, 1)
+        Candidate(mode, mode_reason(mode, duration, band) or reason, 1)
         for mode, reason in dropped
         if part[0] <= mode.frequency <= part[1]
     ]
@@ -133,7 +133,7 @@ def _modes_of_lines(lines: Lines, scale, part, band, duration, order, known):
     )
 
 
-def _reason(mode: IdentifiedMode, duration, band) -> str:
+def mode_reason(mode: IdentifiedMode, duration, band) -> str:
     """Reason for rejecting a mode: a complex shape, only if errors are not what makes it complex.
 
     Of a close pair that one force excites alike the log tells the sum of the shapes, hardly each.
@@ -165,7 +165,7 @@ def _diagram(lines: Lines, scale, part, order) -> Diagram:
     return stabilise(poles, (part[0] / 4, 0.5 / lines.step))
 
 
-def _refined(lines, poles, scale, part):
+def refined_model(lines, poles, scale, part):
     """Model of those poles that are determined, and the modes of the others with reasons.
 
     Two poles for one resonance, or one for none, make others uncertain, so that one goes at a time.
@@ -185,7 +185,7 @@ def _refined(lines, poles, scale, part):
         poles = np.delete(model.poles, worst)
 
 
-def _completed(lines, model, scale, part):
+def completed(lines, model, scale, part):
     """Model with poles added where errors are more than noise, if that is the better one."""
     tried: list[complex] = []
     for _ in range(MAX_ADDED):
@@ -204,7 +204,7 @@ def _completed(lines, model, scale, part):
         poles = np.append(model.poles, missing)
         if new[0] > 0:
             poles = split_pole(model, int(model.moving[new[0] - 1]))
-        other, _ = _refined(lines, poles, scale, part)
+        other, _ = refined_model(lines, poles, scale, part)
         fit = linear_fit(model.lines, other.poles)
         if criterion(fit, other.poles.size) < criterion(model.fit, model.poles.size):
             model = other

@@ -61,9 +61,20 @@ def single_pole_chances(model: FittedModel) -> Float[np.ndarray, " moving"]:
 
 
 def missing_pole(model: FittedModel, band: tuple[float, float]) -> tuple[complex, float]:
-    """The pole (1/s) that would lower the errors most, and the probability that noise does so.
+    """The pole (1/s) that would lower the errors most, and the probability that noise does so."""
+    tried = promising_poles(model.lines, model.fit.errors, band)
+    best = tried[:MOST_PROMISING]
+    chances = [_chance(model, pole, model.freedom_at(pole), 1) for pole in best]
+    least = int(np.argmin(chances))
+    return best[least], len(tried) * chances[least]
 
-    Poles of several damping ratios are tried, a half-power bandwidth apart.
+
+def promising_poles(
+    lines: Lines, errors: Float[np.ndarray, "row output"], band: tuple[float, float]
+) -> list[complex]:
+    """Poles (1/s) in a band (Hz), those first that seem to explain most of the errors.
+
+    They are of several damping ratios, a half-power bandwidth apart.
     """
     low, high = 2 * np.pi * band[0], 2 * np.pi * band[1]
     tried = [
@@ -72,24 +83,20 @@ def missing_pole(model: FittedModel, band: tuple[float, float]) -> tuple[complex
         for angular in np.geomspace(low, high, int(np.log(high / low) / (2 * ratio)) + 2).tolist()
     ]
     # Without the terms of the model in them, columns explain less than they could: a first choice.
-    least = _least_statistics(model, tried)
-    best = [tried[k] for k in np.argsort(-least, kind="stable")[:MOST_PROMISING]]
-    chances = [_chance(model, pole, model.freedom_at(pole), 1) for pole in best]
-    least = int(np.argmin(chances))
-    return best[least], len(tried) * chances[least]
+    least = _least_statistics(lines, errors, tried)
+    return [tried[k] for k in np.argsort(-least, kind="stable")]
 
 
-def _least_statistics(model: FittedModel, tried) -> Float[np.ndarray, " tried"]:
+def _least_statistics(lines: Lines, errors, tried) -> Float[np.ndarray, " tried"]:
     """What 1 / (s - p) explains of the errors, over their variance, if the model keeps its own."""
-    count = len(model.lines.z)
-    angular = np.angle(model.lines.z) / model.lines.step
-    errors = model.fit.errors.reshape(2, count, -1)
-    variance = line_means(model.fit.errors**2, NEIGHBOURS)
-    reach = NEAR_LINES * model.lines.spacing
+    angular = np.angle(lines.z) / lines.step
+    variance = line_means(errors**2, NEIGHBOURS)
+    errors = errors.reshape(2, len(lines.z), -1)
+    reach = NEAR_LINES * lines.spacing
     found = []
     for pole in tried:
         near = np.abs(angular - pole.imag) < reach + NEAR_WIDTHS * abs(pole.real)
-        columns = _columns_of(model.lines.part(near), pole, 1)
+        columns = _columns_of(lines.part(near), pole, 1)
         along = np.linalg.qr(columns)[0].T @ errors[:, near].reshape(len(columns), -1)
         own = variance[np.argmin(np.abs(angular - pole.imag))]
         found.append(np.sum(np.sum(along**2, axis=0) / np.maximum(own, 1e-300)))
@@ -137,10 +144,22 @@ def criterion(fit: LinearFit, modes: int) -> float:
 
     It is less for the better model.
     """
-    rows, outputs = fit.errors.shape
-    parameters = outputs * fit.columns.shape[1] + 2 * modes
-    size = np.sum(np.log(np.maximum(np.mean(fit.errors**2, axis=0), 1e-300)))
+    rows, columns = fit.columns.shape
+    return _criterion(np.sum(fit.errors**2, axis=0), rows, columns, modes)
+
+
+def _criterion(squares, rows, columns, modes) -> float:
+    parameters = squares.size * columns + 2 * modes
+    size = np.sum(np.log(np.maximum(squares / rows, 1e-300)))
     return float(rows * size + parameters * np.log(rows))
+
+
+def criterion_with(lines: Lines, fit: LinearFit, modes: int, pole: complex) -> float:
+    """The same of a fit to which a pole (1/s) is added as it is."""
+    columns = _columns_of(lines, pole, 1)
+    basis = np.linalg.qr(columns - fit.basis @ (fit.basis.T @ columns))[0]
+    squares = np.sum(fit.errors**2, axis=0) - np.sum((basis.T @ fit.errors) ** 2, axis=0)
+    return _criterion(squares, len(columns), fit.columns.shape[1] + columns.shape[1], modes + 1)
 
 
 def split_pole(model: FittedModel, k: int) -> Complex[np.ndarray, " mode"]:

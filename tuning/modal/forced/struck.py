@@ -1,0 +1,235 @@
+"""Modes from the response to blows that nobody measured, of whole records.
+
+Decays between blows are as long as the shortest of them, nearly, when they are fitted side by side;
+slow modes have then hardly begun to fade. Here the record is one: unit impulses stand at the
+instants of the blows (`instants`), and the residues are amplitudes of each mode after each blow,
+so that a vibration that lasts through the next blow counts as long as it lasts.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.signal import detrend
+
+from tuning.modal.ambient import divided_band
+from tuning.modal.decay.poles import NEARBY_BINS, NONLINEARITY_SHARE
+from tuning.modal.forced.common_denominator import Lines
+from tuning.modal.forced.instants import (
+    MAX_BLOWS,
+    WORK,
+    Blow,
+    Response,
+    after_blows,
+    bins_of,
+    poles_within,
+    response_in_band,
+    with_missed_blows,
+    work,
+)
+from tuning.modal.forced.likelihood import FittedModel, linear_fit, refined_poles
+from tuning.modal.forced.modal_model import modes_of_model, unexplained
+from tuning.modal.forced.modes import mode_reason, refined_model
+from tuning.modal.forced.significance import criterion, criterion_with, promising_poles
+from tuning.modal.result import IdentifiedMode
+from tuning.modal.shapes import mac_matrix
+
+MIN_BLOWS = 2
+MAX_ADDED = 16  # poles, one at a time
+TRIED = 6  # for each of them
+TRIAL_STEPS = 6  # in which it is refined, before it is compared
+MIN_DECAY = 0.2  # nepers, over the whole record, of a mode
+SAME_POLE = 0.1  # distance of two poles over the smaller decay rate, below which they are one
+MEDIAN_LINES = 30  # on either side of a line, whose errors tell its level
+EARLY = 0.1  # of a record, within which a blow begins it
+# Share of the energy that is unexplained, times the swing of the errors: at most 0.33 in 130
+# planted logs of blows, at least 0.5 in 80 of crossing loads.
+MAX_UNEXPLAINED = 0.4
+SWING_PARTS = 20  # of a record, whose errors are compared
+SAME_MAC = 0.9
+WEAK = 0.05  # share of a mode in the energy
+MAX_ENERGY = 3.0  # of a mode, over that of the log; poles that cancel each other have more
+
+
+class StruckModes(NamedTuple):
+    """Modes well identified, blows in samples of their records, and the band (Hz) used."""
+
+    modes: tuple[IdentifiedMode, ...]
+    blows: tuple[Blow, ...]
+    band: tuple[float, float]
+
+
+def struck_modes(
+    records: tuple[Float[np.ndarray, "_ channel"], ...],
+    rate: float,
+    band: tuple[float, float],
+    blows: tuple[Blow, ...],
+    poles: Complex[np.ndarray, " pole"],
+) -> StruckModes | None:
+    """Modes of a band (Hz), from known blows and poles (1/s), to which others are added.
+
+    None if less than two blows are found, or if blows are not all that excites: then the modes
+    leave much unexplained, or more in some parts of a record than in others. The band is narrower
+    if the least squares would be too large.
+    """
+    if len(blows) > MAX_BLOWS:
+        return None
+    records = tuple(np.asarray(detrend(record, axis=0)) for record in records)
+    begins, found, response = [0] * len(records), -1, None
+    while len(blows) > found:
+        found = len(blows)
+        lower = _affordable(records, rate, band, poles, found)
+        poles = poles_within(poles, lower)
+        if not poles.size:
+            return None
+        if response is None or lower != band:
+            response, band = response_in_band(records, rate, lower), lower
+        blows = with_missed_blows(response, blows, poles)
+        records, blows, left_out = _from_first_blow(records, blows)
+        if any(left_out):
+            response = response_in_band(records, rate, band)
+        begins = [old + new for old, new in zip(begins, left_out, strict=True)]
+        lines = after_blows(response, blows)
+        poles = _completed(lines, poles, band, response.duration)
+    every = tuple(
+        sorted(
+            [Blow(blow.record, blow.sample + begins[blow.record]) for blow in blows]
+            + [Blow(record, begin) for record, begin in enumerate(begins) if begin]
+        )
+    )
+    if len(every) < MIN_BLOWS:
+        return None
+    model, _ = refined_model(lines, poles, response.scale, band)
+    if not _explains(model, response):
+        return None
+    modes = tuple(
+        mode
+        for mode in modes_of_model(model, response.scale, divided_band(band))
+        if not mode_reason(mode, response.duration, band) and mode.energy_share < MAX_ENERGY
+    )
+    return StruckModes(modes, every, band)
+
+
+def alike(a: IdentifiedMode, b: IdentifiedMode) -> bool:
+    """Whether a mode is closer to another than their half-power bandwidths, and of its shape.
+
+    Frequency and damping of a real structure depend on amplitude, so that errors alone do not tell;
+    the shape of a weak mode is not known well enough to differ.
+    """
+    widths = sum(max(one.damping_ratio, 0.0) * one.frequency for one in (a, b))
+    errors = a.quantile * a.frequency_sd + b.quantile * b.frequency_sd
+    near = abs(a.frequency - b.frequency) < max(widths, errors)
+    same = mac_matrix(a.shape[None], b.shape[None])[0, 0] > SAME_MAC
+    return bool(near and (same or a.energy_share < WEAK))
+
+
+def _affordable(records, rate, band, poles, blows) -> tuple[float, float]:
+    """The band (Hz), or as much of its lower part as WORK allows, with room for two more blows."""
+    (low, high), duration = band, sum(map(len, records)) / rate
+    while high > low:
+        modes = poles_within(poles, (low, high)).size
+        if work(duration, (low, high), modes, blows + 2) < WORK:
+            break
+        high *= 0.9
+    return low, max(high, low)
+
+
+def _explains(model: FittedModel, response: Response) -> bool:
+    """Whether modes and blows explain nearly all, and as much in all parts of the records."""
+    rest = unexplained(model)
+    whole = np.sum(np.abs(model.plain.outputs) ** 2)
+    share = np.sum(np.abs(rest.outputs) ** 2) / max(whole, 1e-300)
+    swings = [
+        _swing(rest, number, length, response.rate)
+        for number, length in enumerate(response.lengths)
+    ]
+    return bool(share * max(swings) < MAX_UNEXPLAINED)
+
+
+def _swing(rest: Lines, number: int, length: int, rate: float) -> float:
+    """Energy of the errors in the louder parts of a record over that in the quieter ones.
+
+    It is one for noise that goes on as it is, and large if something else than blows excites.
+    """
+    these = rest.record == number
+    spectrum = np.zeros((length // 2 + 1, rest.outputs.shape[1]), complex)
+    spectrum[bins_of(rest, these, length, rate)] = rest.outputs[these]
+    energy = np.sum(np.fft.irfft(spectrum, length, axis=0) ** 2, axis=1)
+    parts = [part.mean() for part in np.array_split(energy, SWING_PARTS)]
+    low, high = np.quantile(parts, [0.25, 0.75])
+    return float(high / max(low, 1e-300))
+
+
+def _from_first_blow(records, blows):
+    """Records from a blow soon after their beginning on, the other blows, and the samples left out.
+
+    What vibrates from the start on and what such a blow leaves are hardly told from each other.
+    """
+    first = [0] * len(records)
+    for blow in reversed(blows):
+        if blow.sample < EARLY * len(records[blow.record]):
+            first[blow.record] = blow.sample
+    shifted = [Blow(blow.record, blow.sample - first[blow.record]) for blow in blows]
+    kept = tuple(blow for blow in shifted if blow.sample > 0)
+    return tuple(r[begin:] for r, begin in zip(records, first, strict=True)), kept, first
+
+
+def _completed(lines: Lines, poles, band, duration):
+    """Poles with those that the criterion asks for, one after another."""
+    inside = _inside(lines, band)
+    for _ in range(MAX_ADDED):
+        own = _levelled(inside, poles)
+        poles = refined_poles(own, poles, np.arange(poles.size))
+        fit = linear_fit(own, poles)
+        tried = _distinct(promising_poles(own, fit.errors, band))
+        sizes = [criterion_with(own, fit, poles.size, pole) for pole in tried]
+        more = np.append(poles, tried[int(np.argmin(sizes))])
+        more = refined_poles(own, more, np.array([poles.size]), steps=TRIAL_STEPS)
+        least = criterion(fit, poles.size)
+        better = criterion(linear_fit(own, more), more.size) < least
+        if not better or not _may_be_mode(more[-1], poles, band, duration):
+            break
+        poles = more
+    return poles
+
+
+def _distinct(poles: list[complex]) -> list[complex]:
+    """The first poles of a list that differ by more than their half-power bandwidths."""
+    kept: list[complex] = []
+    for pole in poles:
+        if all(abs(pole.imag - one.imag) > 2 * max(-pole.real, -one.real) for one in kept):
+            kept.append(pole)
+        if len(kept) == TRIED:
+            break
+    return kept
+
+
+def _may_be_mode(pole: complex, others, band, duration) -> bool:
+    """Whether a pole decays, is in the band (Hz) and is none of the others."""
+    decays = -pole.real * duration > MIN_DECAY
+    within = band[0] < abs(pole) / (2 * np.pi) < band[1]
+    apart = np.abs(pole - others) > SAME_POLE * np.minimum(-pole.real, -others.real)
+    return bool(decays and within and apart.all())
+
+
+def _inside(lines: Lines, band) -> Lines:
+    frequencies = np.angle(lines.z) / (2 * np.pi * lines.step)
+    return lines.part((frequencies >= band[0]) & (frequencies <= band[1]))
+
+
+def _levelled(lines: Lines, poles) -> Lines:
+    """Lines of one level of errors: noise, and what no linear structure explains of strong modes.
+
+    The level of noise is a median, so that modes not yet found stand out.
+    """
+    errors = linear_fit(lines, poles).errors
+    errors = np.sum(errors.reshape(2, len(lines.z), -1) ** 2, axis=0)
+    size = np.maximum(np.mean(errors, axis=0), 1e-300)
+    nearby = uniform_filter1d(np.abs(lines.outputs) ** 2, 2 * NEARBY_BINS + 1, axis=0)
+    power = median_filter(np.mean(errors / size, axis=1), 2 * MEDIAN_LINES + 1, mode="reflect")
+    power = power + NONLINEARITY_SHARE**2 * np.mean(nearby / size, axis=1)
+    level = 1 / np.sqrt(np.maximum(power, 1e-12))
+    return lines._replace(
+        outputs=lines.outputs * level[:, None], inputs=lines.inputs * level[:, None], level=level
+    )
