@@ -147,8 +147,8 @@ def with_missed_blows(
 
 
 def _beside(response: Response, blows, apart) -> list[Bool[np.ndarray, " sample"]]:
-    """Samples of each record that are apart from the blows."""
-    places = [np.ones(length, bool) for length in response.lengths]
+    """Samples of each record that are apart from the blows, and from its end."""
+    places = [np.arange(length) < length - apart for length in response.lengths]
     for blow in blows:
         places[blow.record][max(blow.sample - apart, 0) : blow.sample + apart + 1] = False
     return places
@@ -156,7 +156,9 @@ def _beside(response: Response, blows, apart) -> list[Bool[np.ndarray, " sample"
 
 def _about(response: Response, blow: Blow, apart) -> list[Bool[np.ndarray, " sample"]]:
     """Samples of each record that are not apart from a blow."""
-    return [~own for own in _beside(response, (blow,), apart)]
+    places = [np.zeros(length, bool) for length in response.lengths]
+    places[blow.record][max(blow.sample - apart, 0) : blow.sample + apart + 1] = True
+    return places
 
 
 def _with_one_more(response: Response, blows, poles, places) -> tuple[Blow, ...] | None:
