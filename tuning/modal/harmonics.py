@@ -127,11 +127,13 @@ def _line_test(spectra, level):
 def _amplitudes(record, rate, frequency, parts):
     """Complex amplitudes of a line in equal parts of a record (part, channel), by Hann windows."""
     size = len(record) // parts
-    times = np.arange(size * parts) / rate
-    shifted = record[: size * parts] * np.exp(-2j * np.pi * frequency * times)[:, None]
-    window = np.hanning(size)
-    pieces = shifted.reshape(parts, size, -1)
-    return 2 * np.einsum("t,ptc->pc", window, pieces) / window.sum()
+    window, turn = np.hanning(size), -2j * np.pi * frequency / rate
+    # Parts differ by a phase: the exponentials of one serve all.
+    kernel = window * np.exp(turn * np.arange(size))
+    pieces = record[: size * parts].reshape(parts, size, -1)
+    sums = np.stack([kernel.real, kernel.imag]) @ pieces
+    phases = np.exp(turn * size * np.arange(parts))
+    return 2 * phases[:, None] * (sums[:, 0] + 1j * sums[:, 1]) / window.sum()
 
 
 def _followed(record, rate, frequency, variance) -> float | None:
