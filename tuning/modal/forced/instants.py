@@ -202,7 +202,7 @@ def _gains(
     level = np.ones(count) if lines.level is None else lines.level
     first, second = resonances_of(lines, own.poles)
     columns = np.concatenate([first + second, 1j * (first - second)], axis=1) * level[:, None]
-    errors = own.fit.errors / np.sqrt(np.mean(own.fit.errors**2, axis=0))
+    errors = own.fit.errors / np.sqrt(np.maximum(np.mean(own.fit.errors**2, axis=0), 1e-300))
     errors = errors[:count] + 1j * errors[count:]
     found = []
     for number, length in enumerate(response.lengths):
