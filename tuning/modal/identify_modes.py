@@ -29,7 +29,7 @@ from tuning.modal.arguments import (
 )
 from tuning.modal.chosen import chosen_modes
 from tuning.modal.decay.modes import Decays, excited, free_decay_modes
-from tuning.modal.decay.whole_log import FromDecays, modes_of_decays
+from tuning.modal.decay.whole_log import FromDecays, after_blows_unseen, modes_of_decays
 from tuning.modal.fit import Choice, ModalFit
 from tuning.modal.forced.blows import force_at_blows
 from tuning.modal.forced.forces import force_names, force_records, without_forces
@@ -154,12 +154,14 @@ def identify_modes(
     used_method = method or "covariance"
     if found is None:
         found = _ambient_modes(cleaned, samples, used_band, used_method, order, progress)
+        if may_decay:
+            found = _of_unseen_blows(found, samples, struck, used_band)
         if may_decay and window is None and all(one.reason for one in found.candidates):
             # The energy of a short decay falls little, but damped vibrations explain all of it.
             how["whole"] = True
             whole = free_decay_modes(samples, struck, derivatives, used_band, **how)
             found = _Found(*whole) if whole else found
-    if found.decays is None:
+    if found.is_ambient:
         if lines:
             choices.append(Choice(f"{len(lines)} harmonic lines subtracted", "--exclude FREQUENCY"))
         wandering, doubtful = steady_candidates(found.candidates, cleaned, samples, used_band)
@@ -210,6 +212,11 @@ class _Found(NamedTuple):
     kind: str = "ambient"
     blows: int = 0
 
+    @property
+    def is_ambient(self) -> bool:
+        """Whether neither decays nor blows explain the log."""
+        return self.decays is None and not self.blows
+
 
 def _of_decays(told: FromDecays) -> _Found:
     return _Found(told.candidates, told.diagrams, told.decays, blows=told.blows)
@@ -241,6 +248,14 @@ def _ambient_modes(cleaned, samples: Samples, band, method, order, progress) -> 
     return _Found(*found, None)
 
 
+def _of_unseen_blows(found: _Found, samples: Samples, struck, band) -> _Found:
+    """Modes of a log without clear decays, of whole records if blows alone explain them."""
+    told = after_blows_unseen(found.candidates, samples, struck, band)
+    if told is None:
+        return found
+    return found._replace(candidates=told[0], kind="free decay", blows=told[1])
+
+
 def _kind_words(found: _Found, struck, lines) -> str:
     """Sentence on the excitation."""
     if found.blows:
@@ -269,7 +284,7 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, keep: _K
     """The fit: candidates divided into modes and rejected ones."""
     longest = max(len(record) for record in samples.records)
     resolution = samples.rate / longest
-    speed = fundamental(lines, samples.rate, longest) if found.decays is None else None
+    speed = fundamental(lines, samples.rate, longest) if found.is_ambient else None
     modes, rejected = [], []
     for candidate in found.candidates:
         mode, reason = candidate.mode, candidate.reason
@@ -277,7 +292,7 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, keep: _K
         hit = [one for one in lines if abs(mode.frequency - one.frequency) < 2 * resolution]
         if near:
             reason = f"excluded, {near[0]:g} Hz"
-        elif hit and found.decays is None and mode.damping_ratio < 0.002:
+        elif hit and found.is_ambient and mode.damping_ratio < 0.002:
             reason = f"a harmonic line, {hit[0].frequency:.3f} Hz"
         elif mode.damping_ratio < NARROW and is_multiple(
             mode.frequency, max(0.5 * resolution, 2 * mode.frequency_sd), speed

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy.signal import resample_poly
+from scipy.signal import decimate, lfilter, resample_poly
 
 from experiments.validation.modal_identification import log_of
 from tests.oracles.planted_structures import random_structure, sampled
 from tuning import Log, identify_modes
+from tuning.modal.forced.beginnings import StruckRecords, from_early_blows, from_rests
 from tuning.modal.forced.instants import (
     Blow,
     after_blows,
@@ -14,7 +15,7 @@ from tuning.modal.forced.instants import (
     response_in_band,
     with_missed_blows,
 )
-from tuning.modal.forced.likelihood import linear_fit, whitened
+from tuning.modal.forced.likelihood import linear_fit, refined_poles, whitened
 from tuning.modal.forced.significance import criterion, criterion_with
 from tuning.modal.forced.struck import alike, struck_modes
 from tuning.modal.result import IdentifiedMode
@@ -25,16 +26,23 @@ POLES = 2 * np.pi * FREQUENCIES * (-DAMPING + 1j * np.sqrt(1 - DAMPING**2))
 TIMES = (2.5, 14.9, 27.4, 39.0, 48.1)  # s; the slowest mode falls to 2/3 from one to the next
 
 
-def after(times, noise=0.1, seed=0, channels=3, duration=60.0):
-    """Velocities of four modes after blows at some times (s), in closed form, with white noise."""
+# Three modes that fall to a third in all of a minute, as sampled at 10 Hz.
+SLOW_RATE, SLOW_TIMES = 10.0, (3.9, 15.1, 27.0, 40.3, 50.3)
+SLOW_FREQUENCIES, SLOW_DAMPING = np.array([0.91, 1.25, 1.92]), np.array([0.0033, 0.0021, 0.0045])
+COLUMNS = ("v1", "v2", "v3"), ("velocity",) * 3, ("m/s",) * 3
+SLOW_POLES = 2 * np.pi * SLOW_FREQUENCIES * (-SLOW_DAMPING + 1j * np.sqrt(1 - SLOW_DAMPING**2))
+
+
+def after(times, noise=0.1, seed=0, channels=3, duration=60.0, poles=POLES, rate=RATE):
+    """Velocities of some modes after blows at some times (s), in closed form, with white noise."""
     random = np.random.default_rng(seed)
-    shapes = random.normal(size=(POLES.size, channels))
-    fine = np.arange(int(duration * RATE) * FINER) / (RATE * FINER)
+    shapes = random.normal(size=(poles.size, channels))
+    fine = np.arange(int(duration * rate) * FINER) / (rate * FINER)
     values = np.zeros((fine.size, channels))
     for time in times:
-        strengths = random.normal(size=POLES.size)
+        strengths = random.normal(size=poles.size)
         later = fine - time
-        free = np.exp(np.multiply.outer(np.maximum(later, 0), POLES)) * (later >= 0)[:, None]
+        free = np.exp(np.multiply.outer(np.maximum(later, 0), poles)) * (later >= 0)[:, None]
         values += free.real @ (strengths[:, None] * shapes)
     values = resample_poly(values, 1, FINER, axis=0)  # without aliases, as sensors do
     return values + noise * values.std() * random.normal(size=values.shape)
@@ -87,13 +95,80 @@ def test_intervals_of_slow_modes_hold():
 
 def test_whole_records_tell_more_than_decays_of_one_length():
     """The slowest mode needs all of the record; the excitation is named, and shares are sums."""
-    columns = ("v1", "v2", "v3"), ("velocity",) * 3, ("m/s",) * 3
-    fit = identify_modes(Log(np.arange(2400) / RATE, after(TIMES), *columns), band=BAND)
+    fit = identify_modes(Log(np.arange(2400) / RATE, after(TIMES), *COLUMNS), band=BAND)
     assert fit.kind == "free decay" and fit.frequencies == pytest.approx(FREQUENCIES, rel=0.001)
     assert "5 blows, between which records are fitted as a whole" in str(fit)
     widths = np.ptp(fit.damping_intervals, axis=1) / fit.damping_ratios
     assert np.all(widths < 0.2)  # decays side by side miss the third mode
     assert all(0.01 < mode.energy_share < 1.2 for mode in fit.modes)
+
+
+def slow(seed, noise=0.15):
+    return after(SLOW_TIMES, noise, seed, poles=SLOW_POLES, rate=SLOW_RATE)
+
+
+@pytest.mark.parametrize("seed", [6, 8, 9])
+def test_blows_are_found_where_no_decay_is_seen(seed):
+    """Modes that hardly fall from one blow to the next look like ambient vibration."""
+    fit = identify_modes(Log(np.arange(600) / SLOW_RATE, slow(seed), *COLUMNS))
+    assert fit.kind == "free decay" and fit.method == "decay"
+    assert fit.frequencies == pytest.approx(SLOW_FREQUENCIES, rel=0.003)
+    assert "5 blows, between which records are fitted as a whole" in str(fit)
+    within = fit.damping_intervals
+    assert np.all((within[:, 0] < SLOW_DAMPING) & (within[:, 1] > SLOW_DAMPING))
+
+
+def test_ambient_vibration_has_no_blows():
+    """White noise in place of blows, of the same modes for as long."""
+    random = np.random.default_rng(3)
+    forces = random.normal(size=(6000, SLOW_POLES.size))
+    filtered = [
+        lfilter([1.0], [1.0, -np.exp(pole / 100)], force).real
+        for pole, force in zip(SLOW_POLES, forces.T, strict=True)
+    ]
+    values = decimate(np.stack(filtered, axis=1) @ random.normal(size=(3, 3)), 10, axis=0)
+    values += 0.1 * values.std() * random.normal(size=values.shape)
+    fit = identify_modes(Log(np.arange(len(values)) / SLOW_RATE, values, *COLUMNS))
+    assert fit.kind == "ambient" and "blows," not in str(fit)
+    assert struck_modes((values,), SLOW_RATE, (0.5, 2.6), (), SLOW_POLES, 0.2) is None
+
+
+def test_records_begin_at_the_end_of_an_early_rest():
+    """The first blow is not sought; no vibration from the start on fits the rest before it."""
+    values = slow(0, 0.05)
+    found = struck_modes((values,), SLOW_RATE, (0.5, 2.6), (), SLOW_POLES[:2])
+    assert found is not None
+    assert [blow.sample / SLOW_RATE for blow in found.blows] == pytest.approx(SLOW_TIMES, abs=0.6)
+
+
+@pytest.mark.parametrize("louder, begin", [(1.0, 0), (4.0, 40), (0.25, 0)])
+def test_a_rest_ends_where_errors_become_less(louder, begin):
+    """Noise of another level for the first four seconds of a minute."""
+    noise = np.random.default_rng(5).normal(size=(600, 3))
+    noise[:40] *= louder
+    response = response_in_band((noise,), SLOW_RATE, (0.5, 4.0))
+    later = from_rests(StruckRecords((noise,), (0,), ()), response, response.lines)
+    assert later.begins[0] == pytest.approx(begin, abs=4)
+    assert len(later.records[0]) == 600 - later.begins[0]
+    # Records that begin at a blow have no rest.
+    struck = StruckRecords((noise,), (1,), (Blow(0, 300),))
+    assert from_rests(struck, response, response.lines).begins == (1,)
+
+
+def test_blows_are_counted_in_samples_of_whole_records():
+    records = np.zeros((100, 1)), np.zeros((100, 1))
+    struck = StruckRecords(records, (0, 0), (Blow(0, 4), Blow(0, 7), Blow(0, 50), Blow(1, 60)))
+    later = from_early_blows(struck)
+    assert later.begins == (7, 0) and later.blows == (Blow(0, 43), Blow(1, 60))
+    assert later.every_blow() == (Blow(0, 7), Blow(0, 50), Blow(1, 60))
+
+
+def test_poles_leave_a_start_that_hardly_decays():
+    """Steps are compared with the distance of lines, too: less is not told from nothing."""
+    lines = after_blows(response_in_band((after(TIMES),), RATE, BAND), blows(TIMES))
+    starts = np.append(POLES.imag[:3] * (1j - 1e-6), POLES[3])
+    found = refined_poles(lines, starts, np.arange(POLES.size))
+    assert np.all(np.abs(found - POLES) < 0.15 * np.abs(POLES.real))
 
 
 def test_a_crossing_load_is_no_blow():

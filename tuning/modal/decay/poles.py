@@ -241,7 +241,8 @@ def _project_amplitudes(poles, spectrum: Spectrum, weights, nuisance):
         data = _real_over_imag(values * weight)
         fitted = basis.T @ data
         solution = np.linalg.lstsq(r_factor, fitted, rcond=1e-12)[0] / size
-        slope_columns = np.einsum("jkpr,kr->jkp", slopes, solution[: 2 * count].reshape(count, 2))
+        real, imag = solution[: 2 * count].reshape(count, 2).T[:, :, None]
+        slope_columns = slopes[..., 0] * real + slopes[..., 1] * imag
         slope_columns = _real_over_imag(slope_columns.reshape(bins, 2 * count) * weight[:, None])
         residuals.append(data - basis @ fitted)
         jacobians.append(basis @ (basis.T @ slope_columns) - slope_columns)
@@ -326,10 +327,12 @@ def _fit_amplitudes(poles, spectrum: Spectrum, level, nuisance) -> PoleFit:
     )
     weighted = (stacked[:, :bins] + 1j * stacked[:, bins:]).T  # bin, channel
     slopes = slopes[:, :bins] + 1j * slopes[:, bins:]  # channel, bin, parameter
-    normal = np.einsum("cjp,cjq->pq", slopes.conj(), slopes).real
+    normal = np.einsum("cjp,cjq->pq", slopes.conj(), slopes, optimize=True).real
     inverse = np.linalg.pinv(normal, hermitian=True) if poles.size else normal
     leverage = np.array(leverages).T  # of the two real numbers of each bin and channel
-    leverage = leverage + np.einsum("cjp,pq,cjq->jc", slopes.conj(), inverse, slopes).real
+    leverage = (
+        leverage + np.einsum("cjp,pq,cjq->jc", slopes.conj(), inverse, slopes, optimize=True).real
+    )
     residual_share = np.maximum(2 - leverage, 0.02) / 2
     count = _smooth(residual_share, NOISE_SMOOTHING_BINS)
     # The residual is averaged without weights, which would keep the shape of the assumed level.
@@ -340,7 +343,7 @@ def _fit_amplitudes(poles, spectrum: Spectrum, level, nuisance) -> PoleFit:
     cross = cross / np.sqrt(count[:, :, None] * count[:, None, :])
     noise = np.einsum("jcc->jc", cross).real + 1e-30 * np.max(np.abs(spectrum.values)) ** 2
     cross = cross / np.sqrt(level[:, :, None] * level[:, None, :])
-    score = np.einsum("cjp,jcd,djq->pq", slopes.conj(), cross, slopes).real / 2
+    score = np.einsum("cjp,jcd,djq->pq", slopes.conj(), cross, slopes, optimize=True).real / 2
     pairs = solutions[:, : 2 * poles.size].reshape(channels, poles.size, 2)
     peaks = np.argmin(np.abs(spectrum.bins[:, None] - poles.imag / (2 * np.pi)), axis=0)
     freedom = 2 * np.min(count[peaks], axis=1)

@@ -1,5 +1,6 @@
 """What the decays of a log tell: in a band, in a narrower one, above it, and of whole records."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,11 +10,13 @@ from tuning.modal.ambient import Candidate, without_duplicates
 from tuning.modal.decay.candidates import NONLINEARITY
 from tuning.modal.decay.modes import Decays, band_of_ends, excited, free_decay_modes
 from tuning.modal.forced.instants import marked_blows
-from tuning.modal.forced.struck import WEAK, alike, struck_modes
+from tuning.modal.forced.struck import MAX_UNEXPLAINED, WEAK, alike, struck_modes
 from tuning.modal.preprocessing import HALF_POWER, kinetic_band
 from tuning.modal.result import is_at_edge
 from tuning.modal.samples import Samples
 from tuning.modal.stabilisation import Diagram
+
+MAX_UNSEEN = 0.2  # unexplained, of blows after which no decay was seen
 
 Band = tuple[float, float]
 Struck = tuple[Bool[np.ndarray, " time"], ...]
@@ -82,31 +85,63 @@ def _with_others(found: FromDecays, more, wide: Band) -> FromDecays:
 
 
 def _with_blows(found: FromDecays, samples: Samples, struck: Struck, band: Band) -> FromDecays:
-    """Modes of decays, with those of whole records if blows are all that excites them.
-
-    Whole records must tell of all strong modes of the decays, too.
-    """
-    good = [one.mode for one in found.candidates if not one.reason]
-    poles = np.array([mode.pole for mode in good], complex)
-    blows = marked_blows(struck, samples.rate, band)
-    whole = struck_modes(samples.records, samples.rate, band, blows, poles)
-    if whole is None:
+    """Modes of decays, with those of whole records if blows are all that excites them."""
+    good = [one.mode.pole for one in found.candidates if not one.reason]
+    told = of_whole_records(found.candidates, good, samples, struck, band)
+    if told is None:
         return found
+    return found._replace(candidates=told[0], band=band, blows=told[1])
+
+
+def of_whole_records(
+    candidates: tuple[Candidate, ...],
+    poles: Sequence[complex],
+    samples: Samples,
+    struck: Struck,
+    band: Band,
+    most: float = MAX_UNEXPLAINED,
+) -> tuple[tuple[Candidate, ...], int] | None:
+    """Candidates of whole records, and the number of blows, if these are all that excites them.
+
+    Whole records must tell of all strong modes among some candidates, too; others of these, and
+    what they know as nonlinearity, are kept. The search starts from some `poles` (1/s); at `most`
+    so much may be unexplained (see `struck_modes`).
+    """
+    blows = marked_blows(struck, samples.rate, band)
+    whole = struck_modes(samples.records, samples.rate, band, blows, np.array(poles, complex), most)
+    if whole is None:
+        return None
     strong = [
-        mode for mode in good if mode.energy_share > WEAK and not is_at_edge(mode, whole.band)
+        one.mode
+        for one in candidates
+        if not one.reason and one.mode.energy_share > WEAK and not is_at_edge(one.mode, whole.band)
     ]
     if not all(any(alike(mode, other) for other in whole.modes) for mode in strong):
-        return found
-    added = [one.mode for one in found.candidates if one.reason.startswith(NONLINEARITY)]
+        return None
+    added = [one.mode for one in candidates if one.reason.startswith(NONLINEARITY)]
     modes = [mode for mode in whole.modes if not any(alike(mode, one) for one in added)]
     others = [
         one
-        for one in found.candidates
+        for one in candidates
         if one.reason.startswith(NONLINEARITY) or not any(alike(one.mode, mode) for mode in modes)
     ]
-    candidates = [*(Candidate(mode, "", 1) for mode in modes), *others]
-    return found._replace(
-        candidates=tuple(sorted(candidates, key=lambda one: one.mode.frequency)),
-        band=band,
-        blows=len(whole.blows),
-    )
+    every = [*(Candidate(mode, "", 1) for mode in modes), *others]
+    return tuple(sorted(every, key=lambda one: one.mode.frequency)), len(whole.blows)
+
+
+def after_blows_unseen(
+    candidates: tuple[Candidate, ...], samples: Samples, struck: Struck, band: Band
+) -> tuple[tuple[Candidate, ...], int] | None:
+    """The same of a log without clear decays, from candidates of ambient vibration.
+
+    Lightly damped structures may hardly fall from one blow to the next. As no decay is seen, less
+    may be unexplained.
+    """
+    poles = [
+        one.mode.pole
+        for one in candidates
+        if one.mode.damping_ratio > 0 and (not one.reason or one.mode.energy_share > WEAK)
+    ]
+    if not poles:
+        return None
+    return of_whole_records(candidates, poles, samples, struck, band, MAX_UNSEEN)

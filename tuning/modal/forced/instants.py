@@ -13,7 +13,13 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from tuning.modal.forced.common_denominator import Lines, transforms
-from tuning.modal.forced.likelihood import REST_TERMS, LinearFit, linear_fit, whitened
+from tuning.modal.forced.likelihood import (
+    FEWER_REST_POWERS,
+    REST_TERMS,
+    LinearFit,
+    linear_fit,
+    whitened,
+)
 from tuning.modal.forced.significance import criterion
 from tuning.modal.forced.terms import resonances_of
 
@@ -175,7 +181,7 @@ def _with_one_more(response: Response, blows, poles, places) -> tuple[Blow, ...]
     impulse = _impulses(response, own.lines, (best,)) * level[:, None]
     lines = own.lines._replace(inputs=np.concatenate([own.lines.inputs, impulse], axis=1))
     count = poles.size
-    if criterion(linear_fit(lines, poles), count) > criterion(own.fit, count):
+    if criterion(_few_terms(lines, poles), count) > criterion(own.fit, count):
         return None
     return tuple(sorted((*blows, best)))
 
@@ -183,12 +189,20 @@ def _with_one_more(response: Response, blows, poles, places) -> tuple[Blow, ...]
 def _fitted(response: Response, blows, poles) -> _Fit | None:
     """Fit by given poles; None with too few lines for them, or too many."""
     lines = after_blows(response, blows)
-    columns = (2 * poles.size + REST_TERMS) * (len(blows) + 2)
+    columns = (2 * poles.size + len(FEWER_REST_POWERS) + 2) * (len(blows) + 2)
     too_few = 2 * len(lines.z) < ROWS_OVER_COLUMNS * columns
     if too_few or work(response.duration, response.band, poles.size, len(blows)) > WORK:
         return None
     lines = whitened(lines, poles)
-    return _Fit(lines, poles, linear_fit(lines, poles))
+    return _Fit(lines, poles, _few_terms(lines, poles))
+
+
+def _few_terms(lines: Lines, poles) -> LinearFit:
+    """Fit with few terms for other modes: in short records all of them cost more than a blow tells.
+
+    In one of a minute, of three modes, five of six blows are found so, two with all terms.
+    """
+    return linear_fit(lines, poles, FEWER_REST_POWERS)
 
 
 def _gains(

@@ -35,9 +35,10 @@ MIN_SPREAD = 1e-3  # of errors, over that of all lines
 MIN_PIVOT = (
     1e-4  # of Cholesky's factor, whose relative errors are those of rounding over its square
 )
-MAX_STEP = 0.5  # of a pole, over its decay rate
+MAX_STEP = 0.5  # of a pole, over its width
 CONVERGED = 1e-4  # step over the decay rate; what is left after it is of the order of its square
-MAX_SHIFT = 3.0  # from the start, over the decay rate; beyond, a pole is none of the data
+MAX_SHIFT = 3.0  # from the start, over the width; beyond, a pole is none of the data
+MIN_WIDTH = 0.5  # of a pole, over the distance of lines: less is not told from nothing
 
 
 class LinearFit(NamedTuple):
@@ -152,6 +153,7 @@ def refined_poles(
 ) -> Complex[np.ndarray, " mode"]:
     """Poles after Gauss-Newton steps; those that leave their surroundings return to the start."""
     poles = starts.astype(complex)
+    least = MIN_WIDTH * lines.spacing
     for _ in range(steps if moving.size else 0):
         found, gram, along, squares = _reduced(lines, poles, moving, powers)
         directions = pole_directions(lines, found, poles.size, moving)
@@ -159,10 +161,12 @@ def refined_poles(
         right = np.einsum("cko,co,o->k", directions, along, weight, optimize=True)
         step = np.linalg.lstsq(_normal(gram, directions, weight), right, rcond=1e-12)[0]
         change = step[: moving.size] + 1j * step[moving.size :]
-        limit = MAX_STEP * np.abs(poles[moving].real)
+        # A pole with hardly any decay could not leave it by steps of its decay rate.
+        limit = MAX_STEP * np.maximum(np.abs(poles[moving].real), least)
         change *= np.minimum(1, limit / np.maximum(np.abs(change), 1e-300))
-        poles[moving] += change
-        far = np.abs(poles - starts) > MAX_SHIFT * np.abs(starts.real)
+        rise = np.minimum(change.real, MAX_STEP * np.abs(poles[moving].real))
+        poles[moving] += rise + 1j * change.imag
+        far = np.abs(poles - starts) > MAX_SHIFT * np.maximum(np.abs(starts.real), least)
         lost = far | (poles.real >= 0)
         poles[lost] = starts[lost]
         if np.all(np.abs(change) < CONVERGED * np.abs(poles[moving].real)):

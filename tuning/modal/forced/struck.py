@@ -15,6 +15,12 @@ from scipy.signal import detrend
 
 from tuning.modal.ambient import divided_band
 from tuning.modal.decay.poles import NEARBY_BINS, NONLINEARITY_SHARE
+from tuning.modal.forced.beginnings import (
+    StruckRecords,
+    energy_along,
+    from_early_blows,
+    from_rests,
+)
 from tuning.modal.forced.common_denominator import Lines
 from tuning.modal.forced.instants import (
     MAX_BLOWS,
@@ -22,7 +28,6 @@ from tuning.modal.forced.instants import (
     Blow,
     Response,
     after_blows,
-    bins_of,
     poles_within,
     response_in_band,
     with_missed_blows,
@@ -42,7 +47,6 @@ TRIAL_STEPS = 6  # in which it is refined, before it is compared
 MIN_DECAY = 0.2  # nepers, over the whole record, of a mode
 SAME_POLE = 0.1  # distance of two poles over the smaller decay rate, below which they are one
 MEDIAN_LINES = 30  # on either side of a line, whose errors tell its level
-EARLY = 0.1  # of a record, within which a blow begins it
 # Share of the energy that is unexplained, times the swing of the errors: at most 0.33 in 130
 # planted logs of blows, at least 0.5 in 80 of crossing loads.
 MAX_UNEXPLAINED = 0.4
@@ -66,49 +70,47 @@ def struck_modes(
     band: tuple[float, float],
     blows: tuple[Blow, ...],
     poles: Complex[np.ndarray, " pole"],
+    most: float = MAX_UNEXPLAINED,
 ) -> StruckModes | None:
     """Modes of a band (Hz), from known blows and poles (1/s), to which others are added.
 
     None if less than two blows are found, or if blows are not all that excites: then the modes
-    leave much unexplained, or more in some parts of a record than in others. The band is narrower
-    if the least squares would be too large.
+    leave much unexplained, or more in some parts of a record than in others; the product of share
+    and swing is `most` or more. The band is narrower if the least squares would be too large.
     """
     if len(blows) > MAX_BLOWS:
         return None
-    records = tuple(np.asarray(detrend(record, axis=0)) for record in records)
-    begins, found, response = [0] * len(records), -1, None
-    while len(blows) > found:
-        found = len(blows)
-        lower = _affordable(records, rate, band, poles, found)
-        poles = poles_within(poles, lower)
-        if not poles.size:
+    whole = tuple(np.asarray(detrend(record, axis=0)) for record in records)
+    struck = StruckRecords(whole, (0,) * len(whole), blows)
+    while True:
+        known = len(struck.blows)
+        band = _affordable(struck.records, rate, band, poles, known)
+        start = poles_within(poles, band)
+        if not start.size:
             return None
-        if response is None or lower != band:
-            response, band = response_in_band(records, rate, lower), lower
-        blows = with_missed_blows(response, blows, poles)
-        records, blows, left_out = _from_first_blow(records, blows)
-        if any(left_out):
-            response = response_in_band(records, rate, band)
-        begins = [old + new for old, new in zip(begins, left_out, strict=True)]
-        lines = after_blows(response, blows)
-        poles = _completed(lines, poles, band, response.duration)
-    every = tuple(
-        sorted(
-            [Blow(blow.record, blow.sample + begins[blow.record]) for blow in blows]
-            + [Blow(record, begin) for record, begin in enumerate(begins) if begin]
-        )
-    )
-    if len(every) < MIN_BLOWS:
+        response = response_in_band(struck.records, rate, band)
+        struck = struck._replace(blows=with_missed_blows(response, struck.blows, start))
+        struck = from_early_blows(struck)
+        response = response_in_band(struck.records, rate, band)
+        lines = after_blows(response, struck.blows)
+        poles = _completed(lines, start, band, response.duration)
+        if len(struck.blows) > known or poles.size > start.size:
+            continue
+        begins = struck.begins
+        struck = from_rests(struck, response, _errors(lines, poles, band))
+        if struck.begins == begins:
+            break
+    if len(struck.every_blow()) < MIN_BLOWS:
         return None
     model, _ = refined_model(lines, poles, response.scale, band)
-    if not _explains(model, response):
+    if not _explains(model, response, most):
         return None
     modes = tuple(
         mode
         for mode in modes_of_model(model, response.scale, divided_band(band))
         if not mode_reason(mode, response.duration, band) and mode.energy_share < MAX_ENERGY
     )
-    return StruckModes(modes, every, band)
+    return StruckModes(modes, struck.every_blow(), band)
 
 
 def alike(a: IdentifiedMode, b: IdentifiedMode) -> bool:
@@ -135,7 +137,7 @@ def _affordable(records, rate, band, poles, blows) -> tuple[float, float]:
     return low, max(high, low)
 
 
-def _explains(model: FittedModel, response: Response) -> bool:
+def _explains(model: FittedModel, response: Response, most: float) -> bool:
     """Whether modes and blows explain nearly all, and as much in all parts of the records."""
     rest = unexplained(model)
     whole = np.sum(np.abs(model.plain.outputs) ** 2)
@@ -144,7 +146,7 @@ def _explains(model: FittedModel, response: Response) -> bool:
         _swing(rest, number, length, response.rate)
         for number, length in enumerate(response.lengths)
     ]
-    return bool(share * max(swings) < MAX_UNEXPLAINED)
+    return bool(share * max(swings) < most)
 
 
 def _swing(rest: Lines, number: int, length: int, rate: float) -> float:
@@ -152,27 +154,18 @@ def _swing(rest: Lines, number: int, length: int, rate: float) -> float:
 
     It is one for noise that goes on as it is, and large if something else than blows excites.
     """
-    these = rest.record == number
-    spectrum = np.zeros((length // 2 + 1, rest.outputs.shape[1]), complex)
-    spectrum[bins_of(rest, these, length, rate)] = rest.outputs[these]
-    energy = np.sum(np.fft.irfft(spectrum, length, axis=0) ** 2, axis=1)
+    energy = energy_along(rest, number, length, rate)
     parts = [part.mean() for part in np.array_split(energy, SWING_PARTS)]
     low, high = np.quantile(parts, [0.25, 0.75])
     return float(high / max(low, 1e-300))
 
 
-def _from_first_blow(records, blows):
-    """Records from a blow soon after their beginning on, the other blows, and the samples left out.
-
-    What vibrates from the start on and what such a blow leaves are hardly told from each other.
-    """
-    first = [0] * len(records)
-    for blow in reversed(blows):
-        if blow.sample < EARLY * len(records[blow.record]):
-            first[blow.record] = blow.sample
-    shifted = [Blow(blow.record, blow.sample - first[blow.record]) for blow in blows]
-    kept = tuple(blow for blow in shifted if blow.sample > 0)
-    return tuple(r[begin:] for r, begin in zip(records, first, strict=True)), kept, first
+def _errors(lines: Lines, poles, band) -> Lines:
+    """Lines in a band (Hz) with errors in place of outputs, of one level and unit size."""
+    own = _levelled(_inside(lines, band), poles)
+    errors = linear_fit(own, poles).errors
+    errors = errors / np.sqrt(np.maximum(np.mean(errors**2, axis=0), 1e-300))
+    return own._replace(outputs=errors[: len(own.z)] + 1j * errors[len(own.z) :])
 
 
 def _completed(lines: Lines, poles, band, duration):
