@@ -29,7 +29,7 @@ from tuning.modal.arguments import (
 )
 from tuning.modal.chosen import chosen_modes
 from tuning.modal.decay.modes import Decays, excited, free_decay_modes
-from tuning.modal.decay.whole_log import FromDecays, after_blows_unseen, modes_of_decays
+from tuning.modal.decay.whole_log import FromDecays, modes_after_unseen_blows, modes_of_decays
 from tuning.modal.fit import Choice, ModalFit
 from tuning.modal.forced.blows import force_at_blows
 from tuning.modal.forced.forces import force_names, force_records, without_forces
@@ -250,7 +250,7 @@ def _ambient_modes(cleaned, samples: Samples, band, method, order, progress) -> 
 
 def _of_unseen_blows(found: _Found, samples: Samples, struck, band) -> _Found:
     """Modes of a log without clear decays, of whole records if blows alone explain them."""
-    told = after_blows_unseen(found.candidates, samples, struck, band)
+    told = modes_after_unseen_blows(found.candidates, samples, struck, band)
     if told is None:
         return found
     return found._replace(candidates=told[0], kind="free decay", blows=told[1])

@@ -17,7 +17,7 @@ from tuning.modal.forced.instants import (
 )
 from tuning.modal.forced.likelihood import linear_fit, refined_poles, whitened
 from tuning.modal.forced.significance import criterion, criterion_with
-from tuning.modal.forced.struck import alike, struck_modes
+from tuning.modal.forced.struck import FROM_AMBIENT, alike, struck_modes
 from tuning.modal.result import IdentifiedMode
 
 RATE, BAND, FINER = 40.0, (0.5, 8.0), 8
@@ -130,13 +130,13 @@ def test_ambient_vibration_has_no_blows():
     values += 0.1 * values.std() * random.normal(size=values.shape)
     fit = identify_modes(Log(np.arange(len(values)) / SLOW_RATE, values, *COLUMNS))
     assert fit.kind == "ambient" and "blows," not in str(fit)
-    assert struck_modes((values,), SLOW_RATE, (0.5, 2.6), (), SLOW_POLES, 0.2) is None
+    assert struck_modes((values,), SLOW_RATE, (0.5, 2.6), (), SLOW_POLES, FROM_AMBIENT) is None
 
 
 def test_records_begin_at_the_end_of_an_early_rest():
     """The first blow is not sought; no vibration from the start on fits the rest before it."""
     values = slow(0, 0.05)
-    found = struck_modes((values,), SLOW_RATE, (0.5, 2.6), (), SLOW_POLES[:2])
+    found = struck_modes((values,), SLOW_RATE, (0.5, 2.6), (), SLOW_POLES[:2], FROM_AMBIENT)
     assert found is not None
     assert [blow.sample / SLOW_RATE for blow in found.blows] == pytest.approx(SLOW_TIMES, abs=0.6)
 

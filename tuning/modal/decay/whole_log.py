@@ -1,6 +1,5 @@
 """What the decays of a log tell: in a band, in a narrower one, above it, and of whole records."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,13 +9,20 @@ from tuning.modal.ambient import Candidate, without_duplicates
 from tuning.modal.decay.candidates import NONLINEARITY
 from tuning.modal.decay.modes import Decays, band_of_ends, excited, free_decay_modes
 from tuning.modal.forced.instants import marked_blows
-from tuning.modal.forced.struck import MAX_UNEXPLAINED, WEAK, alike, struck_modes
+from tuning.modal.forced.struck import (
+    AFTER_BLOWS,
+    AFTER_UNSEEN_BLOWS,
+    FROM_AMBIENT,
+    MIN_BLOWS,
+    WEAK,
+    Search,
+    alike,
+    struck_modes,
+)
 from tuning.modal.preprocessing import HALF_POWER, kinetic_band
 from tuning.modal.result import is_at_edge
 from tuning.modal.samples import Samples
 from tuning.modal.stabilisation import Diagram
-
-MAX_UNSEEN = 0.2  # unexplained, of blows after which no decay was seen
 
 Band = tuple[float, float]
 Struck = tuple[Bool[np.ndarray, " time"], ...]
@@ -86,29 +92,42 @@ def _with_others(found: FromDecays, more, wide: Band) -> FromDecays:
 
 def _with_blows(found: FromDecays, samples: Samples, struck: Struck, band: Band) -> FromDecays:
     """Modes of decays, with those of whole records if blows are all that excites them."""
-    good = [one.mode.pole for one in found.candidates if not one.reason]
-    told = of_whole_records(found.candidates, good, samples, struck, band)
+    seen = marked_blows(struck, samples.rate, band)
+    poles = [one.mode.pole for one in found.candidates if not one.reason]
+    search = AFTER_BLOWS if len(seen) >= MIN_BLOWS else AFTER_UNSEEN_BLOWS
+    told = _of_whole_records(found.candidates, samples, band, seen, poles, search)
     if told is None:
         return found
     return found._replace(candidates=told[0], band=band, blows=told[1])
 
 
-def of_whole_records(
-    candidates: tuple[Candidate, ...],
-    poles: Sequence[complex],
-    samples: Samples,
-    struck: Struck,
-    band: Band,
-    most: float = MAX_UNEXPLAINED,
+def modes_after_unseen_blows(
+    candidates: tuple[Candidate, ...], samples: Samples, struck: Struck, band: Band
 ) -> tuple[tuple[Candidate, ...], int] | None:
+    """Candidates of whole records, and the number of blows, of a log without clear decays.
+
+    Lightly damped structures may hardly fall from one blow to the next, which looks like ambient
+    vibration, of which some candidates are given. None if blows are not all that excites.
+    """
+    poles = [
+        one.mode.pole
+        for one in candidates
+        if one.mode.damping_ratio > 0 and (not one.reason or one.mode.energy_share > WEAK)
+    ]
+    if not poles:
+        return None
+    seen = marked_blows(struck, samples.rate, band)
+    return _of_whole_records(candidates, samples, band, seen, poles, FROM_AMBIENT)
+
+
+def _of_whole_records(candidates, samples: Samples, band, seen, poles, search: Search):
     """Candidates of whole records, and the number of blows, if these are all that excites them.
 
     Whole records must tell of all strong modes among some candidates, too; others of these, and
-    what they know as nonlinearity, are kept. The search starts from some `poles` (1/s); at `most`
-    so much may be unexplained (see `struck_modes`).
+    what they know as nonlinearity, are kept.
     """
-    blows = marked_blows(struck, samples.rate, band)
-    whole = struck_modes(samples.records, samples.rate, band, blows, np.array(poles, complex), most)
+    starts = np.array(poles, complex)
+    whole = struck_modes(samples.records, samples.rate, band, seen, starts, search)
     if whole is None:
         return None
     strong = [
@@ -127,21 +146,3 @@ def of_whole_records(
     ]
     every = [*(Candidate(mode, "", 1) for mode in modes), *others]
     return tuple(sorted(every, key=lambda one: one.mode.frequency)), len(whole.blows)
-
-
-def after_blows_unseen(
-    candidates: tuple[Candidate, ...], samples: Samples, struck: Struck, band: Band
-) -> tuple[tuple[Candidate, ...], int] | None:
-    """The same of a log without clear decays, from candidates of ambient vibration.
-
-    Lightly damped structures may hardly fall from one blow to the next. As no decay is seen, less
-    may be unexplained.
-    """
-    poles = [
-        one.mode.pole
-        for one in candidates
-        if one.mode.damping_ratio > 0 and (not one.reason or one.mode.energy_share > WEAK)
-    ]
-    if not poles:
-        return None
-    return of_whole_records(candidates, poles, samples, struck, band, MAX_UNSEEN)

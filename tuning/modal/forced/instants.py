@@ -14,7 +14,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from tuning.modal.forced.common_denominator import Lines, transforms
 from tuning.modal.forced.likelihood import (
-    FEWER_REST_POWERS,
+    REST_POWERS,
     REST_TERMS,
     LinearFit,
     linear_fit,
@@ -133,22 +133,28 @@ class _Fit(NamedTuple):
 
 
 def with_missed_blows(
-    response: Response, blows: tuple[Blow, ...], poles: Complex[np.ndarray, " pole"]
+    response: Response,
+    blows: tuple[Blow, ...],
+    poles: Complex[np.ndarray, " pole"],
+    powers: tuple[int, ...] = REST_POWERS,
 ) -> tuple[Blow, ...]:
     """Blows with those that vibrations of some poles (1/s) tell of besides, in the order of time.
 
-    More than MAX_BLOWS in all are not sought, nor more than WORK allows.
+    `powers` of z stand for other modes. More than MAX_BLOWS in all are not sought, nor more than
+    WORK allows.
     """
     apart = _apart(response.rate, response.band)
     while len(blows) < MAX_BLOWS:
-        more = _with_one_more(response, blows, poles, _beside(response, blows, apart))
+        places = _beside(response, blows, apart)
+        more = _with_one_more(response, blows, poles, powers, places)
         if more is None:
             break
         blows = more
     for blow in blows:
         # Beside those found later, its instant may be another.
         others = tuple(one for one in blows if one != blow)
-        blows = _with_one_more(response, others, poles, _about(response, blow, apart)) or blows
+        places = _about(response, blow, apart)
+        blows = _with_one_more(response, others, poles, powers, places) or blows
     return blows
 
 
@@ -167,9 +173,9 @@ def _about(response: Response, blow: Blow, apart) -> list[Bool[np.ndarray, " sam
     return places
 
 
-def _with_one_more(response: Response, blows, poles, places) -> tuple[Blow, ...] | None:
+def _with_one_more(response: Response, blows, poles, powers, places) -> tuple[Blow, ...] | None:
     """Blows with the one that explains most, of some places; None if the criterion is against."""
-    own = _fitted(response, blows, poles)
+    own = _fitted(response, blows, poles, powers)
     if own is None:
         return None
     best, most = Blow(0, 0), -1.0
@@ -181,28 +187,20 @@ def _with_one_more(response: Response, blows, poles, places) -> tuple[Blow, ...]
     impulse = _impulses(response, own.lines, (best,)) * level[:, None]
     lines = own.lines._replace(inputs=np.concatenate([own.lines.inputs, impulse], axis=1))
     count = poles.size
-    if criterion(_few_terms(lines, poles), count) > criterion(own.fit, count):
+    if criterion(linear_fit(lines, poles, powers), count) > criterion(own.fit, count):
         return None
     return tuple(sorted((*blows, best)))
 
 
-def _fitted(response: Response, blows, poles) -> _Fit | None:
+def _fitted(response: Response, blows, poles, powers) -> _Fit | None:
     """Fit by given poles; None with too few lines for them, or too many."""
     lines = after_blows(response, blows)
-    columns = (2 * poles.size + len(FEWER_REST_POWERS) + 2) * (len(blows) + 2)
+    columns = (2 * poles.size + len(powers) + 2) * (len(blows) + 2)
     too_few = 2 * len(lines.z) < ROWS_OVER_COLUMNS * columns
     if too_few or work(response.duration, response.band, poles.size, len(blows)) > WORK:
         return None
     lines = whitened(lines, poles)
-    return _Fit(lines, poles, _few_terms(lines, poles))
-
-
-def _few_terms(lines: Lines, poles) -> LinearFit:
-    """Fit with few terms for other modes: in short records all of them cost more than a blow tells.
-
-    In one of a minute, of three modes, five of six blows are found so, two with all terms.
-    """
-    return linear_fit(lines, poles, FEWER_REST_POWERS)
+    return _Fit(lines, poles, linear_fit(lines, poles, powers))
 
 
 def _gains(

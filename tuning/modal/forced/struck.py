@@ -33,7 +33,13 @@ from tuning.modal.forced.instants import (
     with_missed_blows,
     work,
 )
-from tuning.modal.forced.likelihood import FittedModel, linear_fit, refined_poles
+from tuning.modal.forced.likelihood import (
+    FEWER_REST_POWERS,
+    REST_POWERS,
+    FittedModel,
+    linear_fit,
+    refined_poles,
+)
 from tuning.modal.forced.modal_model import modes_of_model, unexplained
 from tuning.modal.forced.modes import mode_reason, refined_model
 from tuning.modal.forced.significance import criterion, criterion_with, promising_poles
@@ -47,13 +53,34 @@ TRIAL_STEPS = 6  # in which it is refined, before it is compared
 MIN_DECAY = 0.2  # nepers, over the whole record, of a mode
 SAME_POLE = 0.1  # distance of two poles over the smaller decay rate, below which they are one
 MEDIAN_LINES = 30  # on either side of a line, whose errors tell its level
-# Share of the energy that is unexplained, times the swing of the errors: at most 0.33 in 130
-# planted logs of blows, at least 0.5 in 80 of crossing loads.
-MAX_UNEXPLAINED = 0.4
 SWING_PARTS = 20  # of a record, whose errors are compared
 SAME_MAC = 0.9
 WEAK = 0.05  # share of a mode in the energy
 MAX_ENERGY = 3.0  # of a mode, over that of the log; poles that cancel each other have more
+
+
+class Search(NamedTuple):
+    """How blows are sought from poles, and what must be true of the errors that are left.
+
+    `powers` of z stand for other modes: of few poles many terms cost more than what a blow tells.
+    With `rounds` blows are sought again beside poles that were added. The `swing` of the errors is
+    less than given, and its product with their share of the energy less than `most`.
+    """
+
+    powers: tuple[int, ...]
+    rounds: bool
+    most: float
+    swing: float
+
+
+# Of poles of decays, which are nearly all: more rounds explain forces of crossing loads, too.
+AFTER_BLOWS = Search(REST_POWERS, False, 0.4, np.inf)
+# The same of blows that are not seen: the swing is 1.4 at most in twenty planted logs, 2.5 at least
+# in four of crossing loads whose forces blows explain.
+AFTER_UNSEEN_BLOWS = AFTER_BLOWS._replace(swing=2.0)
+# Of poles of ambient vibration. Of a minute with three modes and six blows, from two poles, five
+# blows are found so, else two.
+FROM_AMBIENT = Search(FEWER_REST_POWERS, True, 0.2, np.inf)
 
 
 class StruckModes(NamedTuple):
@@ -70,31 +97,37 @@ def struck_modes(
     band: tuple[float, float],
     blows: tuple[Blow, ...],
     poles: Complex[np.ndarray, " pole"],
-    most: float = MAX_UNEXPLAINED,
+    search: Search = AFTER_BLOWS,
 ) -> StruckModes | None:
     """Modes of a band (Hz), from known blows and poles (1/s), to which others are added.
 
     None if less than two blows are found, or if blows are not all that excites: then the modes
-    leave much unexplained, or more in some parts of a record than in others; the product of share
-    and swing is `most` or more. The band is narrower if the least squares would be too large.
+    leave much unexplained, or more in some parts of a record than in others. The band is narrower
+    if the least squares would be too large.
     """
     if len(blows) > MAX_BLOWS:
         return None
     whole = tuple(np.asarray(detrend(record, axis=0)) for record in records)
     struck = StruckRecords(whole, (0,) * len(whole), blows)
+    most_poles = poles.size
     while True:
         known = len(struck.blows)
         band = _affordable(struck.records, rate, band, poles, known)
-        start = poles_within(poles, band)
-        if not start.size:
+        poles = poles_within(poles, band)
+        if not poles.size:
             return None
         response = response_in_band(struck.records, rate, band)
-        struck = struck._replace(blows=with_missed_blows(response, struck.blows, start))
+        found = with_missed_blows(response, struck.blows, poles, search.powers)
+        struck = struck._replace(blows=found)
         struck = from_early_blows(struck)
         response = response_in_band(struck.records, rate, band)
         lines = after_blows(response, struck.blows)
-        poles = _completed(lines, start, band, response.duration)
-        if len(struck.blows) > known or poles.size > start.size:
+        poles = _completed(lines, poles, band, response.duration)
+        more = len(struck.blows)
+        # More poles tell of more blows, but in a narrower band some would be lost again.
+        same = _affordable(struck.records, rate, band, poles, more) == band
+        if more > known or (search.rounds and poles.size > most_poles and same):
+            most_poles = max(most_poles, poles.size)
             continue
         begins = struck.begins
         struck = from_rests(struck, response, _errors(lines, poles, band))
@@ -103,7 +136,7 @@ def struck_modes(
     if len(struck.every_blow()) < MIN_BLOWS:
         return None
     model, _ = refined_model(lines, poles, response.scale, band)
-    if not _explains(model, response, most):
+    if not _explains(model, response, search):
         return None
     modes = tuple(
         mode
@@ -137,7 +170,7 @@ def _affordable(records, rate, band, poles, blows) -> tuple[float, float]:
     return low, max(high, low)
 
 
-def _explains(model: FittedModel, response: Response, most: float) -> bool:
+def _explains(model: FittedModel, response: Response, search: Search) -> bool:
     """Whether modes and blows explain nearly all, and as much in all parts of the records."""
     rest = unexplained(model)
     whole = np.sum(np.abs(model.plain.outputs) ** 2)
@@ -146,7 +179,7 @@ def _explains(model: FittedModel, response: Response, most: float) -> bool:
         _swing(rest, number, length, response.rate)
         for number, length in enumerate(response.lengths)
     ]
-    return bool(share * max(swings) < most)
+    return bool(share * max(swings) < search.most and max(swings) < search.swing)
 
 
 def _swing(rest: Lines, number: int, length: int, rate: float) -> float:
