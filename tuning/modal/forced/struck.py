@@ -75,9 +75,9 @@ class Search(NamedTuple):
 
 # Of poles of decays, which are nearly all: more rounds explain forces of crossing loads, too.
 AFTER_BLOWS = Search(REST_POWERS, False, 0.4, np.inf)
-# The same of blows that are not seen: the swing is 1.4 at most in twenty planted logs, 2.5 at least
-# in four of crossing loads whose forces blows explain.
-AFTER_UNSEEN_BLOWS = AFTER_BLOWS._replace(swing=2.0)
+# The same of blows that are not seen: the swing is 1.4 at most in twenty planted logs, 1.8 at least
+# in five of crossing loads whose forces blows explain.
+AFTER_UNSEEN_BLOWS = AFTER_BLOWS._replace(swing=1.5)
 # Of poles of ambient vibration. Of a minute with three modes and six blows, from two poles, five
 # blows are found so, else two.
 FROM_AMBIENT = Search(FEWER_REST_POWERS, True, 0.2, np.inf)
