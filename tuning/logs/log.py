@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.case.loads.base import AbstractLoad
 
+GAP_STEPS = 1.5  # usual steps between two samples, beyond which samples are missing
 MAX_GRID_DEVIATION_STEPS = 0.25  # steps between times and an even grid, for rounded times
 
 

@@ -1,4 +1,4 @@
-"""Faults of logged samples: gaps, clock drift, offsets, spikes, clipping, stuck values.
+"""Faults of logged samples: gaps, clock drift, offsets, held, missing, clipped and stuck values.
 
 Faulty samples are reported, and left out of fits only on request:
 
@@ -15,14 +15,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import median_filter
 
-from tuning.logs.log import Log
+from tuning.logs.log import GAP_STEPS, Log
+from tuning.logs.logger import samples_held, unread
 from tuning.logs.units import STANDARD_GRAVITY
 
-GAP_STEPS = 1.5  # usual steps between two samples, beyond which samples are missing
 SPIKE_SD = 12.0  # robust standard deviations between a spike and its neighbours
 SPIKE_WINDOW_SAMPLES = 31  # samples around a spike, for that standard deviation
 MIN_SPIKE_RANGE_SHARE = 0.02  # height of a spike over the range of its channel
-MIN_CLIPPED_SAMPLES = 4  # equal samples at an extreme value that are clipped
+MIN_CLIPPED_READINGS = 4  # equal readings at an extreme value that are clipped
 MIN_STUCK_SAMPLES = 12  # equal samples in a channel that otherwise never repeats a value
 GRAVITY_TOLERANCE = 0.1  # of standard gravity, for the mean of an accelerometer that feels it
 MAX_OFFSET_GRAVITIES = 1.2  # mean acceleration beyond which a sensor has no right zero or scale
@@ -43,7 +43,7 @@ class Fault:
 
 
 def find_faults(log: Log) -> list[Fault]:
-    """Gaps, clock drift, gravity and offsets, spikes, clipped and stuck samples of a log.
+    """Gaps, clock drift, offsets, held readings, spikes, and missing, clipped and stuck samples.
 
     >>> import numpy as np
     >>> import tuning
@@ -52,7 +52,7 @@ def find_faults(log: Log) -> list[Fault]:
     >>> print(*tuning.find_faults(tuning.Log(times, values, ("d1",), ("deflection",), ("m",))))
     log: d1 has spikes (one sample), first at t = 0.5 s
     """
-    found = [*_gaps(log), *_clock_drift(log), *_offsets(log)]
+    found = [*_gaps(log), *_clock_drift(log), *_offsets(log), *_held(log)]
     for i, name in enumerate(log.names):
         for kind, rule in _SAMPLE_FAULTS.items():
             samples = rule.find(log.values[:, i]) & log.valid[:, i]
@@ -86,19 +86,6 @@ def mask(log: Log, kinds: Sequence[str]) -> Log:
             count = int(fault.samples.sum())
             notes.append(f"{count} samples of {fault.channel} are left out ({fault.kind})")
     return dataclasses.replace(log, valid=valid, notes=tuple(notes))
-
-
-def interpolate_invalid(
-    times: Float[np.ndarray, " time"],
-    values: Float[np.ndarray, "time channel"],
-    valid: Bool[np.ndarray, "time channel"],
-) -> Float[np.ndarray, "time channel"]:
-    """Values with linear interpolation over the samples that are not valid."""
-    filled = np.array(values)
-    for column, good in zip(filled.T, valid.T, strict=True):
-        if good.any():
-            column[~good] = np.interp(times[~good], times[good], column[good])
-    return filled
 
 
 def _gaps(log: Log):
@@ -146,6 +133,15 @@ def _offsets(log: Log):
             yield Fault("offset", name, everywhere, message)
 
 
+def _held(log: Log):
+    """Channels whose readings are held for some samples."""
+    for i, name in enumerate(log.names):
+        held = samples_held(log.values[:, i])
+        if held > 1:
+            message = f"{log.source}: {name} holds each reading for {held:.3g} samples"
+            yield Fault("held", name, np.ones(log.times.size, bool), message)
+
+
 def _spikes(values: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
     """Single samples far from the cubic through their two neighbours on either side."""
     spikes = np.zeros(values.size, bool)
@@ -175,11 +171,12 @@ def _constant_runs(values: Float[np.ndarray, " time"], min_length: int):
 
 
 def _clipped(values: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
-    """Equal samples at the largest or smallest value, reached and left steeply."""
+    """Equal readings at the largest or smallest value, reached and left steeply."""
     clipped = np.zeros(values.size, bool)
+    least = int(np.ceil(MIN_CLIPPED_READINGS * samples_held(values)))
     steps = np.abs(np.diff(values))
     resolution = np.min(steps[steps > 0], initial=np.inf)
-    for start, stop in _constant_runs(values, MIN_CLIPPED_SAMPLES):
+    for start, stop in _constant_runs(values, least):
         inside = start > 0 and stop < values.size
         extreme = values[start] in (values.max(), values.min())
         steep = inside and min(steps[start - 1], steps[stop - 1]) > 3 * resolution
@@ -207,6 +204,9 @@ class _SampleFault(NamedTuple):
 
 
 _SAMPLE_FAULTS = {
+    "dropouts": _SampleFault(
+        unread, "{channel} reads 0, as if its sensor did not answer ({count})"
+    ),
     "spikes": _SampleFault(_spikes, "{channel} has spikes ({count})"),
     "saturation": _SampleFault(
         _clipped, "{channel} looks clipped at the end of its range ({count})"

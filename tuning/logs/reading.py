@@ -35,7 +35,7 @@ import numpy as np
 from tuning.logs.columns import with_named_columns, with_times
 from tuning.logs.description import LogDescription, read_description
 from tuning.logs.log import Log, check_samples
-from tuning.logs.quality import interpolate_invalid
+from tuning.logs.logger import interpolate_invalid
 from tuning.logs.readers import LogTable, is_time_name, read_tables
 from tuning.logs.readers.table import shown
 from tuning.logs.units import UNITS, transducer_unit, unit

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from tuning.logs.log import MAX_GRID_DEVIATION_STEPS, Log
-from tuning.logs.quality import GAP_STEPS
+from tuning.logs.log import GAP_STEPS, MAX_GRID_DEVIATION_STEPS, Log
 
 MIN_RECORD_SAMPLES = 64
 
@@ -26,15 +25,9 @@ def even_records(log: Log) -> tuple[float, tuple[EvenRecord, ...], tuple[str, ..
 
     Raises ValueError for a log whose records between gaps are all too short.
     """
-    steps = np.diff(log.times)
-    usual = np.median(steps)
-    # The median of rounded steps is one of the rounded steps; their mean without gaps is not.
-    cuts = np.flatnonzero(steps > GAP_STEPS * usual) + 1
-    within = np.delete(steps, cuts - 1)
-    step = float(np.mean(within)) if within.size else float(usual)
-    edges = [0, *cuts.tolist(), log.times.size]
+    step, parts = between_gaps(log.times)
     records, notes, resampled, dropped = [], [], 0.0, 0
-    for start, stop in zip(edges[:-1], edges[1:], strict=True):
+    for start, stop in parts:
         if stop - start < MIN_RECORD_SAMPLES:
             dropped += 1
             continue
@@ -51,15 +44,33 @@ def even_records(log: Log) -> tuple[float, tuple[EvenRecord, ...], tuple[str, ..
         records.append(EvenRecord(float(times[0]), values))
     if not records:
         raise ValueError(
-            f"{log.source}: after {len(cuts)} gaps no record has {MIN_RECORD_SAMPLES} samples"
+            f"{log.source}: after {len(parts) - 1} gaps no record has {MIN_RECORD_SAMPLES} samples"
         )
-    if cuts.size:
-        notes.append(
-            f"{cuts.size} gaps: {len(records)} records between them are used together"
-            + (f", {dropped} of less than {MIN_RECORD_SAMPLES} samples are not" if dropped else "")
-        )
+    if len(parts) > 1:
+        used = "1 record is used" if len(records) == 1 else f"{len(records)} records are used"
+        less = f", {dropped} of less than {MIN_RECORD_SAMPLES} samples left out" if dropped else ""
+        many = "1 gap" if len(parts) == 2 else f"{len(parts) - 1} gaps"
+        notes.append(f"{many}: {used}{less}")
     if resampled:
         notes.append(
             f"times are up to {resampled:.2g} steps off an even grid of {step:.6g} s: interpolated"
         )
     return 1 / step, tuple(records), tuple(notes)
+
+
+def between_gaps(times: Float[np.ndarray, " time"]) -> tuple[float, list[tuple[int, int]]]:
+    """Step (s) of some times, and the first and last (exclusive) sample of each part without gap.
+
+    >>> import numpy as np
+    >>> from tuning.logs.records import between_gaps
+    >>> between_gaps(np.array([0.0, 1.0, 2.0, 7.0, 8.0]))
+    (1.0, [(0, 3), (3, 5)])
+    """
+    steps = np.diff(times)
+    usual = np.median(steps)
+    # The median of rounded steps is one of the rounded steps; their mean without gaps is not.
+    cuts = np.flatnonzero(steps > GAP_STEPS * usual) + 1
+    within = np.delete(steps, cuts - 1)
+    step = float(np.mean(within)) if within.size else float(usual)
+    edges = [0, *cuts.tolist(), times.size]
+    return step, list(zip(edges[:-1], edges[1:], strict=True))

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tuning.logs.log import Log
+from tuning.logs.logger import sensor_readings
 from tuning.logs.units import time_derivative
 from tuning.modal.ambient import Candidate, subspace_modes
 from tuning.modal.arguments import (
@@ -102,7 +103,7 @@ def identify_modes(
     >>> [f"{frequency:.2f} Hz" for frequency in fit.frequencies]
     ['3.20 Hz']
     """
-    logs = [log] if isinstance(log, Log) else list(log)
+    logs = [sensor_readings(one) for one in ([log] if isinstance(log, Log) else log)]
     check_arguments(count, kind, order, method)
     check_choice(count, exclude, choose)
     keep = _Keep(count, exclude, choose)

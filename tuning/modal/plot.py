@@ -11,6 +11,7 @@ from jaxbeam.runtime.whole_file import whole_file
 from tuning.modal.shape_plot import draw_shapes
 
 FIT, MODE = COLOURS[:2]
+NAME_WIDTH = 0.08  # of a mode in the spectrum, over that of the axes
 MAX_POINTS = 4000  # of the log; a longer one is drawn as the range of each of so many pieces
 
 
@@ -94,12 +95,23 @@ def _draw_spectrum(axes, fit, channel, unit):
 
 
 def _name_modes(axes, fit):
-    """Frequency and damping ratio beside the line of each mode, on top of all else."""
-    for k, mode in enumerate(fit.modes):
+    """Frequency and damping ratio beside the line of each mode, on top of all else.
+
+    Each is in the highest row that has room for it.
+    """
+    low, high = fit.band
+    width = NAME_WIDTH * (high - low)
+    ends: list[float] = []  # of the names in each row
+    for mode in fit.modes:
+        at_end = mode.frequency + width > high
+        begins = mode.frequency - width if at_end else mode.frequency
+        row = next((i for i, end in enumerate(ends) if end <= begins), len(ends))
+        ends[row : row + 1] = [begins + width]
         axes.annotate(
             f"{mode.frequency:.2f} Hz\n{100 * mode.damping_ratio:.2f} %", (mode.frequency, 1.0),
-            xycoords=axes.get_xaxis_transform(), xytext=(3, -2 - 24 * (k % 2)),
-            textcoords="offset points", va="top", fontsize=8, color=MODE,
+            xycoords=axes.get_xaxis_transform(), xytext=(-3 if at_end else 3, -2 - 24 * row),
+            textcoords="offset points", va="top", ha="right" if at_end else "left",
+            fontsize=8, color=MODE,
             bbox={"facecolor": "white", "alpha": 0.8, "linewidth": 0, "pad": 0.5},
         )  # fmt: skip
 

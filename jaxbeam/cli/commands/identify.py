@@ -69,7 +69,7 @@ def identify(
         ADDRESS,ADDRESS,...: free parameters to fit first, the others fixed; repeat it for more
         stages.
     mask
-        missing, spikes, saturation or stuck: samples to leave out; repeat it for more.
+        missing, dropouts, spikes, saturation or stuck: samples to leave out; repeat it for more.
     profile
         ADDRESS: free parameter whose profile likelihood to compute; repeat it for more.
     draws

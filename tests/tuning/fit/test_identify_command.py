@@ -86,7 +86,7 @@ REFUSED = [
     ("--free beam.length --scale beam.length=log", "the scale 'log' needs two bounds"),
     (
         "--free beam.length --mask missing --mask gaps",
-        "'gaps' cannot be masked; spikes, saturation, stuck can",
+        "'gaps' cannot be masked; dropouts, spikes, saturation, stuck can",
     ),
     ("--free beam.length --resume", "--resume goes on with what is kept beside the output: -o"),
     ("--validate", "the options of fits are for fitting a case; name what is free with --free"),

@@ -145,7 +145,7 @@ def test_records_between_gaps():
     rate, records, notes = even_records(log)
     assert rate == pytest.approx(100)
     assert [len(record.values) for record in records] == [300, 600]
-    assert records[1].start == 4.0 and "1 gaps: 2 records between them" in notes[0]
+    assert records[1].start == 4.0 and "1 gap: 2 records are used" in notes[0]
     wandering = times[:300] + 0.005 * np.sin(times[:300])
     log = Log(wandering, np.sin(5 * wandering)[:, None], ("a",), ("acceleration",), ("g",))
     rate, (record,), notes = even_records(log)

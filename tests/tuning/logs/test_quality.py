@@ -81,5 +81,7 @@ def test_masking_is_on_request_and_noted():
     np.testing.assert_array_equal(masked.values, log.values)
     assert [fault.kind for fault in find_faults(masked)] == ["stuck"]
     assert np.sum(~mask(masked, ["stuck"]).valid) == 101
-    with pytest.raises(ValueError, match="'gaps' cannot be masked; spikes, saturation, stuck can"):
+    with pytest.raises(
+        ValueError, match="'gaps' cannot be masked; dropouts, spikes, saturation, stuck can"
+    ):
         mask(log, ["gaps"])

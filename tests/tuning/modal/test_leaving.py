@@ -74,6 +74,17 @@ def test_a_part_with_more_than_noise_ends_the_excitation():
     assert shaken_until(fitted + noise, fitted, 0.5) == 0
 
 
+def test_errors_in_proportion_to_a_decay_are_no_forces():
+    """A nonlinear structure leaves a share of its energy, loud or not; a force acts for a time."""
+    random = np.random.default_rng(1)
+    fitted = np.exp(-np.arange(2000) / 400)[:, None] * np.ones((1, 2))
+    errors = 0.01 * random.normal(size=fitted.shape)
+    errors += 0.35 * fitted * random.normal(size=fitted.shape)
+    assert shaken_until(fitted + errors, fitted, 0.5) == 0
+    errors[:400] *= 2
+    assert shaken_until(fitted + errors, fitted, 0.5) == 400
+
+
 def test_decays_with_more_than_noise_do_not_count():
     """Three decays of two channels after blows of other strength; forces act in the second."""
     random = np.random.default_rng(1)

@@ -12,6 +12,9 @@ NOT_REPRODUCED = "not the same in parts of the window"
 NONLINEARITY = "what nonlinearity adds to the mode of"
 NONLINEAR_DECAY = 2.5, 4.5  # decay rates over that of a mode, of what its nonlinearity adds to it
 NONLINEAR_MAC = 0.95
+# Over that of the mode. Its phase moves by k in all, so that k^2 / 3 of its energy is that of the
+# first such term; fits of more than two terms that Duffing's equation asks for give up to four.
+MAX_CUBE_ENERGY = 4.0
 MAX_CUBE_SPREAD = 3.0  # of energies of several decays over what they would be of cubes
 
 BandFits = list[tuple[tuple[float, float], DecayFit]]  # of parts of a band (Hz)
@@ -47,6 +50,8 @@ def decay_candidates(
 def share_of_modes(found: tuple[Candidate, ...], fits: BandFits, duration: float) -> float:
     """Share of identified modes in the energy at the beginning of decays, beside rejected ones.
 
+    What nonlinearity adds to a mode is a part of it.
+
     That is the first tenth: the energy over all of a decay would count steady hum for more, that at
     the first sample a pole that is gone at the next. Poles damped too strongly for modes, which
     stand for leakage into the band or the end of a blow, do not count.
@@ -60,7 +65,7 @@ def share_of_modes(found: tuple[Candidate, ...], fits: BandFits, duration: float
             nepers = 4 * np.pi * one.mode.frequency * one.mode.damping_ratio * duration
             early = np.expm1(-nepers / PARTS) / np.expm1(-nepers) if nepers > 1e-6 else 1 / PARTS
             energy = early * np.sum(fit.measured**2)
-            if one.reason:
+            if one.reason and not one.reason.startswith(NONLINEARITY):
                 # Poles side by side may cancel each other, each with many times the energy of all.
                 rejected += min(one.mode.energy_share, 1.0) * energy
             else:
@@ -89,7 +94,7 @@ def _is_cube(mode: IdentifiedMode, other: IdentifiedMode) -> bool:
     rate = mode.pole.real / other.pole.real
     near = abs(mode.frequency - other.frequency) < mode.damping_ratio * mode.frequency
     alike = mac_matrix(mode.shape[None], other.shape[None])[0, 0] > NONLINEAR_MAC
-    less = mode.energy_share < other.energy_share
+    less = mode.energy_share < MAX_CUBE_ENERGY * other.energy_share
     return bool(near and alike and less and NONLINEAR_DECAY[0] < rate < NONLINEAR_DECAY[1])
 
 

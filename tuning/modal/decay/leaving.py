@@ -121,6 +121,7 @@ def shaken_until(
 ) -> int:
     """Sample of a fitted decay up to which errors are more than elsewhere; 0 if they are not.
 
+    They must be more than the noise, and than their share of the energy, of what comes after.
     `independent` is the share of samples that are, in the band of the fit.
     """
     scale = np.maximum(np.mean(measured**2, axis=0), 1e-300)
@@ -133,9 +134,17 @@ def shaken_until(
     # What is little of the whole decay tells little of it, and may be chance.
     least = MIN_UNEXPLAINED * np.maximum(energy, energy.mean())
     more = (errors > ratio * np.median(errors)) & (errors > least)
-    if not more.any():
-        return 0
-    return len(measured) * (int(np.flatnonzero(more)[-1]) + 1) // PARTS
+    last = _last(more)
+    # Errors in proportion to the energy, before as after, are those of a nonlinear structure.
+    noise = np.median(errors[last:]) if last < PARTS else 0.0
+    share = max(np.sum(errors[last:] - noise) / max(np.sum(energy[last:]), 1e-300), 0.0)
+    more &= errors > ratio * (noise + share * energy)
+    return len(measured) * _last(more) // PARTS
+
+
+def _last(more) -> int:
+    """Number of parts to the last of some."""
+    return int(np.max(np.flatnonzero(more) + 1, initial=0))
 
 
 def undisturbed(
