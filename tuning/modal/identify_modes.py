@@ -44,7 +44,7 @@ from tuning.modal.harmonics import (
     steady_candidates,
 )
 from tuning.modal.preprocessing import energy_band, kinetic_band, prepare
-from tuning.modal.samples import Samples, samples_of, with_channels
+from tuning.modal.samples import Samples, samples_of, with_channels, without_constant
 from tuning.modal.spectral.efdd_modes import SingularValues, efdd_modes
 from tuning.modal.spectral.plscf_modes import plscf_modes
 from tuning.modal.stabilisation import Diagram
@@ -110,10 +110,10 @@ def identify_modes(
     check_force(force, force_window, kind, method)
     measured = logs
     forces = () if kind or method not in (None, "plscf") else force_names(logs, force)
-    logs = [without_forces(with_channels(one, channels)) for one in logs]
+    logs, dead = without_constant([without_forces(with_channels(one, channels)) for one in logs])
     if not forces and force_window is not None:
         raise ValueError(f"{logs[0].source}: a force window is for measured forces; none is in N")
-    samples = samples_of(logs, window)
+    samples = samples_of(logs, window).with_notes(dead)
     check_band(logs[0], samples.rate, band)
     choices = _together(logs)
     derivatives = tuple(time_derivative(name) for name in logs[0].quantities)

@@ -23,6 +23,10 @@ class Samples(NamedTuple):
     rate: float
     notes: tuple[str, ...]
 
+    def with_notes(self, notes: Sequence[str]) -> "Samples":
+        """The samples with further notes."""
+        return self._replace(notes=(*self.notes, *notes))
+
 
 def samples_of(logs: Sequence[Log], window: tuple[float, float] | None) -> Samples:
     """Records of the logs in a window (s), and notes on the logs and their faults.
@@ -110,6 +114,25 @@ def with_channels(log: Log, channels: Sequence[str] | None) -> Log:
         log.source, pick(log.sensors), pick(log.positions), pick(log.actuators), log.loads,
         log.valid[:, kept], log.notes,
     )  # fmt: skip
+
+
+def without_constant(logs: Sequence[Log]) -> tuple[list[Log], tuple[str, ...]]:
+    """Logs of the same channels without those that stay at one value in all, and notes on these.
+
+    Raises ValueError if no channel is left.
+    """
+    names, dead = logs[0].names, []
+    if all(same_channels(log, logs[0]) for log in logs):  # others are refused later
+        constant = np.all([np.ptp(log.values, axis=0) == 0 for log in logs], axis=0)
+        dead = [name for name, one in zip(names, constant, strict=True) if one]
+    if not dead:
+        return list(logs), ()
+    if len(dead) == len(names):
+        raise ValueError(
+            f"{logs[0].source}: each channel stays at one value: {', '.join(names)}; give others"
+        )
+    kept = [with_channels(log, [name for name in log.names if name not in dead]) for log in logs]
+    return kept, tuple(f"{name} stays at one value: left out" for name in dead)
 
 
 def _sample_range(log: Log, window) -> tuple[int, int]:

@@ -263,6 +263,19 @@ def test_samples_are_left_out_while_a_sensor_settles():
     np.testing.assert_allclose(identify_modes(log, band=BAND).frequencies, [3.0, 7.0], rtol=0.02)
 
 
+def test_a_channel_that_stays_at_one_value_is_left_out():
+    """As of a sensor that is not connected; it would have been a node of all modes."""
+    alive = decay(0).values
+    dead = np.column_stack([alive, np.full(len(alive), 2.5)])
+    log, with_dead = make_log(alive, 100.0), make_log(dead, 100.0)
+    fit = identify_modes(with_dead)
+    assert "a2 stays at one value: left out" in fit.notes
+    np.testing.assert_array_equal(fit.frequencies, identify_modes(log).frequencies)
+    assert fit.shapes.shape[1] == 2
+    with pytest.raises(ValueError, match="each channel stays at one value: a2; give others"):
+        identify_modes(with_dead, channels=["a2"])
+
+
 def test_table_json_and_figures_of_a_fit(tmp_path):
     fit = identify_modes(decay(3), band=BAND)
     table = str(fit)
