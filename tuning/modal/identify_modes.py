@@ -30,7 +30,6 @@ from tuning.modal.arguments import (
 )
 from tuning.modal.chosen import chosen_modes
 from tuning.modal.decay.modes import Decays, excited, free_decay_modes
-from tuning.modal.decay.whole_log import FromDecays, modes_after_unseen_blows, modes_of_decays
 from tuning.modal.fit import Choice, ModalFit
 from tuning.modal.forced.blows import force_at_blows
 from tuning.modal.forced.forces import force_names, force_records, without_forces
@@ -48,6 +47,7 @@ from tuning.modal.samples import Samples, samples_of, with_channels, without_con
 from tuning.modal.spectral.efdd_modes import SingularValues, efdd_modes
 from tuning.modal.spectral.plscf_modes import plscf_modes
 from tuning.modal.stabilisation import Diagram
+from tuning.modal.struck.whole_log import FromDecays, modes_after_unseen_blows, modes_of_decays
 
 FORCED = "measured force"
 NARROW = 0.005  # damping ratio of a mode below which it may be a harmonic

@@ -15,24 +15,7 @@ from scipy.signal import detrend
 
 from tuning.modal.ambient import divided_band
 from tuning.modal.decay.poles import NEARBY_BINS, NONLINEARITY_SHARE
-from tuning.modal.forced.beginnings import (
-    StruckRecords,
-    energy_along,
-    from_early_blows,
-    from_rests,
-)
 from tuning.modal.forced.common_denominator import Lines
-from tuning.modal.forced.instants import (
-    MAX_BLOWS,
-    WORK,
-    Blow,
-    Response,
-    after_blows,
-    poles_within,
-    response_in_band,
-    with_missed_blows,
-    work,
-)
 from tuning.modal.forced.likelihood import (
     FEWER_REST_POWERS,
     REST_POWERS,
@@ -45,6 +28,23 @@ from tuning.modal.forced.modes import mode_reason, refined_model
 from tuning.modal.forced.significance import criterion, criterion_with, promising_poles
 from tuning.modal.result import IdentifiedMode
 from tuning.modal.shapes import mac_matrix
+from tuning.modal.struck.beginnings import (
+    StruckRecords,
+    energy_along,
+    from_early_blows,
+    from_rests,
+)
+from tuning.modal.struck.instants import (
+    MAX_BLOWS,
+    WORK,
+    Blow,
+    Response,
+    after_blows,
+    poles_within,
+    response_in_band,
+    with_missed_blows,
+    work,
+)
 
 MIN_BLOWS = 2
 MAX_ADDED = 16  # poles, one at a time

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tuning.modal.forced.common_denominator import Lines
-from tuning.modal.forced.instants import Blow, Response, bins_of
+from tuning.modal.struck.instants import Blow, Response, bins_of
 
 EARLY = 0.1  # of a record, within which a blow begins it
 

@@ -8,8 +8,12 @@ from jaxtyping import Bool
 from tuning.modal.ambient import Candidate, without_duplicates
 from tuning.modal.decay.candidates import NONLINEARITY
 from tuning.modal.decay.modes import Decays, band_of_ends, excited, free_decay_modes
-from tuning.modal.forced.instants import marked_blows
-from tuning.modal.forced.struck import (
+from tuning.modal.preprocessing import HALF_POWER, kinetic_band
+from tuning.modal.result import is_at_edge
+from tuning.modal.samples import Samples
+from tuning.modal.stabilisation import Diagram
+from tuning.modal.struck.instants import marked_blows
+from tuning.modal.struck.struck_modes import (
     AFTER_BLOWS,
     AFTER_UNSEEN_BLOWS,
     FROM_AMBIENT,
@@ -19,10 +23,6 @@ from tuning.modal.forced.struck import (
     alike,
     struck_modes,
 )
-from tuning.modal.preprocessing import HALF_POWER, kinetic_band
-from tuning.modal.result import is_at_edge
-from tuning.modal.samples import Samples
-from tuning.modal.stabilisation import Diagram
 
 Band = tuple[float, float]
 Struck = tuple[Bool[np.ndarray, " time"], ...]

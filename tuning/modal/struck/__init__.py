@@ -1,0 +1,1 @@
+"""Modes after blows that were not measured, from whole records."""
