@@ -18,6 +18,7 @@ UNREAD_SD = 12.0  # robust standard deviations of a channel from its median to z
 MIN_CHANGE = 4.0  # of the resolution of a channel: smaller changes may be those of a coarse one
 MIN_CHANGES = 32  # of such size, to tell that values are held
 HELD_SHARE = 0.9  # of these changes, after which the next sample is the same
+OPTION = "  [--as-logged]"  # of the command line, with which nothing of this is done
 EVEN_SHARE = 0.8  # of the times until the next change that are usual, within a sample
 
 
@@ -75,7 +76,9 @@ def sensor_readings(log: Log) -> Log:
         if none.any():
             valid[none, i] = False
             many = f"{none.sum()} samples" if none.sum() > 1 else "one sample"
-            notes.append(f"{name} reads 0 in {many}, as if its sensor did not answer: interpolated")
+            notes.append(
+                f"{name} reads 0 in {many}, as if its sensor did not answer: interpolated{OPTION}"
+            )
     if not valid.all():
         values = interpolate_invalid(log.times, log.values, valid)
         log = dataclasses.replace(log, values=values, valid=None, notes=tuple(notes))
@@ -87,7 +90,7 @@ def sensor_readings(log: Log) -> Log:
     factor = int(np.ceil(most - 0.05))
     notes.append(
         f"each reading is held for {most:.3g} samples: decimated from {1 / step:.5g} Hz to "
-        f"{1 / step / factor:.5g} Hz"
+        f"{1 / step / factor:.5g} Hz{OPTION}"
     )
     times, values = [], []
     for start, stop in parts:

@@ -68,6 +68,7 @@ def identify_modes(
     force_window: float | None = None,
     exclude: Sequence[float] = (),
     choose: Sequence[float] = (),
+    as_logged: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> ModalFit:
     """Modes from a log, or from several of the same channels, of unknown excitation.
@@ -84,7 +85,9 @@ def identify_modes(
     lacks, as of a hammer that strikes another place in each, is zero there. `force_window` (s) is
     the time after each blow of a hammer from which on the force is taken for zero. `exclude` are
     frequencies (Hz) that are no modes. The modes nearest to the frequencies `choose` (Hz) are kept,
-    also those that are not well identified, and no others. `progress` is called with a few words on
+    also those that are not well identified, and no others. Readings that a logger repeats are
+    decimated, and zeros before a sensor has answered interpolated, but with samples `as_logged`.
+    `progress` is called with a few words on
     what is being done.
 
     Raises ValueError for a log without evenly sampled records, or too short, a window outside the
@@ -103,7 +106,8 @@ def identify_modes(
     >>> [f"{frequency:.2f} Hz" for frequency in fit.frequencies]
     ['3.20 Hz']
     """
-    logs = [sensor_readings(one) for one in ([log] if isinstance(log, Log) else log)]
+    logs = [log] if isinstance(log, Log) else list(log)
+    logs = logs if as_logged else [sensor_readings(one) for one in logs]
     check_arguments(count, kind, order, method)
     check_choice(count, exclude, choose)
     keep = _Keep(count, exclude, choose)

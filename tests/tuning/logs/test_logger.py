@@ -94,7 +94,8 @@ def test_modes_of_a_hammer_test_from_a_node_that_repeats_readings():
     rest[0] = 0.0
     times = np.r_[np.arange(rest.size) / 7200, rest.size / 7200 + 0.016 + asked]
     columns = ("a",), ("acceleration",), ("m/s^2",)
-    fit = identify_modes(Log(times, np.r_[rest, held][:, None], *columns))
+    log = Log(times, np.r_[rest, held][:, None], *columns)
+    fit = identify_modes(log)
     notes = " ".join(fit.notes)
     assert "a reads 0 in 2 samples" in notes and "held for 4.5 samples" in notes
     assert fit.kind == "free decay"
@@ -102,3 +103,5 @@ def test_modes_of_a_hammer_test_from_a_node_that_repeats_readings():
     for one in (fit, direct):
         np.testing.assert_allclose(one.frequencies, frequencies, rtol=2e-3)
         np.testing.assert_allclose(one.damping_ratios, damping, rtol=0.1)
+    raw = identify_modes(log, as_logged=True)
+    assert "holds each reading" in str(raw) and "decimated" not in str(raw) and "reads 0" in str(raw)

@@ -42,6 +42,7 @@ def modes_from_log(
     choose: str | None = None,
     count: int | None = None,
     align: bool = False,
+    as_logged: bool = False,
     plot: bool = False,
     length: float | None = None,
     case: Path | None = None,
@@ -104,6 +105,9 @@ def modes_from_log(
         Number of modes to keep, those with most energy.
     align
         The logs are of one experiment by loggers whose clocks differ: align them by correlation.
+    as_logged
+        Take all samples as they are logged: readings that a logger repeats are not decimated, zeros
+        before a sensor has answered not interpolated.
     plot
         Draw the log, its spectrum with the stabilisation diagram, and the shapes to a PNG named
         after the first log; of setups LOG_setup1.png and so on, and merged LOG_setups.png.
@@ -169,6 +173,7 @@ def modes_from_log(
             method=method,
             exclude=excluded,
             choose=chosen,
+            as_logged=as_logged,
             progress=None if options.json_ or not sys.stderr.isatty() else print_message,
             **of_setup,
         )
