@@ -7,6 +7,7 @@ from hypothesis import given, settings, strategies as st
 from tests.oracles.planted_structures import Structure, random_structure, response
 from tuning import Log, find_faults, identify_modes, mask
 from tuning.logs.logger import samples_held, sensor_readings, unread
+from tuning.modal.decay.stretches import excited_samples
 
 TIMES = np.arange(600) / 500
 SMOOTH = np.sin(12 * TIMES) * np.exp(-TIMES)
@@ -73,20 +74,39 @@ def test_one_channel_that_is_not_held_keeps_the_rate():
     assert [str(fault) for fault in find_faults(log)] == ["log: a holds each reading for 4 samples"]
 
 
+FREQUENCIES, DAMPING = np.array([12.0, 17.5, 26.0]), np.array([0.01, 0.008, 0.006])
+
+
+def after_a_blow(frequencies, damping, rate, duration):
+    """Accelerations (m/s^2) of a structure after one blow, with noise, and its random numbers."""
+    whole, random = random_structure(1), np.random.default_rng(0)
+    planted = Structure(frequencies, damping, whole.shapes[:3, :1], whole.inputs[:3])
+    forces = np.zeros((int(duration * rate), 4))
+    forces[16:19, 0] = [1.0, 2.0, 1.0]
+    clean = np.gradient(response(planted, forces, rate), 1 / rate, axis=0)
+    return 0.3 * clean / clean.std() + 0.005 * random.normal(size=clean.shape), random
+
+
+def test_steps_of_held_readings_look_like_blows_and_readings_do_not():
+    clean, _ = after_a_blow(FREQUENCIES, DAMPING, 1600.0, 4.0)
+    asked = np.arange(int(4 * 7200) - 8) / 7200
+    held = np.round(clean[(asked * 1600).astype(int)] - 9.81, 3)
+    log = Log(asked, held, ("a",), ("acceleration",), ("m/s^2",))
+    struck_late = []
+    for one in (log, sensor_readings(log)):
+        values = one.values - one.values.mean(axis=0)
+        marks = excited_samples(values, one.sample_rate, 1 / FREQUENCIES[0])
+        struck_late.append(bool(marks[one.times > 0.1].any()))
+    assert struck_late == [True, False]
+
+
 def test_modes_of_a_hammer_test_from_a_node_that_repeats_readings():
     """As a wireless node writes: gravity, a zero first, readings held, a pause before the blow.
 
     The modes are those of the same test without these faults, and the truth.
     """
-    whole, rate = random_structure(1), 1600.0
-    frequencies, damping = np.array([12.0, 17.5, 26.0]), np.array([0.01, 0.008, 0.006])
-    planted = Structure(frequencies, damping, whole.shapes[:3, :1], whole.inputs[:3])
-    forces = np.zeros((int(6 * rate), 4))
-    forces[16:19, 0] = [1.0, 2.0, 1.0]
-    clean = response(planted, forces, rate)
-    random = np.random.default_rng(0)
-    clean = np.gradient(clean, 1 / rate, axis=0)
-    clean = 0.3 * clean / clean.std() + 0.005 * random.normal(size=clean.shape)
+    rate, frequencies, damping = 1600.0, FREQUENCIES, DAMPING
+    clean, random = after_a_blow(frequencies, damping, rate, 6.0)
     asked = np.arange(int(6 * 7200) - 8) / 7200 + 1e-4
     held = np.round(clean[(asked * rate).astype(int), 0] - 9.81, 3)
     held[0] = 0.0
