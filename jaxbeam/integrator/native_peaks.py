@@ -8,17 +8,15 @@ controller, in double precision, on CPUs. The first large sweep compiles it, onc
 """
 
 import ctypes
-import functools
 import sys
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.integrator.discrete_model import discrete_model
-from jaxbeam.integrator.integrate import integrate_peaks as integrate_peaks_in_jax
 from jaxbeam.integrator.kinks.passages import may_have_kinks
 from jaxbeam.integrator.peaks.contact_minimum import (
     FORCE_FRACTIONS,
@@ -80,25 +78,25 @@ C_MACROS = {
     "TIE_TOLERANCE": TIE_ROUNDING_UNITS * sys.float_info.epsilon,
 }
 HEADERS = (
-    *("ffi", "load_path", "matrices", "peak_search", "preparation", "propagators", "registers"),
+    *("load_path", "matrices", "peak_search", "preparation", "propagators", "registers"),
     *("step_matrices", "steps", "vehicle_layout", "vehicle_propagators", "vehicles", "workspace"),
 )
 LIBRARY = Library(
     sources=("integrate_peaks.c", "preparation.c", "matrices.c"),
     headers=tuple(f"{name}.h" for name in HEADERS),
     macros=tuple(C_MACROS.items()),
-    targets=("integrate_peaks",),
 )
 
 
 def chosen_for(case: Case, runs: int) -> bool:
-    """Whether a new sweep of peaks of a case uses the C integrator.
+    """Whether a new sweep of peaks of a case uses the C integrator, or is to compile it first.
 
-    A sweep of many runs compiles it if it is missing; without a compiler, XLA integrates.
+    Sweeps of many runs do so where it is missing, and there is a compiler.
     """
     if not supports(case):
         return False
-    return available() or (runs >= MIN_RUNS_TO_COMPILE and LIBRARY.build_if_missing())
+    missing = runs >= MIN_RUNS_TO_COMPILE and on_cpu() and LIBRARY.can_be_built()
+    return missing or available()
 
 
 def supports(case: Case) -> bool:
@@ -119,30 +117,105 @@ def supports(case: Case) -> bool:
 
 def available() -> bool:
     """Whether the C integrator is compiled for this machine, and JAX computes on a CPU."""
-    return LIBRARY.available()
+    return on_cpu() and LIBRARY.available()
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-@jax.named_scope("native")
-def integrate_peaks(
-    max_loads: int,
-    mask: Bool[Array, " task"],
+def on_cpu() -> bool:
+    """Whether JAX computes on a CPU."""
+    return jax.default_backend() == "cpu"
+
+
+class NativeInputs(NamedTuple):
+    """Arguments of the C integrator after the mask, in the order of `workspace.h`.
+
+    Their first axis are the tasks, of length one where all share them.
+    """
+
+    state_matrix: Float[Array, "task block state state"]
+    shape_nodes: Float[Array, "task node"]
+    shape_series: Float[Array, "task segment term mode"]
+    panel_starts: Float[Array, "task boundary"]
+    step_counts: Int[Array, "task panel"]
+    step_lengths: Float[Array, "task length"]
+    loads_on_beam: Bool[Array, "task panel load"]
+    on_beam_intervals: Float[Array, "task load 2"]
+    breakpoints: Float[Array, "task load piece"]
+    cubics: Float[Array, "task load piece 4"]
+    inertia: Float[Array, "task load run"]
+    weight: Float[Array, "task load run"]
+    stiffness: Float[Array, "task load run"]
+    damping: Float[Array, "task load run"]
+    vehicles: Int[Array, "1 group 4"]
+    vehicle_state_matrix: Float[Array, "task entry run"]
+    vehicle_input_matrix: Float[Array, "task entry run"]
+    vehicle_output_matrix: Float[Array, "task entry run"]
+    output_rows: Float[Array, "task output state"]
+    output_bounds: Float[Array, "task output block"]
+    influence_breaks: Float[Array, "task break"]
+    influence_series: Float[Array, "task piece term output"]
+
+
+class _Argument(ctypes.Structure):
+    """An array as C takes it: address of its numbers, and the sizes of its axes."""
+
+    _fields_ = (("numbers", ctypes.c_void_p), ("sizes", ctypes.c_int64 * 4))
+
+
+def native_inputs(
     models: ModalModel,
     grids: TimeGrid,
     outputs: OutputRows,
     correction: StaticCorrection | None,
     loads: LoadSet,
-) -> Peaks:
-    """Peaks of tasks, each a batch of runs without commands; only where C is `available`.
+) -> NativeInputs:
+    """What the C integrator needs to know of tasks, each a batch of runs without commands.
 
-    All arguments but `max_loads`, the largest number of loads on the beam at once, have tasks as
-    their first axis, of length one where models are shared. Peaks are those of the `outputs` with
-    their static `correction`, if it is given. Grids are of one step length a panel
-    (`grid_by_step_length`). Tasks not in the mask stay at rest.
+    Arrays of all arguments have tasks as their first axis, of length one where models are shared.
+    Peaks are to be those of the `outputs` with their static `correction`, if it is given. Grids are
+    of one step length a panel (`grid_by_step_length`).
     """
     shapes = models.modes.series
     if models.mode_map is not None:
         shapes = shapes @ models.mode_map[:, None]
+    shared = None if models.state_matrix.shape[0] == 1 else 0
+    own = jax.tree.map(lambda leaf: leaf[0], models) if shared is None else models
+    linear = jax.vmap(linear_outputs, (shared, 0, 0))(own, outputs, correction)
+    corrected = None if correction is None else correction.rows
+    bounds = jax.vmap(bounds_by_energy, (shared, 0, 0))(own, outputs, corrected)
+    influence = np.zeros((1, 1)), np.zeros((1, 1, 0, linear.rows.shape[1]))
+    if linear.influence is not None:
+        influence = linear.influence.breaks, linear.influence.series
+    return NativeInputs(
+        *(models.state_matrix, models.modes.nodes, shapes),
+        *(grids.boundaries, grids.counts, grids.lengths),
+        *(grids.loads_on_beam, grids.on_beam_intervals),
+        *(*jax.vmap(LoadSet.cubics)(loads), loads.wheels.inertia, loads.wheels.weight),
+        *_vehicle_inputs(loads.wheels),
+        *(linear.rows, bounds, *influence),
+    )
+
+
+def integrate_peaks(max_loads: int, mask: Bool[np.ndarray, " task"], inputs: NativeInputs) -> Peaks:
+    """Peaks of tasks; only where C is `available`. Other threads of Python run meanwhile.
+
+    `max_loads` is the largest number of loads on the beam at once. Tasks not in the mask stay at
+    rest. Raises MemoryError without memory for the matrices of the steps.
+    """
+    arrays = [np.ascontiguousarray(array) for array in (mask, *inputs, *_constants())]
+    tasks, loads, runs = inputs.weight.shape
+    outputs = inputs.output_rows.shape[1]
+    peaks = Peaks(*(np.empty((tasks, runs, count)) for count in (outputs, outputs, loads, loads)))
+    arguments = (_Argument * len(arrays))(
+        *((array.ctypes.data, (*array.shape, 1, 1, 1)[:4]) for array in arrays)
+    )
+    found = (ctypes.c_void_p * len(peaks))(*(part.ctypes.data for part in peaks))
+    if LIBRARY.load().integrate_peaks(ctypes.c_int64(max_loads), arguments, found):
+        raise MemoryError("there is no memory for the matrices of all steps of a sweep")
+    return peaks
+
+
+def _constants() -> tuple[np.ndarray, ...]:
+    """Nodes, weights and coefficients of the integrator, which all tasks share."""
     constants = (
         np.asarray(GAUSS_NODES),
         lagrange_coefficients(NODE_COUNT),
@@ -151,49 +224,7 @@ def integrate_peaks(
         FORCE_FRACTIONS,
         force_weights_at_fractions(),
     )
-    shared = None if models.state_matrix.shape[0] == 1 else 0
-    own = jax.tree.map(lambda leaf: leaf[0], models) if shared is None else models
-    linear = jax.vmap(linear_outputs, (shared, 0, 0))(own, outputs, correction)
-    corrected = None if correction is None else correction.rows
-    bounds = jax.vmap(bounds_by_energy, (shared, 0, 0))(own, outputs, corrected)
-    count = linear.rows.shape[1]
-    influence = np.zeros((1, 1)), np.zeros((1, 1, 0, count))
-    if linear.influence is not None:
-        influence = linear.influence.breaks, linear.influence.series
-    arguments = (
-        *(mask, models.state_matrix, models.modes.nodes, shapes),
-        *(
-            grids.boundaries,
-            grids.counts,
-            grids.lengths,
-            grids.loads_on_beam,
-            grids.on_beam_intervals,
-        ),
-        *(*jax.vmap(LoadSet.cubics)(loads), loads.wheels.inertia, loads.wheels.weight),
-        *_vehicle_arguments(loads.wheels),
-        *(linear.rows, bounds, *influence),
-        *(part[None] for part in constants),
-    )
-    tasks, load_count, batch_size = loads.wheels.inertia.shape
-    modes = shapes.shape[-1]
-    blocks, block_size = models.state_matrix.shape[1:3]
-    beam = grids.counts.shape[1], blocks, block_size, modes // blocks, *shapes.shape[1:3]
-    groups = vehicle_numbers(loads.wheels)
-    sizes = *beam, max_loads, load_count, count, batch_size, len(groups)
-    workspace_size = LIBRARY.load().workspace_size
-    pointer = np.ctypeslib.ndpointer(np.int64, flags="C")
-    workspace_size.restype = ctypes.c_int64
-    workspace_size.argtypes = [*(ctypes.c_int64,) * len(sizes), pointer]
-    results = [(tasks, batch_size, columns) for columns in (count, count, load_count, load_count)]
-    call = jax.ffi.ffi_call(
-        LIBRARY.ffi_name("integrate_peaks"),
-        [
-            jax.ShapeDtypeStruct(shape, float)
-            for shape in (*results, (workspace_size(*sizes, groups),))
-        ],
-        vmap_method="sequential",
-    )
-    return Peaks(*call(*arguments, max_loads=np.int64(max_loads))[:-1])
+    return tuple(np.asarray(part, float)[None] for part in constants)
 
 
 def vehicle_numbers(wheels: WheelSet) -> Int[np.ndarray, "group 4"]:
@@ -202,7 +233,7 @@ def vehicle_numbers(wheels: WheelSet) -> Int[np.ndarray, "group 4"]:
     return np.array(numbers, np.int64).reshape(-1, 4)
 
 
-def _vehicle_arguments(wheels: WheelSet):
+def _vehicle_inputs(wheels: WheelSet):
     """Springs of the wheels, numbers of the vehicles, and their matrices, one after the other."""
     if not wheels.vehicles:
         none = np.zeros((1, 0, 1))
@@ -213,19 +244,3 @@ def _vehicle_arguments(wheels: WheelSet):
         flat = [part.reshape(part.shape[0], -1, part.shape[-1]) for part in matrices]
         parts.append(jnp.concatenate(flat, axis=1))
     return wheels.stiffness, wheels.damping, vehicle_numbers(wheels)[None], *parts
-
-
-@integrate_peaks.defjvp
-def _integrate_peaks_jvp(max_loads, primals, tangents):
-    """Derivatives of the same function in JAX."""
-
-    def jax_peaks(mask, models, *rest):
-        def task(model, grid, outputs, correction, loads):
-            discrete = discrete_model(model, grid, None, None, outputs, correction)
-            return integrate_peaks_in_jax(discrete, loads, max_loads=max_loads)[0].peaks()
-
-        tasks = mask.shape[0]
-        models = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (tasks, *leaf.shape[1:])), models)
-        return jax.vmap(task)(models, *rest)
-
-    return jax.jvp(jax_peaks, primals, tangents)

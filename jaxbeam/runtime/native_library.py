@@ -1,9 +1,10 @@
-"""Optional C code: compiled when first of use, stored in the cache folder, called by XLA.
+"""Optional C code: compiled when first of use, stored in the cache folder.
 
-A library is named by a hash of its source, its compiler flags, the machine and the version of JAX.
-Its functions are targets of XLA's foreign function interface. Everything also runs without it.
+A library is named by a hash of its source, its compiler flags and the machine. Everything also runs
+without it.
 """
 
+import contextlib
 import functools
 import hashlib
 import os
@@ -12,10 +13,9 @@ import shutil
 import subprocess
 import tempfile
 import warnings
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
-
-import jax
 
 from jaxbeam.runtime.cache_folder import (
     LIBRARY_PREFIX,
@@ -38,12 +38,11 @@ COMPILER_FLAGS = (
 
 
 class Library(NamedTuple):
-    """A C library: file names in C_FOLDER, macros, and names of the functions that XLA calls."""
+    """A C library: file names in C_FOLDER, and macros."""
 
     sources: tuple[str, ...]
     headers: tuple[str, ...]
     macros: tuple[tuple[str, float], ...]
-    targets: tuple[str, ...]
 
     @property
     def compiler_flags(self) -> tuple[str, ...]:
@@ -59,10 +58,6 @@ class Library(NamedTuple):
         """Path of the compiled library, built or not. Raises CacheError without a cache folder."""
         return cache_folder() / self.file_name
 
-    def ffi_name(self, name: str) -> str:
-        """Name under which a function of the library is registered with XLA."""
-        return f"jaxbeam_{name}_{_fingerprint(self)}"
-
     def build(self) -> pathlib.Path:
         """Compile the library for this machine; its path.
 
@@ -76,18 +71,27 @@ class Library(NamedTuple):
         except (CacheError, OSError) as error:
             raise RuntimeError(f"the C code cannot be stored: {error}") from None
 
-    def build_if_missing(self) -> bool:
-        """Whether the library is available after compiling it, if it never was, where possible.
-
-        One that was removed or is refused is not compiled; a failure leaves everything as it was.
-        """
+    def can_be_built(self) -> bool:
+        """Whether there is a compiler, and the library never was compiled here, nor removed."""
         try:
-            if os.path.lexists(self.library_path()) or find_compiler() is None:
-                return False
-            self.build()
-        except (CacheError, RuntimeError):
+            return not os.path.lexists(self.library_path()) and find_compiler() is not None
+        except CacheError:
             return False
-        return self.available()
+
+    @contextlib.contextmanager
+    def built_meanwhile(self) -> Iterator[None]:
+        """A context in which the library is compiled, if it can be, beside what is done there.
+
+        At its end the library is `available`, unless compiling it failed: that changes nothing.
+        """
+        if not self.can_be_built():
+            yield
+            return
+        with ThreadPoolExecutor(1) as pool:
+            build = pool.submit(self.build)
+            yield
+            with contextlib.suppress(RuntimeError):
+                build.result()
 
     def remove(self) -> pathlib.Path:
         """Remove the compiled library until `build`; its path, of an empty file in its place.
@@ -100,7 +104,7 @@ class Library(NamedTuple):
             raise RuntimeError(f"the C code cannot be removed: {error}") from None
 
     def available(self) -> bool:
-        """Whether the library is compiled, authentic and loadable, and JAX computes on a CPU.
+        """Whether the library is compiled, authentic and loadable.
 
         Warns of a library that is refused.
         """
@@ -108,12 +112,10 @@ class Library(NamedTuple):
             status = self.library_path().lstat()
         except (CacheError, OSError):
             return False
-        return jax.default_backend() == "cpu" and _is_usable(
-            self, self.library_path(), status.st_ctime_ns, status.st_size
-        )
+        return _is_usable(self, self.library_path(), status.st_ctime_ns, status.st_size)
 
     def load(self) -> NativeCode:
-        """The library, with its targets registered; only where it is `available`."""
+        """The library; only where it is `available`."""
         return _load(self)
 
 
@@ -132,11 +134,10 @@ def _compile(library: Library, target: pathlib.Path) -> None:
     command = find_compiler()
     if command is None:
         raise RuntimeError("there is no C compiler here: install gcc or clang, or name one in CC")
-    flags = [*library.compiler_flags, "-I", jax.ffi.include_dir()]
 
     def compile_file(name: str) -> str:
         source, compiled = str(C_FOLDER / name), str(target.with_name(f"{name}.o"))
-        _run_compiler(command, ["-c", source, *flags, "-o", compiled], source)
+        _run_compiler(command, ["-c", source, *library.compiler_flags, "-o", compiled], source)
         return compiled
 
     with ThreadPoolExecutor() as pool:
@@ -167,18 +168,13 @@ def _is_usable(library: Library, path: pathlib.Path, changed: int, size: int) ->
 
 @functools.cache
 def _load(library: Library) -> NativeCode:
-    """Load a library and register its targets with XLA, which accepts each name once a process."""
-    loaded = loaded_library(library.file_name)
-    for name in library.targets:
-        jax.ffi.register_ffi_target(
-            library.ffi_name(name), jax.ffi.pycapsule(getattr(loaded, name))
-        )
-    return loaded
+    """Load a library, once a process."""
+    return loaded_library(library.file_name)
 
 
 @functools.cache
 def _fingerprint(library: Library) -> str:
-    """Hash of source, compiler flags, JAX version and machine."""
+    """Hash of source, compiler flags and machine."""
     texts = [(C_FOLDER / name).read_text() for name in library.sources + library.headers]
-    parts = [*texts, *library.compiler_flags, jax.__version__, machine_description()]
+    parts = [*texts, *library.compiler_flags, machine_description()]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.events import sample_schedule
 from jaxbeam.integrator.static_shapes import StaticShapes, max_concurrent_loads
 from jaxbeam.model.load_set import load_set
@@ -236,7 +237,7 @@ class Runner:
             models = self._models_without_controller(models)
         yield (
             programs.block_program(program, single=False),
-            (program, self.devices, mask, models, *self._values_of(indices), step_size),
+            (program, mask, models, *self._values_of(indices), step_size),
         )
         if self.discretise_separately:
             yield programs.discrete_models, discretise_arguments
@@ -258,15 +259,17 @@ class Runner:
             models = programs.discrete_models(program, mask, models, shared_values, step_size)
         else:
             models = self._models_without_controller(models)
-        arguments = program, self.devices, mask, models, shared_values, batched_values, step_size
+        arguments = program, mask, models, shared_values, batched_values, step_size
         arguments = jax.tree.map(_to_single_precision, arguments) if single else arguments
-        integrate = programs.block_program(program, single)
+        compiled_program = programs.block_program(program, single)
         with _single_precision() if single else contextlib.nullcontext():
             with self._compile_lock:  # other threads wait instead of compiling the same variant
                 if (substeps, single) not in self._compiled_variants:
-                    integrate.precompile(*arguments)()
+                    compiled_program.precompile(*arguments)()
                     self._compiled_variants.add((substeps, single))
-            results = integrate(*arguments)
+            results = compiled_program(*arguments)
+        if compiled_program is programs.native_block:
+            results = native_peaks.integrate_peaks(self.shapes.max_loads, mask, results)._asdict()
         arrays = {name: np.asarray(values) for name, values in results.items()}
         # Histories are large: a full block is not copied.
         return arrays if mask.all() else {name: values[rows] for name, values in arrays.items()}
@@ -290,7 +293,12 @@ class Runner:
         scheduled = substeps is not None or self.case.controller is not None
         sampling = (self.schedule if scheduled else None), substeps
         return programs.Program(
-            self.case, self.shapes, *self.addresses, *sampling, self.known_outputs
+            self.case,
+            self.shapes,
+            *self.addresses,
+            *sampling,
+            known_outputs=self.known_outputs,
+            devices=self.devices,
         )
 
 

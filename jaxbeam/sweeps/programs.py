@@ -54,7 +54,8 @@ class Program(NamedTuple):
 
     With a `schedule` steps end at its events; with `substeps` there are so many between events, and
     histories are saved, otherwise the step size of each batch determines their number.
-    `known_outputs` are those of all batches, if they share them.
+    `known_outputs` are those of all batches, if they share them. Each of the `devices` computes a
+    part of a block.
     """
 
     case: Case
@@ -64,6 +65,7 @@ class Program(NamedTuple):
     schedule: EventSchedule | None = None
     substeps: int | None = None
     known_outputs: Outputs | None = None
+    devices: int = 1
 
     def case_with(self, shared_values) -> Case:
         """Case of a batch."""
@@ -164,15 +166,13 @@ def discrete_models(program: Program, mask, models, shared_values, step_size):
 
 
 def block_program(program: Program, single: bool) -> Compiled:
-    """The program of the results of a block: that with steps in C, or `integrate_block`."""
+    """The program of a block: `native_block`, whose steps are taken in C, or `integrate_block`."""
     native = program.shapes.native and program.substeps is None and not single
-    return integrate_native_block if native else integrate_block
+    return native_block if native else integrate_block
 
 
 @compiled
-def integrate_block(
-    program: Program, devices: int, mask, models, shared_values, batched_values, step_size
-):
+def integrate_block(program: Program, mask, models, shared_values, batched_values, step_size):
     """Results of a block by name: runs of a batch vectorised, batches in sequence on each device.
 
     `models` are discrete models, or modal models, which are discretised here; None with a
@@ -181,16 +181,24 @@ def integrate_block(
     if isinstance(models, ModalModel):
         models = discrete_models(program, mask, models, shared_values, step_size)
     values = mask, models, shared_values, batched_values, step_size
-    return _on_devices(functools.partial(_compiled_results, program), devices)(*values)
+    return _on_devices(functools.partial(_compiled_results, program), program.devices)(*values)
 
 
 @compiled(**LOW_OPTIMISATION)
-def integrate_native_block(
-    program: Program, devices: int, mask, models, shared_values, batched_values, step_size
-):
-    """Results of a block by name, from modal models; steps are taken by the C library."""
-    values = mask, models, shared_values, batched_values, step_size
-    return _on_devices(functools.partial(_native_results, program), devices)(*values)
+def native_block(
+    program: Program, mask, models, shared_values, batched_values, step_size
+) -> native_peaks.NativeInputs:
+    """What the C integrator needs to know of a block, from modal models."""
+    del mask
+    shared_model, own_models = _split_shared_model(models)
+
+    def batch_inputs(own_model, shared, batched, step):
+        model = shared_model or own_model
+        grid, outputs = program.grid(model, shared, step), program.outputs(model, shared)
+        return grid, *outputs, program.loads(shared, batched)
+
+    inputs = jax.vmap(batch_inputs)(own_models, shared_values, batched_values, step_size)
+    return native_peaks.native_inputs(models, *inputs)
 
 
 def _on_devices(integrate, devices: int):
@@ -199,20 +207,6 @@ def _on_devices(integrate, devices: int):
         return integrate
     mesh, spec = Mesh(np.array(jax.local_devices()), ("device",)), PartitionSpec("device")
     return jax.shard_map(integrate, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
-
-
-def _native_results(program: Program, mask, models, shared_values, batched_values, step_size):
-    """Results of the C library, from time grids, outputs and loads of the batches."""
-    shared_model, own_models = _split_shared_model(models)
-
-    def integration_inputs(own_model, shared, batched, step):
-        model = shared_model or own_model
-        grid, outputs = program.grid(model, shared, step), program.outputs(model, shared)
-        return grid, *outputs, program.loads(shared, batched)
-
-    inputs = jax.vmap(integration_inputs)(own_models, shared_values, batched_values, step_size)
-    peaks = native_peaks.integrate_peaks(program.shapes.max_loads, mask, models, *inputs)
-    return peaks._asdict()
 
 
 def _compiled_results(program: Program, mask, discrete, shared_values, batched_values, step_size):

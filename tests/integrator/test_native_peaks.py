@@ -5,11 +5,11 @@ import dataclasses
 import json
 import pathlib
 import platform
+import re
 import shutil
 import subprocess
 import sys
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,20 +17,11 @@ import xarray
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.case import replace
 from jaxbeam.cli import main
 from jaxbeam.integrator import native_peaks
-from jaxbeam.integrator.discrete_model import discrete_model
-from jaxbeam.integrator.integrate import integrate_peaks
 from jaxbeam.integrator.propagators import PEAK_NODES
-from jaxbeam.integrator.time_grid import grid_by_step_length
-from jaxbeam.model.load_set import load_set
-from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
-from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.numerics.peak_search import interpolation_matrix, refine_peak
 from jaxbeam.runtime import native_library
-from jaxbeam.simulation.integration_plan import static_shapes
 from jaxbeam.sweeps.specification import sweep_specification
 from jaxbeam.sweeps.store import ZarrStore
 
@@ -183,48 +174,11 @@ def test_contact_is_lost_in_one_of_the_cases():
     assert np.isfinite(contact_lost_time).any()
 
 
-def peaks_of_mass(case, native, max_step=1e-3):
-    """Function of the mass (kg) of a load: peaks of the sensors of a single run."""
-    shapes = static_shapes(case)
-
-    def peaks(mass):
-        varied = replace(case, {"loads.0.mass": mass})
-        model = modal_model(varied, shapes.layout, shapes.coupled)
-        places = corrected_places(varied, model, varied.sensors)
-        grid = grid_by_step_length(varied, model, jnp.asarray(max_step), places=places)
-        outputs = sensor_rows(model, varied, varied.sensors)
-        correction = static_correction(model, varied, varied.sensors, outputs)
-        loads = load_set(varied)
-        if not native:
-            discrete = discrete_model(model, grid, None, None, outputs, correction)
-            running_peaks, _ = integrate_peaks(discrete, loads, max_loads=shapes.max_loads)
-            return running_peaks.refined_peak()[0][:, 0]
-        arguments = jnp.ones((), bool), model, grid, outputs, correction, loads
-        one_task = jax.tree.map(lambda leaf: leaf[None], arguments)
-        return native_peaks.integrate_peaks(shapes.max_loads, *one_task).peak_deflection[0, 0]
-
-    return jax.jit(peaks)
-
-
-BENT = dataclasses.replace(PLAIN, sensors=[jb.Sensor(0.2, "moment"), jb.Sensor(0.3, "velocity")])
-
-
-@pytest.mark.parametrize("case", [PLAIN, COUPLED, BENT], ids=["plain", "coupled", "moment"])
-def test_derivatives_equal_those_of_xla(case):
-    mass = jnp.asarray(0.4)
-    value, slope = jax.jvp(peaks_of_mass(case, True), (mass,), (jnp.ones(()),))
-    plain, slope_without = jax.jvp(peaks_of_mass(case, False), (mass,), (jnp.ones(()),))
-    assert_allclose(value, plain, rtol=1e-11)
-    assert_allclose(slope, slope_without, rtol=1e-9)
-    step = 1e-4
-    above, below = (peaks_of_mass(case, True)(mass + sign * step) for sign in (1, -1))
-    assert_allclose(slope, (above - below) / (2 * step), rtol=1e-6)
-
-
-def test_vmap_equals_a_loop():
-    masses = jnp.linspace(0.1, 1.0, 3)
-    batched = jax.vmap(peaks_of_mass(PLAIN, True))(masses)
-    assert_allclose(batched, jnp.stack([peaks_of_mass(PLAIN, True)(m) for m in masses]), rtol=1e-12)
+def test_arguments_are_those_of_the_c_code():
+    """In the same order, the mask before and constants after them."""
+    text = (native_library.C_FOLDER / "workspace.h").read_text()
+    names = re.search(r"enum \{\n    MASK,\n(.*?),\n    GAUSS_NODES", text, re.DOTALL).group(1)
+    assert tuple(names.lower().replace(" ", "").split(",\n")) == native_peaks.NativeInputs._fields
 
 
 def test_masked_tasks_do_not_change_the_others():
@@ -289,17 +243,21 @@ def interrupted(*_):
 
 def test_the_first_large_sweep_compiles_c(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    library = native_peaks.LIBRARY
-    assert not native_peaks.chosen_for(PLAIN, native_peaks.MIN_RUNS_TO_COMPILE - 1)
-    assert not library.library_path().exists()
+    library, many = native_peaks.LIBRARY, native_peaks.MIN_RUNS_TO_COMPILE
+    over = {"loads.0.mass": np.linspace(0.1, 0.9, many // 2), "loads.0.speed": [5.0, 7.0]}
+    case = dataclasses.replace(PLAIN, run=jb.Run(0.2))
+    assert not native_peaks.chosen_for(case, many - 1)
+    assert native_peaks.chosen_for(case, many)
     with monkeypatch.context() as patch:
         patch.setenv("CC", "false")
-        assert not native_peaks.chosen_for(PLAIN, native_peaks.MIN_RUNS_TO_COMPILE)
+        without = jb.sweep(case, over, progress=False)
     assert not library.library_path().exists()
-    assert native_peaks.chosen_for(PLAIN, native_peaks.MIN_RUNS_TO_COMPILE)
-    assert library.library_path().exists() and native_peaks.chosen_for(PLAIN, 1)
+    found = jb.sweep(case, over, progress=False)
+    assert library.library_path().exists() and native_peaks.chosen_for(case, 1)
+    assert_allclose(found.peak_deflection, without.peak_deflection, rtol=1e-11)
+    assert np.any(found.peak_deflection != without.peak_deflection)
     library.remove()
-    assert not native_peaks.chosen_for(PLAIN, native_peaks.MIN_RUNS_TO_COMPILE)
+    assert not native_peaks.chosen_for(case, many)
 
 
 def test_the_command_compiles_and_removes(monkeypatch, tmp_path, capsys):

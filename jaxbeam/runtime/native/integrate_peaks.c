@@ -4,29 +4,9 @@
  * of runs, as many as fill a vector register, are advanced through all steps of the chunk, so that
  * their states stay in the first-level cache. native_peaks.py compiles this file and calls it. */
 
-#include "steps.h"
+#include <stdlib.h>
 
-/* Size of the workspace in doubles. XLA allocates it, as an output that is not read: to allocate it
- * in every call would take long. */
-int64_t workspace_size(int64_t panels, int64_t blocks, int64_t block_size, int64_t modes,
-                       int64_t segments, int64_t terms, int64_t max_loads, int64_t loads,
-                       int64_t positions, int64_t batch_size, int64_t groups_of_vehicles,
-                       const int64_t *vehicles) {
-    Workspace w = {.panels = (int)panels,
-                   .blocks = (int)blocks,
-                   .block_size = (int)block_size,
-                   .modes = (int)modes,
-                   .segments = (int)segments,
-                   .terms = (int)terms,
-                   .max_loads = (int)max_loads,
-                   .loads = (int)loads,
-                   .positions = (int)positions,
-                   .batch_size = batch_size,
-                   .groups_of_vehicles = (int)groups_of_vehicles,
-                   .vehicles = vehicles};
-    derive_sizes(&w);
-    return (int64_t)((partition_workspace(&w, 0) + sizeof(Register)) / 8);
-}
+#include "steps.h"
 
 /* Initial state: at rest, without peaks. */
 static void reset(Workspace *w) {
@@ -138,42 +118,39 @@ static void end_slopes(Workspace *w) {
         }
 }
 
-XLA_FFI_Error *integrate_peaks(XLA_FFI_CallFrame *frame) {
-    if (answer_version_query(frame)) return NULL;
-    if (frame->args.size != ARGUMENT_COUNT || frame->rets.size != RESULT_COUNT)
-        return ffi_error(frame, "the compiled C is of another version than jaxbeam: compile it "
-                                "anew with `jaxbeam native`");
-    const int64_t *dims[ARGUMENT_COUNT];
-    for (int i = 0; i < ARGUMENT_COUNT; i++)
-        dims[i] = ((XLA_FFI_Buffer *)frame->args.args[i])->dims;
-    XLA_FFI_Buffer **results = (XLA_FFI_Buffer **)frame->rets.rets;
-    const int64_t max_loads = *(const int64_t *)((XLA_FFI_Scalar *)frame->attrs.attrs[0])->value;
-    Workspace workspace = {.panels = (int)dims[STEP_COUNTS][1],
-                           .blocks = (int)dims[STATE_MATRIX][1],
-                           .block_size = (int)dims[STATE_MATRIX][2],
-                           .modes = (int)(dims[SHAPE_SERIES][3] / dims[STATE_MATRIX][1]),
-                           .segments = (int)dims[SHAPE_SERIES][1],
-                           .terms = (int)dims[SHAPE_SERIES][2],
-                           .pieces = (int)dims[BREAKPOINTS][2],
+/* Integrate the tasks, and write their outputs, (task, run, position) or (task, run, load); 1 if
+ * there is no memory for it. */
+int integrate_peaks(int64_t max_loads, const Array *arguments, double *const *outputs) {
+    const int64_t *sizes[ARGUMENT_COUNT];
+    for (int i = 0; i < ARGUMENT_COUNT; i++) sizes[i] = arguments[i].sizes;
+    Workspace workspace = {.panels = (int)sizes[STEP_COUNTS][1],
+                           .blocks = (int)sizes[STATE_MATRIX][1],
+                           .block_size = (int)sizes[STATE_MATRIX][2],
+                           .modes = (int)(sizes[SHAPE_SERIES][3] / sizes[STATE_MATRIX][1]),
+                           .segments = (int)sizes[SHAPE_SERIES][1],
+                           .terms = (int)sizes[SHAPE_SERIES][2],
+                           .pieces = (int)sizes[BREAKPOINTS][2],
                            .max_loads = (int)max_loads,
-                           .loads = (int)dims[INERTIA][1],
-                           .positions = (int)dims[OUTPUT_ROWS][1],
-                           .influence_pieces = (int)dims[INFLUENCE_SERIES][1],
-                           .influence_terms = (int)dims[INFLUENCE_SERIES][2],
-                           .batch_size = dims[INERTIA][2],
-                           .groups_of_vehicles = (int)dims[VEHICLES][1],
-                           .vehicles = ((XLA_FFI_Buffer *)frame->args.args[VEHICLES])->data};
+                           .loads = (int)sizes[INERTIA][1],
+                           .positions = (int)sizes[OUTPUT_ROWS][1],
+                           .influence_pieces = (int)sizes[INFLUENCE_SERIES][1],
+                           .influence_terms = (int)sizes[INFLUENCE_SERIES][2],
+                           .batch_size = sizes[INERTIA][2],
+                           .groups_of_vehicles = (int)sizes[VEHICLES][1],
+                           .vehicles = arguments[VEHICLES].numbers,
+                           .outputs = outputs};
     Workspace *w = &workspace;
     derive_sizes(w);
-    for (int i = 0; i < RESULT_COUNT; i++) w->outputs[i] = results[i]->data;
-    partition_workspace(w, (uintptr_t)aligned_memory(frame, WORKSPACE));
-    const int64_t tasks = results[PEAK]->dims[0];
-    for (int64_t task = 0; task < tasks; task++) {
-        set_inputs(w, frame, task);
+    void *memory = aligned_alloc(sizeof(Register), partition_workspace(w, 0));
+    if (!memory) return 1;
+    partition_workspace(w, (uintptr_t)memory);
+    for (int64_t task = 0; task < sizes[MASK][0]; task++) {
+        set_inputs(w, arguments, task);
         if (task == 0) end_slopes(w);
         if (*(const uint8_t *)w->inputs[MASK]) integrate_task(w);
         else reset(w);
         write_results(w, task);
     }
-    return NULL;
+    free(memory);
+    return 0;
 }

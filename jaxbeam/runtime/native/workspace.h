@@ -7,12 +7,19 @@
 
 #include <math.h>
 
-#include "ffi.h"
+#include "registers.h"
 
 enum { PADDED_NODES = (NODES + PADDING - 1) / PADDING * PADDING };
 enum { STEP_FRACTIONS = NODES + 1 }; /* Gauss nodes and end of a step */
 enum { PATH_NODES = NODES + 2 };     /* Gauss nodes, start and end of a step; no more than padded */
 enum { INTERLEAVED_GROUPS = 2 };     /* groups of runs that are advanced together */
+
+/* An argument of the call: its numbers, and the sizes of its axes, 1 beyond the last. */
+enum { MAX_AXES = 4 };
+typedef struct {
+    const void *numbers;
+    int64_t sizes[MAX_AXES];
+} Array;
 
 /* Arguments of the call, with tasks as the first axis, of length one if shared: modal model, panels
  * of the time grid, trajectories, loads, outputs, constants. */
@@ -48,7 +55,7 @@ enum {
     FORCE_WEIGHTS,
     ARGUMENT_COUNT
 };
-enum { PEAK, PEAK_TIME, LOWEST_FORCE, CONTACT_LOSS_TIME, WORKSPACE, RESULT_COUNT };
+enum { PEAK, PEAK_TIME, LOWEST_FORCE, CONTACT_LOSS_TIME, RESULT_COUNT };
 
 /* Numbers of the vehicles of a load, all alike: first wheel, and wheels and states of each. */
 enum { FIRST_WHEEL, WHEELS, STATES, COUNT, VEHICLE_NUMBERS };
@@ -94,7 +101,7 @@ typedef struct {
     const int64_t *vehicles;
     ptrdiff_t batch_size;
     const double *inputs[ARGUMENT_COUNT];
-    double *outputs[RESULT_COUNT];
+    double *const *outputs;
     /* Of the task: series of mode shapes and their derivatives. */
     double *series;
     /* Of each panel: propagators, with nodes, forces or samples as the last axis. */
@@ -246,13 +253,13 @@ static void derive_sizes(Workspace *w) {
 }
 
 /* Arguments of a task. */
-static void set_inputs(Workspace *w, const XLA_FFI_CallFrame *frame, int64_t task) {
+static void set_inputs(Workspace *w, const Array *arguments, int64_t task) {
     for (int i = 0; i < ARGUMENT_COUNT; i++) {
-        const XLA_FFI_Buffer *buffer = frame->args.args[i];
+        const Array *array = arguments + i;
         int64_t bytes = i == MASK || i == LOADS_ON_BEAM ? 1 : 8;
-        for (int64_t d = 1; d < buffer->rank; d++) bytes *= buffer->dims[d];
-        int64_t away = buffer->dims[0] > 1 ? task * bytes : 0;
-        w->inputs[i] = (const double *)((const char *)buffer->data + away);
+        for (int axis = 1; axis < MAX_AXES; axis++) bytes *= array->sizes[axis];
+        int64_t away = array->sizes[0] > 1 ? task * bytes : 0;
+        w->inputs[i] = (const double *)((const char *)array->numbers + away);
     }
 }
 

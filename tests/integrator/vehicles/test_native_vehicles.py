@@ -100,13 +100,8 @@ def test_peaks_are_those_of_the_steps_in_numpy(name):
     case = case_of(name)
     addresses = numbers_of_vehicles(case)
     values = np.array([jb.addresses(case)[address] for address in addresses])
-    in_c = jax.jit(
-        lambda max_loads, model, grid, outputs, loads: native_peaks.integrate_peaks(
-            max_loads,
-            np.ones(1, bool),
-            *jax.tree.map(lambda leaf: leaf[None], (model, grid, outputs, None, loads)),
-        ),
-        static_argnums=0,
+    inputs_of_one = jax.jit(
+        lambda *known: native_peaks.native_inputs(*jax.tree.map(lambda leaf: leaf[None], known))
     )
 
     @settings(max_examples=4, phases=[Phase.generate])
@@ -117,7 +112,9 @@ def test_peaks_are_those_of_the_steps_in_numpy(name):
         max_loads, (model, grid, outputs, loads) = inputs_of_runs(case, batch)
         discrete = discrete_model(model, grid, None, None, outputs)
         expected = integrate_peaks(discrete, loads, max_loads=max_loads)[0].peaks()
-        found = jax.tree.map(lambda part: part[0], in_c(max_loads, model, grid, outputs, loads))
+        inputs = inputs_of_one(model, grid, outputs, None, loads)
+        peaks = native_peaks.integrate_peaks(max_loads, np.ones(1, bool), inputs)
+        found = jax.tree.map(lambda part: part[0], peaks)
         for part, known in zip(found[::2], expected[::2], strict=True):
             assert_allclose(part, known, rtol=1e-10, atol=1e-10)
         assert_allclose(found.contact_lost_time, expected.contact_lost_time, rtol=1e-10)
