@@ -185,13 +185,31 @@ def native_inputs(
     influence = np.zeros((1, 1)), np.zeros((1, 1, 0, linear.rows.shape[1]))
     if linear.influence is not None:
         influence = linear.influence.breaks, linear.influence.series
+    breakpoints, cubics = jax.vmap(LoadSet.cubics)(loads)
+    wheels, none = loads.wheels, np.zeros((1, 0, 1))
     return NativeInputs(
-        *(models.state_matrix, models.modes.nodes, shapes),
-        *(grids.boundaries, grids.counts, grids.lengths),
-        *(grids.loads_on_beam, grids.on_beam_intervals),
-        *(*jax.vmap(LoadSet.cubics)(loads), loads.wheels.inertia, loads.wheels.weight),
-        *_vehicle_inputs(loads.wheels),
-        *(linear.rows, bounds, *influence),
+        state_matrix=models.state_matrix,
+        shape_nodes=models.modes.nodes,
+        shape_series=shapes,
+        panel_starts=grids.boundaries,
+        step_counts=grids.counts,
+        step_lengths=grids.lengths,
+        loads_on_beam=grids.loads_on_beam,
+        on_beam_intervals=grids.on_beam_intervals,
+        breakpoints=breakpoints,
+        cubics=cubics,
+        inertia=wheels.inertia,
+        weight=wheels.weight,
+        stiffness=none if wheels.stiffness is None else wheels.stiffness,
+        damping=none if wheels.damping is None else wheels.damping,
+        vehicles=vehicle_numbers(wheels)[None],
+        vehicle_state_matrix=_vehicle_matrices(wheels, "A"),
+        vehicle_input_matrix=_vehicle_matrices(wheels, "B"),
+        vehicle_output_matrix=_vehicle_matrices(wheels, "H"),
+        output_rows=linear.rows,
+        output_bounds=bounds,
+        influence_breaks=influence[0],
+        influence_series=influence[1],
     )
 
 
@@ -233,14 +251,8 @@ def vehicle_numbers(wheels: WheelSet) -> Int[np.ndarray, "group 4"]:
     return np.array(numbers, np.int64).reshape(-1, 4)
 
 
-def _vehicle_inputs(wheels: WheelSet):
-    """Springs of the wheels, numbers of the vehicles, and their matrices, one after the other."""
-    if not wheels.vehicles:
-        none = np.zeros((1, 0, 1))
-        return none, none, np.zeros((1, 0, 4), np.int64), none, none, none
-    parts = []
-    for name in ("A", "B", "H"):
-        matrices = [getattr(group, name) for group in wheels.vehicles]
-        flat = [part.reshape(part.shape[0], -1, part.shape[-1]) for part in matrices]
-        parts.append(jnp.concatenate(flat, axis=1))
-    return wheels.stiffness, wheels.damping, vehicle_numbers(wheels)[None], *parts
+def _vehicle_matrices(wheels: WheelSet, name: str) -> Array:
+    """Numbers (task, entry, run) of the matrices of all vehicles, one after the other."""
+    matrices = [getattr(group, name) for group in wheels.vehicles]
+    flat = [part.reshape(part.shape[0], -1, part.shape[-1]) for part in matrices]
+    return jnp.concatenate(flat, axis=1) if flat else np.zeros((1, 0, 1))
