@@ -78,11 +78,11 @@ C_MACROS = {
     "TIE_TOLERANCE": TIE_ROUNDING_UNITS * sys.float_info.epsilon,
 }
 HEADERS = (
-    *("load_path", "matrices", "peak_search", "preparation", "propagators", "registers"),
+    *("contact", "load_path", "matrices", "peak_search", "preparation", "propagators", "registers"),
     *("step_matrices", "steps", "vehicle_layout", "vehicle_propagators", "vehicles", "workspace"),
 )
 LIBRARY = Library(
-    sources=("integrate_peaks.c", "preparation.c", "matrices.c"),
+    sources=("integrate_peaks.c", "contact.c", "preparation.c", "matrices.c"),
     headers=tuple(f"{name}.h" for name in HEADERS),
     macros=tuple(C_MACROS.items()),
 )

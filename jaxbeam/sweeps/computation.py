@@ -16,6 +16,7 @@ from jaxbeam.case.display.addresses import address_words
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime.dataset import labelled_dataset
+from jaxbeam.runtime.garbage import rare_collections
 from jaxbeam.simulation.integration_plan import sample_times
 from jaxbeam.simulation.result_variables import SWEEP_VARIABLES, sensor_coordinates
 from jaxbeam.sweeps import cluster, store as sweep_store
@@ -111,7 +112,7 @@ def _new_runner(specification: SweepSpecification) -> tuple[Runner | ForceRunner
     that fails the sweep does without.
     """
     if specification.uses_c():
-        with native_peaks.LIBRARY.built_meanwhile():
+        with rare_collections(), native_peaks.LIBRARY.built_meanwhile():
             runner = specification.runner(native=True)
         if native_peaks.available():
             return runner, True

@@ -184,7 +184,7 @@ def integrate_block(program: Program, mask, models, shared_values, batched_value
     return _on_devices(functools.partial(_compiled_results, program), program.devices)(*values)
 
 
-@compiled(**LOW_OPTIMISATION)
+@compiled(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)
 def native_block(
     program: Program, mask, models, shared_values, batched_values, step_size
 ) -> native_peaks.NativeInputs:

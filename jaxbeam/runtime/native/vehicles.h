@@ -9,13 +9,13 @@
 
 /* Whether a vehicle is between its entry and its exit in a step; others are at rest or do not
  * return. */
-static int vehicles_move(const Workspace *w, const Step *step) {
+int vehicles_move(const Workspace *w, const Step *step) {
     const double middle = step->start + step->length / 2;
     return w->first_vehicle_entry < middle && middle < w->last_vehicle_exit;
 }
 
 /* Times of the first entry of a wheel of a vehicle and of the last exit. */
-static void set_vehicle_times(Workspace *w) {
+void set_vehicle_times(Workspace *w) {
     w->first_vehicle_entry = INFINITY, w->last_vehicle_exit = -INFINITY;
     for (int group = 0; group < w->groups_of_vehicles; group++) {
         const int64_t *numbers = w->vehicles + group * VEHICLE_NUMBERS;
@@ -81,7 +81,7 @@ static inline ALWAYS_INLINE void add_vehicles(const Workspace *w, const Step *st
 }
 
 /* States of vehicles at the end of a step; its contact forces follow the state of the beam. */
-static void propagate_vehicles(const Workspace *w, const Step *step, Group *g) {
+void propagate_vehicles(const Workspace *w, const Step *step, Group *g) {
     const int rows = step->rows;
     const Register *z = g->vehicle_state;
     Register *next = g->next_vehicle_state, *surface = g->surface, *start = vehicles_of(w, g);
