@@ -255,4 +255,4 @@ def _vehicle_matrices(wheels: WheelSet, name: str) -> Array:
     """Numbers (task, entry, run) of the matrices of all vehicles, one after the other."""
     matrices = [getattr(group, name) for group in wheels.vehicles]
     flat = [part.reshape(part.shape[0], -1, part.shape[-1]) for part in matrices]
-    return jnp.concatenate(flat, axis=1) if flat else np.zeros((1, 0, 1))
+    return jnp.concatenate(flat, axis=1) if flat else jnp.zeros((1, 0, 1))

@@ -12,9 +12,12 @@ from jaxtyping import Bool, Float, Int
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.integrator.kinks.passages import KinkPassages, kink_passages
-from jaxbeam.model.load_set import load_set
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import Array, put, searchsorted, stop_gradient, take, xp
+
+# Entry and exit of each wheel (s), and times of all load events (s).
+LoadEvents = tuple[Float[Array, "wheel 2"], Float[Array, " event"]]
 
 
 class TimeGrid(eqx.Module):
@@ -81,15 +84,25 @@ class TimeGrid(eqx.Module):
         return take(self.cumulative_counts, panel) - take(self.counts, panel)
 
 
-def _load_events(case: Case, model: ModalModel, places, start, end):
-    """Entry and exit of each wheel (wheel, 2), and times of events between start and end, in s.
+def load_events(
+    model: ModalModel, loads: LoadSet, places: Float[Array, " place"] | None
+) -> LoadEvents:
+    """Entry and exit of each wheel (wheel, 2), and times of all load events (event,), in s.
 
-    Those of load events (event,), and of passages over kinks, each of them twice: a panel of no
-    length lies in between. Then the passages, and the index of each, -1 for one that does not
-    happen, whose times are the end.
+    These include the times at which a wheel passes one of the `places` (m).
     """
-    own, loads = model.modes.nodes[1:-1], load_set(case, model.modes.layout)
-    windows, events = loads.events(own if places is None else xp.concatenate([own, places]))
+    own = model.modes.nodes[1:-1]
+    return loads.events(own if places is None else xp.concatenate([own, places]))
+
+
+def _events_between(case: Case, model: ModalModel, places, start, end, known=None):
+    """The `load_events`, if not `known`, clipped to start and end, and passages over kinks.
+
+    Of these each time twice: a panel of no length lies in between. Then the passages, and the
+    index of each, -1 for one that does not happen, whose times are the end.
+    """
+    loads = load_set(case, model.modes.layout)
+    windows, events = known or load_events(model, loads, places)
     events, kinks = xp.clip(events, start, end), kink_passages(case, model, loads)
     if kinks is None:
         return windows, events, xp.zeros(0), None, np.zeros(0, int)
@@ -117,17 +130,21 @@ def grid_by_step_length(
     extra_steps: int | Int[Array, ""] = 0,
     places: Float[Array, " place"] | None = None,
     refinement: int = 1,
+    known_events: LoadEvents | None = None,
 ) -> TimeGrid:
     """Panels between load events, with steps of at most `max_step` (s).
 
-    With a `refinement` each of these steps is divided into so many.
+    With a `refinement` each of these steps is divided into so many. The `load_events` of these
+    places can be given, if they are known.
 
     `extra_steps` are added to each panel. An error estimate takes one: a smaller `max_step` may
     leave the number of steps of a short panel unchanged. Steps also end where a wheel passes one of
     the `places` (m).
     """
     end = case.run.duration
-    windows, events, twice, kinks, index = _load_events(case, model, places, np.zeros(()), end)
+    windows, events, twice, kinks, index = _events_between(
+        case, model, places, np.zeros(()), end, known_events
+    )
     times = xp.concatenate([xp.zeros(1), events, twice, end[None]])
     order = xp.argsort(times, stable=True)
     boundaries, positions = times[order], xp.argsort(order)
@@ -178,7 +195,7 @@ def grid_by_schedule(
     wheel passes one of the `places` (m).
     """
     times = schedule.times
-    windows, events, twice, kinks, index = _load_events(case, model, places, times[0], times[-1])
+    windows, events, twice, kinks, index = _events_between(case, model, places, times[0], times[-1])
     if schedule.control_sample is not None:
         # A step of zero length after the end: the controller acts at the last event too.
         events = xp.append(events, times[-1])

@@ -1,6 +1,7 @@
 """Runner of a sweep: its batches in blocks of equal shape, compiled once."""
 
 import contextlib
+import dataclasses
 import functools
 import os
 import threading
@@ -78,21 +79,21 @@ class Runner:
         leaves_model_unchanged = ("loads.", "run.", "controller.")
         same_model = all(name.startswith(leaves_model_unchanged) for name in self.addresses[0])
         self.same_model = same_model and self.devices == 1
+        self.shapes = StaticShapes(layout, has_coupling(case), 1, native)
+        self.known_outputs = self.models = None
+        if self.same_model:
+            limits = self._make_shared_model()
         # Compilation of the programs for one load need not wait for its entry and exit times.
         max_loads = load_set(case).wheel_count
         if max_loads > 1:
-            max_loads = max(max_concurrent_loads(times) for times in self._entry_exit_times[0])
-        self.shapes = StaticShapes(layout, has_coupling(case), max_loads, native)
+            max_loads = max(map(max_concurrent_loads, self._path_times.load_events[0]))
+        self.shapes = dataclasses.replace(self.shapes, max_loads=max_loads)
         # The C library makes its own step matrices.
         self.discretise_separately = case.controller is None and not native
-        self.known_outputs = None
-        if self.same_model:
-            limits = self._make_shared_model()
-            entries, exits = self._compile_programs()
-        else:
-            entries, exits = self._compile_programs()
+        self._compile_programs()
+        if not self.same_model:
             limits = self._make_models()
-        self._set_step_limits(entries, exits, limits)
+        self._set_step_limits(limits)
 
     def _set_block_size(self):
         """Numbers of batches per block and per trial, multiples of the number of devices."""
@@ -110,12 +111,11 @@ class Runner:
         self.block_count = -(-count // self.batches_per_block)
 
     @functools.cached_property
-    def _entry_exit_times(self) -> tuple[np.ndarray, np.ndarray]:
-        """Entry and exit times (path, wheel, 2), and longest steps of forces (path,), in s."""
-        times, steps = programs.entry_exit_times(
-            self.case, self.addresses[0], self.batches.shared_values
-        )
-        return np.asarray(times), np.asarray(steps)
+    def _path_times(self) -> programs.PathTimes:
+        """Times of all paths, with passages of the model if all share one."""
+        model = jax.tree.map(lambda leaf: leaf[0], self.models) if self.same_model else None
+        found = programs.path_times(self.case, self.addresses[0], self.batches.shared_values, model)
+        return jax.tree.map(np.asarray, found)
 
     def _model_groups(self) -> list:
         """Indices of batches whose models are made in one call."""
@@ -132,19 +132,17 @@ class Runner:
             self.known_outputs = jax.tree.map(np.asarray, program.outputs(model, values))
         return _stable_steps(np.repeat(np.asarray(limit), self.batches.run_index.shape[0]))
 
-    def _compile_programs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Compile the programs for step sizes; entry and exit times (path, load) in s."""
+    def _compile_programs(self) -> None:
+        """Compile the programs for step sizes."""
         program = self.program()
         first_values = self.batches.shared_values[self._model_groups()[0]]
         compilations = [
             self.pool.submit(compiled_program.precompile(*arguments))
             for compiled_program, arguments in self._programs_to_compile(program, first_values)
         ]
-        times, self.force_steps = self._entry_exit_times
-        entries, exits = np.moveaxis(times, 2, 0)
+        _ = self._path_times  # meanwhile, unless they are known
         for compilation in compilations:
             compilation.result()  # raises its error, if any
-        return entries, exits
 
     def _make_models(self) -> Float[np.ndarray, " path"]:
         """Make the models of all batches; longest stable steps (s), infinite without one."""
@@ -156,15 +154,17 @@ class Runner:
         self.models, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *groups)
         return _stable_steps(limits[:count])
 
-    def _set_step_limits(self, entries, exits, limits):
+    def _set_step_limits(self, limits):
         """Crossing rates (1/s), longest steps and initial steps (s) of all batches."""
+        (windows, _), force_steps = self._path_times
+        entries, exits = np.moveaxis(windows, 2, 0)
         duration = values_at(self.case, self.batches, "run.duration")
         times_on_beam = np.minimum(exits, duration[:, None]) - entries
         times_on_beam = np.where(times_on_beam > 0, times_on_beam, duration[:, None])
         crossing_time = np.min(times_on_beam, axis=1, initial=np.inf)
         crossing_time = np.where(np.isfinite(crossing_time), crossing_time, duration)
         self.crossing_rates = 1 / crossing_time
-        limits = np.minimum(limits, self.force_steps)
+        limits = np.minimum(limits, force_steps)
         self.max_steps = np.minimum(limits, duration)
         if self.schedule is not None and self.case.controller is not None:  # steps end at events
             self.max_steps = np.minimum(self.max_steps, self.schedule.lengths.max())
@@ -224,20 +224,20 @@ class Runner:
     def _programs_to_compile(self, program, shared_values):
         """Programs that step sizes need, the slowest to compile first, and template arguments."""
         indices = np.zeros(self.batches_per_block, int)
-        step_size, mask = (np.ones(self.batches_per_block), indices), indices > 0
+        stepping, mask = self._stepping(indices, np.ones(self.batches_per_block)), indices > 0
         if self.same_model:
             models = self.models
         else:
             model_template, _ = programs.modal_models.template(program, shared_values)
             models = jax.tree.map(lambda leaf: leaf[indices], model_template)
-        discretise_arguments = program, mask, models, self.batches.shared_values[indices], step_size
+        discretise_arguments = program, mask, models, self.batches.shared_values[indices], stepping
         if self.discretise_separately:
             models = programs.discrete_models.template(*discretise_arguments)
         else:
             models = self._models_without_controller(models)
         yield (
             programs.block_program(program, single=False),
-            (program, mask, models, *self._values_of(indices), step_size),
+            (program, mask, models, *self._values_of(indices), stepping),
         )
         if self.discretise_separately:
             yield programs.discrete_models, discretise_arguments
@@ -252,14 +252,14 @@ class Runner:
         mask[rows] = True
         nearest_row = np.cumsum(mask) - 1
         batch_indices, steps = batch_indices[nearest_row], steps[nearest_row]
-        step_size = steps, np.full(batch_indices.size, extra_steps)
+        stepping = self._stepping(batch_indices, steps, extra_steps)
         program, models = self.program(substeps), self._models_of(batch_indices)
         shared_values, batched_values = self._values_of(batch_indices)
         if self.discretise_separately:
-            models = programs.discrete_models(program, mask, models, shared_values, step_size)
+            models = programs.discrete_models(program, mask, models, shared_values, stepping)
         else:
             models = self._models_without_controller(models)
-        arguments = program, mask, models, shared_values, batched_values, step_size
+        arguments = program, mask, models, shared_values, batched_values, stepping
         arguments = jax.tree.map(_to_single_precision, arguments) if single else arguments
         compiled_program = programs.block_program(program, single)
         with _single_precision() if single else contextlib.nullcontext():
@@ -273,6 +273,13 @@ class Runner:
         arrays = {name: np.asarray(values) for name, values in results.items()}
         # Histories are large: a full block is not copied.
         return arrays if mask.all() else {name: values[rows] for name, values in arrays.items()}
+
+    def _stepping(self, batch_indices, steps, extra_steps: int = 0) -> programs.Stepping:
+        """Steps of batches; their load events are known if all share a model."""
+        events = None
+        if self.same_model and self.schedule is None:
+            events = jax.tree.map(lambda part: part[batch_indices], self._path_times.load_events)
+        return programs.Stepping(steps, np.full(batch_indices.size, extra_steps), events)
 
     def _models_of(self, batch_indices):
         """Models of batches; one that all share is single."""

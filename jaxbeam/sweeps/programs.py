@@ -25,7 +25,12 @@ from jaxbeam.integrator.integrate import (
     max_stable_step,
 )
 from jaxbeam.integrator.static_shapes import StaticShapes
-from jaxbeam.integrator.time_grid import grid_by_schedule, grid_by_step_length
+from jaxbeam.integrator.time_grid import (
+    LoadEvents,
+    grid_by_schedule,
+    grid_by_step_length,
+    load_events,
+)
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.sensing.corrected_rows import (
@@ -34,6 +39,7 @@ from jaxbeam.model.sensing.corrected_rows import (
     static_correction,
 )
 from jaxbeam.model.sensing.output_rows import OutputRows, sensor_rows
+from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,
     PARALLEL_COMPILATION,
@@ -47,6 +53,21 @@ MAX_KNOWN_WHEELS = 200  # of all paths; their times take as long as compiling th
 
 # Rows of what the sensors measure, and their static correction.
 Outputs = tuple[OutputRows, StaticCorrection | None]
+
+
+class Stepping(NamedTuple):
+    """Steps of a batch: the longest (s), extra steps per panel, and load events, if known."""
+
+    max_step: Array
+    extra_steps: Array
+    load_events: LoadEvents | None = None
+
+
+class PathTimes(NamedTuple):
+    """Times of paths: of load events (s), and the longest steps of forces (s)."""
+
+    load_events: LoadEvents
+    force_steps: Array
 
 
 class Program(NamedTuple):
@@ -89,18 +110,20 @@ class Program(NamedTuple):
             wheels = eqx.tree_at(_inertia, wheels, massless, is_leaf=lambda leaf: leaf is None)
         return dataclasses.replace(load_set(varied, self.shapes.layout), wheels=wheels)
 
-    def grid(self, model, shared_values, step_size):
-        """Time grid of a batch for a longest step (s) and a number of extra steps per event."""
-        varied, (max_step, extra_steps) = self.case_with(shared_values), step_size
+    def grid(self, model, shared_values, stepping: Stepping):
+        """Time grid of a batch."""
+        varied, steps = self.case_with(shared_values), (stepping.max_step, stepping.extra_steps)
         places = corrected_places(varied, model, varied.sensors)
         if self.schedule is None:
-            return grid_by_step_length(varied, model, max_step, extra_steps, places)
-        substeps = jnp.ceil(jnp.max(self.schedule.lengths) / max_step).astype(int) + extra_steps
+            known = stepping.load_events
+            return grid_by_step_length(varied, model, *steps, places, known_events=known)
+        longest = jnp.max(self.schedule.lengths)
+        substeps = jnp.ceil(longest / stepping.max_step).astype(int) + stepping.extra_steps
         return grid_by_schedule(varied, model, self.schedule, self.substeps or substeps, places)
 
-    def discretise(self, model, shared_values, step_size, policy=None):
+    def discretise(self, model, shared_values, stepping, policy=None):
         """Discrete model of a batch, with peaks of what the sensors measure."""
-        grid = self.grid(model, shared_values, step_size)
+        grid = self.grid(model, shared_values, stepping)
         return discrete_model(model, grid, None, policy, *self.outputs(model, shared_values))
 
     def outputs(self, model, shared_values) -> Outputs:
@@ -127,28 +150,32 @@ def model_and_limit(program: Program, shared_values):
     return model, max_stable_step(model, load_set(varied, program.shapes.layout))
 
 
-def entry_exit_times(case, addresses, shared_values):
-    """Entry and exit times (path, wheel, 2), and longest steps of forces (path,), in s."""
+def path_times(case, addresses, shared_values, model: ModalModel | None) -> PathTimes:
+    """Times of all paths; load events with passages of a model that all share, if it is given."""
     if shared_values.shape[0] * load_set(case).wheel_count > MAX_KNOWN_WHEELS:
-        return _compiled_entry_exit_times(case, addresses, shared_values)
-    found = [_entry_exit_times(case, addresses, values) for values in shared_values]
-    return tuple(np.stack(parts) for parts in zip(*found, strict=True))
+        return _compiled_path_times(case, addresses, shared_values, model)
+    found = [_path_times(case, addresses, values, model) for values in shared_values]
+    return jax.tree.map(lambda *parts: np.stack(parts), *found)
 
 
 @compiled_if_traced
-def _entry_exit_times(case, addresses, values):
+def _path_times(case, addresses, values, model) -> PathTimes:
     varied = replace(case, dict(zip(addresses, values, strict=True)))
-    loads = load_set(varied)
-    return loads.entry_exit_times(), longest_force_step(varied, loads)
+    loads, nowhere = load_set(varied), np.zeros(0)
+    if model is None:
+        events = loads.events(nowhere)
+    else:
+        events = load_events(model, loads, corrected_places(varied, model, varied.sensors))
+    return PathTimes(events, longest_force_step(varied, loads))
 
 
 @compiled
-def _compiled_entry_exit_times(case, addresses, shared_values):
-    return jax.vmap(lambda values: _entry_exit_times(case, addresses, values))(shared_values)
+def _compiled_path_times(case, addresses, shared_values, model) -> PathTimes:
+    return jax.vmap(lambda values: _path_times(case, addresses, values, model))(shared_values)
 
 
 @compiled(**PARALLEL_COMPILATION)
-def discrete_models(program: Program, mask, models, shared_values, step_size):
+def discrete_models(program: Program, mask, models, shared_values, stepping):
     """Discrete models of batches; a single model is shared by all and stays single."""
     shared_model, own_models = _split_shared_model(models)
 
@@ -157,10 +184,10 @@ def discrete_models(program: Program, mask, models, shared_values, step_size):
 
     if (shared_model or jax.tree.map(lambda leaf: leaf[0], own_models)).modes_per_block == 1:
         # Uncoupled modes take little arithmetic, so that calls of kernels dominate: all at once.
-        discretised = jax.vmap(discretise_one)(own_models, shared_values, step_size)
+        discretised = jax.vmap(discretise_one)(own_models, shared_values, stepping)
     else:
         discretised = _map_masked(
-            lambda values: discretise_one(*values), mask, (own_models, shared_values, step_size)
+            lambda values: discretise_one(*values), mask, (own_models, shared_values, stepping)
         )
     return _with_model(discretised, models)
 
@@ -172,21 +199,21 @@ def block_program(program: Program, single: bool) -> Compiled:
 
 
 @compiled
-def integrate_block(program: Program, mask, models, shared_values, batched_values, step_size):
+def integrate_block(program: Program, mask, models, shared_values, batched_values, stepping):
     """Results of a block by name: runs of a batch vectorised, batches in sequence on each device.
 
     `models` are discrete models, or modal models, which are discretised here; None with a
     controller, whose closed loop has a model of its own.
     """
     if isinstance(models, ModalModel):
-        models = discrete_models(program, mask, models, shared_values, step_size)
-    values = mask, models, shared_values, batched_values, step_size
+        models = discrete_models(program, mask, models, shared_values, stepping)
+    values = mask, models, shared_values, batched_values, stepping
     return _on_devices(functools.partial(_compiled_results, program), program.devices)(*values)
 
 
 @compiled(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)
 def native_block(
-    program: Program, mask, models, shared_values, batched_values, step_size
+    program: Program, mask, models, shared_values, batched_values, stepping
 ) -> native_peaks.NativeInputs:
     """What the C integrator needs to know of a block, from modal models."""
     del mask
@@ -197,7 +224,7 @@ def native_block(
         grid, outputs = program.grid(model, shared, step), program.outputs(model, shared)
         return grid, *outputs, program.loads(shared, batched)
 
-    inputs = jax.vmap(batch_inputs)(own_models, shared_values, batched_values, step_size)
+    inputs = jax.vmap(batch_inputs)(own_models, shared_values, batched_values, stepping)
     return native_peaks.native_inputs(models, *inputs)
 
 
@@ -209,13 +236,13 @@ def _on_devices(integrate, devices: int):
     return jax.shard_map(integrate, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
 
 
-def _compiled_results(program: Program, mask, discrete, shared_values, batched_values, step_size):
+def _compiled_results(program: Program, mask, discrete, shared_values, batched_values, stepping):
     """Results of the integrator in JAX."""
     if discrete is None:
         return _map_masked(
             lambda values: _closed_loop_results(program, *values),
             mask,
-            (shared_values, batched_values, step_size),
+            (shared_values, batched_values, stepping),
         )
     shared_model, own_models = _split_shared_model(discrete.model)
 
@@ -230,13 +257,13 @@ def _compiled_results(program: Program, mask, discrete, shared_values, batched_v
     )
 
 
-def _closed_loop_results(program: Program, shared_values, batched_values, step_size):
+def _closed_loop_results(program: Program, shared_values, batched_values, stepping):
     """Results of a batch with a controller."""
     varied, loads = program.case_with(shared_values), program.loads(shared_values, batched_values)
     policy = closed_loop(varied, program.shapes.layout, loads, program.schedule)
     return _results(
         program,
-        program.discretise(policy.model, shared_values, step_size, policy),
+        program.discretise(policy.model, shared_values, stepping, policy),
         varied,
         loads,
         policy,

@@ -7,6 +7,8 @@ import subprocess
 import sys
 import time
 
+import equinox as eqx
+import jax
 import numpy as np
 import pytest
 import xarray
@@ -15,6 +17,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.case import declared_checks
+from jaxbeam.case.case import replace
+from jaxbeam.integrator.time_grid import grid_by_step_length
+from jaxbeam.model.modal_model import modal_model
+from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.statics import static_peak
 from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.batches import make_batches
@@ -57,12 +63,31 @@ def test_grid_is_labelled_by_address_and_agrees_with_single_runs(grid_dataset):
 
 
 @pytest.mark.parametrize("count", [3, programs.MAX_KNOWN_WHEELS + 1])
-def test_loads_cross_in_length_over_speed(count):
+@pytest.mark.parametrize("shared_model", [True, False])
+def test_loads_cross_in_length_over_speed(count, shared_model):
     """Times of few paths are computed at once, those of many by a program."""
     speeds = np.linspace(1.0, 4.0, count)
-    times, steps = programs.entry_exit_times(CASE, ("loads.0.speed",), speeds[:, None])
-    assert_allclose(times[:, 0, 1], 0.6 / speeds, rtol=1e-13)
-    assert np.all(times[:, 0, 0] == 0) and np.all(np.isinf(steps))
+    case = dataclasses.replace(CASE, supports=[jb.Support(0.4)])
+    model = modal_model(case, mesh_layout(case), False) if shared_model else None
+    found = programs.path_times(case, ("loads.0.speed",), speeds[:, None], model)
+    windows, events = found.load_events
+    assert_allclose(windows[:, 0, 1], 0.6 / speeds, rtol=1e-13)
+    assert np.all(windows[:, 0, 0] == 0) and np.all(np.isinf(found.force_steps))
+    passages = np.any(np.isclose(events, (0.4 / speeds)[:, None], rtol=1e-12), axis=1)
+    assert passages.all() if shared_model else not passages.any()
+
+
+def test_the_time_grid_is_the_same_with_known_load_events():
+    case = dataclasses.replace(CASE, supports=[jb.Support(0.4)])
+    model, speeds = modal_model(case, mesh_layout(case), False), np.linspace(1.0, 4.0, 3)
+    events = programs.path_times(case, ("loads.0.speed",), speeds[:, None], model).load_events
+    for i, speed in enumerate(speeds):
+        varied = replace(case, {"loads.0.speed": speed})
+        found, expected = (
+            grid_by_step_length(varied, model, np.asarray(1e-2), known_events=known)
+            for known in (jax.tree.map(lambda part, i=i: part[i], events), None)
+        )
+        assert eqx.tree_equal(found, expected)
 
 
 @pytest.mark.parametrize(
