@@ -13,18 +13,13 @@ from jaxbeam.runtime.native_library import Library
 
 pytestmark = pytest.mark.skipif(native_library.find_compiler() is None, reason="no C compiler here")
 
-SOURCE = """
-#include <stddef.h>
-#include "xla/ffi/api/c_api.h"
-XLA_FFI_Error *nothing(XLA_FFI_CallFrame *frame) { return NULL; }
-"""
-LIBRARY = Library(sources=("small.c",), headers=(), macros=(("SIZE", 3),), targets=())
+LIBRARY = Library(sources=("small.c",), headers=(), macros=(("SIZE", 3),))
 
 
 @pytest.fixture(autouse=True)
 def source(tmp_path, monkeypatch):
     """Folder of the C source of a small library, and an empty cache folder."""
-    (tmp_path / "small.c").write_text(SOURCE)
+    (tmp_path / "small.c").write_text("int size(void) { return SIZE; }")
     monkeypatch.setattr(native_library, "C_FOLDER", tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     return tmp_path / "small.c"
@@ -34,10 +29,30 @@ def test_a_library_is_available_once_it_is_compiled_until_it_is_removed():
     assert not LIBRARY.available()
     path = LIBRARY.build()
     assert path == LIBRARY.library_path() and LIBRARY.available()
-    assert LIBRARY.load().nothing
+    assert LIBRARY.load().size() == 3
     assert LIBRARY.remove() == path
     assert not LIBRARY.available()
     LIBRARY.remove()
+
+
+def test_a_library_is_compiled_beside_other_work_unless_it_was_removed():
+    with LIBRARY.built_meanwhile():
+        assert not LIBRARY.available() or LIBRARY.load().size() == 3
+    assert LIBRARY.available() and not LIBRARY.can_be_built()
+    LIBRARY.remove()
+    with LIBRARY.built_meanwhile():
+        pass
+    assert not LIBRARY.available() and not LIBRARY.can_be_built()
+
+
+def test_a_compiler_that_fails_beside_other_work_changes_nothing(monkeypatch):
+    monkeypatch.setenv("CC", "false")
+    assert LIBRARY.can_be_built()
+    with LIBRARY.built_meanwhile():
+        pass
+    assert not LIBRARY.library_path().exists()
+    with pytest.raises(ZeroDivisionError), LIBRARY.built_meanwhile():
+        raise ZeroDivisionError
 
 
 def without_hmac(path, library):
