@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxbeam.case.case import Case, replace
+from jaxbeam.case.case import Case, concrete_case, replace
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule
@@ -45,7 +45,6 @@ from jaxbeam.runtime.compiling import (
     PARALLEL_COMPILATION,
     Compiled,
     compiled,
-    compiled_if_traced,
 )
 from jaxbeam.simulation.closed_loop import closed_loop
 
@@ -154,11 +153,12 @@ def path_times(case, addresses, shared_values, model: ModalModel | None) -> Path
     """Times of all paths; load events with passages of a model that all share, if it is given."""
     if shared_values.shape[0] * load_set(case).wheel_count > MAX_KNOWN_WHEELS:
         return _compiled_path_times(case, addresses, shared_values, model)
-    found = [_path_times(case, addresses, values, model) for values in shared_values]
+    known = concrete_case(case)
+    with np.errstate(all="ignore"):  # as in compiled code
+        found = [_path_times(known, addresses, values, model) for values in shared_values]
     return jax.tree.map(lambda *parts: np.stack(parts), *found)
 
 
-@compiled_if_traced
 def _path_times(case, addresses, values, model) -> PathTimes:
     varied = replace(case, dict(zip(addresses, values, strict=True)))
     loads, nowhere = load_set(varied), np.zeros(0)

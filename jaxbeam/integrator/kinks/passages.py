@@ -73,6 +73,8 @@ def kink_passages(case: Case, model: ModalModel, loads: LoadSet) -> KinkPassages
     """Passages of the wheels of a case that may have mass over all kinks; None without any."""
     wheels = np.flatnonzero(np.concatenate([np.zeros(0, bool), *map(_has_mass, case.loads)]))
     nodes = np.array(kink_nodes(case, model.modes.layout), int)
+    if not (wheels.size and (nodes.size or loads.profile is not None)):
+        return None
     positions, profile_jumps = model.modes.nodes[nodes], xp.zeros(nodes.size)
     rows = slope_jumps(model.modes.nodes, model.modes.series)[nodes - 1]
     rows = rows if model.mode_map is None else rows @ model.mode_map
@@ -81,7 +83,7 @@ def kink_passages(case: Case, model: ModalModel, loads: LoadSet) -> KinkPassages
         positions = xp.concatenate([positions, more])
         profile_jumps = xp.concatenate([profile_jumps, jumps])
         rows = xp.concatenate([rows, xp.zeros((jumps.shape[0], rows.shape[1]))])
-    if not (wheels.size and positions.shape[0]):
+    if not positions.shape[0]:
         return None
     # A wheel that stops on a kink does not pass it.
     times, rest = loads.passages(positions)[wheels], loads.rest_times()[wheels][:, None]
