@@ -36,6 +36,7 @@ from jaxbeam.cli.commands.thesis import demo, reproduce
 from jaxbeam.cli.commands.tune import tune
 from jaxbeam.cli.commands.weigh import identify_responses, weigh
 from jaxbeam.cli.options import print_message
+from jaxbeam.runtime.garbage import RARELY
 
 COMMANDS = {
     "Simulation": (new, check, describe, modes, frf, simulate, sweep),
@@ -161,5 +162,5 @@ def _relax_garbage_collection() -> None:
 
     Tracing makes millions of objects that live on; this saves about a second a command.
     """
-    gc.set_threshold(500_000, 20, 100)
+    gc.set_threshold(*RARELY)
     atexit.register(gc.freeze)

@@ -20,4 +20,5 @@ def rare_collections() -> Iterator[None]:
     try:
         yield
     finally:
-        gc.set_threshold(*former)
+        if former != RARELY:  # else another thread, or the command line, has set and restores it
+            gc.set_threshold(*former)
