@@ -110,6 +110,9 @@ def sweep_by_c_and_xla(case, over):
     [
         pytest.param(PLAIN, GRID, id="plain"),
         pytest.param(COUPLED, GRID | {"beam.flexural_rigidity": [9.0, 12.0]}, id="coupled"),
+        pytest.param(
+            PLAIN, {"loads.0.mass": [0.1, 0.5], "beam.flexural_rigidity": [9.0]}, id="one model"
+        ),
         pytest.param(STREAM, FEW, id="stream"),
         pytest.param(LONG, {"loads.0.mass": [0.5, 2.0], "sensors.1.position": [1.8]}, id="long"),
         pytest.param(LOST_CONTACT, {"loads.0.mass": [0.5, 5.0, 60.0]}, id="lost contact"),
