@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.integrator.kinks.passages import KinkPassages, kink_passages
-from jaxbeam.model.load_set import LoadSet, load_set
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import Array, put, searchsorted, stop_gradient, take, xp
 
@@ -84,25 +84,22 @@ class TimeGrid(eqx.Module):
         return take(self.cumulative_counts, panel) - take(self.counts, panel)
 
 
-def load_events(
-    model: ModalModel, loads: LoadSet, places: Float[Array, " place"] | None
-) -> LoadEvents:
-    """Entry and exit of each wheel (wheel, 2), and times of all load events (event,), in s.
-
-    These include the times at which a wheel passes one of the `places` (m).
-    """
+def event_places(
+    model: ModalModel, places: Float[Array, " place"] | None
+) -> Float[Array, " event_place"]:
+    """Places (m) at which a passing wheel is a load event: those of the model, and some more."""
     own = model.modes.nodes[1:-1]
-    return loads.events(own if places is None else xp.concatenate([own, places]))
+    return own if places is None else xp.concatenate([own, places])
 
 
 def _events_between(case: Case, model: ModalModel, places, start, end, known=None):
-    """The `load_events`, if not `known`, clipped to start and end, and passages over kinks.
+    """Events of the loads, if not `known`, clipped to start and end, and passages over kinks.
 
     Of these each time twice: a panel of no length lies in between. Then the passages, and the
     index of each, -1 for one that does not happen, whose times are the end.
     """
     loads = load_set(case, model.modes.layout)
-    windows, events = known or load_events(model, loads, places)
+    windows, events = known or loads.events(event_places(model, places))
     events, kinks = xp.clip(events, start, end), kink_passages(case, model, loads)
     if kinks is None:
         return windows, events, xp.zeros(0), None, np.zeros(0, int)
@@ -134,8 +131,8 @@ def grid_by_step_length(
 ) -> TimeGrid:
     """Panels between load events, with steps of at most `max_step` (s).
 
-    With a `refinement` each of these steps is divided into so many. The `load_events` of these
-    places can be given, if they are known.
+    With a `refinement` each of these steps is divided into so many. The events of the loads at
+    all `event_places` can be given, if they are known.
 
     `extra_steps` are added to each panel. An error estimate takes one: a smaller `max_step` may
     leave the number of steps of a short panel unchanged. Steps also end where a wheel passes one of

@@ -16,8 +16,10 @@ from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.events import sample_schedule
 from jaxbeam.integrator.static_shapes import StaticShapes, max_concurrent_loads
+from jaxbeam.integrator.time_grid import event_places
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling
+from jaxbeam.model.sensing.corrected_rows import corrected_places
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import sample_times, steps_per_interval
 from jaxbeam.sweeps import programs
@@ -113,8 +115,11 @@ class Runner:
     @functools.cached_property
     def _path_times(self) -> programs.PathTimes:
         """Times of all paths, with passages of the model if all share one."""
-        model = jax.tree.map(lambda leaf: leaf[0], self.models) if self.same_model else None
-        found = programs.path_times(self.case, self.addresses[0], self.batches.shared_values, model)
+        case, places = concrete_case(self.case), np.zeros(0)
+        if self.same_model:
+            model = jax.tree.map(lambda leaf: leaf[0], self.models)
+            places = event_places(model, corrected_places(case, model, case.sensors))
+        found = programs.path_times(case, self.addresses[0], self.batches.shared_values, places)
         return jax.tree.map(np.asarray, found)
 
     def _model_groups(self) -> list:

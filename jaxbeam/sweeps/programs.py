@@ -29,7 +29,6 @@ from jaxbeam.integrator.time_grid import (
     LoadEvents,
     grid_by_schedule,
     grid_by_step_length,
-    load_events,
 )
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
@@ -149,29 +148,25 @@ def model_and_limit(program: Program, shared_values):
     return model, max_stable_step(model, load_set(varied, program.shapes.layout))
 
 
-def path_times(case, addresses, shared_values, model: ModalModel | None) -> PathTimes:
-    """Times of all paths; load events with passages of a model that all share, if it is given."""
+def path_times(case, addresses, shared_values, places) -> PathTimes:
+    """Times of all paths, those at which wheels pass some places (m) included."""
     if shared_values.shape[0] * load_set(case).wheel_count > MAX_KNOWN_WHEELS:
-        return _compiled_path_times(case, addresses, shared_values, model)
+        return _compiled_path_times(case, addresses, shared_values, places)
     known = concrete_case(case)
     with np.errstate(all="ignore"):  # as in compiled code
-        found = [_path_times(known, addresses, values, model) for values in shared_values]
+        found = [_path_times(known, addresses, values, places) for values in shared_values]
     return jax.tree.map(lambda *parts: np.stack(parts), *found)
 
 
-def _path_times(case, addresses, values, model) -> PathTimes:
+def _path_times(case, addresses, values, places) -> PathTimes:
     varied = replace(case, dict(zip(addresses, values, strict=True)))
-    loads, nowhere = load_set(varied), np.zeros(0)
-    if model is None:
-        events = loads.events(nowhere)
-    else:
-        events = load_events(model, loads, corrected_places(varied, model, varied.sensors))
-    return PathTimes(events, longest_force_step(varied, loads))
+    loads = load_set(varied)
+    return PathTimes(loads.events(places), longest_force_step(varied, loads))
 
 
 @compiled
-def _compiled_path_times(case, addresses, shared_values, model) -> PathTimes:
-    return jax.vmap(lambda values: _path_times(case, addresses, values, model))(shared_values)
+def _compiled_path_times(case, addresses, shared_values, places) -> PathTimes:
+    return jax.vmap(lambda values: _path_times(case, addresses, values, places))(shared_values)
 
 
 @compiled(**PARALLEL_COMPILATION)

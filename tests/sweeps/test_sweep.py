@@ -18,7 +18,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxbeam as jb
 from jaxbeam.case import declared_checks
 from jaxbeam.case.case import replace
-from jaxbeam.integrator.time_grid import grid_by_step_length
+from jaxbeam.integrator.time_grid import event_places, grid_by_step_length
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.statics import static_peak
@@ -68,8 +68,9 @@ def test_loads_cross_in_length_over_speed(count, shared_model):
     """Times of few paths are computed at once, those of many by a program."""
     speeds = np.linspace(1.0, 4.0, count)
     case = dataclasses.replace(CASE, supports=[jb.Support(0.4)])
-    model = modal_model(case, mesh_layout(case), False) if shared_model else None
-    found = programs.path_times(case, ("loads.0.speed",), speeds[:, None], model)
+    model = modal_model(case, mesh_layout(case), False)
+    places = event_places(model, None) if shared_model else np.zeros(0)
+    found = programs.path_times(case, ("loads.0.speed",), speeds[:, None], places)
     windows, events = found.load_events
     assert_allclose(windows[:, 0, 1], 0.6 / speeds, rtol=1e-13)
     assert np.all(windows[:, 0, 0] == 0) and np.all(np.isinf(found.force_steps))
@@ -80,7 +81,8 @@ def test_loads_cross_in_length_over_speed(count, shared_model):
 def test_the_time_grid_is_the_same_with_known_load_events():
     case = dataclasses.replace(CASE, supports=[jb.Support(0.4)])
     model, speeds = modal_model(case, mesh_layout(case), False), np.linspace(1.0, 4.0, 3)
-    events = programs.path_times(case, ("loads.0.speed",), speeds[:, None], model).load_events
+    places = event_places(model, None)
+    events = programs.path_times(case, ("loads.0.speed",), speeds[:, None], places).load_events
     for i, speed in enumerate(speeds):
         varied = replace(case, {"loads.0.speed": speed})
         found, expected = (
