@@ -11,10 +11,9 @@ the results, and rules of derivatives that no sweep needs; and compile after the
 
 import ctypes
 import sys
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -39,7 +38,7 @@ from jaxbeam.integrator.propagators import (
 from jaxbeam.integrator.step_matrices import CHUNK_STEPS
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.layout import is_uniform
-from jaxbeam.model.load_set import LoadSet, WheelSet
+from jaxbeam.model.load_set import WheelSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.corrected_rows import StaticCorrection
 from jaxbeam.model.sensing.linear_outputs import linear_outputs
@@ -54,7 +53,7 @@ from jaxbeam.numerics.peak_search import (
     interpolation_matrix,
     newton_step_limit,
 )
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.native_library import Library
 
 MIN_RUNS_TO_COMPILE = 1000  # smaller sweeps do not wait for a compiler
@@ -130,8 +129,9 @@ def on_cpu() -> bool:
 class NativeInputs(NamedTuple):
     """Arguments of the C integrator after the mask, in the order of `workspace.h`.
 
-    Their first axis are the tasks, of length one where all share them. None stands for an array
-    without numbers: what a program returns takes 20 microseconds each.
+    Their first axis are the tasks, of length one where all share them. Tasks are batches of runs
+    without commands. None stands for an array without numbers: what a program returns takes 20
+    microseconds each.
     """
 
     state_matrix: Float[Array, "task block state state"]
@@ -148,7 +148,7 @@ class NativeInputs(NamedTuple):
     weight: Float[Array, "task load run"]
     stiffness: Float[Array, "task load run"] | None
     damping: Float[Array, "task load run"] | None
-    vehicles: Int[Array, "1 group 4"] | None
+    vehicles: Int[Array, "task group 4"] | None
     vehicle_state_matrix: Float[Array, "task entry run"] | None
     vehicle_input_matrix: Float[Array, "task entry run"] | None
     vehicle_output_matrix: Float[Array, "task entry run"] | None
@@ -164,54 +164,54 @@ class _Argument(ctypes.Structure):
     _fields_ = (("numbers", ctypes.c_void_p), ("sizes", ctypes.c_int64 * 4))
 
 
-def native_inputs(
-    models: ModalModel,
-    grids: TimeGrid,
-    outputs: OutputRows,
-    correction: StaticCorrection | None,
-    loads: LoadSet,
-) -> NativeInputs:
-    """What the C integrator needs to know of tasks, each a batch of runs without commands.
-
-    Arrays of all arguments have tasks as their first axis, of length one where models are shared.
-    Peaks are to be those of the `outputs` with their static `correction`, if it is given. Grids are
-    of one step length a panel (`grid_by_step_length`).
-    """
-    shapes = models.modes.series
-    if models.mode_map is not None:
-        shapes = shapes @ models.mode_map[:, None]
-    shared = None if models.state_matrix.shape[0] == 1 else 0
-    own = jax.tree.map(lambda leaf: leaf[0], models) if shared is None else models
-    linear = jax.vmap(linear_outputs, (shared, 0, 0))(own, outputs, correction)
-    corrected = None if correction is None else correction.rows
-    bounds = jax.vmap(bounds_by_energy, (shared, 0, 0))(own, outputs, corrected)
+def model_inputs(
+    model: ModalModel, outputs: OutputRows, correction: StaticCorrection | None
+) -> dict[str, Any]:
+    """Those of the `NativeInputs` that a model determines, and outputs with their correction."""
+    series = model.modes.series
+    linear = linear_outputs(model, outputs, correction)
     influence = linear.influence
-    breakpoints, cubics = jax.vmap(LoadSet.cubics)(loads)
-    wheels = loads.wheels
-    return NativeInputs(
-        state_matrix=models.state_matrix,
-        shape_nodes=models.modes.nodes,
-        shape_series=shapes,
-        panel_starts=grids.boundaries,
-        step_counts=grids.counts,
-        step_lengths=grids.lengths,
-        loads_on_beam=grids.loads_on_beam,
-        on_beam_intervals=grids.on_beam_intervals,
-        breakpoints=breakpoints,
-        cubics=cubics,
-        inertia=wheels.inertia,
-        weight=wheels.weight,
-        stiffness=wheels.stiffness,
-        damping=wheels.damping,
-        vehicles=vehicle_numbers(wheels)[None] if wheels.vehicles else None,
-        vehicle_state_matrix=_vehicle_matrices(wheels, "A"),
-        vehicle_input_matrix=_vehicle_matrices(wheels, "B"),
-        vehicle_output_matrix=_vehicle_matrices(wheels, "H"),
-        output_rows=linear.rows,
-        output_bounds=bounds,
-        influence_breaks=None if influence is None else influence.breaks,
-        influence_series=None if influence is None else influence.series,
-    )
+    return {
+        "state_matrix": model.state_matrix,
+        "shape_nodes": model.modes.nodes,
+        "shape_series": series if model.mode_map is None else series @ model.mode_map,
+        "output_rows": linear.rows,
+        "output_bounds": bounds_by_energy(
+            model, outputs, None if correction is None else correction.rows
+        ),
+        "influence_breaks": None if influence is None else influence.breaks,
+        "influence_series": None if influence is None else influence.series,
+    }
+
+
+def batch_inputs(
+    grid: TimeGrid,
+    paths: tuple[Float[Array, "wheel piece"], Float[Array, "wheel piece 4"]],
+    wheels: WheelSet,
+) -> dict[str, Any]:
+    """Those of the `NativeInputs` that the grid and the loads of a batch of runs determine.
+
+    The grid is of one step length a panel (`grid_by_step_length`), the paths are the cubics of the
+    `LoadSet`.
+    """
+    breakpoints, cubics = paths
+    return {
+        "panel_starts": grid.boundaries,
+        "step_counts": grid.counts,
+        "step_lengths": grid.lengths,
+        "loads_on_beam": grid.loads_on_beam,
+        "on_beam_intervals": grid.on_beam_intervals,
+        "breakpoints": breakpoints,
+        "cubics": cubics,
+        "inertia": wheels.inertia,
+        "weight": wheels.weight,
+        "stiffness": wheels.stiffness,
+        "damping": wheels.damping,
+        "vehicles": vehicle_numbers(wheels) if wheels.vehicles else None,
+        "vehicle_state_matrix": _vehicle_matrices(wheels, "A"),
+        "vehicle_input_matrix": _vehicle_matrices(wheels, "B"),
+        "vehicle_output_matrix": _vehicle_matrices(wheels, "H"),
+    }
 
 
 def integrate_peaks(max_loads: int, mask: Bool[np.ndarray, " task"], inputs: NativeInputs) -> Peaks:
@@ -253,8 +253,8 @@ def vehicle_numbers(wheels: WheelSet) -> Int[np.ndarray, "group 4"]:
     return np.array(numbers, np.int64).reshape(-1, 4)
 
 
-def _vehicle_matrices(wheels: WheelSet, name: str) -> Array | None:
-    """Numbers (task, entry, run) of the matrices of all vehicles, one after the other, if any."""
+def _vehicle_matrices(wheels: WheelSet, name: str) -> Float[Array, "entry run"] | None:
+    """Numbers of the matrices of all vehicles, one after the other, if there are any."""
     matrices = [getattr(group, name) for group in wheels.vehicles]
-    flat = [part.reshape(part.shape[0], -1, part.shape[-1]) for part in matrices]
-    return jnp.concatenate(flat, axis=1) if flat else None
+    flat = [part.reshape(-1, part.shape[-1]) for part in matrices]
+    return xp.concatenate(flat) if flat else None

@@ -98,8 +98,11 @@ def _events_between(case: Case, model: ModalModel, places, start, end, known=Non
     Of these each time twice: a panel of no length lies in between. Then the passages, and the
     index of each, -1 for one that does not happen, whose times are the end.
     """
-    loads = load_set(case, model.modes.layout)
-    windows, events = known or loads.events(event_places(model, places))
+    loads = None
+    if known is None:
+        loads = load_set(case, model.modes.layout)
+        known = loads.events(event_places(model, places))
+    windows, events = known
     events, kinks = xp.clip(events, start, end), kink_passages(case, model, loads)
     if kinks is None:
         return windows, events, xp.zeros(0), None, np.zeros(0, int)

@@ -16,7 +16,7 @@ from jaxbeam.case.loads.vehicle_model import VehicleModel
 from jaxbeam.case.trajectory import AbstractTrajectory
 from jaxbeam.model.layout import Layout
 from jaxbeam.model.settlement import surface
-from jaxbeam.runtime.arrays import Array, add_at, is_jax, xp
+from jaxbeam.runtime.arrays import Array, add_at, is_jax, is_known, xp
 from jaxbeam.runtime.module import Module
 
 
@@ -95,6 +95,11 @@ class WheelSet(Module):
     damping: Float[Array, "wheel batch"] | None = None
     vehicles: tuple[VehicleGroup, ...] = ()
     histories: dict[int, ForceHistory] = eqx.field(default_factory=dict)
+
+    @property
+    def massless(self) -> bool:
+        """Whether all wheels are known to have no inertia or springs: their forces are weights."""
+        return not self.vehicles and is_known(self.inertia) and not np.any(self.inertia)
 
     def scaled(self, factor: Float[Array, ""]) -> "WheelSet":
         """Wheels and vehicles of similar loads, with all masses, springs and dampers in proportion.
@@ -223,8 +228,7 @@ class LoadSet(Module):
     @property
     def massless(self) -> bool:
         """Whether all wheels are known to have no inertia or springs: their forces are weights."""
-        inertia = self.wheels.inertia
-        return not self.wheels.vehicles and not is_jax(inertia) and not np.any(inertia)
+        return self.wheels.massless
 
     def entry_exit_times(self) -> Float[Array, "wheel 2"]:
         """Times (s) at which wheels enter and leave the beam; `NEVER` for what does not happen."""
@@ -290,8 +294,13 @@ def load_set(case: Case, layout: Layout | None = None) -> LoadSet:
     )
 
 
+def wheel_set(case: Case) -> WheelSet:
+    """Wheels of the loads of a case, as a batch of one run."""
+    return _wheels(case.loads, [load.vehicle(case.run.gravity) for load in case.loads])
+
+
 def _wheels(loads: Sequence[AbstractLoad], vehicles: Sequence[VehicleModel]) -> WheelSet:
-    """Numbers of the wheels of loads, as a batch of one run."""
+    """The same of loads whose vehicles are known."""
     counts = [load.spacings().shape[0] for load in loads]
 
     def of_all_wheels(name):

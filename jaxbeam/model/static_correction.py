@@ -73,11 +73,12 @@ def _residual_flexibility(case: Case, x, load_positions, derivative: int, layout
     """The same of a case and positions that are known to be valid."""
     x, load_positions = xp.asarray(x, float), xp.asarray(load_positions, float)
     exact = unchecked_influence_line(case, layout, x, load_positions, derivative)
-    return exact - _modal_influence_line(case, layout, x, load_positions, derivative)
+    return exact - modal_influence_line(case, layout, x, load_positions, derivative)
 
 
 @compiled_if_traced
-def _modal_influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
+def modal_influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
+    """The part of the modes in `unchecked_influence_line`."""
     model = modal_model(case, layout)
     load_shapes = model.shapes(load_positions.reshape(-1), (0,))[0]
     amplitudes = solve(model.stiffness(), -load_shapes.T)

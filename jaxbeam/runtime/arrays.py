@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbeam.runtime import lapack
+from jaxbeam.runtime import lapack, vectorised
+from jaxbeam.runtime.vectorised import VectorisedArray
 
 _KNOWN = {np.ndarray, np.float64, np.int64, np.bool_, float, int, bool, str, type(None), slice}
 MAX_TRIANGLE_ROWS = 64  # of triangular systems that are solved as general ones
@@ -28,6 +29,11 @@ def is_jax(value: Any) -> bool:
     if isinstance(value, list | tuple):
         return any(map(is_jax, value))
     return isinstance(value, jax.Array)
+
+
+def is_known(value: Any) -> bool:
+    """Whether an array is one of NumPy, with the numbers of one case."""
+    return not is_jax(value) and not isinstance(value, VectorisedArray)
 
 
 def any_jax(*trees: Any) -> bool:
@@ -66,6 +72,20 @@ def _einsum(subscripts: str, *operands: np.ndarray) -> np.ndarray | np.generic:
     return product.transpose([labels.index(label) for label in output])
 
 
+def _asarray(value: Any, dtype: Any = None) -> Any:
+    """`numpy.asarray`, which is outside of the protocols of NumPy."""
+    if isinstance(value, VectorisedArray):
+        return value if dtype is None else value.astype(dtype)
+    return np.asarray(value, dtype)
+
+
+def _array(value: Any, *args: Any, **kwargs: Any) -> Any:
+    """`numpy.array`, of vectorised numbers too."""
+    if isinstance(value, list) and any(isinstance(part, VectorisedArray) for part in value):
+        return np.stack(value)
+    return np.array(value, *args, **kwargs)
+
+
 class _Namespace:
     """Functions of two libraries under one name; see the module."""
 
@@ -75,7 +95,7 @@ class _Namespace:
     def __getattr__(self, name):
         known = getattr(self._known, name)
         traced: Any = lapack if name == "linalg" else getattr(self._traced, name)
-        known = _einsum if name == "einsum" else known
+        known = {"einsum": _einsum, "array": _array, "asarray": _asarray}.get(name, known)
         if name in ("linalg", "fft"):
             attribute: Any = _Namespace(known, traced)
         elif isinstance(known, type) or not callable(known):
@@ -105,7 +125,7 @@ else:
 
     class _OfEitherLibrary(type):
         def __instancecheck__(cls, value) -> bool:
-            return isinstance(value, (jax.Array, np.ndarray, np.generic))
+            return isinstance(value, (jax.Array, np.ndarray, np.generic, VectorisedArray))
 
     class Array(metaclass=_OfEitherLibrary):
         """An array of JAX or NumPy. One class, as a union of three takes jaxtyping longer."""
@@ -125,6 +145,8 @@ def set_at(array, index, value) -> Any:
     """Copy of an array with the entries at an index replaced."""
     if is_jax(array) or is_jax(index) or is_jax(value):
         return jnp.asarray(array, jnp.result_type(array, value)).at[index].set(value)
+    if isinstance(array, VectorisedArray) or isinstance(value, VectorisedArray):
+        return vectorised.set_at(array, index, value)
     array = np.array(array, np.result_type(array, value))
     array[index] = value
     return array
@@ -248,11 +270,13 @@ def fori_loop(start: int, end: int, step: Callable, carry) -> Any:
 
 
 def vmap(function: Callable, in_axes: Any = 0, out_axes: int = 0) -> Callable:
-    """`jax.vmap`; a loop for known arguments, so for few elements."""
+    """`jax.vmap`; a loop for known arguments, so for few elements; see also `vectorised`."""
 
     def mapped(*args):
         if any_jax(args):
             return jax.vmap(function, in_axes, out_axes)(*args)
+        if any(isinstance(leaf, VectorisedArray) for leaf in jax.tree.leaves(args)):
+            return vectorised.vectorised(function, out_axes)(*args)
         axes = in_axes if isinstance(in_axes, tuple) else (in_axes,) * len(args)
         pairs = zip(args, axes, strict=True)
         leaves = [(leaf, axis) for arg, axis in pairs for leaf in jax.tree.leaves(arg)]

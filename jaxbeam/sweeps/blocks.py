@@ -20,10 +20,12 @@ from jaxbeam.integrator.time_grid import event_places
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.model.sensing.corrected_rows import corrected_places
+from jaxbeam.runtime.vectorised import NotVectorisedError
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import sample_times, steps_per_interval
 from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.batches import Batches, common_layout, swept_masses, values_at
+from jaxbeam.sweeps.known_inputs import KnownInputs
 from jaxbeam.sweeps.step_size import (
     choose_step_sizes,
     initial_share,
@@ -88,11 +90,13 @@ class Runner:
         # Compilation of the programs for one load need not wait for its entry and exit times.
         max_loads = load_set(case).wheel_count
         if max_loads > 1:
-            max_loads = max(map(max_concurrent_loads, self._path_times.load_events[0]))
+            max_loads = max(map(max_concurrent_loads, self._paths.load_events[0]))
         self.shapes = dataclasses.replace(self.shapes, max_loads=max_loads)
         # The C library makes its own step matrices.
         self.discretise_separately = case.controller is None and not native
-        self._compile_programs()
+        self.known_inputs = self._known_inputs() if native and self.same_model else None
+        if self.known_inputs is None:
+            self._compile_programs()
         if not self.same_model:
             limits = self._make_models()
         self._set_step_limits(limits)
@@ -113,13 +117,13 @@ class Runner:
         self.block_count = -(-count // self.batches_per_block)
 
     @functools.cached_property
-    def _path_times(self) -> programs.PathTimes:
-        """Times of all paths, with passages of the model if all share one."""
+    def _paths(self) -> programs.Paths:
+        """Paths of all batches, with passages of the model if all share one."""
         case, places = concrete_case(self.case), np.zeros(0)
         if self.same_model:
             model = jax.tree.map(lambda leaf: leaf[0], self.models)
             places = event_places(model, corrected_places(case, model, case.sensors))
-        found = programs.path_times(case, self.addresses[0], self.batches.shared_values, places)
+        found = programs.known_paths(case, self.addresses[0], self.batches.shared_values, places)
         return jax.tree.map(np.asarray, found)
 
     def _model_groups(self) -> list:
@@ -137,6 +141,17 @@ class Runner:
             self.known_outputs = jax.tree.map(np.asarray, program.outputs(model, values))
         return _stable_steps(np.repeat(np.asarray(limit), self.batches.run_index.shape[0]))
 
+    def _known_inputs(self) -> KnownInputs | None:
+        """What the C integrator needs to know, if all batches share a model; else None."""
+        program = self.program()._replace(case=concrete_case(self.case))
+        model = jax.tree.map(lambda leaf: leaf[0], self.models)
+        known, one = KnownInputs(program, model, self._paths, self.batches), np.zeros(1, int)
+        try:
+            known.of_batches(one, self._stepping(one, np.ones(1)))
+        except NotVectorisedError:
+            return None
+        return known
+
     def _compile_programs(self) -> None:
         """Compile the programs for step sizes."""
         program = self.program()
@@ -145,7 +160,7 @@ class Runner:
             self.pool.submit(compiled_program.precompile(*arguments))
             for compiled_program, arguments in self._programs_to_compile(program, first_values)
         ]
-        _ = self._path_times  # meanwhile, unless they are known
+        _ = self._paths  # meanwhile, unless they are known
         for compilation in compilations:
             compilation.result()  # raises its error, if any
 
@@ -161,7 +176,7 @@ class Runner:
 
     def _set_step_limits(self, limits):
         """Crossing rates (1/s), longest steps and initial steps (s) of all batches."""
-        (windows, _), force_steps = self._path_times
+        (windows, _), force_steps, _ = self._paths
         entries, exits = np.moveaxis(windows, 2, 0)
         duration = values_at(self.case, self.batches, "run.duration")
         times_on_beam = np.minimum(exits, duration[:, None]) - entries
@@ -251,6 +266,11 @@ class Runner:
 
     def _integrate(self, batch_indices, steps, substeps, single, extra_steps=0):
         """Results of at most a block of batches by name."""
+        if self.known_inputs is not None:
+            stepping = self._stepping(batch_indices, steps, extra_steps)
+            inputs = self.known_inputs.of_batches(batch_indices, stepping)
+            mask = np.ones(batch_indices.size, bool)
+            return native_peaks.integrate_peaks(self.shapes.max_loads, mask, inputs)._asdict()
         # Fewer batches are spread over the block, so that each device has its part.
         rows = np.arange(batch_indices.size) * self.batches_per_block // batch_indices.size
         mask = np.zeros(self.batches_per_block, bool)
@@ -283,7 +303,7 @@ class Runner:
         """Steps of batches; their load events are known if all share a model."""
         events = None
         if self.same_model and self.schedule is None:
-            events = jax.tree.map(lambda part: part[batch_indices], self._path_times.load_events)
+            events = jax.tree.map(lambda part: part[batch_indices], self._paths.load_events)
         return programs.Stepping(steps, np.full(batch_indices.size, extra_steps), events)
 
     def _models_of(self, batch_indices):

@@ -19,12 +19,13 @@ from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.garbage import rare_collections
 from jaxbeam.simulation.integration_plan import sample_times
 from jaxbeam.simulation.result_variables import SWEEP_VARIABLES, sensor_coordinates
-from jaxbeam.sweeps import cluster, store as sweep_store
+from jaxbeam.sweeps import cluster
 from jaxbeam.sweeps.batches import Batches
-from jaxbeam.sweeps.block_store import BlockStore, MemoryStore
 from jaxbeam.sweeps.blocks import Runner
 from jaxbeam.sweeps.force_runner import ForceRunner
 from jaxbeam.sweeps.specification import SweepSpecification
+from jaxbeam.sweeps.stores import store as sweep_store
+from jaxbeam.sweeps.stores.block_store import BlockStore, MemoryStore
 from jaxbeam.sweeps.truncation import WorstRun, estimated_errors, is_corrected
 
 if TYPE_CHECKING:

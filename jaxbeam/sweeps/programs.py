@@ -30,7 +30,7 @@ from jaxbeam.integrator.time_grid import (
     grid_by_schedule,
     grid_by_step_length,
 )
-from jaxbeam.model.load_set import LoadSet, load_set
+from jaxbeam.model.load_set import LoadSet, WheelSet, load_set, wheel_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.sensing.corrected_rows import (
     StaticCorrection,
@@ -38,16 +38,15 @@ from jaxbeam.model.sensing.corrected_rows import (
     static_correction,
 )
 from jaxbeam.model.sensing.output_rows import OutputRows, sensor_rows
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, vmap
 from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,
     PARALLEL_COMPILATION,
     Compiled,
     compiled,
 )
+from jaxbeam.runtime.vectorised import NotVectorisedError, vectorised
 from jaxbeam.simulation.closed_loop import closed_loop
-
-MAX_KNOWN_WHEELS = 200  # of all paths; their times take as long as compiling the program for more
 
 # Rows of what the sensors measure, and their static correction.
 Outputs = tuple[OutputRows, StaticCorrection | None]
@@ -61,11 +60,12 @@ class Stepping(NamedTuple):
     load_events: LoadEvents | None = None
 
 
-class PathTimes(NamedTuple):
-    """Times of paths: of load events (s), and the longest steps of forces (s)."""
+class Paths(NamedTuple):
+    """Numbers of paths: times of load events (s), longest steps of forces (s), cubics of wheels."""
 
     load_events: LoadEvents
     force_steps: Array
+    cubics: tuple[Array, Array]
 
 
 class Program(NamedTuple):
@@ -90,31 +90,37 @@ class Program(NamedTuple):
         """Case of a batch."""
         return replace(self.case, dict(zip(self.shared_addresses, shared_values, strict=True)))
 
-    def loads(self, shared_values, batched_values) -> LoadSet:
-        """Loads of a batch, in all its runs."""
+    def wheels(self, shared_values, batched_values) -> WheelSet:
+        """Wheels of the loads of a batch, in all its runs."""
         varied = self.case_with(shared_values)
 
         def wheels_of_run(values):
             pairs = zip(self.batched_addresses, values, strict=True)
-            loads = load_set(replace(varied, dict(pairs)), self.shapes.layout)
-            wheels = loads.wheels
-            if loads.massless:  # known to be, which `vmap` would hide: no equations of contact
+            wheels = wheel_set(replace(varied, dict(pairs)))
+            if wheels.massless:  # known to be, which `vmap` would hide: no equations of contact
                 wheels = eqx.tree_at(_inertia, wheels, None)
             return jax.tree.map(lambda part: part[..., 0], wheels)
 
-        wheels = jax.vmap(wheels_of_run, out_axes=-1)(batched_values)
+        wheels = vmap(wheels_of_run, out_axes=-1)(batched_values)
         if wheels.inertia is None:
             massless = np.zeros(wheels.weight.shape)
             wheels = eqx.tree_at(_inertia, wheels, massless, is_leaf=lambda leaf: leaf is None)
-        return dataclasses.replace(load_set(varied, self.shapes.layout), wheels=wheels)
+        return wheels
+
+    def loads(self, shared_values, batched_values) -> LoadSet:
+        """Loads of a batch, in all its runs."""
+        loads = load_set(self.case_with(shared_values), self.shapes.layout)
+        return dataclasses.replace(loads, wheels=self.wheels(shared_values, batched_values))
 
     def grid(self, model, shared_values, stepping: Stepping):
         """Time grid of a batch."""
         varied, steps = self.case_with(shared_values), (stepping.max_step, stepping.extra_steps)
+        known = stepping.load_events
+        if known is not None:
+            return grid_by_step_length(varied, model, *steps, known_events=known)
         places = corrected_places(varied, model, varied.sensors)
         if self.schedule is None:
-            known = stepping.load_events
-            return grid_by_step_length(varied, model, *steps, places, known_events=known)
+            return grid_by_step_length(varied, model, *steps, places)
         longest = jnp.max(self.schedule.lengths)
         substeps = jnp.ceil(longest / stepping.max_step).astype(int) + stepping.extra_steps
         return grid_by_schedule(varied, model, self.schedule, self.substeps or substeps, places)
@@ -148,25 +154,28 @@ def model_and_limit(program: Program, shared_values):
     return model, max_stable_step(model, load_set(varied, program.shapes.layout))
 
 
-def path_times(case, addresses, shared_values, places) -> PathTimes:
-    """Times of all paths, those at which wheels pass some places (m) included."""
-    if shared_values.shape[0] * load_set(case).wheel_count > MAX_KNOWN_WHEELS:
-        return _compiled_path_times(case, addresses, shared_values, places)
+def known_paths(case, addresses, shared_values, places) -> Paths:
+    """Paths of all batches, with the times at which wheels pass some places (m).
+
+    Compiled only where they cannot be vectorised, as with values of tables of positions.
+    """
     known = concrete_case(case)
-    with np.errstate(all="ignore"):  # as in compiled code
-        found = [_path_times(known, addresses, values, places) for values in shared_values]
-    return jax.tree.map(lambda *parts: np.stack(parts), *found)
+    try:
+        with np.errstate(all="ignore"):  # as in compiled code
+            return vectorised(lambda values: _path(known, addresses, values, places))(shared_values)
+    except NotVectorisedError:
+        return _compiled_paths(case, addresses, shared_values, places)
 
 
-def _path_times(case, addresses, values, places) -> PathTimes:
+def _path(case, addresses, values, places) -> Paths:
     varied = replace(case, dict(zip(addresses, values, strict=True)))
     loads = load_set(varied)
-    return PathTimes(loads.events(places), longest_force_step(varied, loads))
+    return Paths(loads.events(places), longest_force_step(varied, loads), loads.cubics())
 
 
 @compiled
-def _compiled_path_times(case, addresses, shared_values, places) -> PathTimes:
-    return jax.vmap(lambda values: _path_times(case, addresses, values, places))(shared_values)
+def _compiled_paths(case, addresses, shared_values, places) -> Paths:
+    return jax.vmap(lambda values: _path(case, addresses, values, places))(shared_values)
 
 
 @compiled(**PARALLEL_COMPILATION)
@@ -214,13 +223,14 @@ def native_block(
     del mask
     shared_model, own_models = _split_shared_model(models)
 
-    def batch_inputs(own_model, shared, batched, step):
+    def inputs_of_batch(own_model, shared, batched, step):
         model = shared_model or own_model
-        grid, outputs = program.grid(model, shared, step), program.outputs(model, shared)
-        return grid, *outputs, program.loads(shared, batched)
+        of_model = native_peaks.model_inputs(model, *program.outputs(model, shared))
+        grid, loads = program.grid(model, shared, step), program.loads(shared, batched)
+        return of_model | native_peaks.batch_inputs(grid, loads.cubics(), loads.wheels)
 
-    inputs = jax.vmap(batch_inputs)(own_models, shared_values, batched_values, stepping)
-    return native_peaks.native_inputs(models, *inputs)
+    found = jax.vmap(inputs_of_batch)(own_models, shared_values, batched_values, stepping)
+    return native_peaks.NativeInputs(**found)
 
 
 def _on_devices(integrate, devices: int):

@@ -11,10 +11,10 @@ from jaxbeam.case.case import Case
 from jaxbeam.simulation.integration_plan import TOLERANCE
 from jaxbeam.sweeps.computation import compute_sweep
 from jaxbeam.sweeps.specification import sweep_specification
-from jaxbeam.sweeps.store import read_dataset
+from jaxbeam.sweeps.stores.store import read_dataset
+from jaxbeam.sweeps.stores.writing import writing
 from jaxbeam.sweeps.truncation import warn_of_truncation
 from jaxbeam.sweeps.words import compute_word_sweep, split_words, word_sweep
-from jaxbeam.sweeps.writing import writing
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX

@@ -15,8 +15,8 @@ from jaxbeam.integrator.step_size import check_step_count, trial_run, without_la
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.static_correction import is_supported, residual_flexibility
-from jaxbeam.model.statics import influence_line
+from jaxbeam.model.static_correction import is_supported, modal_influence_line
+from jaxbeam.model.statics import unchecked_influence_line
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.simulation.errors import truncation_changes
 from jaxbeam.simulation.motion.at_samples import motion_at
@@ -66,13 +66,16 @@ def static_shares(case: Case) -> dict[str, float]:
     layout, shares = mesh_layout(case), {}
     if not is_supported(case, layout):
         return shares
-    for sensor in static:
-        entry, x = QUANTITIES[sensor.quantity], sensor.position
-        at = x if entry.x_derivative == 0 else case.beam.length / 4
-        exact = float(influence_line(case, x, at, entry.x_derivative, layout))
-        missing = float(residual_flexibility(case, x, at, entry.x_derivative, layout))
-        share = abs(missing / exact) if exact else 0.0
-        shares[sensor.quantity] = max(share, shares.get(sensor.quantity, 0.0))
+    for quantity in dict.fromkeys(sensor.quantity for sensor in static):
+        derivative = QUANTITIES[quantity].x_derivative
+        x = np.stack([sensor.position for sensor in static if sensor.quantity == quantity])
+        at = x if derivative == 0 else np.full(x.size, case.beam.length / 4)
+        exact, of_modes = (
+            np.diagonal(line(case, layout, x, at, derivative))
+            for line in (unchecked_influence_line, modal_influence_line)
+        )
+        missing = np.where(exact == 0, 0.0, exact - of_modes)
+        shares[quantity] = float(np.max(np.abs(missing / np.where(exact == 0, 1.0, exact))))
     return shares
 
 

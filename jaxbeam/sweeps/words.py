@@ -23,11 +23,17 @@ from jaxbeam.case.case import Case, addresses
 from jaxbeam.case.display.addresses import address_words
 from jaxbeam.case.joint_addresses import ALL
 from jaxbeam.files.case_file import case_to_dict, with_settings
-from jaxbeam.sweeps import MAX_RUNS, store as sweep_store
+from jaxbeam.sweeps import MAX_RUNS
 from jaxbeam.sweeps.computation import compute_sweep, count_as_done, worst_runs
 from jaxbeam.sweeps.specification import SweepSpecification, sweep_specification
+from jaxbeam.sweeps.stores import store as sweep_store
+from jaxbeam.sweeps.stores.zarr_files import (
+    BLOCKS_GROUP,
+    FINGERPRINT_ATTRIBUTE,
+    new_store,
+    replace_blocks,
+)
 from jaxbeam.sweeps.truncation import estimated_errors, static_shares
-from jaxbeam.sweeps.zarr_files import BLOCKS_GROUP, FINGERPRINT_ATTRIBUTE, new_store, replace_blocks
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX

@@ -44,7 +44,7 @@ def test_nothing_is_written_at_its_place():
 
     Except caches, and stores of sweeps, which are written in blocks under a lock.
     """
-    by_themselves = "jaxbeam.runtime.", "jaxbeam.sweeps.zarr_files"
+    by_themselves = "jaxbeam.runtime.", "jaxbeam.sweeps.stores.zarr_files"
     writing = {"write_text", "write_bytes", "savefig", "savez", "to_netcdf", "to_zarr", "savemat"}
     wrong = []
     for module, path in module_files().items():

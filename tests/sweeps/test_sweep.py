@@ -19,6 +19,7 @@ import jaxbeam as jb
 from jaxbeam.case import declared_checks
 from jaxbeam.case.case import replace
 from jaxbeam.integrator.time_grid import event_places, grid_by_step_length
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.statics import static_peak
@@ -62,15 +63,13 @@ def test_grid_is_labelled_by_address_and_agrees_with_single_runs(grid_dataset):
             assert_allclose(found, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize("count", [3, programs.MAX_KNOWN_WHEELS + 1])
 @pytest.mark.parametrize("shared_model", [True, False])
-def test_loads_cross_in_length_over_speed(count, shared_model):
-    """Times of few paths are computed at once, those of many by a program."""
-    speeds = np.linspace(1.0, 4.0, count)
+def test_loads_cross_in_length_over_speed(shared_model):
+    speeds = np.linspace(1.0, 4.0, 30)
     case = dataclasses.replace(CASE, supports=[jb.Support(0.4)])
     model = modal_model(case, mesh_layout(case), False)
     places = event_places(model, None) if shared_model else np.zeros(0)
-    found = programs.path_times(case, ("loads.0.speed",), speeds[:, None], places)
+    found = programs.known_paths(case, ("loads.0.speed",), speeds[:, None], places)
     windows, events = found.load_events
     assert_allclose(windows[:, 0, 1], 0.6 / speeds, rtol=1e-13)
     assert np.all(windows[:, 0, 0] == 0) and np.all(np.isinf(found.force_steps))
@@ -78,11 +77,25 @@ def test_loads_cross_in_length_over_speed(count, shared_model):
     assert passages.all() if shared_model else not passages.any()
 
 
+def test_paths_of_tables_are_those_of_each():
+    """Values of a table of positions are not vectorised, but compiled."""
+    load = jb.MovingMass(mass=0.5, times=[0.0, 0.2, 0.5], positions=[0.0, 0.2, 0.6])
+    case, times = dataclasses.replace(CASE, loads=[load]), np.linspace(0.1, 0.3, 4)
+    places = np.array([0.3])
+    found = programs.known_paths(case, ("loads.0.times.1",), times[:, None], places)
+    for i, middle in enumerate(times):
+        loads = load_set(replace(case, {"loads.0.times.1": middle}))
+        parts = jax.tree.leaves((found.load_events, found.cubics))
+        expected = jax.tree.leaves((loads.events(places), loads.cubics()))
+        for part, one in zip(parts, expected, strict=True):
+            assert_allclose(part[i], one, rtol=1e-12, atol=1e-12)
+
+
 def test_the_time_grid_is_the_same_with_known_load_events():
     case = dataclasses.replace(CASE, supports=[jb.Support(0.4)])
     model, speeds = modal_model(case, mesh_layout(case), False), np.linspace(1.0, 4.0, 3)
     places = event_places(model, None)
-    events = programs.path_times(case, ("loads.0.speed",), speeds[:, None], places).load_events
+    events = programs.known_paths(case, ("loads.0.speed",), speeds[:, None], places).load_events
     for i, speed in enumerate(speeds):
         varied = replace(case, {"loads.0.speed": speed})
         found, expected = (

@@ -13,9 +13,9 @@ import xarray
 
 import jaxbeam as jb
 from jaxbeam.runtime.writer_lock import InUseError
-from jaxbeam.sweeps import writing as store_writing
-from jaxbeam.sweeps.store import ZarrStore, create_store, status
-from jaxbeam.sweeps.writing import writing
+from jaxbeam.sweeps.stores import writing as store_writing
+from jaxbeam.sweeps.stores.store import ZarrStore, create_store, status
+from jaxbeam.sweeps.stores.writing import writing
 from tests.sweeps.test_store import CASE, OVER, files_of, stop_after, sweep
 
 OTHER = jb.replace(CASE, {"beam.flexural_rigidity": 20.0})

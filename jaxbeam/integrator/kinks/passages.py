@@ -15,8 +15,9 @@ from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.layout import kink_nodes
-from jaxbeam.model.load_set import LoadSet
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.model.settlement import has_settlement
 from jaxbeam.numerics.piecewise import slope_jumps
 from jaxbeam.runtime.arrays import Array, take, xp
 
@@ -69,12 +70,20 @@ class KinkPassages(eqx.Module):
         return (self.times > xp.maximum(entry, start)) & (self.times < leave) & (self.times <= end)
 
 
-def kink_passages(case: Case, model: ModalModel, loads: LoadSet) -> KinkPassages | None:
-    """Passages of the wheels of a case that may have mass over all kinks; None without any."""
-    wheels = np.flatnonzero(np.concatenate([np.zeros(0, bool), *map(_has_mass, case.loads)]))
+def kink_passages(
+    case: Case, model: ModalModel, loads: LoadSet | None = None
+) -> KinkPassages | None:
+    """Passages of the wheels of a case that may have mass over all kinks; None without any.
+
+    `loads` are those of the case, if they are known.
+    """
     nodes = np.array(kink_nodes(case, model.modes.layout), int)
-    if not (wheels.size and (nodes.size or loads.profile is not None)):
+    if not (nodes.size or case.profile is not None or has_settlement(case)):
         return None
+    wheels = np.flatnonzero(np.concatenate([np.zeros(0, bool), *map(_has_mass, case.loads)]))
+    if not wheels.size:
+        return None
+    loads = load_set(case, model.modes.layout) if loads is None else loads
     positions, profile_jumps = model.modes.nodes[nodes], xp.zeros(nodes.size)
     rows = slope_jumps(model.modes.nodes, model.modes.series)[nodes - 1]
     rows = rows if model.mode_map is None else rows @ model.mode_map

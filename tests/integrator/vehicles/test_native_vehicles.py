@@ -100,9 +100,12 @@ def test_peaks_are_those_of_the_steps_in_numpy(name):
     case = case_of(name)
     addresses = numbers_of_vehicles(case)
     values = np.array([jb.addresses(case)[address] for address in addresses])
-    inputs_of_one = jax.jit(
-        lambda *known: native_peaks.native_inputs(*jax.tree.map(lambda leaf: leaf[None], known))
-    )
+
+    def inputs_of_one(model, grid, outputs, loads):
+        of_model = native_peaks.model_inputs(model, outputs, None)
+        of_batch = native_peaks.batch_inputs(grid, loads.cubics(), loads.wheels)
+        one = jax.tree.map(lambda part: np.asarray(part)[None], of_model | of_batch)
+        return native_peaks.NativeInputs(**one)
 
     @settings(max_examples=4, phases=[Phase.generate])
     @given(FACTORS)
@@ -112,7 +115,7 @@ def test_peaks_are_those_of_the_steps_in_numpy(name):
         max_loads, (model, grid, outputs, loads) = inputs_of_runs(case, batch)
         discrete = discrete_model(model, grid, None, None, outputs)
         expected = integrate_peaks(discrete, loads, max_loads=max_loads)[0].peaks()
-        inputs = inputs_of_one(model, grid, outputs, None, loads)
+        inputs = inputs_of_one(model, grid, outputs, loads)
         peaks = native_peaks.integrate_peaks(max_loads, np.ones(1, bool), inputs)
         found = jax.tree.map(lambda part: part[0], peaks)
         for part, known in zip(found[::2], expected[::2], strict=True):

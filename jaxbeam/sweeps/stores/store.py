@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxbeam.files.zarr_codecs import check_codecs
-from jaxbeam.sweeps.block_store import BlockStore
-from jaxbeam.sweeps.zarr_files import (
+from jaxbeam.sweeps.stores.block_store import BlockStore
+from jaxbeam.sweeps.stores.zarr_files import (
     BLOCKS_GROUP,
     DAMAGE_ERRORS,
     FINGERPRINT_ATTRIBUTE,

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxbeam.runtime.writer_lock import writer_lock
-from jaxbeam.sweeps.store import check_writable, status
-from jaxbeam.sweeps.zarr_files import explaining_write_errors
+from jaxbeam.sweeps.stores.store import check_writable, status
+from jaxbeam.sweeps.stores.zarr_files import explaining_write_errors
 
 
 class Writing(NamedTuple):

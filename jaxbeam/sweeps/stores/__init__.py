@@ -1,0 +1,1 @@
+"""Stores of sweeps: blocks in zarr, which one process writes and all read, and in memory."""
