@@ -55,34 +55,43 @@ def contact_minimum(
     most, least = xp.max(by_row, axis=2), xp.min(by_row, axis=2)
     bound = 0.5 * (most + least) + spread_factor() * (most - least)
     bound = xp.where(is_load[..., None], bound[:, :, None], -xp.inf)
-    # Most chunks stay far above the smallest force so far; NaN is passed on.
-    changes = ~(bound <= -lowest) | ((bound > 0) & (lost_time >= NEVER))
+    # Most chunks stay above the smallest force so far, and fewer lose contact; NaN is passed on.
+    falls = xp.any(~(bound <= -lowest))
+    may_lose = xp.any(~(bound <= 0) & (lost_time >= NEVER))
 
-    def refined(earlier):
-        pulls = xp.einsum("slnb,fn->slfb", by_row, force_weights_at_fractions())
-        vertex, rising = _vertices(pulls)
-        pull = xp.maximum(xp.max(pulls, axis=2), xp.max(vertex, axis=2))
+    def with_smaller(lowest):
+        pulls = _at_fractions(by_row)
+        pull = xp.maximum(xp.max(pulls, axis=2), xp.max(_vertices(pulls)[0], axis=2))
         force = xp.where(is_load[..., None], -pull[:, :, None], xp.inf)
+        return xp.minimum(lowest, xp.min(force, axis=(0, 1), initial=xp.inf))
+
+    def with_first_loss(lost_time):
+        pulls = _at_fractions(by_row)
         powers = xp.einsum("slnb,nk->kslb", by_row, lagrange_coefficients(NODE_COUNT))
-        fraction = _zero_nearby(powers, _first_loss(pulls, vertex, rising))
+        fraction = _zero_nearby(powers, _first_loss(pulls, *_vertices(pulls)))
         time = start[:, None, None] + length[:, None, None] * fraction
         time = xp.where(fraction < NEVER, time, NEVER)
         time = xp.where(is_load[..., None], time[:, :, None], NEVER)
-        return (
-            xp.minimum(earlier[0], xp.min(force, axis=(0, 1), initial=xp.inf)),
-            xp.minimum(earlier[1], xp.min(time, axis=(0, 1), initial=NEVER)),
-        )
+        return xp.minimum(lost_time, xp.min(time, axis=(0, 1), initial=NEVER))
 
-    return cond(xp.any(changes), refined, lambda earlier: earlier, (lowest, lost_time))
+    return (
+        cond(falls, with_smaller, lambda same: same, lowest),
+        cond(may_lose, with_first_loss, lambda same: same, lost_time),
+    )
+
+
+def _at_fractions(by_row: Float[Array, "step row node batch"]):
+    """Pulls at the FORCE_FRACTIONS."""
+    return xp.einsum("slnb,fn->slfb", by_row, force_weights_at_fractions())
 
 
 def _vertices(pulls: Float[Array, "step row fraction batch"]):
     """Tops of the parabolas through three fractions, -inf without one, and zeros before them."""
     gaps = np.diff(FORCE_FRACTIONS)[:, None]
-    slopes = xp.diff(pulls, axis=2) / gaps
+    slopes = xp.diff(pulls, axis=2) * (1 / gaps)  # XLA does not make products of divisions
     rise, fall = slopes[:, :, :-1], slopes[:, :, 1:]
     inside = (rise > 0) & (fall < 0)
-    curvature = xp.where(inside, (fall - rise) / (gaps[:-1] + gaps[1:]), -1.0)
+    curvature = xp.where(inside, (fall - rise) * (1 / (gaps[:-1] + gaps[1:])), -1.0)
     slope = rise + curvature * gaps[:-1]
     top = pulls[:, :, 1:-1] - slope**2 / (4 * curvature)
     at = FORCE_FRACTIONS[1:-1, None] - slope / (2 * curvature)

@@ -81,14 +81,13 @@ def update_peaks(
     on_states, on_others = xp.split(matrices.monitored, [states.shape[1]], axis=2)
     deflections = on_states @ states + on_others @ others
     samples = deflections.reshape(steps, len(PEAK_NODES), -1, batch_size)
-    samples = optimization_barrier(samples)
+    # Steps of no length, as of loads that leave after the end, are no part of the run.
+    samples = optimization_barrier(xp.where(length[:, None, None, None] > 0, samples, 0.0))
 
     def updated(best):
         estimate = optimization_barrier(
             estimate_peak(xp.moveaxis(samples, 1, 0), PEAK_NODES, best.magnitude)
         )
-        # Steps of no length, as of loads that leave after the end, are no part of the run.
-        estimate = xp.where(length[:, None, None] > 0, estimate, 0.0)
         best_estimate, peak_step = max_with_ties(estimate)
         peak_step = xp.max(xp.where(peak_step, np.arange(steps)[:, None, None], 0), axis=0)
         better = best_estimate > best.estimate
