@@ -142,9 +142,26 @@ def grid_by_step_length(
     the `places` (m).
     """
     end = case.run.duration
-    windows, events, twice, kinks, index = _events_between(
-        case, model, places, np.zeros(()), end, known_events
-    )
+    found = _events_between(case, model, places, np.zeros(()), end, known_events)
+    return _grid_of_steps(found, end, max_step, extra_steps, refinement)
+
+
+def grid_between_events(
+    load_events: LoadEvents,
+    duration: Float[Array, ""],
+    max_step: Float[Array, ""],
+    extra_steps: int | Int[Array, ""] = 0,
+) -> TimeGrid:
+    """`grid_by_step_length` of known load events, where no wheel with mass passes a kink."""
+    windows, events = load_events
+    events = xp.clip(events, 0.0, duration)
+    found = windows, events, np.zeros(0), None, np.zeros(0, int)
+    return _grid_of_steps(found, duration, max_step, extra_steps)
+
+
+def _grid_of_steps(found, end, max_step, extra_steps, refinement: int = 1) -> TimeGrid:
+    """Grid with steps of at most a length between the events that `_events_between` has found."""
+    windows, events, twice, kinks, index = found
     times = xp.concatenate([xp.zeros(1), events, twice, end[None]])
     order = xp.argsort(times, stable=True)
     boundaries, positions = times[order], xp.argsort(order)

@@ -147,7 +147,7 @@ class Runner:
         model = jax.tree.map(lambda leaf: leaf[0], self.models)
         known, one = KnownInputs(program, model, self._paths, self.batches), np.zeros(1, int)
         try:
-            known.of_batches(one, self._stepping(one, np.ones(1)))
+            known.of_batches(one, np.ones(1))
         except NotVectorisedError:
             return None
         return known
@@ -267,8 +267,7 @@ class Runner:
     def _integrate(self, batch_indices, steps, substeps, single, extra_steps=0):
         """Results of at most a block of batches by name."""
         if self.known_inputs is not None:
-            stepping = self._stepping(batch_indices, steps, extra_steps)
-            inputs = self.known_inputs.of_batches(batch_indices, stepping)
+            inputs = self.known_inputs.of_batches(batch_indices, steps, extra_steps)
             mask = np.ones(batch_indices.size, bool)
             return native_peaks.integrate_peaks(self.shapes.max_loads, mask, inputs)._asdict()
         # Fewer batches are spread over the block, so that each device has its part.

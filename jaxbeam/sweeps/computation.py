@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import closing
@@ -78,8 +79,9 @@ def _computed(
         steps, error = block_store.steps[:-1], float(block_store.steps[-1])
     else:
         progress_bar.set_description("compiling")
-        # Compilers leave a core free, on which to import what the dataset needs.
-        threading.Thread(target=importlib.import_module, args=["xarray"]).start()
+        if "xarray" not in sys.modules:
+            # Compilers leave a core free, on which to import what the dataset needs.
+            threading.Thread(target=importlib.import_module, args=["xarray"]).start()
         runner, native = _new_runner(specification)
         steps, error = runner.choose_step_sizes()
         progress_bar.set_description(None)

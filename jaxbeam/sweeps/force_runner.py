@@ -100,11 +100,11 @@ class ForceRunner:
 
 def force_runner(case: Case, batches: Batches, tolerance: float) -> ForceRunner | None:
     """Runner of trains of forces at constant speeds; None for other loads and varied models."""
-    case = concrete_case(case)
-    addresses, loads = batches.shared_addresses, load_set(case)
-    known = all(map(ADDRESS.fullmatch, addresses)) and not batches.batched_addresses
+    known = all(map(ADDRESS.fullmatch, batches.shared_addresses)) and not batches.batched_addresses
     if not (known and case.controller is None and tolerance >= LEAST_TOLERANCE):
         return None
+    case = concrete_case(case)
+    loads = load_set(case)
     if loads.wheel_count < MIN_WHEELS or not constant_speeds(loads):
         return None
     content = case_to_dict(case)

@@ -4,14 +4,15 @@ import functools
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from jaxbeam.integrator import native_peaks
+from jaxbeam.integrator.time_grid import grid_between_events
 from jaxbeam.model.load_set import WheelSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.vectorised import vectorised
-from jaxbeam.sweeps.batches import Batches
-from jaxbeam.sweeps.programs import Paths, Program, Stepping
+from jaxbeam.sweeps.batches import Batches, values_at
+from jaxbeam.sweeps.programs import Paths, Program
 
 GROUP_RUNS = 4096  # of which wheels are made at once; one of 512 takes as long
 
@@ -20,7 +21,8 @@ class KnownInputs:
     """Inputs of the C integrator of batches of known numbers that share a model and outputs."""
 
     def __init__(self, program: Program, model: ModalModel, paths: Paths, batches: Batches):
-        self.program, self.model, self.paths, self.batches = program, model, paths, batches
+        self.program, self.paths, self.batches = program, paths, batches
+        self.durations = values_at(program.case, batches, "run.duration")
         assert program.known_outputs is not None
         with np.errstate(all="ignore"):  # as in compiled code
             of_model = native_peaks.model_inputs(model, *program.known_outputs)
@@ -33,18 +35,24 @@ class KnownInputs:
         self._wheels_of_group = functools.lru_cache(maxsize=4)(self._make_wheels_of_group)
 
     def of_batches(
-        self, batch_indices: Int[np.ndarray, " task"], stepping: Stepping
+        self,
+        batch_indices: Int[np.ndarray, " task"],
+        max_steps: Float[np.ndarray, " task"],
+        extra_steps: int = 0,
     ) -> native_peaks.NativeInputs:
-        """Inputs of some batches. Raises NotVectorisedError where loads cannot be vectorised."""
+        """Inputs of some batches, with steps (s) at most and extra steps in each panel.
 
-        def of_batch(shared_values, step, path, wheels):
-            grid = self.program.grid(self.model, shared_values, step)
-            return native_peaks.batch_inputs(grid, path, wheels)
+        Raises NotVectorisedError where loads cannot be vectorised.
+        """
 
-        rows = self.batches.shared_values[batch_indices], stepping
-        path = jax.tree.map(lambda part: part[batch_indices], self.paths.cubics)
+        def of_batch(path, wheels, duration, max_step):
+            grid = grid_between_events(path.load_events, duration, max_step, extra_steps)
+            return native_peaks.batch_inputs(grid, path.cubics, wheels)
+
+        rows = jax.tree.map(lambda part: part[batch_indices], (self.paths, self.durations))
         with np.errstate(all="ignore"):
-            found = vectorised(of_batch)(*rows, path, self._wheels(batch_indices))
+            wheels = self._wheels(batch_indices)
+            found = vectorised(of_batch)(rows[0], wheels, rows[1], max_steps)
         return native_peaks.NativeInputs(**self.of_model, **found)
 
     def _wheels(self, batch_indices) -> WheelSet:

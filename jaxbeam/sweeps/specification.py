@@ -81,6 +81,7 @@ class SweepSpecification:
         columns = values if self.paired else np.meshgrid(*values, indexing="ij")
         return np.stack([column.ravel() for column in columns], axis=-1)
 
+    @functools.cached_property
     def batches(self) -> Batches:
         """Batches of the runs."""
         controller = self.case.controller
@@ -93,7 +94,7 @@ class SweepSpecification:
         """Runner of peaks in closed form; None where there is none."""
         if self.histories or self.single:
             return None
-        return force_runner(self.case, self.batches(), self.tolerance)
+        return force_runner(self.case, self.batches, self.tolerance)
 
     def runner(self, native: bool) -> Runner | ForceRunner:
         """Runner of the batches in blocks: in closed form, or whose steps are in C if `native`.
@@ -103,7 +104,7 @@ class SweepSpecification:
         if self._force_runner is not None:
             return self._force_runner
         settings = self.histories, self.tolerance, self.single
-        return Runner(self.case, self.batches(), *settings, native)
+        return Runner(self.case, self.batches, *settings, native)
 
     def resumed_runner(self, content: dict[str, Any]) -> Runner | ForceRunner:
         """Runner of the sweep of a store with this content, in C if it was begun so.

@@ -46,7 +46,7 @@ TIMOSHENKO = dataclasses.replace(
 
 def runner_of(case, over):
     plan = sweep_specification(case, over, False, False, 1e-8, "double")
-    return force_runner(case, plan.batches(), 1e-8)
+    return force_runner(case, plan.batches, 1e-8)
 
 
 @pytest.mark.parametrize("case", [TWO_SPANS, TIMOSHENKO], ids=["two spans", "Timoshenko"])
