@@ -21,7 +21,13 @@ from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.static_shapes import StaticShapes, model_limits
-from jaxbeam.integrator.time_grid import TimeGrid, grid_by_schedule, grid_by_step_length
+from jaxbeam.integrator.time_grid import (
+    LoadEvents,
+    TimeGrid,
+    event_places,
+    grid_by_schedule,
+    grid_by_step_length,
+)
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 
@@ -133,15 +139,17 @@ def choose_step_size(
     step = longest_trial_step(case, shapes)
     check_step_count(float(concrete(case.run.duration)) / step, step)
     model = modal_model(case, shapes.layout, shapes.coupled)
-    case, loads = without_later_vibration(case, model), load_set(case, shapes.layout)
+    loads = load_set(case, shapes.layout)
+    events = loads.events(event_places(model, None))
+    case = without_later_vibration(case, model, loads)
     schedule = None if schedule is None else _until(schedule, float(case.run.duration))
-    halvings, least, floor = 0, rounding_deflection(case, model), ErrorFloor(tolerance)
+    halvings, least, floor = 0, rounding_deflection(case, model, loads), ErrorFloor(tolerance)
     former, former_error, shrink = None, 0.0, 0.0
     for _ in range(MAX_TRIALS):
         step, substeps = _step_and_substeps(schedule, step)
         (times, coarse), (_, fine) = (
             run_of_grid(grid, model, loads, shapes.max_loads)
-            for grid in _grids(case, model, step, schedule, substeps)
+            for grid in _grids(case, model, events, step, schedule, substeps)
         )
         trial = StepTrial(times, coarse, fine[::2], substeps=substeps)
         change = UNSAMPLED * _largest_deflection_change(case, model, trial, least)
@@ -149,7 +157,7 @@ def choose_step_size(
         if not substeps:
             error, trial = max(change, share * former_error), trial._replace(former=former)
         if error <= tolerance:
-            panels = _loaded_panels(case, model, step)
+            panels = _loaded_panels(case, model, events, step)
             return step, error, trial._replace(share=share, panels=panels)
         floor.check(change, step)
         shrink, former, former_error = 0.5, None, 0.0
@@ -188,33 +196,43 @@ def _step_and_substeps(schedule: EventSchedule | None, step: float) -> tuple[flo
 
 
 def _grids(
-    case: Case, model: ModalModel, step: float, schedule: EventSchedule | None, substeps: int
+    case: Case,
+    model: ModalModel,
+    events: LoadEvents,
+    step: float,
+    schedule: EventSchedule | None,
+    substeps: int,
 ) -> list[TimeGrid]:
     """Grids of a trial: of steps (s), or so many in each interval, and of steps half as long."""
     if schedule is None or not substeps:
         max_step = np.asarray(step)
-        return [grid_by_step_length(case, model, max_step, refinement=n) for n in (1, 2)]
+        return [
+            grid_by_step_length(case, model, max_step, refinement=n, known_events=events)
+            for n in (1, 2)
+        ]
     check_step_count(float(schedule.times.size * substeps), step)
     return [grid_by_schedule(case, model, schedule, n * substeps) for n in (1, 2)]
 
 
-def _loaded_panels(case: Case, model: ModalModel, step: float) -> Float[np.ndarray, "2 panel"]:
+def _loaded_panels(
+    case: Case, model: ModalModel, events: LoadEvents, step: float
+) -> Float[np.ndarray, "2 panel"]:
     """Times (s) between load events with loads on the beam, and steps there of at most a `step`.
 
     Without those of no length, between events at one time.
     """
-    grid = grid_by_step_length(case, model, np.asarray(step))
+    grid = grid_by_step_length(case, model, np.asarray(step), known_events=events)
     times, loaded = np.diff(grid.boundaries), np.any(grid.loads_on_beam, axis=1)
     return np.stack([times, np.asarray(grid.lengths)[:-1]])[:, loaded & (times > 0)]
 
 
-def without_later_vibration(case: Case, model: ModalModel) -> Case:
+def without_later_vibration(case: Case, model: ModalModel, loads: LoadSet) -> Case:
     """The case until one period of the lowest mode after the last exit.
 
     Free vibration is exact with any step, and no error grows in it.
     """
     lowest = float(np.sqrt(np.maximum(np.min(model.modes.stiffness), 0.0)))
-    last_exit = float(np.max(load_set(case).entry_exit_times(), initial=0.0))
+    last_exit = float(np.max(loads.entry_exit_times(), initial=0.0))
     end = last_exit + 2 * np.pi / lowest if lowest > 0 else np.inf
     return replace(case, {"run.duration": min(end, float(concrete(case.run.duration)))})
 
@@ -267,12 +285,11 @@ def _largest_deflection_change(
     return _relative(change, largest, least)
 
 
-def rounding_deflection(case: Case, model: ModalModel) -> float:
+def rounding_deflection(case: Case, model: ModalModel, loads: LoadSet) -> float:
     """Deflection (m) that may be all rounding: a share of that of all loads at the trial positions.
 
     Loads that stand on supports deflect nothing, and rounding falls with no step.
     """
-    loads = load_set(case)
     times = np.linspace(0.0, float(concrete(case.run.duration)), 100)
     weight = np.max(np.sum(np.abs(loads.varying_weight(times)), axis=1), initial=0.0)
     rows = model.shapes(trial_positions(case), (0,))[0]

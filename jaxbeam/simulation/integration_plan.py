@@ -242,7 +242,8 @@ def _choose_substeps(
     policy = None if is_compiled else _known_loop(case, shapes, schedule)
 
     model = modal_model(case, shapes.layout, shapes.coupled)
-    least, own = rounding_deflection(case, model), slice(None, -1)  # no step starts at the last
+    least = rounding_deflection(case, model, load_set(case))
+    own = slice(None, -1)  # no step starts at the last
 
     def trial(coarse, fine):
         return StepTrial(schedule.times[own], coarse[own], fine[own])

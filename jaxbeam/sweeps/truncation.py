@@ -135,7 +135,7 @@ def _changes_in_run(case: Case, known: Collection[str]) -> Float[np.ndarray, " s
 def _truncation_of(case: Case) -> Float[Array, " sensor"] | None:
     """`truncation_changes` of a run."""
     loads, model = load_set(case), modal_model(case, mesh_layout(case), has_coupling(case))
-    case = without_later_vibration(case, model)
+    case = without_later_vibration(case, model, loads)
     duration = float(case.run.duration)
     found = motion_of_forces(case, model, loads, np.linspace(0.0, duration, SAMPLES))
     if found is not None:

@@ -138,7 +138,7 @@ def test_paths_are_those_of_the_loads():
 
 def test_truncation_errors_are_those_of_the_integrated_run():
     # Of the passage, and of one period of the first mode after it.
-    case = without_later_vibration(TWO_SPANS, modal_model(TWO_SPANS))
+    case = without_later_vibration(TWO_SPANS, modal_model(TWO_SPANS), load_set(TWO_SPANS))
     assert case.run.duration < TWO_SPANS.run.duration
     times = np.linspace(0, case.run.duration, SAMPLES)
     record = jb.simulate(case, times, tolerance=1e-9)

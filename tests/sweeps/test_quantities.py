@@ -88,7 +88,7 @@ def test_stated_truncation_is_that_of_a_run_with_short_steps():
     speed = float(case.loads[0].speed)
     found = jb.sweep(case, {"loads.0.speed": [speed]}, progress=False)
     model, loads = modal_model(case), load_set(case)
-    case = without_later_vibration(case, model)
+    case = without_later_vibration(case, model, load_set(case))
     longest = float(longest_stable_step(case, model, loads))
     step = min(float(case.run.duration) / SAMPLES, longest)
     times = np.unique(trial_run(case, model, loads, 2, step)[0])
