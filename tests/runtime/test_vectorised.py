@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
@@ -108,6 +108,7 @@ LOADS = {
 
 
 @pytest.mark.parametrize("name", LOADS)
+@settings(max_examples=20)
 @given(st.data())
 def test_loads_are_those_of_each_case(name, data):
     case = concrete_case(jb.Case(BEAM, loads=[LOADS[name]]))
