@@ -24,12 +24,12 @@ from jaxbeam.runtime.vectorised import NotVectorisedError
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import sample_times, steps_per_interval
 from jaxbeam.sweeps import programs
-from jaxbeam.sweeps.batches import Batches, common_layout, swept_masses, values_at
+from jaxbeam.sweeps.batches import Batches, common_layout, swept_masses
 from jaxbeam.sweeps.known_inputs import KnownInputs
+from jaxbeam.sweeps.path_times import PathTimes, path_times
+from jaxbeam.sweeps.step_limits import step_limits
 from jaxbeam.sweeps.step_size import (
     choose_step_sizes,
-    initial_share,
-    initial_step_sizes,
     rounding_error,
     stratified_sample,
 )
@@ -90,7 +90,7 @@ class Runner:
         # Compilation of the programs for one load need not wait for its entry and exit times.
         max_loads = load_set(case).wheel_count
         if max_loads > 1:
-            max_loads = max(map(max_concurrent_loads, self._paths.load_events[0]))
+            max_loads = max(map(max_concurrent_loads, self._path_times.load_events[0]))
         self.shapes = dataclasses.replace(self.shapes, max_loads=max_loads)
         # The C library makes its own step matrices.
         self.discretise_separately = case.controller is None and not native
@@ -99,7 +99,10 @@ class Runner:
             self._compile_programs()
         if not self.same_model:
             limits = self._make_models()
-        self._set_step_limits(limits)
+        longest = None
+        if self.schedule is not None and case.controller is not None:  # steps end at events
+            longest = self.schedule.lengths.max()
+        self.limits = step_limits(case, batches, self._path_times, limits, longest, tolerance)
 
     def _set_block_size(self):
         """Numbers of batches per block and per trial, multiples of the number of devices."""
@@ -117,13 +120,13 @@ class Runner:
         self.block_count = -(-count // self.batches_per_block)
 
     @functools.cached_property
-    def _paths(self) -> programs.Paths:
-        """Paths of all batches, with passages of the model if all share one."""
+    def _path_times(self) -> PathTimes:
+        """Times of all paths, with passages of the model if all share one."""
         case, places = concrete_case(self.case), np.zeros(0)
         if self.same_model:
             model = jax.tree.map(lambda leaf: leaf[0], self.models)
             places = event_places(model, corrected_places(case, model, case.sensors))
-        found = programs.known_paths(case, self.addresses[0], self.batches.shared_values, places)
+        found = path_times(case, self.addresses[0], self.batches.shared_values, places)
         return jax.tree.map(np.asarray, found)
 
     def _model_groups(self) -> list:
@@ -145,7 +148,10 @@ class Runner:
         """What the C integrator needs to know, if all batches share a model; else None."""
         program = self.program()._replace(case=concrete_case(self.case))
         model = jax.tree.map(lambda leaf: leaf[0], self.models)
-        known, one = KnownInputs(program, model, self._paths, self.batches), np.zeros(1, int)
+        known, one = (
+            KnownInputs(program, model, self._path_times.load_events, self.batches),
+            np.zeros(1, int),
+        )
         try:
             known.of_batches(one, np.ones(1))
         except NotVectorisedError:
@@ -160,7 +166,7 @@ class Runner:
             self.pool.submit(compiled_program.precompile(*arguments))
             for compiled_program, arguments in self._programs_to_compile(program, first_values)
         ]
-        _ = self._paths  # meanwhile, unless they are known
+        _ = self._path_times  # meanwhile, unless they are known
         for compilation in compilations:
             compilation.result()  # raises its error, if any
 
@@ -173,24 +179,6 @@ class Runner:
         ]
         self.models, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *groups)
         return _stable_steps(limits[:count])
-
-    def _set_step_limits(self, limits):
-        """Crossing rates (1/s), longest steps and initial steps (s) of all batches."""
-        (windows, _), force_steps, _ = self._paths
-        entries, exits = np.moveaxis(windows, 2, 0)
-        duration = values_at(self.case, self.batches, "run.duration")
-        times_on_beam = np.minimum(exits, duration[:, None]) - entries
-        times_on_beam = np.where(times_on_beam > 0, times_on_beam, duration[:, None])
-        crossing_time = np.min(times_on_beam, axis=1, initial=np.inf)
-        crossing_time = np.where(np.isfinite(crossing_time), crossing_time, duration)
-        self.crossing_rates = 1 / crossing_time
-        limits = np.minimum(limits, force_steps)
-        self.max_steps = np.minimum(limits, duration)
-        if self.schedule is not None and self.case.controller is not None:  # steps end at events
-            self.max_steps = np.minimum(self.max_steps, self.schedule.lengths.max())
-        modes = self.case.beam.modes
-        initial = initial_step_sizes(crossing_time, limits, modes, self.tolerance)
-        self.initial_steps = initial * initial_share(s.quantity for s in self.case.sensors)
 
     def choose_step_sizes(self) -> tuple[Float[np.ndarray, " path"], float]:
         """Step sizes (s) of all batches, and the estimated relative error of their peaks.
@@ -211,10 +199,11 @@ class Runner:
         batches, runs = self.batches.run_index.shape
         if runs == 1 and batches <= MAX_CHECKED_RUNS:
             checked = np.arange(batches)
-        search = self.crossing_rates, masses, self.initial_steps, self.max_steps, count
+        rates, initial_steps, max_steps = self.limits
+        search = rates, masses, initial_steps, max_steps, count
         steps, error = choose_step_sizes(peaks, *search, self.tolerance, self.pool.map, checked)
         if self.single:
-            sample = stratified_sample(self.crossing_rates, count)
+            sample = stratified_sample(rates, count)
             error += rounding_error(
                 *(peaks(sample, steps[sample], single=single) for single in (False, True))
             )
@@ -302,7 +291,7 @@ class Runner:
         """Steps of batches; their load events are known if all share a model."""
         events = None
         if self.same_model and self.schedule is None:
-            events = jax.tree.map(lambda part: part[batch_indices], self._paths.load_events)
+            events = jax.tree.map(lambda part: part[batch_indices], self._path_times.load_events)
         return programs.Stepping(steps, np.full(batch_indices.size, extra_steps), events)
 
     def _models_of(self, batch_indices):

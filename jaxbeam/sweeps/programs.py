@@ -14,14 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxbeam.case.case import Case, concrete_case, replace
+from jaxbeam.case.case import Case, replace
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.integrator.integrate import (
     integrate_history,
     integrate_peaks,
-    longest_force_step,
     max_stable_step,
 )
 from jaxbeam.integrator.static_shapes import StaticShapes
@@ -30,7 +29,7 @@ from jaxbeam.integrator.time_grid import (
     grid_by_schedule,
     grid_by_step_length,
 )
-from jaxbeam.model.load_set import LoadSet, WheelSet, load_set, wheel_set
+from jaxbeam.model.load_set import LoadSet, load_set, wheel_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.sensing.corrected_rows import (
     StaticCorrection,
@@ -45,7 +44,6 @@ from jaxbeam.runtime.compiling import (
     Compiled,
     compiled,
 )
-from jaxbeam.runtime.vectorised import NotVectorisedError, vectorised
 from jaxbeam.simulation.closed_loop import closed_loop
 
 # Rows of what the sensors measure, and their static correction.
@@ -58,14 +56,6 @@ class Stepping(NamedTuple):
     max_step: Array
     extra_steps: Array
     load_events: LoadEvents | None = None
-
-
-class Paths(NamedTuple):
-    """Numbers of paths: times of load events (s), longest steps of forces (s), cubics of wheels."""
-
-    load_events: LoadEvents
-    force_steps: Array
-    cubics: tuple[Array, Array]
 
 
 class Program(NamedTuple):
@@ -90,8 +80,8 @@ class Program(NamedTuple):
         """Case of a batch."""
         return replace(self.case, dict(zip(self.shared_addresses, shared_values, strict=True)))
 
-    def wheels(self, shared_values, batched_values) -> WheelSet:
-        """Wheels of the loads of a batch, in all its runs."""
+    def loads(self, shared_values, batched_values) -> LoadSet:
+        """Loads of a batch, in all its runs."""
         varied = self.case_with(shared_values)
 
         def wheels_of_run(values):
@@ -105,12 +95,7 @@ class Program(NamedTuple):
         if wheels.inertia is None:
             massless = np.zeros(wheels.weight.shape)
             wheels = eqx.tree_at(_inertia, wheels, massless, is_leaf=lambda leaf: leaf is None)
-        return wheels
-
-    def loads(self, shared_values, batched_values) -> LoadSet:
-        """Loads of a batch, in all its runs."""
-        loads = load_set(self.case_with(shared_values), self.shapes.layout)
-        return dataclasses.replace(loads, wheels=self.wheels(shared_values, batched_values))
+        return dataclasses.replace(load_set(varied, self.shapes.layout), wheels=wheels)
 
     def grid(self, model, shared_values, stepping: Stepping):
         """Time grid of a batch."""
@@ -152,30 +137,6 @@ def model_and_limit(program: Program, shared_values):
     varied = program.case_with(shared_values)
     model = modal_model(varied, program.shapes.layout, program.shapes.coupled)
     return model, max_stable_step(model, load_set(varied, program.shapes.layout))
-
-
-def known_paths(case, addresses, shared_values, places) -> Paths:
-    """Paths of all batches, with the times at which wheels pass some places (m).
-
-    Compiled only where they cannot be vectorised, as with values of tables of positions.
-    """
-    known = concrete_case(case)
-    try:
-        with np.errstate(all="ignore"):  # as in compiled code
-            return vectorised(lambda values: _path(known, addresses, values, places))(shared_values)
-    except NotVectorisedError:
-        return _compiled_paths(case, addresses, shared_values, places)
-
-
-def _path(case, addresses, values, places) -> Paths:
-    varied = replace(case, dict(zip(addresses, values, strict=True)))
-    loads = load_set(varied)
-    return Paths(loads.events(places), longest_force_step(varied, loads), loads.cubics())
-
-
-@compiled
-def _compiled_paths(case, addresses, shared_values, places) -> Paths:
-    return jax.vmap(lambda values: _path(case, addresses, values, places))(shared_values)
 
 
 @compiled(**PARALLEL_COMPILATION)
