@@ -18,13 +18,14 @@ import numpy as np
 from jaxbeam.runtime import lapack, vectorised
 from jaxbeam.runtime.vectorised import VectorisedArray
 
-_KNOWN = {np.ndarray, np.float64, np.int64, np.bool_, float, int, bool, str, type(None), slice}
+_NOT_JAX = {np.ndarray, VectorisedArray, np.float64, np.int64, np.bool_, float, int, bool, str}
+_NOT_JAX |= {type(None), slice}
 MAX_TRIANGLE_ROWS = 64  # of triangular systems that are solved as general ones
 
 
 def is_jax(value: Any) -> bool:
     """Whether a value, or any in a nested list or tuple, is an array of JAX."""
-    if type(value) in _KNOWN:
+    if type(value) in _NOT_JAX:
         return False
     if isinstance(value, list | tuple):
         return any(map(is_jax, value))
@@ -105,7 +106,7 @@ class _Namespace:
             @functools.wraps(known)
             def call(*args, **kwargs):
                 for value in args:
-                    if type(value) not in _KNOWN and is_jax(value):
+                    if type(value) not in _NOT_JAX and is_jax(value):
                         return traced(*args, **kwargs)
                 if kwargs and any(map(is_jax, kwargs.values())):
                     return traced(*args, **kwargs)

@@ -100,14 +100,11 @@ class VectorisedArray(NDArrayOperatorsMixin):
     def __getitem__(self, index):
         index = index if isinstance(index, tuple) else (index,)
         if any(isinstance(part, VectorisedArray) for part in index):
-            positions = index[0]
-            if not (
-                len(index) == self.ndim == positions.ndim == 1 and self.level == _level(positions)
-            ):
+            positions, axes = index[0], {len(index), self.ndim, _ndim(index[0])}
+            if axes != {1} or self.level != _level(positions):
                 raise NotVectorisedError("an index that varies, into an array of several axes")
-            return VectorisedArray(
-                np.take_along_axis(self.values, positions.values, axis=1), self.level
-            )
+            found = np.take_along_axis(self.values, positions.values, axis=1)
+            return VectorisedArray(found, self.level)
         return VectorisedArray(self.values[(slice(None), *index)], self.level)
 
     def __getattr__(self, name):
@@ -126,7 +123,7 @@ class VectorisedArray(NDArrayOperatorsMixin):
     def __array_ufunc__(self, ufunc, method, *inputs, **kwargs):
         if ufunc is np.matmul and method == "__call__":
             return _product(*inputs, **kwargs)
-        if method != "__call__" or ufunc.signature or kwargs:
+        if method != "__call__" or ufunc.signature or ufunc.nout > 1 or kwargs:
             raise NotVectorisedError(f"numpy.{ufunc.__name__}, {method}")
         return _elementwise(ufunc, *inputs)
 
@@ -135,13 +132,18 @@ class VectorisedArray(NDArrayOperatorsMixin):
             raise NotVectorisedError(f"numpy.{function.__name__}")
         try:
             return _FUNCTIONS[function](*args, **kwargs)
-        except TypeError as error:  # arguments that its rule lacks
+        except (AttributeError, TypeError) as error:  # arguments that its rule lacks
             raise NotVectorisedError(f"numpy.{function.__name__}") from error
 
 
 def _level(part) -> int:
     """Level of an array, 0 of one of NumPy."""
     return part.level if isinstance(part, VectorisedArray) else 0
+
+
+def _ndim(part) -> int:
+    """Number of axes, sooner than by `numpy.ndim`, which would come back to this module."""
+    return part.ndim if hasattr(part, "ndim") else np.ndim(part)
 
 
 def _moved(array, source: int, target: int):
@@ -164,8 +166,7 @@ def _deepest(parts) -> tuple[int, int]:
 
 def _elementwise(function, *parts):
     """Result of a function of broadcast entries."""
-    level, _ = _deepest(parts)
-    ndim = max(map(np.ndim, parts))
+    level, ndim = max(map(_level, parts)), max(map(_ndim, parts))
 
     def aligned(part):
         if _level(part) < level:
@@ -182,16 +183,16 @@ def _elementwise(function, *parts):
 
 def _product(first, second):
     """Product of matrices or vectors."""
-    if np.ndim(second) == 1:
+    if _ndim(second) == 1:
         return _product(first, np.expand_dims(second, 1))[..., 0]
-    if np.ndim(first) == 1:
+    if _ndim(first) == 1:
         return _product(np.expand_dims(first, 0), second)[..., 0, :]
     return _elementwise(np.matmul, first, second)
 
 
 def _solution(matrix, right):
     """Solution of linear equations, with a matrix or a vector on the right."""
-    if np.ndim(right) == 1:
+    if _ndim(right) == 1:
         return _solution(matrix, np.expand_dims(right, 1))[..., 0]
     return _elementwise(np.linalg.solve, matrix, right)
 
@@ -207,15 +208,21 @@ def _joined(function):
     return rule
 
 
-def _along(function, default: int | None = -1):
-    """Rule of a function along an axis, or along all of them if it is None."""
+def _along(function, default: int | None, *options: str):
+    """Rule of a function along an axis, or along all of them if it is None.
 
-    def rule(array, axis=default, **kwargs):
+    `options` are those that it takes beside.
+    """
+
+    def rule(array, axis=default, **given):
+        """Raises NotVectorisedError for other options."""
+        if not set(given) <= set(options):
+            raise NotVectorisedError(f"numpy.{function.__name__} with {', '.join(given)}")
         values = array.values
         if axis is None:
             values, axis = values.reshape(values.shape[0], -1), -1
         axis = axis + 1 if axis >= 0 else axis
-        return VectorisedArray(function(values, axis=axis, **kwargs), array.level)
+        return VectorisedArray(function(values, axis=axis, **given), array.level)
 
     return rule
 
@@ -230,9 +237,8 @@ def _reshape(array, shape):
 
 
 def _expand_dims(array, axis):
-    return VectorisedArray(
-        np.expand_dims(array.values, axis + 1 if axis >= 0 else axis), array.level
-    )
+    axis = axis + 1 if axis >= 0 else axis
+    return VectorisedArray(np.expand_dims(array.values, axis), array.level)
 
 
 def _broadcast_to(array, shape):
@@ -286,9 +292,7 @@ _FUNCTIONS: dict[Callable, Callable] = {
     np.shape: lambda array: array.shape,
     np.ndim: lambda array: array.ndim,
     np.size: lambda array: array.size,
-    np.result_type: lambda *parts: np.result_type(
-        *(getattr(part, "dtype", part) for part in parts)
-    ),
+    np.result_type: _result_type,
     np.linalg.solve: _solution,
     np.where: lambda *parts: _elementwise(np.where, *parts),
     np.clip: lambda *parts: _elementwise(np.clip, *parts),
@@ -303,11 +307,11 @@ _FUNCTIONS: dict[Callable, Callable] = {
     np.pad: _pad,
     np.tile: _tile,
     np.zeros_like: lambda array: np.zeros(array.shape, array.dtype),
-    np.diff: lambda array: _along(np.diff)(array),
-    np.argsort: _along(np.argsort),
-    np.cumsum: lambda array: _along(np.cumsum)(array),
-    np.min: _along(np.min, None),
-    np.max: _along(np.max, None),
+    np.diff: lambda array: _along(np.diff, -1)(array),
+    np.argsort: _along(np.argsort, -1, "stable", "kind"),
+    np.cumsum: _along(np.cumsum, None),
+    np.min: _along(np.min, None, "initial"),
+    np.max: _along(np.max, None, "initial"),
     np.sum: _along(np.sum, None),
     np.any: _along(np.any, None),
     np.all: _along(np.all, None),

@@ -104,6 +104,8 @@ def test_a_case_is_fitted_to_the_modes(run, decay_log):
         (f"node.csv {COLUMNS} --choose 12 --count 1", "chosen modes are all that are kept; leave"),
         (f"node.csv {COLUMNS} --choose 90", "no pole within 2 % of the chosen 90 Hz; the nearest"),
         (f"node.csv {COLUMNS} --from 3 --to 2", "--from must be less than --to"),
+        (f"node.csv {COLUMNS} --from 90 --to 95", "has no part from 90 to 95 s: change --from"),
+        (f"node.csv {COLUMNS} --to -1", "has no part from 0 to -1 s"),
         (f"node.csv {COLUMNS} --channels c", "the log has no channel 'c'; it has a, b"),
         (f"node.csv {COLUMNS} --method x", "method must be"),
         (f"node.csv {COLUMNS} --method fdd --order 10", "method 'fdd' has no models and no order"),

@@ -20,6 +20,7 @@ FUNCTIONS = {
     "inner axes": lambda a, x: a[:, None] * x - CONSTANT[0],
     "comparison": lambda a, x: (a < x) | (a > 2 * x),
     "where": lambda a, x: xp.where(a > x, a, 0.0),
+    "list": lambda a, x: a * [1.0, 2.0, 3.0] + xp.where(x > 0, [x.dtype.itemsize, 1.0, 2.0], a),
     "clip": lambda a, x: xp.clip(a, 0.0, x),
     "concatenate": lambda a, x: xp.concatenate([a, CONSTANT, x * a], axis=1),
     "stack": lambda a, x: xp.stack([a[0], CONSTANT[1], x * a[1]], axis=-1),
@@ -36,6 +37,7 @@ FUNCTIONS = {
     "differences": lambda a, x: xp.diff(a) * x,
     "order": lambda a, x: a[0][xp.argsort(a[0], stable=True)] + xp.cumsum(a[1]),
     "reductions": lambda a, x: xp.max(a) - xp.min(a, axis=0) + xp.sum(a, axis=-1)[0] * x,
+    "sums": lambda a, x: xp.cumsum(a) * x + xp.cumsum(a, axis=0)[-1, 0],
     "any": lambda a, x: xp.any(a > x) & xp.all(a[1] > x),
     "matrices": lambda a, x: a @ CONSTANT.T + CONSTANT @ (x * a).T,
     "vectors": lambda a, x: a @ CONSTANT[0] + CONSTANT[:, :2] @ a[:, 0] + a[0] @ a[1],
@@ -83,6 +85,10 @@ def test_the_axis_of_results_can_be_the_last():
         lambda x: np.add(x, 1, where=True),
         lambda x: xp.stack([x, x])[xp.asarray(x > 0), 0],
         lambda x: xp.tile(CONSTANT * x, 2),
+        lambda x: np.modf(x)[0],
+        lambda x: np.sum(CONSTANT * x, keepdims=True),
+        lambda x: xp.max(CONSTANT, initial=x),
+        lambda x: xp.pad(np.ones(2), (0, 1), constant_values=x),
     ],
 )
 def test_what_cannot_be_vectorised_says_so(function):

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.quantities import Quantity, quantity_of
+from jaxbeam.case.quantities import QUANTITIES, Quantity, quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
@@ -118,23 +118,35 @@ class OutputRows(Module):
 
 def sensor_rows(model: ModalModel, case: Case, sensors: Sequence[Sensor]) -> OutputRows:
     """Output rows of sensors on a case, as ideal ones, on the coordinates of its modal model."""
-    quantities = [quantity_of(s.quantity, s.fibre_distance, s.section_modulus) for s in sensors]
-    rows, on_commands = [], []
-    for sensor, quantity in zip(sensors, quantities, strict=True):
-        x, parameters = sensor.position, (sensor.fibre_distance, sensor.section_modulus)
-        fields = banded_fields(model, sensor.mode_band)
-        rows.append(modal_row(fields, case, x, sensor.quantity, *parameters))
-        active = active_moments(case, x)
-        if quantity.has_active_moment:
-            modulus = sensor.section_modulus if quantity.over_modulus else 1.0
-            on_commands.append(active / modulus)
-        else:
-            on_commands.append(xp.zeros_like(active))
+    alike: dict[tuple[str, str], list[int]] = {}
+    for i, sensor in enumerate(sensors):
+        alike.setdefault((sensor.quantity, sensor.mode_band), []).append(i)
+    rows, on_commands = [xp.zeros((0, model.mode_count))], [xp.zeros((0, len(case.actuators)))]
+    for (name, band), index in alike.items():
+        x, fibre_distance, section_modulus = (
+            _stacked([getattr(sensors[i], field) for i in index])
+            for field in ("position", "fibre_distance", "section_modulus")
+        )
+        quantity = quantity_of(name, fibre_distance, section_modulus)
+        fields = banded_fields(model, band)
+        rows.append(modal_row(fields, case, x, name, fibre_distance, section_modulus))
+        active = active_moments(case, x).T
+        if not quantity.has_active_moment:
+            active = xp.zeros_like(active)
+        elif quantity.over_modulus:
+            active = active / section_modulus[:, None]
+        on_commands.append(active)
+    order = np.argsort(np.array(sum(alike.values(), []), int))
     return OutputRows(
-        xp.array(rows).reshape(len(rows), model.mode_count),
-        xp.array(on_commands).reshape(len(rows), len(case.actuators)),
-        tuple(quantity.time_derivative for quantity in quantities),
+        xp.concatenate(rows)[order],
+        xp.concatenate(on_commands)[order],
+        tuple(QUANTITIES[sensor.quantity].time_derivative for sensor in sensors),
     )
+
+
+def _stacked(values):
+    """Values of some sensors as an array; None where one of them has none."""
+    return None if any(value is None for value in values) else xp.stack(values)
 
 
 def row_on_states(

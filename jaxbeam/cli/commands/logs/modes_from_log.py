@@ -204,11 +204,20 @@ def _picture(log: Path, word: str) -> Path:
 
 
 def _window(log: "Log", from_: float | None, to: float | None):
-    """Part (s) of a log between two times, either of which may be left out; None for all."""
+    """Part (s) of a log between two times, either of which may be left out; None for all.
+
+    Raises ValueError if the log has no such part.
+    """
     if from_ is None and to is None:
         return None
     first, last = (float(log.times[i]) for i in (0, -1))
-    return first if from_ is None else max(from_, first), last if to is None else min(to, last)
+    start, end = first if from_ is None else from_, last if to is None else to
+    if start >= last or end <= first:
+        raise ValueError(
+            f"the log is from {first:g} to {last:g} s, and has no part from {start:g} to {end:g} s:"
+            " change --from or --to"
+        )
+    return max(start, first), min(end, last)
 
 
 def _of_setup(names: list[str] | None, setup: "list[Log]", read: "list[Log]"):
