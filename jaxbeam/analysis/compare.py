@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -19,6 +18,7 @@ from jaxbeam.analysis.limit_cycles import CommandOscillation, command_oscillatio
 from jaxbeam.case.aliases import renamed_property
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.controller import AbstractController
+from jaxbeam.runtime.module import Module
 from jaxbeam.simulation.commands.path import with_exact_compensation
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
@@ -48,7 +48,7 @@ class PerformanceMetrics(NamedTuple):
     swings = renamed_property("swings", "limit_cycles")
 
 
-class Comparison(eqx.Module):
+class Comparison(Module):
     """Result of `compare`: records and metrics of the controllers by name, and the bound.
 
     `uncontrolled` is the run without controller, `optimal` the run with the commands of the bound.

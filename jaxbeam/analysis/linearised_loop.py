@@ -39,13 +39,14 @@ from jaxbeam.runtime.arrays import (
     zeros,
 )
 from jaxbeam.runtime.compiling import LOW_OPTIMISATION, compiled
+from jaxbeam.runtime.module import Module
 
 NEWTON_ITERATIONS = 8  # towards the equilibrium about which the loop is linearised
 NEWTON_ROUNDING = 1e-14  # relative change below which an iterate counts as the last
 EIGENVALUE_OFFSET = 1e-10  # of the shift of inverse iteration from an eigenvalue, relative
 
 
-class LinearisedLoop(eqx.Module):
+class LinearisedLoop(Module):
     """Matrices of the loop at one time, opened at the commands; u = K z closes it.
 
     With a `period` (s) they are those of a sampled loop, else of a continuous one. The first

@@ -1,6 +1,5 @@
 """Beam and supports: section, material, modal damping, end conditions."""
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -41,7 +40,7 @@ END_CONDITIONS = {
 }
 
 
-class Support(ReprWithUnits, eqx.Module):
+class Support(ReprWithUnits):
     """Support at a position along a beam, rigid or elastic.
 
     Without a `stiffness` it holds the deflection rigidly; with one it is a vertical spring.
@@ -73,7 +72,7 @@ class Support(ReprWithUnits, eqx.Module):
     )
 
 
-class Beam(ReprWithUnits, eqx.Module):
+class Beam(ReprWithUnits):
     """Straight beam, by default an Euler-Bernoulli beam of uniform section.
 
     Give either `flexural_rigidity` and `mass_per_length`, or the rectangular section and material

@@ -7,7 +7,6 @@ import typing
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -34,9 +33,10 @@ from jaxbeam.case.quantities import OF_QUANTITY
 from jaxbeam.case.reading.units import in_si
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.runtime.arrays import Array, set_at, xp
+from jaxbeam.runtime.module import Module
 
 
-class Run(ReprWithUnits, eqx.Module):
+class Run(ReprWithUnits):
     """Duration of a run, sampling rate of its record, gravity, and seed of the sensor noise.
 
     >>> import jaxbeam as jb
@@ -56,7 +56,7 @@ class Run(ReprWithUnits, eqx.Module):
     seed: int = count("seed of the noise of the sensors", minimum=0, default=0)
 
 
-class Case(eqx.Module):
+class Case(Module):
     """Beam, supports, actuators, sensors, loads, profile, controller and run settings.
 
     Sensors are on the beam; `vehicle_sensors` are on bodies and axles of the loads.

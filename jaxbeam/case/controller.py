@@ -36,7 +36,7 @@ class Measurement(NamedTuple):
     command: Command
 
 
-class ControllerFilter(eqx.Module):
+class ControllerFilter(Module):
     """Continuous filter of the readings y of one sensor: x' = A x + B y, output C x + D y."""
 
     sensor: int = eqx.field(static=True)
@@ -161,7 +161,7 @@ def commanded(actuators: Sequence[Any]) -> tuple[int, ...]:
     return tuple(i for i, actuator in enumerate(actuators) if actuator.command_unit != "1")
 
 
-class AbstractController(ReprWithUnits, eqx.Module, metaclass=AcceptsFormerArguments):
+class AbstractController(ReprWithUnits, Module, metaclass=AcceptsFormerArguments):
     """Settings of a controller.
 
     With a sampling `period` (s) its law acts at 0, period, 2 period, ...; a command begins `delay`

@@ -8,7 +8,6 @@ the state. Estimators are in `jaxbeam.estimation`.
 import abc
 from typing import Any, ClassVar, NamedTuple
 
-import equinox as eqx
 from jaxtyping import Float
 
 from jaxbeam.case.controller import Command, Measurement, Time
@@ -85,7 +84,7 @@ class AbstractContinuousFilter(Module):
         """Rates of the states x (1/s) under a command."""
 
 
-class AbstractEstimator(ReprWithUnits, eqx.Module, metaclass=AcceptsFormerArguments):
+class AbstractEstimator(ReprWithUnits, Module, metaclass=AcceptsFormerArguments):
     """Settings of an estimator; it acts at the samples of its controller.
 
     To add one, write a file in `jaxbeam.estimation` with a subclass that names its `kind`.

@@ -7,7 +7,6 @@ and sampling period may be traced, batched and differentiated.
 
 import functools
 
-import equinox as eqx
 import numpy as np
 import scipy
 from jaxtyping import Bool, Float
@@ -17,7 +16,7 @@ from jaxbeam.case.fields import POSITIVE, choice, concrete, count, is_concrete, 
 from jaxbeam.runtime.arrays import Array, scan, xp
 
 
-class Filter(ReprWithUnits, eqx.Module):
+class Filter(ReprWithUnits):
     """Low-pass filter with gain 1 at low frequency and 1 / sqrt(2) at the cutoff.
 
     An analogue filter acts on the signal before it is sampled, a digital one on the samples.

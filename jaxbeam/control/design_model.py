@@ -10,12 +10,13 @@ from jaxbeam.case.fields import NOT_NEGATIVE, count, number
 from jaxbeam.model.modal_model import assemble_modal_model
 from jaxbeam.model.state_space import Plant, build_plant
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
 
 ACTUATOR_FIELDS = ("force_per_volt", "stiffness", "damping", "correction")
 LOAD_FIELDS = ("mass", "speed", "entry_time")
 
 
-class DesignModel(eqx.Module):
+class DesignModel(Module):
     """Parameters of actuators and loads in the design of a controller, and its number of modes.
 
     Each is one number for all parts that have it, or a list with one for each actuator (or load); a

@@ -5,7 +5,6 @@ In a simulation the gate times are computed from the trajectory of the load.
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -28,7 +27,7 @@ from jaxbeam.runtime.compiling import compiled_if_traced
 INFLUENCE_POSITIONS = 201  # load positions along the beam at which influence lines are tabulated
 
 
-class LoadIdentification(ReprWithUnits, eqx.Module):
+class LoadIdentification(ReprWithUnits):
     """Settings for identifying speed and mass of a load while it crosses.
 
     The speed follows from two `gates`, which may lie before the beam (at a negative position if the

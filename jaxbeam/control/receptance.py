@@ -25,13 +25,14 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.control.output_feedback import OutputFeedback
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.runtime.arrays import Array, is_jax, solve, xp
+from jaxbeam.runtime.module import Module
 
 COLLOCATION_NODES = 24  # over a delay; the rightmost poles are refined afterwards
 REFINEMENTS = 20  # at most, of each pole
 MAX_TURN = 300.0  # |s| times the delay
 
 
-class ReceptanceFeedback(eqx.Module):
+class ReceptanceFeedback(Module):
     """Law u = g . w(t - delay) + f . w'(t - delay) of an actuator; w are deflections at sensors.
 
     `displacement` are the gains g (command per m), `velocity` the gains f (command per m/s),

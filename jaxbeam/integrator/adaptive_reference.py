@@ -12,7 +12,6 @@ Where a load passes a kink of the beam, the momentum (I + sum m s s^T) q' + sum 
 
 import itertools
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -24,13 +23,14 @@ from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.module import Module
 
 EVENT_MARGIN_SHARE = (
     1e-14  # of the duration: kinematics are evaluated at least this far from events
 )
 
 
-class AdaptiveSolution(eqx.Module):
+class AdaptiveSolution(Module):
     """A run by the adaptive integrator: histories in SI units, deflection positive upwards.
 
     `contact_force` is positive where the load presses on the beam and zero off the beam. Samples

@@ -20,9 +20,10 @@ from jaxbeam.model.sensing.corrected_rows import LoadInfluence, StaticCorrection
 from jaxbeam.model.sensing.linear_outputs import linear_outputs
 from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
 
 
-class DiscreteModel(eqx.Module):
+class DiscreteModel(Module):
     """Modal model on a time grid: propagators of each step length, rows of monitored outputs.
 
     Outputs are deflections, or other quantities of sensors. `energy_bounds` bound each of them by

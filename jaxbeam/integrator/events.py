@@ -12,12 +12,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
 
 SAME_TIME_SHARE = 1e-9  # of the duration: closer times are one event
 MAX_DISTINCT_GAPS = 64  # with more different intervals, each has a length of its own
 
 
-class EventSchedule(eqx.Module):
+class EventSchedule(Module):
     """Times of events (s), lengths of the intervals between them, and the actions at each event.
 
     `length_index` is the index of each interval among the `lengths` (s); `sample_events` are the

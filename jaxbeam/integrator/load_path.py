@@ -1,6 +1,5 @@
 """Load path in the steps of a chunk: wheels on the beam, their rows, and the surface under them."""
 
-import equinox as eqx
 import jax
 from jaxtyping import Bool, Float, Int
 
@@ -12,9 +11,10 @@ from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.contact import SurfaceRows, surface_rows
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.runtime.arrays import Array, take, xp
+from jaxbeam.runtime.module import Module
 
 
-class LoadPath(eqx.Module):
+class LoadPath(Module):
     """Load path in the steps of a chunk: rows at the wheels on the beam, and the surface.
 
     `length_index` is the index of a step's length among those of the grid; start and length are in

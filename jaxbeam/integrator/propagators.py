@@ -15,7 +15,6 @@ import functools
 import math
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -24,6 +23,7 @@ from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS
 from jaxbeam.numerics.gauss import gauss_nodes, lagrange_coefficients
 from jaxbeam.runtime.arrays import Array, cond, scan, set_at, stop_gradient, vmap, xp
+from jaxbeam.runtime.module import Module
 
 NODE_COUNT = 6  # Gauss nodes in a step; the integrator has order 12
 DOUBLINGS = 7
@@ -37,7 +37,7 @@ GAUSS_NODES = gauss_nodes(NODE_COUNT)
 PEAK_NODES = (0.0, *(float(node) for node in GAUSS_NODES), 1.0)
 
 
-class Propagators(eqx.Module):
+class Propagators(Module):
     """Propagators over steps of given lengths, to the Gauss nodes and to the end of a step.
 
     `transition_*` act on the state at the start, `input_*` on the inputs at the Gauss nodes, in the

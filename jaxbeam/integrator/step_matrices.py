@@ -10,7 +10,6 @@ import math
 import operator
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
@@ -29,20 +28,21 @@ from jaxbeam.runtime.arrays import (
     map_elements,
     xp,
 )
+from jaxbeam.runtime.module import Module
 
 CHUNK_STEPS = 16  # steps whose matrices a compiled program computes together
 MANY_STATES = 48  # of which NumPy makes no matrix a step
 KNOWN_CHUNK_ENTRIES = 2**19  # of matrices that NumPy computes together, so that caches hold them
 
 
-class CommandMatrices(eqx.Module):
+class CommandMatrices(Module):
     """From commands at the nodes to the acceleration under the loads and the state at the end."""
 
     contact_response: Float[Array, "step row command"] | None
     input_matrix: Float[Array, "step state command"]
 
 
-class NodeMatrices(eqx.Module):
+class NodeMatrices(Module):
     """From state at the start, contact forces and commands to the states at the Gauss nodes."""
 
     transition: Float[Array, "step node_state state"]
@@ -50,7 +50,7 @@ class NodeMatrices(eqx.Module):
     command_response: Float[Array, "step node_state command"]
 
 
-class SpringMatrices(eqx.Module):
+class SpringMatrices(Module):
     """To deflections and velocities under the wheels at the nodes.
 
     From the state at the start, the contact forces, and the commands; one of the motions, or both
@@ -62,7 +62,7 @@ class SpringMatrices(eqx.Module):
     commands: Float[Array, "step *motion row command"] | None
 
 
-class StepMatrices(eqx.Module):
+class StepMatrices(Module):
     """Matrices of the steps of a chunk; rows are (load, node), commands (node, actuator).
 
     `contact_response` maps the state at the start to the acceleration under the loads at the

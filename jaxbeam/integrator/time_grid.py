@@ -5,7 +5,6 @@ a support or the end of a patch. No step contains one inside. The structure of t
 number of panels, so the grid can be compiled; a panel of zero length has no effect.
 """
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -15,12 +14,13 @@ from jaxbeam.integrator.kinks.passages import KinkPassages, kink_passages
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import Array, put, searchsorted, stop_gradient, take, xp
+from jaxbeam.runtime.module import Module
 
 # Entry and exit of each wheel (s), and times of all load events (s).
 LoadEvents = tuple[Float[Array, "wheel 2"], Float[Array, " event"]]
 
 
-class TimeGrid(eqx.Module):
+class TimeGrid(Module):
     """Panels between `boundaries` (s), each with a number of equal steps.
 
     `counts` are the numbers of steps of the panels, `cumulative_counts` those up to the end of

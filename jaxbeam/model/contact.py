@@ -14,7 +14,6 @@ rows times states, and y'' is also (shape row) . f.
 
 import math
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -23,11 +22,12 @@ from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.batched_linalg import solve_small
 from jaxbeam.runtime.arrays import Array, add_at, any_jax, custom_jvp, slice_in_dim, xp
+from jaxbeam.runtime.module import Module
 
 KNOWN_BLOCK = 2**14  # instants times wheels at once: fifty for 30 s take 0.1 GiB, not 0.9
 
 
-class SurfaceRows(eqx.Module):
+class SurfaceRows(Module):
     """Rows from modal states to the motion of the beam under wheels; zero off the beam.
 
     `shape` is that of the modes; `acceleration`, `velocity` and `deflection` act on the states in
@@ -84,7 +84,7 @@ def surface_rows(
     return SurfaceRows(blocks_of_shape, rows, all_states(velocity), all_states(deflection))
 
 
-class ContactState(eqx.Module):
+class ContactState(Module):
     """Contact forces f (N, upwards on the beam) and accelerations at instants.
 
     Of the coordinates q, and of the degrees of freedom of the vehicles of each load (m/s^2).
@@ -216,7 +216,7 @@ def solve_at_instants(
     return xp.moveaxis(solution.reshape(columns.shape), 0, -2)
 
 
-class ModalCompliance(eqx.Module):
+class ModalCompliance(Module):
     """Compliance G = U V' of contact forces that act through fewer modes than there are loads.
 
     `response` U maps generalised forces at the Gauss nodes (node and mode) to the acceleration

@@ -20,12 +20,13 @@ from jaxbeam.model.theory.statics import SectionFlexibility, is_held, section_fl
 from jaxbeam.numerics.piecewise import piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, set_at, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
+from jaxbeam.runtime.module import Module
 
 # Least stiffness against rigid-body motion of a statically supported beam, in E I / L^3.
 MIN_RIGID_BODY_STIFFNESS = 1e-10
 
 
-class FlexibilityPoints(eqx.Module):
+class FlexibilityPoints(Module):
     """Points of unit forces (derivative 0) or unit couples (1) on the beam; positions in L.
 
     A derivative d stands for the d-th x-derivative of a unit force, up to 3.
@@ -40,7 +41,7 @@ class FlexibilityPoints(eqx.Module):
         return [(int(order), np.flatnonzero(orders == order)) for order in np.unique(orders)]
 
 
-class Flexibility(eqx.Module):
+class Flexibility(Module):
     """Deflections of the beam under unit sources, to be evaluated at any position y.
 
     In beam units: lengths in L, stiffness in E I / L^3. `series` holds the cubics between the

@@ -26,6 +26,7 @@ from jaxbeam.model.modes import Layout, mesh_layout
 from jaxbeam.runtime.arrays import Array, add_at, set_at, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.dataset import labelled_dataset
+from jaxbeam.runtime.module import Module
 from jaxbeam.runtime.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 StationaryMasses = Sequence[tuple[Any, Any]]  # position (m) and mass (kg) of each
 
 
-class FrequencyResponse(TableViews, eqx.Module):
+class FrequencyResponse(TableViews, Module):
     """Frequency responses at `frequencies` (Hz), one column for each pair of input and output.
 
     `values` are complex amplitudes of the output per input, in the `unit` of the pair; their phase

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from jaxbeam.numerics.discretisation import c2d
 from jaxbeam.runtime.arrays import Array, solve, xp
+from jaxbeam.runtime.module import Module
 from jaxbeam.runtime.whole_file import whole_file
 
 
@@ -20,7 +21,7 @@ class Signal(NamedTuple):
     unit: str
 
 
-class StateSpace(eqx.Module):
+class StateSpace(Module):
     """A linear system z' = A z + B u, y = C z + D u with named signals.
 
     With a `period` (s) it is one in discrete time, z_(k+1) = A z_k + B u_k. Frozen at several

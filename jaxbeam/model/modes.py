@@ -39,6 +39,7 @@ from jaxbeam.numerics.eigen import REPEATED_EIGENVALUE_TOLERANCE, eigen
 from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, add_at, set_at, stop_gradient, xp
 from jaxbeam.runtime.dataset import labelled_dataset
+from jaxbeam.runtime.module import Module
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -58,7 +59,7 @@ def _reference_element(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return legendre_to_chebyshev(degree + 1) @ basis, mass, bending
 
 
-class Modes(TableViews, eqx.Module):
+class Modes(TableViews, Module):
     """Modes of the supported beam: q_j'' + damping_j q_j' + stiffness_j q_j = psi_j(x) . force.
 
     `coupling` is the off-diagonal stiffness between repeated modes, zero in value but not in

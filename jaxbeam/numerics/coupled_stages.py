@@ -14,7 +14,6 @@ import functools
 import math
 import operator
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,11 +24,12 @@ from jaxbeam.numerics.gauss import gauss_weights, lagrange_coefficients
 from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square
 from jaxbeam.numerics.stages import GAUSS_NODES, NODE_COUNT, Stage, command_cost_matrix
 from jaxbeam.runtime.arrays import Array, add_at, any_jax, index_in_dim, scan, xp
+from jaxbeam.runtime.module import Module
 
 TAYLOR_TERMS = 12  # of the series for the shortest intervals
 
 
-class ConstantPlant(eqx.Module):
+class ConstantPlant(Module):
     """Constant part A, B, E of a plant; see the module."""
 
     A: Square
@@ -37,7 +37,7 @@ class ConstantPlant(eqx.Module):
     E: Float[Array, "state direction"]
 
 
-class Coupling(eqx.Module):
+class Coupling(Module):
     """Time-varying part F, V, S, D of a plant; see the module."""
 
     force_distribution: Float[Array, "*time direction force"]
@@ -46,7 +46,7 @@ class Coupling(eqx.Module):
     force_feedthrough: Float[Array, "*time force force"]
 
 
-class StageResponse(eqx.Module):
+class StageResponse(Module):
     """Response and cost of the constant part over an interval.
 
     `state_at_nodes` and `state_at_end` give the state at the Gauss nodes and at the end from

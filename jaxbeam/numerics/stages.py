@@ -8,7 +8,6 @@ Optimal control minimises over U, one interval after the other, backward in time
 the end, that at the start is the minimum of W + (Phi, Gamma)' P (Phi, Gamma) over U.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,12 +18,13 @@ from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.gauss import gauss_nodes, gauss_weights, integration_matrix
 from jaxbeam.numerics.matrices import InputWeight, Square, symmetric_part
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
 
 NODE_COUNT = 6  # Gauss nodes of an interval; order 12
 GAUSS_NODES = gauss_nodes(NODE_COUNT)
 
 
-class Stage(eqx.Module):
+class Stage(Module):
     """Transition Phi, input matrix Gamma and cost matrix W of an interval; see the module."""
 
     transition: Float[Array, "*batch state state"]

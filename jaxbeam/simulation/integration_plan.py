@@ -43,6 +43,7 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
+from jaxbeam.runtime.module import Module
 from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
 from jaxbeam.simulation.errors import step_errors
 
@@ -58,7 +59,7 @@ SHARE_OF_TRIAL_STEP = 0.8
 SPACING_TOLERANCE = 1e-6  # largest deviation of equally spaced samples, relative to the spacing
 
 
-class IntegrationPlan(eqx.Module):
+class IntegrationPlan(Module):
     """Integration plan: static shapes, steps per sample interval, estimated error.
 
     Valid for cases that differ in numbers only, if these keep the order of supports and loads and

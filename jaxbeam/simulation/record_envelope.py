@@ -13,6 +13,7 @@ from jaxbeam.model.modes import Modes
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, take, xp
 from jaxbeam.runtime.dataset import labelled_dataset
+from jaxbeam.runtime.module import Module
 from jaxbeam.simulation.section_forces import SIDES, history, shear_force
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ MAX_ENTRIES = 4_000_000  # of the influence of all loads at all times on one par
 DEFAULT_POSITIONS = 101
 
 
-class RecordEnvelope(TableViews, eqx.Module):
+class RecordEnvelope(TableViews, Module):
     """Smallest and largest values of a quantity at positions (m), from the samples of a record.
 
     Values are in the unit of the quantity; with each are its time (s) and the positions of the

@@ -13,7 +13,6 @@ smaller peak, whatever it measures, estimates or predicts.
 import dataclasses
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -41,6 +40,7 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled_if_traced
+from jaxbeam.runtime.module import Module
 from jaxbeam.simulation.commands.limits import acting_ranges
 from jaxbeam.simulation.record import Record
 
@@ -63,7 +63,7 @@ class ActiveConstraints(NamedTuple):
     instants = renamed_property("instants", "times")
 
 
-class Bound(eqx.Module):
+class Bound(Module):
     """Least achievable peak deflection of a case, and commands that attain it.
 
     `peak` (m) is the largest absolute deflection at the `positions` (m) and at times at most

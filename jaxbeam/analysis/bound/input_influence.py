@@ -28,6 +28,7 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
+from jaxbeam.runtime.module import Module
 from jaxbeam.simulation.integration_plan import steps_per_interval
 
 TOLERANCE = 1e-9  # relative to the largest deflection
@@ -35,7 +36,7 @@ MAX_BATCH_SIZE = 1024  # unit commands at once; more take gigabytes
 MAX_RESPONSE_SIZE = 3e8  # numbers in `response`: 2.4 GB
 
 
-class InputInfluence(eqx.Module):
+class InputInfluence(Module):
     """Modal coordinates at `times` (s): `unforced` by commands, and `response` to unit commands.
 
     A unit command is held from one of the `hold_times` (s) to the next. `deflection_rows` map the

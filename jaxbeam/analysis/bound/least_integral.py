@@ -9,7 +9,6 @@ that of eq. (3.3), as its commands jump. The deflection is affine in the held co
 and its least value that of a quadratic program. (3.2) is half of J.
 """
 
-import equinox as eqx
 import numpy as np
 import scipy  # loads its parts on first use
 from jaxtyping import Float
@@ -21,13 +20,14 @@ from jaxbeam.case.case import Case
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.model.channels import accepts_commands
 from jaxbeam.numerics.optimisation.qp import STATUS_TEXT, solve_qp
+from jaxbeam.runtime.module import Module
 from jaxbeam.simulation.record import Record
 
 REGULARISATION = 1e-10  # on squared commands, of the largest effect of one: some have no effect
 GAP_TOLERANCE = 1e-6  # of the integral without commands, between the commands and their proof
 
 
-class LeastIntegral(eqx.Module):
+class LeastIntegral(Module):
     """Least integral of the weighted squared deflection of a case, and commands that attain it.
 
     `integral` (m^2 s) is that of the `commands`, which start at `times` (s) and are held over

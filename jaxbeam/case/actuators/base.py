@@ -13,7 +13,7 @@ from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.module import Module
 
 
-class Attachment(eqx.Module):
+class Attachment(Module):
     """Linear device that acts on the beam along one generalised displacement s.
 
     s is the displacement at its port, a deflection or a difference of slopes of the beam (see
@@ -41,7 +41,7 @@ class Attachment(eqx.Module):
         return self.feedthrough - self.output_matrix @ steady_states
 
 
-class SectionStiffening(eqx.Module):
+class SectionStiffening(Module):
     """Bending stiffness (N m^2) and mass per length (kg/m) added between two positions (m)."""
 
     start: Float[Array, ""]

@@ -10,7 +10,6 @@ Applications 148, 2001; the order hysteresis, then creep, is that of Croft, Shed
 Journal of Dynamic Systems, Measurement, and Control 123, 2001).
 """
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -21,7 +20,7 @@ from jaxbeam.runtime.arrays import Array, xp
 Lags = Float[Array, "lag *batch"]
 
 
-class Creep(ReprWithUnits, eqx.Module):
+class Creep(ReprWithUnits):
     """Sum of first-order lags added to the command that acts at once; both have its unit.
 
     A steady command of 1 acts as 1 at once and as 1 + sum of the weights in the end.

@@ -9,7 +9,6 @@ rate of the command, and its inverse is an operator of the same kind (Krejci and
 Proceedings - Control Theory and Applications 148, 2001).
 """
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -21,7 +20,7 @@ from jaxbeam.runtime.arrays import Array, xp
 Plays = Float[Array, "play *batch"]
 
 
-class Hysteresis(ReprWithUnits, eqx.Module):
+class Hysteresis(ReprWithUnits):
     """Prandtl-Ishlinskii operator, from the command of an actuator to the command that acts.
 
     Both have the unit of the command. Its slope is the first weight where the command turns, and

@@ -52,7 +52,7 @@ class LoopPort(NamedTuple):
     voltage: PortSignal
 
 
-class AbstractInnerLoop(ReprWithUnits, eqx.Module):
+class AbstractInnerLoop(ReprWithUnits):
     """Interface of inner loops: proportional and integral gains, or a bandwidth."""
 
     kind: ClassVar[str]

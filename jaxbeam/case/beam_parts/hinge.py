@@ -1,6 +1,5 @@
 """Hinge inside a beam."""
 
-import equinox as eqx
 from jaxtyping import Float
 
 from jaxbeam.case.display.parts import ReprWithUnits
@@ -8,7 +7,7 @@ from jaxbeam.case.fields import NOT_NEGATIVE, ON_BEAM, number
 from jaxbeam.runtime.arrays import Array
 
 
-class Hinge(ReprWithUnits, eqx.Module):
+class Hinge(ReprWithUnits):
     """Hinge between the ends of a beam: no bending moment, or that of a rotational spring.
 
     The deflection is continuous, the rotation jumps. A moment M = k (phi_right - phi_left) is that

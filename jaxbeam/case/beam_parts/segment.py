@@ -1,6 +1,5 @@
 """Segment of a stepped or tapered beam."""
 
-import equinox as eqx
 from jaxtyping import Float
 
 from jaxbeam.case.display.parts import ReprWithUnits
@@ -8,7 +7,7 @@ from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, number
 from jaxbeam.runtime.arrays import Array
 
 
-class Segment(ReprWithUnits, eqx.Module):
+class Segment(ReprWithUnits):
     """Length of a beam over which stiffness and mass are constant or polynomials.
 
     Each property is one number, or the coefficients c_0, c_1, ... of

@@ -5,17 +5,17 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 
 from jaxbeam.case.display.arguments import ExplainsArguments
+from jaxbeam.runtime.module import Module
 
 MAX_VALUES = 6  # of a list that are written out
 MAX_PARTS = 8  # in a row under one key that are written out
 
 
-class ReprWithUnits(eqx.Module, metaclass=ExplainsArguments):
+class ReprWithUnits(Module, metaclass=ExplainsArguments):
     """Base of parts of a case whose `repr` shows numbers with units: "Beam(length=0.6 m, ...)".
 
     Entries that equal their defaults are left out.

@@ -23,7 +23,7 @@ from jaxbeam.case.trajectory import (
 from jaxbeam.runtime.arrays import Array, xp
 
 
-class AbstractLoad(ReprWithUnits, eqx.Module):
+class AbstractLoad(ReprWithUnits):
     """Interface of loads. A subclass that declares a `kind` is one of case files."""
 
     kind: ClassVar[str]

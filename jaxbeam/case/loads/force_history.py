@@ -1,13 +1,13 @@
 """Force over time, as a sum of waves and a table."""
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
 
 
-class ForceHistory(eqx.Module):
+class ForceHistory(Module):
     """Force (N, positive downwards) over time, in addition to a constant one.
 
     The sum of A sin(2 pi f t + phase) and of a table of forces at times, with straight lines

@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.runtime.arrays import Array, cholesky, solve, xp
+from jaxbeam.runtime.module import Module
 
 
-class VehicleModel(eqx.Module):
+class VehicleModel(Module):
     """Matrices of one vehicle: equations of motion, and what its wheels do to the surface.
 
     `offsets` are the distances (m) of the wheels behind the first one. Wheels have static loads P

@@ -18,6 +18,7 @@ from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, Cont
 from jaxbeam.case.fields import INCREASING, POSITIVE, concrete, count, is_concrete, number
 from jaxbeam.case.filters import Filter, filter_step, second_order_sections, steady_filter_state
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
 
 SHARES = (-0.6, -0.3, -0.15, 0.0, 0.15, 0.3, 0.6, 0.9, 1.2, 1.6, 2.2)
 VALUES = (-0.97, -0.5, -0.17, 0.0, 0.28, 0.38, 0.6, 0.74, 0.84, 0.96, 1.0)
@@ -186,7 +187,7 @@ def equaliser(
     return xp.stack(rows)
 
 
-class LawState(eqx.Module):
+class LawState(Module):
     """States of the equalisers and of the reference filter, and the last acting commands."""
 
     equalisers: tuple[Float[Array, "section 2"], ...]

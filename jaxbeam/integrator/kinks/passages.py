@@ -5,7 +5,6 @@ shear stiffness does; that of a profile at the ends of a ramp. A wheel that stay
 then changes its velocity by |v| ([w'] + [r']) at once, from left to right: see `kinks.steps`.
 """
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -20,9 +19,10 @@ from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.settlement import has_settlement
 from jaxbeam.numerics.piecewise import slope_jumps
 from jaxbeam.runtime.arrays import Array, take, xp
+from jaxbeam.runtime.module import Module
 
 
-class KinkSteps(eqx.Module):
+class KinkSteps(Module):
     """Which steps are passages over kinks, and the jumps of velocity under the wheels there.
 
     `slopes` are rows from q to |v| [w'], `profile` is |v| [r'] (m/s); zero for other wheels.
@@ -33,7 +33,7 @@ class KinkSteps(eqx.Module):
     profile: Float[Array, "step load"]
 
 
-class KinkPassages(eqx.Module):
+class KinkPassages(Module):
     """Passages of wheels over kinks: times (s; `NEVER` if there is none), indices of the wheels.
 
     `slope_jumps` are rows from the coordinates q to the jump [w'] of the slope of the beam,

@@ -5,7 +5,6 @@ extrapolation of the forces at the Gauss nodes is the least accurate there; the 
 accurate, of order 12, and so are the forces that the contact law gives for them.
 """
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -14,11 +13,12 @@ from jaxbeam.model.contact import solve_at_instants, surface_rows
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
 
 END_FRACTIONS = (1e-9, 1.0 - 1e-9)  # of a step: limits within, where accelerations of loads jump
 
 
-class EndRows(eqx.Module):
+class EndRows(Module):
     """Wheels at the two ends of steps: mode shapes, rows of accelerations, and height rates.
 
     `accelerations` map states to the accelerations under the wheels, `surface` is the second rate

@@ -18,6 +18,7 @@ from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.step_matrices import StepMatrices
 from jaxbeam.numerics.peak_search import estimate_peak, max_with_ties, refine_peak
 from jaxbeam.runtime.arrays import Array, cond, optimization_barrier, take, xp
+from jaxbeam.runtime.module import Module
 
 PEAK_MARGIN = 1.1  # upper bound of a peak over the highest of the samples around it
 
@@ -34,7 +35,7 @@ class Peaks(NamedTuple):
     contact_lost_time: Float[Array, "*task batch load"]
 
 
-class RunningPeaks(eqx.Module):
+class RunningPeaks(Module):
     """Peaks of the runs of a batch so far.
 
     `samples` are the deflections (m) at the peak nodes of the step with the largest `estimate` of

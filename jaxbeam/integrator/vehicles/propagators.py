@@ -9,7 +9,6 @@ vehicle follow exactly (`propagators`), and the springs press on the surface at 
 where z are its states at the start of the step.
 """
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -23,9 +22,10 @@ from jaxbeam.integrator.propagators import (
 from jaxbeam.model.load_set import LoadSet, VehicleGroup
 from jaxbeam.numerics.batched_linalg import matmul_last
 from jaxbeam.runtime.arrays import Array, any_jax, cond, map_elements, stop_gradient, xp
+from jaxbeam.runtime.module import Module
 
 
-class VehiclePropagators(eqx.Module):
+class VehiclePropagators(Module):
     """Matrices of the vehicles of one load over steps of some lengths.
 
     `transition` and `input` map states and q at the nodes to the states at the end;

@@ -3,7 +3,6 @@
 See `vehicle_propagators` for the response of a vehicle to the surface under its wheels.
 """
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -34,11 +33,12 @@ from jaxbeam.runtime.arrays import (
     take,
     xp,
 )
+from jaxbeam.runtime.module import Module
 
 MAX_UNROLLED_ROWS = 24  # of contact equations whose elimination is spelt out
 
 
-class VehicleStep(eqx.Module):
+class VehicleStep(Module):
     """Wheels of the rows of a step, and the surface, for each step of a chunk.
 
     `length_index` is that of the step's length; `on_beam` tells which wheels are there; `surface`
@@ -51,7 +51,7 @@ class VehicleStep(eqx.Module):
     surface: Float[Array, "*step 3 all node"] | None
 
 
-class StepInput(eqx.Module):
+class StepInput(Module):
     """What a step of a batch takes: matrices, and inertia (kg) and weight (N) of the rows.
 
     The weight includes the inertia forces of the profile. Without vehicles, `vehicles` is None.
@@ -63,7 +63,7 @@ class StepInput(eqx.Module):
     vehicles: VehicleStep | None
 
 
-class Vehicles(eqx.Module):
+class Vehicles(Module):
     """Loads with vehicles, and the propagators of the vehicles of each for all step lengths."""
 
     loads: LoadSet

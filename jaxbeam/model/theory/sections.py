@@ -18,12 +18,13 @@ from jaxbeam.case.case import Case
 from jaxbeam.model.layout import Layout, node_positions
 from jaxbeam.numerics.piecewise import piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
 
 PROPERTIES = ("rigidity", "mass", "shear_stiffness", "rotary_inertia", "foundation_stiffness")
 RIGIDITY, MASS, SHEAR, ROTARY, FOUNDATION = range(len(PROPERTIES))
 
 
-class Sections(eqx.Module):
+class Sections(Module):
     """Section properties as polynomials on each element between the `nodes` (in L).
 
     In beam units, of the `bending_stiffness` E I and the `linear_density` m of the beam: E I, m,

@@ -4,7 +4,6 @@ matrices between them.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -14,13 +13,14 @@ from jaxbeam.model.theory.elements import add_nodal_parts, nodal_unknowns
 from jaxbeam.model.theory.sections import sections
 from jaxbeam.model.theory.transfer import SYMPLECTIC, Transfer, transfer
 from jaxbeam.runtime.arrays import Array, add_at, solve, take, xp
+from jaxbeam.runtime.module import Module
 
 # Signs of the entries (S, -M) of nodal forces in (M, S), so that work is w P + phi C.
 TO_FORCES = np.array([[0.0, 1.0], [-1.0, 0.0]])
 LEAST_STIFFNESS = 1e-8  # of a supported beam, in E I / L^3
 
 
-class SectionFlexibility(eqx.Module):
+class SectionFlexibility(Module):
     """Fields of the beam under unit sources, to be evaluated at any position y (see `Flexibility`).
 
     `left_states` are the states at the left node of each part under each source; source i makes the

@@ -13,7 +13,6 @@ part of an element by collocation; its transfer matrix Phi is symplectic.
 import functools
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import chebyshev
@@ -23,12 +22,13 @@ from jaxbeam.model.theory.fields import SLOPE
 from jaxbeam.model.theory.sections import FOUNDATION, RIGIDITY, SHEAR, Sections
 from jaxbeam.numerics.piecewise import piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, solve, xp
+from jaxbeam.runtime.module import Module
 
 POINTS = 24  # of the collocation: exact to rounding on the parts that a layout has
 SYMPLECTIC = np.array([[0, 0, 0, 1], [0, 0, -1, 0], [0, 1, 0, 0], [-1, 0, 0, 0]], float)
 
 
-class Transfer(eqx.Module):
+class Transfer(Module):
     """Transfer matrices Phi(x) from the left node of each part to x, in beam units.
 
     `nodes` (in L) are those between the parts; `series` are Chebyshev series of the 16 entries.

@@ -10,16 +10,16 @@ q_u'' of the commands, and the forces q = k y + c y' that the beam exerts on spr
 The profile and forces that vary in time add to W and q what `known_disturbance` returns.
 """
 
-import equinox as eqx
 from jaxtyping import Bool, Float
 
 from jaxbeam.model.contact import SurfaceRows, surface_rows
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import Array, block_diag, set_at, xp
+from jaxbeam.runtime.module import Module
 
 
-class ContactRows(eqx.Module):
+class ContactRows(Module):
     """S, m (kg; zero off the beam), V and Y at some times; see the module. Y has no vehicle part.
 
     Without vehicles Y is None.

@@ -4,18 +4,18 @@ Commands are held for a period. What acts in it is the mean over the period, whi
 than a rate of the creep times the period from its ends.
 """
 
-import equinox as eqx
 from jaxtyping import Float
 
 from jaxbeam.case.actuators.creep import Creep
 from jaxbeam.case.actuators.hysteresis import Hysteresis
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
 
 State = Float[Array, "state batch"]
 Command = Float[Array, " batch"]
 
 
-class CommandOperator(eqx.Module):
+class CommandOperator(Module):
     """Hysteresis, then creep, under commands held for a period (s): from a command to what acts.
 
     The state has the plays, the first of which is the command itself, and the lags at the start of
@@ -58,7 +58,7 @@ class CommandOperator(eqx.Module):
         return state[:count], state[count:]
 
 
-class InverseOperator(eqx.Module):
+class InverseOperator(Module):
     """Inverse of a `CommandOperator`; `hysteresis` is the inverse of that of the operator.
 
     The lags follow from past commands, so that y = s v + sum of s_i z_i has the solution v, the

@@ -17,6 +17,7 @@ from jaxbeam.files.tables import write_result
 from jaxbeam.model.modes import Modes
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.dataset import labelled_dataset
+from jaxbeam.runtime.module import Module
 from jaxbeam.runtime.whole_file import whole_file
 from jaxbeam.simulation.extremes import Extremes
 from jaxbeam.simulation.views.dataset import dataset_parts
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-class RecordViews(TableViews, eqx.Module):
+class RecordViews(TableViews, Module):
     """Base of records: what others see of one."""
 
     case: eqx.AbstractVar[Case]

@@ -3,7 +3,6 @@
 Positions are in m along the vehicle, forward positive, from any common origin.
 """
 
-import equinox as eqx
 from jaxtyping import Float
 
 from jaxbeam.case.display.parts import ReprWithUnits
@@ -11,7 +10,7 @@ from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, number
 from jaxbeam.runtime.arrays import Array
 
 
-class VehicleBody(ReprWithUnits, eqx.Module):
+class VehicleBody(ReprWithUnits):
     """Rigid body; without `inertia` it has a height only, like the lumped mass of an axle.
 
     >>> import jaxbeam as jb
@@ -46,7 +45,7 @@ class VehicleBody(ReprWithUnits, eqx.Module):
     position: Float[Array, ""] = number("m", "centre of mass, forward positive", default=0.0)
 
 
-class VehicleSpring(ReprWithUnits, eqx.Module):
+class VehicleSpring(ReprWithUnits):
     """Vertical spring and damper between two bodies at a position, and those between their pitches.
 
     A vertical force acts on both bodies along one line, so that they share the position.
@@ -89,7 +88,7 @@ class VehicleSpring(ReprWithUnits, eqx.Module):
     )
 
 
-class VehicleHinge(ReprWithUnits, eqx.Module):
+class VehicleHinge(ReprWithUnits):
     """Point at which two bodies have the same height, exactly, such as a fifth wheel.
 
     >>> import jaxbeam as jb
@@ -128,7 +127,7 @@ class VehicleHinge(ReprWithUnits, eqx.Module):
     position: Float[Array, ""] = number("m", "position, forward positive")
 
 
-class VehicleAxle(ReprWithUnits, eqx.Module):
+class VehicleAxle(ReprWithUnits):
     """Axle under a body: on a suspension, on a tyre, or on both with its mass in between.
 
     Without a tyre it stays on the surface, where its mass is unsprung, as that of a wheelset;

@@ -2,7 +2,6 @@
 
 from typing import ClassVar
 
-import equinox as eqx
 from jaxtyping import Float
 
 from jaxbeam.case import fields
@@ -12,12 +11,13 @@ from jaxbeam.case.loads.planar.files import is_path, load_vehicle, unknown_vehic
 from jaxbeam.case.loads.planar.vehicle import PlanarVehicle
 from jaxbeam.case.loads.vehicle_model import VehicleModel
 from jaxbeam.runtime.arrays import Array, block_diag, xp
+from jaxbeam.runtime.module import Module
 
 PER_WHEEL = ("static_loads", "wheel_masses", "contact_stiffness", "contact_damping")
 MATRICES = ("mass", "damping", "stiffness")
 
 
-class Coach(eqx.Module):
+class Coach(Module):
     """Vehicles of one kind in a train, `count` one behind the other.
 
     `length` over couplers is that of the vehicle file if it is left out; the wheels are in the

@@ -1,6 +1,5 @@
 """Planar vehicles of any bodies, springs, dampers, hinges and axles."""
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -16,9 +15,10 @@ from jaxbeam.case.loads.planar.parts import (
 from jaxbeam.case.loads.vehicle_checks import known_numbers, static_load_error
 from jaxbeam.case.loads.vehicle_model import VehicleModel
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
 
 
-class PlanarVehicle(eqx.Module):
+class PlanarVehicle(Module):
     """Vehicle of a vehicle file: its fields are the keys of the file, its parts are tables there.
 
     Bodies and hinges in any order, axles front first. `spacing` is the distance at which such
