@@ -148,12 +148,9 @@ class Runner:
         """What the C integrator needs to know, if all batches share a model; else None."""
         program = self.program()._replace(case=concrete_case(self.case))
         model = jax.tree.map(lambda leaf: leaf[0], self.models)
-        known, one = (
-            KnownInputs(program, model, self._path_times.load_events, self.batches),
-            np.zeros(1, int),
-        )
+        known = KnownInputs(program, model, self._path_times.load_events, self.batches)
         try:
-            known.of_batches(one, np.ones(1))
+            known.of_batches(np.zeros(1, int), np.ones(1))
         except NotVectorisedError:
             return None
         return known
