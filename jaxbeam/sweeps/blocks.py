@@ -5,12 +5,13 @@ import dataclasses
 import functools
 import os
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.integrator import native_peaks
@@ -33,6 +34,7 @@ from jaxbeam.sweeps.step_size import (
     rounding_error,
     stratified_sample,
 )
+from jaxbeam.sweeps.trials import Trials
 
 MAX_BLOCK_RUNS = 512  # about; a block is one call of the compiled program and one write
 # The same where batches are integrated at once: an H100 takes 65536 runs in 0.33 s, in blocks of
@@ -71,8 +73,7 @@ class Runner:
             )
         elif histories:
             self.schedule = sample_schedule(sample_times(case), True, end=case.run.duration)
-        # More threads than cores, as some wait for others.
-        self.pool = ThreadPoolExecutor(2 * (os.cpu_count() or 1))
+        self.trials = Trials()
         # The variant that measures step sizes is compiled below, others on first use.
         self._compile_lock, self._compiled_variants = threading.Lock(), {(None, False)}
         self._set_block_size()
@@ -95,6 +96,9 @@ class Runner:
         # The C library makes its own step matrices.
         self.discretise_separately = case.controller is None and not native
         self.known_inputs = self._known_inputs() if native and self.same_model else None
+        # More threads than cores where some wait for others.
+        waiting = self.known_inputs is None
+        self.pool = ThreadPoolExecutor((os.cpu_count() or 1) * (2 if waiting else 1))
         if self.known_inputs is None:
             self._compile_programs()
         if not self.same_model:
@@ -148,12 +152,10 @@ class Runner:
         """What the C integrator needs to know, if all batches share a model; else None."""
         program = self.program()._replace(case=concrete_case(self.case))
         model = jax.tree.map(lambda leaf: leaf[0], self.models)
-        known = KnownInputs(program, model, self._path_times.load_events, self.batches)
         try:
-            known.of_batches(np.zeros(1, int), np.ones(1))
+            return KnownInputs(program, model, self._path_times.load_events, self.batches)
         except NotVectorisedError:
             return None
-        return known
 
     def _compile_programs(self) -> None:
         """Compile the programs for step sizes."""
@@ -187,9 +189,12 @@ class Runner:
         def peaks(batch_indices, steps, extra_steps=0, single=False):
             calls = -(-batch_indices.size // self.trial_batches)
             parts = np.array_split(batch_indices, calls), np.array_split(steps, calls)
-            settings = None, single, extra_steps
-            results = [self._integrate(*part, *settings) for part in zip(*parts, strict=True)]
-            found = [one["peak_deflection"] for one in results]
+            found = []
+            for part in zip(*parts, strict=True):
+                results = self._integrate_few(*part, single, extra_steps)
+                if not (extra_steps or single):
+                    self.trials.add(*part, results)
+                found.append(results["peak_deflection"])
             return self._compared_by_quantity(np.concatenate(found))
 
         masses, checked = swept_masses(self.case, self.batches), None
@@ -218,14 +223,47 @@ class Runner:
         rows = slice(block * self.batches_per_block, (block + 1) * self.batches_per_block)
         return int((self.batches.run_index[rows] >= 0).sum())
 
-    def compute_block(self, block: int, steps: Float[np.ndarray, " path"]) -> dict[str, np.ndarray]:
-        """Results (path, batch, ...) of a block by name, with the step sizes (s) of all batches."""
+    def block_function(
+        self, steps: Float[np.ndarray, " path"], trials: Trials | None = None
+    ) -> Callable[[int], dict[str, np.ndarray]]:
+        """Function of a block's number: its results (path, batch, ...) by name.
+
+        `steps` (s) are those of all batches. Results among the `trials` are not computed again;
+        nor are those from which an interrupted sweep continues, which agree to the bit.
+        """
+        integrate, known_results = self._block_integrator(steps), trials or Trials()
+        if self.histories:
+            known_results = Trials()  # trials have none
+
+        def compute(block: int) -> dict[str, np.ndarray]:
+            batch_indices = self._batches_of(block)
+            known = known_results.known(batch_indices, steps[batch_indices])
+            results = integrate(block, ~known)
+            if not known.any():
+                return results
+            return known_results.completed(results, batch_indices, known)
+
+        return compute
+
+    def _batches_of(self, block: int) -> Int[np.ndarray, " path"]:
+        """Indices of the batches of a block; the last one is filled with the first batches."""
         first, count = block * self.batches_per_block, self.batches.run_index.shape[0]
-        batch_indices = np.arange(first, first + self.batches_per_block) % count
+        return np.arange(first, first + self.batches_per_block) % count
+
+    def _block_integrator(self, steps) -> Callable:
+        """Function of a block's number and a mask of its batches: results of those in the mask."""
+        if self.known_inputs is not None:
+            inputs_of_block = self.known_inputs.of_blocks(steps, self.batches_per_block)
+            return lambda block, mask: self._integrate_in_c(inputs_of_block(block), mask)
         substeps = None
         if self.histories:
             substeps = steps_per_interval(float(self.schedule.lengths.max()), steps.min())
-        return self._integrate(batch_indices, steps[batch_indices], substeps, self.single)
+
+        def integrate(block, mask):
+            rows = self._batches_of(block)
+            return self._integrate_compiled(rows, steps[rows], mask, substeps, self.single)
+
+        return integrate
 
     def _programs_to_compile(self, program, shared_values):
         """Programs that step sizes need, the slowest to compile first, and template arguments."""
@@ -250,18 +288,26 @@ class Runner:
         if not self.same_model:
             yield programs.modal_models, (program, shared_values)
 
-    def _integrate(self, batch_indices, steps, substeps, single, extra_steps=0):
+    def _integrate_few(self, batch_indices, steps, single=False, extra_steps=0):
         """Results of at most a block of batches by name."""
         if self.known_inputs is not None:
             inputs = self.known_inputs.of_batches(batch_indices, steps, extra_steps)
-            mask = np.ones(batch_indices.size, bool)
-            return native_peaks.integrate_peaks(self.shapes.max_loads, mask, inputs)._asdict()
+            return self._integrate_in_c(inputs, np.ones(batch_indices.size, bool))
         # Fewer batches are spread over the block, so that each device has its part.
         rows = np.arange(batch_indices.size) * self.batches_per_block // batch_indices.size
         mask = np.zeros(self.batches_per_block, bool)
         mask[rows] = True
         nearest_row = np.cumsum(mask) - 1
-        batch_indices, steps = batch_indices[nearest_row], steps[nearest_row]
+        in_block = batch_indices[nearest_row], steps[nearest_row]
+        results = self._integrate_compiled(*in_block, mask, None, single, extra_steps)
+        return {name: values[rows] for name, values in results.items()}
+
+    def _integrate_in_c(self, inputs: native_peaks.NativeInputs, mask):
+        """Results by name of batches whose inputs are known; any for those not in the mask."""
+        return native_peaks.integrate_peaks(self.shapes.max_loads, mask, inputs)._asdict()
+
+    def _integrate_compiled(self, batch_indices, steps, mask, substeps, single, extra_steps=0):
+        """Results of a block of batches by name; any for those not in the mask."""
         stepping = self._stepping(batch_indices, steps, extra_steps)
         program, models = self.program(substeps), self._models_of(batch_indices)
         shared_values, batched_values = self._values_of(batch_indices)
@@ -279,10 +325,8 @@ class Runner:
                     self._compiled_variants.add((substeps, single))
             results = compiled_program(*arguments)
         if compiled_program is programs.native_block:
-            results = native_peaks.integrate_peaks(self.shapes.max_loads, mask, results)._asdict()
-        arrays = {name: np.asarray(values) for name, values in results.items()}
-        # Histories are large: a full block is not copied.
-        return arrays if mask.all() else {name: values[rows] for name, values in arrays.items()}
+            return self._integrate_in_c(results, mask)
+        return {name: np.asarray(values) for name, values in results.items()}
 
     def _stepping(self, batch_indices, steps, extra_steps: int = 0) -> programs.Stepping:
         """Steps of batches; their load events are known if all share a model."""

@@ -127,9 +127,10 @@ def compute_and_store(blocks: list[int], fingerprint: str, path: Path) -> list[i
             "a worker has another version of jaxbeam or JAX than the machine that started the"
             " sweep; install the same everywhere"
         )
+    compute = runner.block_function(block_store.steps[:-1])
     for block in blocks:
         if not block_store.is_done(block):
-            block_store.write(block, runner.compute_block(block, block_store.steps[:-1]))
+            block_store.write(block, compute(block))
     return blocks
 
 

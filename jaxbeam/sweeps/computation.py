@@ -135,7 +135,10 @@ def _compute(
     runner: Runner | ForceRunner, blocks: list[int], steps, block_store: BlockStore
 ) -> Iterator[int]:
     """Numbers of blocks as they are computed, on all cores, and stored."""
-    results = runner.pool.map(lambda block: (block, runner.compute_block(block, steps)), blocks)
+    # What is stored must not depend on trials, which a sweep that continues does not make.
+    trials = runner.trials if isinstance(block_store, MemoryStore) else None
+    compute = runner.block_function(steps, trials)
+    results = runner.pool.map(lambda block: (block, compute(block)), blocks)
     # An error or an interrupt closes the iterator, which cancels blocks not yet started.
     with closing(results):  # type: ignore[type-var]
         for block, result in results:

@@ -4,6 +4,7 @@ import functools
 import json
 import os
 import re
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -45,6 +46,8 @@ PHASE = 1.6  # rad of the fastest pole in a step of the search
 class ForceRunner:
     """Runner of batches of one run each (see `blocks.Runner`)."""
 
+    trials = None  # are not kept
+
     def __init__(self, case: Case, batches: Batches, system: str):
         self.case, self.batches, self.system = case, batches, system
         self.pool = ThreadPoolExecutor(os.cpu_count())
@@ -69,18 +72,25 @@ class ForceRunner:
         """Number of runs in a block."""
         return self._runs(block).size
 
-    def compute_block(self, block: int, steps) -> dict[str, np.ndarray]:
-        """Results (path, batch, ...) of a block by name; the last run repeated in a short block.
+    def block_function(
+        self, steps: Float[np.ndarray, " path"], trials: None = None
+    ) -> Callable[[int], dict[str, np.ndarray]]:
+        """Function of a block's number: its results (path, batch, ...) by name.
 
-        Blocks are of equal size, as those of `blocks.Runner`: stores find a block by its size.
+        The last run is repeated in a short block. Blocks are of equal size, as those of
+        `blocks.Runner`: stores find a block by its size.
         """
-        runs = self._runs(block)
-        found = self._peaks(runs, steps[runs[0]])._asdict()
-        more = self._runs(0).size - runs.size
-        return {
-            name: np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
-            for name, values in found.items()
-        }
+
+        def compute(block: int) -> dict[str, np.ndarray]:
+            runs = self._runs(block)
+            found = self._peaks(runs, steps[runs[0]])._asdict()
+            more = self._runs(0).size - runs.size
+            return {
+                name: np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
+                for name, values in found.items()
+            }
+
+        return compute
 
     def _runs(self, block: int) -> np.ndarray:
         count = len(self.batches.run_index)

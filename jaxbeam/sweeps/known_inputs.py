@@ -1,6 +1,7 @@
 """What the C integrator needs to know of batches that share a model, without a compiler."""
 
 import functools
+from collections.abc import Callable
 
 import jax
 import numpy as np
@@ -13,13 +14,14 @@ from jaxbeam.runtime.vectorised import vectorised
 from jaxbeam.sweeps.batches import Batches, values_at
 from jaxbeam.sweeps.programs import Program
 
-GROUP_RUNS = 4096  # whose loads are made at once; those of 512 take as long
+GROUP_RUNS = 4096  # whose inputs are made at once; those of 512 take as long
 
 
 class KnownInputs:
     """Inputs of the C integrator of batches of known numbers that share a model and outputs.
 
-    `events` are the `LoadEvents` of all paths.
+    `events` are the `LoadEvents` of all paths. Raises NotVectorisedError where loads cannot be
+    vectorised.
     """
 
     def __init__(
@@ -37,15 +39,11 @@ class KnownInputs:
         self.of_model = {
             name: None if part is None else part[None] for name, part in of_model.items()
         }
+        # Those of large sweeps are made for each call; a single batch tells whether they can be.
         count, runs = batches.run_index.shape
-        self.group_size = group_size = min(count, max(1, GROUP_RUNS // runs))
-
-        @functools.lru_cache(maxsize=4)  # blocks are taken in their order, by few threads
-        def loads_of_group(group: int):
-            end = min((group + 1) * group_size, count)
-            return _paths_and_wheels(program, batches, np.arange(group * group_size, end))
-
-        self._loads_of_group = loads_of_group
+        few = count * runs <= GROUP_RUNS
+        loads = _paths_and_wheels(program, batches, np.arange(count if few else 1))
+        self.all_loads = loads if few else None
 
     def of_batches(
         self,
@@ -53,10 +51,7 @@ class KnownInputs:
         max_steps: Float[np.ndarray, " task"],
         extra_steps: int = 0,
     ) -> native_peaks.NativeInputs:
-        """Inputs of some batches, with steps (s) at most and extra steps in each panel.
-
-        Raises NotVectorisedError where loads cannot be vectorised.
-        """
+        """Inputs of some batches, with steps (s) at most and extra steps in each panel."""
 
         def of_batch(events, duration, max_step, *loads):
             grid = grid_between_events(events, duration, max_step, extra_steps)
@@ -68,12 +63,36 @@ class KnownInputs:
             found = vectorised(of_batch)(*events, max_steps, *loads)
         return native_peaks.NativeInputs(**self.of_model, **found)
 
+    def of_blocks(
+        self, max_steps: Float[np.ndarray, " path"], batches_per_block: int
+    ) -> Callable[[int], native_peaks.NativeInputs]:
+        """Function of a block's number: its inputs, which are made for several blocks at once.
+
+        `max_steps` (s) are those of all batches.
+        """
+        count, runs = self.batches.run_index.shape
+        most = max(1, GROUP_RUNS // (batches_per_block * runs))
+        blocks = min(-(-count // batches_per_block), most)
+        group_size = blocks * batches_per_block
+
+        @functools.lru_cache(maxsize=4)  # blocks are taken in their order, by few threads
+        def of_group(group: int) -> native_peaks.NativeInputs:
+            batch_indices = np.arange(group * group_size, (group + 1) * group_size) % count
+            return self.of_batches(batch_indices, max_steps[batch_indices])
+
+        def of_block(block: int) -> native_peaks.NativeInputs:
+            group, place = divmod(block, blocks)
+            rows = slice(place * batches_per_block, (place + 1) * batches_per_block)
+            return _inputs_of_rows(of_group(group), rows)
+
+        of_group(0)  # before threads ask for it
+        return of_block
+
     def _loads(self, batch_indices):
         """Cubics and wheels of the loads of some batches."""
-        groups, rows = np.divmod(batch_indices, self.group_size)
-        if np.any(groups != groups[0]):
+        if self.all_loads is None:
             return _paths_and_wheels(self.program, self.batches, batch_indices)
-        return jax.tree.map(lambda part: part[rows], self._loads_of_group(int(groups[0])))
+        return jax.tree.map(lambda part: part[batch_indices], self.all_loads)
 
 
 def _paths_and_wheels(program: Program, batches: Batches, batch_indices):
@@ -84,3 +103,9 @@ def _paths_and_wheels(program: Program, batches: Batches, batch_indices):
     values = batches.shared_values[batch_indices], batches.batched_values[batch_indices]
     with np.errstate(all="ignore"):
         return vectorised(of_batch)(*values)
+
+
+def _inputs_of_rows(inputs: native_peaks.NativeInputs, rows: slice) -> native_peaks.NativeInputs:
+    """Inputs of some of the batches; what all share stays as it is."""
+    parts = (part if part is None or len(part) == 1 else part[rows] for part in inputs)
+    return native_peaks.NativeInputs(*parts)

@@ -53,7 +53,7 @@ def runner_of(case, over):
 def test_peaks_equal_those_of_the_integrator(case):
     runner = runner_of(case, {"loads.0.speed": [25.0]})
     phases, error = runner.choose_step_sizes()
-    found = {name: values[0, 0] for name, values in runner.compute_block(0, phases).items()}
+    found = {name: values[0, 0] for name, values in runner.block_function(phases)(0).items()}
     record = jb.simulate(case, tolerance=1e-9)
     largest = np.maximum(np.abs(record.smallest), record.largest)
     for i, quantity in enumerate(QUANTITIES):

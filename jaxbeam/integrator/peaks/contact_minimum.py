@@ -12,7 +12,7 @@ from jaxbeam.case.trajectory import NEVER
 from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES
 from jaxbeam.numerics.gauss import lagrange_coefficients
 from jaxbeam.numerics.peak_search import horner
-from jaxbeam.runtime.arrays import Array, cond, fori_loop, xp
+from jaxbeam.runtime.arrays import Array, cond, fori_loop, take, xp
 
 ZERO_ITERATIONS = 4  # of Newton's method for the time of a loss
 # Peak nodes, and the middles between them.
@@ -55,46 +55,52 @@ def contact_minimum(
     most, least = xp.max(by_row, axis=2), xp.min(by_row, axis=2)
     bound = 0.5 * (most + least) + spread_factor() * (most - least)
     bound = xp.where(is_load[..., None], bound[:, :, None], -xp.inf)
-    # Most chunks stay above the smallest force so far, and fewer lose contact; NaN is passed on.
-    falls = xp.any(~(bound <= -lowest))
-    may_lose = xp.any(~(bound <= 0) & (lost_time >= NEVER))
 
     def with_smaller(lowest):
+        return xp.minimum(lowest, xp.min(-pulls_of_loads(), axis=(0, 1), initial=xp.inf))
+
+    def pulls_of_loads():
         pulls = _at_fractions(by_row)
-        pull = xp.maximum(xp.max(pulls, axis=2), xp.max(_vertices(pulls)[0], axis=2))
-        force = xp.where(is_load[..., None], -pull[:, :, None], xp.inf)
-        return xp.minimum(lowest, xp.min(force, axis=(0, 1), initial=xp.inf))
+        pull = xp.maximum(xp.max(pulls, axis=0), xp.max(_vertices(pulls)[0], axis=0))
+        return xp.where(is_load[..., None], pull[:, :, None], -xp.inf)
 
     def with_first_loss(lost_time):
-        pulls = _at_fractions(by_row)
-        powers = xp.einsum("slnb,nk->kslb", by_row, lagrange_coefficients(NODE_COUNT))
-        fraction = _zero_nearby(powers, _first_loss(pulls, *_vertices(pulls)))
-        time = start[:, None, None] + length[:, None, None] * fraction
-        time = xp.where(fraction < NEVER, time, NEVER)
-        time = xp.where(is_load[..., None], time[:, :, None], NEVER)
-        return xp.minimum(lost_time, xp.min(time, axis=(0, 1), initial=NEVER))
+        """Of each load only the first step with a pull counts."""
+        rows = xp.arange(is_load.shape[0] * is_load.shape[1])
+        pulls = pulls_of_loads().reshape(rows.size, *lost_time.shape)
+        first = xp.min(xp.where(pulls > 0, rows[:, None, None], rows.size), axis=0)
+        found = xp.minimum(first, rows.size - 1)
+        of_rows = by_row.reshape(rows.size, NODE_COUNT, batch_size)
+        nodes = xp.take_along_axis(of_rows, found[:, None], axis=0)[:, None]  # load, 1, node, batch
+        pulls = _at_fractions(nodes)
+        powers = xp.einsum("slnb,nk->kslb", nodes, lagrange_coefficients(NODE_COUNT))
+        fraction = _zero_nearby(powers, _first_loss(pulls, *_vertices(pulls)))[:, 0]
+        step = found // is_load.shape[1]
+        time = take(start, step) + take(length, step) * fraction
+        return xp.minimum(lost_time, xp.where(first < rows.size, time, NEVER))
 
-    return (
-        cond(falls, with_smaller, lambda same: same, lowest),
-        cond(may_lose, with_first_loss, lambda same: same, lost_time),
-    )
+    # Most chunks stay above the smallest force so far; NaN is passed on.
+    lowest = cond(xp.any(~(bound <= -lowest)), with_smaller, lambda same: same, lowest)
+    loses = xp.any((lowest < 0) & (lost_time >= NEVER))
+    return lowest, cond(loses, with_first_loss, lambda same: same, lost_time)
 
 
 def _at_fractions(by_row: Float[Array, "step row node batch"]):
-    """Pulls at the FORCE_FRACTIONS."""
-    return xp.einsum("slnb,fn->slfb", by_row, force_weights_at_fractions())
+    """Pulls at the FORCE_FRACTIONS, as a sum that XLA computes along with what follows it."""
+    weights = force_weights_at_fractions()[..., None, None, None]
+    return sum(weights[:, node] * by_row[:, :, node] for node in range(NODE_COUNT))
 
 
-def _vertices(pulls: Float[Array, "step row fraction batch"]):
+def _vertices(pulls: Float[Array, "fraction step row batch"]):
     """Tops of the parabolas through three fractions, -inf without one, and zeros before them."""
-    gaps = np.diff(FORCE_FRACTIONS)[:, None]
-    slopes = xp.diff(pulls, axis=2) * (1 / gaps)  # XLA does not make products of divisions
-    rise, fall = slopes[:, :, :-1], slopes[:, :, 1:]
+    gaps = np.diff(FORCE_FRACTIONS)[:, None, None, None]
+    slopes = xp.diff(pulls, axis=0) * (1 / gaps)  # XLA does not make products of divisions
+    rise, fall = slopes[:-1], slopes[1:]
     inside = (rise > 0) & (fall < 0)
     curvature = xp.where(inside, (fall - rise) * (1 / (gaps[:-1] + gaps[1:])), -1.0)
     slope = rise + curvature * gaps[:-1]
-    top = pulls[:, :, 1:-1] - slope**2 / (4 * curvature)
-    at = FORCE_FRACTIONS[1:-1, None] - slope / (2 * curvature)
+    top = pulls[1:-1] - slope**2 / (4 * curvature)
+    at = FORCE_FRACTIONS[1:-1, None, None, None] - slope / (2 * curvature)
     top = xp.where(inside, top, -xp.inf)
     return top, at - xp.sqrt(xp.where(top > 0, top, 1.0) / -curvature)
 
@@ -104,14 +110,15 @@ def _first_loss(pulls, vertex, rising) -> Float[Array, "step row batch"]:
 
     By the line between two fractions, or by the parabola if there is a pull only between them.
     """
-    before, after = pulls[:, :, :-1], pulls[:, :, 1:]
+    before, after = pulls[:-1], pulls[1:]
     rises = (before <= 0) & (after > 0)
     share = before / xp.where(rises, before - after, 1.0)
-    crossing = FORCE_FRACTIONS[:-1, None] + np.diff(FORCE_FRACTIONS)[:, None] * share
-    first = xp.min(xp.where(rises, crossing, NEVER), axis=2)
-    touching = (vertex > 0) & (pulls[:, :, 1:-1] <= 0)
-    first = xp.minimum(first, xp.min(xp.where(touching, rising, NEVER), axis=2))
-    return xp.where(pulls[:, :, 0] > 0, 0.0, first)
+    starts, gaps = FORCE_FRACTIONS[:-1], np.diff(FORCE_FRACTIONS)
+    crossing = starts[:, None, None, None] + gaps[:, None, None, None] * share
+    first = xp.min(xp.where(rises, crossing, NEVER), axis=0)
+    touching = (vertex > 0) & (pulls[1:-1] <= 0)
+    first = xp.minimum(first, xp.min(xp.where(touching, rising, NEVER), axis=0))
+    return xp.where(pulls[0] > 0, 0.0, first)
 
 
 def _zero_nearby(
