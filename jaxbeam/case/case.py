@@ -162,8 +162,16 @@ def _key_name(key) -> str:
 
 
 def _leaves_by_address(case: Case) -> dict[str, Any]:
-    paths, _ = jax.tree_util.tree_flatten_with_path(case)
-    return {".".join(_key_name(key) for key in path): leaf for path, leaf in paths}
+    leaves, structure = jax.tree.flatten(case)
+    return dict(zip(_addresses_of(structure), leaves, strict=True))
+
+
+@functools.lru_cache(maxsize=64)  # a sweep asks eight times, which took half a millisecond
+def _addresses_of(structure) -> list[str]:
+    """Addresses of the leaves of all cases of a structure."""
+    numbered = jax.tree.unflatten(structure, range(structure.num_leaves))
+    paths, _ = jax.tree_util.tree_flatten_with_path(numbered)
+    return [".".join(map(_key_name, path)) for path, _ in paths]
 
 
 def addresses(case: Case) -> dict[str, Float[Array, "..."]]:
@@ -295,9 +303,8 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
     >>> print(jb.replace(case, {"loads.0.mass": 0.2}).loads[0].mass)
     0.2
     """
-    paths, structure = jax.tree_util.tree_flatten_with_path(case)
-    leaves = [leaf for _, leaf in paths]
-    index = {".".join(_key_name(key) for key in path): i for i, (path, _) in enumerate(paths)}
+    leaves, structure = jax.tree.flatten(case)
+    index = {address: i for i, address in enumerate(_addresses_of(structure))}
     known = dict(zip(index, leaves, strict=True))
     each = [
         (one, value) for key, value in values.items() for one in _own_addresses(case, key, known)
@@ -348,6 +355,11 @@ def concrete_case(case: Case) -> Case:
     Raises `jax.errors.ConcretizationTypeError` if it is traced by `jit` or `vmap`.
     """
     return jax.tree.map(lambda leaf: concrete(leaf), case)
+
+
+def structure_of(case: Case) -> Case:
+    """The case of what stands: the beam with its supports, actuators and sensors, without loads."""
+    return Case(case.beam, case.supports, case.actuators, case.sensors)
 
 
 def stack_cases(cases: Sequence[Case]) -> Case:

@@ -16,17 +16,16 @@ from jaxtyping import Float, Int
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.events import sample_schedule
+from jaxbeam.integrator.integrate import max_stable_step
 from jaxbeam.integrator.static_shapes import StaticShapes, max_concurrent_loads
-from jaxbeam.integrator.time_grid import event_places
 from jaxbeam.model.load_set import load_set
-from jaxbeam.model.modal_model import has_coupling
-from jaxbeam.model.sensing.corrected_rows import corrected_places
+from jaxbeam.model.modal_model import ModalModel, has_coupling
 from jaxbeam.runtime.vectorised import NotVectorisedError
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import sample_times, steps_per_interval
 from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.batches import Batches, common_layout, swept_masses
-from jaxbeam.sweeps.known_inputs import KnownInputs
+from jaxbeam.sweeps.known_inputs import KnownInputs, inputs_of_rows, known_model
 from jaxbeam.sweeps.path_times import PathTimes, path_times
 from jaxbeam.sweeps.step_limits import step_limits
 from jaxbeam.sweeps.step_size import (
@@ -83,11 +82,8 @@ class Runner:
         # share; not on several devices, each of which has the models of its part of a block.
         leaves_model_unchanged = ("loads.", "run.", "controller.")
         same_model = all(name.startswith(leaves_model_unchanged) for name in self.addresses[0])
-        self.same_model = same_model and self.devices == 1
         self.shapes = StaticShapes(layout, has_coupling(case), 1, native)
-        self.known_outputs = self.models = None
-        if self.same_model:
-            limits = self._make_shared_model()
+        self.known_model = known_model(case) if same_model and self.devices == 1 else None
         # Compilation of the programs for one load need not wait for its entry and exit times.
         max_loads = load_set(case).wheel_count
         if max_loads > 1:
@@ -95,14 +91,13 @@ class Runner:
         self.shapes = dataclasses.replace(self.shapes, max_loads=max_loads)
         # The C library makes its own step matrices.
         self.discretise_separately = case.controller is None and not native
-        self.known_inputs = self._known_inputs() if native and self.same_model else None
+        self.known_inputs = self._known_inputs()
         # More threads than cores where some wait for others.
         waiting = self.known_inputs is None
         self.pool = ThreadPoolExecutor((os.cpu_count() or 1) * (2 if waiting else 1))
         if self.known_inputs is None:
             self._compile_programs()
-        if not self.same_model:
-            limits = self._make_models()
+        self.models, limits = self._make_models()
         longest = None
         if self.schedule is not None and case.controller is not None:  # steps end at events
             longest = self.schedule.lengths.max()
@@ -127,9 +122,8 @@ class Runner:
     def _path_times(self) -> PathTimes:
         """Times of all paths, with passages of the model if all share one."""
         case, places = concrete_case(self.case), np.zeros(0)
-        if self.same_model:
-            model = jax.tree.map(lambda leaf: leaf[0], self.models)
-            places = event_places(model, corrected_places(case, model, case.sensors))
+        if self.known_model is not None:
+            places = self.known_model.event_places
         found = path_times(case, self.addresses[0], self.batches.shared_values, places)
         return jax.tree.map(np.asarray, found)
 
@@ -138,22 +132,14 @@ class Runner:
         count = self.batches.run_index.shape[0]
         return list(np.resize(np.arange(count), (self.block_count, self.batches_per_block)))
 
-    def _make_shared_model(self) -> Float[np.ndarray, " path"]:
-        """Make model and outputs that all batches share, of known numbers; longest stable steps."""
-        program = programs.Program(concrete_case(self.case), self.shapes, *self.addresses)
-        values = self.batches.shared_values[0]
-        model, limit = programs.model_and_limit(program, values)
-        self.models = jax.tree.map(lambda leaf: np.asarray(leaf)[None], model)
-        if self.case.controller is None:
-            self.known_outputs = jax.tree.map(np.asarray, program.outputs(model, values))
-        return _stable_steps(np.repeat(np.asarray(limit), self.batches.run_index.shape[0]))
-
     def _known_inputs(self) -> KnownInputs | None:
         """What the C integrator needs to know, if all batches share a model; else None."""
+        if self.known_model is None or not self.shapes.native:
+            return None
         program = self.program()._replace(case=concrete_case(self.case))
-        model = jax.tree.map(lambda leaf: leaf[0], self.models)
+        events = self._path_times.load_events
         try:
-            return KnownInputs(program, model, self._path_times.load_events, self.batches)
+            return KnownInputs(program, self.known_model, events, self.batches)
         except NotVectorisedError:
             return None
 
@@ -169,15 +155,20 @@ class Runner:
         for compilation in compilations:
             compilation.result()  # raises its error, if any
 
-    def _make_models(self) -> Float[np.ndarray, " path"]:
-        """Make the models of all batches; longest stable steps (s), infinite without one."""
-        program, count = self.program(), self.batches.run_index.shape[0]
+    def _make_models(self) -> tuple[ModalModel, Float[np.ndarray, " path"]]:
+        """Models of all batches, a single one if they share it; longest stable steps (s)."""
+        count = self.batches.run_index.shape[0]
+        if self.known_model is not None:
+            model = self.known_model.model
+            limit = max_stable_step(model, load_set(concrete_case(self.case), self.shapes.layout))
+            models = jax.tree.map(lambda leaf: leaf[None], model)
+            return models, _stable_steps(np.repeat(limit, count))
         groups = [
-            programs.modal_models(program, self.batches.shared_values[group])
+            programs.modal_models(self.program(), self.batches.shared_values[group])
             for group in self._model_groups()
         ]
-        self.models, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *groups)
-        return _stable_steps(limits[:count])
+        models, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *groups)
+        return models, _stable_steps(limits[:count])
 
     def choose_step_sizes(self) -> tuple[Float[np.ndarray, " path"], float]:
         """Step sizes (s) of all batches, and the estimated relative error of their peaks.
@@ -186,16 +177,13 @@ class Runner:
         """
         count = _round_up(MIN_TRIAL_BATCHES, self.trial_batches)
 
-        def peaks(batch_indices, steps, extra_steps=0, single=False):
-            calls = -(-batch_indices.size // self.trial_batches)
-            parts = np.array_split(batch_indices, calls), np.array_split(steps, calls)
-            found = []
-            for part in zip(*parts, strict=True):
-                results = self._integrate_few(*part, single, extra_steps)
-                if not (extra_steps or single):
-                    self.trials.add(*part, results)
-                found.append(results["peak_deflection"])
-            return self._compared_by_quantity(np.concatenate(found))
+        def peaks(batch_indices, steps, extra_steps, single=False):
+            results = self._trial_results(batch_indices, steps, extra_steps, single)
+            if not single:
+                final = extra_steps == 0  # as those of blocks
+                of_final = {name: values[final] for name, values in results.items()}
+                self.trials.add(batch_indices[final], steps[final], of_final)
+            return self._compared_by_quantity(results["peak_deflection"])
 
         masses, checked = swept_masses(self.case, self.batches), None
         batches, runs = self.batches.run_index.shape
@@ -203,12 +191,11 @@ class Runner:
             checked = np.arange(batches)
         rates, initial_steps, max_steps = self.limits
         search = rates, masses, initial_steps, max_steps, count
-        steps, error = choose_step_sizes(peaks, *search, self.tolerance, self.pool.map, checked)
+        steps, error = choose_step_sizes(peaks, *search, self.tolerance, checked)
         if self.single:
             sample = stratified_sample(rates, count)
-            error += rounding_error(
-                *(peaks(sample, steps[sample], single=single) for single in (False, True))
-            )
+            given = sample, steps[sample], np.zeros(sample.size, int)
+            error += rounding_error(*(peaks(*given, single) for single in (False, True)))
         return steps, error
 
     def _compared_by_quantity(self, peaks):
@@ -261,16 +248,17 @@ class Runner:
 
         def integrate(block, mask):
             rows = self._batches_of(block)
-            return self._integrate_compiled(rows, steps[rows], mask, substeps, self.single)
+            stepping = steps[rows], np.zeros(rows.size, int)
+            return self._integrate_compiled(rows, *stepping, mask, substeps, self.single)
 
         return integrate
 
     def _programs_to_compile(self, program, shared_values):
         """Programs that step sizes need, the slowest to compile first, and template arguments."""
         indices = np.zeros(self.batches_per_block, int)
-        stepping, mask = self._stepping(indices, np.ones(self.batches_per_block)), indices > 0
-        if self.same_model:
-            models = self.models
+        stepping, mask = self._stepping(indices, np.ones(indices.size), indices), indices > 0
+        if self.known_model is not None:
+            models = jax.tree.map(lambda leaf: leaf[None], self.known_model.model)
         else:
             model_template, _ = programs.modal_models.template(program, shared_values)
             models = jax.tree.map(lambda leaf: leaf[indices], model_template)
@@ -285,28 +273,43 @@ class Runner:
         )
         if self.discretise_separately:
             yield programs.discrete_models, discretise_arguments
-        if not self.same_model:
+        if self.known_model is None:
             yield programs.modal_models, (program, shared_values)
 
-    def _integrate_few(self, batch_indices, steps, single=False, extra_steps=0):
-        """Results of at most a block of batches by name."""
+    def _trial_results(self, batch_indices, steps, extra_steps, single):
+        """Results of batches by name, on all cores."""
         if self.known_inputs is not None:
             inputs = self.known_inputs.of_batches(batch_indices, steps, extra_steps)
-            return self._integrate_in_c(inputs, np.ones(batch_indices.size, bool))
-        # Fewer batches are spread over the block, so that each device has its part.
+            calls = min(batch_indices.size, os.cpu_count() or 1)
+        else:
+            inputs, calls = None, -(-batch_indices.size // self.trial_batches)
+
+        def integrate(rows):
+            if inputs is not None:
+                return self._integrate_in_c(inputs_of_rows(inputs, rows), np.ones(rows.size, bool))
+            return self._integrate_few(batch_indices[rows], steps[rows], extra_steps[rows], single)
+
+        parts = np.array_split(np.arange(batch_indices.size), calls)
+        results = list(self.pool.map(integrate, parts))
+        return {name: np.concatenate([one[name] for one in results]) for name in results[0]}
+
+    def _integrate_few(self, batch_indices, steps, extra_steps, single):
+        """Results of at most a block of batches by name."""
+        # They are spread over the block, so that each device has its part.
         rows = np.arange(batch_indices.size) * self.batches_per_block // batch_indices.size
         mask = np.zeros(self.batches_per_block, bool)
         mask[rows] = True
         nearest_row = np.cumsum(mask) - 1
-        in_block = batch_indices[nearest_row], steps[nearest_row]
-        results = self._integrate_compiled(*in_block, mask, None, single, extra_steps)
+        stepping = steps[nearest_row], extra_steps[nearest_row]
+        settings = mask, None, single
+        results = self._integrate_compiled(batch_indices[nearest_row], *stepping, *settings)
         return {name: values[rows] for name, values in results.items()}
 
     def _integrate_in_c(self, inputs: native_peaks.NativeInputs, mask):
         """Results by name of batches whose inputs are known; any for those not in the mask."""
         return native_peaks.integrate_peaks(self.shapes.max_loads, mask, inputs)._asdict()
 
-    def _integrate_compiled(self, batch_indices, steps, mask, substeps, single, extra_steps=0):
+    def _integrate_compiled(self, batch_indices, steps, extra_steps, mask, substeps, single):
         """Results of a block of batches by name; any for those not in the mask."""
         stepping = self._stepping(batch_indices, steps, extra_steps)
         program, models = self.program(substeps), self._models_of(batch_indices)
@@ -328,16 +331,16 @@ class Runner:
             return self._integrate_in_c(results, mask)
         return {name: np.asarray(values) for name, values in results.items()}
 
-    def _stepping(self, batch_indices, steps, extra_steps: int = 0) -> programs.Stepping:
+    def _stepping(self, batch_indices, steps, extra_steps) -> programs.Stepping:
         """Steps of batches; their load events are known if all share a model."""
         events = None
-        if self.same_model and self.schedule is None:
+        if self.known_model is not None and self.schedule is None:
             events = jax.tree.map(lambda part: part[batch_indices], self._path_times.load_events)
-        return programs.Stepping(steps, np.full(batch_indices.size, extra_steps), events)
+        return programs.Stepping(steps, extra_steps, events)
 
     def _models_of(self, batch_indices):
         """Models of batches; one that all share is single."""
-        if self.same_model:
+        if self.known_model is not None:
             return self.models
         return jax.tree.map(lambda leaf: leaf[batch_indices], self.models)
 
@@ -353,12 +356,14 @@ class Runner:
         """Data of the programs; with `substeps` per sample interval, also for histories."""
         scheduled = substeps is not None or self.case.controller is not None
         sampling = (self.schedule if scheduled else None), substeps
+        shared = self.known_model is not None and self.case.controller is None
+        outputs = self.known_model.outputs if shared else None
         return programs.Program(
             self.case,
             self.shapes,
             *self.addresses,
             *sampling,
-            known_outputs=self.known_outputs,
+            known_outputs=outputs,
             devices=self.devices,
         )
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 from tqdm import tqdm
 
 from jaxbeam.case.case import Case, unit_at
@@ -49,50 +50,8 @@ def compute_sweep(
     computed again, and count in the progress bar as done before. With a `client` of Dask its
     workers compute all blocks but the first.
     """
-    dataset, block_store = _computed(specification, path, state, client, progress_bar)
-    if estimates:
-        worst = worst_runs(specification, dataset)
-        for quantity, share in estimated_errors(specification.case, worst).items():
-            dataset[f"peak_{quantity}"].attrs["truncation_error"] = share
-    block_store.finish(dataset)
-    return dataset
-
-
-def peaks_in_memory(specification: SweepSpecification) -> "xarray.Dataset":
-    """Dataset of a sweep that is not stored, without estimated truncation errors."""
-    with tqdm(disable=True) as progress_bar:
-        return _computed(specification, None, "new", None, progress_bar)[0]
-
-
-def _computed(
-    specification: SweepSpecification,
-    path: Path | None,
-    state: str,
-    client: Any,
-    progress_bar: tqdm,
-) -> "tuple[xarray.Dataset, BlockStore]":
-    """Dataset of a sweep, and the store of its blocks (see `compute_sweep`)."""
     fingerprint = specification.fingerprint()
-    if path is not None and state == "resume":
-        block_store = sweep_store.ZarrStore(path)
-        runner = specification.resumed_runner(block_store.specification())
-        steps, error = block_store.steps[:-1], float(block_store.steps[-1])
-    else:
-        progress_bar.set_description("compiling")
-        if "xarray" not in sys.modules:
-            # Compilers leave a core free, on which to import what the dataset needs.
-            threading.Thread(target=importlib.import_module, args=["xarray"]).start()
-        runner, native = _new_runner(specification)
-        steps, error = runner.choose_step_sizes()
-        progress_bar.set_description(None)
-        if path is None:
-            block_store = MemoryStore(runner.block_count)
-        else:
-            step_sizes_and_error = np.append(steps, error)
-            content = specification.to_dict() | {"native": native}
-            block_store = sweep_store.create_store(
-                path, fingerprint, content, runner.block_count, step_sizes_and_error
-            )
+    runner, steps, error, block_store = _begun(specification, path, state, progress_bar)
     missing = block_store.missing()
     remaining = sum(runner.run_count(block) for block in missing)
     count_as_done(progress_bar, specification.count - remaining)
@@ -105,7 +64,40 @@ def _computed(
             progress_bar.update(runner.run_count(block))
     dataset = _to_dataset(specification, runner.batches, block_store.collect())
     dataset.attrs |= {"error_estimate": error, sweep_store.FINGERPRINT_ATTRIBUTE: fingerprint}
-    return dataset, block_store
+    if estimates:
+        worst = worst_runs(specification, dataset)
+        for quantity, share in estimated_errors(specification.case, worst).items():
+            dataset[f"peak_{quantity}"].attrs["truncation_error"] = share
+    block_store.finish(dataset)
+    return dataset
+
+
+def peaks_in_memory(specification: SweepSpecification) -> "xarray.Dataset":
+    """Dataset of a sweep that is not stored, without estimated truncation errors."""
+    with tqdm(disable=True) as progress_bar:
+        return compute_sweep(specification, None, "new", None, progress_bar, estimates=False)
+
+
+def _begun(
+    specification: SweepSpecification, path: Path | None, state: str, progress_bar: tqdm
+) -> "tuple[Runner | ForceRunner, Float[np.ndarray, ' path'], float, BlockStore]":
+    """Runner, step sizes (s), estimated error and store of a sweep, new or to be continued."""
+    if path is not None and state == "resume":
+        stored = sweep_store.ZarrStore(path)
+        runner = specification.resumed_runner(stored.specification())
+        return runner, stored.steps[:-1], float(stored.steps[-1]), stored
+    progress_bar.set_description("compiling")
+    if "xarray" not in sys.modules:
+        # Compilers leave a core free, on which to import what the dataset needs.
+        threading.Thread(target=importlib.import_module, args=["xarray"]).start()
+    runner, native = _new_runner(specification)
+    steps, error = runner.choose_step_sizes()
+    progress_bar.set_description(None)
+    if path is None:
+        return runner, steps, error, MemoryStore(runner.block_count)
+    content, given = specification.to_dict() | {"native": native}, np.append(steps, error)
+    new = path, specification.fingerprint(), content, runner.block_count, given
+    return runner, steps, error, sweep_store.create_store(*new)
 
 
 def _new_runner(specification: SweepSpecification) -> tuple[Runner | ForceRunner, bool]:
@@ -209,7 +201,8 @@ def worst_runs(specification: SweepSpecification, dataset) -> dict[str, WorstRun
 def _peak_variables(case: Case, dims: tuple[str, ...], peaks) -> dict[str, tuple]:
     """Peaks (..., sensor) as a variable for each quantity, NaN at sensors of others."""
     quantities = np.array([sensor.quantity for sensor in case.sensors])
-    variables, corrected = {}, is_corrected(case)
+    variables = {}
+    corrected = any(sensor.bends for sensor in case.sensors) and is_corrected(case)
     for sensor in case.sensors:
         entry, own = QUANTITIES[sensor.quantity], quantities == sensor.quantity
         words = f"largest absolute {sensor.quantity}"

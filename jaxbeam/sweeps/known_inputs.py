@@ -2,19 +2,49 @@
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxbeam.case.case import Case, concrete_case, structure_of
 from jaxbeam.integrator import native_peaks
-from jaxbeam.integrator.time_grid import grid_between_events
-from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.integrator.time_grid import event_places, grid_between_events
+from jaxbeam.model.modal_model import ModalModel, has_coupling, modal_model
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.sensing.corrected_rows import corrected_places
+from jaxbeam.runtime.remembering import remembered
 from jaxbeam.runtime.vectorised import vectorised
 from jaxbeam.sweeps.batches import Batches, values_at
-from jaxbeam.sweeps.programs import Program
+from jaxbeam.sweeps.programs import Outputs, Program, outputs_of
 
 GROUP_RUNS = 4096  # whose inputs are made at once; those of 512 take as long
+
+
+class KnownModel(NamedTuple):
+    """What a structure determines: modal model, outputs of its sensors, and load events.
+
+    The latter are at places (m) that wheels pass.
+    """
+
+    model: ModalModel
+    outputs: Outputs
+    event_places: Float[np.ndarray, " place"]
+
+
+def known_model(case: Case) -> KnownModel:
+    """Model that all batches share whose loads and settings of the run alone differ."""
+    return _model_of(structure_of(concrete_case(case)))
+
+
+@remembered
+def _model_of(structure: Case) -> KnownModel:
+    layout = mesh_layout(structure)
+    model = modal_model(structure, layout, has_coupling(structure))
+    places = event_places(model, corrected_places(structure, model, structure.sensors))
+    found = KnownModel(model, outputs_of(structure, model), places)
+    return jax.tree.map(np.asarray, found)
 
 
 class KnownInputs:
@@ -27,15 +57,14 @@ class KnownInputs:
     def __init__(
         self,
         program: Program,
-        model: ModalModel,
+        known: KnownModel,
         events: tuple[Float[np.ndarray, "path wheel 2"], Float[np.ndarray, "path event"]],
         batches: Batches,
     ):
         self.program, self.batches = program, batches
         self.events = events, values_at(program.case, batches, "run.duration")
-        assert program.known_outputs is not None
         with np.errstate(all="ignore"):  # as in compiled code
-            of_model = native_peaks.model_inputs(model, *program.known_outputs)
+            of_model = native_peaks.model_inputs(known.model, *known.outputs)
         self.of_model = {
             name: None if part is None else part[None] for name, part in of_model.items()
         }
@@ -49,18 +78,18 @@ class KnownInputs:
         self,
         batch_indices: Int[np.ndarray, " task"],
         max_steps: Float[np.ndarray, " task"],
-        extra_steps: int = 0,
+        extra_steps: Int[np.ndarray, " task"],
     ) -> native_peaks.NativeInputs:
         """Inputs of some batches, with steps (s) at most and extra steps in each panel."""
 
-        def of_batch(events, duration, max_step, *loads):
+        def of_batch(events, duration, max_step, extra_steps, *loads):
             grid = grid_between_events(events, duration, max_step, extra_steps)
             return native_peaks.batch_inputs(grid, *loads)
 
         events = jax.tree.map(lambda part: part[batch_indices], self.events)
         with np.errstate(all="ignore"):
             loads = self._loads(batch_indices)
-            found = vectorised(of_batch)(*events, max_steps, *loads)
+            found = vectorised(of_batch)(*events, max_steps, extra_steps, *loads)
         return native_peaks.NativeInputs(**self.of_model, **found)
 
     def of_blocks(
@@ -78,12 +107,13 @@ class KnownInputs:
         @functools.lru_cache(maxsize=4)  # blocks are taken in their order, by few threads
         def of_group(group: int) -> native_peaks.NativeInputs:
             batch_indices = np.arange(group * group_size, (group + 1) * group_size) % count
-            return self.of_batches(batch_indices, max_steps[batch_indices])
+            no_more = np.zeros(batch_indices.size, int)
+            return self.of_batches(batch_indices, max_steps[batch_indices], no_more)
 
         def of_block(block: int) -> native_peaks.NativeInputs:
             group, place = divmod(block, blocks)
             rows = slice(place * batches_per_block, (place + 1) * batches_per_block)
-            return _inputs_of_rows(of_group(group), rows)
+            return inputs_of_rows(of_group(group), rows)
 
         of_group(0)  # before threads ask for it
         return of_block
@@ -105,7 +135,7 @@ def _paths_and_wheels(program: Program, batches: Batches, batch_indices):
         return vectorised(of_batch)(*values)
 
 
-def _inputs_of_rows(inputs: native_peaks.NativeInputs, rows: slice) -> native_peaks.NativeInputs:
+def inputs_of_rows(inputs: native_peaks.NativeInputs, rows) -> native_peaks.NativeInputs:
     """Inputs of some of the batches; what all share stays as it is."""
     parts = (part if part is None or len(part) == 1 else part[rows] for part in inputs)
     return native_peaks.NativeInputs(*parts)

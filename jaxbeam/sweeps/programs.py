@@ -119,24 +119,26 @@ class Program(NamedTuple):
         """Outputs of a batch."""
         if self.known_outputs is not None:
             return self.known_outputs
-        varied = self.case_with(shared_values)
-        rows = sensor_rows(model, varied, varied.sensors)
-        return rows, static_correction(model, varied, varied.sensors, rows)
+        return outputs_of(self.case_with(shared_values), model)
+
+
+def outputs_of(case: Case, model: ModalModel) -> Outputs:
+    """Rows of what the sensors of a case measure, and their static correction."""
+    rows = sensor_rows(model, case, case.sensors)
+    return rows, static_correction(model, case, case.sensors, rows)
 
 
 @compiled(**PARALLEL_COMPILATION, **LOW_OPTIMISATION)
 def modal_models(program: Program, shared_values):
     """Models of batches, and their longest stable steps (s)."""
 
+    def model_and_limit(values):
+        varied = program.case_with(values)
+        model = modal_model(varied, program.shapes.layout, program.shapes.coupled)
+        return model, max_stable_step(model, load_set(varied, program.shapes.layout))
+
     # `map` is less to trace than `vmap`.
-    return jax.lax.map(lambda values: model_and_limit(program, values), shared_values)
-
-
-def model_and_limit(program: Program, shared_values):
-    """Model of a batch, and its longest stable step (s)."""
-    varied = program.case_with(shared_values)
-    model = modal_model(varied, program.shapes.layout, program.shapes.coupled)
-    return model, max_stable_step(model, load_set(varied, program.shapes.layout))
+    return jax.lax.map(model_and_limit, shared_values)
 
 
 @compiled(**PARALLEL_COMPILATION)

@@ -27,8 +27,10 @@ SAMPLE_DIVISOR = 4  # the sample grows with the square root of the number of bat
 SMALL_TOLERANCE = 1e-10  # below it, rounding in double precision may be what no step lessens
 NEGLIGIBLE_PEAK = 1e-6  # of a run's largest peak; errors of smaller peaks are relative to this
 
-# Peaks (path, batch, sensor) of batches for their steps (s) and a number of extra steps per event.
-PeaksFunction = Callable[[Int[np.ndarray, " path"], Float[np.ndarray, " path"], int], np.ndarray]
+# Peaks (path, batch, sensor) of batches for their steps (s) and numbers of extra steps per panel.
+PeaksFunction = Callable[
+    [Int[np.ndarray, " path"], Float[np.ndarray, " path"], Int[np.ndarray, " path"]], np.ndarray
+]
 
 
 def initial_step_sizes(
@@ -79,16 +81,15 @@ def log_spaced_sample(
     return order[np.where(heaviest, distances, np.inf).argmin(axis=0)]
 
 
-def step_errors(
-    peaks: PeaksFunction, batches, steps, map_function=map
-) -> Float[np.ndarray, " path"]:
+def step_errors(peaks: PeaksFunction, batches, steps) -> Float[np.ndarray, " path"]:
     """Largest relative change of the peaks of each batch with steps REFINEMENT times finer.
 
     At least one step is added between events, of which there may be few. Runs that fail are left
-    out; NaN if all do. `map_function` has the interface of `map` and may run in parallel.
+    out; NaN if all do.
     """
-    # The finer runs take longer and start first.
-    fine, coarse = map_function(peaks, (batches, batches), (steps / REFINEMENT, steps), (1, 0))
+    # The finer runs take longer and come first.
+    both_steps, extra_steps = np.append(steps / REFINEMENT, steps), np.repeat([1, 0], len(batches))
+    fine, coarse = np.split(peaks(np.tile(batches, 2), both_steps, extra_steps), 2)
     return relative_changes(coarse, fine)
 
 
@@ -144,7 +145,6 @@ def choose_step_sizes(
     max_steps: Float[np.ndarray, " path"],
     count: int,
     tolerance: float,
-    map_function: Callable = map,
     checked: Int[np.ndarray, " checked"] | None = None,
 ) -> tuple[Float[np.ndarray, " path"], float]:
     """Longest steps (s) of all batches for a tolerance, and the estimated error of their runs.
@@ -152,15 +152,15 @@ def choose_step_sizes(
     That is SAFETY_FACTOR times the largest error of the sample: of random sweeps of beams of one
     and two spans and all quantities, 0.02 % of the runs had larger true errors, at most twice.
 
-    `peaks` is called, through `map_function`, with indices of batches. The search over
-    `crossing_rates` (1/s), among the batches of the largest `masses` (kg), starts from
-    `initial_steps` (s) and is limited by `max_steps` (s). The steps are then checked on the batches
-    `checked`, by default a stratified sample. Raises RuntimeError if no step meets the tolerance.
+    The search over `crossing_rates` (1/s), among the batches of the largest `masses` (kg), starts
+    from `initial_steps` (s) and is limited by `max_steps` (s). The steps are then checked on the
+    batches `checked`, by default a stratified sample. Raises RuntimeError if no step meets the
+    tolerance.
     """
     target_error = tolerance / SAFETY_FACTOR
     chosen = log_spaced_sample(crossing_rates, masses, count)
     valid_steps, succeeds = _search_step_sizes(
-        peaks, chosen, initial_steps[chosen], max_steps[chosen], target_error, map_function
+        peaks, chosen, initial_steps[chosen], max_steps[chosen], target_error
     )
     if not np.all(valid_steps > 0):
         raise _no_step_error(tolerance)
@@ -178,7 +178,7 @@ def choose_step_sizes(
         sample = stratified_sample(crossing_rates, count * groups)
     error, fails = np.full(sample.size, np.nan), np.ones(sample.size, bool)
     for _ in range(MAX_ROUNDS):
-        found = step_errors(peaks, sample[fails], steps[sample[fails]], map_function)
+        found = step_errors(peaks, sample[fails], steps[sample[fails]])
         error[fails] = found
         fails, known = error > target_error, ~np.isnan(error)  # NaN: no run succeeds
         if not fails.any():
@@ -199,7 +199,6 @@ def _search_step_sizes(
     initial_steps,
     max_steps,
     tolerance: float,
-    map_function: Callable,
 ):
     """Longest steps (s) of batches that meet a tolerance, 0 without one; whether any run succeeds.
 
@@ -216,7 +215,7 @@ def _search_step_sizes(
     step_factor = np.ones(batches.size)
     for _ in range(0 if settled.all() else MAX_ROUNDS):
         left = ~settled
-        error[left] = step_errors(peaks, batches[left], steps[left], map_function)
+        error[left] = step_errors(peaks, batches[left], steps[left])
         with np.errstate(divide="ignore"):
             step_factor = np.clip(
                 (TARGET_ERROR * tolerance / error) ** (1 / CONVERGENCE_ORDER), 0.5, 1.5

@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.case import Case, concrete_case, replace
+from jaxbeam.case.case import Case, concrete_case, replace, structure_of
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.integrator.static_shapes import longest_stable_step, max_concurrent_loads
 from jaxbeam.integrator.step_size import check_step_count, trial_run, without_later_vibration
@@ -18,6 +18,7 @@ from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import is_supported, modal_influence_line
 from jaxbeam.model.statics import unchecked_influence_line
 from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.remembering import remembered
 from jaxbeam.simulation.errors import truncation_changes
 from jaxbeam.simulation.motion.at_samples import motion_at
 from jaxbeam.simulation.motion.moving_forces import motion_of_forces
@@ -55,23 +56,25 @@ def static_shares(case: Case) -> dict[str, float]:
     At each sensor under a load there; a rotation, which may be zero there, under one at a quarter
     of the span.
     """
+    return dict(_static_shares(structure_of(concrete_case(case))))
+
+
+@remembered
+def _static_shares(structure: Case) -> dict[str, float]:
     static = [
         sensor
-        for sensor in case.sensors
+        for sensor in structure.sensors
         if not (QUANTITIES[sensor.quantity].bends or QUANTITIES[sensor.quantity].time_derivative)
     ]
-    if not static:
-        return {}
-    case = concrete_case(case)
-    layout, shares = mesh_layout(case), {}
-    if not is_supported(case, layout):
+    layout, shares = mesh_layout(structure), {}
+    if not static or not is_supported(structure, layout):
         return shares
     for quantity in dict.fromkeys(sensor.quantity for sensor in static):
         derivative = QUANTITIES[quantity].x_derivative
         x = np.stack([sensor.position for sensor in static if sensor.quantity == quantity])
-        at = x if derivative == 0 else np.full(x.size, case.beam.length / 4)
+        at = x if derivative == 0 else np.full(x.size, structure.beam.length / 4)
         exact, of_modes = (
-            np.diagonal(line(case, layout, x, at, derivative))
+            np.diagonal(line(structure, layout, x, at, derivative))
             for line in (unchecked_influence_line, modal_influence_line)
         )
         missing = np.where(exact == 0, 0.0, exact - of_modes)
@@ -86,16 +89,14 @@ class WorstRun(NamedTuple):
     peaks: Float[np.ndarray, " sensor"]
 
 
-def estimated_errors(
-    case: Case, worst: dict[str, WorstRun], static: dict[str, float] | None = None
-) -> dict[str, float]:
+def estimated_errors(case: Case, worst: dict[str, WorstRun]) -> dict[str, float]:
     """Truncation errors of peaks relative to the largest, by quantity, where they are known.
 
     `worst` is the run with the largest peak of each quantity. Of deflections and rotations the
     error is the static one; others are estimated from that run (see `truncation_changes`), without
-    a controller. `static` are the `static_shares`, if known.
+    a controller.
     """
-    errors, found_before = dict(static_shares(case) if static is None else static), {}
+    errors, found_before = static_shares(case), {}
     quantities = [sensor.quantity for sensor in case.sensors]
     if case.controller is not None:
         return errors

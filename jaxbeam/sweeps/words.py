@@ -33,7 +33,7 @@ from jaxbeam.sweeps.stores.zarr_files import (
     new_store,
     replace_blocks,
 )
-from jaxbeam.sweeps.truncation import estimated_errors, static_shares
+from jaxbeam.sweeps.truncation import estimated_errors
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -196,15 +196,13 @@ def compute_word_sweep(
 
 def _estimates(plan: WordSweep, datasets: "Sequence[xarray.Dataset]") -> dict[str, float]:
     """Truncation errors by quantity, each of the words with the largest peak of it."""
-    errors, static = {}, {}
+    errors = {}
     for quantity in {sensor.quantity for sensor in plan.case.sensors}:
         peaks = [part[f"peak_{quantity}"].max().item() for part in datasets]
         worst = int(np.argmax(np.nan_to_num(peaks)))
         part, run = plan.sweeps[worst], worst_runs(plan.sweeps[worst], datasets[worst])
-        if worst not in static:
-            static[worst] = static_shares(part.case)
         of_quantity = {q: run[q] for q in run if q == quantity}
-        found = estimated_errors(part.case, of_quantity, static[worst])
+        found = estimated_errors(part.case, of_quantity)
         errors |= {q: share for q, share in found.items() if q == quantity}
     return errors
 

@@ -19,7 +19,7 @@ ORDER = 12
 def peaks_with_error(unit_steps, order=ORDER, failing=()):
     """Peaks (path, batch, sensor) whose relative error is (step / unit step)^order."""
 
-    def peaks_of(chosen, steps, extra_steps=0):
+    def peaks_of(chosen, steps, extra_steps):
         error = (np.asarray(steps) / unit_steps[chosen]) ** order
         peaks = np.repeat((1 + error)[:, None, None] * 1e-3, 2, axis=1)
         peaks[np.isin(chosen, failing)] = np.nan
@@ -57,18 +57,18 @@ def test_steps_at_their_limit_are_checked_without_search(best):
     measured, rates, limits = [], np.geomspace(1, 10, 20), np.full(20, 0.01)
     peaks = peaks_with_error(np.full(20, best))
 
-    def recorded_peaks(chosen, steps, extra_steps=0):
+    def recorded_peaks(chosen, steps, extra_steps):
         measured.append(steps.max())
-        return peaks(chosen, steps)
+        return peaks(chosen, steps, extra_steps)
 
     steps, error = choose_step_sizes(
         recorded_peaks, rates, np.ones(rates.size), LIMIT_RATIO * limits, limits, 4, 1e-6
     )
     assert error <= 1e-6
     if best == 1.0:
-        assert np.all(steps == limits) and len(measured) == 2  # coarse and fine, of the check
+        assert np.all(steps == limits) and len(measured) == 1  # the check
     else:
-        assert np.all(steps < best) and len(measured) > 2
+        assert np.all(steps < best) and len(measured) > 1
 
 
 def test_failed_runs_are_left_out():
@@ -101,17 +101,17 @@ def test_settled_batches_are_not_measured_again():
     rates, unit_steps = np.geomspace(1, 10, 4), np.full(4, 0.1)
     measured, peaks = [], peaks_with_error(unit_steps)
 
-    def recorded_peaks(chosen, steps, extra_steps=0):
+    def recorded_peaks(chosen, steps, extra_steps):
         measured.append(set(np.asarray(chosen).tolist()))
-        return peaks(chosen, steps)
+        return peaks(chosen, steps, extra_steps)
 
     initial_steps = np.full(4, 0.9 * 0.1 * (1e-7 / SAFETY_FACTOR) ** (1 / ORDER))
     initial_steps[-1] *= 2
     choose_step_sizes(
         recorded_peaks, rates, np.ones(rates.size), initial_steps, np.ones(4), 4, 1e-7
     )
-    # Fine and coarse steps each: of all, of the fastest, and of the sample.
-    assert measured == [{0, 1, 2, 3}] * 2 + [{3}] * 2 + [{0, 1, 2, 3}] * 2
+    # Steps of all, of the fastest, and of the sample.
+    assert measured == [{0, 1, 2, 3}, {3}, {0, 1, 2, 3}]
 
 
 def test_short_initial_steps_are_lengthened():
@@ -124,7 +124,7 @@ def test_short_initial_steps_are_lengthened():
 
 
 def test_no_step_meets_the_tolerance():
-    def measure(chosen, steps, extra_steps=0):
+    def measure(chosen, steps, extra_steps):
         return np.random.default_rng(int(1e9 * steps[0])).uniform(size=(len(chosen), 1, 1))
 
     rates = np.geomspace(1, 10, 8)
@@ -133,7 +133,7 @@ def test_no_step_meets_the_tolerance():
 
 
 def test_error_is_the_largest_of_a_batch():
-    def measure(chosen, steps, extra_steps=0):
+    def measure(chosen, steps, extra_steps):
         peaks = np.ones((len(chosen), 2, 1))
         peaks[:, 1] += steps[:, None]
         return peaks
@@ -173,14 +173,14 @@ def test_sample_grows_with_the_number_of_batches():
         asked, rates = [], np.geomspace(1, 10, batches)
         measure = peaks_with_error(np.full(batches, 0.1))
 
-        def recorded(chosen, steps, extra_steps=0, asked=asked, measure=measure):
+        def recorded(chosen, steps, extra_steps, asked=asked, measure=measure):
             asked.append(len(chosen))
-            return measure(chosen, steps)
+            return measure(chosen, steps, extra_steps)
 
         choose_step_sizes(
             recorded, rates, np.ones(batches), np.full(batches, 0.01), np.ones(batches), 4, 1e-7
         )
-        assert asked[-1] == sample_size
+        assert asked[-1] == 2 * sample_size  # with coarse and fine steps
 
 
 def test_between_two_rates_the_shorter_step_holds():
