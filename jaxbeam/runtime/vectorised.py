@@ -166,19 +166,20 @@ def _deepest(parts) -> tuple[int, int]:
 
 def _elementwise(function, *parts):
     """Result of a function of broadcast entries."""
-    level, ndim = max(map(_level, parts)), max(map(_ndim, parts))
-
-    def aligned(part):
-        if _level(part) < level:
-            return part
-        shape = part.values.shape
-        missing = ndim + 1 - len(shape)
-        if not missing:
-            return part.values
-        return part.values.reshape(shape[0], *(1,) * missing, *shape[1:])
-
-    found = function(*map(aligned, parts))
-    return VectorisedArray(found, level)
+    level = ndim = 0
+    for part in parts:
+        if isinstance(part, VectorisedArray):
+            level = max(level, part.level)
+        ndim = max(ndim, _ndim(part))
+    values = []
+    for part in parts:
+        if _level(part) == level:
+            part = part.values
+            missing = ndim + 1 - part.ndim
+            if missing:
+                part = part.reshape(part.shape[0], *(1,) * missing, *part.shape[1:])
+        values.append(part)
+    return VectorisedArray(function(*values), level)
 
 
 def _product(first, second):

@@ -82,8 +82,10 @@ def update_peaks(
     on_states, on_others = xp.split(matrices.monitored, [states.shape[1]], axis=2)
     deflections = on_states @ states + on_others @ others
     samples = deflections.reshape(steps, len(PEAK_NODES), -1, batch_size)
-    # Steps of no length, as of loads that leave after the end, are no part of the run.
-    samples = optimization_barrier(xp.where(length[:, None, None, None] > 0, samples, 0.0))
+    if path.influence is not None:
+        # Forces of loads that leave after the end are in steps of no length, no part of the run.
+        samples = xp.where(length[:, None, None, None] > 0, samples, 0.0)
+    samples = optimization_barrier(samples)
 
     def updated(best):
         estimate = optimization_barrier(
