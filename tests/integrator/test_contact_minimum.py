@@ -1,7 +1,10 @@
 """Smallest contact forces and first losses within steps: of polynomials, and beside scipy."""
 
+import jax
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
+from hypothesis.extra import numpy as hnp
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
@@ -61,6 +64,39 @@ def test_a_bound_skips_no_smaller_force():
         alone = minimum(curve)[0]
         assert minimum(curve, alone + 1e-9)[0] == alone
         assert minimum(curve, alone - 1e-9)[0] == alone - 1e-9
+
+
+@settings(max_examples=30)
+@given(
+    hnp.arrays(float, (3, 2, 3, 2), elements=st.floats(-1, 1)),
+    hnp.arrays(bool, (3, 2, 2)),
+    st.booleans(),
+)
+def test_each_load_is_lost_in_the_first_step_with_a_pull(coefficients, on_beam, swapped):
+    """Parabolas of two rows in three steps, by (step, row, power, run), for either of two loads."""
+    start, length = np.array([0.0, 1.0, 3.0]), np.array([1.0, 2.0, 0.5])
+    rows = np.eye(2, dtype=bool)[:, ::-1] if swapped else np.eye(2, dtype=bool)
+    is_load = on_beam[:, :, :1] & rows  # step, row, load
+    forces = np.einsum("srpb,np->srnb", coefficients, NODES[:, None] ** np.arange(3))
+    given_before = np.full((2, 2), np.inf), np.full((2, 2), NEVER)
+    arguments = *given_before, -forces.reshape(3, -1, 2), is_load, start, length
+    found = contact_minimum(*arguments)
+    fine = np.linspace(0.0, 1.0, 2001)
+    curves = np.einsum("srpb,np->srnb", coefficients, fine[:, None] ** np.arange(3))
+    for load in range(2):
+        row = 1 - load if swapped else load
+        here = is_load[:, row, load]
+        values, times = curves[here, row], start[here, None] + length[here, None] * fine
+        lowest = np.min(values, axis=(0, 1), initial=np.inf)
+        assert_allclose(found[0][load], lowest, atol=1e-6)
+        for run in range(2):
+            pulls = times[values[..., run] < -1e-6]
+            if pulls.size:
+                assert found[1][load, run] <= pulls.min() + 1e-9
+            earlier = times[values[..., run] < 1e-6]
+            assert found[1][load, run] >= np.min(earlier, initial=NEVER) - 2e-3
+    for traced, known in zip(jax.jit(contact_minimum)(*arguments), found, strict=True):
+        assert_allclose(traced, known, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(("mass", "speed"), [(3.0, 15.0), (3.0, -30.0)])

@@ -1,0 +1,50 @@
+"""Results of trials: a sweep takes over those with its own steps, equal to the bit."""
+
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+from jaxbeam.integrator import native_peaks
+from jaxbeam.sweeps.trials import Trials
+
+CASE = jb.Case(
+    jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, modes=2),
+    sensors=[jb.Sensor(0.2), jb.Sensor(0.3)],
+    loads=[jb.MovingMass(mass=0.5, speed=2.0)],
+    run=jb.Run(0.5),
+)
+OVER = {"loads.0.mass": [0.2, 0.4], "loads.0.speed": np.linspace(1.0, 5.0, 40)}
+
+
+def test_only_results_with_the_same_steps_are_known():
+    trials, results = Trials(), {"peak": np.arange(6.0).reshape(3, 2)}
+    trials.add(np.array([4, 7, 9]), np.array([0.1, 0.2, 0.3]), results)
+    trials.add(np.array([7]), np.array([0.4]), {"peak": np.array([[8.0, 9.0]])})
+    batches, steps = np.array([9, 7, 5, 4]), np.array([0.3, 0.2, 0.1, 0.1])
+    known = trials.known(batches, steps)
+    assert known.tolist() == [True, False, False, True]
+    found = trials.completed({"peak": np.full((4, 2), -1.0)}, batches, known)
+    assert found["peak"].tolist() == [[4.0, 5.0], [-1.0, -1.0], [-1.0, -1.0], [0.0, 1.0]]
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_results_of_trials_are_those_of_stored_sweeps(native, tmp_path, monkeypatch):
+    """Sweeps in memory compute fewer batches; stored ones take over no trial."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    if native:
+        native_peaks.LIBRARY.build()
+    monkeypatch.setattr(native_peaks, "available", lambda: native)
+    masks, completed = [], Trials.completed
+
+    def counted(trials, results, batch_indices, known):
+        masks.append(known.sum())
+        return completed(trials, results, batch_indices, known)
+
+    monkeypatch.setattr(Trials, "completed", counted)
+    in_memory = jb.sweep(CASE, OVER, progress=False)
+    blocks, count = len(masks), sum(masks)
+    assert 0 < count < 40
+    stored = jb.sweep(CASE, OVER, progress=False, store=tmp_path / "sweep.zarr")
+    for name in in_memory:
+        np.testing.assert_array_equal(in_memory[name], stored[name], err_msg=name)
+    assert len(masks) == blocks
