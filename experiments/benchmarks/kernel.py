@@ -66,10 +66,12 @@ def kernel_arguments(modes: int) -> tuple[np.ndarray, list]:
     runner = sweep_specification(case, over, False, False, TOLERANCE, "double").runner(native=False)
     steps, _ = runner.choose_step_sizes()
     mask = np.ones(SPEEDS.size, bool)
-    models = jax.tree.map(lambda leaf: np.repeat(leaf[:1], SPEEDS.size, axis=0), runner.models)
+    models = jax.tree.map(
+        lambda leaf: np.repeat(leaf[:1], SPEEDS.size, axis=0), runner.compiled.models
+    )
     step_size = steps, np.zeros(steps.size, int)
     batched_models = programs.discrete_models(
-        runner.program(), mask, models, runner.batches.shared_values, step_size
+        runner.program, mask, models, runner.batches.shared_values, step_size
     )
     discrete_models = jax.tree.map(np.asarray, batched_models)
     pinned_beam = PinnedBeam(modes)

@@ -1,14 +1,11 @@
-"""Runner of a sweep: its batches in blocks of equal shape, compiled once."""
+"""Runner of a sweep: its batches in blocks of equal shape, with the longest steps allowed."""
 
-import contextlib
 import dataclasses
 import functools
 import os
-import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,15 +16,15 @@ from jaxbeam.integrator.events import sample_schedule
 from jaxbeam.integrator.integrate import max_stable_step
 from jaxbeam.integrator.static_shapes import StaticShapes, max_concurrent_loads
 from jaxbeam.model.load_set import load_set
-from jaxbeam.model.modal_model import ModalModel, has_coupling
+from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.runtime.vectorised import NotVectorisedError
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import sample_times, steps_per_interval
 from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.batches import Batches, common_layout, swept_masses
+from jaxbeam.sweeps.compiled_batches import CompiledBatches
 from jaxbeam.sweeps.known_inputs import KnownInputs, inputs_of_rows, known_model
-from jaxbeam.sweeps.path_times import PathTimes, path_times
-from jaxbeam.sweeps.step_limits import step_limits
+from jaxbeam.sweeps.path_times import PathTimes, path_times, step_limits
 from jaxbeam.sweeps.step_size import (
     choose_step_sizes,
     rounding_error,
@@ -73,35 +70,68 @@ class Runner:
         elif histories:
             self.schedule = sample_schedule(sample_times(case), True, end=case.run.duration)
         self.trials = Trials()
-        # The variant that measures step sizes is compiled below, others on first use.
-        self._compile_lock, self._compiled_variants = threading.Lock(), {(None, False)}
         self._set_block_size()
-        self.addresses = (batches.shared_addresses, batches.batched_addresses)
-        layout = common_layout(case, batches)
         # Loads, settings of the run and controllers do not change the model, which all batches then
         # share; not on several devices, each of which has the models of its part of a block.
         leaves_model_unchanged = ("loads.", "run.", "controller.")
-        same_model = all(name.startswith(leaves_model_unchanged) for name in self.addresses[0])
-        self.shapes = StaticShapes(layout, has_coupling(case), 1, native)
+        same_model = all(
+            name.startswith(leaves_model_unchanged) for name in batches.shared_addresses
+        )
         self.known_model = known_model(case) if same_model and self.devices == 1 else None
-        # Compilation of the programs for one load need not wait for its entry and exit times.
-        max_loads = load_set(case).wheel_count
-        if max_loads > 1:
-            max_loads = max(map(max_concurrent_loads, self._path_times.load_events[0]))
-        self.shapes = dataclasses.replace(self.shapes, max_loads=max_loads)
-        # The C library makes its own step matrices.
-        self.discretise_separately = case.controller is None and not native
-        self.known_inputs = self._known_inputs()
+        self.program = self._make_program(native)
+        self.known_inputs = self._known_inputs() if native else None
         # More threads than cores where some wait for others.
         waiting = self.known_inputs is None
         self.pool = ThreadPoolExecutor((os.cpu_count() or 1) * (2 if waiting else 1))
         if self.known_inputs is None:
-            self._compile_programs()
-        self.models, limits = self._make_models()
+            self.compiled = self._compile()
         longest = None
         if self.schedule is not None and case.controller is not None:  # steps end at events
             longest = self.schedule.lengths.max()
-        self.limits = step_limits(case, batches, self._path_times, limits, longest, tolerance)
+        limits = self._path_times, self._stable_steps(), longest, tolerance
+        self.limits = step_limits(case, batches, *limits)
+
+    def _make_program(self, native: bool) -> programs.Program:
+        """Data of the programs that compute peaks."""
+        case, batches = self.case, self.batches
+        shapes = StaticShapes(common_layout(case, batches), has_coupling(case), 1, native)
+        # Compilation of the programs for one load need not wait for its entry and exit times.
+        max_loads = load_set(case).wheel_count
+        if max_loads > 1:
+            max_loads = max(map(max_concurrent_loads, self._path_times.load_events[0]))
+        shared = self.known_model is not None and case.controller is None
+        return programs.Program(
+            case,
+            dataclasses.replace(shapes, max_loads=max_loads),
+            batches.shared_addresses,
+            batches.batched_addresses,
+            self.schedule if case.controller is not None else None,
+            known_outputs=self.known_model.outputs if shared else None,
+            devices=self.devices,
+        )
+
+    def _compile(self) -> CompiledBatches:
+        """Batches whose programs are compiled, beside which the times of their paths are found."""
+        known, events = self.known_model, None
+        if known is not None and self.schedule is None:
+            events = self._path_times.load_events
+        settings = self.batches, self.batches_per_block, known and known.model, events
+        compiled = CompiledBatches(self.program, *settings, self.schedule)
+        compilations = compiled.begin_compilation(self.pool)
+        _ = self._path_times  # meanwhile, unless they are known
+        for compilation in compilations:
+            compilation.result()  # raises its error, if any
+        return compiled
+
+    def _stable_steps(self) -> Float[np.ndarray, " path"]:
+        """Longest stable steps (s), infinite where there is none: a run fails with any step."""
+        if self.known_model is None:
+            limits = self.compiled.make_models()
+        else:
+            loads = load_set(concrete_case(self.case), self.program.shapes.layout)
+            limit = max_stable_step(self.known_model.model, loads)
+            limits = np.repeat(limit, self.batches.run_index.shape[0])
+        return np.where(np.isfinite(limits), limits, np.inf)
 
     def _set_block_size(self):
         """Numbers of batches per block and per trial, multiples of the number of devices."""
@@ -124,51 +154,19 @@ class Runner:
         case, places = concrete_case(self.case), np.zeros(0)
         if self.known_model is not None:
             places = self.known_model.event_places
-        found = path_times(case, self.addresses[0], self.batches.shared_values, places)
+        found = path_times(case, self.batches.shared_addresses, self.batches.shared_values, places)
         return jax.tree.map(np.asarray, found)
-
-    def _model_groups(self) -> list:
-        """Indices of batches whose models are made in one call."""
-        count = self.batches.run_index.shape[0]
-        return list(np.resize(np.arange(count), (self.block_count, self.batches_per_block)))
 
     def _known_inputs(self) -> KnownInputs | None:
         """What the C integrator needs to know, if all batches share a model; else None."""
-        if self.known_model is None or not self.shapes.native:
+        if self.known_model is None:
             return None
-        program = self.program()._replace(case=concrete_case(self.case))
+        program = self.program._replace(case=concrete_case(self.case))
         events = self._path_times.load_events
         try:
             return KnownInputs(program, self.known_model, events, self.batches)
         except NotVectorisedError:
             return None
-
-    def _compile_programs(self) -> None:
-        """Compile the programs for step sizes."""
-        program = self.program()
-        first_values = self.batches.shared_values[self._model_groups()[0]]
-        compilations = [
-            self.pool.submit(compiled_program.precompile(*arguments))
-            for compiled_program, arguments in self._programs_to_compile(program, first_values)
-        ]
-        _ = self._path_times  # meanwhile, unless they are known
-        for compilation in compilations:
-            compilation.result()  # raises its error, if any
-
-    def _make_models(self) -> tuple[ModalModel, Float[np.ndarray, " path"]]:
-        """Models of all batches, a single one if they share it; longest stable steps (s)."""
-        count = self.batches.run_index.shape[0]
-        if self.known_model is not None:
-            model = self.known_model.model
-            limit = max_stable_step(model, load_set(concrete_case(self.case), self.shapes.layout))
-            models = jax.tree.map(lambda leaf: leaf[None], model)
-            return models, _stable_steps(np.repeat(limit, count))
-        groups = [
-            programs.modal_models(self.program(), self.batches.shared_values[group])
-            for group in self._model_groups()
-        ]
-        models, limits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *groups)
-        return models, _stable_steps(limits[:count])
 
     def choose_step_sizes(self) -> tuple[Float[np.ndarray, " path"], float]:
         """Step sizes (s) of all batches, and the estimated relative error of their peaks.
@@ -240,41 +238,19 @@ class Runner:
     def _block_integrator(self, steps) -> Callable:
         """Function of a block's number and a mask of its batches: results of those in the mask."""
         if self.known_inputs is not None:
+            integrate, max_loads = native_peaks.integrate_peaks, self.program.shapes.max_loads
             inputs_of_block = self.known_inputs.of_blocks(steps, self.batches_per_block)
-            return lambda block, mask: self._integrate_in_c(inputs_of_block(block), mask)
+            return lambda block, mask: integrate(max_loads, mask, inputs_of_block(block))._asdict()
         substeps = None
         if self.histories:
             substeps = steps_per_interval(float(self.schedule.lengths.max()), steps.min())
 
-        def integrate(block, mask):
+        def integrate_block(block, mask):
             rows = self._batches_of(block)
             stepping = steps[rows], np.zeros(rows.size, int)
-            return self._integrate_compiled(rows, *stepping, mask, substeps, self.single)
+            return self.compiled.integrate(rows, *stepping, mask, substeps, self.single)
 
-        return integrate
-
-    def _programs_to_compile(self, program, shared_values):
-        """Programs that step sizes need, the slowest to compile first, and template arguments."""
-        indices = np.zeros(self.batches_per_block, int)
-        stepping, mask = self._stepping(indices, np.ones(indices.size), indices), indices > 0
-        if self.known_model is not None:
-            models = jax.tree.map(lambda leaf: leaf[None], self.known_model.model)
-        else:
-            model_template, _ = programs.modal_models.template(program, shared_values)
-            models = jax.tree.map(lambda leaf: leaf[indices], model_template)
-        discretise_arguments = program, mask, models, self.batches.shared_values[indices], stepping
-        if self.discretise_separately:
-            models = programs.discrete_models.template(*discretise_arguments)
-        else:
-            models = self._models_without_controller(models)
-        yield (
-            programs.block_program(program, single=False),
-            (program, mask, models, *self._values_of(indices), stepping),
-        )
-        if self.discretise_separately:
-            yield programs.discrete_models, discretise_arguments
-        if self.known_model is None:
-            yield programs.modal_models, (program, shared_values)
+        return integrate_block
 
     def _trial_results(self, batch_indices, steps, extra_steps, single):
         """Results of batches by name, on all cores."""
@@ -285,94 +261,15 @@ class Runner:
             inputs, calls = None, -(-batch_indices.size // self.trial_batches)
 
         def integrate(rows):
-            if inputs is not None:
-                return self._integrate_in_c(inputs_of_rows(inputs, rows), np.ones(rows.size, bool))
-            return self._integrate_few(batch_indices[rows], steps[rows], extra_steps[rows], single)
+            if inputs is None:
+                few = batch_indices[rows], steps[rows], extra_steps[rows]
+                return self.compiled.integrate_few(*few, single)
+            settings = self.program.shapes.max_loads, np.ones(rows.size, bool)
+            return native_peaks.integrate_peaks(*settings, inputs_of_rows(inputs, rows))._asdict()
 
         parts = np.array_split(np.arange(batch_indices.size), calls)
         results = list(self.pool.map(integrate, parts))
         return {name: np.concatenate([one[name] for one in results]) for name in results[0]}
-
-    def _integrate_few(self, batch_indices, steps, extra_steps, single):
-        """Results of at most a block of batches by name."""
-        # They are spread over the block, so that each device has its part.
-        rows = np.arange(batch_indices.size) * self.batches_per_block // batch_indices.size
-        mask = np.zeros(self.batches_per_block, bool)
-        mask[rows] = True
-        nearest_row = np.cumsum(mask) - 1
-        stepping = steps[nearest_row], extra_steps[nearest_row]
-        settings = mask, None, single
-        results = self._integrate_compiled(batch_indices[nearest_row], *stepping, *settings)
-        return {name: values[rows] for name, values in results.items()}
-
-    def _integrate_in_c(self, inputs: native_peaks.NativeInputs, mask):
-        """Results by name of batches whose inputs are known; any for those not in the mask."""
-        return native_peaks.integrate_peaks(self.shapes.max_loads, mask, inputs)._asdict()
-
-    def _integrate_compiled(self, batch_indices, steps, extra_steps, mask, substeps, single):
-        """Results of a block of batches by name; any for those not in the mask."""
-        stepping = self._stepping(batch_indices, steps, extra_steps)
-        program, models = self.program(substeps), self._models_of(batch_indices)
-        shared_values, batched_values = self._values_of(batch_indices)
-        if self.discretise_separately:
-            models = programs.discrete_models(program, mask, models, shared_values, stepping)
-        else:
-            models = self._models_without_controller(models)
-        arguments = program, mask, models, shared_values, batched_values, stepping
-        arguments = jax.tree.map(_to_single_precision, arguments) if single else arguments
-        compiled_program = programs.block_program(program, single)
-        with _single_precision() if single else contextlib.nullcontext():
-            with self._compile_lock:  # other threads wait instead of compiling the same variant
-                if (substeps, single) not in self._compiled_variants:
-                    compiled_program.precompile(*arguments)()
-                    self._compiled_variants.add((substeps, single))
-            results = compiled_program(*arguments)
-        if compiled_program is programs.native_block:
-            return self._integrate_in_c(results, mask)
-        return {name: np.asarray(values) for name, values in results.items()}
-
-    def _stepping(self, batch_indices, steps, extra_steps) -> programs.Stepping:
-        """Steps of batches; their load events are known if all share a model."""
-        events = None
-        if self.known_model is not None and self.schedule is None:
-            events = jax.tree.map(lambda part: part[batch_indices], self._path_times.load_events)
-        return programs.Stepping(steps, extra_steps, events)
-
-    def _models_of(self, batch_indices):
-        """Models of batches; one that all share is single."""
-        if self.known_model is not None:
-            return self.models
-        return jax.tree.map(lambda leaf: leaf[batch_indices], self.models)
-
-    def _models_without_controller(self, models):
-        """Models for the program of a block: None with a controller, whose loop has its own."""
-        return models if self.case.controller is None else None
-
-    def _values_of(self, batch_indices):
-        """Shared and batched values of batches."""
-        return self.batches.shared_values[batch_indices], self.batches.batched_values[batch_indices]
-
-    def program(self, substeps: int | None = None) -> programs.Program:
-        """Data of the programs; with `substeps` per sample interval, also for histories."""
-        scheduled = substeps is not None or self.case.controller is not None
-        sampling = (self.schedule if scheduled else None), substeps
-        shared = self.known_model is not None and self.case.controller is None
-        outputs = self.known_model.outputs if shared else None
-        return programs.Program(
-            self.case,
-            self.shapes,
-            *self.addresses,
-            *sampling,
-            known_outputs=outputs,
-            devices=self.devices,
-        )
-
-
-@contextlib.contextmanager
-def _single_precision():
-    """A context of float32; of all its digits in products, of which GPUs keep three by default."""
-    with jax.enable_x64(False), jax.default_matmul_precision("highest"):
-        yield
 
 
 def _round_up(count: int, unit: int) -> int:
@@ -383,10 +280,3 @@ def _round_up(count: int, unit: int) -> int:
 def _stable_steps(limits) -> Float[np.ndarray, " path"]:
     """Longest stable steps (s), infinite where there is none: such a run fails with any step."""
     return np.where(np.isfinite(limits), limits, np.inf)
-
-
-def _to_single_precision(leaf):
-    """Array in float32 or int32; booleans and static values as they are."""
-    if not eqx.is_array(leaf) or leaf.dtype == bool:
-        return leaf
-    return np.asarray(leaf, np.float32 if np.issubdtype(leaf.dtype, np.floating) else np.int32)

@@ -17,6 +17,7 @@ from jaxbeam.model.sensing.corrected_rows import corrected_places
 from jaxbeam.runtime.remembering import remembered
 from jaxbeam.runtime.vectorised import vectorised
 from jaxbeam.sweeps.batches import Batches, values_at
+from jaxbeam.sweeps.path_times import PathEvents
 from jaxbeam.sweeps.programs import Outputs, Program, outputs_of
 
 GROUP_RUNS = 4096  # whose inputs are made at once; those of 512 take as long
@@ -50,7 +51,7 @@ def _model_of(structure: Case) -> KnownModel:
 class KnownInputs:
     """Inputs of the C integrator of batches of known numbers that share a model and outputs.
 
-    `events` are the `LoadEvents` of all paths. Raises NotVectorisedError where loads cannot be
+    `events` are those of all paths. Raises NotVectorisedError where loads cannot be
     vectorised.
     """
 
@@ -58,7 +59,7 @@ class KnownInputs:
         self,
         program: Program,
         known: KnownModel,
-        events: tuple[Float[np.ndarray, "path wheel 2"], Float[np.ndarray, "path event"]],
+        events: PathEvents,
         batches: Batches,
     ):
         self.program, self.batches = program, batches
