@@ -16,7 +16,6 @@ from jaxbeam.runtime.vectorised import NotVectorisedError, vectorised
 from jaxbeam.sweeps.batches import Batches, values_at
 from jaxbeam.sweeps.step_size import initial_share, initial_step_sizes
 
-
 # `LoadEvents` of all paths, of known numbers.
 PathEvents = tuple[Float[np.ndarray, "path wheel 2"], Float[np.ndarray, "path event"]]
 
