@@ -256,9 +256,10 @@ class Runner:
         """Results of batches by name, on all cores."""
         if self.known_inputs is not None:
             inputs = self.known_inputs.of_batches(batch_indices, steps, extra_steps)
-            calls = min(batch_indices.size, os.cpu_count() or 1)
+            calls = os.cpu_count() or 1
         else:
-            inputs, calls = None, -(-batch_indices.size // self.trial_batches)
+            # Two at least, of fine and of coarse steps.
+            inputs, calls = None, max(2, -(-batch_indices.size // self.trial_batches))
 
         def integrate(rows):
             if inputs is None:
@@ -267,7 +268,7 @@ class Runner:
             settings = self.program.shapes.max_loads, np.ones(rows.size, bool)
             return native_peaks.integrate_peaks(*settings, inputs_of_rows(inputs, rows))._asdict()
 
-        parts = np.array_split(np.arange(batch_indices.size), calls)
+        parts = np.array_split(np.arange(batch_indices.size), min(calls, batch_indices.size))
         results = list(self.pool.map(integrate, parts))
         return {name: np.concatenate([one[name] for one in results]) for name in results[0]}
 
