@@ -87,9 +87,12 @@ def step_errors(peaks: PeaksFunction, batches, steps) -> Float[np.ndarray, " pat
     At least one step is added between events, of which there may be few. Runs that fail are left
     out; NaN if all do.
     """
-    # The finer runs take longer and come first.
-    both_steps, extra_steps = np.append(steps / REFINEMENT, steps), np.repeat([1, 0], len(batches))
-    fine, coarse = np.split(peaks(np.tile(batches, 2), both_steps, extra_steps), 2)
+    # The finer runs take longer: each half has those of every other batch.
+    fine_first = np.arange(len(batches)) % 2 == 0
+    is_fine = np.append(fine_first, ~fine_first)
+    both_steps = np.tile(steps, 2) / np.where(is_fine, REFINEMENT, 1.0)
+    halves = np.split(peaks(np.tile(batches, 2), both_steps, is_fine.astype(int)), 2)
+    fine, coarse = (np.where(fine_first[:, None, None], *pair) for pair in (halves, halves[::-1]))
     return relative_changes(coarse, fine)
 
 
