@@ -77,15 +77,17 @@ def update_peaks(
     states, forces, *_ = inputs
     steps, batch_size = states.shape[0], states.shape[-1]
     start, length = path.start, path.length
-    # Two products: the states, by far the largest part, are not copied.
-    others = xp.concatenate([part for part in inputs[1:] if part is not None], axis=1)
-    on_states, on_others = xp.split(matrices.monitored, [states.shape[1]], axis=2)
-    deflections = on_states @ states + on_others @ others
-    samples = deflections.reshape(steps, len(PEAK_NODES), -1, batch_size)
-    if path.influence is not None:
+    others = [part for part in inputs[1:] if part is not None]
+    if path.influence is None:
+        outputs = matrices.monitored @ xp.concatenate([states, *others], axis=1)
+    else:
+        # By two products, with which sweeps of moments take a tenth less time, and those of
+        # deflections 3 % more.
+        on_states, on_others = xp.split(matrices.monitored, [states.shape[1]], axis=2)
+        outputs = on_states @ states + on_others @ xp.concatenate(others, axis=1)
         # Forces of loads that leave after the end are in steps of no length, no part of the run.
-        samples = xp.where(length[:, None, None, None] > 0, samples, 0.0)
-    samples = optimization_barrier(samples)
+        outputs = xp.where(length[:, None, None] > 0, outputs, 0.0)
+    samples = optimization_barrier(outputs.reshape(steps, len(PEAK_NODES), -1, batch_size))
 
     def updated(best):
         estimate = optimization_barrier(
