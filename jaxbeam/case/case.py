@@ -358,7 +358,7 @@ def concrete_case(case: Case) -> Case:
 
 
 def structure_of(case: Case) -> Case:
-    """The case of what stands: the beam with its supports, actuators and sensors, without loads."""
+    """Beam, supports, actuators and sensors of a case, as a case without loads."""
     return Case(case.beam, case.supports, case.actuators, case.sensors)
 
 

@@ -111,7 +111,7 @@ class Runner:
         )
 
     def _compile(self) -> CompiledBatches:
-        """Batches whose programs are compiled, beside which the times of their paths are found."""
+        """Batches with compiled programs; times of their paths are computed meanwhile."""
         known, events = self.known_model, None
         if known is not None and self.schedule is None:
             events = self._path_times.load_events
@@ -213,8 +213,7 @@ class Runner:
     ) -> Callable[[int], dict[str, np.ndarray]]:
         """Function of a block's number: its results (path, batch, ...) by name.
 
-        `steps` (s) are those of all batches. Results among the `trials` are not computed again;
-        nor are those from which an interrupted sweep continues, which agree to the bit.
+        `steps` (s) are those of all batches. Results among the `trials` are not computed again.
         """
         integrate, known_results = self._block_integrator(steps), trials or Trials()
         if self.histories:

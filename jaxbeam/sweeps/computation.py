@@ -127,7 +127,7 @@ def _compute(
     runner: Runner | ForceRunner, blocks: list[int], steps, block_store: BlockStore
 ) -> Iterator[int]:
     """Numbers of blocks as they are computed, on all cores, and stored."""
-    # What is stored must not depend on trials, which a sweep that continues does not make.
+    # A stored sweep that continues has no trials, and must agree to the bit.
     trials = runner.trials if isinstance(block_store, MemoryStore) else None
     compute = runner.block_function(steps, trials)
     results = runner.pool.map(lambda block: (block, compute(block)), blocks)
