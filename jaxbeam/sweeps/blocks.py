@@ -216,8 +216,8 @@ class Runner:
         `steps` (s) are those of all batches. Results among the `trials` are not computed again.
         """
         integrate, known_results = self._block_integrator(steps), trials or Trials()
-        if self.histories:
-            known_results = Trials()  # trials have none
+        if self.histories or self.single:
+            known_results = Trials()  # trials are of peaks, in double precision
 
         def compute(block: int) -> dict[str, np.ndarray]:
             batch_indices = self._batches_of(block)
@@ -275,8 +275,3 @@ class Runner:
 def _round_up(count: int, unit: int) -> int:
     """Smallest multiple of a unit that is at least a count."""
     return -(-count // unit) * unit
-
-
-def _stable_steps(limits) -> Float[np.ndarray, " path"]:
-    """Longest stable steps (s), infinite where there is none: such a run fails with any step."""
-    return np.where(np.isfinite(limits), limits, np.inf)

@@ -99,6 +99,12 @@ def test_each_load_is_lost_in_the_first_step_with_a_pull(coefficients, on_beam, 
         assert_allclose(traced, known, rtol=1e-9, atol=1e-9)
 
 
+def test_without_loads_nothing_is_found():
+    none = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((2, 0, 3)), np.zeros((2, 0, 0), bool)
+    for found in (contact_minimum, jax.jit(contact_minimum)):
+        assert [part.shape for part in found(*none, START, LENGTH)] == [(0, 3), (0, 3)]
+
+
 @pytest.mark.parametrize(("mass", "speed"), [(3.0, 15.0), (3.0, -30.0)])
 def test_few_samples_give_the_smallest_force_of_scipy(mass, speed):
     """Steps are long, and forces change much within them."""

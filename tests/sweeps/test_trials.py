@@ -27,9 +27,10 @@ def test_only_results_with_the_same_steps_are_known():
     assert found["peak"].tolist() == [[4.0, 5.0], [-1.0, -1.0], [-1.0, -1.0], [0.0, 1.0]]
 
 
-@pytest.mark.parametrize("native", [True, False])
-def test_results_of_trials_are_those_of_stored_sweeps(native, tmp_path, monkeypatch):
-    """Sweeps in memory compute fewer batches; stored ones take over no trial."""
+@pytest.mark.parametrize("way", ["C", "XLA", "single"])
+def test_results_of_trials_are_those_of_stored_sweeps(way, tmp_path, monkeypatch):
+    """Sweeps in memory compute fewer batches; stored ones and single precision take over none."""
+    native, precision = way == "C", "single" if way == "single" else "double"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     if native:
         native_peaks.LIBRARY.build()
@@ -41,10 +42,11 @@ def test_results_of_trials_are_those_of_stored_sweeps(native, tmp_path, monkeypa
         return completed(trials, results, batch_indices, known)
 
     monkeypatch.setattr(Trials, "completed", counted)
-    in_memory = jb.sweep(CASE, OVER, progress=False)
+    given = {"progress": False, "precision": precision}
+    in_memory = jb.sweep(CASE, OVER, **given)
     blocks, count = len(masks), sum(masks)
-    assert 0 < count < 40
-    stored = jb.sweep(CASE, OVER, progress=False, store=tmp_path / "sweep.zarr")
+    assert count < 40 and (count == 0) == (precision == "single")
+    stored = jb.sweep(CASE, OVER, store=tmp_path / "sweep.zarr", **given)
     for name in in_memory:
         np.testing.assert_array_equal(in_memory[name], stored[name], err_msg=name)
     assert len(masks) == blocks

@@ -50,6 +50,8 @@ def contact_minimum(
     which load a row is. Times are NEVER without a loss, which is the first zero of the polynomial,
     or the start of a step with a pull.
     """
+    if not is_load.size:  # of a case without loads
+        return lowest, lost_time
     steps, batch_size = forces.shape[0], forces.shape[-1]
     by_row = forces.reshape(steps, -1, NODE_COUNT, batch_size)
     most, least = xp.max(by_row, axis=2), xp.min(by_row, axis=2)
