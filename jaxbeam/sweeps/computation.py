@@ -17,6 +17,7 @@ from jaxbeam.case.case import Case, unit_at
 from jaxbeam.case.display.addresses import address_words
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.integrator import native_peaks
+from jaxbeam.runtime.arrays import collapse
 from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.garbage import rare_collections
 from jaxbeam.simulation.integration_plan import sample_times
@@ -143,20 +144,21 @@ def _to_dataset(
 ) -> "xarray.Dataset":
     """Results of all batches as a dataset with a dimension per address, or `run`."""
     case, dims, shape = specification.case, specification.dims, specification.shape
-    mask = batches.run_index >= 0
-    flat = {}
-    for name, values in results.items():
-        values = values[: batches.run_index.shape[0]][mask]
-        flat[name] = np.empty_like(values)
-        flat[name][batches.run_index[mask]] = values
-    peaks = flat["peak_deflection"]
-    failed = ~np.all(np.isfinite(peaks), axis=1)
+    index = batches.run_index.reshape(-1)
+    rows = np.empty(specification.count, int)
+    rows[index[index >= 0]] = np.flatnonzero(index >= 0)
+    flat = {
+        name: collapse(values, 0, 2)[rows]  # padding is at the end, or left out
+        for name, values in results.items()
+    }
+    failed = ~np.all(np.isfinite(flat["peak_deflection"]), axis=1)
     variables: dict[str, Any] = {
         "failed": (dims, failed.reshape(shape), {"long_name": "whether the run failed"})
     }
     for name, values in flat.items():
         own_dims, unit, words = SWEEP_VARIABLES[name]
-        values = np.where(failed.reshape(-1, *(1,) * (values.ndim - 1)), np.nan, values)
+        values = values.astype(np.result_type(values, np.float32), copy=False)
+        values[failed] = np.nan
         attributes = {"units": unit, "long_name": words}
         if name == "peak_deflection":
             variables |= _peak_variables(case, dims, values.reshape(*shape, values.shape[1]))
@@ -203,13 +205,13 @@ def _peak_variables(case: Case, dims: tuple[str, ...], peaks) -> dict[str, tuple
     quantities = np.array([sensor.quantity for sensor in case.sensors])
     variables = {}
     corrected = any(sensor.bends for sensor in case.sensors) and is_corrected(case)
-    for sensor in case.sensors:
-        entry, own = QUANTITIES[sensor.quantity], quantities == sensor.quantity
-        words = f"largest absolute {sensor.quantity}"
+    for quantity in dict.fromkeys(quantities.tolist()):
+        entry, own = QUANTITIES[quantity], quantities == quantity
+        words = f"largest absolute {quantity}"
         if entry.bends:
             modes = f"sum of {case.beam.modes} modes"
             words += ", statically corrected" if corrected else f", {modes}"
         values = np.where(own, peaks, np.nan).astype(peaks.dtype)
         attributes = {"units": entry.unit, "long_name": words}
-        variables[f"peak_{sensor.quantity}"] = ((*dims, "sensor"), values, attributes)
+        variables[f"peak_{quantity}"] = ((*dims, "sensor"), values, attributes)
     return variables
