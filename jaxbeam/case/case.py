@@ -166,7 +166,7 @@ def _leaves_by_address(case: Case) -> dict[str, Any]:
     return dict(zip(_addresses_of(structure), leaves, strict=True))
 
 
-@functools.lru_cache(maxsize=64)  # a sweep asks eight times, which took half a millisecond
+@functools.lru_cache(maxsize=64)  # `replace` takes 0.03 ms, 0.05 without
 def _addresses_of(structure) -> list[str]:
     """Addresses of the leaves of all cases of a structure."""
     numbered = jax.tree.unflatten(structure, range(structure.num_leaves))

@@ -257,7 +257,7 @@ class Runner:
             inputs = self.known_inputs.of_batches(batch_indices, steps, extra_steps)
             calls = os.cpu_count() or 1
         else:
-            # Two at least, of fine and of coarse steps.
+            # Two at least, side by side.
             inputs, calls = None, max(2, -(-batch_indices.size // self.trial_batches))
 
         def integrate(rows):

@@ -24,9 +24,9 @@ GROUP_RUNS = 4096  # whose inputs are made at once; those of 512 take as long
 
 
 class KnownModel(NamedTuple):
-    """What a structure determines: modal model, outputs of its sensors, and load events.
+    """What a structure determines: its modal model, and the outputs of its sensors.
 
-    The latter are at places (m) that wheels pass.
+    At the `event_places` (m) a passing wheel is a load event.
     """
 
     model: ModalModel
@@ -51,8 +51,7 @@ def _model_of(structure: Case) -> KnownModel:
 class KnownInputs:
     """Inputs of the C integrator of batches of known numbers that share a model and outputs.
 
-    `events` are those of all paths. Raises NotVectorisedError where loads cannot be
-    vectorised.
+    `events` are those of all paths. Raises NotVectorisedError where loads cannot be vectorised.
     """
 
     def __init__(

@@ -2,7 +2,7 @@
 
 Within a step a contact force is the polynomial through its values at the Gauss nodes. It is
 compared at fractions of the step, the ends among them, and at the vertices of the parabolas through
-three of these. `runtime/native/steps.h` does the same in C.
+three of these. `runtime/native/contact.c` does the same in C.
 """
 
 import numpy as np
@@ -58,13 +58,13 @@ def contact_minimum(
     bound = 0.5 * (most + least) + spread_factor() * (most - least)
     bound = xp.where(is_load[..., None], bound[:, :, None], -xp.inf)
 
-    def with_smaller(lowest):
-        return xp.minimum(lowest, xp.min(-pulls_of_loads(), axis=(0, 1), initial=xp.inf))
-
     def pulls_of_loads():
         pulls = _at_fractions(by_row)
         pull = xp.maximum(xp.max(pulls, axis=0), xp.max(_vertices(pulls)[0], axis=0))
         return xp.where(is_load[..., None], pull[:, :, None], -xp.inf)
+
+    def with_smaller(lowest):
+        return xp.minimum(lowest, xp.min(-pulls_of_loads(), axis=(0, 1), initial=xp.inf))
 
     def with_first_loss(lost_time):
         """Of each load only the first step with a pull counts."""
