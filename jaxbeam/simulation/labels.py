@@ -1,12 +1,14 @@
 """Wheels of a case in words: labels of datasets, reports and figures, and where contact is lost."""
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.model.load_set import load_set
+from jaxbeam.model.load_set import LoadSet, load_set
 
 MAX_LISTED = 4  # wheels in a sentence
+ROUNDING = 1e-12  # of a given force
 
 
 def wheel_labels(case: Case) -> np.ndarray:
@@ -27,7 +29,11 @@ def contact_sentence(case: Case, lost_times, lost_positions, lowest_forces) -> s
     Times are NaN for wheels that press on the beam throughout. The first of many wheels are listed.
     Prescribed forces may be negative: these pull because they were given so.
     """
-    negative, prescribed = np.isfinite(lost_times), load_set(case).prescribed
+    loads = load_set(case)
+    negative, prescribed = np.isfinite(lost_times), loads.prescribed
+    rounding = ROUNDING * _given_forces(loads)
+    lowest_forces = np.where(np.abs(lowest_forces) <= rounding, 0.0, lowest_forces)
+    negative = negative & ~(prescribed & (lowest_forces == 0))
     lost = np.flatnonzero(negative & ~prescribed)
     pulling = np.flatnonzero(negative & prescribed)
     if pulling.size and not lost.size:
@@ -37,10 +43,8 @@ def contact_sentence(case: Case, lost_times, lost_positions, lowest_forces) -> s
             f"the prescribed force of load {wheel_labels(case)[i]}{more} is negative at times, down"
             f" to {lowest_forces[i]:.4g} N, as given"
         )
-    if case.loads and not _any_on_beam(case):
-        return "no load is on the beam during the run"
     if not lost.size:
-        return "every load presses on the beam throughout"
+        return _pressing_sentence(case, loads, lowest_forces)
     labels = wheel_labels(case)
     first = lost[np.argsort(lost_times[lost], kind="stable")][:MAX_LISTED]
     parts = [
@@ -52,7 +56,41 @@ def contact_sentence(case: Case, lost_times, lost_positions, lowest_forces) -> s
     return "; ".join([*parts, f"{more} more wheels lose contact"] if more else parts)
 
 
-def _any_on_beam(case: Case) -> bool:
-    """Whether any wheel is on the beam at some time of the run."""
-    enter, leave = concrete(load_set(case).entry_exit_times()).T
-    return bool(np.any((enter < concrete(case.run.duration)) & (leave > 0)))
+def _given_forces(loads: LoadSet) -> Float[np.ndarray, " wheel"]:
+    """Bounds (N) of the given forces of wheels: weights, waves and tables."""
+    bounds = np.abs(concrete(loads.weight)[:, 0])
+    for wheel, history in loads.wheels.histories.items():
+        amplitudes, forces = concrete(history.amplitudes), concrete(history.forces)
+        bounds[wheel] += np.sum(np.abs(amplitudes)) + np.max(np.abs(forces), initial=0.0)
+    return bounds
+
+
+def _pressing_sentence(case: Case, loads: LoadSet, lowest_forces) -> str:
+    """Which wheels press on the beam throughout, where none pulls: none without weight, say."""
+    if not case.loads:
+        return "the case has no loads"
+    labels = wheel_labels(case)
+    enter, leave = concrete(loads.entry_exit_times()).T
+    crosses = (enter < concrete(case.run.duration)) & (leave > 0)
+    if not np.any(crosses):
+        return "no load is on the beam during the run"
+    weightless = crosses & (concrete(loads.weight)[:, 0] == 0) & (lowest_forces == 0)
+    weightless[list(loads.wheels.histories)] = False
+    released = crosses & (lowest_forces == 0) & ~weightless
+    exceptions = [
+        (weightless, "{} has no weight", "{} have no weight"),
+        (released, "the force of {} falls to 0 N", "the forces of {} fall to 0 N"),
+        (~crosses, "{} is not on the beam", "{} are not on the beam"),
+    ]
+    parts = []
+    for wheels, one, several in exceptions:
+        index = np.flatnonzero(wheels)
+        if index.size:
+            listed = ", ".join(labels[index[:MAX_LISTED]])
+            more = f" and {index.size - MAX_LISTED} more" if index.size > MAX_LISTED else ""
+            words, loads_of = (one, "load") if index.size == 1 else (several, "loads")
+            parts.append(words.format(f"{loads_of} {listed}{more}"))
+    if np.any(crosses & ~weightless & ~released):
+        other = "other " if parts else ""
+        parts.append(f"every {other}load presses on the beam throughout")
+    return "; ".join(parts)

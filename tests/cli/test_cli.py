@@ -11,7 +11,31 @@ import pytest
 from PIL import Image
 
 from jaxbeam.cli import main
+from jaxbeam.files.case_file import load_case
+from jaxbeam.model.load_set import load_set
 from tests.cli.example import CASE
+
+TRUCKS = """
+[beam]
+length = 20.0
+flexural_rigidity = 1e10
+mass_per_length = 12e3
+damping_ratio = 0.02
+modes = 3
+[profile]
+kind = "sine"
+amplitude = "3 mm"
+wavelength = 4.0
+[[sensors]]
+position = 10.0
+[[loads]]
+kind = "train"
+speed = 20.0
+coaches = [{ model = "truck-5-axle", count = 2, length = 20.0 }]
+[run]
+duration = 3.0
+sample_rate = 200.0
+"""
 
 
 def frequency(n: int, rigidity: float = 11.68) -> float:
@@ -118,7 +142,6 @@ def films_of(frames: int, monkeypatch) -> None:
 
 def test_simulate_prints_and_writes_the_same(run, folder, monkeypatch):
     import jaxbeam as jb
-    from jaxbeam.files.case_file import load_case
 
     films_of(3, monkeypatch)
     record = jb.simulate(load_case(folder / "case.toml"))
@@ -401,7 +424,6 @@ def test_identify_modes_of_a_decay(run, folder):
 
 def test_identify_a_case(run, folder):
     import jaxbeam as jb
-    from jaxbeam.files.case_file import load_case
 
     record = jb.simulate(load_case(folder / "case.toml"))
     table = np.column_stack([record.times, np.asarray(record.deflection)[:, 0]])
@@ -421,3 +443,22 @@ def test_contact_loss_is_printed_once(run):
     printed = run("simulate case.toml --set loads.0.speed=6 --set loads.0.mass=3")
     assert printed.count("load 0 loses contact") == 1
     assert "lowest contact force (N)" in printed
+
+
+def test_wheels_are_named_by_what_they_are_chosen_for(folder, run):
+    """Of two trucks the wheel unloaded most, that of the lowest and that of the largest force."""
+    (folder / "trucks.toml").write_text(TRUCKS)
+    found = run("simulate trucks.toml --json")
+    weights = np.asarray(load_set(load_case(folder / "trucks.toml")).weight)[:, 0]
+    lowest, unloading = (np.array(found[n]) for n in ("lowest_contact_force", "wheel_unloading"))
+    largest = np.array(found["largest_contact_force"])
+    expected = {"most unloaded": unloading, "lowest force": -lowest, "largest force": largest}
+    assert np.argmax(unloading) != np.argmin(lowest)
+    printed = [line for line in run("simulate trucks.toml").splitlines() if " of 10 " in line]
+    for words, values in expected.items():
+        wheel = int(np.argmax(values))
+        (line,) = (line for line in printed if f"0 wheel {wheel + 1}, " in line)
+        assert words in line
+        numbers = [float(text) for text in line.split(" of 10 ")[1].split()[:3]]
+        own = weights[wheel], lowest[wheel], largest[wheel]
+        np.testing.assert_allclose(numbers, own, rtol=1e-5)

@@ -192,6 +192,29 @@ def test_verdict_names_contact_loss_and_error(record):
     assert "load 1" not in lost.verdict
 
 
+def test_verdict_says_which_loads_press():
+    """In 0.5 s on a beam of 1 m: a mass of 0 kg, a force that starts at 0 N, a late force."""
+    beam, run = jb.Beam(1.0, 10.0, 1.0, modes=2), jb.Run(0.5, sample_rate=20.0)
+    ball, nothing = jb.MovingMass(0.1, 4.0), jb.MovingMass(0.0, 4.0)
+    rising = jb.VaryingForce(force_times=[0.0, 0.2], forces=[0.0, 3.0], position=0.5)
+    absent = jb.MovingForce(force=1.0, speed=4.0, entry_time=0.7)
+    for loads, words in (
+        ([], "the case has no loads"),
+        ([ball], "every load presses on the beam throughout"),
+        ([nothing], "load 0 has no weight"),
+        ([nothing, nothing], "loads 0, 1 have no weight"),
+        ([rising], "the force of load 0 falls to 0 N"),
+        ([absent], "no load is on the beam during the run"),
+        (
+            [ball, nothing, absent],
+            "load 1 has no weight; load 2 is not on the beam; every other load presses on the beam"
+            " throughout",
+        ),
+    ):
+        verdict = jb.simulate(jb.Case(beam, loads=loads, run=run)).verdict
+        assert verdict.split("; estimated error")[0] == words
+
+
 def test_record_without_loads_and_sensors(tmp_path):
     case = jb.Case(jb.Beam(1.0, 10.0, 1.0, modes=2), run=jb.Run(0.1))
     record = jb.simulate(case)

@@ -162,7 +162,7 @@ def _extremes_of_sensors(record: "jb.Record") -> list[dict[str, float]]:
 
 
 def _wheel_lines(record: "jb.Record") -> list[str]:
-    """Table of contact forces by wheel; of loads of many wheels the one unloaded most."""
+    """Table of contact forces by wheel; of loads of many wheels those with an extreme."""
     import numpy as np
 
     from jaxbeam.model.load_set import load_set
@@ -175,20 +175,33 @@ def _wheel_lines(record: "jb.Record") -> list[str]:
     load_of_wheel, rows = np.array(loads.load_of_wheel), []
     for load in np.unique(load_of_wheel):
         wheels = np.flatnonzero(load_of_wheel == load)
+        names = {int(i): str(labels[i]) for i in wheels}
         if wheels.size > MAX_WHEELS:
-            worst = wheels[np.argmax(np.nan_to_num(unloading[wheels], nan=-np.inf))]
-            names = [f"{labels[worst]}, lowest of {wheels.size}"]
-            largest[worst] = np.max(largest[wheels])
-            wheels = np.array([worst])
-        else:
-            names = [str(labels[i]) for i in wheels]
+            names = _extreme_wheels(names, unloading=unloading, lowest=-lowest, largest=largest)
         rows += [
             (name, *(f"{f[i]:.6g}" for f in (static, lowest, largest)), _percent(unloading[i]))
-            for name, i in zip(names, wheels, strict=True)
+            for i, name in names.items()
         ]
     forces = ("static load (N)", "lowest contact force (N)", "largest (N)")
     header = ("load", *forces, "unloading")
     return table(header, rows)
+
+
+def _extreme_wheels(labels: dict[int, str], **values) -> dict[int, str]:
+    """Of many wheels, those at which one of the values is largest, named by what is extreme."""
+    import numpy as np
+
+    wheels, words = np.array(list(labels)), {"unloading": "most unloaded"}
+    found: dict[int, list[str]] = {}
+    for name, of_wheels in values.items():
+        own = np.nan_to_num(of_wheels[wheels], nan=-np.inf, posinf=np.inf, neginf=-np.inf)
+        if np.any(np.isfinite(own)):
+            wheel = int(wheels[np.argmax(own)])
+            found.setdefault(wheel, []).append(words.get(name, f"{name} force"))
+    return {
+        wheel: f"{labels[wheel]}, {' and '.join(names)} of {wheels.size}"
+        for wheel, names in found.items()
+    }
 
 
 def _percent(share: float) -> str:
@@ -218,7 +231,7 @@ def _body_lines(record: "jb.Record") -> list[str]:
         for name, row in heights.items():
             key = re.sub(r" vehicle \d+", "", name)
             largest[key] = np.maximum(largest.get(key, row), row).tolist()
-        heights = {f"{name}, largest": row for name, row in largest.items()}
+        heights = {f"{name}, largest of all": row for name, row in largest.items()}
     header = ("body", "displacement (m)", "acceleration (m/s^2)")
     if ride is not None:
         header += ("W_k rms (m/s^2)", "VDV (m/s^1.75)", "Sperling W_z")

@@ -54,7 +54,7 @@ def draw_forces(axes, record: Record) -> None:
             worst = _draw_envelope(axes, times, force, static, wheels, tint)
             if worst is not None:
                 heights.append(np.nanmin(force[:, worst]))
-                names.append(f"wheel {labels[worst].split()[-1]}, lowest")
+                names.append(f"wheel {labels[worst].split()[-1]}, most unloaded")
                 tints.append(tint)
         else:
             for i, wheel in enumerate(wheels):

@@ -81,7 +81,9 @@ def test_wheels_that_would_have_to_pull_are_named():
         "; load 1 wheel 3 loses contact, first at t = 0.2 s, x = 7.5 m"
         " (smallest contact force -12 N)"
     )
-    assert contact_sentence(CASE, np.full(16, nan), times, times).startswith("every load presses")
+    assert contact_sentence(CASE, np.full(16, nan), times, np.ones(16)).startswith(
+        "every load presses"
+    )
     many = contact_sentence(CASE, 2.0 - 0.1 * np.arange(16), np.ones(16), np.ones(16))
     assert many.count("loses contact, first at") == 4
     assert many.startswith("load 1 wheel 5 ") and many.endswith("; 12 more wheels lose contact")
