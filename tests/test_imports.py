@@ -6,9 +6,6 @@ import graphlib
 import itertools
 import tomllib
 from collections.abc import Iterator, Mapping
-from pathlib import Path
-
-import pytest
 
 from tests.modules import PACKAGES, ROOT, module_files, parse
 
@@ -154,11 +151,6 @@ def test_only_methods_called_plot_may_forward_to_figures():
     ):
         tree = ast.parse(code.format(name, package_name))
         assert {module for module, _ in imported(tree, FILES)} == found
-
-
-@pytest.mark.parametrize("folder", sorted({path.parent for path in FILES.values()}))
-def test_no_package_has_more_than_fifteen_files(folder: Path):
-    assert len(list(folder.glob("*.py"))) <= 16, "a package of at most fifteen files and its door"
 
 
 def test_experiments_are_imported_only_when_a_command_needs_them():

@@ -33,9 +33,7 @@ BENCHMARKS = {
     "cases": Benchmark(
         "one and two spans, loops, histories: scipy and diffrax", "--quick", "--modes 3"
     ),
-    "kernel": Benchmark("sweeps: the same method by hand in C", "--modes 3"),
     "first_answer": Benchmark("first answers of fresh processes: a script with scipy", "--quick"),
-    "quantities": Benchmark("sweeps of every quantity, beside deflections", "--modes 3"),
     "trains": Benchmark("ten trains at many speeds: a script with numpy", "--speeds 5"),
     "vehicles": Benchmark("quarter cars: moving masses, and a script with scipy", "--runs 20"),
     "growth": Benchmark(
@@ -47,20 +45,10 @@ BENCHMARKS = {
         "ten million runs in a store: time, memory, disk", "--runs 40000 100000"
     ),
     "dimensions": Benchmark("samples, modes, loads and supports of a run, as they grow", "--quick"),
-    "identification": Benchmark("identification: scipy's least squares"),
-    "regulator_designs": Benchmark("designs of regulators, many at once"),
     "quadratic_programs": Benchmark("programs of predictive control: OSQP"),
     "controller_steps": Benchmark("steps of controllers", "--only feedback"),
-    "tuning_methods": Benchmark("tuning by gradients, beside differential evolution"),
     "profile": Benchmark("where the time of a sweep goes", "--modes 3"),
     "cluster": Benchmark("a sweep of a million runs on workers", "--runs 40000", "--runs 400000"),
-}
-RENAMED = {
-    "identify": "identification",
-    "quadratic": "quadratic_programs",
-    "riccati": "regulator_designs",
-    "steps": "controller_steps",
-    "tuners": "tuning_methods",
 }
 
 
@@ -74,13 +62,12 @@ def main() -> None:
     options.add_argument("--list", action="store_true", help="only list the benchmarks")
     options.add_argument("--pages", action="store_true", help="write what is printed to the docs")
     arguments = options.parse_args()
-    names = [_current_name(name) for name in arguments.names]
-    unknown = set(names) - set(BENCHMARKS)
+    unknown = set(arguments.names) - set(BENCHMARKS)
     if unknown:
         message = f"{', '.join(sorted(unknown))}; there are {', '.join(BENCHMARKS)}"
         options.error(f"no benchmark {message}")
     failed = []
-    for name in names or BENCHMARKS:
+    for name in arguments.names or BENCHMARKS:
         about, quick, page = BENCHMARKS[name]
         if arguments.list:
             print(f"{name:18} {about}")
@@ -112,13 +99,6 @@ def write_page(name: str, printed: str) -> None:
     where = f"{os.cpu_count()} cores, load {load:.1f}, {day}:"
     text = re.sub(r"^took .*$", "", printed, flags=re.M).strip()
     (PAGES / f"{name}.md").write_text(f"{where}\n\n{text}\n", encoding="utf-8")
-
-
-def _current_name(name: str) -> str:
-    """The name of a benchmark today, with a warning for an old one."""
-    if name in RENAMED:
-        print(f"warning: {name} is now called {RENAMED[name]}", file=sys.stderr)
-    return RENAMED.get(name, name)
 
 
 if __name__ == "__main__":

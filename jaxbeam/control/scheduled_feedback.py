@@ -1,7 +1,4 @@
-"""Feedback of readings with gains scheduled over the mass of the load, k(m), as in Fig. 6.7.
-
-`jaxbeam.analysis.derived_gains` computes such gains.
-"""
+"""Feedback of readings with gains scheduled over the mass of the load, k(m), as in Fig. 6.7."""
 
 from typing import ClassVar
 

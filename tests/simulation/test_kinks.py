@@ -12,9 +12,9 @@ import jaxbeam as jb
 from jaxbeam.case.actuators.point import PointForce
 from jaxbeam.case.case import replace
 from jaxbeam.case.loads.oscillator import Oscillator
-from jaxbeam.integrator.adaptive_reference import simulate_adaptive
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.simulate import simulate_readings
+from tests.adaptive_reference import simulate_adaptive
 from tests.differences import central
 from tests.oracles.kinked_path import PiecewiseShapes, Wheel, crossing
 from tests.runs import plan_of

@@ -14,6 +14,12 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments.thesis.cases import reduction
 from experiments.thesis.chapter6 import published
+from experiments.thesis.chapter6.derived_gains import (
+    BestGain,
+    best_gains,
+    equivalent_gains,
+    scheduled_controller,
+)
 from experiments.thesis.chapter6.filter_oscillation import gain_margin
 from experiments.thesis.chapter6.patch_rigs import (
     GAIN,
@@ -23,12 +29,6 @@ from experiments.thesis.chapter6.patch_rigs import (
 )
 from experiments.thesis.verdicts import Finding, make_finding
 from jaxbeam.analysis.crossing_margin import stability_margin
-from jaxbeam.analysis.derived_gains import (
-    BestGain,
-    best_gains,
-    equivalent_gains,
-    scheduled_controller,
-)
 from jaxbeam.control.scheduled_feedback import ScheduledFeedback
 from jaxbeam.plot.style import colour, set_title, use_style
 

@@ -42,8 +42,8 @@ class Patch(AbstractActuator):
     Commands stay within `limits` and within the voltages `depolarisation`, beyond which the patch
     loses its polarisation; `rate_limit` is that of the amplifier. Commands act through the
     `hysteresis` of the patch and then its `creep`, if it has them; the inverses of `compensation`
-    and `creep_compensation`, identified from a log by `tuning.fit.actuators.hysteresis` and
-    `tuning.fit.actuators.creep`, make it act as a linear one.
+    (identified from a log by `tuning.fit.hysteresis`) and `creep_compensation` make it act as a
+    linear one.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(

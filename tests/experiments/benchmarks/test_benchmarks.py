@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,10 +15,7 @@ from experiments.benchmarks import (
     cases,
     controller_steps,
     growth,
-    identification,
     quadratic_programs,
-    regulator_designs,
-    tuning_methods,
 )
 from experiments.benchmarks.common import import_optional
 from experiments.benchmarks.trains import __main__ as trains
@@ -37,15 +33,6 @@ def test_one_command_runs_all_benchmarks(capsys, monkeypatch):
     with pytest.raises(SystemExit):
         __main__.main()
     assert "no benchmark sweeep; there are sweep, cases" in capsys.readouterr().err
-
-
-def test_old_names_of_benchmarks_are_accepted_with_a_warning(capsys, monkeypatch):
-    assert set(__main__.RENAMED.values()) <= set(__main__.BENCHMARKS)
-    monkeypatch.setattr(sys, "argv", ["benchmarks", "riccati", "--list"])
-    __main__.main()
-    printed = capsys.readouterr()
-    assert printed.out.startswith("regulator_designs ")
-    assert "riccati is now called regulator_designs" in printed.err
 
 
 @pytest.mark.parametrize("name", [name for name, one in __main__.BENCHMARKS.items() if one.quick])
@@ -124,26 +111,6 @@ def test_growth_measures_times_and_memory():
 def test_steps_of_a_controller_are_timed():
     times = controller_steps.measure(controller_steps.CONTROLLERS["feedback, linear"])
     assert 0 < times.median <= times.worst < 1e-3
-
-
-def test_designs_are_timed():
-    shared = regulator_designs.time_finite_horizon(2, 8, True, 1 / 256)
-    for times in (regulator_designs.time_invariant(2), shared):
-        assert times.compiling > 0 and times.run > 0
-
-
-def test_scipy_identifies_the_same_optimum(monkeypatch):
-    monkeypatch.setattr(identification, "SPEEDS", np.array([2.0, 4.0]))
-    results = identification.time_fits()
-    assert results["difference"] < 1e-5 < results["largest_error"]
-    assert results["ratio"] > 1
-
-
-def test_evolution_does_not_end_above_its_start():
-    case, free = tuning_methods.tuning_problem()
-    result = tuning_methods.run_evolution(case, free, evaluations=1)
-    assert jnp.isfinite(result.peak) and 0 < result.peak <= 0.83
-    assert result.evaluations == 2 * 4 * len(free)
 
 
 def test_a_profile_divides_the_time_between_stages():

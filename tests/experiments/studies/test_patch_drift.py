@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.testing import assert_allclose
 
+from experiments.studies.creep import CreepFit, fitted_creep
 from experiments.studies.patch_drift import CREEP, HYSTERESIS, log_of_patch, what_is_left
-from tuning.fit.actuators.creep import CreepFit, fitted_creep
 
 
 def test_what_the_page_says():

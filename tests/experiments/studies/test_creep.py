@@ -6,11 +6,11 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
+from experiments.studies.creep import fitted_creep, lags_of
 from jaxbeam.simulation.commands.operators import command_operator
 from tests.case.test_creep import acting
 from tests.case.test_hysteresis import OPERATOR, by_hand
-from tests.tuning.fit.actuators.test_hysteresis import log_of
-from tuning.fit.actuators.creep import fitted_creep, lags_of
+from tests.tuning.fit.test_hysteresis import log_of
 
 RATES, WEIGHTS = np.array([2.0, 0.2]), np.array([0.08, 0.05])
 # Ramps with plateaus, of 20 s together, sampled at 10 Hz.

@@ -43,7 +43,7 @@ def fitted_hysteresis(
     do not begin with zero and increase, and readings that do not rise or fall with the command.
 
     >>> import jaxbeam as jb, numpy as np, tuning
-    >>> from tuning.fit.actuators.hysteresis import fitted_hysteresis
+    >>> from tuning.fit.hysteresis import fitted_hysteresis
     >>> true = jb.Hysteresis([0.0, 1.0], [0.8, 0.25])
     >>> commands = np.concatenate([np.linspace(0, 5, 50), np.linspace(5, -5, 99)[1:]])
     >>> values = np.stack([commands, 1e-5 * true.outputs(commands)], axis=1)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.actuators.creep import Creep
 from jaxbeam.case.actuators.hysteresis import Hysteresis
-from tuning.fit.actuators.hysteresis import (
+from tuning.fit.hysteresis import (
     channel_pair,
     checked_thresholds,
     non_negative,
@@ -56,7 +56,7 @@ def fitted_creep(
     Raises ValueError as `fitted_hysteresis` does, and for rates that are not positive.
 
     >>> import jaxbeam as jb, numpy as np, tuning
-    >>> from tuning.fit.actuators.creep import fitted_creep
+    >>> from experiments.studies.creep import fitted_creep
     >>> times, commands = np.arange(0.0, 40.0, 0.1), np.ones(400)
     >>> readings = 1 + 0.1 * (1 - np.exp(-0.5 * times))  # a step, then creep
     >>> commands[0] = readings[0] = 0.0

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 
 import tuning
 from tests.case.test_hysteresis import OPERATOR, by_hand
-from tuning.fit.actuators.hysteresis import fitted_hysteresis
+from tuning.fit.hysteresis import fitted_hysteresis
 
 TURNS = np.array([0.0, 2.0, -1.0, 4.0, -3.0, 5.0, 0.0])
 COMMANDS = np.interp(np.linspace(0, 6, 121), np.arange(7), TURNS)

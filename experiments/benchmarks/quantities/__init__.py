@@ -1,1 +1,0 @@
-"""Sweeps of every quantity, beside one of deflections."""

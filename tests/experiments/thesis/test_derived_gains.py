@@ -1,0 +1,82 @@
+"""Gains over the mass of the load: from statics, and of the lowest peak."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from experiments.thesis.chapter6.derived_gains import (
+    BestGain,
+    best_gains,
+    equivalent_gains,
+    scheduled_controller,
+)
+from jaxbeam.case.validation import check_case
+from tests.analysis.test_compare import critical_gain
+from tests.control.test_scheduled_feedback import beam_case, gains_at, law
+from tests.loop_as_oracle import expected
+
+
+def test_printed_gains_follow_from_statics():
+    """Fig. 6.7: 2 V/mm up to 0.345 kg, 3 up to 0.45, then 3.6, in place of 2 V/mm^3.
+
+    The static deflection of a pinned beam is g L^3 / (48 E I) per kilogram; w = 1 mm, where k w = 2
+    w^3 at k = 2, and w = 1.2247 mm at k = 3 give the masses, with the lift of a patch at midspan.
+    """
+    case = jb.replace(beam_case(), {"actuators.0.correction": 0.502})
+    deflection_per_mass = 9.81 * 0.6**3 / (48 * 13.211)
+    # A moment between 0.2575 m and its mirror image: w(L/2) is the integral of x M / (E I) from
+    # the support to the middle.
+    lift = 200.0 * 0.502 * 8.292e-4 * (0.3**2 - 0.2575**2) / 2 / 13.211
+    masses = [(w + lift * 2e9 * w**3) / deflection_per_mass for w in (1e-3, np.sqrt(1.5) * 1e-3)]
+    assert_allclose(masses, [0.344, 0.4486], atol=1e-3)
+    assert_allclose(equivalent_gains(case, masses, 2e9), [[2000.0, 3000.0]], rtol=1e-6)
+    assert_allclose(equivalent_gains(case, [0.509], 2e9), [[3596.0]], rtol=2e-3)
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return beam_case(jb.Feedback([1000.0], period=0.01))
+
+
+def test_best_gain_has_the_lowest_peak_by_the_oracle(loop):
+    """The peak at the samples, by scipy, is higher with a seventh less gain and with more."""
+    light, heavy = best_gains(loop, [0.05, 0.2], 1e5)
+    times = np.asarray(jb.simulate(loop).times)
+
+    def peak(gain, mass):
+        changed = jb.replace(loop, {"loads.0.mass": mass, "controller.gains.0": gain})
+        return np.max(np.abs(expected(changed, times).deflection))
+
+    for found in (light, heavy):
+        lowest = peak(found.gain, found.mass)
+        assert_allclose(found.peak, lowest, rtol=0.02)  # between samples it is a little higher
+        assert found.peak < 0.95 * found.uncontrolled
+        for other in (0.85, 1.18):
+            assert peak(other * found.gain, found.mass) > lowest
+    made = scheduled_controller(loop, [light, heavy], "stepped")
+    assert_allclose(gains_at(made, loop, 0.1), [light.gain], rtol=1e-12)
+    check_case(dataclasses.replace(loop, controller=made))
+
+
+def test_best_gain_with_a_margin(loop):
+    """Against the critical gain with the mass at rest, by scipy."""
+    case = jb.replace(loop, {"loads.0.mass": 0.509})
+    (found,) = best_gains(case, [0.509], 1e4, margin=2.0)
+    critical = min(critical_gain(case, x) for x in np.linspace(0, 0.6, 13))
+    assert found.gain <= critical / 2 * (1 + 1e-6)
+    with pytest.raises(ValueError, match="the gain margin is below 1e"):
+        best_gains(case, [0.509], 1e4, margin=1e6)
+
+
+def test_other_controllers_are_refused():
+    with pytest.raises(ValueError, match="kind 'feedback' with one power"):
+        best_gains(beam_case(law()), [0.2], 1.0)
+    with pytest.raises(ValueError, match="only 0 sensors for 1 actuators"):
+        equivalent_gains(dataclasses.replace(beam_case(), sensors=()), [0.2], 1.0)
+    with pytest.raises(ValueError, match="masses must increase"):
+        scheduled_controller(
+            beam_case(law()), [BestGain(mass, 1.0, 1.0, 1.0) for mass in (0.2, 0.1)]
+        )

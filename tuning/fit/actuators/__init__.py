@@ -1,1 +1,0 @@
-"""Actuators from logs: their hysteresis."""
