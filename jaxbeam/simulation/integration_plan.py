@@ -4,23 +4,25 @@ A plan is computed from concrete numbers and is static in the compiled code, whi
 all numbers for which the plan is valid.
 """
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule, sample_schedule
 from jaxbeam.integrator.held_commands import HeldCommands
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_at_events
-from jaxbeam.integrator.static_shapes import StaticShapes, static_shapes
+from jaxbeam.integrator.static_shapes import StaticShapes, model_limits, static_shapes
 from jaxbeam.integrator.step_size import (
     CONVERGENCE_ORDER,
     MAX_DIVERGED_HALVINGS,
@@ -41,11 +43,17 @@ from jaxbeam.integrator.step_size import (
 from jaxbeam.integrator.time_grid import grid_by_schedule
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, any_jax, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.module import Module
 from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
 from jaxbeam.simulation.errors import step_errors
+from jaxbeam.simulation.plan_origin import (
+    PlanOrigin,
+    check_origin,
+    check_same_events,
+    common_origin,
+)
 
 TOLERANCE = 1e-7  # relative to the largest deflection
 MAX_STEPS_PER_SAMPLE = 10**5  # time steps between samples of a controlled run
@@ -68,7 +76,9 @@ class IntegrationPlan(Module):
     to the largest value of what each sensor measures (empty where they are not known).
     `lead_samples` are added before the first sample, back to the start of the run. The run ends
     with the last sample, or `to_duration` at the duration of the case. With a controller the
-    `schedule` holds its events, the samples and the end.
+    `schedule` holds its events, the samples and the end. The `origin` is what the plan was made
+    for, with which a case is compared before it is run by the plan; None where the caller answers
+    for that.
     """
 
     shapes: StaticShapes = eqx.field(static=True)
@@ -79,6 +89,11 @@ class IntegrationPlan(Module):
     schedule: EventSchedule | None = None
     to_duration: bool = eqx.field(static=True, default=False)
     sensor_errors: tuple[float, ...] = eqx.field(static=True, default=())
+    origin: PlanOrigin | None = eqx.field(static=True, default=None)
+
+    def without_statements(self) -> "IntegrationPlan":
+        """The plan without errors and origin: static data of programs that other runs share."""
+        return dataclasses.replace(self, error=0.0, sensor_errors=(), origin=None)
 
 
 # A run by a plan under an input policy: its states at all events, as `beam_and_vehicles`, and its
@@ -100,18 +115,21 @@ def integration_plan(
     RuntimeError if no time step meets the tolerance.
     """
     check_tolerance(tolerance)
+    if times is not None:
+        check_times(times)
     check_case(case)
     case = concrete_case(case)
     shapes = static_shapes(case)
     to_duration = times is None
     samples = np.asarray(sample_times(case) if to_duration else concrete(times))
+    origin = PlanOrigin(case, samples, float(model_limits(case, shapes.layout)[0]))
     if case.controller is not None:
         end = float(case.run.duration) if to_duration else None
         schedule = loop_schedule(case, samples, end)
 
         def plan(substeps, error, errors=()):
             parts = shapes, substeps, 0, False, error, schedule, to_duration, errors
-            return IntegrationPlan(*parts)
+            return IntegrationPlan(*parts, origin)
 
         def run_first(substeps, policy):
             assert first_run is not None
@@ -139,7 +157,51 @@ def integration_plan(
         share * error,
         to_duration=to_duration,
         sensor_errors=tuple(share * each for each in _sensor_errors(case, shapes, trial)),
+        origin=origin,
     )
+
+
+def check_plan(case: Case, plan: IntegrationPlan, times) -> IntegrationPlan:
+    """The plan for a run of a case sampled at `times` (s); its errors are NaN for other numbers.
+
+    Raises ValueError, in one sentence, if the plan is that of another case or of other times.
+    """
+    if plan.origin is None:
+        return plan
+    lengths = np.diff(concrete(times)) if is_concrete(times) else np.array([np.inf])
+    if plan.schedule is not None:
+        lengths = np.asarray(plan.schedule.lengths)
+    steps_per_limit = float(lengths.max()) / plan.substeps / plan.origin.max_stable_step
+    same = check_origin(plan.origin, plan.shapes, case, times, steps_per_limit, plan.error)
+    if same and not any_jax(case, times):
+        return plan
+    if plan.schedule is not None:
+        with contextlib.suppress(jax.errors.ConcretizationTypeError):  # of traced events
+            end = float(concrete(case.run.duration)) if plan.to_duration else None
+            check_same_events(plan.schedule, loop_schedule(case, concrete(times), end))
+    if same:
+        return plan
+    return dataclasses.replace(
+        plan, error=np.nan, sensor_errors=(np.nan,) * len(plan.sensor_errors)
+    )
+
+
+def check_times(times) -> None:
+    """Raises ValueError for times (s) that are not finite, ascending, or from the start on."""
+    if not is_concrete(times):
+        return
+    times = concrete(times)
+    if times.ndim != 1 or times.size < 2:
+        raise ValueError(
+            f"times must be at least two numbers in a list; its shape is {times.shape}"
+        )
+    if not np.all(np.isfinite(times)) or not np.all(np.diff(times) > 0):
+        raise ValueError("times (s from the start of the run) must be finite and ascend")
+    if times[0] < 0:
+        raise ValueError(
+            f"times (s) count from the start of the run, so that none is before 0; the first is"
+            f" {times[0]:g}"
+        )
 
 
 def _substeps_and_share(trial: StepTrial, step: float, interval: float) -> tuple[int, float]:
@@ -196,6 +258,7 @@ def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> Integr
         equally_spaced=all(plan.equally_spaced for plan in plans),
         error=max(plan.error for plan in plans),
         sensor_errors=tuple(map(max, zip(*(plan.sensor_errors for plan in plans), strict=True))),
+        origin=common_origin([plan.origin for plan in plans]),
     )
 
 

@@ -293,5 +293,9 @@ class Record(RecordViews):
         if failures:
             parts.append(f"the controller found no solution in {failures} of its steps")
         error = float(concrete(self.error_estimate))
-        parts.append(f"estimated error of the steps {error:.1e} of the largest deflection")
+        parts.append(
+            "the error of the steps is not known, as the plan is of other numbers"
+            if np.isnan(error)
+            else f"estimated error of the steps {error:.1e} of the largest deflection"
+        )
         return "; ".join(parts)

@@ -34,6 +34,8 @@ from jaxbeam.simulation.integration_plan import (
     FirstRun,
     IntegrationPlan,
     beam_and_vehicles,
+    check_plan,
+    check_times,
     integration_plan,
     run_schedule,
     runs_compiled,
@@ -61,10 +63,11 @@ def simulate(
     ascending `times` (s), with the last of which it then ends. Samples do not depend on the time
     step, peaks not on the sample rate. Differentiable in every number of the case, forward and in
     reverse. Inside `jit` or `vmap`, give a `plan` made outside by
-    `jaxbeam.simulation.integration_plan.integration_plan`.
+    `jaxbeam.simulation.integration_plan.integration_plan`. A plan is for the times and the parts of
+    one case, and for other numbers near those of it; the error that it states is for its own.
 
-    Raises ValueError for an invalid case or times, RuntimeError if no time step meets the
-    tolerance; warns (ContactLossWarning) of negative contact forces.
+    Raises ValueError for an invalid case or times and for a plan of another case, RuntimeError if
+    no time step meets the tolerance; warns (ContactLossWarning) of negative contact forces.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
@@ -76,11 +79,20 @@ def simulate(
     2.00 mm
     """
     if times is not None:
-        _check_times(times)
+        check_times(times)
     first_records: dict[int, Record] = {}
-    if plan is None:
-        plan = integration_plan(case, times, tolerance, _first_run(case, times, first_records))
+    given, plan = (
+        plan,
+        plan or integration_plan(case, times, tolerance, _first_run(case, times, first_records)),
+    )
     times = sample_times(case) if times is None else xp.asarray(times, float)
+    if given is not None:
+        if tolerance != TOLERANCE and plan.error > tolerance:
+            raise ValueError(
+                f"the plan has an error of {plan.error:.1e}, more than the tolerance of"
+                f" {tolerance:g}: give one of them only"
+            )
+        plan = check_plan(case, plan, times)
     sensor_errors = plan.sensor_errors or (np.nan,) * len(case.sensors)
     errors = xp.asarray(plan.error), xp.asarray(sensor_errors, float)
     record = first_records.get(plan.substeps)
@@ -90,25 +102,12 @@ def simulate(
         # Plans that differ in their errors only share compiled programs.
         is_compiled = plan.schedule is not None and runs_compiled(case, plan.schedule)
         simulate_record = _simulate_compiled if is_compiled else _simulate
-        without_errors = dataclasses.replace(plan, error=0.0, sensor_errors=())
-        record = simulate_record(case, without_errors, times, errors)
+        record = simulate_record(case, plan.without_statements(), times, errors)
     if is_concrete(record.contact_lost_time):
         lost = np.isfinite(concrete(record.contact_lost_time)) & ~load_set(case).prescribed
         if lost.any() and np.isnan(concrete(record.diverged_time)):
             warnings.warn(record.verdict, ContactLossWarning, stacklevel=2)
     return record
-
-
-def _check_times(times) -> None:
-    if not is_concrete(times):
-        return
-    times = concrete(times)
-    if times.ndim != 1 or times.size < 2:
-        raise ValueError(
-            f"times must be at least two numbers in a list; its shape is {times.shape}"
-        )
-    if not np.all(np.isfinite(times)) or not np.all(np.diff(times) > 0):
-        raise ValueError("times (s from the start of the run) must be finite and ascend")
 
 
 def _first_run(case: Case, times, records: dict[int, Record]) -> FirstRun | None:
@@ -196,6 +195,7 @@ def simulate_readings(
     is unknown. For fits: less to compile and differentiate than `simulate`, without its checks and
     warnings.
     """
+    plan = check_plan(case, plan, times).without_statements()
     integration = run_integration(case, plan, times, None, noisy=False)
     outputs = integration.outputs
     readings = outputs.readings
@@ -230,6 +230,7 @@ def simulate_histories(
 
     See `simulate_readings`.
     """
+    plan = check_plan(case, plan, times).without_statements()
     integration = run_integration(case, plan, times, None)
     motion, modal = integration.outputs.motion, integration.model.modes
     deflection = motion.coordinates @ modal.shapes(positions).T

@@ -158,7 +158,7 @@ def make_run_set(
     return RunSet(
         runs=runs,
         stacked=stack_cases(cases),
-        plan=_without_errors(plan),
+        plan=plan.without_statements(),
         error=np.asarray(plan.error),
         sensor_errors=np.array(plan.sensor_errors),
         times=times,
@@ -183,15 +183,10 @@ def _integration_plan(cases: list[Case]) -> IntegrationPlan:
     return common_plan([integration_plan(case, tolerance=PEAK_TOLERANCE) for case in cases], "runs")
 
 
-def _without_errors(plan: IntegrationPlan) -> IntegrationPlan:
-    """The plan without its errors: static data of compiled programs, which other runs share."""
-    return dataclasses.replace(plan, error=0.0, sensor_errors=())
-
-
 def _uncontrolled_histories(cases: list[Case], times, positions, quantities) -> Histories:
     """Histories of runs without their controllers, along a first axis."""
     without_controller = [dataclasses.replace(case, controller=None) for case in cases]
-    plan = _without_errors(_integration_plan(without_controller))
+    plan = _integration_plan(without_controller).without_statements()
     wanted = times, plan, positions, quantities
     if len(cases) <= MAX_KNOWN_RUNS:
         found = [_known_histories(case, *wanted) for case in without_controller]
