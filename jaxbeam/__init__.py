@@ -9,7 +9,7 @@ import sys
 
 import lazy_loader
 
-from jaxbeam.case.aliases import NAMES, warn_renamed
+from jaxbeam.case.former_words import NAMES
 
 # Matrices are small and runs share the cores: threads of LAPACK would wait for each other, on a
 # busy machine for minutes. LAPACK reads this when it is loaded; a setting by the user prevails.
@@ -32,6 +32,5 @@ _import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 def __getattr__(name: str):
     if name in NAMES and name not in __all__:
-        warn_renamed(f"jaxbeam.{name}", f"jaxbeam.{NAMES[name]}")
-        name = NAMES[name]
+        raise AttributeError(f"jaxbeam.{name} is called jaxbeam.{NAMES[name]} now")
     return _import_name(name)

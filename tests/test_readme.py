@@ -7,7 +7,7 @@ import shlex
 import pytest
 
 from experiments.thesis.reproduction import experiments
-from jaxbeam.cli.app import COMMANDS, app, current_words
+from jaxbeam.cli.app import COMMANDS, app, refuse_former_words
 from tests.modules import ROOT
 
 # Not the pages that a build of the site writes among its sources.
@@ -51,8 +51,9 @@ def options_of_commands() -> set[str]:
 @pytest.mark.parametrize("line", command_lines("jaxbeam"))
 def test_commands_are_accepted(capsys, line):
     words = shlex.split(line)[1:]
-    app.parse_args(list(current_words(words)), exit_on_error=False, print_error=False)
-    assert capsys.readouterr().err == "", "no old words"
+    refuse_former_words(words)
+    app.parse_args(words, exit_on_error=False, print_error=False)
+    assert capsys.readouterr().err == ""
 
 
 def captions() -> list[str]:

@@ -7,8 +7,6 @@ import os
 # XLA reads this variable before its first computation; a setting by the user prevails.
 os.environ.setdefault("PJRT_NPROC", str(max(8, os.cpu_count() or 1)))
 
-from jaxbeam.case.aliases import warn_renamed
-from tuning.aliases import OLD_NAMES
 from tuning.control.integer_choices import tune_integers
 from tuning.control.load_cases import LoadCases, full_grid, latin_hypercube, read_load_cases
 from tuning.control.objective import Objective
@@ -96,10 +94,3 @@ __all__ = [
     "with_identified_plant",
     "write_report",
 ]
-
-
-def __getattr__(name: str):
-    if name not in OLD_NAMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    warn_renamed(f"tuning.{name}", f"tuning.{OLD_NAMES[name]}")
-    return globals()[OLD_NAMES[name]]

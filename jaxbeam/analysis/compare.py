@@ -15,7 +15,6 @@ from jaxtyping import Float
 from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, Bound, bound
 from jaxbeam.analysis.crossing_margin import StabilityMargin, stability_margin
 from jaxbeam.analysis.limit_cycles import CommandOscillation, command_oscillations
-from jaxbeam.case.aliases import renamed_property
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.runtime.module import Module
@@ -44,9 +43,6 @@ class PerformanceMetrics(NamedTuple):
     stability_margin: StabilityMargin
     limit_cycles: tuple[CommandOscillation, ...]
 
-    reserve = renamed_property("reserve", "stability_margin")
-    swings = renamed_property("swings", "limit_cycles")
-
 
 class Comparison(Module):
     """Result of `compare`: records and metrics of the controllers by name, and the bound.
@@ -60,11 +56,6 @@ class Comparison(Module):
     records: dict[str, Record]
     metrics: dict[str, PerformanceMetrics]
     bound: Bound
-
-    free = renamed_property("free", "uncontrolled")
-    best = renamed_property("best", "optimal")
-    merits = renamed_property("merits", "metrics")
-    loop = renamed_property("loop", "loop_summary")
 
     def loop_summary(self, name: str) -> str:
         """Sentence on saturation, instability under stationary loads and oscillation of commands.

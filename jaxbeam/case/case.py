@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator
-from jaxbeam.case.aliases import current_address
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.display.parts import ReprWithUnits, case_html, case_text
@@ -25,6 +24,7 @@ from jaxbeam.case.fields import (
     is_concrete,
     number,
 )
+from jaxbeam.case.former_words import attribute_address, present_address
 from jaxbeam.case.joint_addresses import ALL, each_address
 from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
 from jaxbeam.case.loads.planar.sensors import VehicleSensor
@@ -206,7 +206,7 @@ def unknown_address_error(case: Case, address: str) -> ValueError:
             " value first"
         )
     names = list(addresses(case))
-    nearest = difflib.get_close_matches(address, names, n=1, cutoff=0.5)
+    nearest = difflib.get_close_matches(present_address(address), names, n=1, cutoff=0.5)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; it has {', '.join(names)}"
     return ValueError(f"the case has no number at address {address!r}{hint}")
 
@@ -237,7 +237,7 @@ def own_addresses(case: Case, address: str) -> list[str]:
 
 
 def _own_addresses(case: Case, address: str, leaves: dict[str, Any]) -> list[str]:
-    current = current_address(address)
+    current = attribute_address(address)
     found = each_address(current, list_sizes(case))
     for one in found:
         parent, entry = _parent_and_entry(one, leaves)
@@ -275,7 +275,7 @@ def value_at(case: Case, address: str) -> Float[Array, "..."]:
 def unit_at(case: Case, address: str) -> str:
     """SI unit of the number at an address; "" or "1" if it has none."""
     unit, part = "", case
-    each = own_addresses(case, address) if ALL in address else [current_address(address)]
+    each = own_addresses(case, address) if ALL in address else [attribute_address(address)]
     for name in each[0].split("."):
         if isinstance(part, tuple):
             part = part[int(name)]

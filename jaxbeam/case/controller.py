@@ -13,9 +13,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxbeam.case.display.arguments import ExplainsArguments
 from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, number
-from jaxbeam.case.former_arguments import AcceptsFormerArguments
 from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.module import Module
 
@@ -161,7 +161,7 @@ def commanded(actuators: Sequence[Any]) -> tuple[int, ...]:
     return tuple(i for i, actuator in enumerate(actuators) if actuator.command_unit != "1")
 
 
-class AbstractController(ReprWithUnits, Module, metaclass=AcceptsFormerArguments):
+class AbstractController(ReprWithUnits, Module, metaclass=ExplainsArguments):
     """Settings of a controller.
 
     With a sampling `period` (s) its law acts at 0, period, 2 period, ...; a command begins `delay`

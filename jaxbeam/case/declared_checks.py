@@ -25,6 +25,7 @@ from jaxbeam.case.fields import (
     fits_shape,
     is_concrete,
 )
+from jaxbeam.case.former_words import WORDS
 from jaxbeam.case.kinds import kinds
 from jaxbeam.case.quantities import OF_QUANTITY
 from jaxbeam.runtime.arrays import Array
@@ -57,6 +58,8 @@ def check_on_beam(name: str, positions: Any, length: Float[Array, ""]) -> None:
 def suggestion(word: str, allowed: Iterable[str]) -> str:
     """End of an error message about an unknown word: the nearest allowed one, or all of them."""
     allowed = list(allowed)
+    if WORDS.get(word) in allowed:
+        return f"it is called {WORDS[word]!r} now"
     nearest = difflib.get_close_matches(word, allowed, n=1)
     return f"did you mean {nearest[0]!r}?" if nearest else f"it may be {', '.join(allowed)}"
 

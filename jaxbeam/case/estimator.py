@@ -11,8 +11,8 @@ from typing import Any, ClassVar, NamedTuple
 from jaxtyping import Float
 
 from jaxbeam.case.controller import Command, Measurement, Time
+from jaxbeam.case.display.arguments import ExplainsArguments
 from jaxbeam.case.display.parts import ReprWithUnits
-from jaxbeam.case.former_arguments import AcceptsFormerArguments
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.module import Module
 
@@ -84,7 +84,7 @@ class AbstractContinuousFilter(Module):
         """Rates of the states x (1/s) under a command."""
 
 
-class AbstractEstimator(ReprWithUnits, Module, metaclass=AcceptsFormerArguments):
+class AbstractEstimator(ReprWithUnits, Module, metaclass=ExplainsArguments):
     """Settings of an estimator; it acts at the samples of its controller.
 
     To add one, write a file in `jaxbeam.estimation` with a subclass that names its `kind`.

@@ -6,7 +6,7 @@ import gc
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NoReturn
 
 from cyclopts import (
@@ -53,7 +53,7 @@ COMMANDS = {
     "Other": (demo, reproduce, schema, native),
 }
 
-# Old words work for one release, with a warning that names the new one.
+# Words of former versions, which are refused by a sentence that names the present ones.
 RENAMED_COMMANDS = {"judge": "compare-models", "sharpen": "design-experiment"}
 RENAMED_OPTIONS = {  # by command, in its new word
     "compare-models": {"--unseen": "--held-out"},
@@ -106,7 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         arguments = sys.argv[1:]
         _relax_garbage_collection()
     try:
-        app(list(current_words(arguments)), exit_on_error=False, print_error=False)
+        refuse_former_words(arguments)
+        app(arguments, exit_on_error=False, print_error=False)
     except BrokenPipeError:  # the reader of the output, as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
@@ -141,20 +142,15 @@ def _missing(error: MissingArgumentError) -> str:
     return f"{what} needs {name}: {meaning}; see jaxbeam {what} --help"
 
 
-def current_words(arguments: Sequence[str]) -> Iterator[str]:
-    """Words of a command line, renamed commands and options in their new words; warns once each."""
-    command, warned = None, set()
+def refuse_former_words(arguments: Sequence[str]) -> None:
+    """Raise ValueError for a command or an option that is called otherwise now."""
+    former = RENAMED_COMMANDS
     for word in arguments:
-        name, equals, value = word.partition("=")
-        if command is None:
-            new = RENAMED_COMMANDS.get(name, name)
-            command = new
-        else:
-            new = RENAMED_OPTIONS.get(command, {}).get(name, name)
-        if new != name and name not in warned:
-            warned.add(name)
-            print_message(f"warning: {name} is called {new} now; the old word will be removed")
-        yield new + equals + value
+        name = word.partition("=")[0]
+        if name in former:
+            raise ValueError(f"{name} is called {former[name]} now")
+        if former is RENAMED_COMMANDS:
+            former = RENAMED_OPTIONS.get(name, {})
 
 
 def _relax_garbage_collection() -> None:

@@ -12,11 +12,11 @@ from typing import Any
 
 import tomli_w
 
-from jaxbeam.case.aliases import current_address
 from jaxbeam.case.case import Case, list_sizes, part_classes, unknown_address_error
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.declared_checks import describe_value, suggestion
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.joint_addresses import each_address
 from jaxbeam.case.kinds import kind_of
 from jaxbeam.case.loads.planar.files import is_path
@@ -185,7 +185,7 @@ def with_settings(case: Case, settings: dict[str, Any]) -> Case:
     each = [
         (one, value)
         for address, value in settings.items()
-        for one in each_address(current_address(address), list_sizes(case))
+        for one in each_address(attribute_address(address), list_sizes(case))
     ]
     each.sort(key=lambda setting: not setting[0].endswith(".kind"))  # kinds first
     for address, value in each:

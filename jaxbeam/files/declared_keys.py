@@ -4,9 +4,9 @@ import dataclasses
 import inspect
 from typing import Any, NamedTuple
 
-from jaxbeam.case.aliases import FILE_KEYS
 from jaxbeam.case.case import part_classes
 from jaxbeam.case.fields import describe_shape
+from jaxbeam.case.former_words import FILE_KEYS
 from jaxbeam.case.kinds import kinds
 
 

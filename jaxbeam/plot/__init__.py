@@ -7,15 +7,4 @@ each is imported when it is first used, since some need what takes as long as to
 
 import lazy_loader
 
-from jaxbeam.case.aliases import warn_renamed
-
-_import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-OLD_NAMES = {"plot_frequency": "plot_frequency_response", "plot_front": "plot_pareto_front"}
-
-
-def __getattr__(name: str):
-    if name in OLD_NAMES:
-        warn_renamed(f"jaxbeam.plot.{name}", f"jaxbeam.plot.{OLD_NAMES[name]}")
-        name = OLD_NAMES[name]
-    return _import_name(name)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

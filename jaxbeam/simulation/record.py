@@ -6,7 +6,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbeam.case.aliases import renamed_property
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.model.load_set import load_set
@@ -86,8 +85,6 @@ class Record(RecordViews):
     steps: int = eqx.field(static=True)
     controller_readings: Float[Array, "time sensor"] | None = None
     acting_command: Float[Array, "time actuator"] | None = None
-
-    shown = renamed_property("shown", "controller_readings")
 
     @property
     def bodies(self) -> list[str]:

@@ -13,9 +13,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.aliases import current_address
 from jaxbeam.case.case import Case, addresses, list_sizes, own_addresses, replace, unit_at
 from jaxbeam.case.declared_checks import describe_value
+from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.joint_addresses import each_address, overlap
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.reading.units import in_si
@@ -203,7 +203,7 @@ def sweep_specification(
                 " and which is not statically corrected, as the beam can move as a rigid body:"
                 " leave it out, or hold the beam"
             )
-    over = {current_address(address): given for address, given in over.items()}
+    over = {attribute_address(address): given for address, given in over.items()}
     twice = overlap(over, list_sizes(case))
     if twice:
         raise ValueError(f"{twice} is swept twice: leave one of {', '.join(over)} out")

@@ -18,9 +18,9 @@ import equinox as eqx
 import numpy as np
 from tqdm import tqdm
 
-from jaxbeam.case.aliases import current_address
 from jaxbeam.case.case import Case, addresses
 from jaxbeam.case.display.addresses import address_words
+from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.joint_addresses import ALL
 from jaxbeam.files.case_file import case_to_dict, with_settings
 from jaxbeam.sweeps import MAX_RUNS
@@ -104,7 +104,10 @@ def split_words(
     """
     numbers_of_case, words, others = addresses(case), {}, {}
     for address, given in over.items():
-        values, current = np.atleast_1d(np.asarray(given, object)).ravel(), current_address(address)
+        values, current = (
+            np.atleast_1d(np.asarray(given, object)).ravel(),
+            attribute_address(address),
+        )
         is_word = [isinstance(value, str) for value in values]
         if not any(is_word) or current.replace(ALL, "0") in numbers_of_case:
             others[address] = given
@@ -151,7 +154,7 @@ def word_sweep(
         if [str(s.quantity) for s in changed.sensors] != [str(s.quantity) for s in case.sensors]:
             raise ValueError(f"{named} changes the sensors, which all runs share: make two sweeps")
         cases.append(changed)
-    dims = tuple(current_address(address) for address in order)
+    dims = tuple(attribute_address(address) for address in order)
     plan = WordSweep(case, words, dims, cases, sweeps)
     if plan.count > MAX_RUNS:
         raise ValueError(

@@ -178,16 +178,6 @@ def test_invalid_controller_is_named(comparison):
         compare(comparison.case, {"two": jb.Feedback([1.0, 2.0], period=0.01)})
 
 
-def test_former_names_warn(comparison):
-    for old, new in (("free", "uncontrolled"), ("best", "optimal"), ("merits", "metrics")):
-        with pytest.warns(DeprecationWarning, match=f"Comparison.{old} is called {new} now"):
-            assert getattr(comparison, old) is getattr(comparison, new)
-    metrics = comparison.metrics["weak"]
-    for old, new in (("reserve", "stability_margin"), ("swings", "limit_cycles")):
-        with pytest.warns(DeprecationWarning, match=f"{old} is called {new} now"):
-            assert getattr(metrics, old) is getattr(metrics, new)
-
-
 def run(line: str, folder, monkeypatch, capsys) -> tuple[int, str, str]:
     monkeypatch.chdir(folder)
     with pytest.raises(SystemExit) as ended:

@@ -70,7 +70,6 @@ def test_a_table_of_gains_holds_the_numbers_of_its_file():
     assert_allclose(gains.table[0, 0, 1, 0], expected, rtol=1e-6)
 
 
-def test_former_kinds_are_read_with_a_warning():
-    with pytest.warns(FutureWarning, match="'passage' is called 'feedforward' now"):
-        case = jb.load_case(FOLDER / "feedforward.toml")
-    assert isinstance(case.controller, jb.Feedforward)
+def test_former_kinds_are_named_with_their_present_word():
+    with pytest.raises(ValueError, match="'passage'; it is called 'feedforward' now"):
+        jb.load_case(FOLDER / "feedforward.toml")

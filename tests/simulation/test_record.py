@@ -224,11 +224,6 @@ def test_record_without_loads_and_sensors(tmp_path):
     assert_same(jb.read_record(tmp_path / "nothing.nc"), record)
 
 
-def test_former_name_of_the_readings_warns(record):
-    with pytest.warns(DeprecationWarning, match="Record.shown is called controller_readings now"):
-        assert record.shown is record.controller_readings is None
-
-
 def test_text_has_the_extremes_of_each_sensor(record):
     lines = repr(record).splitlines()
     assert lines[0] == "Record of 'a run for its record': 101 samples to 0.4 s, 5 sensors, 2 loads"

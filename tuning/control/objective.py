@@ -10,7 +10,6 @@ from jaxtyping import Float
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.simulation.simulate import Histories
-from tuning.aliases import accepts_old_arguments
 
 METRICS = ("peak", "shortfall", "rms", "after_exit", "effort", "contact")
 # Metrics named by what sensors measure; deflections have the metric `peak`.
@@ -28,7 +27,6 @@ class WeightsAndLimits(NamedTuple):
     limits: Float[Array, " metric"]
 
 
-@accepts_old_arguments(over="aggregation", share="tail_share")
 @dataclasses.dataclass(frozen=True)
 class Objective:
     """A weighted sum of metrics, aggregated over runs.

@@ -7,7 +7,6 @@ import numpy as np
 
 from jaxbeam.case.case import Case
 from jaxbeam.files.report import text_table
-from tuning.aliases import accepts_old_arguments, has_old_attributes
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import ALL_METRICS, Objective
 from tuning.control.stability_constraint import StabilityConstraint
@@ -15,7 +14,6 @@ from tuning.control.tune import ParameterBounds, TuningProblem, check_arguments
 from tuning.control.tuning_result import TuningResult
 
 
-@has_old_attributes(merit="metric")
 @dataclasses.dataclass(frozen=True, eq=False)
 class ParetoFront:
     """Tunings for one objective under ever tighter limits on one metric, loosest first."""
@@ -48,7 +46,6 @@ class ParetoFront:
         return plot_pareto_front(lines, self.metric, title=self.tuned[0].case.title)
 
 
-@accepts_old_arguments(merit="metric", places="positions", bounds="least_peaks")
 def pareto(
     case: Case,
     free: ParameterBounds,
@@ -101,9 +98,6 @@ def pareto(
     return ParetoFront(metric, limits, tuple(tuned))
 
 
-@accepts_old_arguments(
-    merits="metrics", over="aggregation", places="positions", bounds="least_peaks"
-)
 def lexicographic(
     case: Case,
     free: ParameterBounds,

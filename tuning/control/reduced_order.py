@@ -10,7 +10,6 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.control.optimal.lqr import AbstractRegulator
 from jaxbeam.files.report import text_table
-from tuning.aliases import has_old_attributes
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
 from tuning.control.tune import ParameterBounds, tune
@@ -21,7 +20,6 @@ SHARE_PENALTY = 10.0  # added to the objective if the sum of the shares is off b
 CANDIDATE_COUNT = 3  # states tried as the last one to be fed back
 
 
-@has_old_attributes(kept="fed_back")
 @dataclasses.dataclass(frozen=True, eq=False)
 class ReducedFeedback:
     """Indices of the states that are fed back, and all `shares` of the relaxed search.

@@ -13,7 +13,6 @@ from jaxbeam.analysis.linearised_loop import linearise, loop_dynamics, loop_timi
 from jaxbeam.case.case import Case, concrete_case, crossing_times, replace, stack_cases, value_at
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.arrays import Array
-from tuning.aliases import accepts_old_arguments
 from tuning.control.fixed_design import with_fixed_design
 from tuning.control.load_cases import AddressValues, run_cases
 from tuning.control.run_set import RunSet
@@ -21,12 +20,6 @@ from tuning.control.run_set import RunSet
 STABILITY_PENALTY_SLOPE = 1.0  # added to the objective for each 1/s of violation
 
 
-@accepts_old_arguments(
-    largest="max_real_part",
-    delay="extra_delay",
-    spread="parameter_tolerance",
-    places="instants",
-)
 @dataclasses.dataclass(frozen=True)
 class StabilityConstraint:
     """Real parts of the frozen poles of all training runs are at most `max_real_part` (1/s).

@@ -16,7 +16,6 @@ from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, Histories
-from tuning.aliases import accepts_old_arguments
 from tuning.checkpoint import Checkpoint, checkpoint_path, fingerprint
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
@@ -33,7 +32,6 @@ from tuning.parameters.free import free_parameters
 ParameterBounds = Mapping[str, tuple[float, float] | None]
 
 
-@accepts_old_arguments(places="positions", bounds="least_peaks", price="penalty")
 def tune(
     case: Case,
     free: ParameterBounds,

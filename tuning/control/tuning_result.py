@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.files.report import text_table
-from tuning.aliases import has_old_attributes
 from tuning.control.load_cases import AddressValues, value_columns
 from tuning.control.objective import Objective
 from tuning.parameters.free import FreeParameter
@@ -17,15 +16,6 @@ from tuning.parameters.free import FreeParameter
 LIMIT_TOLERANCE = 0.01  # share of a limit by which it may be exceeded without a remark
 
 
-@has_old_attributes(
-    uncontrolled="uncontrolled_peaks",
-    before="peaks_before",
-    after="peaks_after",
-    least="least_peaks",
-    saturated="saturated_share",
-    merits="metrics",
-    shares="attained_shares",
-)
 @dataclasses.dataclass(frozen=True, eq=False)
 class RunSetResult:
     """Runs of a run set before and after tuning.
@@ -59,14 +49,6 @@ class StartResult(NamedTuple):
     values: Float[np.ndarray, " parameter"]
 
 
-@has_old_attributes(
-    numbers="parameters",
-    rejected="rejected_steps",
-    outcomes="run_sets",
-    violation="stability_violation",
-    minima="start_results",
-    excess="limit_excess",
-)
 @dataclasses.dataclass(frozen=True, eq=False)
 class TuningResult:
     """Result of a tuning: the tuned case, and its training and held-out runs.

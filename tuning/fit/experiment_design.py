@@ -20,13 +20,11 @@ from jaxbeam.runtime.arrays import xp
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import IntegrationPlan, integration_plan, sample_times
 from jaxbeam.simulation.simulate import simulate_readings
-from tuning.aliases import has_old_attributes
 from tuning.fit.dataset import SIMULATION_TOLERANCE
 
 START_COUNT = 5  # of the search, as there may be several local minima
 
 
-@has_old_attributes(slopes="error_sensitivities")
 @dataclasses.dataclass(frozen=True, eq=False)
 class ExperimentDesign:
     """Values of the chosen numbers, and standard errors of the free parameters (SI units).

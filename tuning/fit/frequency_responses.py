@@ -18,7 +18,6 @@ from jaxtyping import Complex, Float
 from jaxbeam.case.case import Case, replace
 from jaxbeam.model.frequency_response import StationaryMasses, frequency_response
 from jaxbeam.model.modes import mesh_layout
-from tuning.aliases import accepts_old_arguments, has_old_attributes
 from tuning.fit.least_squares import MAX_STEPS, LeastSquares
 from tuning.fit.summary import parameter_table
 from tuning.fit.uncertainty.covariance import confidence_intervals
@@ -30,7 +29,6 @@ from tuning.parameters.prior import Prior
 MIN_RELATIVE_SD = 1e-3  # of a measured response; no sensor is better calibrated
 
 
-@accepts_old_arguments(parked="stationary_masses")
 @dataclasses.dataclass(frozen=True, eq=False)
 class Responses:
     """Measured frequency responses, a column for each pair of an input and an output.
@@ -77,7 +75,6 @@ class Responses:
             )
 
 
-@accepts_old_arguments(least="min_coherence")
 def responses_of(log: Log, segment: float | None = None, min_coherence: float = 0.8) -> Responses:
     """Frequency responses of the sensors in a log to the one command in it.
 
@@ -166,12 +163,6 @@ class _ResponseData:
         return FunctionPrediction(predict)
 
 
-@has_old_attributes(
-    numbers="parameters",
-    unseen="unidentifiable",
-    freedom="degrees_of_freedom",
-    misfit="relative_misfit",
-)
 @dataclasses.dataclass(frozen=True, eq=False)
 class ResponseFit:
     """Parameters fitted to frequency responses (SI units), named as in `tuning.Fit`.

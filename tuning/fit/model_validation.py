@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.runtime.compiling import compiled
-from tuning.aliases import has_old_attributes
 from tuning.fit.dataset import make_dataset
 from tuning.fit.result import Fit
 from tuning.logs.log import Log
@@ -16,7 +15,6 @@ from tuning.logs.log import Log
 MAX_RESIDUAL_RATIO = 1.5  # residuals over the fit's noise, beyond which a log is not predicted
 
 
-@has_old_attributes(numbers="parameter_count")
 @dataclasses.dataclass(frozen=True)
 class ModelCriteria:
     """Information criteria of one of several models of the same logs; lower is better.
@@ -97,7 +95,6 @@ def compare_fits(fits: Mapping[str, Fit]) -> list[ModelCriteria]:
     return sorted(criteria, key=lambda model: model.bic)
 
 
-@has_old_attributes(ratio="residual_ratio")
 @dataclasses.dataclass(frozen=True, eq=False)
 class HeldOutPrediction:
     """A log predicted by a fit that did not use it.

@@ -7,7 +7,6 @@ import numpy as np
 
 from jaxbeam.files import report
 from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable
-from tuning.aliases import accepts_old_arguments
 from tuning.fit.model_validation import HeldOutPrediction, ModelCriteria
 from tuning.fit.result import Fit
 from tuning.fit.summary import interval_text
@@ -15,7 +14,6 @@ from tuning.fit.uncertainty.posterior import Posterior
 from tuning.fit.uncertainty.profile import Profile
 
 
-@accepts_old_arguments(unseen="held_out", rivals="models")
 def write_report(
     folder: str | os.PathLike,
     fit: Fit,

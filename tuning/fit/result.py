@@ -8,7 +8,6 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.quantities import unit_of
-from tuning.aliases import has_old_attributes
 from tuning.fit import summary
 from tuning.fit.dataset import Dataset
 from tuning.fit.least_squares import MAX_STEPS, LeastSquares, LeastSquaresSolution
@@ -18,15 +17,6 @@ from tuning.fit.uncertainty.covariance import confidence_intervals
 from tuning.parameters.free import LOG_ADDRESS, FreeParameter, to_unbounded, with_values
 
 
-@has_old_attributes(
-    numbers="parameters",
-    unseen="unidentifiable",
-    campaign="dataset",
-    colour="autocorrelation_factor",
-    freedom="degrees_of_freedom",
-    search="least_squares",
-    starts="start_values",
-)
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
     """Result of an identification, in SI units and the order of `parameters`.

@@ -16,19 +16,9 @@ from tuning.fit.multi_start import LocalMinimum
 from tuning.fit.result import Fit
 from tuning.logs.log import Log
 from tuning.parameters.free import FreeParameter
-from tuning.parameters.prior import OLD_SCALES, Prior
+from tuning.parameters.prior import Prior
 
-FORMAT, OLD_FORMAT = "jaxbeam fit 2", "jaxbeam fit 1"
-# Names in the old format of what is now called otherwise.
-_OLD_NAMES = {
-    "nominal_case": "given",
-    "parameters": "numbers",
-    "unidentifiable": "unseen",
-    "degrees_of_freedom": "freedom",
-    "autocorrelation_factor": "colour",
-    "typical_size": "size",
-    "prior": "belief",
-}
+FORMAT, FORMER_FORMAT = "jaxbeam fit 2", "jaxbeam fit 1"
 _FIT_ARRAYS = ("values", "errors", "correlation", "noise", "fitted", "autocorrelation_factor")
 _LOG_ARRAYS = ("times", "values", "valid")
 _LOG_FIELDS = (
@@ -112,31 +102,20 @@ def load_fit(path: str | os.PathLike) -> Fit:
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict]:
-    """Arrays and header of a file of either format, by their present names."""
-    for file_format in (FORMAT, OLD_FORMAT):
+    """Arrays and header of a file. Raises ValueError if it is no fit of the present format."""
+    try:
+        arrays = load(path, FORMAT)
+    except ValueError as error:
         try:
-            arrays = load(path, file_format)
+            load(path, FORMER_FORMAT)
         except ValueError:
-            continue
-        header = json.loads(str(arrays["about"]))
-        if file_format == OLD_FORMAT:
-            arrays, header = _with_new_names(arrays), _with_new_names(header)
-            header["parameters"] = [_with_new_scale(entry) for entry in header["parameters"]]
-        return arrays, header
-    raise ValueError(f"{path} is no fit, or is damaged; name the .npz file that identify wrote")
-
-
-def _with_new_names(content: dict) -> dict:
-    """Content of the old format with the present names."""
-    new_names = {old: new for new, old in _OLD_NAMES.items()}
-    return {new_names.get(name, name): entry for name, entry in content.items()}
-
-
-def _with_new_scale(entry: dict) -> dict:
-    """A free parameter of the old format, with the present names and scales."""
-    entry = _with_new_names(entry)
-    scale = entry["prior"]["scale"]
-    return entry | {"prior": entry["prior"] | {"scale": OLD_SCALES.get(scale, scale)}}
+            raise ValueError(
+                f"{path} is no fit, or is damaged; name the .npz file that identify wrote"
+            ) from error
+        raise ValueError(
+            f"{path} was written by jaxbeam 0.1: identify from the logs again"
+        ) from error
+    return arrays, json.loads(str(arrays["about"]))
 
 
 def _log_header(log: Log, case: Case) -> dict:

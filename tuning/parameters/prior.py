@@ -7,10 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.runtime.arrays import Array, xp
-from tuning.aliases import current_word
 
 SCALES = ("linear", "log", "logit")
-OLD_SCALES = {"plain": "linear"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +36,6 @@ class Prior:
     scale: str = "linear"
 
     def __post_init__(self):
-        object.__setattr__(self, "scale", current_word(self.scale, OLD_SCALES, "the scale"))
         if self.scale not in SCALES:
             raise ValueError(f"a scale is one of {', '.join(SCALES)}, not {self.scale!r}")
         if (self.mean is None) != (self.deviation is None):

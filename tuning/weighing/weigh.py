@@ -11,7 +11,6 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.loads.mass import MovingMass
-from tuning.aliases import accepts_old_arguments, has_old_attributes
 from tuning.fit.identify import identify
 from tuning.fit.model_validation import ModelCriteria, compare_fits
 from tuning.fit.residuals import WHITENESS_SIGNIFICANCE
@@ -26,7 +25,6 @@ _MAX_MISFIT_RATIO = 0.7
 _MAX_RESIDUAL_SHARE = 0.65
 
 
-@has_old_attributes(counts="load_counts")
 @dataclasses.dataclass(frozen=True, eq=False)
 class Weighing:
     """Loads found in a log: the best fit, and criteria of all load counts tried, best first.
@@ -58,7 +56,6 @@ class Weighing:
         return "\n".join([*lines, str(self.fit)])
 
 
-@accepts_old_arguments(most="max_count")
 def weigh(
     case: Case, log: Log, speeds: tuple[float, float], max_count: int = 3, both_ways: bool = True
 ) -> Weighing:

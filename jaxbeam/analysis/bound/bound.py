@@ -24,7 +24,6 @@ from jaxbeam.analysis.bound.input_influence import (
     input_influence,
 )
 from jaxbeam.analysis.bound.linear_program import least_peak
-from jaxbeam.case.aliases import renamed_property, warn_renamed
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.validation import check_case
@@ -59,9 +58,6 @@ class ActiveConstraints(NamedTuple):
     times: Float[np.ndarray, " constraint"]
     weights: Float[np.ndarray, " constraint"]
 
-    places = renamed_property("places", "positions")
-    instants = renamed_property("instants", "times")
-
 
 class Bound(Module):
     """Least achievable peak deflection of a case, and commands that attain it.
@@ -80,9 +76,6 @@ class Bound(Module):
     period: float
     spacing: float
     active_constraints: ActiveConstraints
-
-    places = renamed_property("places", "positions")
-    binding = renamed_property("binding", "active_constraints")
 
     @property
     def reduction(self) -> float:
@@ -117,7 +110,6 @@ def bound(
     positions: ArrayLike | None = None,
     period: float | None = None,
     spacing: float | None = None,
-    places: ArrayLike | None = None,
 ) -> Bound:
     """Least peak deflection over all commands within the limits, and commands that attain it.
 
@@ -125,10 +117,8 @@ def bound(
     whole beam. Commands are held over `period` (s), by default that of the case's controller, or
     0.01 s, within the limits and rates of the actuators, if any; resolution, delay, and the
     controller of the case have no influence. The deflection is evaluated every `spacing` (s), by
-    default at the run's sample rate, and at changes of the commands. `places` is the former name of
-    `positions`.
+    default at the run's sample rate, and at changes of the commands.
 
-    Raises TypeError for both `places` (the former name) and `positions`.
     Raises ValueError for an invalid case, one without loads, without positions or without actuators
     that take commands, for a period or spacing that is not positive, for limits that the rates
     cannot reach from zero, and under `jit` or differentiation (there are no derivatives);
@@ -147,11 +137,6 @@ def bound(
     >>> print(f"{best.reduction:.0%} of the peak, at most")
     24% of the peak, at most
     """
-    if places is not None:
-        if positions is not None:
-            raise TypeError("places is the former name of positions: give one of them")
-        warn_renamed("the argument places of bound", "positions")
-        positions = places
     least = _bound_without_baseline(case, positions, period, spacing)
     return dataclasses.replace(least, uncontrolled=_uncontrolled_peak(case, least.positions))
 

@@ -5,9 +5,9 @@ import inspect
 import re
 from typing import Any
 
-from jaxbeam.case.aliases import current_keys, current_kind
 from jaxbeam.case.declared_checks import check_field, describe_value, missing_error, suggestion
 from jaxbeam.case.fields import describe_shape, fits_shape
+from jaxbeam.case.former_words import with_attribute_names
 from jaxbeam.case.kinds import find_kind, kinds
 from jaxbeam.case.quantities import OF_QUANTITY, unit_of
 from jaxbeam.case.reading.units import in_si
@@ -24,7 +24,7 @@ def read_part(address: str, table: dict[str, Any], part_class: type) -> Any:
     if inspect.isabstract(part_class):
         part_class = _class_of_kind(address, values.pop("kind", None), part_class)
     fields = {field.name: field for field in dataclasses.fields(part_class) if field.metadata}
-    values = current_keys(address, values, fields)
+    values = with_attribute_names(address, values, fields)
     default_quantity = fields["quantity"].default if "quantity" in fields else None
     for key, value in values.items():
         if key not in fields:
@@ -60,7 +60,7 @@ def read_parts(address: str, tables: Any, part_class: type) -> tuple[Any, ...]:
 
 def _class_of_kind(address: str, kind: Any, family: type) -> type:
     if isinstance(kind, str):
-        found = find_kind(family, kind) or find_kind(family, current_kind(address, kind))
+        found = find_kind(family, kind)
         if found is not None:
             return found
     classes = kinds(family)

@@ -260,16 +260,3 @@ ERRORS = {
 def test_errors_are_named(words):
     with pytest.raises(ValueError, match=words):
         ERRORS[words]()
-
-
-def test_former_names_warn(patch_bound):
-    with pytest.warns(DeprecationWarning, match="Bound.places is called positions now"):
-        assert patch_bound.places is patch_bound.positions
-    with pytest.warns(DeprecationWarning, match="Bound.binding is called active_constraints"):
-        constraints = patch_bound.binding
-    with pytest.warns(DeprecationWarning, match="ActiveConstraints.instants is called times now"):
-        assert constraints.instants is patch_bound.active_constraints.times
-    with pytest.warns(DeprecationWarning, match="the argument places of bound is called positions"):
-        assert bound(patched(), places=[0.3]).peak == pytest.approx(patch_bound.peak, rel=1e-9)
-    with pytest.raises(TypeError, match="places is the former name of positions"):
-        bound(patched(), positions=[0.3], places=[0.3])

@@ -14,19 +14,16 @@ from jaxtyping import Float
 
 from jaxbeam.files.report import ReportTable, text_table
 from jaxbeam.runtime.arrays import Array
-from tuning.aliases import current_word, has_old_attributes
 from tuning.checkpoint import NO_CHECKPOINT, Checkpoint, checkpoint_path, fingerprint
 from tuning.fit.result import Fit
 from tuning.optional import import_extra
 
 NOISE_MODELS = ("fixed", "estimated")
-OLD_NOISE_MODELS = {"held": "fixed"}
 DRAWS_PER_BLOCK = 100  # draws between two checkpoints
 MAX_R_HAT = 1.05  # beyond it chains have not mixed
 MIN_EFFECTIVE_DRAWS = 100  # below it intervals are not reliable
 
 
-@has_old_attributes(effective="effective_draws")
 @dataclasses.dataclass(frozen=True, eq=False)
 class Posterior:
     """Draws (chain, draw, parameter) of the free parameters in SI units, with diagnostics.
@@ -168,7 +165,6 @@ def sample(
             f"not identifiable from the data: {', '.join(fit.unidentifiable[0])}; give a prior, or "
             "a value known otherwise, before sampling"
         )
-    noise = current_word(noise, OLD_NOISE_MODELS, "the noise")
     if noise not in NOISE_MODELS:
         raise ValueError(f"noise can be {' or '.join(map(repr, NOISE_MODELS))}, not {noise!r}")
     path = checkpoint_path(checkpoint, resume)

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from tuning.aliases import has_old_attributes
 from tuning.fit.result import Fit
 from tuning.fit.uncertainty.covariance import t_quantile
 
@@ -13,7 +12,6 @@ LINEAR_AGREEMENT = 0.25  # share of its half width by which an interval may diff
 MAX_STEPS_PER_SIDE = 12  # steps to each side, each at most twice as long as the one before
 
 
-@has_old_attributes(rises="deviance", allowed="critical_deviance", linear="linear_interval")
 @dataclasses.dataclass(frozen=True, eq=False)
 class Profile:
     """Profile of a parameter: `values` (SI), and `deviance`, -2 ln L above its minimum, there.

@@ -1,0 +1,82 @@
+"""Former words of case files, addresses, arguments and the package name the present ones."""
+
+import subprocess
+import sys
+
+import pytest
+
+import jaxbeam as jb
+from jaxbeam.case import former_words
+from jaxbeam.case.case import addresses
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.kinds import kinds
+from jaxbeam.files.case_file import case_from_dict
+
+CASE = {
+    "beam": {"length": 0.6, "flexural_rigidity": 11.68, "mass_per_length": 0.535, "modes": 1},
+    "actuators": [{"kind": "point", "position": 0.3}],
+    "sensors": [{"position": 0.3}],
+    "loads": [{"kind": "mass", "mass": 0.3, "speed": 1.0}],
+}
+SCHEDULED = {"kind": "feedback-scheduled", "masses": [0.2, 0.6], "gains": [[2e3, 4e3]]}
+GATES = {"gates": [-0.2, -0.1], "until": 0.3}
+
+
+def with_controller(**table) -> jb.Case:
+    return case_from_dict(CASE | {"controller": table | {"period": 0.01}})
+
+
+def test_present_words_exist():
+    words, classes = former_words.WORDS, kinds(AbstractController)
+    assert {words["passage"], words["relief"]} <= set(classes)
+    assert not words.keys() & set(classes)
+    assert set(former_words.NAMES.values()) <= set(jb.__all__)
+    assert not set(former_words.NAMES) & set(jb.__all__)
+
+
+def test_former_words_are_refused():
+    with pytest.raises(ValueError, match="kind cannot be 'relief'; it is called 'internal-model'"):
+        with_controller(kind="relief", readings=[0.0, 1e-3], values=[[0.0, 1.0]])
+    present = "'recognition'; it is called 'load_identification' now"
+    with pytest.raises(ValueError, match=f"controller has no key {present}"):
+        with_controller(**SCHEDULED, recognition=GATES)
+    with pytest.raises(TypeError, match="ScheduledFeedback has no recognition; it is called"):
+        jb.ScheduledFeedback(masses=[0.2], gains=[[2e3]], period=0.01, recognition=None)
+    with pytest.raises(TypeError, match="LQR has no places; it is called 'positions' now"):
+        jb.LQR([1.0], [1.0], places=[0.3])
+
+
+def test_former_addresses_are_refused():
+    case = with_controller(**SCHEDULED, load_identification=GATES)
+    present = "controller.load_identification.until"
+    assert present in addresses(case)
+    for use in (
+        lambda old: jb.replace(case, {old: 0.4}),
+        lambda old: jb.sweep(case, {old: [0.3, 0.4]}, progress=False),
+    ):
+        with pytest.raises(ValueError, match=f"did you mean '{present}'?"):
+            use("controller.recognition.until")
+
+
+@pytest.mark.parametrize(("old", "new"), former_words.NAMES.items())
+def test_former_names_of_the_package_are_refused(old, new):
+    with pytest.raises(AttributeError, match=f"jaxbeam.{old} is called jaxbeam.{new} now"):
+        getattr(jb, old)
+
+
+def test_words_of_files_that_python_has_not():
+    profile = {"kind": "iso8608", "class": "B", "seed": 1}
+    case = case_from_dict(CASE | {"profile": profile})
+    assert case.profile.road_class == "B"
+    with pytest.raises(ValueError, match="class is called road_class in Python; leave one"):
+        case_from_dict(CASE | {"profile": profile | {"road_class": "B"}})
+
+
+def test_unknown_name_of_the_package():
+    with pytest.raises(AttributeError, match="no_such_name"):
+        jb.no_such_name  # noqa: B018
+
+
+def test_importing_the_package_does_not_import_jax():
+    code = "import sys, jaxbeam; assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
