@@ -25,7 +25,7 @@ jaxbeam.sweeps  jaxbeam.c_code  jaxbeam.fmi
 jaxbeam.analysis
 jaxbeam.plot
 jaxbeam
-tuning.aliases  tuning.checkpoint  tuning.optional
+tuning.checkpoint  tuning.optional
 tuning.logs
 tuning.parameters  tuning.modal
 tuning.fit

@@ -143,7 +143,7 @@ def _missing(error: MissingArgumentError) -> str:
 
 
 def refuse_former_words(arguments: Sequence[str]) -> None:
-    """Raise ValueError for a command or an option that is called otherwise now."""
+    """Check a command line. Raises ValueError for a command or option that is called otherwise."""
     former = RENAMED_COMMANDS
     for word in arguments:
         name = word.partition("=")[0]

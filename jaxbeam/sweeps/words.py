@@ -104,10 +104,8 @@ def split_words(
     """
     numbers_of_case, words, others = addresses(case), {}, {}
     for address, given in over.items():
-        values, current = (
-            np.atleast_1d(np.asarray(given, object)).ravel(),
-            attribute_address(address),
-        )
+        values = np.atleast_1d(np.asarray(given, object)).ravel()
+        current = attribute_address(address)
         is_word = [isinstance(value, str) for value in values]
         if not any(is_word) or current.replace(ALL, "0") in numbers_of_case:
             others[address] = given

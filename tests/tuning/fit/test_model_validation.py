@@ -23,7 +23,7 @@ from tests.tuning.stand_in import (
     formula,
     least_squares,
 )
-from tuning.checkpoint import Checkpoint, load, save
+from tuning.checkpoint import Checkpoint, save
 from tuning.fit import model_validation, storage
 from tuning.fit.model_validation import compare_fits, cross_validate
 from tuning.fit.residuals import residual_remarks, whiteness_p_value
@@ -284,27 +284,11 @@ def test_a_fit_is_stored_without_loss(plain, tmp_path, monkeypatch):
         storage.load_fit(tmp_path / "cut.npz")
 
 
-def test_fits_of_the_old_format_are_read(plain, tmp_path, monkeypatch):
-    """Names of the format "jaxbeam fit 1" are those of its version of jaxbeam."""
-    monkeypatch.setattr(storage, "make_dataset", lambda case, logs: dataset())
+def test_fits_of_the_former_format_are_refused(plain, tmp_path):
     file = tmp_path / "fit.npz"
-    storage.save_fit(plain, file)
-    arrays = load(file, storage.FORMAT)
-    about = json.loads(str(arrays.pop("about")))
-    for entry in about["parameters"]:
-        entry["size"], entry["belief"] = entry.pop("typical_size"), entry.pop("prior")
-        entry["belief"]["scale"] = "plain"
-    old_names = {
-        "nominal_case": "given",
-        "parameters": "numbers",
-        "unidentifiable": "unseen",
-        "degrees_of_freedom": "freedom",
-    }
-    about = {old_names.get(name, name): entry for name, entry in about.items()}
-    arrays["colour"] = arrays.pop("autocorrelation_factor")
-    save(file, "jaxbeam fit 1", arrays | {"about": np.array(json.dumps(about))})
-    again = storage.load_fit(file)
-    assert str(again) == str(plain) and again.parameters == plain.parameters
+    save(file, storage.FORMER_FORMAT, {"about": np.array("{}")})
+    with pytest.raises(ValueError, match="written by jaxbeam 0.1: identify from the logs again"):
+        storage.load_fit(file)
 
 
 def test_logs_are_stored_with_their_loads():
