@@ -121,15 +121,12 @@ from .model.frequency_response import (
     mobility as mobility,
     receptance as receptance,
 )
-from .model.influence import influence_line as influence_line
+from .model.influence import influence_line as influence_line, static_peak as static_peak
 from .model.modes import modes as modes
 from .model.settlement import settlement_response as settlement_response
 from .model.state_space import state_space as state_space
 from .model.static_correction import bending_moment as bending_moment, shear_force as shear_force
-from .model.statics import (
-    static_deflection as static_deflection,
-    static_peak as static_peak,
-)
+from .model.statics import static_deflection as static_deflection
 from .simulation.coil_history import coil_history as coil_history
 from .simulation.corrected_deflection import corrected_deflection as corrected_deflection
 from .simulation.record import Record as Record

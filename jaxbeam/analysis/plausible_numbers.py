@@ -125,7 +125,7 @@ def _under_loads(
     position, speed, _ = map(np.asarray, loads.kinematics(times))
     x = np.linspace(0.0, float(case.beam.length), POSITIONS)
     present = (position >= 0) & (position <= x[-1])
-    weight = np.where(present, np.asarray(loads.weight), 0.0)
+    weight = np.where(present, np.asarray(loads.varying_weight(times))[..., 0].T, 0.0)
     fastest = float(np.max(np.abs(speed) * present))
     on_beam = float(np.max(np.abs(np.sum(weight, axis=0))))
     if not _is_held(found):

@@ -1,8 +1,10 @@
 """Influence lines of every quantity: deflection, rotation, moment, shear force, reaction.
 
 An influence line is the static value of a quantity under 1 N downwards, over the position of the
-force.
+force. Static peaks are the largest values under the loads of a case wherever they are.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -13,11 +15,13 @@ from jaxbeam.case.declared_checks import check_on_beam, suggestion
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES, quantity_of
 from jaxbeam.model import statics
+from jaxbeam.model.flexibility import flexibility
 from jaxbeam.model.layout import Layout, is_uniform
-from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.output_rows import SIDE_SHARE, beside, quantity_factor
+from jaxbeam.model.static_correction import section_stiffness
 from jaxbeam.model.theory.fields import SLOPE
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.compiling import compiled_if_traced
 
 DEFAULT_POSITIONS = 101
 REACTION = "reaction"
@@ -69,47 +73,147 @@ def influence_line(
     """
     if load_positions is None:
         load_positions = case.beam.length * np.linspace(0.0, 1.0, DEFAULT_POSITIONS)
-    if quantity not in STATIC_QUANTITIES:
-        known = suggestion(quantity, STATIC_QUANTITIES)
-        raise ValueError(f"no influence line of {quantity!r}; {known}")
-    if side not in SIDES:
-        raise ValueError(f"side must be 'left' or 'right' of x, not {side!r}")
-    if quantity == "deflection":
-        return statics.influence_line(case, x, load_positions, derivative, layout)
-    if derivative:
-        raise ValueError(f"derivative is that of the deflection; leave it out for {quantity!r}")
     x, load_positions = xp.asarray(x, float), xp.asarray(load_positions, float)
-    check_on_beam("x", x, case.beam.length)
-    layout = mesh_layout(case) if layout is None else layout
-    if quantity == REACTION:
-        return _reactions(case, x, load_positions, layout)
+    kind = _checked_kind(case, x, _Kind(quantity, derivative, side))
+    layout = statics.validated_layout(case, layout, x=x, positions=load_positions)
+    if quantity == "deflection":
+        return statics.unchecked_influence_line(case, layout, x, load_positions, derivative)
+    return _influence_line(case, layout, x, load_positions, kind, fibre_distance, section_modulus)
+
+
+def static_peak(
+    case: Case,
+    x,
+    layout: Layout | None = None,
+    derivative: int = 0,
+    *,
+    quantity: str = "deflection",
+    fibre_distance=None,
+    section_modulus=None,
+    side: str = "right",
+) -> Float[Array, "*position"]:
+    """Largest absolute static value of a quantity at x (m) over the whole crossing of the loads.
+
+    By default the deflection in m. At every instant the loads press with their weights, and with
+    forces that vary in time, at their positions, without inertia of loads and beam: the denominator
+    of the dynamic amplification, and for one load or loads of equal speed the limit of a slow
+    crossing. The crossing is that from the first entry to the last exit, or stop, whatever the
+    duration of the run; waves of forces last until the end of the run.
+
+    Quantities, `derivative` of the deflection, and `side` are those of `influence_line`. The
+    maximum is exact where the beam is uniform and forces have no waves: between the events of a
+    crossing the value is a polynomial in time. Differentiable in every number where the maximum is
+    unique. Inside `jit`, pass the `layout`; the numbers of loads with waves must be known. Raises
+    ValueError as `influence_line` does.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> case = jb.Case(
+    ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingMass(mass=0.5, speed=2.0)]
+    ... )
+    >>> print(f"{1e3 * jb.static_peak(case, 0.3):.2f} mm")
+    1.89 mm
+    >>> print(f"{jb.static_peak(case, 0.3, quantity='moment'):.4f} N m")  # m g L / 4
+    0.7358 N m
+    """
+    x = xp.asarray(x, float)
+    kind = _checked_kind(case, x, _Kind(quantity, derivative, side))
     parameters = fibre_distance, section_modulus
-    entry = quantity_of(quantity, *parameters)
-    if entry.bends:
-        x = beside(case, x, side)
-    order = 1 if entry.of_axis and is_uniform(case) else entry.field
-    line = statics.influence_line(case, x, load_positions, order, layout)
-    return quantity_factor(case, x, entry, *parameters) * line
+    if quantity != REACTION:
+        quantity_of(quantity, *parameters)
+    layout = statics.validated_layout(case, layout, x=x)
+    if not case.loads:
+        return xp.zeros(x.shape)
+    return _static_peak(case, layout, x, kind, *parameters, statics.intervals_of_waves(case))
 
 
-def _reactions(case: Case, x, load_positions, layout: Layout):
-    """Reactions in N per newton: jumps of the vertical force, and the load on the support."""
-    _check_held(case, x)
-    last = x > case.beam.length * (1 - SIDE_SHARE)
-    first = x < case.beam.length * SIDE_SHARE
-    left, right = (_vertical_force(case, x, load_positions, side, layout) for side in SIDES)
-    jump = xp.where(last, 0.0, right) - xp.where(first, 0.0, left)
-    distance = xp.abs(load_positions.reshape((*load_positions.shape, *(1,) * x.ndim)) - x)
-    return jump + xp.where(distance <= SIDE_SHARE * case.beam.length, 1.0, 0.0)
+class _Kind(NamedTuple):
+    """Quantity, derivative of the deflection, and side of x, of an influence line."""
+
+    quantity: str
+    derivative: int
+    side: str
 
 
-def _vertical_force(case: Case, x, load_positions, side: str, layout: Layout):
-    """Vertical force V - T w' on one side of x, in N per newton."""
-    shear = influence_line(case, x, load_positions, layout=layout, quantity="shear", side=side)
-    if case.beam.axial_force is None:
-        return shear
-    slope = statics.influence_line(case, beside(case, x, side), load_positions, SLOPE, layout)
-    return shear - case.beam.axial_force * slope
+def _checked_kind(case: Case, x, kind: _Kind) -> _Kind:
+    if kind.quantity not in STATIC_QUANTITIES:
+        known = suggestion(kind.quantity, STATIC_QUANTITIES)
+        raise ValueError(f"no influence line of {kind.quantity!r}; {known}")
+    if kind.side not in SIDES:
+        raise ValueError(f"side must be 'left' or 'right' of x, not {kind.side!r}")
+    if kind.derivative and kind.quantity != "deflection":
+        message = "derivative is that of the deflection; leave it out for"
+        raise ValueError(f"{message} {kind.quantity!r}")
+    if kind.quantity == REACTION:
+        check_on_beam("x", x, case.beam.length)
+        _check_held(case, x)
+    return kind
+
+
+@compiled_if_traced
+def _influence_line(case: Case, layout: Layout, x, load_positions, kind: _Kind, *parameters):
+    line, _ = _line(case, layout, x.reshape(-1), kind, *parameters)
+    return line(load_positions).reshape((*load_positions.shape, *x.shape))
+
+
+@compiled_if_traced
+def _static_peak(
+    case: Case,
+    layout: Layout,
+    x,
+    kind: _Kind,
+    fibre_distance,
+    section_modulus,
+    wave_intervals: int,
+):
+    line, breaks = _line(case, layout, x.reshape(-1), kind, fibre_distance, section_modulus)
+    return statics.peak_under_loads(case, line, breaks, wave_intervals).reshape(x.shape)
+
+
+def _line(case: Case, layout: Layout, x, kind: _Kind, fibre_distance, section_modulus):
+    """Influence line at positions x (m) as a function (position...) -> (position..., x) in m.
+
+    And the positions (m) between which it is smooth.
+    """
+    length, rigidity = case.beam.length, case.beam.bending_stiffness
+
+    def field(at, order: int):
+        greens = flexibility(case, layout, at, order)
+        scale = -(length ** (3 - abs(order))) / rigidity
+        return (lambda y: scale * greens(y / length)), length * greens.breakpoints
+
+    if kind.quantity == REACTION:
+        return _reaction_line(case, x, field)
+    if kind.quantity == "deflection":
+        return field(x, kind.derivative)
+    entry = quantity_of(kind.quantity, fibre_distance, section_modulus)
+    at = beside(case, x, kind.side) if entry.bends else x
+    line, breaks = field(at, 1 if entry.of_axis and is_uniform(case) else entry.field)
+    factor = quantity_factor(case, at, entry, fibre_distance, section_modulus)
+    return (lambda y: factor * line(y)), breaks
+
+
+def _reaction_line(case: Case, x, field):
+    """Reactions in N per newton: jumps of the force V - T w', and the load on the support."""
+    length, sides, breaks = case.beam.length, [], []
+    outer = x < length * SIDE_SHARE, x > length * (1 - SIDE_SHARE)
+    for side, sign, beyond in zip(SIDES, (-1.0, 1.0), outer, strict=True):
+        at = beside(case, x, side)
+        third, own = field(at, 3)
+        slope = None if case.beam.axial_force is None else field(at, SLOPE)[0]
+        share = xp.where(beyond, 0.0, sign)
+        sides.append((third, slope, share * section_stiffness(case, at), share))
+        breaks.append(own)
+
+    def line(y):
+        total = xp.where(xp.abs(y[..., None] - x) <= SIDE_SHARE * length, 1.0, 0.0)
+        for third, slope, stiffness, share in sides:
+            total = total + stiffness * third(y)
+            if slope is not None:
+                total = total - share * case.beam.axial_force * slope(y)
+        return total
+
+    return line, xp.concatenate(breaks)
 
 
 def held_positions(case: Case) -> Float[np.ndarray, " support"]:

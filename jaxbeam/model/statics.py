@@ -2,25 +2,30 @@
 and peaks of a slow crossing (see `flexibility`).
 """
 
+from collections.abc import Callable
+
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.declared_checks import check_on_beam
-from jaxbeam.case.fields import is_concrete
+from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.flexibility import check_supported, flexibility
-from jaxbeam.model.load_set import load_set
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modes import Layout, mesh_layout
-from jaxbeam.numerics.peak_search import refine_peak
-from jaxbeam.runtime.arrays import Array, set_at, xp
+from jaxbeam.numerics.peak_search import estimate_peak, refine_peak
+from jaxbeam.runtime.arrays import Array, add_at, is_known, set_at, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 
-# Positions on an interval between events that determine the deflection exactly there: ten for a
-# cubic (flexibility) of a cubic (trajectory), a polynomial of degree nine.
-PEAK_POSITIONS = tuple(float(share) for share in np.linspace(0, 1, 10))
+# Positions on an interval between events that determine the deflection exactly there: eleven for a
+# cubic (flexibility) of a cubic (trajectory) times a table of forces, a polynomial of degree ten.
+# Half a period of a sine is interpolated to 1e-7 of its amplitude.
+PEAK_POSITIONS = tuple(float(share) for share in np.linspace(0, 1, 11))
+BREAK_SHARE = 1e-10  # of the way to the middle of an interval, by which wheels keep off its ends
+BLOCK = 4_000_000  # values of lines under all wheels at a time
 
 
 @compiled_if_traced
@@ -131,56 +136,84 @@ def _deflection_per_port_force(case: Case, layout: Layout, x, derivative: int):
     return (gains * length ** (3 - derivative) / case.beam.bending_stiffness).reshape(-1, *x.shape)
 
 
-def static_peak(
-    case: Case, x, layout: Layout | None = None, derivative: int = 0
-) -> Float[Array, "*position"]:
-    """Largest absolute static deflection (m) at x (m) over the whole crossing of the case's loads.
+def peak_under_loads(
+    case: Case,
+    line: Callable[[Float[Array, "*position"]], Float[Array, "*position x"]],
+    breaks: Float[Array, " break"],
+    wave_intervals: int = 0,
+) -> Float[Array, " x"]:
+    """Largest absolute value of the sums F_l(t) line(y_l(t)) over the loads l and all times.
 
-    At every instant the loads press with their weights at their positions, without inertia of loads
-    and beam: the denominator of the dynamic amplification, and for one load or loads of equal speed
-    the limit of a slow crossing. The crossing is that from the first entry to the last exit (or
-    stop), whatever the duration of the run.
-
-    `derivative` (up to 2) gives that x-derivative instead. The maximum is exact: between the events
-    of a crossing the deflection is a polynomial in time. Differentiable in every number where the
-    maximum is unique. Raises ValueError as `influence_line` does.
-
-    >>> import jaxbeam as jb
-    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
-    >>> case = jb.Case(
-    ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingMass(mass=0.5, speed=2.0)]
-    ... )
-    >>> print(f"{1e3 * jb.static_peak(case, 0.3):.2f} mm")
-    1.89 mm
+    `line` is that of a quantity per newton over the position y (m) of a force, a cubic between the
+    `breaks` (m). Between events the sum is a polynomial in time, of degree POINTS - 1 at most;
+    under waves it is interpolated in `wave_intervals` more (see `intervals_of_waves`).
     """
-    x = xp.asarray(x, float)
-    layout = validated_layout(case, layout, x=x)
-    if not case.loads:
-        return xp.zeros(x.shape)
-    return _static_peak(case, layout, x, derivative)
+    loads, length = load_set(case), case.beam.length
+    windows, times = _intervals(case, loads, breaks, wave_intervals)
+    starts, ends = times[:-1], times[1:]
+    count = line(xp.zeros(0)).shape[-1]
+    size = starts.shape[0] * len(PEAK_POSITIONS) * loads.wheel_count * max(1, count)
+    samples, estimates = [], []
+    for part in np.array_split(np.arange(starts.shape[0]), -(-size // BLOCK)):
+        middle = (starts[part] + ends[part]) / 2
+        within = starts[part] + (ends[part] - starts[part]) * np.array(PEAK_POSITIONS)[:, None]
+        position = xp.clip(loads.kinematics(within)[0], 0.0, length)
+        centre = xp.clip(loads.kinematics(middle)[0], 0.0, length)
+        # At a break, where the line of a shear force jumps, the side on which the wheel is.
+        position = position + BREAK_SHARE * (centre[:, None] - position)
+        forces = loads.varying_weight(within)[..., 0]
+        active = (windows[:, :1] < middle) & (middle < windows[:, 1:])
+        if is_known(active):
+            wheel, at = np.nonzero(active)
+        else:
+            wheel, at = np.divmod(np.arange(loads.wheel_count * part.size), part.size)
+        force = (forces[:, at, wheel] * active[wheel, at])[..., None]
+        total = xp.zeros((len(PEAK_POSITIONS), part.size, count))
+        total = add_at(total, np.s_[:, at], force * line(position[wheel, :, at].T))
+        estimate = estimate_peak(total, PEAK_POSITIONS)
+        best = xp.argmax(estimate, axis=0)[None]
+        estimates.append(xp.take_along_axis(estimate, best, axis=0)[0])
+        samples.append(xp.take_along_axis(total, best[None], axis=1)[:, 0])
+    best = xp.argmax(xp.stack(estimates), axis=0)[None, None]
+    chosen = xp.take_along_axis(xp.stack(samples, axis=1), best, axis=1)[:, 0]
+    return refine_peak(chosen, PEAK_POSITIONS)[0]
 
 
-@compiled_if_traced
-def _static_peak(case: Case, layout: Layout, x, derivative: int):
-    length, order = case.beam.length, abs(derivative)
-    greens = flexibility(case, layout, x.reshape(-1), derivative)
-    loads = load_set(case)
-    windows = loads.entry_exit_times()
-    nodes = greens.breakpoints
-    table_times = [load.times for load in case.loads if load.times is not None]
-    passages = loads.passage_times(nodes * length)
-    events = xp.concatenate([windows.reshape(-1), passages, *table_times])
-    event_times = xp.sort(xp.where(events < NEVER, events, windows[0, 0]))
-    starts, ends = event_times[:-1], event_times[1:]
-    middle = (starts + ends) / 2
-    times = starts + (ends - starts) * np.array(PEAK_POSITIONS)[:, None]
-    total = xp.zeros((*times.shape, x.size))
-    positions = xp.clip(loads.kinematics(times)[0] / length, 0.0, 1.0)
-    for wheel in range(loads.wheel_count):
-        active = (windows[wheel, 0] < middle) & (middle < windows[wheel, 1])
-        total = total + loads.weight[wheel] * active[:, None] * greens(positions[wheel])
-    highest = xp.max(refine_peak(total, PEAK_POSITIONS)[0], axis=0)
-    return (highest * length ** (3 - order) / case.beam.bending_stiffness).reshape(x.shape)
+def _intervals(case: Case, loads: LoadSet, breaks, wave_intervals: int):
+    """Entry and exit of each wheel, and times (s) between which forces and motions are smooth.
+
+    The last interval is that after all events, in which loads that stay still press.
+    """
+    windows, events = loads.events(breaks)
+    happens = events < NEVER
+    happening = xp.any(happens)
+    first = xp.where(happening, xp.min(xp.where(happens, events, NEVER)), 0.0)
+    last = xp.where(happening, xp.max(xp.where(happens, events, -NEVER)), 0.0)
+    end = xp.maximum(last, case.run.duration) if wave_intervals else last + 1.0
+    grid = first + (end - first) * np.linspace(0.0, 1.0, wave_intervals + 2)
+    times = xp.concatenate([xp.where(happens, events, first), grid])
+    return windows, np.unique(times) if is_known(times) else xp.sort(times)
+
+
+def intervals_of_waves(case: Case) -> int:
+    """Half periods of the fastest wave of a force of the case from its first event on; 0 without.
+
+    Waves last until the end of the run, or the last event if that is later. Raises ValueError where
+    there is a wave and a number of the loads or the run is traced.
+    """
+    histories = load_set(case).wheels.histories.values()
+    frequencies = [history.frequencies for history in histories if history.frequencies.size]
+    if not frequencies:
+        return 0
+    if not all(map(is_concrete, jax.tree.leaves((case.loads, case.run, case.beam.length)))):
+        raise ValueError(
+            "the static peak under a force with waves needs known numbers of loads, run and length:"
+            " leave them out of what jax.jit or jax.grad traces"
+        )
+    known = concrete_case(case)
+    _, times = _intervals(known, load_set(known), np.zeros(0), 1)
+    fastest = max(float(np.max(np.abs(concrete(one)))) for one in frequencies)
+    return int(np.ceil(2 * fastest * float(times[-1] - times[0]))) + 1
 
 
 def validated_layout(case: Case, layout: Layout | None, **positions) -> Layout:

@@ -118,5 +118,15 @@ def test_envelope_of_moments_against_the_record_and_amplification_of_a_slow_forc
     moments = np.asarray(record.bending_moment(x))
     low, high = envelope(fast, [x], quantity="moment")
     assert_allclose([low[0], high[0]], [moments.min(), moments.max()], rtol=1e-3)
-    with pytest.raises(ValueError, match="no amplification of 'shear'"):
-        amplification(fast, [x], quantity="shear")
+    with pytest.raises(ValueError, match="no amplification of 'velocity'"):
+        amplification(fast, [x], quantity="velocity")
+
+
+def test_amplification_of_the_shear_force_under_a_slow_force():
+    """Static: F (1 - x / L) just after the force has passed x, F x / L just before it."""
+    x = np.array([0.15, 0.4])
+    low, high = envelope(crossing(0.1, modes=3), x, quantity="shear")
+    assert_allclose(high, FORCE * (1 - x / LENGTH), rtol=0.03)
+    assert_allclose(low, -FORCE * x / LENGTH, rtol=0.03)
+    found = amplification(crossing(0.1, modes=3), x, quantity="shear")
+    assert_allclose(found, np.maximum(high, -low) / FORCE / np.maximum(1 - x / LENGTH, x / LENGTH))

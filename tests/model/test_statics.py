@@ -17,8 +17,9 @@ from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.loads.base import trajectory
 from jaxbeam.case.loads.force import MovingForce
 from jaxbeam.case.loads.mass import MovingMass
+from jaxbeam.model.influence import static_peak
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.statics import influence_line, static_deflection, static_peak
+from jaxbeam.model.statics import influence_line, static_deflection
 from tests.as_oracle import as_oracle
 from tests.differences import central
 from tests.oracles import closed_forms, finite_elements

@@ -10,18 +10,13 @@ from jaxbeam.case.declared_checks import check_on_beam, suggestion
 from jaxbeam.case.quantities import QUANTITIES, quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.integrate import integrate_peaks
-from jaxbeam.model.layout import is_uniform
-from jaxbeam.model.sensing.output_rows import beside, quantity_factor
-from jaxbeam.model.statics import static_peak
+from jaxbeam.model.influence import static_peak
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
 from jaxbeam.simulation.simulate import integration_setup
 
-# Quantities whose static value is continuous in the position of a load.
-AMPLIFIED = tuple(
-    name for name, entry in QUANTITIES.items() if not entry.time_derivative and entry.field < 3
-)
+AMPLIFIED = tuple(name for name, entry in QUANTITIES.items() if not entry.time_derivative)
 
 
 class Envelope(NamedTuple):
@@ -102,12 +97,12 @@ def amplification(
 ) -> Float[Array, " position"]:
     """Dynamic amplification at positions x (m): largest dynamic over largest static value.
 
-    By default of the deflection; `quantity` may be rotation, slope, curvature, strain, moment or
-    stress, as in `envelope`. The static value is that of the same loads without inertia of beam and
-    loads, exact (see `static_peak`). The dynamic deflection has the modes of the case only, so with
-    few modes the ratio of a slow crossing is slightly below one; moments and the like are
-    statically corrected. Raises as `envelope`, and ValueError for a beam that can move as a rigid
-    body, or a quantity without a continuous static value.
+    By default of the deflection; `quantity` may be rotation, slope, curvature, strain, moment,
+    shear or stress, as in `envelope`. The static value is that of the same loads without inertia of
+    beam and loads, exact (see `static_peak`). The dynamic deflection has the modes of the case
+    only, so with few modes the ratio of a slow crossing is slightly below one; moments and the like
+    are statically corrected. Raises as `envelope`, and ValueError for a beam that can move as a rigid
+    body, or a quantity without a static value.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -124,21 +119,4 @@ def amplification(
         raise ValueError(f"no amplification of {quantity!r}; {suggestion(quantity, AMPLIFIED)}")
     quantity_of(quantity, **parameters)
     lowest, highest = envelope(case, x, tolerance, quantity=quantity, **parameters)
-    return xp.maximum(-lowest, highest) / static_amplified(case, x, quantity, **parameters)
-
-
-def static_amplified(
-    case: Case, x, quantity: str = "deflection", fibre_distance=None, section_modulus=None
-) -> Float[Array, " position"]:
-    """Largest absolute static value of a quantity at positions x (m), in its unit.
-
-    The denominator of `amplification`, which says what it is and which quantities have one.
-    Raises ValueError as it does.
-    """
-    parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
-    entry = quantity_of(quantity, **parameters)
-    x = xp.asarray(x, float)
-    order = 1 if entry.of_axis and is_uniform(case) else entry.field
-    at = beside(case, x) if entry.bends else x
-    static = static_peak(case, at, derivative=order)
-    return xp.abs(quantity_factor(case, at, entry, fibre_distance, section_modulus)) * static
+    return xp.maximum(-lowest, highest) / static_peak(case, x, quantity=quantity, **parameters)

@@ -2,13 +2,14 @@
 
 import numpy as np
 
-from jaxbeam.analysis.sections.amplification import AMPLIFIED, static_amplified
+from jaxbeam.analysis.sections.amplification import AMPLIFIED
 from jaxbeam.case.case import Case
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.model.influence import static_peak
 from jaxbeam.model.load_set import load_set
 from jaxbeam.simulation.record import Record
 
-MAX_WHEELS = 120  # of a record with amplification, as its static peaks take about 6 ms a wheel
+MAX_WHEELS = 400  # of a record with amplification, as its static peaks take about 2 ms a wheel
 NEGLIGIBLE = 1e-6  # share of the largest static value of a quantity that counts as none
 
 
@@ -16,8 +17,8 @@ NEGLIGIBLE = 1e-6  # share of the largest static value of a quantity that counts
 def record_amplification(record: Record) -> list[float | None]:
     """Largest absolute over largest static value of the quantity of each sensor of a record.
 
-    None at sensors of velocities, accelerations and shear forces, where the static value vanishes,
-    with a controller, for more wheels than MAX_WHEELS, and for beams whose static deflections are
+    None at sensors of velocities and accelerations, where the static value vanishes, with a
+    controller, for more wheels than MAX_WHEELS, and for beams whose static deflections are
     not known (see `static_peak`).
     """
     case = record.case
@@ -39,9 +40,11 @@ def _static(case: Case, sensor: Sensor) -> float | None:
     """Largest static value at a sensor; None where it is not known."""
     if sensor.quantity not in AMPLIFIED:
         return None
-    parameters = sensor.fibre_distance, sensor.section_modulus
+    channel = {
+        name: getattr(sensor, name) for name in ("quantity", "fibre_distance", "section_modulus")
+    }
     try:
-        value = float(static_amplified(case, [sensor.position], sensor.quantity, *parameters)[0])
+        value = float(static_peak(case, sensor.position, **channel))
     except ValueError:
         return None
     return value if np.isfinite(value) else None
