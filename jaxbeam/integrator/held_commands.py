@@ -18,7 +18,7 @@ class HeldCommands(AbstractInputPolicy):
 
     model: ModalModel
     commands: Float[Array, "event command batch"]
-    state_bound: Float[Array, " state"]
+    load_amplitude: Float[Array, " batch"]
     holds_commands: ClassVar[bool] = True
     implicit: ClassVar[bool] = False
 

@@ -25,14 +25,15 @@ class AbstractInputPolicy(Module):
     """Commands to the actuators of a run as a function of the state.
 
     With `implicit`, commands depend on the states at the Gauss nodes of the step. With
-    `holds_commands`, commands and memory change only at events of the schedule. A run is abandoned
-    as diverged where a state exceeds its `state_bound`.
+    `holds_commands`, commands and memory change only at events of the schedule. `load_amplitude`
+    is the least amplitude from which growth is divergence (see `growth`), infinite for commands
+    that do not depend on the state.
     """
 
     holds_commands: ClassVar[bool] = False
 
     implicit: eqx.AbstractVar[bool]
-    state_bound: eqx.AbstractVar[Float[Array, " state"]]
+    load_amplitude: eqx.AbstractVar[Float[Array, "*batch"]]
 
     @abc.abstractmethod
     def start(self, batch_size: int) -> Any:

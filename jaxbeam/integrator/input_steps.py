@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 
+from jaxbeam.integrator.growth import OVERFLOW
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import GAUSS_NODES
 from jaxbeam.integrator.step import advance, forces_and_vehicles, known_maps
@@ -30,8 +31,8 @@ def step_with_inputs(policy: AbstractInputPolicy, vehicles: Vehicles | None, car
     node_commands, memory = policy.inputs(memory, state, info, node_states)
     commands = collapse(node_commands, 0, 2)
     next_state, (state, forces) = advance(state, step, commands, vehicles)
-    # A run that diverges becomes NaN here, without affecting the others, before it overflows.
-    within = xp.abs(next_state[:count]) <= policy.state_bound[:, None]
+    # A run becomes NaN here, without affecting the others, before it overflows.
+    within = xp.abs(next_state) <= OVERFLOW
     next_state = xp.where(xp.all(within, axis=0), next_state, xp.nan)
     return (next_state, memory), (state, forces, commands, policy.observe(memory, info))
 
@@ -44,8 +45,6 @@ def advance_known_with_inputs(policy, vehicles, steps: StepInput, infos, state, 
     """
     of_forces, of_states = known_maps(steps, vehicles)
     count, batch_size, state_count = of_states.offset.shape
-    bound = np.full(state_count, np.inf)  # of vehicles none
-    bound[: steps.matrices.state_count] = policy.state_bound
     # State and commands.
     sources = np.ones((count + 1, batch_size, of_states.linear.shape[-1]))
     sources[0, :, :state_count] = state.T
@@ -62,7 +61,7 @@ def advance_known_with_inputs(policy, vehicles, steps: StepInput, infos, state, 
         sources[i, :, state_count:] = held
         observations.append(observed)
         next_state = of_states.at(i, sources[i])
-        within = np.abs(next_state) <= bound
+        within = np.abs(next_state) <= OVERFLOW
         if not within.all():
             next_state = np.where(within.all(axis=1, keepdims=True), next_state, np.nan)
         sources[i + 1, :, :state_count] = next_state

@@ -17,6 +17,14 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import DiscreteModel
+from jaxbeam.integrator.growth import (
+    amplitudes,
+    diverged,
+    growth_limit,
+    growth_marks,
+    has_feedback,
+    largest_by_marks,
+)
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.input_steps import advance_known_with_inputs, step_with_inputs
 from jaxbeam.integrator.kinks.steps import weights_with_impulses, with_impulses
@@ -235,7 +243,16 @@ def integrate_history(
     )
     history = jax.tree.map(lambda part: collapse(part, 0, 2)[:steps], history)
     states, commands, observed = history
-    return running_peaks, xp.concatenate([states, state[None]]), commands, observed, memory
+    states = xp.concatenate([states, state[None]])
+    if policy is not None and has_feedback(policy):
+        grid = discrete.grid
+        _, times, _ = grid.locate_steps(np.arange(steps + 1))
+        failed = diverged(discrete.model, grid, states, times, policy.load_amplitude)
+        states = xp.where(failed[:, None], xp.nan, states)
+        commands = xp.where(failed[:-1, None], xp.nan, commands)
+        if running_peaks is not None:
+            running_peaks = running_peaks.without(failed[-1])
+    return running_peaks, states, commands, observed, memory
 
 
 def integrate_peaks(
@@ -247,7 +264,7 @@ def integrate_peaks(
 ) -> tuple[RunningPeaks, Any]:
     """Integrate from rest over a grid: running peaks, and the final memory of the policy.
 
-    The loop ends early when all runs have diverged or, without a policy, when the energy left
+    The loop ends early when no run has finite numbers or, without a policy, when the energy left
     after the last exit cannot raise any peak. `max_loads` is the largest number of loads on the
     beam at once. Forward mode only.
     """
@@ -268,28 +285,40 @@ def integrate_peaks(
         return ~(all_loads_left & settled)
 
     def next_chunk(carry):
-        state, memory, peaks, first_step, _ = carry
-        state, memory, peaks, time, _ = chunk(state, memory, peaks, first_step)
+        state, memory, peaks, largest, first_step, _ = carry
+        state, memory, peaks, time, history = chunk(state, memory, peaks, first_step)
+        if feeds_back:
+            _, times, _ = grid.locate_steps(first_step + xp.arange(chunk_steps))
+            amplitude = amplitudes(discrete.model, history[0])
+            largest = xp.maximum(largest, largest_by_marks(marks, times, amplitude))
         first_step = first_step + chunk_steps
         continues = (
             xp.any(peaks.finite) if policy is not None else can_raise_peak(state, peaks, time)
         )
-        return state, memory, peaks, first_step, continues
+        return state, memory, peaks, largest, first_step, continues
 
     load_count, batch_size = loads.inertia.shape
     running_peaks = initial_peaks(
         discrete.position_count, load_count, batch_size, discrete.magnitude
     )
     memory = None if policy is None else policy.start(batch_size)
+    feeds_back, marks = policy is not None and has_feedback(policy), growth_marks(grid)
     start = (
         _initial_state(discrete, loads, policy),
         memory,
         running_peaks,
+        xp.zeros((len(marks), batch_size)) if feeds_back else None,
         xp.zeros((), int),
         xp.ones((), bool),
     )
     final: Any = while_loop(unfinished, next_chunk, start)
-    return final[2], final[1]
+    state, memory, running_peaks, largest, *_ = final
+    if feeds_back:
+        at_end = amplitudes(discrete.model, state[None])
+        largest = xp.maximum(largest, largest_by_marks(marks, marks[:1], at_end))
+        limit = growth_limit(largest, policy.load_amplitude)
+        running_peaks = running_peaks.without(largest[0] > limit)
+    return running_peaks, memory
 
 
 def integrate_at_events(

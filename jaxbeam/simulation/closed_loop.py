@@ -12,6 +12,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw
 from jaxbeam.case.fields import concrete
 from jaxbeam.integrator.events import EventSchedule, controller_schedule
+from jaxbeam.integrator.growth import load_amplitude
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Layout
@@ -19,7 +20,7 @@ from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensing.sensor_signals import noise_samples, sensor_sections
 from jaxbeam.model.state_space import state_space
-from jaxbeam.runtime.arrays import Array, any_jax, block_diag, set_at, xp
+from jaxbeam.runtime.arrays import Array, any_jax, block_diag, xp
 from jaxbeam.simulation.commands.path import command_path
 from jaxbeam.simulation.continuous_loop import ContinuousLoop
 from jaxbeam.simulation.sampled_loop import SampledLoop
@@ -75,13 +76,15 @@ def closed_loop(
             f" {interface.__name__}: "
             + ("give a period" if controller.period is None else "leave the period out")
         )
+    least = load_amplitude(case, plant.modal_model, loads)
+    if controller.open_loop:
+        least = xp.full(least.shape, xp.inf)
     if controller.period is None:
         model, output_rows = with_sensor_filters(plant, law.filters)
         states = 0 if controller.open_loop else law.state_count
         model, output_rows = _with_controller_states(model, output_rows, states)
-        bound = _state_bound(case, model)
         return ContinuousLoop(
-            plant, law, model, output_rows, bound, not controller.open_loop, states
+            plant, law, model, output_rows, least, not controller.open_loop, states
         )
     if not any_jax(plant, law, schedule):
         law = law.tabulated(schedule.times[schedule.control_sample >= 0])
@@ -99,24 +102,13 @@ def closed_loop(
         model=model,
         output_rows=output_rows,
         measured_rows=measured_rows,
-        state_bound=_state_bound(case, model),
+        load_amplitude=least,
         loads=loads,
         schedule=schedule,
         filter_sections=sections,
         path=command_path(case),
         noise=noise,
     )
-
-
-def _state_bound(case: Case, model: ModalModel) -> Float[Array, " state"]:
-    """Bound on the states beyond which a run has diverged: a deflection of the beam's length.
-
-    Mode shapes are of the order sqrt(2 / mass).
-    """
-    beam = case.beam
-    max_coordinate = beam.length * xp.sqrt(beam.linear_density * beam.length / 2)
-    bound = xp.full(model.state_count, xp.inf)
-    return set_at(bound, np.s_[0 : 2 * beam.modes : 2], max_coordinate)
 
 
 def _with_controller_states(

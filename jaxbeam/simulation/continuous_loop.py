@@ -31,7 +31,7 @@ class ContinuousLoop(AbstractInputPolicy):
     law: AbstractContinuousLaw
     model: ModalModel
     output_rows: Float[Array, "output state"]
-    state_bound: Float[Array, " state"]
+    load_amplitude: Float[Array, " batch"]
     implicit: bool = eqx.field(static=True)
     controller_states: int = eqx.field(static=True)
 

@@ -319,7 +319,7 @@ def _choose_substeps(
     if first_run is not None and policy is not None:
         first_states, commands = map(np.asarray, first_run(min_substeps, policy))
         if policy.holds_commands:
-            held = HeldCommands(policy.model, commands, policy.state_bound)
+            held = HeldCommands(policy.model, commands, policy.load_amplitude)
             fine = np.asarray(trial_run(case, shapes, schedule, np.asarray(2 * min_substeps), held))
             change = largest_change(deflections(first_states), deflections(fine), least)
             error = AMPLIFICATION * UNSAMPLED * change

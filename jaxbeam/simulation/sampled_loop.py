@@ -52,7 +52,7 @@ class SampledLoop(AbstractInputPolicy):
     model: ModalModel
     output_rows: Float[Array, "sensor state"]
     measured_rows: OutputRows | None
-    state_bound: Float[Array, " state"]
+    load_amplitude: Float[Array, " batch"]
     loads: LoadSet
     schedule: EventSchedule
     filter_sections: tuple

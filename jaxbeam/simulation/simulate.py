@@ -157,6 +157,7 @@ def _record(case: Case, integration: "Integration", times, errors) -> Record:
     loads, lost_times = load_set(case), peaks.contact_lost_time
     # Each wheel at its own time.
     lost_positions = xp.diagonal(loads.kinematics(lost_times)[0])
+    diverged = xp.any(xp.isnan(outputs.motion.coordinates))  # errors are not defined
     return Record(
         case=case,
         modes=integration.model.modes,
@@ -168,8 +169,8 @@ def _record(case: Case, integration: "Integration", times, errors) -> Record:
         **peaks._asdict(),
         **extremes._asdict(),
         contact_lost_position=lost_positions,
-        error_estimate=errors[0],
-        step_errors=errors[1],
+        error_estimate=xp.where(diverged, xp.nan, errors[0]),
+        step_errors=xp.where(diverged, xp.nan, errors[1]),
         steps=integration.steps,
     )
 

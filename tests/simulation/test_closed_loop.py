@@ -188,7 +188,7 @@ def test_run_under_its_own_commands_is_the_same_run(monkeypatch):
     policy = closed_loop(case, layout, load_set(case, layout), plan.schedule)
     closed = run_integration(case, plan, times, None, policy=policy)
     events = closed.grid.event_at(np.arange(closed.steps)) >= 0
-    held = HeldCommands(policy.model, closed.commands[events], policy.state_bound)
+    held = HeldCommands(policy.model, closed.commands[events], policy.load_amplitude)
     found = run_integration(case, plan, times, None, policy=held)
     assert len(asked) == 101 and events.sum() > 200
     assert_allclose(found.states, closed.states, rtol=0, atol=1e-14)

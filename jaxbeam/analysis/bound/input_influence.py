@@ -64,7 +64,7 @@ class _UnitCommands(AbstractInputPolicy):
     schedule: EventSchedule
     hold_index: Int[Array, " batch"]
     actuator_index: Int[Array, " batch"]
-    state_bound: Float[Array, " state"]
+    load_amplitude: float
     actuators: int = eqx.field(static=True)
     implicit: bool = eqx.field(static=True, default=False)
 
@@ -176,12 +176,11 @@ def _unit_responses(
     weight = xp.where(is_loaded, wheels.weight, 0.0)
     wheels = dataclasses.replace(wheels, weight=weight, histories=histories)
     loads = dataclasses.replace(case_loads, wheels=wheels)
-    state_bound = xp.full(model.state_count, xp.inf)
     policy = _UnitCommands(
         schedule=schedule,
         hold_index=hold_index,
         actuator_index=actuator_index,
-        state_bound=state_bound,
+        load_amplitude=np.inf,
         actuators=len(case.actuators),
     )
     grid = grid_by_schedule(case, model, schedule, substeps)

@@ -59,6 +59,10 @@ class RunningPeaks(Module):
         time = self.step_start + position * self.step_length
         return xp.where(self.finite, value, xp.nan), xp.where(self.finite, time, xp.nan)
 
+    def without(self, failed: Bool[Array, " batch"]) -> "RunningPeaks":
+        """The running peaks with those of some runs, which have diverged, as not finite."""
+        return eqx.tree_at(lambda own: own.finite, self, self.finite & ~failed)
+
     def peaks(self) -> Peaks:
         """Peaks at the end of the runs, with the batch axis first."""
         lost = xp.where(self.contact_lost_time < NEVER, self.contact_lost_time, xp.nan)
