@@ -76,6 +76,7 @@ def check(gain: float, period: float | None, units: Units) -> str:
         return "bounded" if judged < 0 else "slow"
     assert judged > 5, judged
     assert np.isnan(record.peak_deflection).all() and "diverges" in record.verdict
+    assert np.isnan(record.lowest_contact_force).all()
     return "diverges"
 
 

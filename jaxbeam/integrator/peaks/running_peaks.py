@@ -60,8 +60,15 @@ class RunningPeaks(Module):
         return xp.where(self.finite, value, xp.nan), xp.where(self.finite, time, xp.nan)
 
     def without(self, failed: Bool[Array, " batch"]) -> "RunningPeaks":
-        """The running peaks with those of some runs, which have diverged, as not finite."""
-        return eqx.tree_at(lambda own: own.finite, self, self.finite & ~failed)
+        """The running peaks, with no peak or contact of runs that have diverged."""
+        finite = self.finite & ~failed
+        contact = xp.where(finite, self.lowest_contact_force, xp.nan)
+        lost = xp.where(finite, self.contact_lost_time, NEVER)
+        return eqx.tree_at(
+            lambda own: (own.lowest_contact_force, own.contact_lost_time, own.finite),
+            self,
+            (contact, lost, finite),
+        )
 
     def peaks(self) -> Peaks:
         """Peaks at the end of the runs, with the batch axis first."""
