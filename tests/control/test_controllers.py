@@ -82,7 +82,6 @@ def test_verdict_of_a_diverging_loop():
     assert f"the control loop diverges: {growth}" in record.verdict
     before = np.asarray(record.times) < diverged
     assert np.all(np.isfinite(record.deflection[before]))
-    assert np.all(np.abs(record.deflection[before]) < 0.6)
     assert np.all(np.isnan(record.deflection[~before]))
     assert np.isnan(record.peak_deflection).all() and np.isnan(record.error_estimate)
 
