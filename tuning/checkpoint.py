@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxbeam.runtime.input_file import check_input, max_bytes, not_as_named
 from jaxbeam.runtime.whole_file import whole_file
 
 
@@ -39,10 +40,16 @@ NO_CHECKPOINT = Checkpoint()
 
 
 def checkpoint_path(checkpoint: str | os.PathLike | None, resume: bool) -> Path | None:
-    """Path of a checkpoint. Raises FileExistsError if it exists and `resume` is not set."""
+    """Path of a checkpoint.
+
+    Raises FileExistsError if it exists and `resume` is not set, FileNotFoundError without its
+    folder.
+    """
     path = None if checkpoint is None else Path(checkpoint)
     if path is not None and path.exists() and not resume:
         raise FileExistsError(f"{path} exists: resume that search, or delete it")
+    if path is not None and not path.parent.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: there is no folder {path.parent}")
     return path
 
 
@@ -68,13 +75,30 @@ def save(
 def load(path: Path, digest: str) -> dict[str, np.ndarray]:
     """Arrays written by `save`. Raises ValueError if damaged or written under another digest."""
     try:
-        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError):
-        raise ValueError(f"{path} is damaged: delete it to start anew") from None
+        arrays = read_arrays(path, "checkpoint")
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{error}; delete it to start anew") from None
     if str(arrays.pop("fingerprint", "")) != digest:
         raise ValueError(
             f"{path} belongs to another search (other case, parameters, runs or settings, or an"
             " older version of jaxbeam): delete it to start anew, or name another file"
         )
     return arrays
+
+
+def read_arrays(path: Path, what: str) -> dict[str, np.ndarray]:
+    """Arrays of a NumPy archive, by name; `what` it is to the user.
+
+    Raises ValueError for a file that is no such archive, damaged or too large, also once it is
+    unpacked; OSError if it cannot be read.
+    """
+    check_input(path, what)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(part.file_size for part in archive.infolist())
+        if unpacked <= max_bytes(what):
+            with np.load(path, allow_pickle=False) as file:
+                return {name: np.asarray(file[name]) for name in file.files}
+    except Exception:  # NumPy and zipfile raise many types for damaged files
+        raise not_as_named(path, "NumPy archive", b"PK") from None
+    raise ValueError(f"{path} holds {unpacked / 2**30:.3g} GB, too much for a {what}")

@@ -28,7 +28,6 @@ from jaxbeam.case.fields import (
 )
 from jaxbeam.runtime.arrays import Array
 
-MAX_MODES = 1000  # more modes would take minutes to compute
 SAME_POSITION = 1e-9  # of the length: closer positions are one
 
 # Whether an end condition holds the deflection and the rotation of the end.
@@ -191,8 +190,6 @@ class Beam(ReprWithUnits):
             inconsistent = self._validate_section(address)
         if inconsistent is not None:
             return inconsistent
-        if self.modes > MAX_MODES:
-            return f"{address}.modes must not exceed {MAX_MODES}; it is {self.modes}"
         return self._validate_hinges(address) or self._validate_damping(address)
 
     def _validate_section(self, address: str) -> str | None:

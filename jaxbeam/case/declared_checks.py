@@ -27,6 +27,7 @@ from jaxbeam.case.fields import (
 )
 from jaxbeam.case.former_words import WORDS
 from jaxbeam.case.kinds import kinds
+from jaxbeam.case.limits import check_count, check_entries, check_length
 from jaxbeam.case.quantities import OF_QUANTITY
 from jaxbeam.runtime.arrays import Array
 
@@ -89,6 +90,7 @@ def check_field(address: str, value: Any, field: dataclasses.Field) -> None:
                 f"{address} must be a whole number, {minimum} or more; it is"
                 f" {describe_value(value)}"
             )
+        check_count(address, value)
     elif "part" in field.metadata:
         part_class = field.metadata["part"]
         if value is not None and not isinstance(value, part_class):
@@ -101,6 +103,7 @@ def check_field(address: str, value: Any, field: dataclasses.Field) -> None:
         if value is not None:
             check_fields(address, value)
     elif "parts" in field.metadata:
+        check_length(address, len(value))
         for i, one in enumerate(value):
             if not isinstance(one, field.metadata["parts"]):
                 name = field.metadata["parts"].__name__
@@ -171,6 +174,7 @@ def _check_number(address: str, value: Any, field: dataclasses.Field) -> None:
         shape = np.shape(value)
         given = f"an array of shape {shape}" if shape else "one number"
         raise ValueError(f"{address} must be {describe_shape(field)}, not {given}")
+    check_entries(address, value)
     if not is_concrete(value):
         return
     numbers = np.atleast_1d(concrete(value))

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.beam_parts.properties import has
-from jaxbeam.case.case import Case, parts
+from jaxbeam.case.case import Case, list_sizes, parts
 from jaxbeam.case.controller import commanded
 from jaxbeam.case.declared_checks import (
     POSITION_TOLERANCE,
@@ -26,6 +26,7 @@ from jaxbeam.case.declared_checks import (
 )
 from jaxbeam.case.fields import ON_BEAM, concrete, is_concrete
 from jaxbeam.case.filters import nyquist_error
+from jaxbeam.case.limits import MAX_WHEELS, check_length
 from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
 from jaxbeam.case.loads.planar.sensors import VehicleSensor
 from jaxbeam.case.loads.vehicle_checks import known_numbers
@@ -59,6 +60,8 @@ def check_plant(case: Case) -> None:
 
     Raises ValueError as `check_case`.
     """
+    for key, count in list_sizes(case).items():
+        check_length(key, count)
     for address, part, part_class in parts(case):
         if not isinstance(part, part_class):
             raise ValueError(
@@ -73,6 +76,7 @@ def check_plant(case: Case) -> None:
         if error is not None:
             raise ValueError(error)
     _check_supports(case.supports, case.beam.length)
+    _check_wheels(case)
     _check_kinks(case)
     _check_profile(case)
     _check_labels(case.sensors)
@@ -115,6 +119,23 @@ def _check_supports(supports: tuple[Support, ...], length: Float[Array, ""]) -> 
                 f"supports.{min(i, j)} and supports.{max(i, j)} both hold the beam rigidly at"
                 f" {left:g} m; remove one"
             )
+
+
+def _check_wheels(case: Case) -> None:
+    """Validate that all loads together have no more wheels than can be computed."""
+    wheels = sum(map(_wheel_count, case.loads))
+    if wheels > MAX_WHEELS:
+        raise ValueError(
+            f"the loads have {wheels} wheels in all; {MAX_WHEELS} are the most: make several"
+            " cases of them"
+        )
+
+
+def _wheel_count(load: AbstractLoad) -> int:
+    """About how many wheels a load has, without its vehicles, which may take long to make."""
+    lists = (getattr(load, name, None) for name in ("axles", "offsets", "coaches"))
+    of_vehicle = max(1, *(0 if one is None else len(one) for one in lists))
+    return of_vehicle * getattr(load, "count", 1) * getattr(load, "people", 1)
 
 
 def _check_kinks(case: Case) -> None:

@@ -7,7 +7,9 @@ Keys follow from the fields of the classes, kinds from the classes that declare 
 import dataclasses
 import inspect
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import tomli_w
@@ -33,7 +35,7 @@ def load_case(path: str | os.PathLike) -> Case:
     """The validated case of a TOML file.
 
     A profile of kind "table" may have its points in a file of their own, `file = "profile.csv"`,
-    relative to the folder of the case file (see `profile_from_file`).
+    below the folder of the case file (see `profile_from_file`), and so may vehicles.
 
     Raises ValueError, with the file and the address or line, for invalid TOML, unknown keys or
     kinds, wrong types and the errors of `check_case`; OSError if the file cannot be read.
@@ -57,27 +59,43 @@ def load_case(path: str | os.PathLike) -> Case:
     return case
 
 
-def read_case(path: str | os.PathLike) -> Case:
+def read_case(path: str | os.PathLike, named: Mapping[str, Any] = MappingProxyType({})) -> Case:
     """The case of a TOML file, whose values are not validated yet.
 
-    Raises ValueError and OSError as `load_case`, but for the errors of `check_case`.
+    Files that the user has `named` by address, at profile.file or loads.0.model, take the place of
+    those in the case, and may be anywhere. Raises ValueError and OSError as `load_case`, but for
+    the errors of `check_case`.
     """
     content = read_toml(path)
-    _find_vehicle_files(content, Path(path).parent)
     try:
-        return case_from_dict(with_profile_file(content, path))
+        find_vehicle_files(content.get("loads"), Path(path).parent, named=named)
+        return case_from_dict(with_profile_file(content, path, named.get("profile.file")))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _find_vehicle_files(content: dict[str, Any], folder: Path) -> None:
-    """Paths of vehicle files, which are relative to the case file, as they are from here."""
-    loads = content.get("loads")
-    for load in loads if isinstance(loads, list) else ():
+def find_vehicle_files(
+    loads: Any,
+    folder: Path,
+    address: str = "loads",
+    named: Mapping[str, Any] = MappingProxyType({}),
+) -> None:
+    """Paths of vehicle files in tables of loads, relative to a folder, as they are from here.
+
+    Those that the user has `named` by address take their place. Raises as `check_input` for
+    another file that is not below the folder.
+    """
+    for i, load in enumerate(loads if isinstance(loads, list) else ()):
         coaches = load.get("coaches") if isinstance(load, dict) else None
-        for table in (load, *(coaches if isinstance(coaches, list) else ())):
+        tables = {f"{address}.{i}.model": load}
+        for j, coach in enumerate(coaches if isinstance(coaches, list) else ()):
+            tables[f"{address}.{i}.coaches.{j}.model"] = coach
+        for own, table in tables.items():
             model = table.get("model") if isinstance(table, dict) else None
-            if isinstance(model, str) and is_path(model):
+            if own in named and isinstance(table, dict):
+                table["model"] = named[own]
+            elif isinstance(model, str) and is_path(model):
+                read_toml(folder / model, "vehicle file", folder, own)
                 table["model"] = str(folder / model)
 
 
@@ -92,6 +110,7 @@ def load_controller(path: str | os.PathLike) -> AbstractController:
         if "controller" not in content:
             raise ValueError("has no controller; write a table [controller]")
         if set(content) - {"title", "controller"}:
+            find_vehicle_files(content.get("loads"), Path(path).parent)
             case_from_dict(with_profile_file(content, path))  # to validate the other tables
         return _read_key("controller", content["controller"])
     except ValueError as error:
@@ -169,9 +188,13 @@ def case_to_dict(case: Case, whole: bool = False) -> dict[str, Any]:
 def load_case_with(path: str | os.PathLike, settings: dict[str, Any]) -> Case:
     """The case of a file with other entries at some addresses, validated as it is then.
 
-    `settings` are those of `with_settings`. Raises as `load_case` and `with_settings`.
+    `settings` are those of `with_settings`; `profile.file` names a file with a profile. Raises as
+    `load_case` and `with_settings`.
     """
-    return with_settings(read_case(path), settings) if settings else load_case(path)
+    if not settings:
+        return load_case(path)
+    others = {address: value for address, value in settings.items() if address != "profile.file"}
+    return with_settings(read_case(path, settings), others)
 
 
 def with_settings(case: Case, settings: dict[str, Any]) -> Case:

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, axis_names
+from jaxbeam.case.limits import MAX_COUNTS
 from jaxbeam.case.profiles.table import TableProfile
 from jaxbeam.case.quantities import OF_QUANTITY
 from jaxbeam.files.declared_keys import Key, table_classes, table_keys, tables
@@ -25,7 +26,7 @@ def json_schema() -> dict[str, Any]:
     properties: dict[str, Any] = {"title": {"type": "string", "description": "title of the case"}}
     for name, (part_class, listed) in tables().items():
         table = _table(part_class, definitions)
-        properties[name] = {"type": "array", "items": table} if listed else table
+        properties[name] = _list_of(name, table) if listed else table
     return {
         "$schema": DIALECT,
         "title": "Case file of jaxbeam",
@@ -87,18 +88,23 @@ def _value(key: Key, definitions: dict[str, Any]) -> dict[str, Any]:
     """Schema of the value of a key."""
     if key.part_class is not None:
         table = _table(key.part_class, definitions)
-        return {"type": "array", "items": table} if key.listed else table
+        return _list_of(key.name, table) if key.listed else table
     unit = "" if key.unit in ("", "1") else f" ({key.unit})"
     value: dict[str, Any] = {"description": key.meaning + unit.replace(OF_QUANTITY, "its unit")}
     if key.is_number:
         value |= _number(key)
     elif key.is_count:
         value |= {"type": "integer", "minimum": key.field.metadata["minimum"]}
+        value |= {"maximum": MAX_COUNTS[key.name]} if key.name in MAX_COUNTS else {}
     else:
         value |= {"enum": [*key.words]} if key.words else {"type": "string"}
     if not (key.default is dataclasses.MISSING or key.default in (None, "")):
         value["default"] = key.default
     return value
+
+
+def _list_of(name: str, table: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "array", "items": table, "maxItems": MAX_COUNTS[name]}
 
 
 def _number(key: Key) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxbeam.files.spreadsheet import as_text_cell
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.runtime.whole_file import whole_file
 
@@ -65,5 +66,6 @@ def _write_csv(system: StateSpace, path: Path) -> None:
     labels = [*(f"{step}{signal.name}" for signal in system.states), *names(system.outputs)]
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(heads)
-        writer.writerows([label, *row] for label, row in zip(labels, rows.tolist(), strict=True))
+        writer.writerow(map(as_text_cell, heads))
+        named = zip(map(as_text_cell, labels), rows.tolist(), strict=True)
+        writer.writerows([label, *row] for label, row in named)

@@ -5,6 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from jaxbeam.case.profiles.table import TableProfile
+from jaxbeam.runtime.input_file import read_text_input
+
+POINTS = ("positions", "heights", "point_heights")  # keys of a profile in the case file itself
 
 
 def profile_from_file(path: str | os.PathLike) -> TableProfile:
@@ -13,8 +16,8 @@ def profile_from_file(path: str | os.PathLike) -> TableProfile:
     They are separated by a comma, semicolon, tab or spaces; further columns are left out. Empty
     lines and lines that begin with # are comments, and the first other line may name the columns.
 
-    Raises ValueError, with the file and the line, for anything else; OSError if the file cannot be
-    read.
+    Raises ValueError, with the file and the line, for anything else, and for a file that is too
+    large; OSError if the file cannot be read, or is a device or a pipe.
 
     >>> import pathlib, tempfile
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "road.csv"
@@ -26,35 +29,39 @@ def profile_from_file(path: str | os.PathLike) -> TableProfile:
     return TableProfile(positions, heights)
 
 
-def with_profile_file(content: dict[str, Any], path: str | os.PathLike) -> dict[str, Any]:
+def with_profile_file(
+    content: dict[str, Any], path: str | os.PathLike, named: Any = None
+) -> dict[str, Any]:
     """Tables of a case file with the points of the profile in place of the file that has them.
 
-    `path` is that of the case file. Raises ValueError and OSError as `profile_from_file` does, and
-    ValueError for a table with both points and a file.
+    `path` is that of the case file, below whose folder the profile must be; one that the user has
+    `named` beside the case file takes its place, and may be anywhere. Raises ValueError and OSError
+    as `profile_from_file` does, and ValueError for a table with both points and a file.
     """
-    profile = content.get("profile")
-    if not isinstance(profile, dict) or profile.get("kind") != "table" or "file" not in profile:
+    profile = content.get("profile", {} if named is not None else None)
+    if not isinstance(profile, dict):
+        return content
+    if named is not None:
+        table = {"kind": "table"} | {k: v for k, v in profile.items() if k not in (*POINTS, "file")}
+        table["positions"], table["point_heights"] = _read_points(Path(str(named)))
+        return content | {"profile": table}
+    if profile.get("kind") != "table" or "file" not in profile:
         return content
     table = dict(profile)
     name = table.pop("file")
     if not isinstance(name, str):
         raise ValueError(f"profile.file must be the name of a file in quotes, not {name!r}")
-    for key in ("positions", "heights", "point_heights"):
+    for key in POINTS:
         if key in table:
             raise ValueError(f"profile has both a file and {key}; leave one out")
-    table["positions"], table["point_heights"] = _read_points(Path(path).parent / name)
+    folder = Path(path).parent
+    table["positions"], table["point_heights"] = _read_points(folder / name, folder)
     return content | {"profile": table}
 
 
-def _read_points(path: Path) -> tuple[list[float], list[float]]:
+def _read_points(path: Path, below: Path | None = None) -> tuple[list[float], list[float]]:
     """Positions and heights (m) of a file."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise type(error)(f"cannot read the profile {path}: {reason}") from None
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: a profile is text in UTF-8, which this is not") from None
+    text = read_text_input(path, "profile", below, "profile.file")
     points: list[tuple[float, float]] = []
     has_names = False
     for number, line in enumerate(text.splitlines(), 1):
@@ -65,9 +72,10 @@ def _read_points(path: Path) -> tuple[list[float], list[float]]:
             points.append((float(cells[0]), float(cells[1])))
         except (ValueError, IndexError):
             if points or has_names or len(cells) < 2:
+                # What the line says is not quoted: the file may be one of secrets.
                 raise ValueError(
                     f"{path}, line {number}: a line of a profile is a position and a height in m,"
-                    f" such as 12.5, 0.003; it is {line.strip()[:80]!r}"
+                    " such as 12.5, 0.003, which this is not"
                 ) from None
             has_names = True
     if len(points) < 2:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.whole_file import naming_file, whole_file
 
 Row = Sequence[str]
 
@@ -53,8 +53,10 @@ class ReportSection(NamedTuple):
 
 
 def check_report_folder(folder: str | os.PathLike, overwrite: bool) -> None:
-    """Raises FileExistsError if the folder is not empty and `overwrite` is not set."""
+    """Raises FileExistsError if it is a file, or not empty and `overwrite` is not set."""
     folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise FileExistsError(f"{folder} is a file; a report is written to a folder")
     if folder.exists() and any(folder.iterdir()) and not overwrite:
         raise FileExistsError(f"the folder {folder} is not empty; choose another, or overwrite it")
 
@@ -74,7 +76,8 @@ def write_report(
     """
     check_report_folder(folder, overwrite)
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    with naming_file(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     for section in sections:
         for part in section.parts:
             if isinstance(part, ReportFigure) and part.figure is not None:

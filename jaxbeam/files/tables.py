@@ -1,6 +1,8 @@
 """Results as files for other programs, by their ending: tables of columns, and whole datasets."""
 
+import itertools
 import os
+import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxbeam.files.endings import DATASETS, RESULTS, TABLES, check_ending
+from jaxbeam.files.spreadsheet import as_text_cell
 from jaxbeam.runtime.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -21,8 +24,9 @@ def save(result: Any, path: str | os.PathLike, overwrite: bool = False) -> None:
     """Write a result to a file: a record, modes, frequency responses, an envelope, a sweep.
 
     The ending decides: .nc and .zarr hold its dataset, with units and coordinates; .csv (UTF-8, all
-    digits), .xlsx, .mat and .parquet its `columns`, with units in their heads (`write_table`). Of a
-    sweep, a row for each run (`files.sweep_table.sweep_columns`). Raises FileExistsError if the
+    digits), .xlsx, .mat and .parquet its `columns`, with units in their heads (`write_table`); a
+    text that a spreadsheet would run as a formula has an apostrophe before it in the first two. Of
+    a sweep, a row for each run (`files.sweep_table.sweep_columns`). Raises FileExistsError if the
     file exists, without `overwrite`; ValueError for another ending; ImportError, with what to
     install, if a package is missing.
 
@@ -110,16 +114,26 @@ def _write_csv(beside: Path, columns: Columns) -> None:
 
     with beside.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(columns)
+        writer.writerow(map(as_text_cell, columns))
         writer.writerows(_rows(columns))
 
 
 def _rows(columns: Columns) -> Any:
-    return zip(*(column.tolist() for column in columns.values()), strict=True)
+    """Rows of cells for a spreadsheet."""
+    cells = (
+        map(_text_or_number, column) if column.dtype == object else column.tolist()
+        for column in columns.values()
+    )
+    return zip(*cells, strict=True)
+
+
+def _text_or_number(cell: Any) -> Any:
+    return as_text_cell(cell) if isinstance(cell, str) else cell
 
 
 def _write_excel(beside: Path, columns: Columns) -> None:
     import openpyxl
+    from openpyxl.writer.excel import ExcelWriter
 
     count = max((column.size for column in columns.values()), default=0)
     if count > MAX_EXCEL_ROWS:
@@ -128,10 +142,18 @@ def _write_excel(beside: Path, columns: Columns) -> None:
         )
     book = openpyxl.Workbook(write_only=True)
     sheet = book.create_sheet("jaxbeam")
-    sheet.append(list(columns))
-    for row in _rows(columns):
-        sheet.append([v if isinstance(v, str) or np.isfinite(v) else None for v in row])
-    book.save(beside)
+    for row in itertools.chain([map(as_text_cell, columns)], _rows(columns)):
+        sheet.append([_excel_cell(cell) for cell in row])
+    # `book.save` leaves a file open that it cannot write.
+    with zipfile.ZipFile(beside, "w", zipfile.ZIP_DEFLATED) as archive:
+        ExcelWriter(book, archive).save()
+
+
+def _excel_cell(cell: Any) -> Any:
+    """A number, None if it is not finite, or a text, without the ends of lines that XML changes."""
+    if isinstance(cell, str):
+        return cell.replace("\r", "_x000D_")  # as Office Open XML (ISO 29500) writes them
+    return cell if np.isfinite(cell) else None
 
 
 def _write_matlab(beside: Path, columns: Columns) -> None:

@@ -4,6 +4,8 @@ import json
 import os
 from pathlib import Path
 
+from jaxbeam.runtime.input_file import check_input
+
 CODECS = ("bytes", "vlen-utf8", "zstd")
 DATA_TYPES = ("bool", "uint8", "int32", "int64", "float32", "float64", "string")
 OTHER_FORMATS = (".zarray", ".zgroup", ".zattrs", ".zmetadata")  # files of zarr of format 2
@@ -13,7 +15,7 @@ def check_codecs(path: Path) -> None:
     """Check, before anything is decoded, that a store has no codecs but those of jaxbeam.
 
     Others, of format 2 above all, may run code of the store. Raises ValueError for one, and for
-    metadata that cannot be read.
+    metadata that cannot be read; OSError for a part that is no regular file.
     """
     for folder, folders, files in os.walk(path):
         # A link could lead to metadata that is changed after this check.
@@ -21,6 +23,8 @@ def check_codecs(path: Path) -> None:
         foreign = [*links, *(name for name in files if name in OTHER_FORMATS)]
         if foreign:
             raise ValueError(f"jaxbeam writes no {foreign[0]}, which is in {folder}")
+        for name in files:
+            check_input(Path(folder, name), "part of a store")
         if "zarr.json" in files:
             _check_metadata(Path(folder, "zarr.json"))
 

@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case, replace
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.limits import MAX_SAMPLES
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.integrator.integrate import integrate_history
@@ -31,7 +32,6 @@ from jaxbeam.integrator.time_grid import (
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 
-MAX_STEPS = 10**8  # samples or time steps of a run; more exceed memory or take days
 MAX_TRIALS = 40  # step sizes tried
 CONVERGENCE_ORDER = 9  # assumed order of the error in the step; the true order is higher
 CLOSE_SAMPLES = 0.5  # share of a step; closer ones need no trial with their own steps
@@ -70,10 +70,10 @@ class StepTrial(NamedTuple):
 
 
 def check_step_count(count: float, step: float) -> None:
-    """Raises RuntimeError if a run has more than MAX_STEPS time steps, of `step` (s)."""
-    if not count <= MAX_STEPS:
+    """Raises RuntimeError if a run has more than MAX_SAMPLES time steps, of `step` (s)."""
+    if not count <= MAX_SAMPLES:
         raise RuntimeError(
-            f"the run takes {count:.1e} time steps of {step:.1e} s, more than {MAX_STEPS:.0e}:"
+            f"the run takes {count:.1e} time steps of {step:.1e} s, more than {MAX_SAMPLES:.0e}:"
             " check stiffnesses, masses and damping, shorten the run, or keep fewer modes"
             " (beam.modes)"
         )

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.limits import MAX_SAMPLED, MAX_SAMPLES
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.events import EventSchedule, sample_schedule
@@ -26,7 +27,6 @@ from jaxbeam.integrator.static_shapes import StaticShapes, model_limits, static_
 from jaxbeam.integrator.step_size import (
     CONVERGENCE_ORDER,
     MAX_DIVERGED_HALVINGS,
-    MAX_STEPS,
     NO_STEP,
     UNSAMPLED,
     ErrorFloor,
@@ -266,13 +266,16 @@ def sample_times(case: Case) -> Float[Array, " time"]:
     """Times (s) of the samples of a run: from 0 to its duration at its sample rate.
 
     A run too short for a second sample has one at its end. Raises ValueError if there are more than
-    MAX_STEPS.
+    MAX_SAMPLES, or of all sensors together than MAX_SAMPLED.
     """
     duration, rate = float(concrete(case.run.duration)), float(concrete(case.run.sample_rate))
-    if duration * rate > MAX_STEPS:
+    channels = max(1, len(case.sensors))
+    limit = min(MAX_SAMPLES, MAX_SAMPLED / channels)
+    if duration * rate > limit:
+        of_sensors = f" of {channels} sensors" if limit < MAX_SAMPLES else ""
         raise ValueError(
             f"run.duration ({duration:g} s) and run.sample_rate ({rate:g} Hz) make"
-            f" {duration * rate:.3g} samples, more than {MAX_STEPS:.0e}: lower one of them"
+            f" {duration * rate:.3g} samples{of_sensors}, more than {limit:.0e}: lower one of them"
         )
     intervals = int(np.floor(duration * rate * (1 + 1e-12)))
     return xp.arange(intervals + 1) / rate if intervals else xp.array([0.0, duration])

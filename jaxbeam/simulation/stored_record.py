@@ -16,6 +16,7 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes, mesh_layout, modes
 from jaxbeam.model.theory.sections import sections
 from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.input_file import check_input, not_as_named
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.result_variables import MODE_FIELDS, MODE_VARIABLES, VARIABLES
 
@@ -105,7 +106,7 @@ def _is_sampled(case: Case) -> bool:
 def read_record(path: str | os.PathLike) -> Record:
     """Record from a netCDF file or zarr store written by `Record.save`.
 
-    Raises OSError if the file cannot be read, ValueError if it is not that of a record.
+    Raises OSError if the file cannot be read, ValueError if it is damaged or not that of a record.
 
     >>> import jaxbeam as jb
     >>> import pathlib, tempfile
@@ -122,5 +123,9 @@ def read_record(path: str | os.PathLike) -> Record:
         check_codecs(Path(path))
         dataset = xarray.open_zarr(path, consolidated=False, zarr_format=3)
         return record_from_xarray(dataset.load())
-    with xarray.open_dataset(path, engine="scipy") as dataset:
-        return record_from_xarray(dataset.load())
+    check_input(path, "record")
+    try:
+        dataset = xarray.load_dataset(path, engine="scipy")
+    except Exception:  # xarray and scipy raise many types for damaged files
+        raise not_as_named(path, "classic netCDF file", b"CDF") from None
+    return record_from_xarray(dataset)

@@ -1,11 +1,18 @@
 """Files appear whole or not at all."""
 
 import ast
+import errno
+import resource
+import signal
 
+import numpy as np
 import pytest
 
+import jaxbeam as jb
+from jaxbeam.files.matrices import write_state_space
 from jaxbeam.runtime.whole_file import whole_file
 from tests.modules import module_files, parse
+from tuning.checkpoint import save
 
 
 def test_a_write_that_stops_leaves_what_was_there(tmp_path):
@@ -37,6 +44,69 @@ def test_a_folder_takes_the_place_of_a_folder_and_links_stay(tmp_path):
         beside.mkdir()
         (beside / "new").touch()
     assert link.is_symlink() and [path.name for path in place.iterdir()] == ["new"]
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "no space left on device"),
+        (OSError(errno.EDQUOT, "Disk quota exceeded"), "disk quota exceeded"),
+        (PermissionError(errno.EACCES, "Permission denied", ".x.123.csv"), "permission denied"),
+        (OSError("error of a library"), "error of a library"),
+    ],
+)
+def test_an_error_names_the_file_that_the_user_gave(tmp_path, monkeypatch, error, said):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OSError) as raised, whole_file("x.csv") as beside:
+        beside.write_text("half")
+        raise error
+    assert str(raised.value) == f"cannot write x.csv: {said}" and raised.value.errno == error.errno
+    assert list(tmp_path.iterdir()) == []
+
+
+WRITERS = {
+    "record.csv": lambda path: jb.save(RECORD, path),
+    "record.xlsx": lambda path: jb.save(RECORD, path),
+    "record.mat": lambda path: jb.save(RECORD, path),
+    "record.parquet": lambda path: jb.save(RECORD, path),
+    "record.nc": lambda path: jb.save(RECORD, path),
+    "record.zarr": lambda path: jb.save(RECORD, path),
+    "case.toml": lambda path: jb.save_case(CASE, path),
+    "system.mat": lambda path: write_state_space(jb.state_space(CASE).at(0.0), path),
+    "system.npz": lambda path: write_state_space(jb.state_space(CASE).at(0.0), path),
+    "system.json": lambda path: write_state_space(jb.state_space(CASE).at(0.0), path),
+    "system.csv": lambda path: write_state_space(jb.state_space(CASE).at(0.0), path),
+    "state.npz": lambda path: save(path, "", {"a": np.arange(3)}),
+}
+CASE = jb.Case(
+    jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535), sensors=[jb.Sensor(0.3)]
+)
+RECORD = jb.modes(CASE)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_writer_names_a_missing_folder(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError) as raised:
+        WRITERS[name](f"nodir/{name}")
+    assert str(raised.value) == f"cannot write nodir/{name}: there is no folder nodir"
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_writer_names_its_file_on_a_full_disk(tmp_path, monkeypatch, name):
+    """Files are limited to 20 bytes, as `ulimit -f` does, in place of a full disk."""
+    monkeypatch.chdir(tmp_path)
+    former = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20, former[1]))
+    try:
+        with pytest.raises(OSError) as raised:
+            WRITERS[name](name)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, former)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert str(raised.value) == f"cannot write {name}: file too large"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_nothing_is_written_at_its_place():

@@ -143,9 +143,7 @@ def test_full_disk_keeps_finished_blocks(unfinished, complete, tmp_path):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # bytes in a file
     try:
-        with pytest.raises(
-            OSError, match=r"cannot write to .*: file too large; finished blocks are"
-        ):
+        with pytest.raises(OSError, match=r"cannot write .*: file too large; finished blocks are"):
             sweep(path, resume=True)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)

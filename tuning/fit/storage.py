@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxbeam.case.case import Case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from tuning.checkpoint import load, save
+from tuning.checkpoint import read_arrays, save
 from tuning.fit.dataset import make_dataset
 from tuning.fit.least_squares import LeastSquares
 from tuning.fit.multi_start import LocalMinimum
@@ -64,7 +64,8 @@ def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None
 def load_fit(path: str | os.PathLike) -> Fit:
     """Fit from a file written by `save_fit`.
 
-    Raises ValueError if there is no such file, or it is damaged or no fit.
+    Raises ValueError if there is no such file, or it is damaged or no fit, OSError if it cannot be
+    read.
 
     >>> import tuning
     >>> print(str(tuning.load_fit("fit.npz")).splitlines()[1])
@@ -103,18 +104,14 @@ def load_fit(path: str | os.PathLike) -> Fit:
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], dict]:
     """Arrays and header of a file. Raises ValueError if it is no fit of the present format."""
-    try:
-        arrays = load(path, FORMAT)
-    except ValueError as error:
-        try:
-            load(path, FORMER_FORMAT)
-        except ValueError:
-            raise ValueError(
-                f"{path} is no fit, or is damaged; name the .npz file that identify wrote"
-            ) from error
+    arrays = read_arrays(path, "fit")
+    found = str(arrays.pop("fingerprint", ""))
+    if found == FORMER_FORMAT:
+        raise ValueError(f"{path} was written by jaxbeam 0.1: identify from the logs again")
+    if found != FORMAT or "about" not in arrays:
         raise ValueError(
-            f"{path} was written by jaxbeam 0.1: identify from the logs again"
-        ) from error
+            f"{path} is a NumPy archive, but no fit; name the .npz file that identify wrote"
+        )
     return arrays, json.loads(str(arrays["about"]))
 
 

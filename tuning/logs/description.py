@@ -17,6 +17,7 @@ from jaxbeam.case.reading.tables import (
     check_table,
 )
 from jaxbeam.case.reading.toml_file import read_toml
+from jaxbeam.files.case_file import find_vehicle_files
 
 _KEYS = {"loads": TABLES, "columns": TABLE, "time": WORD, "runs": TABLE}
 _COLUMN_KEYS = {
@@ -78,12 +79,16 @@ def read_description(log: Path) -> LogDescription:
     one) and values of the wrong type.
     """
     path = log.with_suffix(".toml")
-    if not path.is_file():
+    if not path.exists():
         return LogDescription()
     data = read_toml(path, "description of a log")
     if "beam" in data:  # a case file of the same stem
         return LogDescription()
     try:
+        find_vehicle_files(data.get("loads"), path.parent)
+        for name, run in data["runs"].items() if isinstance(data.get("runs"), dict) else ():
+            loads = run.get("loads") if isinstance(run, dict) else None
+            find_vehicle_files(loads, path.parent, f"runs.{name}.loads")
         return _description(data)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None

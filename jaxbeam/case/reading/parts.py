@@ -9,6 +9,7 @@ from jaxbeam.case.declared_checks import check_field, describe_value, missing_er
 from jaxbeam.case.fields import describe_shape, fits_shape
 from jaxbeam.case.former_words import with_attribute_names
 from jaxbeam.case.kinds import find_kind, kinds
+from jaxbeam.case.limits import check_length
 from jaxbeam.case.quantities import OF_QUANTITY, unit_of
 from jaxbeam.case.reading.units import in_si
 
@@ -50,11 +51,12 @@ def read_part(address: str, table: dict[str, Any], part_class: type) -> Any:
 def read_parts(address: str, tables: Any, part_class: type) -> tuple[Any, ...]:
     """The parts that a list of tables describes.
 
-    Raises ValueError, with the address, if it is no such list, and as `read_part` does.
+    Raises ValueError, with the address, if it is no such list or too long, and as `read_part` does.
     """
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         listed = re.sub(r"\.\d+", "", address).removeprefix(".")
         raise ValueError(f"{address} must be a list of tables; write [[{listed}]]")
+    check_length(address, len(tables))
     return tuple(read_part(f"{address}.{i}", one, part_class) for i, one in enumerate(tables))
 
 

@@ -6,26 +6,29 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from jaxbeam.runtime.input_file import read_text_input
+
 MAX_DEPTH = 32  # of tables and lists within each other; no file that people write comes near
 
 
-def read_toml(path: str | os.PathLike, what: str = "case file") -> dict[str, Any]:
+def read_toml(
+    path: str | os.PathLike,
+    what: str = "case file",
+    below: Path | None = None,
+    address: str = "",
+) -> dict[str, Any]:
     """Tables of a file, validated as TOML only; `what` it is to the user.
 
-    Raises OSError if the file cannot be read, ValueError if it is not UTF-8, not valid TOML, or
-    nested without end; both name the file.
+    A file that another one names at an `address` must be `below` the folder of that one. Raises
+    OSError if the file cannot be read, ValueError if it is elsewhere, too large, not UTF-8, not
+    valid TOML, or nested without end; both name the file.
     """
-    text = ""
+    text = read_text_input(path, what, below, address)
     try:
-        text = Path(path).read_text(encoding="utf-8-sig")
         content = tomllib.loads(text)
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise type(error)(f"cannot read the {what} {path}: {reason}") from None
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: a {what} is text in UTF-8, which this is not") from None
     except (ValueError, RecursionError) as error:  # RecursionError: lists nested without end
-        raise ValueError(f"{path}: not valid TOML: {error}{_hint(text, str(error))}") from None
+        hint = _hint(text, str(error)) if below is None else ""  # quotes nothing of other files
+        raise ValueError(f"{path}: not valid TOML: {error}{hint}") from None
     if _depth_exceeds(content, MAX_DEPTH):
         raise ValueError(f"{path}: tables or lists are nested more than {MAX_DEPTH} deep")
     return content

@@ -9,6 +9,7 @@ import io
 import json
 import math
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ import scipy
 
 from jaxbeam.files.export.gains import ARRAYS, Gains
 from jaxbeam.files.export.header import c_header
+from jaxbeam.files.spreadsheet import as_text_cell
+from jaxbeam.runtime.input_file import check_input, describe_content
 from jaxbeam.runtime.whole_file import whole_file
 
 FORMAT = "jaxbeam gains 3"
@@ -46,10 +49,16 @@ def read_gains(path: str | os.PathLike) -> Gains:
     path = Path(path)
     if path.suffix not in READERS:
         raise ValueError(f"{path}: gains are read from {', '.join(READERS)}")
+    check_input(path, "gains")
     try:
         gains, check_values = _gains_from_file(*READERS[path.suffix](path))
-    except (ValueError, KeyError, TypeError):
-        raise ValueError(f"{path}: not a file of gains written by jaxbeam") from None
+    except ImportError:
+        raise
+    except Exception:  # readers raise many types for damaged files
+        raise ValueError(
+            f"{path}: not a file of gains written by jaxbeam, or damaged: it is"
+            f" {describe_content(path.read_bytes()[:4096])}"
+        ) from None
     computed = gains.checksum, gains.test_command.tolist(), gains.test_estimate.tolist()
     if computed != check_values:
         raise ValueError(
@@ -119,13 +128,20 @@ def _to_csv(gains: Gains) -> bytes:
             rows += [["rest", mass, speed, "", *gains.rest[i, j].ravel()]]
     rows += [["filter", "", "", *row] for row in gains.filters]
     rows += [["estimator", "", "", "", *row] for row in gains.estimator]
-    lines = [f"# {json.dumps(_metadata(gains))}"]
-    lines += [",".join(map(_csv_cell, row)) for row in rows]
-    return ("\n".join(lines) + "\n").encode()
+    text = io.StringIO()
+    # A comma in the name of a body would begin a cell, which may be a formula.
+    metadata = re.sub(
+        r'"(?:[^"\\]|\\.)*"',
+        lambda name: re.sub(r",(?=\s*[=+@-])", r"\\u002c", name[0]),
+        json.dumps(_metadata(gains)),
+    )
+    text.write(f"# {metadata}\n")
+    csv.writer(text, lineterminator="\n").writerows([map(_csv_cell, row) for row in rows])
+    return text.getvalue().encode()
 
 
 def _csv_cell(entry: Any) -> str:
-    return entry if isinstance(entry, str) else repr(float(entry))
+    return as_text_cell(entry) if isinstance(entry, str) else repr(float(entry))
 
 
 def _from_csv(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxbeam.runtime.dataset import labelled_dataset
+from jaxbeam.runtime.whole_file import naming_file
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -64,13 +65,8 @@ def explaining_damage(path: Path):
 @contextlib.contextmanager
 def explaining_write_errors(path: Path):
     """Replace errors in writing; raises OSError that says that finished blocks are kept."""
-    try:
+    with naming_file(path, "; finished blocks are kept: mend this, then resume"):
         yield
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise type(error)(
-            f"cannot write to {path}: {reason}; finished blocks are kept: mend this, then resume"
-        ) from None
 
 
 @contextlib.contextmanager
@@ -84,12 +80,15 @@ def new_store(path: Path, fingerprint: str) -> Iterator[Any]:
     # Written beside the path and renamed, so that a store is complete or does not exist.
     temporary_path = path.with_name(f".{path.name}.start")
     shutil.rmtree(temporary_path, ignore_errors=True)
-    with explaining_write_errors(path):
-        group = zarr.create_group(temporary_path, zarr_format=3)
-        group.create_group(BLOCKS_GROUP)
-        yield group
-        group.attrs[FINGERPRINT_ATTRIBUTE] = fingerprint
-        temporary_path.rename(path)
+    try:
+        with naming_file(path):
+            group = zarr.create_group(temporary_path, zarr_format=3)
+            group.create_group(BLOCKS_GROUP)
+            yield group
+            group.attrs[FINGERPRINT_ATTRIBUTE] = fingerprint
+            temporary_path.rename(path)
+    finally:
+        shutil.rmtree(temporary_path, ignore_errors=True)
 
 
 def _of_any_length(values: np.ndarray) -> np.ndarray:

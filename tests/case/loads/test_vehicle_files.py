@@ -107,17 +107,17 @@ def test_settings_reach_the_numbers_and_the_model():
 
 
 def test_path_of_a_vehicle_file_is_relative_to_the_case_file(tmp_path, monkeypatch):
-    (tmp_path / "cases").mkdir()
-    (tmp_path / "cart.toml").write_text(CART)
+    (tmp_path / "cases" / "carts").mkdir(parents=True)
+    (tmp_path / "cases" / "carts" / "cart.toml").write_text(CART)
     (tmp_path / "cases" / "case.toml").write_text(
         "[beam]\nlength = 25.0\nflexural_rigidity = 4.8e10\nmass_per_length = 18358.0\n"
-        '[[loads]]\nkind = "vehicle"\nmodel = "../cart.toml"\nspeed = 20.0\n'
+        '[[loads]]\nkind = "vehicle"\nmodel = "carts/cart.toml"\nspeed = 20.0\n'
     )
     monkeypatch.chdir(tmp_path)
     case = load_case("cases/case.toml")
     assert case.loads[0].bodies[0].name == "cart"
     save_case(case, "elsewhere.toml")
-    (tmp_path / "cart.toml").unlink()
+    (tmp_path / "cases" / "carts" / "cart.toml").unlink()
     assert eqx.tree_equal(load_case("elsewhere.toml"), case)
 
 

@@ -209,7 +209,7 @@ def test_a_stopped_search_is_resumed_to_the_same_result(tuned, tmp_path, monkeyp
     np.testing.assert_array_equal(resumed.history, tuned.history)
     np.testing.assert_array_equal(resumed.values, tuned.values)
     file.write_bytes(file.read_bytes()[:200])
-    with pytest.raises(ValueError, match="is damaged: delete it"):
+    with pytest.raises(ValueError, match="is damaged or cut off; delete it"):
         load(file, "")
 
 

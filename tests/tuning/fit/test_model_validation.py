@@ -280,7 +280,7 @@ def test_a_fit_is_stored_without_loss(plain, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="there is no such fit"):
         storage.load_fit(tmp_path / "other.npz")
     (tmp_path / "cut.npz").write_bytes((tmp_path / "fit.npz").read_bytes()[:900])
-    with pytest.raises(ValueError, match="is no fit, or is damaged; name the .npz"):
+    with pytest.raises(ValueError, match="this NumPy archive is damaged or cut off"):
         storage.load_fit(tmp_path / "cut.npz")
 
 

@@ -7,6 +7,7 @@ import importlib
 import pkgutil
 from pathlib import Path
 
+from jaxbeam.runtime.input_file import describe_content
 from tuning.logs.readers.table import (
     LogFormat,
     LogTable,
@@ -51,8 +52,8 @@ def _format_of(path: Path, start: bytes) -> LogFormat:
         if log_format.is_text:
             return log_format
         raise ValueError(
-            f"{path}: this is no {log_format.name} file, whatever it is called: it starts with "
-            f"{start[:8]!r}"
+            f"{path}: this is no {log_format.name} file, whatever it is called: it is"
+            f" {describe_content(start)}"
         )
     known = ", ".join(suffix for log_format in FORMATS for suffix in log_format.suffixes)
     raise ValueError(f"{path}: unknown kind of log {path.suffix!r}; known are {known}")

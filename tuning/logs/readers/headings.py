@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from jaxbeam.files.spreadsheet import from_text_cell
 from tuning.logs.readers.table import is_time_name, parse_heading
 from tuning.logs.units import is_unit
 
@@ -45,7 +46,7 @@ def find_headings(rows: Sequence[Sequence[str]]) -> Headings:
     if head is None:
         notes = (f"{first} lines above the numbers are skipped",) if first else ()
         return Headings((), (), first, notes)
-    cells = [cell.strip() for cell in rows[head]]
+    cells = [from_text_cell(cell.strip()) for cell in rows[head]]
     while len(cells) > 1 and not cells[-1]:
         cells.pop()
     names, units = zip(*map(parse_heading, cells), strict=True)

@@ -6,7 +6,13 @@ import numpy as np
 from scipy.io import loadmat, matlab
 
 from tuning.logs.readers.mat_elements import check_elements
-from tuning.logs.readers.table import LogFormat, LogTable, damaged_file_error, table_of
+from tuning.logs.readers.table import (
+    LogFormat,
+    LogTable,
+    damaged_file_error,
+    read_bytes,
+    table_of,
+)
 
 MAGIC = b"MATLAB 5.0 MAT-file"
 
@@ -20,7 +26,7 @@ def read_mat(path: Path) -> dict[str, LogTable]:
     Raises ValueError for a damaged file, or one that holds objects only (such as a timetable).
     """
     try:
-        check_elements(path.read_bytes())
+        check_elements(read_bytes(path))
         content = loadmat(path, squeeze_me=True, struct_as_record=False)
     except Exception as error:  # scipy raises many types for damaged files
         raise damaged_file_error(path, error) from None

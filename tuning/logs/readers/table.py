@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxbeam.runtime.input_file import check_input, describe_content, read_input
+
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 MAX_SHOWN = 40  # characters of a cell in a message
 TIME_NAMES = ("time", "t", "zeit", "temps", "x_value")
@@ -109,15 +111,22 @@ def _length(arrays: Mapping[str, np.ndarray]) -> int:
     return max(sizes, key=lambda size: (sizes.count(size), size), default=0)
 
 
-def read_bytes(path: Path, count: int = -1) -> bytes:
+def read_bytes(path: Path, count: int | None = None) -> bytes:
     """Bytes of a file, or the first `count` of them.
 
-    Raises ValueError if there is no such file or it is empty.
+    Raises ValueError if there is no such file, it is empty, too large, a folder, pipe or device.
     """
-    if not path.is_file():
+    if not path.exists():
         raise ValueError(f"{path}: there is no such log file")
-    with open(path, "rb") as file:
-        data = file.read(count)
+    try:
+        if count is None:
+            data = read_input(path, "log")
+        else:
+            check_input(path, "log")
+            with open(path, "rb") as file:
+                data = file.read(count)
+    except OSError as error:
+        raise ValueError(str(error)) from None
     if not data:
         raise ValueError(f"{path}: the log is empty")
     return data
@@ -130,7 +139,10 @@ def read_text(path: Path) -> str:
     """
     data = read_bytes(path)
     if b"\0" in data:
-        raise ValueError(f"{path}: this is no text but a binary file of an unknown format")
+        raise ValueError(
+            f"{path}: this is no text but a binary file of an unknown format:"
+            f" {describe_content(data)}"
+        )
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:

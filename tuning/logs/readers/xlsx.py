@@ -69,7 +69,7 @@ def _text(cell, origin) -> str:
         return ""
     if _is_date(cell):
         return repr((cell - origin).total_seconds())
-    return cell if isinstance(cell, str) else repr(float(cell))
+    return cell.replace("_x000D_", "\r") if isinstance(cell, str) else repr(float(cell))
 
 
 FORMAT = LogFormat("Excel", read_xlsx, suffixes=(".xlsx",), magics=(MAGIC,))

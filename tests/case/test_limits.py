@@ -1,0 +1,93 @@
+"""Counts of what a case has are limited, and a case beyond a limit is refused at once."""
+
+import time
+
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+from jaxbeam.case.case import part_classes
+from jaxbeam.case.limits import MAX_COUNTS, MAX_ENTRIES, MAX_WHEELS
+from jaxbeam.case.validation import check_case
+from jaxbeam.files.case_file import case_from_dict
+from jaxbeam.files.declared_keys import table_classes, table_keys, tables
+
+BEAM = {"length": 20.0, "flexural_rigidity": 1e10, "mass_per_length": 12e3}
+
+
+def test_200_000_sensors_are_refused_at_once():
+    start = time.process_time()
+    with pytest.raises(ValueError, match="sensors has 200000 entries; 10000 are the most"):
+        case_from_dict({"beam": BEAM, "sensors": [{"position": 1.0}] * 200_000})
+    case = jb.Case(jb.Beam(**BEAM), sensors=[jb.Sensor(1.0)] * 200_000, run=jb.Run(1.0))
+    with pytest.raises(ValueError, match="sensors has 200000 entries"):
+        jb.simulate(case)
+    assert time.process_time() - start < 5.0
+
+
+@pytest.mark.parametrize("key", [k for k, found in part_classes().items() if found.listed])
+def test_all_lists_of_a_case_are_limited(key):
+    with pytest.raises(ValueError, match=f"^{key} has .* entries; {MAX_COUNTS[key]} are the most"):
+        case_from_dict({"beam": BEAM, key: [{}] * (MAX_COUNTS[key] + 1)})
+
+
+def test_lists_of_parts_and_counts_are_declared():
+    """Every list of parts in a part has a limit, and every whole number but seeds and indices."""
+    free = {"seed", "load", "vehicle"}
+    for part_class, _ in tables().values():
+        for each in table_classes(part_class).values():
+            for key in table_keys(each):
+                if key.listed or (key.is_count and key.name not in free):
+                    assert key.name in MAX_COUNTS, f"{each.__name__}.{key.name}"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"beam": BEAM | {"modes": 1001}}, "beam.modes must not exceed 1000; it is 1001"),
+        (
+            {"beam": BEAM | {"segments": [{}] * 2001}},
+            "beam.segments has 2001 entries; 2000 are the most",
+        ),
+        (
+            {
+                "beam": BEAM,
+                "loads": [{"kind": "vehicle", "model": "half-truck", "speed": 1.0, "count": 10**9}],
+            },
+            "loads.0.count must not exceed 2000; it is 1000000000",
+        ),
+        (
+            {
+                "beam": BEAM,
+                "profile": {
+                    "kind": "table",
+                    "positions": np.arange(MAX_ENTRIES + 1.0).tolist(),
+                    "heights": [0.0, 1.0],
+                },
+            },
+            f"profile.positions has {MAX_ENTRIES + 1} numbers; {MAX_ENTRIES} are the most",
+        ),
+    ],
+)
+def test_limits_within_parts(content, message):
+    with pytest.raises(ValueError, match=message):
+        check_case(case_from_dict(content))
+
+
+def test_all_wheels_together_are_limited():
+    axles = jb.Axles(
+        offsets=np.arange(100.0), forces=np.ones(100), speed=20.0, count=300, spacing=200.0
+    )
+    case = jb.Case(jb.Beam(**BEAM), sensors=[jb.Sensor(10.0)], loads=[axles], run=jb.Run(1.0))
+    with pytest.raises(ValueError, match=f"loads have 30000 wheels in all; {MAX_WHEELS} are"):
+        check_case(case)
+
+
+def test_samples_of_all_sensors_are_limited():
+    case = jb.Case(
+        jb.Beam(**BEAM), sensors=[jb.Sensor(10.0)] * 1000, run=jb.Run(1e4, sample_rate=1e3)
+    )
+    named = [jb.Sensor(10.0, name=str(i)) for i in range(1000)]
+    case = jb.Case(case.beam, sensors=named, run=case.run, loads=[jb.MovingForce(1.0, speed=1.0)])
+    with pytest.raises(ValueError, match="1e\\+07 samples of 1000 sensors, more than 4e\\+06"):
+        jb.simulate(case)
