@@ -178,6 +178,8 @@ def _check_number(address: str, value: Any, field: dataclasses.Field) -> None:
     if not is_concrete(value):
         return
     numbers = np.atleast_1d(concrete(value))
+    if _all_allowed(numbers, field.metadata["constraint"]):
+        return
     names = [f"{address}.{i}" for i in range(numbers.size)] if np.ndim(value) else [address]
     constraint, unit = field.metadata["constraint"], _unit_suffix(field)
     for name, x in zip(names, numbers.flat, strict=True):
@@ -190,6 +192,17 @@ def _check_number(address: str, value: Any, field: dataclasses.Field) -> None:
             raise ValueError(f"the size of {name} must be {bound}{unit}; it is {x:g}{unit}")
     if constraint == INCREASING:
         _check_increasing(names, numbers, unit)
+
+
+def _all_allowed(numbers: np.ndarray, constraint: str) -> bool:
+    """Whether no number of a list is wrong; to name the first that is takes a loop in Python."""
+    if not np.all(np.abs(numbers) <= LARGEST):  # also not if one is NaN
+        return False
+    if constraint == POSITIVE:
+        return bool(np.all(numbers >= SMALLEST))
+    if constraint == NOT_NEGATIVE:
+        return bool(np.all(numbers >= 0))
+    return constraint != INCREASING or not np.any(numbers[1:] <= numbers[:-1])
 
 
 def _check_increasing(names: list[str], numbers: np.ndarray, unit: str) -> None:

@@ -57,7 +57,10 @@ def check_count(address: str, count: int) -> None:
 
 
 def check_entries(address: str, value: Any) -> None:
-    """Validate the size of a list of numbers. Raises ValueError with the largest allowed."""
-    size = int(np.prod(np.shape(value)))
+    """Validate the size of an array, or of a list, of numbers.
+
+    Raises ValueError with the largest allowed.
+    """
+    size = len(value) if isinstance(value, list) else int(np.prod(np.shape(value)))
     if size > MAX_ENTRIES:
         raise ValueError(f"{address} has {size} numbers; {MAX_ENTRIES} are the most")

@@ -50,8 +50,9 @@ def check_input(
     """Check, before it is opened, that a file is regular, not too large, and in its place.
 
     `what` it is to the user. A file that another file names at an `address` must be `below` the
-    folder of that one, links followed. Raises OSError, with both names, if it cannot be read or is
-    a pipe, a device or a folder; ValueError if it is too large or elsewhere.
+    folder of that one, links followed. Raises OSError (a FileNotFoundError, a PermissionError) if
+    it cannot be read or is a pipe, a device or a folder; ValueError if it is too large or
+    elsewhere.
     """
     if below is not None:
         _check_below(path, what, below, address)

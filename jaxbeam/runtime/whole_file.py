@@ -16,7 +16,8 @@ def whole_file(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Pat
     """Path at which to write the file or folder that takes the place of `path` at the end.
 
     A write that is stopped leaves what was there. Raises FileExistsError if something is there,
-    without `overwrite`; OSError with the name `path`, whatever cannot be written.
+    without `overwrite`; OSError (a FileNotFoundError without its folder) with the name `path`,
+    whatever cannot be written.
     """
     place = Path(os.path.realpath(path))  # a link stays a link
     _refuse_existing(place, path, overwrite)
@@ -43,7 +44,7 @@ def whole_file(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Pat
 def naming_file(path: str | os.PathLike, kept: str = "") -> Iterator[None]:
     """Replace errors of the system in writing by one sentence with the name that the user gave.
 
-    `kept` says what is there all the same, and how to go on.
+    `kept` says what is there all the same, and how to go on. Raises OSError of the same class.
     """
     try:
         yield

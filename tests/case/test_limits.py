@@ -13,6 +13,7 @@ from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.files.declared_keys import table_classes, table_keys, tables
 
 BEAM = {"length": 20.0, "flexural_rigidity": 1e10, "mass_per_length": 12e3}
+CONVOY = {"kind": "vehicle", "model": "half-truck", "speed": 1.0, "count": 10**9}
 
 
 def test_200_000_sensors_are_refused_at_once():
@@ -21,7 +22,7 @@ def test_200_000_sensors_are_refused_at_once():
         case_from_dict({"beam": BEAM, "sensors": [{"position": 1.0}] * 200_000})
     case = jb.Case(jb.Beam(**BEAM), sensors=[jb.Sensor(1.0)] * 200_000, run=jb.Run(1.0))
     with pytest.raises(ValueError, match="sensors has 200000 entries"):
-        jb.simulate(case)
+        check_case(case)
     assert time.process_time() - start < 5.0
 
 
@@ -61,7 +62,7 @@ def test_lists_of_parts_and_counts_are_declared():
                 "beam": BEAM,
                 "profile": {
                     "kind": "table",
-                    "positions": np.arange(MAX_ENTRIES + 1.0).tolist(),
+                    "positions": [0.0] * (MAX_ENTRIES + 1),
                     "heights": [0.0, 1.0],
                 },
             },

@@ -9,7 +9,7 @@ from jaxbeam.case.declared_checks import check_field, describe_value, missing_er
 from jaxbeam.case.fields import describe_shape, fits_shape
 from jaxbeam.case.former_words import with_attribute_names
 from jaxbeam.case.kinds import find_kind, kinds
-from jaxbeam.case.limits import check_length
+from jaxbeam.case.limits import check_entries, check_length
 from jaxbeam.case.quantities import OF_QUANTITY, unit_of
 from jaxbeam.case.reading.units import in_si
 
@@ -38,6 +38,8 @@ def read_part(address: str, table: dict[str, Any], part_class: type) -> Any:
         elif "parts" in fields[key].metadata:
             values[key] = read_parts(f"{address}.{key}", value, fields[key].metadata["parts"])
         else:
+            if isinstance(value, list):
+                check_entries(f"{address}.{key}", value)
             values[key] = _in_si(
                 f"{address}.{key}", value, _unit(fields[key], values, default_quantity)
             )
