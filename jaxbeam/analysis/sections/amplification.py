@@ -101,8 +101,8 @@ def amplification(
     shear or stress, as in `envelope`. The static value is that of the same loads without inertia of
     beam and loads, exact (see `static_peak`). The dynamic deflection has the modes of the case
     only, so with few modes the ratio of a slow crossing is slightly below one; moments and the like
-    are statically corrected. Raises as `envelope`, and ValueError for a beam that can move as a rigid
-    body, or a quantity without a static value.
+    are statically corrected. Raises as `envelope`, and ValueError for a beam that can move as a
+    rigid body, or a quantity without a static value.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
