@@ -3,8 +3,6 @@ from .analysis.assessment.assessment import Assessment as Assessment, CodeCheck 
 from .analysis.bound.bound import bound as bound
 from .analysis.bound.least_integral import least_integral as least_integral
 from .analysis.control_systems import to_control as to_control
-from .analysis.plausibility import check as check
-from .analysis.plausible_numbers import Plausibility as Plausibility
 from .analysis.ride import (
     RideMeasures as RideMeasures,
     ride_measures as ride_measures,
@@ -122,7 +120,9 @@ from .model.frequency_response import (
     receptance as receptance,
 )
 from .model.influence import influence_line as influence_line, static_peak as static_peak
-from .model.modes import modes as modes
+from .model.plausibility.check import PlausibilityWarning as PlausibilityWarning, check as check
+from .model.plausibility.checked_modes import modes as modes
+from .model.plausibility.numbers import Plausibility as Plausibility
 from .model.settlement import settlement_response as settlement_response
 from .model.state_space import state_space as state_space
 from .model.static_correction import bending_moment as bending_moment, shear_force as shear_force

@@ -51,9 +51,9 @@ def check_on_beam(name: str, positions: Any, length: Float[Array, ""]) -> None:
         (numbers >= -POSITION_TOLERANCE * end) & (numbers <= (1 + POSITION_TOLERANCE) * end)
     )
     if outside.any():
-        raise ValueError(
-            f"{name} must {ON_BEAM}, between 0 and {end:g} m; it is {numbers[outside].flat[0]:g} m"
-        )
+        given = float(numbers[outside].flat[0])
+        unit = ": is it in m, not in mm?" if 0 < given / 1000 <= end else ""
+        raise ValueError(f"{name} must {ON_BEAM}, between 0 and {end:g} m; it is {given:g} m{unit}")
 
 
 def suggestion(word: str, allowed: Iterable[str]) -> str:

@@ -1,6 +1,7 @@
 """Application: the commands, the old words of renamed ones, and the process that runs them."""
 
 import atexit
+import contextvars
 import functools
 import gc
 import os
@@ -107,7 +108,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         _relax_garbage_collection()
     try:
         refuse_former_words(arguments)
-        app(arguments, exit_on_error=False, print_error=False)
+        own = contextvars.copy_context()  # in which commands show warnings by themselves
+        own.run(app, arguments, exit_on_error=False, print_error=False)
     except BrokenPipeError:  # the reader of the output, as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -116,8 +116,11 @@ class CaseOptions(OutputOptions):
             parse_assignment("--set", text)
         read_toml(path)
 
-    def read(self, path: Path) -> "jb.Case":
+    def read(self, path: Path, judged: Literal["case", "structure", ""] = "case") -> "jb.Case":
         """Case of a file with the entries of `--set`.
+
+        Warnings of what looks wrong are printed: of all of the case, of its structure alone, or
+        none, where the command prints them.
 
         Raises OSError if the file cannot be read, ValueError for whatever is wrong in it.
         """
@@ -126,9 +129,15 @@ class CaseOptions(OutputOptions):
             a: parse_value(v) for a, v in (parse_assignment("--set", text) for text in self.set_)
         }
         enable_compile_cache()
+        from jaxbeam.case.case import structure_of
         from jaxbeam.files.case_file import load_case_with
+        from jaxbeam.model.plausibility.check import leave_warnings_to_caller
 
-        return load_case_with(path, changes)
+        leave_warnings_to_caller()
+        case = load_case_with(path, changes)
+        if judged:
+            print_warnings(jb.check(case if judged == "case" else structure_of(case)))
+        return case
 
 
 @Parameter(name="*")
@@ -244,9 +253,14 @@ def print_plausibility(
     found = dataclasses.replace(found, warnings=tuple(warnings))
     if not options.json_:
         print(f"plausibility: {found}", flush=True)
+    print_warnings(found)
+    return numbers_of(found)
+
+
+def print_warnings(found: "jb.Plausibility") -> None:
+    """Print what looks wrong in a case."""
     for warning in found.warnings:
         print_message(f"warning: {warning}")
-    return numbers_of(found)
 
 
 def numbers_of(found: "jb.Plausibility") -> dict[str, Any]:

@@ -28,6 +28,7 @@ from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.kind_changes import change_kind
 from jaxbeam.files.profile_file import with_profile_file
+from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.runtime.whole_file import whole_file
 
 
@@ -38,7 +39,8 @@ def load_case(path: str | os.PathLike) -> Case:
     below the folder of the case file (see `profile_from_file`), and so may vehicles.
 
     Raises ValueError, with the file and the address or line, for invalid TOML, unknown keys or
-    kinds, wrong types and the errors of `check_case`; OSError if the file cannot be read.
+    kinds, wrong types and the errors of `check_case`; OSError if the file cannot be read. Warns
+    (PlausibilityWarning) of what looks wrong, such as units: see `jaxbeam.check`.
 
     >>> import jaxbeam as jb
     >>> import pathlib, tempfile
@@ -56,6 +58,7 @@ def load_case(path: str | os.PathLike) -> Case:
         check_case(case)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+    warn_if_implausible(case)
     return case
 
 

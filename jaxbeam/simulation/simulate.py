@@ -19,6 +19,7 @@ from jaxbeam.integrator.propagators import NODE_COUNT, end_weights
 from jaxbeam.integrator.time_grid import TimeGrid, grid_by_schedule
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
+from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
 from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.sensing.output_rows import sensor_history, sensor_rows
@@ -67,7 +68,8 @@ def simulate(
     one case, and for other numbers near those of it; the error that it states is for its own.
 
     Raises ValueError for an invalid case or times and for a plan of another case, RuntimeError if
-    no time step meets the tolerance; warns (ContactLossWarning) of negative contact forces.
+    no time step meets the tolerance; warns (ContactLossWarning) of negative contact forces, and,
+    unless a `plan` is given, of what looks wrong, such as units (PlausibilityWarning).
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
@@ -81,6 +83,8 @@ def simulate(
     if times is not None:
         check_times(times)
     first_records: dict[int, Record] = {}
+    if plan is None:
+        warn_if_implausible(case if times is None else _until(case, times))
     given, plan = (
         plan,
         plan or integration_plan(case, times, tolerance, _first_run(case, times, first_records)),
@@ -108,6 +112,12 @@ def simulate(
         if lost.any() and np.isnan(concrete(record.diverged_time)):
             warnings.warn(record.verdict, ContactLossWarning, stacklevel=2)
     return record
+
+
+def _until(case: Case, times) -> Case:
+    """The case with a run that ends with the last of some times (s)."""
+    run = dataclasses.replace(case.run, duration=xp.asarray(times, float)[-1])
+    return dataclasses.replace(case, run=run)
 
 
 def _first_run(case: Case, times, records: dict[int, Record]) -> FirstRun | None:

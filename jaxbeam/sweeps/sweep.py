@@ -5,9 +5,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from tqdm import tqdm
 
-from jaxbeam.case.case import Case
+from jaxbeam.case.case import Case, unit_at
+from jaxbeam.case.reading.units import in_si
+from jaxbeam.files.case_file import with_settings
+from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.simulation.integration_plan import TOLERANCE
 from jaxbeam.sweeps.computation import compute_sweep
 from jaxbeam.sweeps.specification import sweep_specification
@@ -18,6 +22,21 @@ from jaxbeam.sweeps.words import compute_word_sweep, split_words, word_sweep
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
+
+
+def first_and_last(case: Case, over: dict[str, Any]) -> list[Case]:
+    """The cases of the first and the last values of a sweep; none for values that it refuses."""
+    ends = []
+    for end in (0, -1):
+        try:
+            settings = {
+                address: in_si(np.asarray(values)[end].item(), unit_at(case, address), address)
+                for address, values in over.items()
+            }
+            ends.append(with_settings(case, settings))
+        except (ValueError, TypeError, IndexError, KeyError, AttributeError):
+            return []
+    return ends
 
 
 def sweep(
@@ -90,6 +109,8 @@ def sweep(
         plan = word_sweep(case, words, numbers, list(over), *settings)
     else:
         plan = sweep_specification(case, over, *settings)
+    for one in (case, *first_and_last(case, over)):
+        warn_if_implausible(one)
     warn_of_truncation(case)
     compute = compute_word_sweep if words else compute_sweep
 

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
 from jaxbeam.files.case_file import case_to_dict
+from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, Histories
@@ -108,6 +109,7 @@ def tune(
         free, cases, objective, method, steps, starts=starts, batch=batch, least_peaks=least_peaks
     )
     path = checkpoint_path(checkpoint, resume)
+    warn_if_implausible(case)
     if path is not None and penalty is not None:
         raise ValueError(
             "a search with a user-defined penalty cannot be checkpointed: leave out `checkpoint`"

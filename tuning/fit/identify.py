@@ -8,8 +8,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool
 
-from jaxbeam.case.case import Case
+from jaxbeam.case.case import Case, structure_of
 from jaxbeam.case.fields import concrete
+from jaxbeam.model.plausibility.check import warn_if_implausible
 from tuning.checkpoint import Checkpoint, checkpoint_path, fingerprint
 from tuning.fit.dataset import Dataset, make_dataset
 from tuning.fit.least_squares import LeastSquares
@@ -78,6 +79,7 @@ def identify(
     check_loss(loss)
     if starts < 1:
         raise ValueError(f"starts must be 1 or more, not {starts}")
+    warn_if_implausible(structure_of(case))
     path = checkpoint_path(checkpoint, resume)
     dataset = make_dataset(case, logs)
     largest_reading = float(np.max(np.abs(dataset.measured)))

@@ -21,6 +21,7 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.reading.units import number_in_si
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import modes
+from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.model.sensing.mode_band import counted_frequency
 from jaxbeam.vehicles.trains import trains as library
 
@@ -93,6 +94,7 @@ def assess(
     if not 0 <= added_damping < 1:
         raise ValueError(f"added_damping is a ratio, as 0.005; it is {added_damping:g}")
     bridge = _bridge(case)
+    warn_if_implausible(bridge)
     length = _determinant_length(bridge, determinant_length)
     frequencies, bridge = _with_counted_modes(bridge, added_damping)
     checks = [

@@ -10,7 +10,6 @@ from jaxbeam.cli.options import (
     OutputOptions,
     PrintOptions,
     numbers_of,
-    print_message,
     table,
 )
 
@@ -83,8 +82,6 @@ def _about_case(path: str) -> tuple[dict[str, Any], list[str]]:
 
     case = jb.load_case(path)
     found, frequencies = jb.check(case), jb.modes(case).frequencies
-    for warning in found.warnings:
-        print_message(f"warning: {warning}")
     lines = [
         case.title or Path(path).stem,
         _beam_words(case),

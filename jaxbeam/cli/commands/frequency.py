@@ -42,7 +42,7 @@ def modes(
     check_suffix(output, TABLES[0], "a table of modes", RESULTS)
     picture = pictures.path(None, case.with_stem(f"{case.stem}_modes"))
     options.check_outputs(output, picture)
-    parsed_case = options.read(case)
+    parsed_case = options.read(case, judged="structure")
     found = jb.modes(parsed_case)
     if picture:
         from jaxbeam.plot import plot_modes
@@ -110,7 +110,7 @@ def frf(
     frequencies = frequency_grid(from_, to, points)
     pairs = [input_output_pair(text) for text in pair] or None
     masses = [stationary_mass(text) for text in mass_at]
-    parsed_case = options.read(case)
+    parsed_case = options.read(case, judged="structure")
 
     from jaxbeam.model.frequency_response import frequency_response, resonances_and_antiresonances
 
@@ -182,7 +182,7 @@ def state_space(
     check_suffix(output, MATRIX_SUFFIXES[0], "a linear system", MATRIX_SUFFIXES[1:])
     refuse_option(period is not None and period <= 0, "--period must be positive, in s")
     options.check_outputs(output)
-    parsed_case = options.read(case)
+    parsed_case = options.read(case, judged="structure")
 
     from jaxbeam.files.matrices import matrices_of, write_state_space
 

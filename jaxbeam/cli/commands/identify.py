@@ -98,7 +98,7 @@ def identify(
 
         import tuning  # sets XLA's threads, therefore before the case is read
 
-        parsed_case = options.read(case)
+        parsed_case = options.read(case, judged="structure")
         bounds, normals, scales = arguments
         normals = {
             address: pair_in_si(parsed_case, address, pair, "--prior")

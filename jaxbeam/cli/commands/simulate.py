@@ -51,7 +51,7 @@ def simulate(
         check_film(animate)
     picture = pictures.path(output, case)
     options.check_outputs(output, picture, animate)
-    parsed_case = options.read(case)
+    parsed_case = options.read(case, judged="")
     labels = pictures.sensor_labels(parsed_case)
     plausibility = print_plausibility(parsed_case, options)
 

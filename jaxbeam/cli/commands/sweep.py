@@ -86,7 +86,7 @@ def sweep(
     )
     if not resume:
         options.check_outputs(output, picture)
-    parsed_case = options.read(case)
+    parsed_case = options.read(case, judged="")
     labels = pictures.sensor_labels(parsed_case)
     plausibility = _print_plausibility(parsed_case, values, options)
 
@@ -132,16 +132,10 @@ def sweep(
 
 def _print_plausibility(case: "jb.Case", values, options: CaseOptions) -> dict:
     """Plausibility of the first run in a line, with warnings of the first and the last one."""
-    from jaxbeam.files.case_file import with_settings
+    from jaxbeam.sweeps.sweep import first_and_last
 
-    try:
-        first, last = (
-            with_settings(case, {address: found[end] for address, found in values.items()})
-            for end in (0, -1)
-        )
-    except ValueError:
-        return {}  # the sweep says what is wrong, of all values
-    return print_plausibility(first, options, last)
+    ends = first_and_last(case, values)  # of wrong values the sweep says what is wrong
+    return print_plausibility(ends[0], options, ends[-1]) if ends else {}
 
 
 def _lines(case: "jb.Case", results: "xarray.Dataset", addresses: Sequence[str]) -> list[str]:

@@ -61,7 +61,7 @@ def assess(
     check_suffix(output, ".md", "a report")
     options.check_outputs(output)
     found = jb.assess(
-        options.read(case),
+        options.read(case, judged="structure"),
         _number_or_quantity(line_speed),
         code=code,
         track=track,

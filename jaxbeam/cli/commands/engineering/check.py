@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import jaxbeam as jb
-from jaxbeam.cli.options import CaseOptions, numbers_of, print_message
+from jaxbeam.cli.options import CaseOptions, numbers_of, print_warnings
 
 
 def check(case: Path, /, *, options: CaseOptions = CaseOptions()) -> None:
@@ -14,9 +14,8 @@ def check(case: Path, /, *, options: CaseOptions = CaseOptions()) -> None:
     case
         Case file, TOML.
     """
-    found = jb.check(options.read(case))
-    for warning in found.warnings:
-        print_message(f"warning: {warning}")
+    found = jb.check(options.read(case, judged=""))
+    print_warnings(found)
     number = len(found.warnings)
     words = "nothing looks wrong" if not number else f"{number} warning{'s' * (number > 1)}"
     options.report(numbers_of(found), [f"plausibility: {found}", words])

@@ -43,7 +43,7 @@ def influence(
     check_suffix(output, TABLES[0], "a table of influence lines", TABLES[1:])
     picture = pictures.path(output, case.with_stem(f"{case.stem}_influence"))
     options.check_outputs(output, picture)
-    parsed_case = options.read(case)
+    parsed_case = options.read(case, judged="structure")
 
     from jaxbeam.analysis.sections.influence_table import influence_table
     from jaxbeam.case.reading.units import number_in_si

@@ -96,14 +96,14 @@ def _longest_span(case: Case) -> float:
     return max(right - left for left, right in itertools.pairwise(marks))
 
 
-def _compliance(found: Modes) -> Float[np.ndarray, " mode"]:
+def compliance(found: Modes) -> Float[np.ndarray, " mode"]:
     """Inverse of the stiffness of modes; zero for motions as a rigid body."""
     elastic = found.stiffness > 1e-9 * found.stiffness_unit
     return np.where(elastic, 1 / np.where(elastic, found.stiffness, 1.0), 0.0)
 
 
 def _is_held(found: Modes) -> bool:
-    return bool(np.all(_compliance(found) > 0))
+    return bool(np.all(compliance(found) > 0))
 
 
 def _under_loads(
@@ -133,7 +133,7 @@ def _under_loads(
     shapes = found.shapes(x)
     under_wheels = np.stack([np.interp(position, x, shape) for shape in shapes.T], -1)
     forces = np.einsum("wt,wtm->tm", weight, under_wheels)
-    deflection = (forces * _compliance(found)) @ shapes.T
+    deflection = (forces * compliance(found)) @ shapes.T
     return float(np.max(np.abs(deflection))), on_beam, fastest
 
 
@@ -144,7 +144,7 @@ def _own_deflection(case: Case, found: Modes) -> float | None:
     shapes = found.shapes(x)
     weight_per_length = float(case.beam.linear_density * case.run.gravity)
     forces = weight_per_length * np.trapezoid(shapes, x, axis=0)
-    return float(np.max(np.abs(shapes @ (forces * _compliance(found)))))
+    return float(np.max(np.abs(shapes @ (forces * compliance(found)))))
 
 
 def _mass_ratio(case: Case, weight: float) -> float | None:

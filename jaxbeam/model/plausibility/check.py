@@ -1,0 +1,133 @@
+"""Check of a case before it runs, by the table of plausible ranges.
+
+Wrong units make a case that computes and means nothing: E I in kN m^2, a speed in km/h, a mass in
+t. What follows from them (first frequency, static deflection, mass ratio, critical speed) shows it.
+"""
+
+import contextvars
+import dataclasses
+import math
+import warnings
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+
+from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.loads.vehicle_checks import known_numbers
+from jaxbeam.case.validation import check_case
+from jaxbeam.model.modes import Modes, modes
+from jaxbeam.model.plausibility.facts import Facts
+from jaxbeam.model.plausibility.numbers import Plausibility, plausible_numbers
+from jaxbeam.model.plausibility.ranges import ADVICE, RANGES, Range
+
+MOST_MODES = 60
+
+
+class PlausibilityWarning(UserWarning):
+    """Warning of a number that computes but can hardly be meant, such as one in a wrong unit.
+
+    >>> import warnings
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(25.0, flexural_rigidity=30e6, mass_per_length=15e3)  # kN m^2!
+    >>> with warnings.catch_warnings(record=True) as shown:
+    ...     warnings.simplefilter("always", jb.PlausibilityWarning)
+    ...     found = jb.modes(jb.Case(beam))
+    >>> print(str(shown[0].message).split(" under")[0])
+    beam.flexural_rigidity: the beam sags by 2.488 m
+    """
+
+
+def check(case: Case) -> Plausibility:
+    """Numbers by which the plausibility of a case is seen, with warnings of what looks wrong.
+
+    Each warning names an address, what follows from the number there, and the likely mistake.
+    Nothing is simulated; it takes a few milliseconds. Raises ValueError for an invalid case,
+    `jax.errors.ConcretizationTypeError` if it is traced by `jit` or `vmap`.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(length=25.0, flexural_rigidity=30e6, mass_per_length=15e3),  # kN m^2!
+    ...     sensors=[jb.Sensor(position=12.5)],
+    ...     loads=[jb.MovingMass(mass=30e3, speed=25.0)],
+    ...     run=jb.Run(duration=2.0),
+    ... )
+    >>> found = jb.check(case)
+    >>> print(found.span_over_deflection < 50)
+    True
+    >>> print(found.warnings[0].split(" under")[0])
+    beam.flexural_rigidity: the beam sags by 3.186 m
+    """
+    check_case(case)
+    return _checked(concrete_case(case), rows=(*RANGES, *ADVICE))
+
+
+def warn_if_implausible(case: Case, found: Modes | None = None) -> None:
+    """Warn of what looks wrong in a case, whose modes may be `found`; if it is traced, of nothing.
+
+    Python shows each sentence once in a process, as all come from one place. An invalid case, or
+    one that has no modes, is left to the work that follows.
+    """
+    if _SHOWN.get() or not known_numbers(case):
+        return
+    try:
+        if found is None:
+            check_case(case)
+        else:
+            found = jax.tree.map(concrete, found)
+        sentences = _checked(concrete_case(case), found).warnings
+    except (ValueError, np.linalg.LinAlgError, jax.errors.ConcretizationTypeError):
+        return
+    for sentence in sentences:
+        warnings.warn(sentence, PlausibilityWarning, stacklevel=1)
+
+
+def leave_warnings_to_caller() -> None:
+    """Let functions in this context not warn: who calls them shows what `check` finds."""
+    _SHOWN.set(True)
+
+
+_SHOWN = contextvars.ContextVar("plausibility_shown", default=False)
+
+
+@np.errstate(all="ignore")  # of numbers that no beam has
+def _checked(
+    case: Case, found: Modes | None = None, rows: tuple[Range, ...] = RANGES
+) -> Plausibility:
+    found = modes(_with_few_modes(case)) if found is None else found
+    numbers = plausible_numbers(case, found)
+    return dataclasses.replace(numbers, warnings=tuple(_sentences(rows, case, found, numbers)))
+
+
+def _with_few_modes(case: Case) -> Case:
+    """The case with modes enough to judge it: hundreds would take seconds."""
+    count, ratios = min(case.beam.modes, MOST_MODES), case.beam.damping_ratio
+    ratios = ratios[:count] if np.ndim(ratios) else ratios
+    beam = dataclasses.replace(case.beam, modes=count, damping_ratio=ratios)
+    return dataclasses.replace(case, beam=beam)
+
+
+def _sentences(rows: tuple[Range, ...], *judged) -> Iterator[str]:
+    facts, explained = Facts(*judged), set()
+    for row in rows:
+        said = False
+        for address, value, words in row.values(facts):
+            part = ".".join(address.split(".")[:2]) if address.startswith("loads") else ""
+            inside = row.low <= value <= row.high or math.isnan(value)
+            if inside or (row.cause, part) in explained:
+                continue
+            said = True
+            yield _sentence(row, address, float(value), words)
+        if said and row.cause:
+            explained.add((row.cause, part))
+
+
+def _sentence(row: Range, address: str, value: float, words: dict) -> str:
+    low = value < row.low
+    says, hint = (
+        text.format(address=address, value=value, **words)
+        for text in (row.says, row.below if low else row.above)
+    )
+    bound = f"{'less' if low else 'more'} than {row.low if low else row.high:g} {row.unit}".rstrip()
+    return f"{address}: {says}{f', {bound}' if row.unit else ''}: {hint}"

@@ -1,0 +1,601 @@
+"""What is judged of a case: derived quantities, each with the address of what it follows from."""
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxbeam.case.actuators.electrodynamic import Electrodynamic
+from jaxbeam.case.trajectory import NEVER
+from jaxbeam.model.plausibility.facts import Facts
+from jaxbeam.model.plausibility.numbers import GRAVITY
+from jaxbeam.model.poles_zeros import poles
+
+INF = math.inf
+SOUND_SPEED = 5000.0  # m/s, of waves in steel, aluminium, timber along the grain; concrete 3500
+ROAD_KINDS = ("quarter-car", "half-car")
+ROAD_SPEED, RAIL_SPEED = 60.0, 120.0  # m/s; 1.2 times 350 km/h is 117 m/s
+CLAMPING_STIFFNESS = 10.0  # E I / L: of two springs that hold the rotation, too
+SUPPORTED = 1e-3  # of the largest influence on a mode: a place that moves as little is held
+SMALL_UNITS = {"m": "mm", "m/s": "mm/s", "m/s^2": "mm/s^2", "1": "1e-6", "Pa": "MPa"}
+
+
+class Value(NamedTuple):
+    """Value at the address of what it follows from, and words for its sentence."""
+
+    address: str
+    value: float
+    words: dict[str, Any] = {}
+
+
+Values = Callable[[Facts], Iterator[Value]]
+Size = Callable[[Facts], float]
+
+
+def _numbers(part: Any, address: str, *names: str) -> Iterator[tuple[str, float]]:
+    """Numbers in some fields of a part, where it has them, with their addresses."""
+    for name in names:
+        value = getattr(part, name, None)
+        if value is not None:
+            for i, number in enumerate(np.ravel(value)):
+                yield f"{address}.{name}.{i}" if np.ndim(value) else f"{address}.{name}", number
+
+
+def _parts(facts: Facts, key: str) -> list[tuple[str, Any]]:
+    """The parts at a key of the case with their addresses."""
+    found = getattr(facts.case, key)
+    if isinstance(found, tuple):
+        return [(f"{key}.{i}", part) for i, part in enumerate(found)]
+    return [] if found is None else [(key, found)]
+
+
+def of_parts(key: str, *names: str, over: Size | None = None, kinds: tuple = ()) -> Values:
+    """Sizes of some fields of the parts at a key, of some kinds or all, over a number."""
+
+    def values(facts):
+        for address, part in _parts(facts, key):
+            if not kinds or part.kind in kinds:
+                for name, number in _numbers(part, address, *names):
+                    yield Value(name, abs(number) / (over(facts) if over else 1.0))
+
+    return values
+
+
+def of_beam(*names: str, over: Size | None = None) -> Values:
+    """Sizes of some fields of the beam over a number."""
+    return of_parts("beam", *names, over=over)
+
+
+def length(facts: Facts) -> float:
+    """Length of the beam (m)."""
+    return facts.length
+
+
+def rigidity(facts: Facts) -> float:
+    """Bending stiffness of the beam (N m^2)."""
+    return facts.rigidity
+
+
+def density(facts: Facts) -> float:
+    """Mass per length of the beam (kg/m)."""
+    return facts.density
+
+
+# The beam: stiffness, mass, damping, supports
+
+
+def _stiffness(facts: Facts) -> tuple[str, dict[str, Any]]:
+    """Address of what lets the beam sag, and words for its unit and that of the mass."""
+    beam, held = facts.case.beam, list(facts.held())
+    springs = [name for _, k, name in held if k < INF]
+    words = {"mass": "beam.mass_per_length in kg/m"}
+    if beam.density is not None:
+        words = {"mass": "beam.density in kg/m^3"}
+    if springs and len(held) - len(springs) < 2:  # the beam hangs on springs
+        return f"{springs[0]}.stiffness", words | {"unit": "N/m, not in kN/m"}
+    if beam.flexural_rigidity is not None:
+        return "beam.flexural_rigidity", words | {"unit": "N m^2, not in kN m^2 or GN m^2"}
+    if any(one.flexural_rigidity is not None for one in beam.segments):
+        address = "beam.segments.0.flexural_rigidity"
+        return address, words | {"unit": "N m^2, not in kN m^2 or GN m^2"}
+    return "beam.youngs_modulus", words | {"unit": "Pa, not in GPa, beam.height in m"}
+
+
+def slenderness(facts):
+    """Length of the beam over its radius of gyration, if waves run in it as in solid material."""
+    address, words = _stiffness(facts)
+    radius = math.sqrt(facts.rigidity / facts.density) / SOUND_SPEED
+    yield Value(address, facts.length / radius, words)
+
+
+def _sag(facts, sag):
+    if sag:
+        address, words = _stiffness(facts)
+        span = facts.numbers.span
+        share = f"1/{span / sag:.2g} of its span of {span:.4g} m"
+        share = "more than its length" if sag > facts.length else share
+        words |= {"sag": sag, "share": share, "stiffness": address}
+        yield Value(address, span / sag, words)
+
+
+def sag_of_loads(facts):
+    """Span over the largest static deflection under the loads."""
+    return _sag(facts, facts.numbers.deflection)
+
+
+def rise_of_loads(facts):
+    """The same at the address of the heaviest load, which weighs too little."""
+    for value in sag_of_loads(facts):
+        if facts.numbers.deflection < 1e-12 * facts.length:
+            return  # they stand on supports
+        heaviest = max(range(len(facts.case.loads)), key=lambda i: facts.static_loads[i].max())
+        yield value._replace(address=f"loads.{heaviest}{_mass_field(facts.case.loads[heaviest])}")
+
+
+def sag_of_beam(facts):
+    """Span over the static deflection under the beam's own weight."""
+    return _sag(facts, facts.numbers.own_deflection)
+
+
+def first_frequency(facts):
+    """First elastic natural frequency (Hz)."""
+    if facts.numbers.first_frequency is not None:
+        address, words = _stiffness(facts)
+        yield Value(address, facts.numbers.first_frequency, words)
+
+
+def damping_ratio(facts):
+    """Largest modal damping ratio, however it is given."""
+    beam, ratios, name = facts.case.beam, facts.modes.damping_ratios, "beam.loss_factor"
+    if beam.rayleigh_damping is not None:
+        ratios, name = ratios[:1], "beam.rayleigh_damping"
+    elif np.any(beam.damping_ratio):
+        ratios, name = beam.damping_ratio, "beam.damping_ratio"
+    elif any(one.loss_factor is not None for one in beam.segments):
+        name = "beam.segments"
+    yield Value(name, float(np.max(ratios)))
+
+
+def rigidity_over_shear(facts):
+    """Bending stiffness over shear stiffness and the square of the length."""
+    for name, shear in _numbers(facts.case.beam, "beam", "shear_stiffness"):
+        yield Value(name, facts.rigidity / (shear * facts.length**2))
+
+
+def radius_of_rotary_inertia(facts):
+    """Radius of gyration of the sections by their rotary inertia, over the length."""
+    for name, inertia in _numbers(facts.case.beam, "beam", "rotary_inertia"):
+        yield Value(name, math.sqrt(inertia / facts.density) / facts.length)
+
+
+def step_of_segments(facts):
+    """Ratio of stiffness, and of mass, from segment to segment."""
+    for name in ("flexural_rigidity", "mass_per_length"):
+        sizes = [getattr(one, name) for one in facts.case.beam.segments]
+        for i, (left, right) in enumerate(itertools.pairwise(sizes)):
+            if left is not None and right is not None:
+                ends = abs(np.ravel(left)[0]), abs(np.ravel(right)[0])
+                if min(ends) > 0:
+                    yield Value(f"beam.segments.{i + 1}.{name}", max(ends) / min(ends))
+
+
+def rigid_motions(facts):
+    """Motions that nothing resists, of a beam that has hinges or on which something presses."""
+    beam = facts.case.beam
+    pressed = any(np.any(loads > 0) for loads in facts.static_loads)
+    if beam.hinges or pressed:
+        motions = facts.modes.stiffness.size - facts.frequencies.size
+        address = "beam.hinges" if beam.hinges else "beam.ends"
+        remedy = "leave a hinge out, or add" if beam.hinges else "choose other ends, or add"
+        yield Value(address, motions, {"remedy": remedy})
+
+
+def settlement(facts):
+    """Settlements of supports over the length."""
+    for address, support in _parts(facts, "supports"):
+        for name, drop in _numbers(support, address, "settlement"):
+            yield Value(name, abs(drop) / facts.length, {"drop": drop})
+
+
+def clamping_distance(facts):
+    """Distances of neighbours that hold the deflection, over the length, if they are stiff."""
+    unit = facts.rigidity / facts.length
+    for (left, k, first), (right, other, second) in itertools.pairwise(sorted(facts.held())):
+        flexibility = sum(1 / each if each else INF for each in (k, other))
+        apart = right - left
+        if apart > 0 and apart * apart > CLAMPING_STIFFNESS * unit * flexibility:
+            address = f"{second if second.startswith('supports') else first}.position"
+            words = {"apart": apart, "first": first, "second": second}
+            yield Value(address, apart / facts.length, words)
+
+
+# Actuators
+
+
+def influence_of_actuator(facts):
+    """Largest influence on any mode over that at the best place; of patches none."""
+    for address, actuator in _parts(facts, "actuators"):
+        terms = actuator.displacement_map()
+        if all(order == 0 for _, order, _ in terms):
+            best = np.abs(facts.shapes).max(axis=0)
+            share = np.max(np.abs(facts.influence(terms)) / best)
+            yield Value(f"{address}.position", float(share), {"x": float(terms[0][0])})
+
+
+def least_command(facts):
+    """Distance of 0 from the commands that an actuator takes."""
+    for address, actuator in _parts(facts, "actuators"):
+        limits = actuator.command_limits()
+        if limits is not None and actuator.command_unit != "1":
+            low, high = map(float, limits)
+            words = {"low": low, "high": high, "unit": actuator.command_unit}
+            words["size"] = max(abs(low), abs(high))
+            name = "limits" if actuator.limits is not None else "inner_loop.limits"
+            yield Value(f"{address}.{name}", max(low, -high, 0.0), words)
+
+
+COMMAND_FIELDS = {
+    "moment_per_volt": "N m/V",
+    "d33": "m/V, not in pm/V",
+    "force_per_volt": "N/V",
+    "force_constant": "N/A",
+    "limits": "N",
+}
+
+
+def sag_of_command(facts):
+    """Deflection by the largest command of an actuator over the length."""
+    for address, actuator in _parts(facts, "actuators"):
+        sag = facts.sag_of_command(actuator)
+        if sag:
+            name = next(n for n in COMMAND_FIELDS if getattr(actuator, n, None) is not None)
+            words = {"sag": sag, "unit": COMMAND_FIELDS[name]}
+            yield Value(f"{address}.{name}", sag / facts.length, words)
+
+
+def lag_of_actuator(facts):
+    """Bandwidth of an actuator over the first natural frequency."""
+    first = facts.numbers.first_frequency
+    for address, actuator in _parts(facts, "actuators"):
+        for name, bandwidth in _numbers(actuator, address, "bandwidth"):
+            if first is not None:
+                yield Value(name, bandwidth / (2 * math.pi * first))
+
+
+def growth_of_inner_loops(facts):
+    """Largest rate of growth (1/s) of the beam with inner loops of actuators."""
+    looped = [
+        f"actuators.{i}.inner_loop"
+        for i, actuator in enumerate(facts.case.actuators)
+        if isinstance(actuator, Electrodynamic) and actuator.inner_loop is not None
+    ]
+    if looped:
+        fastest = max(poles(facts.case), key=lambda pole: pole.real)
+        hertz = abs(fastest.imag) / (2 * math.pi)
+        yield Value(" and ".join(looped), float(fastest.real), {"hertz": hertz})
+
+
+# Loads: vehicles, weights, people
+
+
+def sag_of_spring(facts):
+    """Static deflections (m) of the springs of vehicles."""
+    for stage in facts.stages:
+        if stage.stiffness > 0:
+            yield Value(stage.spring, stage.carried * GRAVITY / stage.stiffness)
+
+
+def stage_damping(facts):
+    """Damping ratios of springs and dampers of vehicles with the masses that they carry."""
+    for stage in facts.stages:
+        if stage.damping > 0 and stage.stiffness > 0 and stage.carried > 0:
+            critical = 2 * math.sqrt(stage.stiffness * stage.carried)
+            yield Value(stage.damper, stage.damping / critical)
+
+
+def _tyre_over_suspension(facts, quantity):
+    for address, load in facts.loads(*ROAD_KINDS):
+        upper, lower = (
+            np.ravel(getattr(load, f"{part}_{quantity}")) for part in ("suspension", "tyre")
+        )
+        if np.all(upper > 0):
+            words = {"other": f"{address}.tyre_{quantity}"}
+            yield Value(f"{address}.suspension_{quantity}", np.max(lower / upper), words)
+
+
+def tyre_over_suspension_stiffness(facts):
+    """Largest ratio of the stiffness of a tyre to that of its suspension."""
+    return _tyre_over_suspension(facts, "stiffness")
+
+
+def tyre_over_suspension_damping(facts):
+    """Largest ratio of the damping of a tyre to that of its suspension."""
+    return _tyre_over_suspension(facts, "damping")
+
+
+def primary_over_secondary_stiffness(facts):
+    """Stiffness of the primary springs of a bogie over that of the secondary ones."""
+    for address, load in facts.loads("wagon"):
+        ratio = 2 * float(load.primary_stiffness) / float(load.secondary_stiffness)
+        words = {"other": f"{address}.primary_stiffness"}
+        yield Value(f"{address}.secondary_stiffness", ratio, words)
+
+
+def unsprung_over_sprung(facts):
+    """Masses below the suspension over that of the body."""
+    for name in ("axle_mass", "axle_masses", "bogie_mass", "wheelset_mass"):
+        for address, load in facts.loads(*ROAD_KINDS, "wagon"):
+            if hasattr(load, name):
+                ratio = np.sum(getattr(load, name)) / load.body_mass
+                yield Value(f"{address}.{name}", ratio, {"upper": f"{address}.body_mass"})
+
+
+def gyration_over_wheelbase(facts):
+    """Radii of gyration in pitch over half the distance of what carries the body."""
+    for address, load in facts.loads("half-car", "wagon"):
+        if load.kind == "half-car":
+            rows = [("body", np.ptp(load.axle_positions))]
+        else:
+            rows = [("body", load.bogie_distance), ("bogie", load.wheelset_distance)]
+        for name, distance in rows:
+            inertia, mass = (getattr(load, f"{name}_{what}") for what in ("inertia", "mass"))
+            radius = math.sqrt(float(inertia) / float(mass))
+            yield Value(f"{address}.{name}_inertia", 2 * radius / float(distance))
+
+
+PLACES = {"axles": "offsets", "half-car": "axle_positions", "wagon": "bogie_distance"}
+
+
+def distance_of_axles(facts):
+    """Largest distance (m) from axle to axle of a vehicle, and from vehicle to vehicle."""
+    for address, load in facts.loads(*PLACES, "vehicle"):
+        gaps = np.diff(np.sort(load.vehicle(facts.case.run.gravity).offsets))
+        if facts.is_bridge and gaps.size and not getattr(load, "train", ""):
+            name = f"{address}.{PLACES.get(load.kind, 'axles')}"
+            yield Value(name, float(gaps.max()))
+        if facts.is_bridge:
+            yield from (Value(*pair) for pair in _numbers(load, address, "spacing"))
+
+
+MASS_FIELDS = ("mass", "force", "body_mass", "forces", "masses", "force_per_length", "weight")
+
+
+def _mass_field(load) -> str:
+    """The field that decides the weight of a load, behind a dot; empty if it has none."""
+    return next((f".{n}" for n in MASS_FIELDS if getattr(load, n, None) is not None), "")
+
+
+def _weights(facts, kinds):
+    """Largest static load (kN) of a wheel, and the field that decides it, on bridges."""
+    for (address, load), static in zip(facts.loads(), facts.static_loads, strict=True):
+        if load.kind in kinds and facts.is_bridge and static.size:
+            name = _mass_field(load)
+            should = "N" if "force" in name else "kg, not its weight in N"
+            yield Value(f"{address}{name}", float(static.max()) / 1e3, {"should": should})
+
+
+def weight_of_axle(facts):
+    """Largest static load (kN) of an axle of a vehicle on a bridge."""
+    return _weights(facts, (*ROAD_KINDS, "wagon", "axles", "vehicle"))
+
+
+def weight_of_load(facts):
+    """Weight (kN) of a single load on a bridge."""
+    return _weights(facts, ("mass", "force", "oscillator"))
+
+
+def weight_over_force(facts):
+    """Weight of the masses of axles over the forces with which they press."""
+    for address, load in facts.loads("axles"):
+        if load.masses is not None and load.forces is not None and float(facts.case.run.gravity):
+            masses, forces = np.max(load.masses), np.max(load.forces)
+            if masses > 0 and forces > 0:
+                yield Value(f"{address}.masses", masses * GRAVITY / forces)
+
+
+def mass_ratio(facts):
+    """Mass of the loads on the beam at once over that of the beam."""
+    if facts.numbers.mass_ratio:
+        yield Value("loads", facts.numbers.mass_ratio, _stiffness(facts)[1])
+
+
+def largest_phase(facts):
+    """Sizes of phases (rad)."""
+    parts = [*facts.loads("varying-force", "pedestrian", "crowd")]
+    for address, part in (*parts, *_parts(facts, "profile"), *_parts(facts, "controller")):
+        for name, phase in _numbers(part, address, "phase", "phases"):
+            yield Value(name, abs(phase))
+
+
+# Loads: their travel
+
+
+def entry_over_duration(facts):
+    """Time at which a load enters over the duration of the run."""
+    duration = float(facts.case.run.duration)
+    for (address, load), (enter, _) in zip(facts.loads(), facts.windows, strict=True):
+        when = f"it would at t = {enter:.4g} s" if enter < NEVER else "it stops before"
+        late = float(load.entry_time) >= duration
+        likely = f"is {address}.entry_time in s, not in ms?" if late else "lengthen run.duration"
+        words = {"when": when, "duration": duration, "likely": likely}
+        yield Value(address, enter / duration, words)
+
+
+def exit_over_duration(facts):
+    """Time at which a load leaves over the duration of the run."""
+    duration = float(facts.case.run.duration)
+    for (address, _), (enter, leave) in zip(facts.loads(), facts.windows, strict=True):
+        if enter < duration and leave < NEVER:
+            yield Value(address, leave / duration, {"leave": leave, "duration": duration})
+
+
+def braking_to_stop(facts):
+    """1 for a load that its deceleration stops on the beam during the run."""
+    for (address, load), (enter, leave) in zip(facts.loads(), facts.windows, strict=True):
+        if load.speed is None or not float(load.deceleration) > 0 or not enter < NEVER <= leave:
+            continue
+        speed, braking = float(load.speed), float(load.deceleration)
+        if float(load.entry_time) + abs(speed) / braking > float(facts.case.run.duration):
+            continue
+        start = facts.length if speed < 0 else 0.0
+        start = start if load.start_position is None else float(load.start_position)
+        rolled = speed * abs(speed) / 2 / braking
+        behind = float(np.max(facts.behind(load)))
+        way = (facts.length - start if speed > 0 else start) + behind
+        words = {"braking": braking, "x": start + rolled, "need": speed**2 / 2 / way}
+        yield Value(f"{address}.deceleration", 1.0, words)
+
+
+def duration_over_crossing(facts):
+    """Duration of the run over the time at which its last load leaves."""
+    if facts.last_exit > 0:
+        duration = float(facts.case.run.duration)
+        words = {"duration": duration, "last": facts.last_exit}
+        yield Value("run.duration", duration / facts.last_exit, words)
+
+
+def _speed(facts) -> tuple[str, dict[str, Any]]:
+    """Address of the fastest load, and words of its speed and the unit of that."""
+    speed, loads = facts.numbers.speed, list(facts.loads())
+    tables = [address for address, load in loads if load.speed is None]
+    sizes = [(abs(float(load.speed)), name) for name, load in loads if load.speed is not None]
+    address = f"{max(sizes)[1]}.speed" if sizes else f"{tables[0]}.positions"
+    unit = "in m/s, not in km/h" if sizes else "in m, not in mm, and are times in s"
+    return address, {"speed": speed, "kmh": 3.6 * speed, "unit": unit}
+
+
+def speed_over_traffic(facts):
+    """Largest speed on a bridge over the highest of such traffic."""
+    if facts.numbers.speed is not None and facts.is_bridge:
+        address, words = _speed(facts)
+        profile = facts.case.profile
+        on_road = any(load.kind in ROAD_KINDS for load in facts.case.loads) or (
+            profile is not None and profile.kind == "iso8608"
+        )
+        limit, traffic = (ROAD_SPEED, "road vehicle") if on_road else (RAIL_SPEED, "train in use")
+        yield Value(address, facts.numbers.speed / limit, words | {"traffic": traffic})
+
+
+def speed_ratio(facts):
+    """Largest speed over the critical speed."""
+    if facts.numbers.speed_ratio is not None:
+        address, words = _speed(facts)
+        words["critical"] = facts.numbers.critical_speed
+        yield Value(address, facts.numbers.speed_ratio, words)
+
+
+# Profile, sensors, controller, run
+
+
+PROFILE_FIELDS = ("amplitude", "height", "point_heights", "amplitudes", "scale")
+
+
+def height_of_profile(facts):
+    """Height of the profile from lowest to highest over the length of the beam."""
+    for address, profile in _parts(facts, "profile"):
+        x, heights = facts.profile
+        name = next((f".{n}" for n in PROFILE_FIELDS if hasattr(profile, n)), "")
+        height = float(np.ptp(heights))
+        yield Value(f"{address}{name}", height / facts.length, {"height": height})
+
+
+def slope_of_profile(facts):
+    """Steepest slope of the profile, but of one with a step."""
+    for address, profile in _parts(facts, "profile"):
+        x, heights = facts.profile
+        name = next((f".{n}" for n in PROFILE_FIELDS if hasattr(profile, n)), "")
+        slope = float(np.max(np.abs(np.diff(heights)))) / (x[1] - x[0])
+        yield Value(f"{address}{name}", slope if profile.kind != "step" else 0.0)
+
+
+def size_of_section_modulus(facts):
+    """Side of a cube as large as a section modulus, over the length."""
+    for name, modulus, _ in of_parts("sensors", "section_modulus")(facts):
+        side = modulus ** (1 / 3)
+        yield Value(name, side / facts.length, {"side": side})
+
+
+def error_over_reading(facts):
+    """Noise, resolution and offset of sensors over the size of their readings."""
+    for address, sensor in _parts(facts, "sensors"):
+        size = facts.reading(sensor)
+        for name, given in _numbers(sensor, address, "noise", "resolution", "offset"):
+            if size:
+                unit = sensor.unit
+                small = SMALL_UNITS.get(unit, f"1e-3 {unit}")
+                words = {"given": abs(given), "unit": unit, "size": size, "small": small}
+                yield Value(name, abs(given) / size, words)
+
+
+def _delays(facts):
+    for address, part in (*_parts(facts, "sensors"), *_parts(facts, "controller")):
+        yield from _numbers(part, address, "delay")
+
+
+def delay_over_duration(facts):
+    """Delays over the duration of the run."""
+    duration = float(facts.case.run.duration)
+    for name, delay in _delays(facts):
+        yield Value(name, delay / duration, {"delay": delay, "duration": duration})
+
+
+def delay_over_period(facts):
+    """Delays over the period of the first mode."""
+    if facts.numbers.first_frequency is not None:
+        for name, delay in _delays(facts):
+            yield Value(name, delay * facts.numbers.first_frequency)
+
+
+def samples_in_period(facts):
+    """Samples of the controller in a period of the highest mode that it is made for."""
+    controller = facts.case.controller
+    if controller is None or controller.period is None or controller.open_loop:
+        return
+    if facts.frequencies.size:
+        mode = min(_controlled_modes(facts), facts.frequencies.size)
+        frequency, period = float(facts.frequencies[mode - 1]), float(controller.period)
+        words = {"mode": mode, "frequency": frequency, "longest": 0.5 / frequency}
+        yield Value("controller.period", 1 / (period * frequency), words)
+
+
+def _controlled_modes(facts) -> int:
+    """Number of the highest mode with a weight in the design, as it deflects; 1 without weights."""
+    controller = facts.case.controller
+    weight = getattr(controller, "state_weight", None)
+    if weight is None or getattr(controller, "coordinates", "") != "modal":
+        return 1
+    design = controller.design
+    modes = facts.case.beam.modes if design is None or design.modes is None else design.modes
+    modes = min(modes, facts.modes.stiffness.size)
+    with_compliance = np.asarray(weight)[:modes] / np.asarray(facts.modes.stiffness)[:modes] ** 2
+    weighted = np.flatnonzero(with_compliance > 1e-3 * np.max(with_compliance))
+    return int(weighted[-1]) + 1 if weighted.size else 1
+
+
+def samples_of_record(facts):
+    """Samples of the record in a period of the first mode; with accelerometers of the third."""
+    if not facts.frequencies.size or not (facts.case.loads or facts.case.controller is not None):
+        return
+    rate, mode = float(facts.case.run.sample_rate), 1
+    if any(sensor.quantity == "acceleration" for sensor in facts.case.sensors):
+        mode = min(3, facts.frequencies.size)
+    frequency = float(facts.frequencies[mode - 1])
+    likely = "in Hz, not in kHz"
+    if rate < 1:
+        likely = f"samples per second, not a time step, of which {1 / rate:.4g} Hz is the inverse"
+    words = {"rate": rate, "what": f"mode {mode}", "frequency": frequency, "likely": likely}
+    yield Value("run.sample_rate", rate / frequency, words)
+
+
+def gravity(facts):
+    """Acceleration of gravity (m/s^2), unless there is none."""
+    if float(facts.case.run.gravity) > 0:
+        yield Value("run.gravity", float(facts.case.run.gravity))
+
+
+def sensor_count(facts):
+    """Sensors of a case with loads."""
+    if facts.case.loads:
+        yield Value("sensors", len(facts.case.all_sensors))

@@ -1,0 +1,564 @@
+"""What looks wrong is said, and nothing else: planted mistakes, and cases that are right."""
+
+import dataclasses
+import math
+import re
+import tomllib
+import warnings
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
+from jaxbeam.model.modes import mesh_layout
+from tests.modules import ROOT
+
+BRIDGE = dict(length=25.0, flexural_rigidity=30e9, mass_per_length=15e3, damping_ratio=0.015)
+RIGHT_FILES = [
+    *sorted((ROOT / "jaxbeam/rigs").glob("*.toml")),
+    *sorted((ROOT / "examples").glob("*.toml")),
+]
+
+
+def bridge(beam=None, supports=(), load=None, run=None, sensors=None, **other) -> jb.Case:
+    """A bridge of 25 m under a truck of 30 t at 90 km/h, with some numbers changed."""
+    return jb.Case(
+        jb.Beam(**BRIDGE | (beam or {})),
+        supports=supports,
+        sensors=[jb.Sensor(position=12.5)] if sensors is None else sensors,
+        loads=[jb.MovingMass(**dict(mass=30e3, speed=25.0) | (load or {}))],
+        run=jb.Run(**dict(duration=2.0) | (run or {})),
+        **other,
+    )
+
+
+@pytest.mark.parametrize("path", RIGHT_FILES, ids=lambda path: path.stem)
+def test_rigs_and_examples_are_plausible(path: Path):
+    assert jb.check(jb.load_case(path)).warnings == ()
+
+
+def test_the_demonstration_is_plausible():
+    case = jb.load_case(ROOT / "jaxbeam/demo/rig.toml")
+    assert jb.check(case).warnings == ()
+    for mass, speed in ((0.05, 0.5), (0.6, 6.0)):
+        loads = [jb.MovingMass(mass=mass, speed=speed)]
+        assert jb.check(jb.Case(case.beam, sensors=case.sensors, loads=loads)).warnings[1:] == ()
+
+
+def test_numbers_are_those_of_the_closed_forms():
+    found = jb.check(bridge(beam={"modes": 30}))
+    EI, m, L, P = 30e9, 15e3, 25.0, 30e3 * 9.81
+    first = math.pi / 2 / L**2 * math.sqrt(EI / m)
+    assert found.warnings == ()
+    assert found.first_frequency == pytest.approx(first, rel=1e-9)
+    assert found.deflection == pytest.approx(P * L**3 / 48 / EI, rel=1e-4)
+    assert found.span_over_deflection == pytest.approx(L / (P * L**3 / 48 / EI), rel=1e-4)
+    assert found.own_deflection == pytest.approx(5 / 384 * m * 9.81 * L**4 / EI, rel=1e-3)
+    assert found.mass_ratio == pytest.approx(30e3 / (m * L))
+    assert found.crossing_time == pytest.approx(1.0)
+    assert found.critical_speed == pytest.approx(math.pi / L * math.sqrt(EI / m))
+    assert found.speed_ratio == pytest.approx(25.0 / found.critical_speed)
+    assert f"{first:.4g} Hz" in str(found)
+
+
+def parsed(text: str) -> jb.Case:
+    return case_from_dict(tomllib.loads(text))
+
+
+BASES = {
+    "bridge": """
+        [beam]
+        length = 25.0
+        flexural_rigidity = 30e9
+        mass_per_length = 15e3
+        damping_ratio = 0.015
+        modes = 5
+        [[sensors]]
+        position = 12.5
+        [[loads]]
+        kind = "mass"
+        mass = 30e3
+        speed = 25.0
+        [run]
+        duration = 2.0
+        """,
+    "section": """
+        [beam]
+        length = 2.0
+        width = 0.06
+        height = 0.012
+        youngs_modulus = 210e9
+        density = 7850.0
+        damping_ratio = 0.01
+        [[sensors]]
+        position = 1.0
+        [[loads]]
+        kind = "force"
+        force = 15.0
+        speed = 2.0
+        [run]
+        duration = 1.5
+        """,
+    "cars": """
+        [beam]
+        length = 25.0
+        flexural_rigidity = 30e9
+        mass_per_length = 15e3
+        damping_ratio = 0.015
+        [[sensors]]
+        position = 12.5
+        [[vehicle_sensors]]
+        load = 0
+        body = "body"
+        [[loads]]
+        kind = "quarter-car"
+        speed = 20.0
+        body_mass = 17000.0
+        axle_mass = 600.0
+        suspension_stiffness = 4e5
+        suspension_damping = 1e4
+        tyre_stiffness = 1.75e6
+        tyre_damping = 1e3
+        [[loads]]
+        kind = "half-car"
+        speed = 20.0
+        entry_time = 1.5
+        body_mass = 16600.0
+        body_inertia = 95765.0
+        axle_positions = [2.4, -2.4]
+        axle_masses = [700.0, 1100.0]
+        suspension_stiffness = [4e5, 1e6]
+        suspension_damping = [1e4, 1e4]
+        tyre_stiffness = [1.75e6, 3.5e6]
+        tyre_damping = [1e3, 1e3]
+        [[loads]]
+        kind = "oscillator"
+        speed = 20.0
+        entry_time = 3.0
+        mass = 17000.0
+        stiffness = 1.6e6
+        damping = 2e4
+        [profile]
+        kind = "sine"
+        amplitude = 0.002
+        wavelength = 4.0
+        [run]
+        duration = 5.0
+        """,
+    "railway": """
+        [beam]
+        length = 25.0
+        flexural_rigidity = 30e9
+        mass_per_length = 15e3
+        damping_ratio = 0.015
+        [[sensors]]
+        position = 12.5
+        quantity = "acceleration"
+        [[loads]]
+        kind = "wagon"
+        speed = 60.0
+        body_mass = 32e3
+        body_inertia = 2e6
+        bogie_mass = 2600.0
+        bogie_inertia = 1400.0
+        wheelset_mass = 1800.0
+        primary_stiffness = 2.4e6
+        primary_damping = 8e3
+        secondary_stiffness = 8.6e5
+        secondary_damping = 4e4
+        bogie_distance = 19.0
+        wheelset_distance = 2.5
+        [[loads]]
+        kind = "axles"
+        offsets = [0.0, 3.0, 11.0, 14.0]
+        forces = 170e3
+        masses = 1800.0
+        speed = 60.0
+        entry_time = 2.0
+        [[loads]]
+        kind = "vehicle"
+        count = 2
+        spacing = 20.0
+        speed = 60.0
+        entry_time = 3.0
+        bodies = [
+            {name = "body", mass = 30e3, inertia = 1e6},
+            {name = "frame", mass = 4e3, inertia = 1e4},
+        ]
+        springs = [
+            {first = "body", second = "frame", position = -2.0, stiffness = 1e6, damping = 2e4},
+            {first = "body", second = "frame", position = 2.0, stiffness = 1e6, damping = 2e4},
+        ]
+        axles = [
+            {body = "frame", position = 2.0, mass = 900.0, suspension_stiffness = 2e6},
+            {body = "frame", position = -2.0, mass = 900.0, suspension_stiffness = 2e6},
+        ]
+        [run]
+        duration = 4.0
+        """,
+    "footbridge": """
+        [beam]
+        length = 30.0
+        flexural_rigidity = 1.8e9
+        mass_per_length = 1200.0
+        damping_ratio = 0.005
+        [[sensors]]
+        position = 15.0
+        quantity = "acceleration"
+        [[loads]]
+        kind = "pedestrian"
+        pace = 2.0
+        speed = 1.5
+        [[loads]]
+        kind = "varying-force"
+        force = 0.0
+        frequencies = [2.0]
+        amplitudes = [300.0]
+        phases = [0.0]
+        position = 10.0
+        [run]
+        duration = 22.0
+        """,
+    "rig": """
+        [beam]
+        length = 0.6
+        flexural_rigidity = 11.68
+        mass_per_length = 0.535
+        damping_ratio = 0.03
+        [[actuators]]
+        kind = "patch"
+        start = 0.25
+        end = 0.35
+        d33 = 4e-10
+        modulus = 30e9
+        electrode_spacing = 0.5e-3
+        beam_height = 3e-3
+        patch_height = 0.3e-3
+        patch_width = 0.028
+        correction = 0.8
+        amplifier_gain = 200.0
+        limits = [-2.5, 7.5]
+        [[actuators]]
+        kind = "shaker"
+        position = 0.5
+        stiffness = 3500.0
+        damping = 80.0
+        limits = [-4.0, 4.0]
+        [[actuators]]
+        kind = "point"
+        position = 0.2
+        limits = [-5.0, 5.0]
+        [[sensors]]
+        position = 0.3
+        noise = 1e-5
+        resolution = 1e-6
+        delay = 0.001
+        [[sensors]]
+        position = 0.2
+        quantity = "strain"
+        fibre_distance = 1.5e-3
+        noise = 1e-6
+        [[sensors]]
+        position = 0.2
+        quantity = "stress"
+        section_modulus = 7.5e-8
+        [[loads]]
+        kind = "mass"
+        mass = 0.5
+        speed = 0.6
+        [controller]
+        kind = "output-feedback"
+        gains = [[2e3, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+        period = 0.005
+        delay = 0.001
+        [run]
+        duration = 1.2
+        """,
+}
+
+# The case, the entry that is wrong, its value, the address that is named, and the likely unit.
+MISTAKES = [
+    # Stiffness, mass and damping of the beam
+    ("bridge", "beam.flexural_rigidity", 30e6, "", "in N m^2, not in kN m^2"),
+    ("bridge", "beam.flexural_rigidity", 30e3, "", "in N m^2, not in kN m^2"),
+    ("bridge", "beam.flexural_rigidity", 30.0, "", "or GN m^2"),
+    ("bridge", "beam.flexural_rigidity", 30e15, "", "in N m^2"),
+    ("rig", "beam.flexural_rigidity", 11.68e-3, "", "in N m^2, not in kN m^2"),
+    ("rig", "beam.flexural_rigidity", 11.68e6, "", "in N m^2"),
+    ("bridge", "beam.mass_per_length", 15.0, "beam.flexural_rigidity", "kg/m, not in t"),
+    ("rig", "beam.mass_per_length", 535.0, "beam.flexural_rigidity", "mass_per_length in kg/m"),
+    ("bridge", "beam.length", 25e3, "beam.flexural_rigidity", "beam.length in m, not in mm"),
+    ("section", "beam.youngs_modulus", 210.0, "", "in Pa, not in GPa"),
+    ("section", "beam.youngs_modulus", 210e3, "", "not in GPa or MPa"),
+    ("section", "beam.youngs_modulus", 210e12, "", "in Pa"),
+    ("section", "beam.density", 7.85, "", "in kg/m^3, not in t/m^3 or g/cm^3"),
+    ("section", "beam.density", 77e3, "", "not a weight in N/m^3"),
+    ("section", "beam.height", 12.0, "", "in m, not in mm"),
+    ("section", "beam.width", 60.0, "", "in m, not in mm"),
+    ("section", "beam.height", 1.2e-5, "", "in m, and is beam.length in m, not in mm"),
+    ("bridge", "beam.damping_ratio", 1.5, "", "0.01 for one per cent"),
+    ("bridge", "beam.damping_ratio", 0.3, "", "0.01 for one per cent"),
+    ("bridge", "beam.shear_stiffness", 2e3, "", "in N, not in kN"),
+    ("bridge", "beam.rotary_inertia", 5e6, "", "in kg m"),
+    # Supports
+    ("bridge", "supports.0", {"position": 12.5, "settlement": 20.0}, ".settlement", "not in mm"),
+    ("bridge", "supports.0", {"position": 24.99}, ".position", "are positions in m"),
+    ("bridge", "beam.ends", "free-free", "", "add [[supports]]"),
+    ("bridge", "beam.ends", "free-pinned", "", "add [[supports]]"),
+    ("bridge", "beam.hinges", [{"position": 10.0}], "", "leave a hinge out"),
+    # Weight and travel of loads
+    ("bridge", "loads.0.mass", 30.0, "", "in kg, not in t"),
+    ("bridge", "loads.0.mass", 30e3 * 9.81, "", "kg, not its weight in N"),
+    ("bridge", "loads.0.mass", 30e6, "", "kg"),
+    ("rig", "loads.0.mass", 500.0, "beam.flexural_rigidity", "masses of loads in kg"),
+    ("rig", "loads.0.mass", 0.5 * 9.81, "loads", "loads in kg"),
+    ("section", "loads.0.force", 0.015, "", "forces in N, not in kN"),
+    ("section", "loads.0.force", 15e3, "beam.youngs_modulus", "forces in N"),
+    ("bridge", "loads.0.speed", 250.0, "", "in m/s, not in km/h"),
+    ("cars", "loads.0.speed", 80.0, "", "in m/s, not in km/h"),
+    ("section", "loads.0.speed", 200.0, "", "in m/s, not in km/h"),
+    ("bridge", "loads.0.entry_time", 500.0, "loads.0", "loads.0.entry_time in s, not in ms"),
+    ("bridge", "loads.0.start_position", -30e3, "loads.0", "lengthen run.duration"),
+    ("bridge", "loads.0.deceleration", 15.0, "", "in m/s^2"),
+    ("bridge", "run.duration", 0.5, "loads.0", "lengthen run.duration"),
+    ("bridge", "run.duration", 2000.0, "", "in s, not in ms"),
+    ("bridge", "run.gravity", 9810.0, "", "in m/s^2, 9.81 on earth, not in mm/s^2"),
+    ("bridge", "run.sample_rate", 0.001, "", "samples per second, not a time step"),
+    ("bridge", "run.sample_rate", 5.0, "", "in Hz, not in kHz"),
+    ("railway", "run.sample_rate", 40.0, "", "in Hz"),
+    ("bridge", "sensors", [], "", "[[sensors]]"),
+    # Vehicles
+    ("cars", "loads.0.suspension_stiffness", 400.0, "", "in N/m, not in kN/m"),
+    ("cars", "loads.0.tyre_stiffness", 1750.0, "", "in N/m, not in kN/m"),
+    ("cars", "loads.0.suspension_damping", 10.0, "", "in N s/m, not in kN s/m"),
+    ("cars", "loads.0.suspension_damping", 1e7, "", "in N s/m"),
+    ("cars", "loads.0.suspension_stiffness", 1.75e7, "", "swapped with loads.0.tyre_stiffness"),
+    ("cars", "loads.0.tyre_damping", 1e5, "loads.0.suspension_damping", "loads.0.tyre_damping"),
+    ("cars", "loads.0.axle_mass", 18e3, "", "swapped with loads.0.body_mass"),
+    ("cars", "loads.0.body_mass", 17e3 * 9.81, "", "in kg, not its weight in N"),
+    ("cars", "loads.1.suspension_stiffness.1", 1000.0, "", "in N/m, not in kN/m"),
+    ("cars", "loads.1.tyre_stiffness.0", 1750.0, "", "in N/m, not in kN/m"),
+    ("cars", "loads.1.suspension_damping.0", 10.0, "", "in N s/m, not in kN s/m"),
+    ("cars", "loads.1.tyre_damping.1", 1.0, "", "in N s/m, not in kN s/m"),
+    ("cars", "loads.1.suspension_stiffness", [4e6, 1e7], "", "swapped"),
+    ("cars", "loads.1.axle_masses", [7e3, 11e3], "", "swapped with loads.1.body_mass"),
+    ("cars", "loads.1.body_inertia", 95.0, "", "in kg m^2, not in t m^2"),
+    ("cars", "loads.1.axle_positions", [2400.0, -2400.0], "", "in m, not in mm"),
+    ("cars", "loads.2.stiffness", 1600.0, "", "in N/m, not in kN/m"),
+    ("cars", "loads.2.damping", 20.0, "", "in N s/m, not in kN s/m"),
+    ("cars", "loads.2.mass", 17e3 * 9.81, "", "kg, not its weight in N"),
+    ("railway", "loads.0.primary_stiffness", 2400.0, "", "in N/m, not in kN/m"),
+    ("railway", "loads.0.secondary_stiffness", 860.0, "", "in N/m, not in kN/m"),
+    ("railway", "loads.0.primary_damping", 8.0, "", "in N s/m, not in kN s/m"),
+    ("railway", "loads.0.secondary_stiffness", 2.4e7, "", "loads.0.primary_stiffness"),
+    ("railway", "loads.0.bogie_mass", 40e3, "", "swapped with loads.0.body_mass"),
+    ("railway", "loads.0.bogie_inertia", 1.4, "", "in kg m^2, not in t m^2"),
+    ("railway", "loads.0.bogie_distance", 19e3, "", "in m, not in mm"),
+    ("railway", "loads.1.offsets", [0.0, 3000.0, 11e3, 14e3], "", "in m, not in mm"),
+    ("railway", "loads.2.spacing", 20e3, "", "in m, not in mm"),
+    ("railway", "loads.1.forces", 170.0, "loads.1.masses", "in N, not in kN"),
+    ("railway", "loads.1.forces", 17e6, "", "in N"),
+    ("railway", "loads.1.masses", 1800 * 9.81 * 3, "", "in kg, the unsprung part"),
+    ("railway", "loads.2.springs.0.stiffness", 1e3, "", "in N/m, not in kN/m"),
+    ("railway", "loads.2.springs.1.damping", 10.0, "", "in N s/m, not in kN s/m"),
+    ("railway", "loads.2.axles.0.suspension_stiffness", 2e3, "", "in N/m, not in kN/m"),
+    # People and machines
+    ("footbridge", "loads.0.weight", 75.0, "", "in N, not in kg"),
+    ("footbridge", "loads.0.weight", 75e3, "", "one person in N"),
+    ("footbridge", "loads.0.pace", 12.6, "", "in Hz, not in rad/s"),
+    ("footbridge", "loads.0.speed", 25.0, "", "in m/s, not in km/h"),
+    ("footbridge", "loads.0.factors", [40.0, 10.0], "loads.0.factors.0", "40 per cent"),
+    ("footbridge", "loads.1.phases", [90.0], "loads.1.phases.0", "in rad, not in degrees"),
+    # Surface
+    ("cars", "profile.amplitude", 2.0, "", "in m, not in mm"),
+    ("cars", "profile.wavelength", 40e3, "", "in m, not in mm"),
+    ("cars", "profile.phase", 90.0, "", "in rad, not in degrees"),
+    ("cars", "profile", dict(kind="bump", start=1.0, end=2.0, height=30.0), ".height", "in mm"),
+    (
+        "cars",
+        "profile",
+        {"kind": "table", "positions": [-9.0, 5.0, 45.0], "point_heights": [0.0, 5.0, 0.0]},
+        ".point_heights",
+        "in m, not in mm",
+    ),
+    # Actuators
+    ("rig", "actuators.0.d33", 400.0, "", "in m/V, not in pm/V"),
+    ("rig", "actuators.0.modulus", 30.0, "", "in Pa, not in GPa"),
+    ("rig", "actuators.0.electrode_spacing", 0.5, "", "in m, not in mm"),
+    ("rig", "actuators.0.patch_width", 28.0, "", "in m, not in mm"),
+    ("rig", "actuators.0.patch_height", 0.3, "", "in m, not in mm"),
+    ("rig", "actuators.0.beam_height", 3.0, "", "in m, not in mm"),
+    ("rig", "actuators.0.correction", 80.0, "", "0.8 for 80 per cent"),
+    ("rig", "actuators.0.limits", [1.0, 5.0], "", "smallest and the largest command"),
+    ("rig", "actuators.1.limits", [-5.0, -1.0], "", "smallest and the largest command"),
+    ("rig", "actuators.0.added_mass", 500.0, "", "in kg/m"),
+    ("rig", "actuators.0.added_rigidity", 2e3, "", "in N m^2"),
+    ("rig", "actuators.1.force_per_volt", 4.6e3, "", "in N/V"),
+    ("rig", "actuators.1.bandwidth", 10.0, "", "in 1/s, 2 pi times the frequency in Hz"),
+    ("rig", "actuators.1.position", 0.0, "", "Move it into a span"),
+    ("rig", "actuators.2.position", 0.6, "", "Move it into a span"),
+    ("rig", "actuators.2.limits", [-5e3, 5e3], "", "in N"),
+    # Sensors
+    ("rig", "sensors.0.noise", 0.01, "", "in m, not in mm"),
+    ("rig", "sensors.0.resolution", 0.01, "", "in m, not in mm"),
+    ("rig", "sensors.0.delay", 2.0, "", "in s, not in ms"),
+    ("rig", "sensors.0.delay", 1.0, "", "in s, not in ms"),
+    ("rig", "sensors.1.fibre_distance", 1.5, "", "in m, not in mm"),
+    ("rig", "sensors.1.noise", 1.0, "", "not in 1e-6"),
+    ("rig", "sensors.2.section_modulus", 75.0, "", "in m^3, not in cm^3 or mm^3"),
+    ("rig", "sensors.0.offset", 3.0, "", "in m, not in mm"),
+    # Controller
+    ("rig", "controller.period", 0.05, "", "in s, not in ms"),
+    ("rig", "controller.delay", 1.5, "", "in s, not in ms"),
+    ("rig", "controller.delay", 0.5, "", "in s, not in ms"),
+]
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_cases_to_begin_with_look_right(base):
+    assert jb.check(parsed(BASES[base])).warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("base", "entry", "value", "named", "unit"),
+    MISTAKES,
+    ids=[f"{base}-{entry}-{i}" for i, (base, entry, *_) in enumerate(MISTAKES)],
+)
+def test_mistakes_are_named_with_their_unit(base, entry, value, named, unit):
+    """One sentence names the entry, or what follows from it, and how to mend it."""
+    case = changed(parsed(BASES[base]), entry, value)
+    address = named if named and not named.startswith(".") else entry + named
+    found = [one for one in jb.check(case).warnings if one.startswith(f"{address}: ")]
+    assert any(unit in one for one in found), (jb.check(case).warnings, address)
+
+
+REFUSED = [
+    ("bridge", "sensors.0.position", 12500.0, "in m, not in mm"),
+    ("bridge", "supports.0", {"position": 12500.0}, "in m, not in mm"),
+    ("rig", "actuators.1.position", 300.0, "in m, not in mm"),
+    ("rig", "actuators.0.start", 250.0, "in m, not in mm"),
+    ("rig", "actuators.0.start", 0.36, "must lie to the right"),
+    ("rig", "actuators.1.limits", [4.0, -4.0], "must be above the entry before it"),
+    ("bridge", "loads.0.speed", 0.0, "must not be 0"),
+    ("bridge", "beam.damping_ratio", -0.01, "must not be negative"),
+    ("bridge", "loads.0.mass", -30e3, "must not be negative"),
+    ("bridge", "beam.length", 0.0, "must be positive"),
+    ("bridge", "loads.0.start_position", 5.0, "give a negative one"),
+    ("rig", "controller.period", 10.0, "must not exceed the run's duration"),
+    ("cars", "loads.1.axle_positions", [-2.4, 2.4], "list the axles front first"),
+    ("railway", "loads.1.offsets", [3.0, 6.0, 14.0, 17.0], "must begin with 0"),
+    ("railway", "loads.2.spacing", 0.2, "must exceed the wheelbase"),
+    ("railway", "loads.0.wheelset_distance", 25.0, "distance between bogie centres"),
+    ("footbridge", "loads.0.pace", 0.5, "must exceed"),
+]
+
+
+@pytest.mark.parametrize(("base", "entry", "value", "words"), REFUSED)
+def test_what_makes_no_sense_is_refused(base, entry, value, words):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        jb.check(changed(parsed(BASES[base]), entry, value))
+
+
+def changed(case: jb.Case, entry: str, value) -> jb.Case:
+    """The case with another value, list or table at an entry."""
+    content, (*path, last) = case_to_dict(case), entry.split(".")
+    content.setdefault(path[0] if path else last, [])
+    node = content
+    for key in path:
+        node = node[int(key)] if isinstance(node, list) else node[key]
+    if isinstance(node, list) and int(last) == len(node):
+        node.append(value)
+    elif isinstance(node, list):
+        node[int(last)] = value
+    else:
+        node[last] = value
+    return case_from_dict(content)
+
+
+def test_soft_springs_beside_each_other_do_not_clamp():
+    springs = [jb.Support(position=x, stiffness=1e7) for x in (10.0, 10.01)]
+    assert jb.check(bridge(supports=springs)).warnings == ()
+
+
+def test_beams_that_are_not_held_and_cases_without_loads():
+    free = jb.Case(jb.Beam(**BRIDGE | {"ends": "free-free"}), sensors=[jb.Sensor(position=1.0)])
+    found = jb.check(free)
+    assert (found.deflection, found.own_deflection, found.mass_ratio) == (None, None, None)
+    first = 4.730040744862704**2 / (2 * math.pi) / 25.0**2 * math.sqrt(30e9 / 15e3)
+    assert found.first_frequency == pytest.approx(first, rel=1e-6)
+    assert found.warnings == ()
+
+
+def test_a_run_without_a_load_on_the_beam_is_not_praised():
+    record = jb.simulate(bridge(load={"entry_time": 10.0}, run={"duration": 4.0}))
+    assert record.verdict.startswith("no load is on the beam during the run")
+    assert np.all(record.deflection == 0)
+
+
+IN_KILONEWTONS = {"flexural_rigidity": 30e6}
+
+
+@pytest.mark.parametrize("name", ["modes", "simulate", "sweep", "assess", "load_case"])
+def test_functions_warn_before_they_work(name, tmp_path):
+    """Each sentence once, at the address, of whatever the function uses."""
+    case = bridge(beam=IN_KILONEWTONS)
+    jb.save_case(case, tmp_path / "case.toml")
+    work = {
+        "modes": lambda: jb.modes(case),
+        "simulate": lambda: jb.simulate(case),
+        "sweep": lambda: jb.sweep(case, {"loads.0.speed": [20.0, 25.0]}, progress=False),
+        "assess": lambda: jb.assess(case, "160 km/h", dynamic=False),
+        "load_case": lambda: jb.load_case(tmp_path / "case.toml"),
+    }
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("default")
+        work[name]()
+    said = [str(one.message) for one in shown if one.category is jb.PlausibilityWarning]
+    assert len(said) == len(set(said)) > 0
+    assert said[0].startswith("beam.flexural_rigidity: the beam sags by")
+
+
+def test_fits_and_tuning_warn_before_they_work(monkeypatch):
+    import tuning
+
+    case = bridge(beam=IN_KILONEWTONS, controller=jb.Feedback(gains=[1.0], period=0.01))
+    case = jb.Case(**vars(case) | {"actuators": (jb.PointForce(10.0, limits=(-1e3, 1e3)),)})
+    log = tuning.Log(np.arange(5.0), np.ones((5, 1)), ("w",), ("deflection",), ("m",), "log", (0,))
+    loads = tuning.LoadCases(({"loads.0.mass": 2e4},), ({"loads.0.mass": 3e4},))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", jb.PlausibilityWarning)
+        with pytest.raises(jb.PlausibilityWarning, match="not in kN m"):
+            tuning.identify(case, [log], "beam.flexural_rigidity")
+        with pytest.raises(jb.PlausibilityWarning, match="not in kN m"):
+            tuning.tune(case, {"controller.gains.0": (0.0, 1.0)}, loads, progress=False)
+
+
+def test_a_sweep_is_judged_at_its_ends():
+    case = bridge()
+    with pytest.warns(jb.PlausibilityWarning, match=r"loads.0.speed: 200 m/s is 720 km/h"):
+        jb.sweep(case, {"loads.0.speed": [20.0, 200.0]}, progress=False)
+
+
+def test_traced_numbers_are_not_judged():
+    """Under jit, vmap and grad nothing fails; concrete numbers under grad are judged."""
+    case = bridge(beam=IN_KILONEWTONS)
+
+    def first(rigidity):
+        beam = dataclasses.replace(case.beam, flexural_rigidity=rigidity)
+        return jb.modes(jb.Case(beam), layout=mesh_layout(case)).frequencies[0]
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", jb.PlausibilityWarning)
+        assert jax.jit(first)(30e6) > 0
+        assert jax.vmap(first)(np.array([30e6, 31e6])).shape == (2,)
+    with pytest.warns(jb.PlausibilityWarning, match="not in kN m"):
+        jax.grad(first)(30e6)
+
+
+def test_hundreds_of_modes_are_judged_by_the_first():
+    found = jb.check(bridge(beam={"modes": 300}))
+    assert found.warnings == ()
+    assert found.deflection == pytest.approx(30e3 * 9.81 * 25.0**3 / 48 / 30e9, rel=1e-5)
