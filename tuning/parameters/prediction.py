@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from jaxbeam.case.case import Case, replace, stack_cases, value_at
 from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.runtime.arrays import xp
-from jaxbeam.runtime.compiling import xla_options
+from jaxbeam.runtime.compiling import compiled, xla_options
 from jaxbeam.simulation.integration_plan import IntegrationPlan
 from jaxbeam.simulation.simulate import simulate_readings
 from tuning.parameters.free import LOG_ADDRESS
@@ -73,16 +73,17 @@ class LogPrediction:
     ):
         own, self.which = log_addresses(addresses, len(cases))
         self.given = np.array([[value_at(case, a) for a in own] for case in cases], float)
-        self.simulated_addresses = [a for a in own if not OFFSET_ADDRESS.fullmatch(a)]
+        self.simulated_addresses = tuple(a for a in own if not OFFSET_ADDRESS.fullmatch(a))
         self.columns = [own.index(address) for address in self.simulated_addresses]
-        self.offset_addresses = _offset_addresses(cases[0])
+        self.offset_addresses = tuple(_offset_addresses(cases[0]))
         # Ones where a column of the table is the offset of a channel.
         self.shifts = np.array([[a == o for o in self.offset_addresses] for a in own], float)
         fixed = np.array([[s.offset for s in case.all_sensors] for case in cases], float)
         self.fixed_offsets = fixed * (1 - self.shifts.sum(axis=0))
         # Ones where a column of the table is a parameter.
         self.selection = (self.which[..., None] == np.arange(len(addresses))).astype(float)
-        self.plan = plan
+        # Plans that differ in their errors only share compiled programs.
+        self.plan = dataclasses.replace(plan, error=0.0, sensor_errors=())
         self.runs = stack_cases(cases), jnp.asarray(times), schedule
 
     def predict(self, values: Float[Array, " parameter"]) -> Float[Array, "log time channel"]:
@@ -97,14 +98,15 @@ class LogPrediction:
     ]:
         """Readings of all logs and their derivatives; as many logs at once as there are cores.
 
-        One program of one log is compiled, at the first call. The three logs of the demo take 0.45
-        s on two cores, 0.54 s one after the other.
+        The three logs of the demo take 0.45 s on two cores, 0.54 s one after the other.
         """
         table = self._table(np.asarray(values))
         offsets = self._offsets(table)
 
+        readings_with_slopes.precompile(*self._log(0, table))()  # once, not in each thread
+
         def of_log(i):
-            simulated, by_column = map(np.asarray, self._compiled(*self._log(i, table)))
+            simulated, by_column = map(np.asarray, readings_with_slopes(*self._log(i, table)))
             slopes = by_column @ self.selection[i, self.columns]
             return simulated + offsets[i], slopes + self.shifts.T @ self.selection[i]
 
@@ -120,16 +122,16 @@ class LogPrediction:
         """Offset of each channel in each log."""
         return self.fixed_offsets + table @ self.shifts
 
-    def _log(self, i: int, table):
-        """Arguments of `_simulated_with_slopes` for a log."""
-        run = jax.tree.map(lambda leaf: leaf[i], self.runs)
-        return run, jnp.asarray(table[i, self.columns])
+    def _arguments(self, case_times_schedule, values):
+        """Arguments of `readings_with_slopes` for a log, at values of the simulated addresses."""
+        case, times, schedule = case_times_schedule
+        plan = dataclasses.replace(self.plan, schedule=schedule)
+        return case, plan, times, values, self.simulated_addresses, self.offset_addresses
 
-    @functools.cached_property
-    def _compiled(self):
-        """The compiled program of `_simulated_with_slopes`."""
-        program = jax.jit(self._simulated_with_slopes)
-        return program.lower(*self._log(0, self.given)).compile(xla_options())
+    def _log(self, i: int, table):
+        """Arguments of `readings_with_slopes` for log i."""
+        run = jax.tree.map(lambda leaf: leaf[i], self.runs)
+        return self._arguments(run, np.asarray(table[i, self.columns]))
 
     @functools.cached_property
     def _simulated_readings(self):
@@ -140,12 +142,16 @@ class LogPrediction:
 
         @jax.custom_jvp
         def readings(columns):
-            return jax.lax.map(lambda part: self._simulated(*part), (self.runs, columns))
+            return jax.lax.map(
+                lambda part: _readings(*self._arguments(*part)), (self.runs, columns)
+            )
 
         # A jitted function is traced once for all programs that it is part of.
         @jax.jit
         def with_slopes(runs, columns):
-            return jax.lax.map(lambda part: self._simulated_with_slopes(*part), (runs, columns))
+            return jax.lax.map(
+                lambda part: readings_with_slopes(*self._arguments(*part)), (runs, columns)
+            )
 
         @readings.defjvp
         def _(primals, tangents):
@@ -154,19 +160,37 @@ class LogPrediction:
 
         return readings
 
-    def _simulated(self, run, values: Float[Array, " own"]) -> Float[Array, "time channel"]:
-        """Readings of one log without offsets."""
-        case, times, schedule = run
-        changes = dict(zip(self.simulated_addresses, values, strict=True))
-        case = replace(case, changes | dict.fromkeys(self.offset_addresses, 0.0))
-        return simulate_readings(case, times, dataclasses.replace(self.plan, schedule=schedule))
 
-    def _simulated_with_slopes(
-        self, run, values: Float[Array, " own"]
-    ) -> tuple[Float[Array, "time channel"], Float[Array, "time channel own"]]:
-        """Readings of one log without offsets, and their derivatives."""
+def _readings(
+    case: Case,
+    plan: IntegrationPlan,
+    times: Float[Array, " time"],
+    values: Float[Array, " own"],
+    addresses: tuple[str, ...],
+    offset_addresses: tuple[str, ...],
+) -> Float[Array, "time channel"]:
+    """Readings of one log without offsets, from values at addresses of its case."""
+    changes = dict(zip(addresses, values, strict=True)) | dict.fromkeys(offset_addresses, 0.0)
+    return simulate_readings(replace(case, changes), times, plan)
 
-        return _forward_mode(lambda v: self._simulated(run, v), values)
+
+@compiled
+def readings_with_slopes(
+    case: Case,
+    plan: IntegrationPlan,
+    times: Float[Array, " time"],
+    values: Float[Array, " own"],
+    addresses: tuple[str, ...],
+    offset_addresses: tuple[str, ...],
+) -> tuple[Float[Array, "time channel"], Float[Array, "time channel own"]]:
+    """Readings of one log without offsets, and their derivatives by the values at addresses.
+
+    One program for all logs, fits and processes with cases of one structure: `case`, `plan` and
+    `times` are arguments of it.
+    """
+    return _forward_mode(
+        lambda values: _readings(case, plan, times, values, addresses, offset_addresses), values
+    )
 
 
 def _forward_mode(function: Callable, values: Float[Array, " value"]) -> tuple[Array, Array]:

@@ -1,13 +1,18 @@
 """Readings of logs and their derivatives by the parameters of a fit, against differences."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxbeam as jb
+from jaxbeam.runtime.compiling import _partition, _signature
+from jaxbeam.runtime.program_key import program_name
 from tuning import Log
 from tuning.fit.dataset import make_dataset
+from tuning.parameters.prediction import LogPrediction, readings_with_slopes
 
 ADDRESSES = [
     "beam.flexural_rigidity",
@@ -73,3 +78,21 @@ def test_fixed_offsets_are_in_the_readings(dataset):
     before = dataset.measured - np.array([0.0, 3e-4])
     np.testing.assert_allclose(readings, before + np.array([5e-4, 3e-4]), rtol=0, atol=1e-8)
     assert np.all(slopes[..., 0] == [1.0, 0.0])
+
+
+def test_fits_of_one_structure_share_a_program(dataset):
+    """Also other processes: it has a name in the cache of programs."""
+    first = dataset.prediction(ADDRESSES)
+    slower = [jb.replace(case, {"loads.0.speed": 1.9}) for case in dataset.cases]
+    other = LogPrediction(
+        slower, 1.01 * dataset.times, dataclasses.replace(dataset.plan, error=1e-3), None, ADDRESSES
+    )
+    entries = []
+    for prediction in (first, other):
+        arrays, *rest = _partition((prediction._log(0, prediction.given), {}))
+        entries.append(readings_with_slopes._entry(arrays, rest))
+    assert entries[0] is entries[1]
+    assert program_name(readings_with_slopes, _signature(arrays, rest))
+    ready, _ = first.linearised(VALUES)
+    changed, _ = other.linearised(VALUES)
+    assert entries[0].compiled and np.any(ready != changed)
