@@ -18,7 +18,7 @@ from jaxbeam.c_code.source import CSource
 from jaxbeam.c_code.texts import check_text, header_text, samples_text, source_text
 from jaxbeam.c_code.writers import NoCCodeError, write_law
 from jaxbeam.case.case import Case
-from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.controller import AbstractController, LawOfCommanded
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.kinds import import_modules, kind_of
 from jaxbeam.case.trajectory import NEVER
@@ -186,6 +186,7 @@ def _given_states(law, loop: RecordedLoop, code: CSource) -> np.ndarray:
     """States that the program is given at each sample, none for a law with an estimator."""
     if not code.given_states:
         return np.zeros((len(loop.times), 0))
+    law = law.law if isinstance(law, LawOfCommanded) else law
     assert isinstance(law, SampledStateLaw)
     filter = law.filter
     while not isinstance(filter, TrueState):

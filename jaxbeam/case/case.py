@@ -117,6 +117,11 @@ class Case(Module):
         return xp.array([sensor.position for sensor in self.sensors]).reshape(-1)
 
     @property
+    def driven(self) -> tuple[AbstractActuator, ...]:
+        """Actuators that take commands: all but springs and dampers."""
+        return tuple(actuator for actuator in self.actuators if actuator.command_unit != "1")
+
+    @property
     def all_sensors(self) -> tuple[Sensor | VehicleSensor, ...]:
         """Sensors on the beam, then those on vehicles: the channels of a log."""
         return (*self.sensors, *self.vehicle_sensors)

@@ -168,15 +168,14 @@ class AbstractController(ReprWithUnits, Module, metaclass=ExplainsArguments):
     (s) later and is held until the next one. Without a period the law acts in continuous time.
     Commands are rounded to `resolution` and kept within the limits of the actuators by the closed
     loop. Where `nominal_plant` is given, the law is designed for that plant instead of the plant
-    of its case; no key of a case file.
+    of its case; no key of a case file. Settings and laws have entries for the actuators that take
+    commands (`Case.driven`), not for springs and dampers among them.
 
     To add a controller, write a file in `jaxbeam.control` with a subclass that names its `kind`.
     """
 
     kind: ClassVar[str]
     open_loop: ClassVar[bool] = False  # whether the command depends on time alone
-    # Whether the settings have entries for actuators that take commands only, not for springs.
-    leaves_passive_out: ClassVar[bool] = False
 
     period: Float[Array, ""] | None = number(
         "s", "sampling period; continuous time if left out", POSITIVE, default=None, kw_only=True
@@ -212,13 +211,10 @@ class AbstractController(ReprWithUnits, Module, metaclass=ExplainsArguments):
     def law(self, plant: Any) -> Any:
         """Law designed for the nominal plant, or for the plant of the case if there is none."""
         plant = plant if self.nominal_plant is None else self.nominal_plant
-        active = None if plant is None else commanded(plant.case.actuators)
-        if active is None or not self.leaves_passive_out:
+        if plant is None or len(plant.case.driven) == len(plant.case.actuators):
             return self.design_law(plant)
-        count = len(plant.case.actuators)
-        if len(active) == count:
-            return self.design_law(plant)
-        return LawOfCommanded(self.design_law(plant.of_actuators(active)), active, count)
+        active, count = commanded(plant.case.actuators), len(plant.case.actuators)
+        return LawOfCommanded(self.design_law(plant.of_driven()), active, count)
 
     def validate(self, case: Any) -> str | None:
         """Error of these settings in a case, as "key must ...", or None; before any compilation."""

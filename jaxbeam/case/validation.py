@@ -9,7 +9,6 @@ import itertools
 from collections.abc import Iterator
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -17,7 +16,6 @@ from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.beam_parts.properties import has
 from jaxbeam.case.case import Case, list_sizes, parts
-from jaxbeam.case.controller import commanded
 from jaxbeam.case.declared_checks import (
     POSITION_TOLERANCE,
     check_fields,
@@ -256,14 +254,13 @@ def _check_sampling(address: str, sensor: Sensor, case: Case) -> None:
 
 def _check_controller(case: Case) -> None:
     controller = case.controller
-    if not case.actuators:
-        raise ValueError("controller has nothing to command: add an actuator, or leave it out")
+    if not case.driven:
+        raise ValueError(
+            "controller has nothing to command: add an actuator that takes commands, or leave the"
+            " controller out"
+        )
     nominal = controller.nominal_plant
     designed_for = case if nominal is None else nominal.case
-    if controller.leaves_passive_out:
-        active = commanded(designed_for.actuators)
-        actuators = tuple(designed_for.actuators[i] for i in active)
-        designed_for = eqx.tree_at(lambda c: c.actuators, designed_for, actuators)
     error = controller.validate(designed_for)
     if error is not None:
         raise ValueError(f"controller.{error}")

@@ -132,7 +132,6 @@ class PD(AbstractCompensator):
     """
 
     kind: ClassVar[str] = "pd"
-    leaves_passive_out: ClassVar[bool] = True
 
     rate_gains: Float[Array, " *actuator"] = number(
         "command per reading per s", "gain of the rate of the reading"
@@ -163,7 +162,6 @@ class Lead(AbstractCompensator):
     """
 
     kind: ClassVar[str] = "lead"
-    leaves_passive_out: ClassVar[bool] = True
 
     zero: Float[Array, " *actuator"] = number(
         "Hz", "corner frequency of the zero, where the gain starts to rise", POSITIVE
@@ -203,7 +201,6 @@ class PositivePositionFeedback(AbstractCompensator):
     """
 
     kind: ClassVar[str] = "ppf"
-    leaves_passive_out: ClassVar[bool] = True
 
     frequency: Float[Array, " *actuator"] = number("Hz", "frequency of the oscillator", POSITIVE)
     damping_ratio: Float[Array, " *actuator"] = number(

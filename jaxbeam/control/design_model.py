@@ -68,7 +68,8 @@ class DesignModel(Module):
             modes = modes.lowest(self.modes)
         parts = self._with_design_values(case.actuators, ACTUATOR_FIELDS), self.design_loads(case)
         case = eqx.tree_at(lambda c: (c.actuators, c.loads), case, parts)
-        return build_plant(case, assemble_modal_model(case, modes), coordinates)
+        built = build_plant(case, assemble_modal_model(case, modes), coordinates)
+        return built if plant.commands == len(case.actuators) else built.of_driven()
 
     def design_loads(self, case: Any) -> tuple:
         """Loads of a case with the design parameters."""

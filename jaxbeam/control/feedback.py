@@ -11,7 +11,7 @@ from jaxbeam.runtime.arrays import Array, xp
 
 def pairing_error(gains: Float[Array, " actuator"], case) -> str | None:
     """Error unless each actuator has one gain and a sensor of the same index, or None."""
-    loops, actuators = gains.shape[0], len(case.actuators)
+    loops, actuators = gains.shape[0], len(case.driven)
     if loops != actuators:
         return f"gains must list one gain for each of {actuators} actuators, not {loops}"
     if loops > len(case.sensors):
@@ -49,7 +49,6 @@ class Feedback(AbstractStaticController):
     """
 
     kind: ClassVar[str] = "feedback"
-    leaves_passive_out: ClassVar[bool] = True
 
     gains: Float[Array, " actuator"] = number(
         "command per reading^power", "one gain for each actuator"
@@ -62,7 +61,7 @@ class Feedback(AbstractStaticController):
     )
 
     def validate(self, case):
-        actuators = len(case.actuators)
+        actuators = len(case.driven)
         error = pairing_error(self.gains, case)
         if error is not None:
             return error

@@ -51,7 +51,6 @@ class Feedforward(AbstractController):
     """
 
     kind: ClassVar[str] = "feedforward"
-    leaves_passive_out: ClassVar[bool] = True
     open_loop: ClassVar[bool] = True
 
     gates: Float[Array, "2"] = number("m", "positions of the gates, in the order of passage")
@@ -74,9 +73,9 @@ class Feedforward(AbstractController):
             return "period must be given: kind 'feedforward' acts at samples"
         if not case.loads:
             return "kind needs loads that pass the gates; add one, or take kind 'prescribed'"
-        if self.values.shape != (len(case.actuators), self.shares.shape[0]):
+        if self.values.shape != (len(case.driven), self.shares.shape[0]):
             return (
-                f"values must have for each of {len(case.actuators)} actuators as many entries as"
+                f"values must have for each of {len(case.driven)} actuators as many entries as"
                 f" shares has, {self.shares.shape[0]}; they are of shape {self.values.shape}"
             )
         if self.confirmation is not None and not _deflection_sensors(case.sensors):

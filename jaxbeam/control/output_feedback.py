@@ -29,14 +29,13 @@ class OutputFeedback(AbstractStaticController):
     """
 
     kind: ClassVar[str] = "output-feedback"
-    leaves_passive_out: ClassVar[bool] = True
 
     gains: Float[Array, "actuator sensor"] = number(
         "command per reading", "row of gains of the sensors for each actuator"
     )
 
     def validate(self, case):
-        wanted = len(case.actuators), len(case.sensors)
+        wanted = len(case.driven), len(case.sensors)
         if self.gains.shape != wanted:
             return (
                 f"gains must have a row for each of {wanted[0]} actuators, with a gain for each of"

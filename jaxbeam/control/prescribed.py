@@ -32,7 +32,6 @@ class Prescribed(AbstractStaticController):
     """
 
     kind: ClassVar[str] = "prescribed"
-    leaves_passive_out: ClassVar[bool] = True
     open_loop: ClassVar[bool] = True
 
     offsets: Float[Array, " actuator"] = number(
@@ -55,11 +54,14 @@ class Prescribed(AbstractStaticController):
     )
 
     def validate(self, case):
-        count = len(case.actuators)
+        count = len(case.driven)
         for name in ("offsets", "amplitudes", "phases", "values"):
             value = getattr(self, name)
             if value is not None and value.shape[0] != count:
-                return f"{name} must have an entry for each of {count} actuators"
+                return (
+                    f"{name} must have an entry for each of {count} actuators that take commands,"
+                    f" not {value.shape[0]}"
+                )
         if (self.amplitudes is None) != (self.frequencies is None):
             return "amplitudes and frequencies belong together; give both or neither"
         if self.phases is not None and self.amplitudes is None:

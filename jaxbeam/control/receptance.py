@@ -20,6 +20,7 @@ from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
 from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.output_feedback import OutputFeedback
@@ -66,8 +67,11 @@ class ReceptanceFeedback(Module):
         delay = float(concrete(self.delay))
         if delay and period is None:
             raise ValueError("a delay needs a sampling period: give period in s")
-        gains = np.zeros((len(case.actuators), 2 * count))
-        gains[self.actuator] = np.concatenate([self.displacement, self.velocity])
+        driven = commanded(case.actuators)
+        if self.actuator not in driven:
+            raise ValueError(f"actuators.{self.actuator} of the case takes no command")
+        gains = np.zeros((len(driven), 2 * count))
+        gains[driven.index(self.actuator)] = np.concatenate([self.displacement, self.velocity])
         return OutputFeedback(gains=gains, period=period, delay=delay or None)
 
 

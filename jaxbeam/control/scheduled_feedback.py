@@ -45,7 +45,6 @@ class ScheduledFeedback(AbstractController):
     """
 
     kind: ClassVar[str] = "feedback-scheduled"
-    leaves_passive_out: ClassVar[bool] = True
 
     masses: Float[Array, " mass"] = number("kg", "masses for which there are gains", INCREASING)
     gains: Float[Array, "actuator mass"] = number(

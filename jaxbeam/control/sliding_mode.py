@@ -12,11 +12,11 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.controller import ControlStep, commanded
+from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.fields import ON_BEAM, POSITIVE, choice, concrete, is_concrete, number
 from jaxbeam.control.state_controller import AbstractStateController, deflection_rows
 from jaxbeam.control.state_law import AbstractStateLaw
-from jaxbeam.runtime.arrays import Array, set_at, solve, xp
+from jaxbeam.runtime.arrays import Array, solve, xp
 
 SMALLEST_EFFECT = 1e-9  # of the commands on the surfaces, of that on all modes
 
@@ -67,7 +67,7 @@ class SlidingMode(AbstractStateController):
     )
 
     def validate(self, case):
-        outputs = len(commanded(case.actuators))
+        outputs = len(case.driven)
         if outputs == 0:
             return "kind needs an actuator that takes commands"
         if self.positions is None and len(case.sensors) < outputs:
@@ -96,23 +96,21 @@ class SlidingMode(AbstractStateController):
         return super().validate(case)
 
     def design_state_law(self, plant, design_plant):
-        active = np.array(commanded(plant.case.actuators))
-        sensors = design_plant.case.sensor_positions[: active.size]
+        outputs = len(plant.case.driven)
+        sensors = design_plant.case.sensor_positions[:outputs]
         positions = sensors if self.positions is None else self.positions
         A, B = _without_lags(design_plant)
         modes = A.shape[0] // 2
         rows = deflection_rows(design_plant, positions)[:, :modes]
         rates, reaching_rate, layer = (
-            xp.broadcast_to(part, active.size)
-            for part in (self.rate, self.reaching_rate, self.layer)
+            xp.broadcast_to(part, outputs) for part in (self.rate, self.reaching_rate, self.layer)
         )
         surface = xp.concatenate([rates[:, None] * rows, rows], axis=1)
-        effect = surface @ B[:, active]
-        _check_effect(effect, rows, B[modes:, active])
-        no_motion = xp.zeros((active.size, A.shape[0]))
+        effect = surface @ B
+        _check_effect(effect, rows, B[modes:])
+        no_motion = xp.zeros((outputs, A.shape[0]))
         own_motion = surface @ A if self.equivalent == "included" else no_motion
         gains = solve(effect, xp.concatenate([own_motion, xp.diag(reaching_rate)], axis=1))
-        gains = set_at(xp.zeros((len(plant.case.actuators), gains.shape[1])), active, gains)
         return SlidingModeLaw(
             surface / layer[:, None], gains[:, : A.shape[0]], gains[:, A.shape[0] :]
         )

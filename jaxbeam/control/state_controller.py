@@ -149,7 +149,7 @@ class AbstractStateController(AbstractController):
 @compiled_if_traced
 def _design_plant(controller: AbstractStateController, case, layout) -> Plant:
     """Design plant of a case."""
-    return controller.design_plant(state_space(case, layout=layout))
+    return controller.design_plant(state_space(case, layout=layout).of_driven())
 
 
 def _design_state_map(plant: Plant, design_plant: Plant) -> Float[Array, "design_state state"]:

@@ -33,7 +33,7 @@ class StateFeedback(AbstractStateController):
     )
 
     def validate(self, case):
-        shape = (len(case.actuators), self.state_count(case))
+        shape = (len(case.driven), self.state_count(case))
         if self.gain.shape != shape:
             return f"gain must have a row for each actuator, a column for each state: {shape}"
         return super().validate(case)

@@ -63,7 +63,7 @@ class CrossingFilter(AbstractSampledFilter):
     table: SampleModel | None = None
 
     def initial_state(self):
-        commands = len(self.filtered.plant.case.actuators)
+        commands = self.filtered.plant.commands
         return FilterState(self.initial, self.initial_covariance, xp.zeros(commands))
 
     def tabulated(self, times):

@@ -54,7 +54,7 @@ class LoadFollowingFilter(AbstractSampledFilter):
     plant_states: int = eqx.field(static=True)
 
     def initial_state(self):
-        commands = len(self.filtered.plant.case.actuators)
+        commands = self.filtered.plant.commands
         return FollowingState(self.initial, self.initial_covariance, xp.zeros(commands))
 
     def update(self, state, measurement, t):
@@ -123,7 +123,7 @@ class LoadFollowingFilter(AbstractSampledFilter):
         on_beam = (position >= 0) & (position <= plant.case.beam.length)
         inertia = self.inertia_share * xp.maximum(mass, 0.0)
         contact = mass_contact_rows(plant.modal_model, position, speed, on_beam, inertia)
-        system, commands = plant.with_contact(contact, self.output_rows), len(plant.case.actuators)
+        system, commands = plant.with_contact(contact, self.output_rows), plant.commands
         times, loads, gravity = position.shape[:-1], position.shape[-1], plant.case.run.gravity
 
         def of_numbers(inputs):

@@ -58,7 +58,7 @@ class SampledWithVehicles(AbstractSampledFilter):
         return self.timing.transition(matrices_at, np.zeros((size, size)), xp.ones(size), t)
 
     def initial_state(self):
-        commands = xp.zeros(len(self.plant.case.actuators))
+        commands = xp.zeros(self.plant.commands)
         beam = xp.zeros(self.plant.modal_model.state_count)
         vehicles = self.plant.augmented_start[: self.plant.vehicle_states]
         state = xp.concatenate([beam, vehicles])

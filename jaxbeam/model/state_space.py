@@ -10,13 +10,13 @@ wheel. Heights and pitch of vehicles are measured from static equilibrium.
 
 import dataclasses
 import math
-from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
+from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.validation import check_plant
 from jaxbeam.model.linear_system import Signal, StateSpace
@@ -83,13 +83,18 @@ class Plant(Module):
         one = xp.ones(int(has_known_disturbance(self.loads)))
         return xp.concatenate([vehicles, self.weights, one])
 
-    def of_actuators(self, indices: Sequence[int]) -> "Plant":
-        """The plant with the commands of some actuators only; the others act as they are."""
-        actuators = tuple(self.case.actuators[i] for i in indices)
-        case = eqx.tree_at(lambda c: c.actuators, self.case, actuators)
-        columns = self.modal_model.command_matrix[:, np.array(indices, int)]
+    @property
+    def commands(self) -> int:
+        """Number of commands: one for each actuator, or for each driven one (`of_driven`)."""
+        return self.modal_model.command_matrix.shape[1]
+
+    def of_driven(self) -> "Plant":
+        """The plant whose inputs are the commands of those actuators that take any."""
+        if self.commands == len(self.case.driven):
+            return self
+        columns = self.modal_model.command_matrix[:, np.array(commanded(self.case.actuators), int)]
         model = eqx.tree_at(lambda m: m.command_matrix, self.modal_model, columns)
-        return dataclasses.replace(self, case=case, modal_model=model)
+        return dataclasses.replace(self, modal_model=model)
 
     def from_modal(self, states: Float[Array, "state *batch"]) -> Float[Array, "state *batch"]:
         """States of the beam from those of the modal model, with the order (q_1, q_1', ...)."""
@@ -115,11 +120,11 @@ class Plant(Module):
 
     def B(self, t: Float[Array, ""] | float) -> Float[Array, "state actuator"]:
         """Command matrix B(t) with the masses on the beam."""
-        return self.at(t).B[:, : len(self.case.actuators)]
+        return self.at(t).B[:, : self.commands]
 
     def B_f(self, t: Float[Array, ""] | float) -> Float[Array, "state load"]:
         """Matrix of the weights W; the columns of loads off the beam are zero."""
-        return self.at(t).B[:, len(self.case.actuators) :]
+        return self.at(t).B[:, self.commands :]
 
     @property
     def unloaded(self) -> StateSpace:
@@ -133,7 +138,7 @@ class Plant(Module):
         `augmented_start`. With a profile, or forces that vary in time, a last state is 1: its
         columns are their effect on the beam and on the vehicles.
         """
-        frozen_system, commands = self.at(t), len(self.case.actuators)
+        frozen_system, commands = self.at(t), self.commands
         columns = frozen_system.B[..., commands:], frozen_system.D[..., commands:]
         constants = frozen_system.inputs[commands:]
         if has_known_disturbance(self.loads):
@@ -160,7 +165,11 @@ class Plant(Module):
     @property
     def output_rows(self) -> OutputRows:
         """Rows of the ideal sensors on the coordinates of the modal model."""
-        return sensor_rows(self.modal_model, self.case, self.case.sensors)
+        rows = sensor_rows(self.modal_model, self.case, self.case.sensors)
+        if self.commands == len(self.case.actuators):
+            return rows
+        columns = rows.on_commands[:, np.array(commanded(self.case.actuators), int)]
+        return dataclasses.replace(rows, on_commands=columns)
 
     def with_contact(
         self, contact: ContactRows | None, output_rows: OutputRows | None = None
@@ -209,7 +218,7 @@ class Plant(Module):
             C=C[..., order] / scales,
             D=D,
             states=signals,
-            inputs=_command_signals(self.case) + weights,
+            inputs=_command_signals(self) + weights,
             outputs=tuple(
                 Signal(f"sensor_{i}_{s.quantity}", s.unit) for i, s in enumerate(self.case.sensors)
             ),
@@ -239,10 +248,12 @@ def _unloaded_plant(plant: Plant) -> StateSpace:
     return plant.with_contact(None)
 
 
-def _command_signals(case: Case) -> tuple[Signal, ...]:
-    """Names and units of the commands."""
-    units = [actuator.command_unit for actuator in case.actuators]
-    return tuple(Signal(f"command_{i}", unit) for i, unit in enumerate(units))
+def _command_signals(plant: Plant) -> tuple[Signal, ...]:
+    """Names and units of the commands, numbered as the actuators are."""
+    actuators = plant.case.actuators
+    every = plant.commands == len(actuators)
+    numbers = range(len(actuators)) if every else commanded(actuators)
+    return tuple(Signal(f"command_{i}", actuators[i].command_unit) for i in numbers)
 
 
 def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = None) -> Plant:

@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.case import Case, crossing_times, replace
+from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.kinds import kind_of
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.quantities import unit_of
 from jaxbeam.case.trajectory import NEVER
@@ -33,8 +35,7 @@ def case_of_log(case: Case, log: Log, times: Float[np.ndarray, " time"]) -> Case
                 _check_command(case, log, channel, actuator)
                 more = times.size - log.times.size
                 commands[actuator] = np.pad(log.values[:, channel], (0, more), mode="edge")
-        controller = Prescribed(offsets=np.zeros(len(commands)), times=times, values=commands)
-        case = dataclasses.replace(case, controller=controller)
+        case = _prescribing(case, times, commands)
     return replace(case, {"run.duration": float(log.times[-1])})
 
 
@@ -43,19 +44,22 @@ def pad_cases(cases: list[Case], times: list[Float[np.ndarray, " time"]]) -> lis
 
     Thus a crossing without commands and a shaken beam without loads are alike.
     """
-    commanded = any(isinstance(case.controller, Prescribed) for case in cases)
+    prescribed = any(isinstance(case.controller, Prescribed) for case in cases)
     longest = max((case.loads for case in cases), key=len)
     made = []
     for case, own in zip(cases, times, strict=True):
-        if commanded and case.controller is None:
-            count = len(case.actuators)
-            zero_commands = Prescribed(
-                np.zeros(count), times=own, values=np.zeros((count, own.size))
-            )
-            case = dataclasses.replace(case, controller=zero_commands)
+        if prescribed and case.controller is None:
+            case = _prescribing(case, own, np.zeros((len(case.actuators), own.size)))
         absent_loads = tuple(_entering_at(load, 2 * own[-1]) for load in longest[len(case.loads) :])
         made.append(dataclasses.replace(case, loads=(*case.loads, *absent_loads)))
     return made
+
+
+def _prescribing(case: Case, times, commands: Float[np.ndarray, "actuator time"]) -> Case:
+    """The case under a table of commands, of which springs and dampers take none."""
+    values = commands[np.array(commanded(case.actuators), int)]
+    controller = Prescribed(offsets=np.zeros(len(values)), times=times, values=values)
+    return dataclasses.replace(case, controller=controller)
 
 
 def _entering_at(load: AbstractLoad, time: float) -> AbstractLoad:
@@ -80,6 +84,11 @@ def _check_command(case: Case, log: Log, channel: int, actuator: int) -> None:
         )
     device = case.actuators[actuator]
     unit = device.command_unit
+    if unit == "1":
+        raise ValueError(
+            f"{log.source}: {log.names[channel]} is the command to actuators.{actuator}, a"
+            f" {kind_of(type(device))}, which takes none; actuators are counted from 0"
+        )
     if COMMAND_UNITS.get(log.quantities[channel]) != unit:
         raise ValueError(
             f"{log.source}: {log.names[channel]} holds {log.quantities[channel]} in"

@@ -51,7 +51,7 @@ def equivalent_gains(
 
     Raises ValueError for an invalid case or one with fewer sensors than actuators.
     """
-    actuators, masses = len(case.actuators), np.asarray(masses, float)
+    actuators, masses = len(case.driven), np.asarray(masses, float)
     if len(case.sensors) < actuators:
         raise ValueError(
             f"only {len(case.sensors)} sensors for {actuators} actuators: add one for each actuator"
@@ -129,7 +129,7 @@ def scheduled_controller(
     controller = case.controller
     return ScheduledFeedback(
         masses=masses,
-        gains=[[each.gain for each in best]] * len(case.actuators),
+        gains=[[each.gain for each in best]] * len(case.driven),
         power=controller.power,
         between=between,
         load_identification=load_identification,
@@ -143,7 +143,7 @@ def _case_with(case: Case, gain: float | None, mass: float) -> Case:
     """Case with a mass (kg) of the first load, and a gain in all loops unless it is None."""
     change = {"loads.0.mass": mass}
     if gain is not None:
-        change["controller.gains"] = np.full(len(case.actuators), gain)
+        change["controller.gains"] = np.full(len(case.driven), gain)
     return replace(case, change)
 
 

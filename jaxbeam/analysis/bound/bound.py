@@ -25,6 +25,7 @@ from jaxbeam.analysis.bound.input_influence import (
 )
 from jaxbeam.analysis.bound.linear_program import least_peak
 from jaxbeam.case.case import Case
+from jaxbeam.case.controller import commanded
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.prescribed import Prescribed
@@ -65,7 +66,8 @@ class Bound(Module):
     `peak` (m) is the largest absolute deflection at the `positions` (m) and at times at most
     `spacing` (s) apart; that between these times may be slightly larger. `uncontrolled` (m) is the
     peak without commands. `commands` start at `times` (s) and are held over `period` (s); they
-    attain the peak to 1e-5, with small and smooth commands among those that do.
+    attain the peak to 1e-5, with small and smooth commands among those that do; those of springs,
+    not among the `driven` actuators, are without effect.
     """
 
     peak: float
@@ -76,6 +78,7 @@ class Bound(Module):
     period: float
     spacing: float
     active_constraints: ActiveConstraints
+    driven: tuple[int, ...]
 
     @property
     def reduction(self) -> float:
@@ -97,10 +100,11 @@ class Bound(Module):
         return float((self.uncontrolled - peak) / attainable) if attainable > 0 else np.nan
 
     def controller(self) -> Prescribed:
-        """Open-loop controller with these commands."""
+        """Open-loop controller with the commands of those actuators that take any."""
         end = self.times[-1] + self.period
-        values = np.concatenate([self.commands, self.commands[-1:]]).T
-        offsets = np.zeros(self.commands.shape[1])
+        commands = self.commands[:, np.array(self.driven, int)]
+        values = np.concatenate([commands, commands[-1:]]).T
+        offsets = np.zeros(len(self.driven))
         table = {"times": np.append(self.times, end), "values": values}
         return Prescribed(offsets=offsets, period=self.period, **table)
 
@@ -162,6 +166,7 @@ def _bound_without_baseline(case: Case, positions, period, spacing) -> Bound:
         active_constraints=ActiveConstraints(
             positions[where], influence.times[when], weights[when, where]
         ),
+        driven=commanded(case.actuators),
     )
 
 

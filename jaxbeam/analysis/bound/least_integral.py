@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from jaxbeam.analysis.bound.bound import checked_influence, held_command_limits
 from jaxbeam.analysis.bound.input_influence import InputInfluence
 from jaxbeam.case.case import Case
+from jaxbeam.case.controller import commanded
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.model.channels import accepts_commands
 from jaxbeam.numerics.optimisation.qp import STATUS_TEXT, solve_qp
@@ -34,7 +35,7 @@ class LeastIntegral(Module):
     `period` (s); no commands within the limits make it smaller than `proven`. `uncontrolled` is the
     integral without commands, at the `positions` (m) with the `weights`, by the trapezoidal rule at
     times at most `spacing` (s) apart. `share_at_limits` is that of the commands at a limit: all but
-    a few, "bang-bang", where limits are tight.
+    a few, "bang-bang", where limits are tight; the `driven` actuators are those that take any.
     """
 
     integral: float
@@ -47,6 +48,7 @@ class LeastIntegral(Module):
     share_at_limits: float
     period: float
     spacing: float
+    driven: tuple[int, ...]
 
     @property
     def reduction(self) -> float:
@@ -59,10 +61,11 @@ class LeastIntegral(Module):
         return float(np.trapezoid(w**2 @ self.weights, np.asarray(record.times)))
 
     def controller(self) -> Prescribed:
-        """Open-loop controller with these commands."""
+        """Open-loop controller with the commands of those actuators that take any."""
         end = self.times[-1] + self.period
-        values = np.concatenate([self.commands, self.commands[-1:]]).T
-        offsets = np.zeros(self.commands.shape[1])
+        commands = self.commands[:, np.array(self.driven, int)]
+        values = np.concatenate([commands, commands[-1:]]).T
+        offsets = np.zeros(len(self.driven))
         times = np.append(self.times, end)
         return Prescribed(offsets=offsets, period=self.period, times=times, values=values)
 
@@ -128,6 +131,7 @@ def least_integral(
         share_at_limits=float(np.mean(at_limits)),
         period=period,
         spacing=spacing,
+        driven=commanded(case.actuators),
     )
 
 

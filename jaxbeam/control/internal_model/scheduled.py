@@ -57,7 +57,6 @@ class ScheduledInternalModel(AbstractController):
     """
 
     kind: ClassVar[str] = "internal-model-scheduled"
-    leaves_passive_out: ClassVar[bool] = True
 
     shares: Float[Array, " breakpoint"] = number(
         "1",
@@ -81,7 +80,7 @@ class ScheduledInternalModel(AbstractController):
         return False
 
     def validate(self, case):
-        actuators = [a for a in case.actuators if a.command_unit != "1"]
+        actuators = case.driven
         if self.period is None:
             return "period must be given: kind 'internal-model-scheduled' acts at samples"
         if self.values.shape != self.shares.shape:
@@ -112,10 +111,10 @@ class ScheduledInternalModel(AbstractController):
 
     def design_law(self, plant):
         system, case = plant.unloaded, plant.case
-        sensors = case.sensors[: len(case.actuators)]
+        sensors = case.sensors[: len(case.driven)]
         static_lift = system.static_response(slice(len(sensors))) @ system.B
         own_lift = xp.diag(static_lift)
-        limits = xp.stack([actuator.command_limits() for actuator in case.actuators])
+        limits = xp.stack([actuator.command_limits() for actuator in case.driven])
         lifts = own_lift[:, None] * limits
         # The full command is the limit that lifts the most, whatever the sign of the lift.
         full = xp.where(lifts[:, 0] > lifts[:, 1], limits[:, 0], limits[:, 1])

@@ -45,7 +45,6 @@ class InternalModel(AbstractController):
     """
 
     kind: ClassVar[str] = "internal-model"
-    leaves_passive_out: ClassVar[bool] = True
 
     readings: Float[Array, " breakpoint"] = number("m", "deflections due to the load", INCREASING)
     values: Float[Array, "actuator breakpoint"] = number(
@@ -66,7 +65,7 @@ class InternalModel(AbstractController):
         return False
 
     def validate(self, case):
-        actuators = len(case.actuators)
+        actuators = len(case.driven)
         if self.period is None:
             return "period must be given: kind 'internal-model' acts at samples"
         if self.values.shape != (actuators, self.readings.shape[0]):

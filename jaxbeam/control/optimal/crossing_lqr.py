@@ -263,7 +263,7 @@ def finite_horizon_gains(
     # actuator with a lag much shorter than the interval are not.
     def system_at(t):
         system = plant.augmented(t) if with_weights else plant.at(t)
-        return system.A, system.B[:, : len(plant.case.actuators)]
+        return system.A, system.B[:, : plant.commands]
 
     return finite_horizon(system_at, *problem)
 

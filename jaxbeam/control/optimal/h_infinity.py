@@ -53,7 +53,6 @@ class HInfinity(AbstractController):
     """
 
     kind: ClassVar[str] = "h-infinity"
-    leaves_passive_out: ClassVar[bool] = True
 
     output_size: Float[Array, " *output"] = number(
         "unit of a reading", "size of each reading that counts as 1", POSITIVE
@@ -90,7 +89,7 @@ class HInfinity(AbstractController):
 
     def validate(self, case):
         outputs = len(case.sensors)
-        actuators = sum(actuator.command_unit != "1" for actuator in case.actuators)
+        actuators = len(case.driven)
         if self.period is None:
             return "period must be given: kind 'h-infinity' acts at samples"
         excess_delay = None if self.delay is None else self.delay - self.period

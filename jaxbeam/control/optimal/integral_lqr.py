@@ -76,7 +76,7 @@ class IntegralLQR(AbstractRegulator):
         return dlqr(A, B, Q, R, N)[0]
 
     def design_state_law(self, plant, design_plant):
-        limits = [actuator.command_limits() for actuator in plant.case.actuators]
+        limits = [actuator.command_limits() for actuator in plant.case.driven]
         unlimited = np.array([-np.inf, np.inf])
         limits = xp.stack([unlimited if part is None else part for part in limits])
         return IntegralLaw(
@@ -97,9 +97,9 @@ class IntegralLQR(AbstractRegulator):
         outputs = self.reference.shape[0]
         if self.integral_weight.shape != self.reference.shape:
             return f"integral_weight must have an entry for each of {outputs} references"
-        if outputs > len(case.actuators):
+        if outputs > len(case.driven):
             return (
-                f"reference must have at most {len(case.actuators)} entries, one for each actuator:"
+                f"reference must have at most {len(case.driven)} entries, one for each actuator:"
                 " so many deflections can be commanded"
             )
         sensors = case.sensors[:outputs]

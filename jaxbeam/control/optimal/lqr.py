@@ -45,7 +45,7 @@ class AbstractRegulator(AbstractStateController):
     def sizes(self, case) -> dict[str, int]:
         """Required number of entries of each list, by name."""
         states = self.state_count(case)
-        return {"state_weight": states, "command_weight": len(case.actuators), "feedback": states}
+        return {"state_weight": states, "command_weight": len(case.driven), "feedback": states}
 
     def validate(self, case):
         for name, size in self.sizes(case).items():

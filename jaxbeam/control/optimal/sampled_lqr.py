@@ -91,8 +91,8 @@ class DiscreteLQR(AbstractRegulator):
         if concrete_delay and concrete(self.delay) >= concrete(self.period):
             return "delay must be less than the period: the design allows for one pending command"
         rate = self.input_rate_weight
-        if rate is not None and rate.shape[0] != len(case.actuators):
-            return f"input_rate_weight must have {len(case.actuators)} entries, not {rate.shape[0]}"
+        if rate is not None and rate.shape[0] != len(case.driven):
+            return f"input_rate_weight must have {len(case.driven)} entries, not {rate.shape[0]}"
         return super().validate(case)
 
 

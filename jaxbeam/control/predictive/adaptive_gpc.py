@@ -78,8 +78,8 @@ class AdaptiveGPC(GPC):
             return "forgetting must be at most 1, which forgets nothing"
         if self.probe is not None and self.until is None:
             return "probe needs a time to end: give until"
-        if self.probe is not None and self.probe.shape not in ((), (len(case.actuators),)):
-            return f"probe must have {len(case.actuators)} entries, not {self.probe.size}"
+        if self.probe is not None and self.probe.shape not in ((), (len(case.driven),)):
+            return f"probe must have {len(case.driven)} entries, not {self.probe.size}"
         return super().validate(case)
 
     def design_law(self, plant):

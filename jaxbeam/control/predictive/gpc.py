@@ -179,7 +179,7 @@ class GPC(AbstractController):
         return False
 
     def validate(self, case):
-        outputs, actuators = len(case.sensors), len(case.actuators)
+        outputs, actuators = len(case.sensors), len(case.driven)
         if self.period is None:
             return "period must be given: kind 'gpc' acts at samples"
         excess_delay = None if self.delay is None else self.delay - self.period
@@ -218,7 +218,7 @@ class GPC(AbstractController):
 
     def weights(self, plant: Plant) -> tuple[Array, Array, Array]:
         """Weights of the readings and of the moves, and the references."""
-        outputs, actuators = len(plant.case.sensors), len(plant.case.actuators)
+        outputs, actuators = len(plant.case.sensors), plant.commands
         weight = 1.0 if self.output_weight is None else self.output_weight
         return (
             xp.broadcast_to(xp.asarray(weight), (outputs,)),

@@ -142,7 +142,7 @@ class MPC(AbstractStateController):
     def validate(self, case):
         outputs = len(case.sensors) if self.positions is None else self.positions.shape[0]
         sizes = {
-            "move_weight": ((), (len(case.actuators),)),
+            "move_weight": ((), (len(case.driven),)),
             "output_weight": ((), (outputs,)),
             "horizon_weight": ((self.horizon,),),
             "soft_limit": ((), (outputs,)),
@@ -171,9 +171,9 @@ class MPC(AbstractStateController):
             return f"laguerre_pole must be below 1, not {concrete(pole):g}"
         if self.loads == "known" and not case.loads:
             return "loads must be 'ignored' where there are none"
-        if self.terminal == "riccati" and outputs > len(case.actuators):
+        if self.terminal == "riccati" and outputs > len(case.driven):
             return (
-                f"terminal must be 'none' or 'dual-mode': {len(case.actuators)} actuators cannot"
+                f"terminal must be 'none' or 'dual-mode': {len(case.driven)} actuators cannot"
                 f" bring {outputs} deflections under a load to zero, so that the cost after the"
                 " horizon is infinite"
             )
@@ -192,9 +192,9 @@ class MPC(AbstractStateController):
                 "moves must be as many as the horizon has periods, and plain, with terminal"
                 " 'dual-mode': the regulator takes over after the last of them"
             )
-        if outputs < len(case.actuators):
+        if outputs < len(case.driven):
             return (
-                f"positions must be {len(case.actuators)} or more with terminal 'dual-mode':"
+                f"positions must be {len(case.driven)} or more with terminal 'dual-mode':"
                 f" commands of so many actuators are not all seen in {outputs} deflections"
             )
         return limits_error(case.actuators)
@@ -202,7 +202,7 @@ class MPC(AbstractStateController):
     def design_error(self, design_plant):
         if self.terminal != "dual-mode" or self.solver == "unconstrained":
             return None
-        regulator = self._regulator(*self._sampled(design_plant), design_plant.case.actuators)
+        regulator = self._regulator(*self._sampled(design_plant), design_plant.case.driven)
         needed = periods_needed(regulator, self.terminal_periods)
         if needed == self.terminal_periods:
             return None
@@ -217,7 +217,7 @@ class MPC(AbstractStateController):
         )
 
     def design_state_law(self, plant, design_plant):
-        actuators = plant.case.actuators
+        actuators = plant.case.driven
         sampled, C, weights = self._sampled(design_plant)
         beam, loaded_plant = design_plant.modal_model.state_count, self._loaded_plant(design_plant)
         vehicles = 0 if loaded_plant is None else loaded_plant.vehicle_states

@@ -130,7 +130,7 @@ class ScenarioMPC(MPC):
         if self.mass_factors.ndim:
             loads = [eqx.tree_at(lambda x: x.mass, x, x.mass * mass) for x in case.loads]
             case = eqx.tree_at(lambda c: c.loads, case, tuple(loads))
-        return build_plant(case, assemble_modal_model(case, modes), self.coordinates)
+        return build_plant(case, assemble_modal_model(case, modes), self.coordinates).of_driven()
 
 
 class ScenarioLaw(AbstractStateLaw):

@@ -107,7 +107,7 @@ def limits_error(actuators: Sequence[Any]) -> str | None:
     """Error of actuators whose limits leave no room about zero, as "terminal must ...", or None."""
     for i, actuator in enumerate(actuators):
         limits = actuator.command_limits()
-        if limits is None or not is_concrete(limits):
+        if limits is None or actuator.command_unit == "1" or not is_concrete(limits):
             continue
         low, high = concrete(limits)
         if not low < 0 < high:

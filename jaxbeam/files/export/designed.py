@@ -136,7 +136,7 @@ class GainDesign(NamedTuple):
 def _design_gains(case: Case, layout, shares) -> GainDesign:
     """Design of the controller of a case, tabulated at shares of the crossing."""
     controller = case.controller
-    plant = state_space(case, layout=layout)
+    plant = state_space(case, layout=layout).of_driven()
     design_plant = controller.design_plant(plant)
     estimator = jnp.zeros((0, 0))
     if controller.estimator is not None:
