@@ -58,6 +58,10 @@ CASES = {
         Feedback([2e3], period=PERIOD),
         actuators=[jb.SpringDamper(0.3, stiffness=100.0), jb.PointForce(0.45, limits=(-1.0, 1.0))],
     ),
+    "spring-lqr": rig(
+        jb.LQR([1e4, 1e2, 1.0, 0.1], [1e-4], period=PERIOD),
+        actuators=[jb.SpringDamper(0.3, stiffness=100.0), jb.PointForce(0.45, limits=(-1.0, 1.0))],
+    ),
     "feedback-cubic": rig(Feedback([5e8, 1e8], power=3, period=PERIOD), sensors=FILTERED),
     "output-feedback": rig(
         OutputFeedback([[2e3, 0.0, 5.0], [0.0, -1e3, 1.0]], period=PERIOD, delay=PERIOD),
