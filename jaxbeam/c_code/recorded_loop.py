@@ -92,6 +92,9 @@ class _DesignedController(AbstractController):
     def runs_compiled(self):
         return self.is_compiled
 
+    def law(self, plant):
+        return self.law_to_run
+
     def design_law(self, plant):
         return self.law_to_run
 

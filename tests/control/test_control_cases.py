@@ -20,7 +20,7 @@ from tests.loop_as_oracle import expected
 ACTUATOR, SENSOR = HELD.actuators[0], HELD.sensors[0]
 SAMPLED = "needs a controller that samples: give controller.period"
 ERRORS = [
-    ({"actuators": ()}, "controller has nothing to command: add an actuator, or leave it out"),
+    ({"actuators": ()}, "controller has nothing to command: add an actuator that takes commands"),
     ({"controller": jb.Feedback([1.0, 2.0])}, "controller.gains must list one gain for each of 1"),
     ({"sensors": ()}, "controller.gains has 1 entries, but there are only 0 sensors"),
     (
