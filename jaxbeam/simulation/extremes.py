@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.peaks.running_peaks import Peaks
@@ -29,6 +29,12 @@ def monitored_sensors(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
     return *(Sensor(sensor.position) for sensor in sensors), *others
 
 
+def own_outputs(sensors: Sequence[Sensor]) -> Int[np.ndarray, " sensor"]:
+    """Index of the quantity of each sensor among those of `monitored_sensors`."""
+    others = np.array([sensor.quantity != "deflection" for sensor in sensors], int)
+    return np.where(others, len(sensors) + np.cumsum(others) - 1, np.arange(len(sensors)))
+
+
 def sensor_extremes(sensors: Sequence[Sensor], peaks: Peaks) -> tuple[Extremes, Peaks]:
     """Extremes at the sensors, and peaks of the absolute deflection there.
 
@@ -37,12 +43,7 @@ def sensor_extremes(sensors: Sequence[Sensor], peaks: Peaks) -> tuple[Extremes, 
     """
     up, down = xp.split(peaks.peak_deflection, 2)
     up_time, down_time = xp.split(peaks.peak_time, 2)
-    own, other = [], len(sensors)  # index of the quantity of each sensor among the monitored
-    for i, sensor in enumerate(sensors):
-        is_deflection = sensor.quantity == "deflection"
-        own.append(i if is_deflection else other)
-        other += not is_deflection
-    index = np.array(own, int)
+    index = own_outputs(sensors)
     extremes = Extremes(-down[index], down_time[index], up[index], up_time[index])
     every = np.arange(len(sensors))
     is_up = up[every] >= down[every]

@@ -15,7 +15,7 @@ from jaxbeam.integrator.discrete_model import DiscreteModel, discrete_model, sig
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.peaks.running_peaks import Peaks
-from jaxbeam.integrator.propagators import NODE_COUNT, end_weights
+from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES, end_weights
 from jaxbeam.integrator.time_grid import TimeGrid, grid_by_schedule
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
@@ -29,6 +29,7 @@ from jaxbeam.runtime.arrays import Array, any_jax, put, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import closed_loop
 from jaxbeam.simulation.commands.limits import acting_ranges
+from jaxbeam.simulation.errors import peak_errors
 from jaxbeam.simulation.extremes import monitored_sensors, sensor_extremes
 from jaxbeam.simulation.integration_plan import (
     TOLERANCE,
@@ -44,6 +45,9 @@ from jaxbeam.simulation.integration_plan import (
 )
 from jaxbeam.simulation.motion.at_samples import motion_at
 from jaxbeam.simulation.record import Record
+
+MAX_SHORTENINGS = 3  # of steps whose peaks are not exact enough,
+LARGEST_SHORTENING = 4.0  # each by so much at most
 
 
 class ContactLossWarning(UserWarning):
@@ -101,12 +105,20 @@ def simulate(
     errors = xp.asarray(plan.error), xp.asarray(sensor_errors, float)
     record = first_records.get(plan.substeps)
     if record is not None:
-        record = dataclasses.replace(record, error_estimate=errors[0], step_errors=errors[1])
+        record = dataclasses.replace(
+            record,
+            error_estimate=record.error_estimate + errors[0],
+            step_errors=record.step_errors + errors[1],
+        )
     else:
-        # Plans that differ in their errors only share compiled programs.
-        is_compiled = plan.schedule is not None and runs_compiled(case, plan.schedule)
-        simulate_record = _simulate_compiled if is_compiled else _simulate
-        record = simulate_record(case, plan.without_statements(), times, errors)
+        record = _run(case, plan, times, errors)
+    if given is None and not any_jax(case, times):
+        for _ in range(MAX_SHORTENINGS):
+            shorter = _substeps_for_peaks(record, plan, tolerance)
+            if shorter == plan.substeps:
+                break
+            plan = dataclasses.replace(plan, substeps=shorter)
+            record = _run(case, plan, times, errors)
     if is_concrete(record.contact_lost_time):
         lost = np.isfinite(concrete(record.contact_lost_time)) & ~load_set(case).prescribed
         if lost.any() and np.isnan(concrete(record.diverged_time)):
@@ -118,6 +130,24 @@ def _until(case: Case, times) -> Case:
     """The case with a run that ends with the last of some times (s)."""
     run = dataclasses.replace(case.run, duration=xp.asarray(times, float)[-1])
     return dataclasses.replace(case, run=run)
+
+
+def _run(case: Case, plan: IntegrationPlan, times, errors) -> Record:
+    """Record of a planned run; plans that differ in their errors only share compiled programs."""
+    is_compiled = plan.schedule is not None and runs_compiled(case, plan.schedule)
+    simulate_record = _simulate_compiled if is_compiled else _simulate
+    return simulate_record(case, plan.without_statements(), times, errors)
+
+
+def _substeps_for_peaks(record: Record, plan: IntegrationPlan, tolerance: float) -> int:
+    """Steps between samples with which the peaks, which are interpolated, meet the tolerance."""
+    excess = (float(record.error_estimate) - plan.error) / max(
+        tolerance - plan.error, 0.1 * tolerance
+    )
+    if not excess > 1:  # or the run diverges
+        return plan.substeps
+    factor = min((2 * excess) ** (1 / len(PEAK_NODES)), LARGEST_SHORTENING)
+    return int(np.ceil(factor * plan.substeps))
 
 
 def _first_run(case: Case, times, records: dict[int, Record]) -> FirstRun | None:
@@ -149,7 +179,7 @@ def _simulate_first(case: Case, plan: IntegrationPlan, times, policy):
         none = xp.zeros((events, *part.shape[1:]))
         return put(none, xp.where(event < 0, events, event), part)
 
-    no_errors = xp.zeros(()), xp.zeros(len(case.sensors))
+    no_errors = xp.zeros(()), xp.zeros(len(case.sensors))  # of steps
     record = _record(case, integration, times, no_errors)
     states = beam_and_vehicles(case, plan.shapes, policy, at_events(integration.states[:-1]))
     return record, states, at_events(integration.commands)
@@ -168,6 +198,7 @@ def _record(case: Case, integration: "Integration", times, errors) -> Record:
     # Each wheel at its own time.
     lost_positions = xp.diagonal(loads.kinematics(lost_times)[0])
     diverged = xp.any(xp.isnan(outputs.motion.coordinates))  # errors are not defined
+    of_peaks = peak_errors(case, integration.model, integration.running_peaks, outputs.motion)
     return Record(
         case=case,
         modes=integration.model.modes,
@@ -179,8 +210,8 @@ def _record(case: Case, integration: "Integration", times, errors) -> Record:
         **peaks._asdict(),
         **extremes._asdict(),
         contact_lost_position=lost_positions,
-        error_estimate=xp.where(diverged, xp.nan, errors[0]),
-        step_errors=xp.where(diverged, xp.nan, errors[1]),
+        error_estimate=xp.where(diverged, xp.nan, errors[0] + of_peaks[0]),
+        step_errors=xp.where(diverged, xp.nan, errors[1] + of_peaks[1]),
         steps=integration.steps,
     )
 

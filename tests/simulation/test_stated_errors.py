@@ -1,0 +1,144 @@
+"""Stated errors of peaks, of single runs and of sweeps, are nowhere far below the true ones."""
+
+import dataclasses
+import warnings
+
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+from jaxbeam.simulation.simulate import ContactLossWarning
+from tests.loop_as_oracle import parts_of
+from tests.oracles.modal_equations import respond
+
+MAX_RATIO = 1.5  # of the true error over the stated one
+EXACT = 1e-11  # tolerance of the reference: a hundredth of the smallest below
+TOLERANCES = 1e-5, 1e-7, 1e-9
+ENDS = "pinned-pinned", "clamped-free", "clamped-clamped", "pinned-clamped"
+
+
+def random_case(seed: int) -> jb.Case:
+    """Up to three forces, masses and vehicles on a beam of one or two spans; every tenth a loop."""
+    rng = np.random.default_rng(seed)
+    length, duration = rng.uniform(0.5, 2), rng.uniform(0.3, 1.0)
+    loads = []
+    for _ in range(int(rng.integers(1, 4))):
+        motion = {"speed": rng.uniform(0.5, 8.0) * rng.choice([-1, 1])}
+        motion["entry_time"] = rng.uniform(0.0, 0.15)
+        kind = rng.integers(0, 3)
+        if kind == 0:
+            loads.append(jb.MovingForce(force=rng.uniform(1.0, 10.0), **motion))
+        elif kind == 1:
+            loads.append(jb.MovingMass(mass=rng.uniform(0.05, 0.6), **motion))
+        else:
+            loads.append(
+                jb.QuarterCar(
+                    body_mass=0.3,
+                    axle_mass=0.05,
+                    suspension_stiffness=60.0,
+                    suspension_damping=0.4,
+                    tyre_stiffness=900.0,
+                    tyre_damping=0.1,
+                    **motion,
+                )
+            )
+    case = jb.Case(
+        jb.Beam(
+            length,
+            12.0,
+            0.5,
+            damping_ratio=rng.uniform(0.0, 0.05),
+            modes=int(rng.integers(1, 9)),
+            ends=str(rng.choice(ENDS)),
+        ),
+        supports=[jb.Support(0.4 * length)] if rng.random() < 0.3 else [],
+        sensors=[jb.Sensor(x * length) for x in rng.uniform(0.1, 0.95, 3)],
+        loads=loads,
+        run=jb.Run(duration, sample_rate=float(rng.choice([10.0, 50.0, 400.0]))),
+    )
+    if seed % 10 != 5:
+        return case
+    return dataclasses.replace(
+        case,
+        actuators=(jb.PointForce(0.5 * length),),
+        controller=jb.OutputFeedback([[20.0, 0.0, 0.0]], period=rng.uniform(0.002, 0.02)),
+    )
+
+
+def largest_deflection(record: jb.Record) -> float:
+    x = np.linspace(0.0, 1.0, 41) * float(record.case.beam.length)
+    deflection = np.asarray(record.coordinates) @ np.asarray(record.modes.shapes(x)).T
+    return max(float(np.abs(deflection).max()), float(np.max(record.peak_deflection)))
+
+
+def check_single_runs(case: jb.Case) -> float:
+    """Largest ratio of true to stated errors; the true ones meet the tolerance."""
+    reference = jb.simulate(case, tolerance=EXACT)
+    largest = largest_deflection(reference)
+    ratios = [0.0]
+    for tolerance in TOLERANCES:
+        record = jb.simulate(case, tolerance=tolerance)
+        error = float(np.max(np.abs(record.peak_deflection - reference.peak_deflection)))
+        stated = float(record.error_estimate)
+        assert error <= tolerance * largest and stated <= 2 * tolerance
+        ratios.append(error / (largest * (stated + 2 * EXACT)))
+    return max(ratios)
+
+
+def check_sweep(case: jb.Case) -> float:
+    """The same of a sweep over the duration of the run, relative to each peak."""
+    over = {"loads.0.speed": float(case.loads[0].speed) * np.array([0.9, 1.0])}
+    runs = jb.sweep(case, over, progress=False, tolerance=1e-6)
+    ratios = [0.0]
+    for speed, found in zip(over["loads.0.speed"], runs.peak_deflection.values, strict=True):
+        exact = jb.simulate(jb.replace(case, {"loads.0.speed": speed}), tolerance=EXACT)
+        exact = np.asarray(exact.peak_deflection)
+        size = np.maximum(exact, 1e-6 * exact.max())
+        error = np.max(np.abs(found - exact)[exact > 0] / size[exact > 0], initial=0.0)
+        ratios.append(float(error) / (runs.attrs["error_estimate"] + 1e-9))
+    return max(ratios)
+
+
+def check(seed: int, swept: bool) -> None:
+    case = random_case(seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ContactLossWarning)
+        assert check_single_runs(case) < MAX_RATIO, seed
+        if swept:
+            assert check_sweep(case) < MAX_RATIO, seed
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_dozen_random_cases(seed):
+    check(seed, swept=seed == 1)
+
+
+@pytest.mark.parametrize("first", range(12, 312, 25))
+def test_three_hundred_random_cases(first):
+    for seed in range(first, first + 25):
+        check(seed, swept=seed % 10 == 0)
+
+
+@pytest.mark.parametrize("modes", [1, 3, 6])
+@pytest.mark.parametrize("tolerance", TOLERANCES)
+def test_peaks_of_masses_by_scipy(modes, tolerance):
+    """By DOP853 with 1e-12, around the instant of the peak."""
+    case = jb.Case(
+        jb.Beam(0.7, 12.0, 0.5, damping_ratio=0.01, modes=modes),
+        sensors=[jb.Sensor(0.31)],
+        loads=[
+            jb.MovingMass(mass=0.3, speed=3.0),
+            jb.MovingForce(mass=0.2, speed=1.7, entry_time=0.03),
+        ],
+        run=jb.Run(0.5, sample_rate=10.0),
+    )
+    record = jb.simulate(case, tolerance=tolerance)
+    time, span = float(record.peak_time[0]), 2e-4
+    times = time + span * np.linspace(-1.0, 1.0, 9)
+    beam, loads, *_ = parts_of(case)
+    values = np.abs(respond(beam, loads, [0.31], times).deflection[:, 0])
+    curve = np.polynomial.Polynomial.fit((times - time) / span, values, 6)
+    exact = curve(np.linspace(-1.0, 1.0, 4001)).max()
+    error = abs(float(record.peak_deflection[0]) - exact) / largest_deflection(record)
+    assert error < MAX_RATIO * float(record.error_estimate) + 2e-11
+    assert float(record.error_estimate) <= 2 * tolerance
