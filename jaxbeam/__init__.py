@@ -7,6 +7,11 @@ The public names are listed in `__init__.pyi`. Each is imported when it is first
 import os
 import sys
 
+from jaxbeam.runtime.early_interrupt import exit_on_interrupt, is_command_line
+
+if is_command_line():
+    exit_on_interrupt()  # before what takes long to import
+
 import lazy_loader
 
 from jaxbeam.case.former_words import NAMES

@@ -1,5 +1,6 @@
 """Checkpoints: the state of a long search on disk, from which a stopped search goes on."""
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxbeam.runtime.input_file import check_input, max_bytes, not_as_named
+from jaxbeam.runtime.interrupts import keeping
 from jaxbeam.runtime.whole_file import whole_file
 
 
@@ -37,6 +39,16 @@ class Checkpoint:
 
 
 NO_CHECKPOINT = Checkpoint()
+
+
+def kept_in(*paths: Path | None) -> contextlib.AbstractContextManager[None]:
+    """Work whose state is kept in checkpoints, if it is interrupted, from which it is resumed."""
+
+    def sentence() -> str:
+        names = [os.fspath(path) for path in paths if path is not None and path.exists()]
+        return f"the search is kept in {', '.join(names)}: resume it, with --resume" * bool(names)
+
+    return keeping(sentence)
 
 
 def checkpoint_path(checkpoint: str | os.PathLike | None, resume: bool) -> Path | None:

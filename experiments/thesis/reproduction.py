@@ -3,6 +3,8 @@
 import dataclasses
 import importlib
 import json
+import multiprocessing
+import signal
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -109,8 +111,13 @@ def _run_all(names: Sequence[str], folder: Path, processes: int) -> Iterator[Exp
     with pool:
         in_order_of_start = sorted(names, key=lambda name: name not in LONGEST)
         results = {name: pool.submit(_run_in_process, name, folder) for name in in_order_of_start}
-        for experiment in selected:
-            yield ExperimentRun(experiment, *results[experiment.name].result())
+        try:
+            for experiment in selected:
+                yield ExperimentRun(experiment, *results[experiment.name].result())
+        except KeyboardInterrupt:
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
 
 
 def _run_in_process(name: str, folder: Path) -> tuple:
@@ -130,7 +137,8 @@ def _save_figures(run: ExperimentRun, folder: Path) -> ExperimentRun:
 
 
 def _initialise_process(cache_folder: str | None) -> None:
-    """Settings of a worker process: the compile cache, and warnings of one line."""
+    """Settings of a worker process: the compile cache, warnings of one line, no word of Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     jax.config.update("jax_compilation_cache_dir", cache_folder)
     warnings.formatwarning = lambda message, *_: f"jaxbeam: warning: {message}\n"
 

@@ -2,6 +2,7 @@
 
 import atexit
 import contextvars
+import errno
 import functools
 import gc
 import os
@@ -38,6 +39,7 @@ from jaxbeam.cli.commands.tune import tune
 from jaxbeam.cli.commands.weigh import identify_responses, weigh
 from jaxbeam.cli.options import print_message
 from jaxbeam.runtime.garbage import RARELY
+from jaxbeam.runtime.interrupts import interruptible
 
 COMMANDS = {
     "Simulation": (new, check, describe, modes, frf, simulate, sweep),
@@ -82,6 +84,7 @@ app = App(
     help="Beams under moving loads: simulation, control and identification from logs.",
     help_format="plaintext",
     result_action="return_value",
+    suppress_keyboard_interrupt=False,  # `interruptible` says what is kept
     default_parameter=Parameter(negative=(), show_default=False),
 )
 for _title, _commands in COMMANDS.items():
@@ -93,8 +96,10 @@ for _title, _commands in COMMANDS.items():
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run a command line (that of the process by default) and exit: status 0, or 1 for an error.
 
-    An error of the user is printed as one sentence on standard error, and so is each warning.
+    An error of the user is printed as one sentence on standard error, and so is each warning. After
+    Ctrl-C one sentence says what is kept, and the status is 130.
     """
+    of_process = arguments is None
     printed_warnings = set()
 
     def print_warning(message, *_, **__):
@@ -103,15 +108,17 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
             print_message(f"warning: {message}")
 
     warnings.showwarning = print_warning
-    if arguments is None:
+    if of_process:
         arguments = sys.argv[1:]
         _relax_garbage_collection()
     try:
         refuse_former_words(arguments)
-        own = contextvars.copy_context()  # in which commands show warnings by themselves
-        own.run(app, arguments, exit_on_error=False, print_error=False)
+        with interruptible(of_process):
+            own = contextvars.copy_context()  # in which commands show warnings by themselves
+            own.run(app, arguments, exit_on_error=False, print_error=False)
+            sys.stdout.flush()
     except BrokenPipeError:  # the reader of the output, as `head`, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _close_output()
         sys.exit(0)
     except MemoryError as error:
         print_message(f"not enough memory: {error}; take fewer runs, samples or modes")
@@ -124,9 +131,18 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         print_message(_missing(error))
         sys.exit(1)
     except (ValueError, OSError, RuntimeError, ImportError, CycloptsError) as error:
-        print_message(" ".join(str(error).split()))
+        message = " ".join(str(error).split())
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
+            _close_output()  # what is printed goes to a file on a full disk
+            message = f"no space left on device{'' if message[:1] == '[' else f': {message}'}"
+        print_message(message)
         sys.exit(1)
     sys.exit(0)
+
+
+def _close_output() -> None:
+    """Print nothing more, also when the process ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _missing(error: MissingArgumentError) -> str:

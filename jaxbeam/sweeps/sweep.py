@@ -12,6 +12,7 @@ from jaxbeam.case.case import Case, unit_at
 from jaxbeam.case.reading.units import in_si
 from jaxbeam.files.case_file import with_settings
 from jaxbeam.model.plausibility.check import warn_if_implausible
+from jaxbeam.runtime.interrupts import keeping
 from jaxbeam.simulation.integration_plan import TOLERANCE
 from jaxbeam.sweeps.computation import compute_sweep
 from jaxbeam.sweeps.specification import sweep_specification
@@ -123,4 +124,11 @@ def sweep(
     with writing(Path(store).absolute(), plan.fingerprint(), resume, overwrite) as place:
         if place.state == "complete":
             return read_dataset(place.folder)
-        return computed(*place)
+
+        def kept() -> str:
+            again = "the same command goes on" if overwrite else "resume it, with --resume"
+            unfinished = (place.folder / "zarr.json").exists()
+            return f"finished blocks are kept in {os.fspath(store)}: {again}" if unfinished else ""
+
+        with keeping(kept):
+            return computed(*place)

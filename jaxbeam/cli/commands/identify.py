@@ -97,6 +97,7 @@ def identify(
         options.check_case(case)
 
         import tuning  # sets XLA's threads, therefore before the case is read
+        from tuning.checkpoint import kept_in
 
         parsed_case = options.read(case, judged="structure")
         bounds, normals, scales = arguments
@@ -107,20 +108,22 @@ def identify(
         priors = _priors(bounds_in_si(parsed_case, bounds), normals, scales)
         if options.overwrite and not resume:
             _remove_checkpoints(output)
-        fit = tuning.identify(
-            parsed_case,
-            _read_logs(logs, mask),
-            priors,
-            loss=loss,
-            starts=starts,
-            seed=seed,
-            stages=[text.split(",") for text in stage],
-            checkpoint=_with_suffix(output, ".search.npz") if starts > 1 else None,
-            resume=resume,
-        )
-        assessment = _assess(
-            fit, profile, draws, {"seed": seed, "noise": noise}, validate, output, resume
-        )
+        searched, drawn = (_with_suffix(output, f".{name}.npz") for name in ("search", "draws"))
+        with kept_in(searched, drawn):
+            fit = tuning.identify(
+                parsed_case,
+                _read_logs(logs, mask),
+                priors,
+                loss=loss,
+                starts=starts,
+                seed=seed,
+                stages=[text.split(",") for text in stage],
+                checkpoint=searched if starts > 1 else None,
+                resume=resume,
+            )
+            assessment = _assess(
+                fit, profile, draws, {"seed": seed, "noise": noise}, validate, output, resume
+            )
         _write_and_print(fit, assessment, report, output, picture, pictures, options)
         return
     refuse_option(

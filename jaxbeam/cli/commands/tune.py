@@ -140,6 +140,7 @@ def tune(
     options.check_case(case)
 
     import tuning  # sets XLA's threads, therefore before the case is read
+    from tuning.checkpoint import kept_in
 
     parsed_case = options.read(case)
     bounds = bounds_in_si(parsed_case, bounds)
@@ -187,10 +188,11 @@ def tune(
         checkpoint = _checkpoint(output)
         if checkpoint and options.overwrite and not resume:
             checkpoint.unlink(missing_ok=True)
-        result = tuning.tune(
-            parsed_case, bounds, loads, total_objective, checkpoint=checkpoint, resume=resume,
-            **start_options, **search_options,
-        )  # fmt: skip
+        with kept_in(checkpoint):
+            result = tuning.tune(
+                parsed_case, bounds, loads, total_objective, checkpoint=checkpoint, resume=resume,
+                **start_options, **search_options,
+            )  # fmt: skip
         tuned = (result,)
     _write_and_print(result, tuned, files, picture, pictures, options)
     if output:

@@ -1,0 +1,104 @@
+"""Ctrl-C at any moment ends a command in one line, which says what is kept, with status 130."""
+
+import subprocess
+import sys
+
+import pytest
+
+from jaxbeam.cli import main
+from jaxbeam.cli.commands import simulate
+from jaxbeam.runtime.interrupts import interruptible, keeping
+from jaxbeam.runtime.whole_file import whole_file
+from tuning.checkpoint import kept_in
+
+# A command that gets SIGINT when it first imports a module, or opens a file, of some name.
+SCRIPT = """
+import os, signal, sys
+sys.argv[0] = "jaxbeam"
+moment = sys.argv.pop(1)
+def hook(event, arguments):
+    global moment
+    if moment and event in ("import", "open") and moment in str(arguments[0]):
+        moment = ""
+        os.kill(os.getpid(), signal.SIGINT)
+sys.addaudithook(hook)
+from jaxbeam.cli import main
+main()
+"""
+SWEEP = "sweep case.toml --over loads.0.speed=1:3:600 -o runs.zarr"
+KEPT = "finished blocks are kept in runs.zarr"
+
+
+def interrupted(folder, moment, line):
+    command = [sys.executable, "-c", SCRIPT, moment, *line.split()]
+    ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+    *before, last = ended.stderr.splitlines()
+    assert ended.returncode == 130 and "Traceback" not in ended.stderr, ended.stderr
+    assert last.startswith("jaxbeam: interrupted")
+    assert not any(one.startswith("jaxbeam: interrupted") for one in before), "one line"
+    assert not [path for path in folder.iterdir() if path.name.startswith(".") and "new" not in
+                path.name], "nothing half written"  # fmt: skip
+    return last.removeprefix("jaxbeam: ")
+
+
+@pytest.mark.parametrize(
+    ("moment", "line", "said"),
+    [
+        ("cyclopts", "simulate case.toml", "interrupted before any work"),
+        ("jaxbeam.cli.commands.weigh", "modes case.toml", "interrupted before any work"),
+        ("numpy", "modes case.toml", "interrupted; nothing is kept"),
+        ("jaxlib.xla_client", "simulate case.toml", "interrupted; nothing is kept"),
+        (".run.", "simulate case.toml -o run.nc", "interrupted; nothing is kept"),
+        (".run.", "simulate case.toml -o out.nc --picture run.png", "interrupted; written: out.nc"),
+        ("/done/c/1", SWEEP, f"interrupted; {KEPT}: resume it, with --resume"),
+    ],
+)
+def test_one_line_says_what_is_kept(folder, moment, line, said):
+    assert interrupted(folder, moment, line) == said
+
+
+def test_a_sweep_goes_on_where_it_was_interrupted(folder, run):
+    interrupted(folder, "/done/c/1", SWEEP)
+    assert (folder / "runs.zarr" / "blocks").is_dir()
+    assert "600 runs, 0 failed" in run(f"{SWEEP} --resume")
+    again = interrupted(folder, "/done/c/1", f"{SWEEP} --overwrite")
+    assert again == f"interrupted; {KEPT}: the same command goes on"
+
+
+def test_status_and_sentence_within_a_process(folder, capfd, monkeypatch):
+    def stopped(*_, **__):
+        with whole_file("a.csv") as beside:
+            beside.write_text("1")
+        with kept_in(folder / "none.npz"), keeping(lambda: "inner"), keeping(lambda: ""):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(simulate, "print_plausibility", stopped)
+    with pytest.raises(SystemExit) as ended:
+        main(["simulate", "case.toml"])
+    assert ended.value.code == 130
+    assert capfd.readouterr().err == "jaxbeam: interrupted; inner; written: a.csv\n"
+
+
+def test_checkpoints_are_named(tmp_path, capfd):
+    (tmp_path / "search.npz").touch()
+    search, other = tmp_path / "search.npz", tmp_path / "b"
+    ends = pytest.raises(SystemExit)
+    with ends, interruptible(False), kept_in(search, None), whole_file(other) as beside:
+        beside.touch()
+        raise KeyboardInterrupt
+    said = f"the search is kept in {tmp_path / 'search.npz'}: resume it, with --resume"
+    assert capfd.readouterr().err == f"jaxbeam: interrupted; {said}\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["search.npz"]
+
+
+def test_errors_pass(tmp_path):
+    with pytest.raises(ZeroDivisionError), interruptible(of_process=False):
+        raise ZeroDivisionError
+
+
+def test_a_full_disk_below_the_output_is_told(folder):
+    """Linux has a device that is always full."""
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "jaxbeam", "--help"]
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (ended.returncode, ended.stderr) == (1, "jaxbeam: no space left on device\n")
