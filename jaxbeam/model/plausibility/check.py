@@ -23,6 +23,7 @@ from jaxbeam.model.plausibility.numbers import Plausibility, plausible_numbers
 from jaxbeam.model.plausibility.ranges import ADVICE, RANGES, Range
 
 MOST_MODES = 60
+LISTS = ("loads", "actuators", "sensors")  # whose parts have causes of their own
 
 
 class PlausibilityWarning(UserWarning):
@@ -109,18 +110,29 @@ def _with_few_modes(case: Case) -> Case:
 
 
 def _sentences(rows: tuple[Range, ...], *judged) -> Iterator[str]:
-    facts, explained = Facts(*judged), set()
+    facts = Facts(*judged)
+    explained: dict[str, set[str]] = {}  # parts of the case by the cause that has spoken of them
     for row in rows:
-        said = False
+        said = set()
         for address, value, words in row.values(facts):
-            part = ".".join(address.split(".")[:2]) if address.startswith("loads") else ""
-            inside = row.low <= value <= row.high or math.isnan(value)
-            if inside or (row.cause, part) in explained:
+            part = _part(address)
+            if row.low <= value <= row.high or math.isnan(value):
                 continue
-            said = True
+            if explained.get(row.cause, set()) & {part, ""}:
+                continue
+            spoken = set().union(*(explained.get(cause, set()) for cause in row.unless))
+            if spoken & {part, ""} or (spoken and not part):
+                continue
+            said.add(part)
             yield _sentence(row, address, float(value), words)
-        if said and row.cause:
-            explained.add((row.cause, part))
+        if row.cause:
+            explained.setdefault(row.cause, set()).update(said)
+
+
+def _part(address: str) -> str:
+    """The part of a list that an address belongs to, such as "loads.0"; empty for others."""
+    name, _, rest = address.partition(".")
+    return f"{name}.{rest.split('.')[0]}" if name in LISTS else ""
 
 
 def _sentence(row: Range, address: str, value: float, words: dict) -> str:

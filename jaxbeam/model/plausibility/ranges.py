@@ -18,8 +18,8 @@ class Range(NamedTuple):
     """Row of the table: values of a case, their range, and what is likely wrong outside.
 
     `says` is what the value means, in words with the value in it; the bound follows in the `unit`,
-    if there is one. Of rows of one `cause` only the first that finds something speaks, of each
-    load.
+    if there is one. Of rows of one `cause` only the first that finds something speaks, of each part
+    of a list; none speaks where one of the causes in `unless` has spoken, from which it may follow.
     """
 
     values: Values
@@ -30,12 +30,12 @@ class Range(NamedTuple):
     above: str = ""
     unit: str = ""
     cause: str = ""
+    unless: tuple[str, ...] = ()
 
 
-STEEL = "steel has 210e9 Pa and 7850 kg/m^3"
-IN_LIMITS = "the beam sags by {sag:.4g} m under {cause}, {share}"
+STEEL = "Steel has 210e9 Pa and 7850 kg/m^3"
 
-BEAM = (
+MATERIAL = (
     Range(
         of_beam("youngs_modulus"),
         1e6,
@@ -63,6 +63,59 @@ BEAM = (
         "is it in m, not in mm, and is beam.length in m?",
         cause="stiffness",
     ),
+)
+
+WEIGHTS = (
+    Range(
+        values.gravity,
+        1.2,
+        30.0,
+        "it is {value:.4g} m/s^2",
+        "is it in m/s^2, 9.81 on earth, not in g?",
+        "is it in m/s^2, 9.81 on earth, not in mm/s^2?",
+        cause="weight",
+    ),
+    Range(
+        values.weight_of_axle,
+        0.0,
+        600.0,
+        "an axle presses with {value:.4g} kN",
+        above="is it in {should}?",
+        unit="kN",
+        cause="weight",
+    ),
+    Range(
+        values.weight_of_load,
+        0.0,
+        1500.0,
+        "it presses with {value:.4g} kN",
+        above="is it in {should}?",
+        unit="kN",
+        cause="weight",
+    ),
+    Range(
+        of_parts("loads", "weight", kinds=("pedestrian", "crowd")),
+        100.0,
+        3000.0,
+        "a person weighs {value:.3g} N",
+        "is it in N, not in kg? 75 kg weigh 736 N",
+        "is it that of one person in N?",
+        unit="N",
+        cause="weight",
+    ),
+    Range(
+        values.mass_ratio,
+        1e-5,
+        10.0,
+        "the loads on the beam have {value:.3g} times its mass",
+        "are the loads in kg, not in t, and forces in N, not in kN?",
+        "is {mass}, not in t, and are the loads in kg, forces in N?",
+        cause="weight",
+        unless=("stiffness",),
+    ),
+)
+
+BEAM = (
     Range(
         values.slenderness,
         5.0,
@@ -70,6 +123,16 @@ BEAM = (
         "the beam is {value:.3g} times as long as its radius of gyration, if it is solid",
         "is it in {unit}, is {mass}, not in t, and is beam.length in m?",
         "is it in {unit}, is beam.length in m, not in mm, and is {mass}?",
+        cause="stiffness",
+        unless=("weight",),
+    ),
+    Range(
+        values.rigidity_over_shear,
+        1e-8,
+        1.0,
+        "shear adds {value:.3g} times what E I / L^2 does to the flexibility",
+        "is it kappa G A in N, and is beam.flexural_rigidity in N m^2?",
+        "is it kappa G A in N, not in kN or MN?",
         cause="stiffness",
     ),
     Range(
@@ -79,6 +142,7 @@ BEAM = (
         "the beam sags by {sag:.4g} m under its loads, {share}",
         "is it in {unit}, and are masses of loads in kg, forces in N?",
         cause="stiffness",
+        unless=("weight",),
     ),
     Range(
         values.rise_of_loads,
@@ -87,6 +151,7 @@ BEAM = (
         "the beam sags by only {sag:.3g} m under its loads, {share}",
         above="are masses in kg, not in t, forces in N, not in kN, and is {stiffness} in {unit}?",
         cause="stiffness",
+        unless=("weight",),
     ),
     Range(
         values.sag_of_beam,
@@ -95,6 +160,7 @@ BEAM = (
         "the beam sags by {sag:.4g} m under its own weight, {share}",
         "is it in {unit}, and is {mass}?",
         cause="stiffness",
+        unless=("weight",),
     ),
     Range(
         values.first_frequency,
@@ -104,6 +170,7 @@ BEAM = (
         "is it in {unit}, and is beam.length in m, not in mm?",
         "is it in {unit}, and is beam.length in m?",
         cause="stiffness",
+        unless=("weight",),
     ),
     Range(
         values.damping_ratio,
@@ -111,14 +178,6 @@ BEAM = (
         0.2,
         "the damping ratio is {value:.3g}",
         above="it is a fraction of critical damping: 0.01 for one per cent",
-    ),
-    Range(
-        values.rigidity_over_shear,
-        1e-8,
-        1.0,
-        "shear adds {value:.3g} times what E I / L^2 does to the flexibility",
-        "is it kappa G A in N, and is beam.flexural_rigidity in N m^2?",
-        "is it kappa G A in N, not in kN or MN?",
     ),
     Range(
         values.radius_of_rotary_inertia,
@@ -164,6 +223,7 @@ ACTUATORS = (
         INF,
         "the actuator at {x:.4g} m is on a support, where it moves nothing",
         "is it in m from the left end? Move it into a span",
+        cause="command",
     ),
     Range(
         values.least_command,
@@ -225,6 +285,7 @@ ACTUATORS = (
         "is it in {unit}, and are limits those of the command?",
         "is it in {unit}, and are limits those of the command, before any amplifier?",
         cause="command",
+        unless=("stiffness",),
     ),
     Range(
         of_parts("actuators", "added_rigidity", over=values.rigidity),
@@ -246,6 +307,7 @@ ACTUATORS = (
         INF,
         "the actuator lags behind commands at {value:.2g} times the first frequency of the beam",
         "is it in 1/s, 2 pi times the frequency in Hz, not in kHz?",
+        unless=("stiffness",),
     ),
     Range(
         values.growth_of_inner_loops,
@@ -282,6 +344,7 @@ LOADS = (
         INF,
         "the suspension is stiffer than the tyre, which has {value:.2g} times its stiffness",
         "is it swapped with {other}?",
+        unless=("spring",),
     ),
     Range(
         values.tyre_over_suspension_damping,
@@ -289,6 +352,7 @@ LOADS = (
         3.0,
         "the tyre has {value:.2g} times the damping of the suspension",
         above="is it swapped with {other}?",
+        unless=("spring",),
     ),
     Range(
         values.primary_over_secondary_stiffness,
@@ -296,6 +360,7 @@ LOADS = (
         INF,
         "the primary springs of a bogie have {value:.2g} times the stiffness of the secondary one",
         "is it swapped with {other}?",
+        unless=("spring",),
     ),
     Range(
         values.unsprung_over_sprung,
@@ -305,14 +370,6 @@ LOADS = (
         above="is it swapped with {upper}, and are both in kg?",
     ),
     Range(
-        values.gyration_over_wheelbase,
-        0.1,
-        5.0,
-        "the radius of gyration in pitch is {value:.2g} times half the wheelbase",
-        "is it in kg m^2, not in t m^2, and are distances in m?",
-        "is it in kg m^2, are masses in kg, not in t, and distances in m?",
-    ),
-    Range(
         values.distance_of_axles,
         0.2,
         200.0,
@@ -320,24 +377,16 @@ LOADS = (
         "are distances in m?",
         "are distances in m, not in mm?",
         unit="m",
+        cause="distance",
     ),
     Range(
-        values.weight_of_axle,
-        0.0,
-        600.0,
-        "an axle presses with {value:.4g} kN",
-        above="is it in {should}?",
-        unit="kN",
-        cause="weight",
-    ),
-    Range(
-        values.weight_of_load,
-        0.0,
-        1500.0,
-        "it presses with {value:.4g} kN",
-        above="is it in {should}?",
-        unit="kN",
-        cause="weight",
+        values.gyration_over_wheelbase,
+        0.1,
+        5.0,
+        "the radius of gyration in pitch is {value:.2g} times half the wheelbase",
+        "is it in kg m^2, not in t m^2, and are distances in m?",
+        "is it in kg m^2, are masses in kg, not in t, and distances in m?",
+        unless=("distance",),
     ),
     Range(
         values.weight_over_force,
@@ -345,16 +394,6 @@ LOADS = (
         3.0,
         "the masses weigh {value:.3g} times what the axles press with",
         above="are they in kg, the unsprung part, and are forces in N, not in kN?",
-    ),
-    Range(
-        of_parts("loads", "weight", kinds=("pedestrian", "crowd")),
-        100.0,
-        3000.0,
-        "a person weighs {value:.3g} N",
-        "is it in N, not in kg? 75 kg weigh 736 N",
-        "is it that of one person in N?",
-        unit="N",
-        cause="weight",
     ),
     Range(
         of_parts("loads", "pace", kinds=("pedestrian", "crowd")),
@@ -381,13 +420,12 @@ LOADS = (
         above="it is a fraction, 0.4 for 40 per cent",
     ),
     Range(
-        values.mass_ratio,
-        1e-5,
-        10.0,
-        "the loads on the beam have {value:.3g} times its mass",
-        "are the loads in kg, not in t, and forces in N, not in kN?",
-        "is {mass}, not in t, and are the loads in kg, forces in N?",
-        cause="weight",
+        of_parts("loads", "start_position", over=values.length),
+        0.0,
+        1000.0,
+        "it starts {value:.3g} lengths of the beam away from it",
+        above="is it in m, not in mm?",
+        cause="travel",
     ),
     Range(
         values.entry_over_duration,
@@ -413,13 +451,7 @@ LOADS = (
         "it has not left the beam by the end of the run at {duration:.4g} s",
         above="it leaves at t = {leave:.4g} s; lengthen run.duration, or peaks may be missed",
         cause="travel",
-    ),
-    Range(
-        of_parts("loads", "start_position", over=values.length),
-        0.0,
-        1000.0,
-        "it starts {value:.3g} lengths of the beam away from it",
-        above="is it in m, not in mm?",
+        unless=("stiffness", "distance"),
     ),
     Range(
         values.speed_over_traffic,
@@ -436,6 +468,7 @@ LOADS = (
         "{speed:.4g} m/s is {kmh:.4g} km/h, faster than the critical speed of {critical:.4g} m/s",
         above="is it {unit}?",
         cause="speed",
+        unless=("stiffness",),
     ),
     Range(
         values.largest_phase,
@@ -452,7 +485,7 @@ OTHERS = (
         0.0,
         0.1,
         "the profile rises and falls by {height:.3g} m, {value:.2g} times the length of the beam",
-        above="is it in m, not in mm?",
+        above="{should}",
         cause="profile",
     ),
     Range(
@@ -460,7 +493,7 @@ OTHERS = (
         0.0,
         1.0,
         "the profile is as steep as {value:.3g}",
-        above="is it in m, not in mm, and are lengths along the beam in m?",
+        above="{should}",
         cause="profile",
     ),
     Range(
@@ -470,6 +503,13 @@ OTHERS = (
         "it is {value:.3g} times the length of the beam",
         above="is it in m, not in mm?",
         cause="profile",
+    ),
+    Range(
+        values.cutoff_over_crossing,
+        0.2,
+        INF,
+        "{cutoff:.3g} Hz let nothing through of loads that leave within {last:.3g} s",
+        "is it in Hz, not in kHz?",
     ),
     Range(
         of_parts("sensors", "fibre_distance", over=values.length),
@@ -489,8 +529,9 @@ OTHERS = (
         values.error_over_reading,
         0.0,
         1.0,
-        "{given:.3g} {unit} hide readings, which are of some {size:.2g} {unit}",
+        "{given:.3g} {unit} exceed the readings, which are of some {size:.2g} {unit}",
         above="is it in {unit}, not in {small}?",
+        unless=("stiffness", "weight"),
     ),
     Range(
         values.delay_over_duration,
@@ -507,6 +548,7 @@ OTHERS = (
         "the delay is {value:.3g} periods of the first mode",
         above="is it in s, not in ms?",
         cause="delay",
+        unless=("stiffness",),
     ),
     Range(
         values.samples_in_period,
@@ -514,6 +556,7 @@ OTHERS = (
         INF,
         "the controller takes {value:.2g} samples in a period of mode {mode} ({frequency:.3g} Hz)",
         "is it in s, not in ms or the rate in Hz? It should be below {longest:.2g} s",
+        unless=("stiffness",),
     ),
     Range(
         values.samples_of_record,
@@ -521,6 +564,7 @@ OTHERS = (
         INF,
         "{rate:.4g} Hz make {value:.2g} samples in a period of {what} at {frequency:.4g} Hz",
         "is it {likely}?",
+        unless=("stiffness",),
     ),
     Range(
         values.duration_over_crossing,
@@ -529,14 +573,6 @@ OTHERS = (
         "the run of {duration:.4g} s is {value:.3g} times as long as its loads need to leave"
         " ({last:.3g} s)",
         above="is it in s, not in ms?",
-    ),
-    Range(
-        values.gravity,
-        0.5,
-        30.0,
-        "it is {value:.4g} m/s^2",
-        "is it in m/s^2, 9.81 on earth, not in g?",
-        "is it in m/s^2, 9.81 on earth, not in mm/s^2?",
     ),
 )
 
@@ -550,4 +586,4 @@ ADVICE = (  # on what commands report
     ),
 )
 
-RANGES = (*BEAM, *ACTUATORS, *LOADS, *OTHERS)
+RANGES = (*MATERIAL, *WEIGHTS, *BEAM, *ACTUATORS, *LOADS, *OTHERS)

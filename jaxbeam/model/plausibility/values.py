@@ -130,8 +130,14 @@ def rise_of_loads(facts):
     for value in sag_of_loads(facts):
         if facts.numbers.deflection < 1e-12 * facts.length:
             return  # they stand on supports
-        heaviest = max(range(len(facts.case.loads)), key=lambda i: facts.static_loads[i].max())
-        yield value._replace(address=f"loads.{heaviest}{_mass_field(facts.case.loads[heaviest])}")
+        yield value._replace(address=_heaviest(facts))
+
+
+def _heaviest(facts) -> str:
+    """Address of what decides the weight of the heaviest load."""
+    sizes = [static.max(initial=0.0) for static in facts.static_loads]
+    heaviest = int(np.argmax(sizes))
+    return f"loads.{heaviest}{_mass_field(facts.case.loads[heaviest])}"
 
 
 def sag_of_beam(facts):
@@ -398,7 +404,7 @@ def weight_over_force(facts):
 def mass_ratio(facts):
     """Mass of the loads on the beam at once over that of the beam."""
     if facts.numbers.mass_ratio:
-        yield Value("loads", facts.numbers.mass_ratio, _stiffness(facts)[1])
+        yield Value(_heaviest(facts), facts.numbers.mass_ratio, _stiffness(facts)[1])
 
 
 def largest_phase(facts):
@@ -495,10 +501,11 @@ PROFILE_FIELDS = ("amplitude", "height", "point_heights", "amplitudes", "scale")
 def height_of_profile(facts):
     """Height of the profile from lowest to highest over the length of the beam."""
     for address, profile in _parts(facts, "profile"):
-        x, heights = facts.profile
+        _, heights = facts.profile
         name = next((f".{n}" for n in PROFILE_FIELDS if hasattr(profile, n)), "")
         height = float(np.ptp(heights))
-        yield Value(f"{address}{name}", height / facts.length, {"height": height})
+        words = {"height": height, "should": _profile_unit(name)}
+        yield Value(f"{address}{name}", height / facts.length, words)
 
 
 def slope_of_profile(facts):
@@ -507,7 +514,21 @@ def slope_of_profile(facts):
         x, heights = facts.profile
         name = next((f".{n}" for n in PROFILE_FIELDS if hasattr(profile, n)), "")
         slope = float(np.max(np.abs(np.diff(heights)))) / (x[1] - x[0])
-        yield Value(f"{address}{name}", slope if profile.kind != "step" else 0.0)
+        slope = slope if profile.kind != "step" else 0.0
+        yield Value(f"{address}{name}", slope, {"should": _profile_unit(name)})
+
+
+def _profile_unit(name: str) -> str:
+    return "it is a factor of the heights" if name == ".scale" else "is it in m, not in mm?"
+
+
+def cutoff_over_crossing(facts):
+    """Cutoffs of filters of sensors times the time at which the last load has left."""
+    for address, sensor in _parts(facts, "sensors"):
+        for name, cutoff in _numbers(sensor.filter, f"{address}.filter", "cutoff"):
+            if facts.last_exit > 0:
+                words = {"cutoff": cutoff, "last": facts.last_exit}
+                yield Value(name, cutoff * facts.last_exit, words)
 
 
 def size_of_section_modulus(facts):
@@ -523,8 +544,8 @@ def error_over_reading(facts):
         size = facts.reading(sensor)
         for name, given in _numbers(sensor, address, "noise", "resolution", "offset"):
             if size:
-                unit = sensor.unit
-                small = SMALL_UNITS.get(unit, f"1e-3 {unit}")
+                small = SMALL_UNITS.get(sensor.unit, f"1e-3 {sensor.unit}")
+                unit = "m/m" if sensor.unit == "1" else sensor.unit
                 words = {"given": abs(given), "unit": unit, "size": size, "small": small}
                 yield Value(name, abs(given) / size, words)
 
