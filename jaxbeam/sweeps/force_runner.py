@@ -39,6 +39,7 @@ OF_BEAM = "beam", "supports", "actuators", "sensors"  # the keys on which the mo
 # Runs of a block at most, and pairs of its wheels at most. Twice as many runs as before took 12 %
 # less time for ten trains at 101 speeds: threads wait for each other between NumPy's short calls.
 FORCE_BLOCK_RUNS, BLOCK_PAIRS = 64, 4e6
+OUTPUTS_AT_ONCE, CORRECTED_AT_ONCE = 32, 8
 TRIAL_RUNS = 4  # in which the error of the peaks is measured
 PHASE = 1.6  # rad of the fastest pole in a step of the search
 
@@ -105,7 +106,33 @@ class ForceRunner:
         values = batches.shared_values[runs]
         paths = force_paths(self.case, self.wheels, batches.shared_addresses, values)
         speeds = tuple(np.unique(paths.speed).tolist())
-        return peaks_of_forces(_responses(self.system, speeds), paths, phase)
+        groups, sensors = output_groups(self.case), len(self.case.sensors)
+        found = None
+        for number, outputs in enumerate(groups):
+            of_group = peaks_of_forces(_responses(self.system, number, speeds), paths, phase)
+            if found is None:
+                found = of_group._replace(
+                    peak_deflection=np.empty((runs.size, 1, sensors)),
+                    peak_time=np.empty((runs.size, 1, sensors)),
+                )
+            found.peak_deflection[..., outputs] = of_group.peak_deflection
+            found.peak_time[..., outputs] = of_group.peak_time
+        assert found is not None
+        return found
+
+
+def output_groups(case: Case) -> list[list[int]]:
+    """Numbers of the sensors whose peaks are searched together.
+
+    Steps end where a force passes a sensor that is statically corrected, so that their number grows
+    with the places of such sensors: few of them are together, neighbours first.
+    """
+    order = sorted(range(len(case.sensors)), key=lambda i: float(case.sensors[i].position))
+    groups = []
+    for bends, most in ((False, OUTPUTS_AT_ONCE), (True, CORRECTED_AT_ONCE)):
+        own = [i for i in order if case.sensors[i].bends == bends]
+        groups += [own[first : first + most] for first in range(0, len(own), most)]
+    return groups
 
 
 def force_runner(case: Case, batches: Batches, tolerance: float) -> ForceRunner | None:
@@ -119,30 +146,31 @@ def force_runner(case: Case, batches: Batches, tolerance: float) -> ForceRunner 
         return None
     content = case_to_dict(case)
     system = json.dumps({key: content[key] for key in OF_BEAM if key in content})
-    return None if _system(system) is None else ForceRunner(case, batches, system)
+    return None if _systems(system) is None else ForceRunner(case, batches, system)
 
 
 @functools.lru_cache(maxsize=4)
-def _system(content: str) -> ForceSystem | None:
-    """System of the beam and the sensors of a case, from those of its file as JSON."""
+def _systems(content: str) -> list[ForceSystem] | None:
+    """Systems of the beam and groups of sensors of a case, from those of its file as JSON."""
     case = case_from_dict(json.loads(content))
     layout = mesh_layout(case)
     if not is_supported(case, layout):
         return None
     model = modal_model(case, layout, has_coupling(case))
-    rows = sensor_rows(model, case, case.sensors)
-    correction = static_correction(model, case, case.sensors, rows)
-    places = corrected_places(case, model, case.sensors)
-    return force_system(
-        model,
-        linear_outputs(model, rows, correction),
-        np.zeros(0) if places is None else np.asarray(places),
-    )
+    found = []
+    for outputs in output_groups(case):
+        sensors = [case.sensors[i] for i in outputs]
+        rows = sensor_rows(model, case, sensors)
+        correction = static_correction(model, case, sensors, rows)
+        places = corrected_places(case, model, sensors)
+        places = np.zeros(0) if places is None else np.asarray(places)
+        found.append(force_system(model, linear_outputs(model, rows, correction), places))
+    return None if None in found else found
 
 
 @functools.lru_cache(maxsize=64)
-def _responses(system: str, speeds: tuple[float, ...]) -> ForceResponses:
-    """Responses to forces of some speeds (m/s), which the trains of a sweep share."""
-    found = _system(system)
+def _responses(system: str, group: int, speeds: tuple[float, ...]) -> ForceResponses:
+    """Responses of a group of outputs to forces of some speeds (m/s), which trains share."""
+    found = _systems(system)
     assert found is not None
-    return force_responses(found, np.array(speeds))
+    return force_responses(found[group], np.array(speeds))

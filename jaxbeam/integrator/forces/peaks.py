@@ -63,13 +63,16 @@ class _Search:
         growth = np.exp(np.maximum(self.poles.real, 0.0) * self.length.max(initial=0.0))
         size, largest = np.abs(self.amplitude) * growth, np.abs(self.C.T)
         on_beam = panels.force * (np.arange(panels.force.shape[1]) < panels.count[:, None])
-        forced_bend = np.einsum(
-            "ps,pso->po", np.abs(on_beam), responses.curvature[panels.response]
-        )[self.panel]
+
+        def of_forces(bound):
+            """Sum (panel, output) of a bound (speed, piece, output) over the forces on the beam."""
+            slots = zip(np.abs(on_beam).T, panels.response.T, panels.piece.T, strict=True)
+            return sum(force[:, None] * bound[number, piece] for force, number, piece in slots)
+
+        forced_bend = of_forces(responses.curvature)[self.panel]
         self.bend = product(size, largest * np.abs(self.poles[:, None]) ** 2) + forced_bend
         lines, self.cubic_slack = (
-            2 * np.einsum("ps,pso->po", np.abs(on_beam), error[panels.response])
-            for error in (responses.table_error, responses.cubic_error)
+            2 * of_forces(error) for error in (responses.table_error, responses.cubic_error)
         )  # of a value, and of that which is reached
         self.slack = lines[self.panel]
         forced = np.stack([self._forced(share) for share in (0.0, 0.5, 1.0)])
@@ -102,10 +105,10 @@ class _Search:
 
         On lines between its points, or on cubics.
         """
-        if panel.size > 1 and self.panels.count[panel].sum() * times.shape[1] > MAX_VALUES:
-            half = panel.size // 2
-            halves = (panel[:half], times[:half]), (panel[half:], times[half:])
-            return np.concatenate([self._from_table(table, *one, cubic) for one in halves])
+        width = times.shape[1] * (table.size // table.shape[0])
+        if self._too_many(panel, width):
+            parts = _halves(panel, times)
+            return np.concatenate([self._from_table(table, *one, cubic) for one in parts])
         which, at = self.panels.forces_in(panel)
         place = self.place[at][:, None] + self.rate[at][:, None] * times[which]
         last = self.last[at][:, None]
@@ -121,6 +124,10 @@ class _Search:
         below += share * (table[low + 1] - below)
         below *= force
         return _sums(below, which, panel.size)
+
+    def _too_many(self, panel, width: int) -> bool:
+        """Whether arrays with so many numbers for each force in panels are too large."""
+        return panel.size > 1 and int(self.panels.count[panel].sum()) * width > MAX_VALUES
 
     def peaks(self) -> tuple[Float[np.ndarray, "run output"], Float[np.ndarray, "run output"]]:
         """Peaks of the outputs in all runs, and their times (s)."""
@@ -206,6 +213,9 @@ class _Search:
 
     def _exact(self, output, panel, times):
         """Exact values of outputs under the forces in panels at times (panel, time)."""
+        if self._too_many(panel, times.shape[1] * self.responses.solutions.shape[2]):
+            parts = _halves(output, panel, times)
+            return np.concatenate([self._exact(*one) for one in parts])
         panels, breaks = self.panels, self.responses.system.breaks
         which, at = panels.forces_in(panel)
         piece = np.repeat(panels.piece[at], times.shape[1])
@@ -214,6 +224,12 @@ class _Search:
         number, own = (np.repeat(a, times.shape[1]) for a in (panels.response[at], output[which]))
         r = self.responses.exact(number, piece, x, own).reshape(-1, times.shape[1])
         return _sums(panels.force[at][:, None] * r, which, panel.size)
+
+
+def _halves(*arrays):
+    """Both halves of arrays along their first axis."""
+    half = arrays[0].shape[0] // 2
+    return [part[:half] for part in arrays], [part[half:] for part in arrays]
 
 
 def _cubic_weights(s):

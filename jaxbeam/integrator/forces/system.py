@@ -28,6 +28,7 @@ from jaxbeam.model.sensing.linear_outputs import LinearOutputs
 MAX_CONDITION = 1e6  # of the eigenvectors; beyond, poles are nearly repeated
 TABLE_POINTS = 600  # of the beam, at least; peaks are searched on lines between them
 POINTS_PER_MODE = 40
+TABLE_PHASE = 0.3  # rad of the fastest pole at most, while the slowest force goes from one to the next
 CURVATURE_MARGIN = 1.2  # of the curvature over second differences of the table
 
 
@@ -63,12 +64,12 @@ class ForceSystem(NamedTuple):
             return np.zeros(self.on_outputs.shape[0], bool)
         return np.any(np.asarray(self.static.influence.series), axis=(0, 1))
 
-    def static_part(self, x, piece) -> Float[np.ndarray, "force output"]:
-        """Static part of r at positions (m) in pieces."""
+    def static_part(self, x, piece, output=None) -> Float[np.ndarray, "force ..."]:
+        """Static part of r (force, output) at positions (m) in pieces; only of one `output` at each, if given."""
         if self.static.influence is None:
             return np.zeros((x.size, self.on_outputs.shape[0]))
         near = (self.breaks[piece] + self.breaks[piece + 1]) / 2
-        return np.asarray(self.static.influence.of_forces_at(x, near))
+        return np.asarray(self.static.influence.of_forces_at(x, near, output))
 
 
 def force_system(
@@ -140,8 +141,9 @@ class ForceResponses(NamedTuple):
 
     `before` and `after` are p at the left and at the right side of the nodes, zero off the beam.
     `on_outputs` are the series of Re(C p). r is tabulated in equal distances, at `count` points
-    from the `first` on in each piece; on lines between them it has errors up to `table_error`,
-    on cubics up to `cubic_error`. `curvature` bounds d2r/dt2 (1/s^2) under the moving force.
+    from the `first` on in each piece; on lines between them it has errors up to `table_error` in
+    each piece, on cubics up to `cubic_error`. `curvature` bounds d2r/dt2 (1/s^2) under the moving
+    force.
     """
 
     system: ForceSystem
@@ -151,9 +153,9 @@ class ForceResponses(NamedTuple):
     after: Complex[np.ndarray, "speed node pole"]
     on_outputs: Float[np.ndarray, "speed segment n output"]
     table: Float[np.ndarray, "speed point output"]
-    table_error: Float[np.ndarray, "speed output"]
-    cubic_error: Float[np.ndarray, "speed output"]
-    curvature: Float[np.ndarray, "speed output"]
+    table_error: Float[np.ndarray, "speed piece output"]
+    cubic_error: Float[np.ndarray, "speed piece output"]
+    curvature: Float[np.ndarray, "speed piece output"]
     first: Int[np.ndarray, " piece"]
     count: Int[np.ndarray, " piece"]
 
@@ -168,8 +170,8 @@ class ForceResponses(NamedTuple):
         value = t * value - lower + series[0]
         has_static = np.flatnonzero(self.system.has_static[output])
         if has_static.size:
-            static = self.system.static_part(x[has_static], piece[has_static])
-            value[has_static] += static[np.arange(has_static.size), output[has_static]]
+            own = (part[has_static] for part in (x, piece, output))
+            value[has_static] += self.system.static_part(*own)
         return value
 
     def particular(self, speed: int, segment: int, x) -> Complex[np.ndarray, "force pole"]:
@@ -191,7 +193,7 @@ def force_responses(system: ForceSystem, speeds: Float[np.ndarray, " speed"]) ->
     after = np.concatenate([np.einsum("usnk,n->usk", solutions, signs), outside], axis=1)
     before = np.concatenate([outside, solutions.sum(axis=2)], axis=1)
     on_outputs = (solutions @ system.on_outputs.T).real
-    points, piece, first, count = _points(system)
+    points, piece, first, count = _points(system, np.abs(speeds).min())
     table = np.empty((speeds.size, points.size, system.on_outputs.shape[0]))
     for s in range(system.nodes.size - 1):
         own = system.segment[piece] == s
@@ -199,27 +201,29 @@ def force_responses(system: ForceSystem, speeds: Float[np.ndarray, " speed"]) ->
         shapes = chebyshev.chebvander(local, solutions.shape[2] - 1)
         table[:, own] = product(shapes, on_outputs[:, s])
     table += system.static_part(points, piece)
-    bends, fourth = (_differences(table, piece, order) for order in (2, 4))
-    distance = np.diff(system.breaks) / (count - 1)
-    error = CURVATURE_MARGIN / 8 * bends.max(axis=1)
+    bends, fourth = (_largest_differences(table, first, order) for order in (2, 4))
+    error = CURVATURE_MARGIN / 8 * bends
     # At the ends of a piece a cubic holds in the outer interval, where its error is the largest.
-    cubic_error = CURVATURE_MARGIN / 24 * fourth.max(axis=1)
-    bends = bends / distance[piece[2:], None] ** 2
-    curvature = CURVATURE_MARGIN * speeds[:, None] ** 2 * bends.max(axis=1)
+    cubic_error = CURVATURE_MARGIN / 24 * fourth
+    distance = (np.diff(system.breaks) / (count - 1))[:, None]
+    curvature = CURVATURE_MARGIN * speeds[:, None, None] ** 2 * bends / distance**2
     parts = solutions, before, after, on_outputs, table, error, cubic_error, curvature
     return ForceResponses(system, speeds, *parts, first, count)
 
 
-def _differences(table, piece, order: int):
-    """Magnitudes of the differences (speed, point, output) of an order within pieces."""
-    same = piece[order:] == piece[:-order]
-    return np.where(same[:, None], np.abs(np.diff(table, order, axis=1)), 0.0)
+def _largest_differences(table, first, order: int):
+    """Largest magnitudes of the differences (speed, piece, output) of an order in each piece."""
+    differences = np.abs(np.diff(table, order, axis=1, append=np.zeros_like(table[:, :order])))
+    last = np.append(first[1:], table.shape[1]) - order
+    bounds = np.stack([first, last], axis=1).reshape(-1)
+    return np.maximum.reduceat(differences, bounds, axis=1)[:, ::2]
 
 
-def _points(system: ForceSystem):
+def _points(system: ForceSystem, slowest: float):
     """Points of the tables (m), their pieces, and first point and number of points of each."""
     lengths = np.diff(system.breaks)
-    most = max(TABLE_POINTS, POINTS_PER_MODE * system.poles.size)
+    phase = system.fastest * lengths.sum() / slowest
+    most = max(TABLE_POINTS, POINTS_PER_MODE * system.poles.size, phase / TABLE_PHASE)
     count = np.maximum(8, np.ceil(most * lengths / lengths.sum()).astype(int) + 1)
     pieces = [
         np.linspace(left, right, n)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy.polynomial import chebyshev
 
 from jaxbeam.case.case import Case
@@ -66,11 +66,15 @@ class LoadInfluence(Module):
     mirrored: bool = eqx.field(static=True, default=False)
 
     def of_forces_at(
-        self, x: Float[Array, "*position"], near: Float[Array, "*position"]
-    ) -> Float[Array, "*position output"]:
-        """Outputs per newton upwards at positions x (m), off the beam as at its nearer end.
+        self,
+        x: Float[Array, "*position"],
+        near: Float[Array, "*position"],
+        output: Int[Array, "*position"] | None = None,
+    ) -> Float[Array, "..."]:
+        """Outputs (*position, output) per newton upwards at positions x (m), off the beam as at its nearer end.
 
-        At a break the limit on the side of it on which `near` (m) is.
+        At a break the limit on the side of it on which `near` (m) is. Only one `output` at each
+        position, if its number is given: (*position,).
         """
         toward = x + SIDE_SHIFT * (near - x)
         piece = xp.sum(toward[..., None] >= self.breaks[1:-1], axis=-1)
@@ -78,6 +82,8 @@ class LoadInfluence(Module):
         width = xp.where(right > left, right - left, 1.0)
         local = xp.clip((2 * x - left - right) / width, -1.0, 1.0)
         table = chebyshev_polynomials(local, self.series.shape[1])
+        if output is not None:
+            return xp.sum(table * self.series[piece, :, output], axis=-1)
         influence = xp.einsum("...k,...ko->...o", table, take(self.series, piece))
         return xp.concatenate([influence, -influence], -1) if self.mirrored else influence
 
