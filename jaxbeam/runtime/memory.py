@@ -25,14 +25,12 @@ def block_memory(given: float | str | None = None) -> float:
     except (KeyError, ValueError):
         found = 0.0
     if not 0 < found < float("inf"):
-        raise ValueError(
-            f"memory is a number of bytes or a text as '2 GB', not {given!r}"
-        )
+        raise ValueError(f"memory is a number of bytes or a text as '2 GB', not {given!r}")
     return found
 
 
 def free_memory() -> float:
-    """Memory (bytes) that this process can still take: of the machine, its container, its limits."""
+    """Memory (bytes) that this process can still take: of machine, container and its own limit."""
     limits = [_of_machine(), _of_container(), _of_process()]
     return max(0.0, min((limit for limit in limits if limit is not None), default=UNKNOWN))
 

@@ -1,7 +1,9 @@
 """Functions whose latest results are kept, by the contents of the tree that they take."""
 
+import collections
 import dataclasses
 import functools
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -39,3 +41,32 @@ def remembered(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
         return result_for(_Content(structure, numbers, tree))
 
     return call
+
+
+def remembered_within(size: float) -> Callable[[Callable], Callable]:
+    """A function whose latest results are kept, by its arguments, within a size (bytes) together.
+
+    The arguments are hashable, the results trees of arrays, which are shared.
+    """
+
+    def decorate(function: Callable) -> Callable:
+        kept: collections.OrderedDict[tuple, tuple[Any, int]] = collections.OrderedDict()
+        lock = threading.Lock()
+
+        @functools.wraps(function)
+        def call(*arguments):
+            with lock:
+                if arguments in kept:
+                    kept.move_to_end(arguments)
+                    return kept[arguments][0]
+            result = function(*arguments)
+            own = sum(getattr(leaf, "nbytes", 0) for leaf in jax.tree.leaves(result))
+            with lock:
+                kept[arguments] = result, own
+                while sum(part for _, part in kept.values()) > size:
+                    kept.popitem(last=False)
+            return result
+
+        return call
+
+    return decorate

@@ -50,18 +50,21 @@ def addresses_within_batches(case: Case, addresses: Collection[str]) -> list[str
 
 
 def make_batches(
-    addresses: list[str], runs: Float[np.ndarray, "run address"], within: Collection[str]
+    addresses: list[str],
+    runs: Float[np.ndarray, "run address"],
+    within: Collection[str],
+    most: int = MAX_BATCH_SIZE,
 ) -> Batches:
     """Batches of runs, which are given by their values at the addresses (SI units).
 
-    Runs that differ in the values at the addresses `within` batches only share one.
+    Runs that differ in the values at the addresses `within` batches only share one, of `most` runs.
     """
     is_batched = np.array([address in within for address in addresses], bool)
     shared_values, batched_values = runs[:, ~is_batched], runs[:, is_batched]
     order = np.lexsort((np.zeros(len(runs)), *shared_values.T[::-1]))
     new_path = np.any(np.diff(shared_values[order], axis=0) != 0, axis=1)
     runs_by_path = np.split(order, np.flatnonzero(new_path) + 1)
-    batch_size = min(MAX_BATCH_SIZE, max(part.size for part in runs_by_path))
+    batch_size = min(most, max(part.size for part in runs_by_path))
     rows = [
         part[i : i + batch_size] for part in runs_by_path for i in range(0, part.size, batch_size)
     ]

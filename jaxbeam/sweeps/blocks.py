@@ -47,8 +47,9 @@ class Runner:
     """Runner of all batches of a sweep in blocks of equal shape.
 
     With `single` precision the integration is in float32, models and propagators are made in
-    float64; `native` steps are taken in C. Raises ValueError if positions along the beam change
-    their order within the sweep.
+    float64; `native` steps are taken in C. Memory allows blocks of `most_batches`, and inputs of C
+    for `most_inputs` batches at once. Raises ValueError if positions along the beam change their
+    order within the sweep.
     """
 
     def __init__(
@@ -59,6 +60,8 @@ class Runner:
         tolerance: float,
         single: bool = False,
         native: bool = False,
+        most_batches: int = 2**31,
+        most_inputs: int = 2**31,
     ):
         self.case, self.batches, self.tolerance = case, batches, tolerance
         self.histories, self.single = histories, single
@@ -70,7 +73,8 @@ class Runner:
         elif histories:
             self.schedule = sample_schedule(sample_times(case), True, end=case.run.duration)
         self.trials = Trials()
-        self._set_block_size()
+        self.most_inputs = most_inputs
+        self._set_block_size(most_batches)
         # Loads, settings of the run and controllers do not change the model, which all batches then
         # share; not on several devices, each of which has the models of its part of a block.
         leaves_model_unchanged = ("loads.", "run.", "controller.")
@@ -133,14 +137,18 @@ class Runner:
             limits = np.repeat(limit, self.batches.run_index.shape[0])
         return np.where(np.isfinite(limits), limits, np.inf)
 
-    def _set_block_size(self):
-        """Numbers of batches per block and per trial, multiples of the number of devices."""
+    def _set_block_size(self, most_batches: int):
+        """Numbers of batches per block and per trial, multiples of the number of devices.
+
+        On a device no more than `most_batches`.
+        """
         count, batch_size = self.batches.run_index.shape
         self.devices = len(jax.local_devices())
         vectorised = not (self.histories or programs.in_sequence())
         block_runs = MAX_VECTORISED_RUNS if vectorised else MAX_BLOCK_RUNS
         max_batches, trial_batches = (
-            max(1, runs * self.devices // batch_size) for runs in (block_runs, MAX_TRIAL_RUNS)
+            max(1, min(runs // batch_size, most_batches)) * self.devices
+            for runs in (block_runs, MAX_TRIAL_RUNS)
         )
         trial_batches = min(count, trial_batches, MAX_TRIAL_BATCHES)
         self.trial_batches = _round_up(trial_batches, self.devices)
@@ -238,7 +246,8 @@ class Runner:
         """Function of a block's number and a mask of its batches: results of those in the mask."""
         if self.known_inputs is not None:
             integrate, max_loads = native_peaks.integrate_peaks, self.program.shapes.max_loads
-            inputs_of_block = self.known_inputs.of_blocks(steps, self.batches_per_block)
+            limits = self.batches_per_block, self.most_inputs
+            inputs_of_block = self.known_inputs.of_blocks(steps, *limits)
             return lambda block, mask: integrate(max_loads, mask, inputs_of_block(block))._asdict()
         substeps = None
         if self.histories:
@@ -253,12 +262,20 @@ class Runner:
 
     def _trial_results(self, batch_indices, steps, extra_steps, single):
         """Results of batches by name, on all cores."""
-        if self.known_inputs is not None:
+        known = self.known_inputs is not None
+        count = batch_indices.size
+        if known and count > self.most_inputs:
+            found = [
+                self._trial_results(batch_indices[rows], steps[rows], extra_steps[rows], single)
+                for rows in np.array_split(np.arange(count), -(-count // self.most_inputs))
+            ]
+            return {name: np.concatenate([one[name] for one in found]) for name in found[0]}
+        if known:
             inputs = self.known_inputs.of_batches(batch_indices, steps, extra_steps)
             calls = os.cpu_count() or 1
         else:
             # Two at least, side by side.
-            inputs, calls = None, max(2, -(-batch_indices.size // self.trial_batches))
+            inputs, calls = None, max(2, -(-count // self.trial_batches))
 
         def integrate(rows):
             if inputs is None:
@@ -267,7 +284,7 @@ class Runner:
             settings = self.program.shapes.max_loads, np.ones(rows.size, bool)
             return native_peaks.integrate_peaks(*settings, inputs_of_rows(inputs, rows))._asdict()
 
-        parts = np.array_split(np.arange(batch_indices.size), min(calls, batch_indices.size))
+        parts = np.array_split(np.arange(count), min(calls, count))
         results = list(self.pool.map(integrate, parts))
         return {name: np.concatenate([one[name] for one in results]) for name in results[0]}
 

@@ -1,11 +1,13 @@
 """Computation of a sweep of numbers, block by block, into a store and a labelled dataset."""
 
+import collections
 import importlib
+import itertools
 import json
+import os
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,13 +22,12 @@ from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime.arrays import collapse
 from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.garbage import rare_collections
+from jaxbeam.runtime.memory import size_text
 from jaxbeam.simulation.integration_plan import sample_times
 from jaxbeam.simulation.result_variables import SWEEP_VARIABLES, sensor_coordinates
 from jaxbeam.sweeps import cluster
 from jaxbeam.sweeps.batches import Batches
-from jaxbeam.sweeps.blocks import Runner
-from jaxbeam.sweeps.force_runner import ForceRunner
-from jaxbeam.sweeps.specification import SweepSpecification
+from jaxbeam.sweeps.specification import AnyRunner, SweepSpecification
 from jaxbeam.sweeps.stores import store as sweep_store
 from jaxbeam.sweeps.stores.block_store import BlockStore, MemoryStore
 from jaxbeam.sweeps.truncation import WorstRun, estimated_errors, is_corrected
@@ -56,6 +57,9 @@ def compute_sweep(
     missing = block_store.missing()
     remaining = sum(runner.run_count(block) for block in missing)
     count_as_done(progress_bar, specification.count - remaining)
+    if missing:
+        within = size_text(specification.block_bytes)
+        progress_bar.set_postfix_str(f"blocks of {runner.run_count(0)}, each within {within}")
     # The first block is always computed here, and creates the arrays of the store.
     computed_locally = missing if client is None else missing[:1]
     for block in _compute(runner, computed_locally, steps, block_store):
@@ -81,7 +85,7 @@ def peaks_in_memory(specification: SweepSpecification) -> "xarray.Dataset":
 
 def _begun(
     specification: SweepSpecification, path: Path | None, state: str, progress_bar: tqdm
-) -> "tuple[Runner | ForceRunner, Float[np.ndarray, ' path'], float, BlockStore]":
+) -> "tuple[AnyRunner, Float[np.ndarray, ' path'], float, BlockStore]":
     """Runner, step sizes (s), estimated error and store of a sweep, new or to be continued."""
     if path is not None and state == "resume":
         stored = sweep_store.ZarrStore(path)
@@ -101,7 +105,7 @@ def _begun(
     return runner, steps, error, sweep_store.create_store(*new)
 
 
-def _new_runner(specification: SweepSpecification) -> tuple[Runner | ForceRunner, bool]:
+def _new_runner(specification: SweepSpecification) -> tuple[AnyRunner, bool]:
     """Runner of a new sweep, and whether it takes its steps in C.
 
     The C integrator is compiled while programs are traced, which saves a third of a second. Where
@@ -124,19 +128,25 @@ def count_as_done(progress_bar: tqdm, runs: int) -> None:
     progress_bar.refresh()
 
 
-def _compute(
-    runner: Runner | ForceRunner, blocks: list[int], steps, block_store: BlockStore
-) -> Iterator[int]:
+def _compute(runner: AnyRunner, blocks: list[int], steps, block_store: BlockStore) -> Iterator[int]:
     """Numbers of blocks as they are computed, on all cores, and stored."""
     # A stored sweep that continues has no trials, and must agree to the bit.
     trials = runner.trials if isinstance(block_store, MemoryStore) else None
     compute = runner.block_function(steps, trials)
-    results = runner.pool.map(lambda block: (block, compute(block)), blocks)
-    # An error or an interrupt closes the iterator, which cancels blocks not yet started.
-    with closing(results):  # type: ignore[type-var]
-        for block, result in results:
-            block_store.write(block, result)
+    waiting, left = collections.deque(), iter(blocks)
+    try:
+        # No more than one result waits to be written for each that is computed.
+        for block in itertools.islice(left, 2 * (os.cpu_count() or 1)):
+            waiting.append((block, runner.pool.submit(compute, block)))
+        while waiting:
+            block, future = waiting.popleft()
+            block_store.write(block, future.result())
+            for following in itertools.islice(left, 1):
+                waiting.append((following, runner.pool.submit(compute, following)))
             yield block
+    finally:  # an error or an interrupt cancels blocks not yet started
+        for _, future in waiting:
+            future.cancel()
 
 
 def _to_dataset(

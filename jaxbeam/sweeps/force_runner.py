@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.case.fields import concrete
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator.forces.paths import constant_speeds, force_paths, force_wheels
-from jaxbeam.integrator.forces.peaks import peaks_of_forces
+from jaxbeam.integrator.forces.peaks import MAX_VALUES, peaks_of_forces, search_bytes
 from jaxbeam.integrator.forces.system import (
     ForceResponses,
     ForceSystem,
@@ -28,7 +29,8 @@ from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correc
 from jaxbeam.model.sensing.linear_outputs import linear_outputs
 from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.static_correction import is_supported
-from jaxbeam.sweeps.batches import Batches
+from jaxbeam.runtime.remembering import remembered_within
+from jaxbeam.sweeps.batches import Batches, values_at
 from jaxbeam.sweeps.step_size import REFINEMENT, relative_changes, stratified_sample
 
 MIN_WHEELS = 8  # of a row; below, integration in batches takes less time
@@ -39,6 +41,8 @@ OF_BEAM = "beam", "supports", "actuators", "sensors"  # the keys on which the mo
 # Runs of a block at most, and pairs of its wheels at most. Twice as many runs as before took 12 %
 # less time for ten trains at 101 speeds: threads wait for each other between NumPy's short calls.
 FORCE_BLOCK_RUNS, BLOCK_PAIRS = 64, 4e6
+LEAST_BYTES = 100 * MAX_VALUES  # of values that a block computes at once, whatever its runs
+RESPONSE_BYTES = 2e8  # of the responses that are kept for further trains at the same speeds
 OUTPUTS_AT_ONCE, CORRECTED_AT_ONCE = 32, 8
 TRIAL_RUNS = 4  # in which the error of the peaks is measured
 PHASE = 1.6  # rad of the fastest pole in a step of the search
@@ -49,14 +53,42 @@ class ForceRunner:
 
     trials = None  # are not kept
 
-    def __init__(self, case: Case, batches: Batches, system: str):
+    def __init__(self, case: Case, batches: Batches, system: str, block_bytes: float):
         self.case, self.batches, self.system = case, batches, system
         self.pool = ThreadPoolExecutor(os.cpu_count())
         self.wheels, count = force_wheels(case), len(batches.run_index)
-        most = max(1, min(FORCE_BLOCK_RUNS, int(BLOCK_PAIRS / self.wheels.force.size**2)))
+        self.run_bytes = self._run_bytes()
+        most = min(
+            FORCE_BLOCK_RUNS,
+            BLOCK_PAIRS / self.wheels.force.size**2,
+            (block_bytes - LEAST_BYTES) / self.run_bytes,
+        )
         # As equal as can be: cores wait for the last block.
-        self.block_runs = -(-count // -(-count // most))
+        self.block_runs = -(-count // -(-count // max(1, int(most))))
         self.block_count = -(-count // self.block_runs)
+
+    def _run_bytes(self) -> float:
+        """Memory (bytes) of a run in a block, at most."""
+        batches, length = self.batches, float(concrete(self.case.beam.length))
+        varied = {name.rpartition(".")[2] for name in batches.shared_addresses}
+        speeds = [np.abs(concrete(load.speed)) for load in self.case.loads]
+        speeds += [
+            np.abs(values).min()
+            for name, values in zip(batches.shared_addresses, batches.shared_values.T, strict=True)
+            if name.endswith(".speed")
+        ]
+        wheels = at_once = self.wheels.force.size
+        if "spacing" not in varied:
+            behind = map(np.sort, self.wheels.behind)
+            at_once = sum(
+                (np.searchsorted(x, x + length, "right") - np.arange(x.size)).max(initial=0)
+                for x in behind
+            )
+        duration = float(values_at(self.case, batches, "run.duration").max())
+        given = wheels, int(at_once), duration, float(min(speeds)), PHASE
+        systems = _systems(self.system)
+        assert systems is not None
+        return max(search_bytes(system, *given) for system in systems)
 
     def choose_step_sizes(self) -> tuple[Float[np.ndarray, " path"], float]:
         """Phases (rad) of the fastest pole in a step, and the relative error of peaks with them."""
@@ -135,8 +167,13 @@ def output_groups(case: Case) -> list[list[int]]:
     return groups
 
 
-def force_runner(case: Case, batches: Batches, tolerance: float) -> ForceRunner | None:
-    """Runner of trains of forces at constant speeds; None for other loads and varied models."""
+def force_runner(
+    case: Case, batches: Batches, tolerance: float, block_bytes: float
+) -> ForceRunner | None:
+    """Runner of trains of forces at constant speeds; None for other loads and varied models.
+
+    A block of runs takes at most `block_bytes` of memory, if one run takes no more.
+    """
     known = all(map(ADDRESS.fullmatch, batches.shared_addresses)) and not batches.batched_addresses
     if not (known and case.controller is None and tolerance >= LEAST_TOLERANCE):
         return None
@@ -146,7 +183,7 @@ def force_runner(case: Case, batches: Batches, tolerance: float) -> ForceRunner 
         return None
     content = case_to_dict(case)
     system = json.dumps({key: content[key] for key in OF_BEAM if key in content})
-    return None if _systems(system) is None else ForceRunner(case, batches, system)
+    return None if _systems(system) is None else ForceRunner(case, batches, system, block_bytes)
 
 
 @functools.lru_cache(maxsize=4)
@@ -168,7 +205,7 @@ def _systems(content: str) -> list[ForceSystem] | None:
     return None if None in found else found
 
 
-@functools.lru_cache(maxsize=64)
+@remembered_within(RESPONSE_BYTES)
 def _responses(system: str, group: int, speeds: tuple[float, ...]) -> ForceResponses:
     """Responses of a group of outputs to forces of some speeds (m/s), which trains share."""
     found = _systems(system)

@@ -93,14 +93,15 @@ class KnownInputs:
         return native_peaks.NativeInputs(**self.of_model, **found)
 
     def of_blocks(
-        self, max_steps: Float[np.ndarray, " path"], batches_per_block: int
+        self, max_steps: Float[np.ndarray, " path"], batches_per_block: int, most_batches: int
     ) -> Callable[[int], native_peaks.NativeInputs]:
         """Function of a block's number: its inputs, which are made for several blocks at once.
 
-        `max_steps` (s) are those of all batches.
+        `max_steps` (s) are those of all batches, of which inputs of `most_batches` are made at once
+        if a block has no more.
         """
         count, runs = self.batches.run_index.shape
-        most = max(1, GROUP_RUNS // (batches_per_block * runs))
+        most = max(1, min(GROUP_RUNS // runs, most_batches) // batches_per_block)
         blocks = min(-(-count // batches_per_block), most)
         group_size = blocks * batches_per_block
 

@@ -6,7 +6,9 @@ import hashlib
 import importlib.metadata
 import json
 import math
+import os
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -15,24 +17,31 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, addresses, list_sizes, own_addresses, replace, unit_at
 from jaxbeam.case.declared_checks import describe_value
+from jaxbeam.case.fields import concrete
 from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.joint_addresses import each_address, overlap
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.reading.units import in_si
+from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.step_size import check_tolerance
+from jaxbeam.runtime.memory import block_memory
 from jaxbeam.sweeps import MAX_RUNS
 from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, Batches, addresses_within_batches, make_batches
+from jaxbeam.sweeps.block_memory import RunSizes, largest_group, run_sizes
 from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner
 from jaxbeam.sweeps.force_runner import FORCE_BLOCK_RUNS, ForceRunner, force_runner
+from jaxbeam.sweeps.sensor_groups import SensorGroups
 from jaxbeam.sweeps.truncation import is_corrected
 
 # Positions and list entries, whose values are valid only in combination.
 JOINTLY_CHECKED = re.compile(
     r"beam\.length|(supports|actuators|sensors)\.(\d+|\*)\.(position|start|end)|.*\.\d+"
 )
+
+AnyRunner = Runner | ForceRunner | SensorGroups
 
 PRECISIONS = ("double", "single")
 
@@ -49,7 +58,8 @@ class SweepSpecification:
 
     The runs are all combinations of the values, or with `paired` the first of each address, the
     second, and so on. `tolerance` is the relative error allowed of peaks, rounding in `single`
-    precision excluded.
+    precision excluded. A block of runs takes at most `block_bytes` of memory, if one run takes no
+    more.
     """
 
     case: Case
@@ -58,6 +68,7 @@ class SweepSpecification:
     histories: bool
     tolerance: float
     single: bool
+    block_bytes: float
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -87,31 +98,68 @@ class SweepSpecification:
         controller = self.case.controller
         one_run_each = controller is not None and controller.design_depends_on_loads
         within = [] if one_run_each else addresses_within_batches(self.case, self.axes)
-        return make_batches(list(self.axes), self.runs(), within)
+        most = largest_group(MAX_BATCH_SIZE, lambda runs: self._fits(self.case.sensors[:1], runs))
+        return make_batches(list(self.axes), self.runs(), within, most)
+
+    @functools.cached_property
+    def _sizes(self) -> RunSizes:
+        """Sizes of the runs that decide how much memory they take."""
+        swept = [values for name, values in self.axes.items() if name.endswith(".speed")]
+        speeds = [float(concrete(load.speed)) for load in self.case.loads if hasattr(load, "speed")]
+        return run_sizes(self.case, np.concatenate([speeds, *swept]), self.histories)
+
+    def _fits(self, sensors: Sequence[Sensor], runs: int) -> bool:
+        """Whether a batch of so many runs with some sensors fits into a block."""
+        return self._sizes.batch_bytes(sensors, runs) <= self.block_bytes
+
+    @functools.cached_property
+    def sensor_groups(self) -> list[list[int]]:
+        """Numbers of the sensors whose peaks are integrated together: all, if memory allows it.
+
+        Those that are statically corrected are neighbours, as steps end where wheels pass them. A
+        controller reads all of them in each run.
+        """
+        sensors, runs = self.case.sensors, self.batches.run_index.shape[1]
+        order = sorted(range(len(sensors)), key=lambda i: (sensors[i].bends, sensors[i].position))
+        if self.case.controller is not None:
+            return [order]
+        most = largest_group(
+            len(order), lambda count: self._fits([sensors[i] for i in order[-count:]], runs)
+        )
+        return [order[first : first + most] for first in range(0, len(order), most)]
 
     @functools.cached_property
     def _force_runner(self) -> ForceRunner | None:
         """Runner of peaks in closed form; None where there is none."""
         if self.histories or self.single:
             return None
-        return force_runner(self.case, self.batches, self.tolerance)
+        return force_runner(self.case, self.batches, self.tolerance, self.block_bytes)
 
-    def runner(self, native: bool) -> Runner | ForceRunner:
+    def runner(self, native: bool) -> AnyRunner:
         """Runner of the batches in blocks: in closed form, or whose steps are in C if `native`.
 
         Raises ValueError if positions along the beam change their order within the sweep.
         """
         if self._force_runner is not None:
             return self._force_runner
-        settings = self.histories, self.tolerance, self.single
-        return Runner(self.case, self.batches, *settings, native)
+        runs, groups = self.batches.run_index.shape[1], self.sensor_groups
+        sensors = [[self.case.sensors[i] for i in group] for group in groups]
+        batch_bytes = max(self._sizes.batch_bytes(group, runs) for group in sensors)
+        input_bytes = max(self._sizes.input_bytes(group, runs) for group in sensors)
+        limits = (max(1, int(self.block_bytes / size)) for size in (batch_bytes, input_bytes))
+        settings = self.batches, self.histories, self.tolerance, self.single, native, *limits
+        if len(groups) == 1:
+            return Runner(self.case, *settings)
+        cases = [dataclasses.replace(self.case, sensors=tuple(group)) for group in sensors]
+        return SensorGroups([Runner(case, *settings) for case in cases], groups)
 
-    def resumed_runner(self, content: dict[str, Any]) -> Runner | ForceRunner:
+    def resumed_runner(self, content: dict[str, Any]) -> AnyRunner:
         """Runner of the sweep of a store with this content, in C if it was begun so.
 
         So all blocks agree to the bit. Raises ValueError if the C code cannot be compiled here.
         """
         native = bool(content["native"])
+        same = dataclasses.replace(self, block_bytes=content["block_bytes"])
         if native and not native_peaks.available():
             try:
                 native_peaks.LIBRARY.build()
@@ -119,7 +167,7 @@ class SweepSpecification:
                 raise ValueError(
                     f"the sweep was begun with steps in C, which continuing it needs: {error}"
                 ) from None
-        return self.runner(native)
+        return same.runner(native)
 
     def uses_c(self) -> bool:
         """Whether a new sweep takes its steps in C (see `native_peaks.chosen_for`)."""
@@ -139,11 +187,16 @@ class SweepSpecification:
             "case": self.case_dict,
             "axes": {address: values.tolist() for address, values in self.axes.items()},
             "settings": [self.paired, self.histories, self.tolerance, self.single],
+            "block_bytes": self.block_bytes,
         }
 
     def fingerprint(self) -> str:
-        """SHA-256 of all that determines the results: case, values, settings and versions."""
+        """SHA-256 of all that determines the results: case, values, settings and versions.
+
+        The memory of blocks is not among them: a sweep is continued with that of its beginning.
+        """
         content = self.to_dict() | {
+            "block_bytes": None,
             "blocks": [
                 MAX_BLOCK_RUNS,
                 FORCE_BLOCK_RUNS,
@@ -164,7 +217,8 @@ def _version() -> str:
 def specification_from_dict(content: dict[str, Any]) -> SweepSpecification:
     """Specification from the dictionary of `SweepSpecification.to_dict`, without checks."""
     axes = {address: np.asarray(values, float) for address, values in content["axes"].items()}
-    return SweepSpecification(case_from_dict(content["case"]), axes, *content["settings"])
+    case, settings = case_from_dict(content["case"]), content["settings"]
+    return SweepSpecification(case, axes, *settings, block_bytes=content["block_bytes"])
 
 
 def sweep_specification(
@@ -174,11 +228,13 @@ def sweep_specification(
     histories: bool,
     tolerance: float,
     precision: str,
+    memory: float | str | None = None,
 ) -> SweepSpecification:
     """Specification of a sweep of a case, checked before compilation.
 
-    Raises ValueError for an unknown address, invalid or too many values, a case without sensors,
-    an unknown precision, or a tolerance below that of double precision.
+    Its blocks take at most `memory` together (see `block_memory`): two for each core, and one that
+    is written. Raises ValueError for an unknown address, invalid or too many values, a case without
+    sensors, an unknown precision, or a tolerance below that of double precision.
     """
     check_tolerance(tolerance)
     check_case(case)
@@ -219,7 +275,9 @@ def sweep_specification(
     sizes = {address: values.size for address, values in axes.items()}
     if paired and len(set(sizes.values())) > 1:
         raise ValueError(f"paired values must be equally many, not {sizes}")
-    specification = SweepSpecification(case, axes, paired, histories, tolerance, single)
+    block_bytes = block_memory(memory) / (1 + 2 * (os.cpu_count() or 1))
+    settings = paired, histories, tolerance, single, block_bytes
+    specification = SweepSpecification(case, axes, *settings)
     if specification.count > MAX_RUNS:
         raise ValueError(
             f"{specification.count:.1e} combinations of values are more than the"

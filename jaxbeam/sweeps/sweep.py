@@ -53,6 +53,7 @@ def sweep(
     tolerance: float = TOLERANCE,
     precision: str = "double",
     client: Any = None,
+    memory: float | str | None = None,
 ) -> "xarray.Dataset":
     """Simulate a case for many values of the numbers, and for words, at given addresses.
 
@@ -80,6 +81,9 @@ def sweep(
     the rounding error of peaks, a few parts in a million, is measured and included in
     `error_estimate`.
 
+    Blocks have as many runs as `memory` allows, in bytes or with a unit ("2 GB"), by default a
+    quarter of what is free; the progress line says how many. Results in memory are not counted.
+
     With a `store` each block is written to a zarr store when it is done; with `resume` an
     interrupted sweep continues from there, with bit-identical results. With a `client` of Dask
     (`distributed.Client`) its workers compute the blocks and write them to the store, in a folder
@@ -105,7 +109,7 @@ def sweep(
     if client is not None and store is None:
         raise ValueError("workers write their blocks to a store; name one")
     words, numbers = split_words(case, over)
-    settings = paired, histories, tolerance, precision
+    settings = paired, histories, tolerance, precision, memory
     if words:
         plan = word_sweep(case, words, numbers, list(over), *settings)
     else:

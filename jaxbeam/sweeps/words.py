@@ -125,6 +125,7 @@ def word_sweep(
     histories: bool,
     tolerance: float,
     precision: str,
+    memory: float | str | None = None,
 ) -> WordSweep:
     """Sweep over all combinations of words and numbers, `order` that of the addresses.
 
@@ -144,7 +145,13 @@ def word_sweep(
         try:
             sweeps.append(
                 sweep_specification(
-                    with_numbers(changed), numbers, False, histories, tolerance, precision
+                    with_numbers(changed),
+                    numbers,
+                    False,
+                    histories,
+                    tolerance,
+                    precision,
+                    memory,
                 )
             )
         except ValueError as error:

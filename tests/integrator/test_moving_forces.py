@@ -17,7 +17,7 @@ from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.sensing.linear_outputs import linear_outputs
 from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.numerics.piecewise import piecewise_chebyshev
-from jaxbeam.sweeps.force_runner import force_runner
+from jaxbeam.sweeps.force_runner import _systems, force_runner
 from jaxbeam.sweeps.specification import sweep_specification
 from jaxbeam.sweeps.truncation import SAMPLES, WorstRun, estimated_errors
 
@@ -46,7 +46,7 @@ TIMOSHENKO = dataclasses.replace(
 
 def runner_of(case, over):
     plan = sweep_specification(case, over, False, False, 1e-8, "double")
-    return force_runner(case, plan.batches, 1e-8)
+    return force_runner(case, plan.batches, 1e-8, plan.block_bytes)
 
 
 @pytest.mark.parametrize("case", [TWO_SPANS, TIMOSHENKO], ids=["two spans", "Timoshenko"])
@@ -164,3 +164,26 @@ def test_other_sweeps_are_integrated():
         dataclasses.replace(TWO_SPANS, beam=free, supports=(), sensors=TWO_SPANS.sensors[:3]),
     ):
         assert runner_of(case, speeds) is None
+
+
+def test_static_parts_of_tapered_beams_are_exact_between_the_breaks():
+    """Against the exact flexibility; pieces of panels hold several of the interpolation."""
+    segments = [jb.Segment(4.0, [8e8, -4e8], 2000.0), jb.Segment(8.0, [4e8, 4e8], 2000.0)]
+    beam = jb.Beam(12.0, damping_ratio=0.02, modes=3, segments=segments)
+    sensors = [jb.Sensor(3.0, "moment"), jb.Sensor(7.0, "shear")]
+    case = dataclasses.replace(TWO_SPANS, beam=beam, supports=(), sensors=sensors)
+    runner = runner_of(case, {"loads.0.speed": [25.0]})
+    (system,) = _systems(runner.system)
+    x = np.linspace(0.0, 12.0, 1000)[1:-1]
+    piece = np.searchsorted(system.breaks, x) - 1
+    rows = np.asarray(system.static.rows)
+    model = modal_model(case)
+    quasi_static = np.linalg.solve(model.stiffness(), np.asarray(model.shapes(x, (0,))[0]).T)
+    found = system.static_part(x, piece) + (rows[:, ::2] @ quasi_static).T
+    for i, sensor in enumerate(sensors):
+        exact = -np.asarray(jb.influence_line(case, sensor.position, x, quantity=sensor.quantity))
+        assert_allclose(
+            found[:, i], exact, atol=1e-7 * np.abs(exact).max(), err_msg=sensor.quantity
+        )
+        one = system.static_part(x, piece, np.full(x.size, i))
+        assert_allclose(one, system.static_part(x, piece)[:, i], rtol=1e-12)

@@ -40,6 +40,7 @@ def sweep(
     resume: bool = False,
     scheduler: str | None = None,
     precision: str = "double",
+    memory: str | None = None,
     pictures: LabelledPictureOptions = LabelledPictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
@@ -64,6 +65,8 @@ def sweep(
         store must be in a folder that all workers see.
     precision
         double, or single: half the bits, errors of a few parts in a million.
+    memory
+        Memory of the blocks of runs, as "2 GB"; a quarter of what is free if left out.
     """
     values = parse_sweep_values(over)
     refuse_option(
@@ -102,6 +105,7 @@ def sweep(
             paired=paired,
             progress=not options.json_,
             precision=precision,
+            memory=memory,
             client=client,
         )
     if output and not store:

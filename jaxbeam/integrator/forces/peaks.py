@@ -12,7 +12,12 @@ from jaxtyping import Float
 from jaxbeam.integrator.forces.panels import Panels, force_panels
 from jaxbeam.integrator.forces.paths import ForcePaths
 from jaxbeam.integrator.forces.products import product
-from jaxbeam.integrator.forces.system import ForceResponses
+from jaxbeam.integrator.forces.system import (
+    ForceResponses,
+    ForceSystem,
+    solution_size,
+    table_points,
+)
 from jaxbeam.integrator.peaks.running_peaks import Peaks
 from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.numerics.peak_search import estimate_peak, refine_peak
@@ -22,7 +27,7 @@ FEW_STEPS = 2
 REFINEMENTS = 4  # of a step,
 MAX_REFINEMENTS = 4  # at most so often,
 ENOUGH_STEPS = 8  # until no more steps than these are left in a run
-MAX_VALUES = 1e6  # of forces at instants at once
+MAX_VALUES = 2.5e5  # of forces at instants at once
 
 
 def peaks_of_forces(responses: ForceResponses, paths: ForcePaths, phase: float) -> Peaks:
@@ -39,6 +44,26 @@ def peaks_of_forces(responses: ForceResponses, paths: ForcePaths, phase: float) 
     lowest = np.where(entered, -paths.force, np.inf)
     lost = np.where(entered & (paths.force > 0), entry, np.nan)
     return Peaks(value[:, None], time[:, None], lowest[:, None], lost[:, None])
+
+
+def search_bytes(
+    system: ForceSystem, wheels: int, at_once: int, duration: float, slowest: float, phase: float
+) -> float:
+    """Memory (bytes) that the search of a run takes at most, beside that of one chunk of values.
+
+    Of `wheels` forces, so many `at_once` on the beam, until the `duration` (s), the slowest at a
+    speed (m/s); steps are of a `phase` (rad). Counted are the arrays of `Panels`, of `_Search` and
+    of `ForceResponses`.
+    """
+    outputs, poles = system.on_outputs.shape
+    segments, terms, _ = system.forces.shape
+    size = solution_size(terms)
+    panels = 1 + wheels * system.breaks.size
+    chunks = panels + duration * system.fastest / phase / CHUNK_STEPS
+    points = table_points(system, slowest) + 8 * system.breaks.size
+    numbers = panels * (12 * poles + 16 * at_once) + chunks * (12 * outputs + 8 * poles + 90)
+    solutions = segments * size * (8 * poles + outputs) + 2 * poles * size**2
+    return 8.0 * (numbers + solutions + points * (8 * outputs + size))
 
 
 class _Search:
@@ -108,7 +133,7 @@ class _Search:
         width = times.shape[1] * (table.size // table.shape[0])
         if self._too_many(panel, width):
             parts = _halves(panel, times)
-            return np.concatenate([self._from_table(table, *one, cubic) for one in parts])
+            return np.concatenate([self._from_table(table, *one, cubic=cubic) for one in parts])
         which, at = self.panels.forces_in(panel)
         place = self.place[at][:, None] + self.rate[at][:, None] * times[which]
         last = self.last[at][:, None]

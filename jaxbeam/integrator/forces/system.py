@@ -28,7 +28,7 @@ from jaxbeam.model.sensing.linear_outputs import LinearOutputs
 MAX_CONDITION = 1e6  # of the eigenvectors; beyond, poles are nearly repeated
 TABLE_POINTS = 600  # of the beam, at least; peaks are searched on lines between them
 POINTS_PER_MODE = 40
-TABLE_PHASE = 0.3  # rad of the fastest pole at most, while the slowest force goes from one to the next
+TABLE_PHASE = 0.3  # rad of the fastest pole, at most, between two points under the slowest force
 CURVATURE_MARGIN = 1.2  # of the curvature over second differences of the table
 
 
@@ -65,7 +65,10 @@ class ForceSystem(NamedTuple):
         return np.any(np.asarray(self.static.influence.series), axis=(0, 1))
 
     def static_part(self, x, piece, output=None) -> Float[np.ndarray, "force ..."]:
-        """Static part of r (force, output) at positions (m) in pieces; only of one `output` at each, if given."""
+        """Static part of r (force, output) at positions (m) in pieces.
+
+        Only of one `output` at each, if it is given.
+        """
         if self.static.influence is None:
             return np.zeros((x.size, self.on_outputs.shape[0]))
         near = (self.breaks[piece] + self.breaks[piece + 1]) / 2
@@ -93,7 +96,7 @@ def force_system(
     return ForceSystem(poles[own], series, on_outputs, nodes, breaks, outputs)
 
 
-def _solution_size(terms: int) -> int:
+def solution_size(terms: int) -> int:
     """Number of terms of a particular solution, for as many of the force."""
     return terms + 6 * int(np.ceil(np.cbrt(terms))) + 12
 
@@ -108,7 +111,7 @@ def particular_solutions(
     solution that vanishes at the left node.
     """
     segments, terms, poles = system.forces.shape
-    size = _solution_size(terms)
+    size = solution_size(terms)
     n = np.arange(size)
     c = np.where(n == 0, 2.0, 1.0)
     b = np.zeros((segments, size + 1, poles), complex)
@@ -219,11 +222,21 @@ def _largest_differences(table, first, order: int):
     return np.maximum.reduceat(differences, bounds, axis=1)[:, ::2]
 
 
+def table_points(system: ForceSystem, slowest: float) -> float:
+    """Number of points of tables, at least, for forces of which the slowest has a speed (m/s).
+
+    Poles that turn further than `terms` in half a segment have polynomials as particular solutions.
+    """
+    segments, terms, poles = system.forces.shape
+    phase = system.fastest * (system.breaks[-1] - system.breaks[0]) / slowest
+    turning = min(phase, 2 * terms * segments) / TABLE_PHASE
+    return float(max(TABLE_POINTS, POINTS_PER_MODE * poles, turning))
+
+
 def _points(system: ForceSystem, slowest: float):
     """Points of the tables (m), their pieces, and first point and number of points of each."""
     lengths = np.diff(system.breaks)
-    phase = system.fastest * lengths.sum() / slowest
-    most = max(TABLE_POINTS, POINTS_PER_MODE * system.poles.size, phase / TABLE_PHASE)
+    most = table_points(system, slowest)
     count = np.maximum(8, np.ceil(most * lengths / lengths.sum()).astype(int) + 1)
     pieces = [
         np.linspace(left, right, n)

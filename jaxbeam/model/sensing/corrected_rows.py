@@ -37,7 +37,8 @@ from jaxbeam.numerics.piecewise import chebyshev_polynomials, piecewise_chebyshe
 from jaxbeam.runtime.arrays import Array, set_at, solve, take, xp
 from jaxbeam.runtime.module import Module
 
-SIDE_SHIFT = 0.01  # towards a position nearby, by which the side of a break is found
+SIDE_SHIFT = 0.01  # towards a position nearby, by which the side of a break is found,
+LARGEST_SHIFT = 0.1  # over the length of the beam and the root of the rounding error, at most
 PARTS, PART_TERMS = 8, 24  # in which influence functions that are no cubics are interpolated
 
 
@@ -71,12 +72,14 @@ class LoadInfluence(Module):
         near: Float[Array, "*position"],
         output: Int[Array, "*position"] | None = None,
     ) -> Float[Array, "..."]:
-        """Outputs (*position, output) per newton upwards at positions x (m), off the beam as at its nearer end.
+        """Outputs (*position, output) per newton upwards at positions x (m).
 
-        At a break the limit on the side of it on which `near` (m) is. Only one `output` at each
-        position, if its number is given: (*position,).
+        Off the beam as at its nearer end. At a break the limit on the side of it on which `near`
+        (m) is. Only one `output` at each position, if its number is given: (*position,).
         """
-        toward = x + SIDE_SHIFT * (near - x)
+        # Further breaks may lie between a position and one nearby.
+        largest = LARGEST_SHIFT * np.finfo(x.dtype).eps ** 0.5 * self.breaks[-1]
+        toward = x + xp.clip(SIDE_SHIFT * (near - x), -largest, largest)
         piece = xp.sum(toward[..., None] >= self.breaks[1:-1], axis=-1)
         left, right = take(self.breaks, piece), take(self.breaks, piece + 1)
         width = xp.where(right > left, right - left, 1.0)

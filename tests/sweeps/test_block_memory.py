@@ -1,0 +1,123 @@
+"""Blocks of sweeps are sized by memory: what they take, and the same results whatever they take."""
+
+import dataclasses
+import tracemalloc
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import jaxbeam as jb
+from jaxbeam.integrator import native_peaks
+from jaxbeam.sweeps import computation
+from jaxbeam.sweeps.force_runner import FORCE_BLOCK_RUNS, LEAST_BYTES, PHASE
+from jaxbeam.sweeps.sensor_groups import SensorGroups
+from jaxbeam.sweeps.specification import sweep_specification
+
+TRAIN = jb.Axles(speed=50.0, offsets=np.arange(10) * 3.0, forces=[1e5] * 10)
+HEAVY = dataclasses.replace(TRAIN, masses=[100.0] * 10)
+UNIFORM = jb.Beam(25.0, 3e10, 15000.0, 0.01, modes=4)
+TAPERED = jb.Beam(
+    25.0,
+    damping_ratio=0.01,
+    modes=4,
+    segments=[jb.Segment(8.0, [6e10, -3e10], 15e3), jb.Segment(17.0, [3e10, 3e10], 15e3)],
+)
+SPEEDS = {"loads.0.speed": np.linspace(30.0, 80.0, 12)}
+
+
+def case_of(beam, load, quantity, count):
+    sensors = [jb.Sensor(x, quantity) for x in np.linspace(1.0, 24.0, count)]
+    return jb.Case(beam, sensors=sensors, loads=[load], run=jb.Run(3.0, sample_rate=20.0))
+
+
+def plan_of(case, memory, histories=False):
+    return sweep_specification(case, SPEEDS, False, histories, 1e-7, "double", memory)
+
+
+@pytest.mark.parametrize("beam", [UNIFORM, TAPERED], ids=["uniform", "tapered"])
+@pytest.mark.parametrize(("quantity", "count"), [("moment", 30), ("deflection", 40)])
+def test_forces_take_no_more_memory_than_counted(beam, quantity, count):
+    case = case_of(beam, TRAIN, quantity, count)
+    large, small = (plan_of(case, memory).runner(False) for memory in ("8 GB", "1 kB"))
+    assert large.block_runs == 12 <= FORCE_BLOCK_RUNS and small.block_runs == 1
+    runs = np.arange(12)
+    tracemalloc.start()
+    found = large._peaks(runs, PHASE)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert 0.1 * 12 * large.run_bytes < most < 12 * large.run_bytes + LEAST_BYTES
+    assert_allclose(small._peaks(runs, PHASE).peak_deflection, found.peak_deflection, rtol=1e-12)
+
+
+def test_sensors_in_groups_have_the_same_peaks():
+    if not native_peaks.available():
+        native_peaks.LIBRARY.build()
+    case = dataclasses.replace(
+        case_of(UNIFORM, jb.MovingMass(mass=2e3, speed=50.0), "moment", 1),
+        sensors=[jb.Sensor(20.0, "moment"), jb.Sensor(12.0), jb.Sensor(3.0, "shear")],
+    )
+    whole, parted = (plan_of(case, memory) for memory in ("8 GB", "1 kB"))
+    assert whole.sensor_groups == [[1, 2, 0]] and parted.sensor_groups == [[1], [2], [0]]
+    runner = parted.runner(native=True)
+    assert isinstance(runner, SensorGroups)
+    steps, error = runner.choose_step_sizes()
+    assert error <= 1e-7
+    found = [runner.block_function(steps)(block) for block in range(runner.block_count)]
+    expected = whole.runner(native=True)
+    compute = expected.block_function(expected.choose_step_sizes()[0])
+    wanted = [compute(block) for block in range(expected.block_count)]
+    # Of contact forces the smallest of samples counts, which other steps place elsewhere.
+    for name, allowed in (("peak_deflection", 3e-7), ("lowest_contact_force", 1e-5)):
+        one, other = (np.concatenate([b[name] for b in part])[:12] for part in (found, wanted))
+        assert_allclose(one, other, rtol=allowed, err_msg=name)
+
+
+def test_the_number_of_runs_falls_with_memory():
+    """A beam with many corrected sensors under many heavy wheels, and one with long histories."""
+    many = case_of(UNIFORM, HEAVY, "moment", 161)
+    batches = {}
+    for memory in ("64 GB", "2 GB"):
+        plan = plan_of(many, memory)
+        assert plan._sizes.batch_bytes(many.sensors[:1], 1) < plan.block_bytes
+        sensors = [many.sensors[i] for i in plan.sensor_groups[0]]
+        batches[memory] = len(plan.sensor_groups), plan._sizes.batch_bytes(sensors, 1)
+        assert batches[memory][1] <= plan.block_bytes
+    assert batches["64 GB"][0] < batches["2 GB"][0]
+    long = dataclasses.replace(
+        case_of(UNIFORM, jb.MovingMass(mass=100.0, speed=50.0), "deflection", 3),
+        run=jb.Run(100.0, sample_rate=500.0),
+    )
+    masses = {"loads.0.mass": np.linspace(1.0, 2.0, 200)}
+    given = long, masses, False, True, 1e-7, "double"
+    runs = [
+        sweep_specification(*given, memory).batches.run_index.shape[1]
+        for memory in ("256 GB", "1 GB")
+    ]
+    assert runs[0] == 200 > 4 * runs[1]
+
+
+def test_a_store_is_continued_with_the_blocks_of_its_beginning(tmp_path, monkeypatch):
+    case = case_of(UNIFORM, TRAIN, "moment", 3)
+    whole = jb.sweep(case, SPEEDS, store=tmp_path / "whole.zarr", progress=False, memory="1 kB")
+    begun = computation._compute
+
+    def interrupted(*given):
+        for i, block in enumerate(begun(*given)):
+            yield block
+            if i == 3:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr(computation, "_compute", interrupted)
+    path = tmp_path / "part.zarr"
+    with pytest.raises(KeyboardInterrupt):
+        jb.sweep(case, SPEEDS, store=path, progress=False, memory="1 kB")
+    monkeypatch.undo()
+    found = jb.sweep(case, SPEEDS, store=path, resume=True, progress=False, memory="8 GB")
+    assert_array_equal(found.peak_moment, whole.peak_moment)
+
+
+def test_the_progress_line_says_how_many_runs_a_block_has(capsys):
+    case = case_of(UNIFORM, TRAIN, "moment", 1)
+    jb.sweep(case, SPEEDS, memory="1 GB")
+    assert "blocks of 12, each within " in capsys.readouterr().err
