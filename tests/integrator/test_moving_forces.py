@@ -173,7 +173,7 @@ def test_static_parts_of_tapered_beams_are_exact_between_the_breaks():
     sensors = [jb.Sensor(3.0, "moment"), jb.Sensor(7.0, "shear")]
     case = dataclasses.replace(TWO_SPANS, beam=beam, supports=(), sensors=sensors)
     runner = runner_of(case, {"loads.0.speed": [25.0]})
-    (system,) = _systems(runner.system)
+    system = (_systems(runner.system) or [])[0]
     x = np.linspace(0.0, 12.0, 1000)[1:-1]
     piece = np.searchsorted(system.breaks, x) - 1
     rows = np.asarray(system.static.rows)
