@@ -1,49 +1,65 @@
 """Steps of a batch under the commands of an input policy."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.integrator.growth import OVERFLOW
-from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
+from jaxbeam.integrator.input_policy import StepInfo
 from jaxbeam.integrator.propagators import GAUSS_NODES
-from jaxbeam.integrator.step import advance, forces_and_vehicles, known_maps
+from jaxbeam.integrator.step_maps import step_maps
 from jaxbeam.integrator.vehicles.steps import StepInput, Vehicles
 from jaxbeam.runtime.arrays import any_jax, collapse, xp
 
 
-def step_with_inputs(policy: AbstractInputPolicy, vehicles: Vehicles | None, carry, step):
-    """One step of a batch under the commands of an input policy."""
-    state, memory = carry
-    step, info = step
-    count = step.matrices.state_count
+def advance_with_inputs(policy, vehicles: Vehicles | None, steps: StepInput, infos, state, memory):
+    """Steps under commands: (state, memory) after them, and (states, forces, commands, observed).
 
-    def node_states(commands):
-        commands = collapse(commands, 0, 2)
-        forces, _ = forces_and_vehicles(state, step, commands, vehicles)
-        nodes, beam = step.matrices.nodes, state[:count]
-        node_values = (
-            nodes.transition @ beam
-            + nodes.force_response @ forces
-            + nodes.command_response @ commands
-        )
-        return node_values.reshape(len(GAUSS_NODES), *beam.shape)
-
-    node_commands, memory = policy.inputs(memory, state, info, node_states)
-    commands = collapse(node_commands, 0, 2)
-    next_state, (state, forces) = advance(state, step, commands, vehicles)
-    # A run becomes NaN here, without affecting the others, before it overflows.
-    within = xp.abs(next_state) <= OVERFLOW
-    next_state = xp.where(xp.all(within, axis=0), next_state, xp.nan)
-    return (next_state, memory), (state, forces, commands, policy.observe(memory, info))
-
-
-def advance_known_with_inputs(policy, vehicles, steps: StepInput, infos, state, memory):
-    """Steps of known numbers under commands that do not depend on the states within a step.
-
-    Results as of a `scan` of `step_with_inputs`; see `step.known_maps`. None if the policy
-    computes with JAX in spite of known numbers, as a law of a user may.
+    These are at the starts of the steps; forces and commands at their nodes.
     """
-    of_forces, of_states = known_maps(steps, vehicles)
+    maps = step_maps(steps, vehicles)
+    known = not policy.implicit and not any_jax(maps, state, memory, policy)
+    found = _advance_known(policy, maps.states, infos, state, memory) if known else None
+    if found is None:
+        found = _advance_traced(policy, maps, infos, state, memory)
+    after, sources, observed = found
+    forces, count = maps.forces(sources), state.shape[0]
+    parts = sources[..., :count], forces, sources[..., count:]
+    states, forces, commands = (xp.swapaxes(part, 1, 2) for part in parts)
+    return after, (states, forces, commands, observed)
+
+
+def _advance_traced(policy, maps, infos, state, memory):
+    """Final state and memory; states and commands (step, batch, column); observations."""
+
+    def one_step(carry, step):
+        state, memory = carry
+        (of_states, of_nodes), info = step
+        columns = state.T
+
+        def node_states(commands):
+            values = of_nodes(xp.concatenate([columns, collapse(commands, 0, 2).T], axis=1))
+            return values.T.reshape(len(GAUSS_NODES), -1, values.shape[0])
+
+        node_commands, memory = policy.inputs(memory, state, info, node_states)
+        sources = xp.concatenate([columns, collapse(node_commands, 0, 2).T], axis=1)
+        after = of_states(sources).T
+        # A run becomes NaN here, without affecting the others, before it overflows.
+        within = xp.all(xp.abs(after) <= OVERFLOW, axis=0)
+        after = xp.where(within, after, xp.nan)
+        return (after, memory), (sources, policy.observe(memory, info))
+
+    steps = (maps.states, maps.nodes), infos
+    start = jax.tree.map(jnp.asarray, (state, memory))  # even if all numbers are known
+    after, (sources, observed) = jax.lax.scan(one_step, start, steps)
+    return after, sources, observed
+
+
+def _advance_known(policy, of_states, infos, state, memory):
+    """The same of known numbers, under commands that do not depend on the states within a step.
+
+    None if the policy computes with JAX in spite of known numbers, as a law of a user may.
+    """
     count, batch_size, state_count = of_states.offset.shape
     # State and commands.
     sources = np.ones((count + 1, batch_size, of_states.linear.shape[-1]))
@@ -65,8 +81,5 @@ def advance_known_with_inputs(policy, vehicles, steps: StepInput, infos, state, 
         if not within.all():
             next_state = np.where(within.all(axis=1, keepdims=True), next_state, np.nan)
         sources[i + 1, :, :state_count] = next_state
-    forces, states = (np.swapaxes(part, 1, 2) for part in (of_forces(sources[:-1]), sources))
-    commands = states[:-1, state_count:]
     observed = jax.tree.map(lambda *parts: np.stack(parts), *observations)
-    states = states[:, :state_count]
-    return (states[-1], memory), (states[:-1], forces, commands, observed)
+    return (sources[-1, :, :state_count].T, memory), sources[:-1], observed

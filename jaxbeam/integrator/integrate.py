@@ -26,18 +26,14 @@ from jaxbeam.integrator.growth import (
     largest_by_marks,
 )
 from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
-from jaxbeam.integrator.input_steps import advance_known_with_inputs, step_with_inputs
+from jaxbeam.integrator.input_steps import advance_with_inputs
 from jaxbeam.integrator.kinks.steps import weights_with_impulses, with_impulses
 from jaxbeam.integrator.load_path import LoadPath, load_path
 from jaxbeam.integrator.peaks.end_forces import END_FRACTIONS, end_forces
 from jaxbeam.integrator.peaks.monitored_rows import energies
 from jaxbeam.integrator.peaks.running_peaks import RunningPeaks, initial_peaks, update_peaks
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
-from jaxbeam.integrator.step import (
-    CHECKPOINT_NAME,
-    advance_free,
-    advance_unforced,
-)
+from jaxbeam.integrator.step import advance_free, advance_unforced
 from jaxbeam.integrator.step_matrices import chunk_length, step_matrices
 from jaxbeam.integrator.vehicles.propagators import vehicle_state_norm
 from jaxbeam.integrator.vehicles.steps import (
@@ -134,15 +130,20 @@ def _step_inputs(discrete: DiscreteModel, loads: LoadSet, path: LoadPath) -> Ste
 
 
 def _chunk_function(
-    discrete: DiscreteModel, loads: LoadSet, max_loads: int, policy: AbstractInputPolicy | None
+    discrete: DiscreteModel,
+    loads: LoadSet,
+    max_loads: int,
+    policy: AbstractInputPolicy | None,
+    steps: int | None = None,
 ):
     """Function that advances state, memory and running peaks by a chunk of steps; their number.
 
     It also returns the time (s) at the end of the chunk, and the histories (states before each
-    step, commands at the nodes, observations).
+    step, commands at the nodes, observations). Of a run of so many `steps` whose path and model are
+    known all are one chunk, whose matrices are known then, too.
     """
 
-    chunk_steps = chunk_length(discrete, loads, max_loads)
+    chunk_steps = chunk_length(discrete, loads, max_loads, any_jax(loads, policy) and steps)
     vehicles = vehicles_of(loads, discrete.grid.lengths)
 
     def chunk(state, memory, running_peaks: Any, first_step):
@@ -167,14 +168,8 @@ def _chunk_function(
             state, states, forces = advance_unforced(steps, state, vehicles)
         else:
             infos = StepInfo(path.start, path.length, discrete.grid.event_at(index))
-            is_known = not any_jax(steps, state, memory, policy)
-            result = None
-            if is_known and not policy.implicit:
-                result = advance_known_with_inputs(policy, vehicles, steps, infos, state, memory)
-            (state, memory), (states, forces, commands, observed) = result or scan(
-                lambda carry, step: step_with_inputs(policy, vehicles, carry, step),
-                (state, memory),
-                (steps, infos),
+            (state, memory), (states, forces, commands, observed) = advance_with_inputs(
+                policy, vehicles, steps, infos, state, memory
             )
         if running_peaks is not None:
             count = discrete.model.state_count
@@ -198,7 +193,7 @@ def _chunk_function(
 def _initial_state(discrete: DiscreteModel, loads: LoadSet, policy) -> Float[Array, "state batch"]:
     """States of model and vehicles at rest at t = 0."""
     batch_size = loads.inertia.shape[1]
-    state = zeros((discrete.model.state_count, batch_size), (discrete, loads, policy))
+    state = zeros((discrete.model.state_count, batch_size), discrete)
     states = initial_vehicle_states(loads)
     return state if states is None else xp.concatenate([state, states])
 
@@ -216,10 +211,10 @@ def integrate_history(
     States (boundary, state, batch) are those before each step and at the end. Commands (step,
     command, batch) at the nodes, observations of each step, and the final memory of the `policy`
     are None without one. Running peaks are those at the monitored positions, None without any.
-    `max_loads` is the largest number of loads on the beam at once. The reverse pass saves states
-    and contact forces of every step; under a policy, one state for each chunk.
+    `max_loads` is the largest number of loads on the beam at once. Where the path or the model is
+    traced, the reverse pass saves one state for each chunk.
     """
-    chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy)
+    chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy, steps)
     load_count, batch_size = loads.inertia.shape
 
     def one_chunk(carry, first):
@@ -234,14 +229,15 @@ def integrate_history(
     )
     memory = None if policy is None else policy.start(batch_size)
     initial_state = _initial_state(discrete, loads, policy)
-    first_steps = xp.arange(0, steps, chunk_steps)
-    checkpointed_chunk = checkpoint(
-        one_chunk, policy=jax.checkpoint_policies.save_only_these_names(CHECKPOINT_NAME)
-    )
-    (state, memory, running_peaks), history = scan(
-        checkpointed_chunk, (initial_state, memory, running_peaks), first_steps
-    )
-    history = jax.tree.map(lambda part: collapse(part, 0, 2)[:steps], history)
+    start = initial_state, memory, running_peaks
+    if chunk_steps >= steps:
+        (state, memory, running_peaks), history = one_chunk(start, np.zeros((), int))
+    else:
+        first_steps = xp.arange(0, steps, chunk_steps)
+        one_chunk = checkpoint(one_chunk, policy=jax.checkpoint_policies.nothing_saveable)
+        (state, memory, running_peaks), history = scan(one_chunk, start, first_steps)
+        history = jax.tree.map(lambda part: collapse(part, 0, 2), history)
+    history = jax.tree.map(lambda part: part[:steps], history)
     states, commands, observed = history
     states = xp.concatenate([states, state[None]])
     if policy is not None and has_feedback(policy):

@@ -23,15 +23,15 @@ from jaxbeam.runtime.arrays import (
     Array,
     any_jax,
     cond,
-    index_in_dim,
-    is_jax,
     map_elements,
+    take,
     xp,
 )
 from jaxbeam.runtime.module import Module
 
 CHUNK_STEPS = 16  # steps whose matrices a compiled program computes together
 MANY_STATES = 48  # of which NumPy makes no matrix a step
+PREPARED_ENTRIES = 2**25  # of the largest matrix of all steps of a prepared run: 0.3 GB
 KNOWN_CHUNK_ENTRIES = 2**19  # of matrices that NumPy computes together, so that caches hold them
 
 
@@ -96,12 +96,15 @@ def advances_by_forces(states: int) -> bool:
     return states >= MANY_STATES
 
 
-def chunk_length(discrete: DiscreteModel, loads: LoadSet, max_loads: int) -> int:
+def chunk_length(
+    discrete: DiscreteModel, loads: LoadSet, max_loads: int, prepared: int | None = None
+) -> int:
     """Number of steps whose matrices are computed together.
 
-    In NumPy, where each operation takes microseconds to begin, as many as caches hold.
+    In NumPy, where each operation takes microseconds to begin, as many as caches hold; of
+    `prepared` steps, which a program takes as they are, all if they fit into memory.
     """
-    if any_jax(discrete, loads):
+    if any_jax(discrete.grid if prepared else discrete):
         return CHUNK_STEPS
     rows = max_loads * NODE_COUNT
     states = discrete.model.state_count + loads.vehicle_states
@@ -115,16 +118,23 @@ def chunk_length(discrete: DiscreteModel, loads: LoadSet, max_loads: int) -> int
         if discrete.monitored_transition is not None:
             transition = max(transition, discrete.monitored_transition[0].size)
     entries = loads.inertia.shape[1] * max(compliance, rows * states, transition)
+    if prepared:
+        return prepared if prepared * entries <= PREPARED_ENTRIES else CHUNK_STEPS
+    if any_jax(loads):
+        return CHUNK_STEPS
     return int(max(1, min(discrete.grid.step_count, KNOWN_CHUNK_ENTRIES // entries)))
 
 
 @jax.named_scope("load_path")
 def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
     """Matrices of the steps of a chunk."""
-    if is_jax(path.length_index):
-        matrices = _matrices_by_branch(discrete, path)
-    else:
+    if not any_jax(discrete.propagators, path.length_index, path.rows):
         matrices = _matrices_by_length(discrete, path)
+    elif len(path.length_index) > CHUNK_STEPS:  # a whole run
+        propagators = _propagators_of(discrete, path.length_index)
+        matrices = _matrices_of_steps(discrete, propagators, path.rows, "t")
+    else:
+        matrices = _matrices_by_branch(discrete, path)
     if path.influence is not None:
         matrices = (*matrices[:4], _with_influence(discrete, matrices[4], path), *matrices[5:])
     return StepMatrices(*matrices, loaded=xp.any(path.on_beam, axis=1))
@@ -158,7 +168,7 @@ def _matrices_by_length(discrete: DiscreteModel, path: LoadPath):
     def matrices_of(index):
         rows = jax.tree.map(lambda part: part[index], path.rows)
         kind = path.length_index[index[0]]
-        return _matrices_of_one_length(discrete, _propagators_of(discrete, kind), rows)
+        return _matrices_of_steps(discrete, _propagators_of(discrete, kind), rows)
 
     if len(indices) == 1:
         return matrices_of(steps)
@@ -178,13 +188,13 @@ def _matrices_by_branch(discrete: DiscreteModel, path: LoadPath):
     first_propagators = _propagators_of(discrete, path.length_index[0])
 
     def equal_lengths(_):
-        return _matrices_of_one_length(discrete, first_propagators, path.rows)
+        return _matrices_of_steps(discrete, first_propagators, path.rows)
 
     def mixed_lengths(_):
         def single_step(step):
             kind, rows = step
             rows = jax.tree.map(lambda part: part[None], rows)
-            matrices = _matrices_of_one_length(discrete, _propagators_of(discrete, kind), rows)
+            matrices = _matrices_of_steps(discrete, _propagators_of(discrete, kind), rows)
             return jax.tree.map(lambda matrix: matrix[0], matrices)
 
         return map_elements(single_step, (path.length_index, path.rows))
@@ -196,15 +206,16 @@ def _matrices_by_branch(discrete: DiscreteModel, path: LoadPath):
 
 
 def _propagators_of(discrete: DiscreteModel, length_index):
-    """Propagators of steps of one length, and their rows of monitored deflections."""
-    return jax.tree.map(
-        lambda part: index_in_dim(part, length_index, keepdims=False),
-        (discrete.propagators, discrete.monitored_transition, discrete.monitored_input),
-    )
+    """Propagators of steps of one length, or of each of several, and their monitored rows."""
+    parts = discrete.propagators, discrete.monitored_transition, discrete.monitored_input
+    return jax.tree.map(lambda part: take(part, length_index), parts)
 
 
-def _matrices_of_one_length(discrete: DiscreteModel, propagators, motion: SurfaceRows):
-    """Matrices of steps of one length, from rows (step, load, node, ...)."""
+def _matrices_of_steps(discrete: DiscreteModel, propagators, motion: SurfaceRows, t: str = ""):
+    """Matrices of steps, from rows (step, load, node, ...).
+
+    Propagators are those of one length, or with "t", the label of their first axis, of each step.
+    """
     shape, rows = motion.shape, motion.acceleration
     of_states, deflection_transition, deflection_force_response = propagators
     steps, load_count, nodes, _, modes = shape.shape
@@ -212,16 +223,18 @@ def _matrices_of_one_length(discrete: DiscreteModel, propagators, motion: Surfac
     states = discrete.model.state_count
     contact_response = contact_compliance = None
     if rows is not None:
-        contact_response = xp.einsum("tpcbi,cbij->tpcbj", rows, of_states.transition_nodes)
+        contact_response = xp.einsum(f"tpcbi,{t}cbij->tpcbj", rows, of_states.transition_nodes)
         contact_response = contact_response.reshape(steps, size, states)
         contact_compliance = _contact_compliance(
-            of_states.input_nodes[..., :modes], shape, rows, motion.deflection is None
+            of_states.input_nodes[..., :modes], shape, rows, motion.deflection is None, t
         )
-    force_response = xp.einsum("tqfbm,fbim->tbiqf", shape, of_states.input_end[..., :modes])
+    force_response = xp.einsum(f"tqfbm,{t}fbim->tbiqf", shape, of_states.input_end[..., :modes])
 
     def for_all_steps(matrix, *shape):
-        matrix = matrix.reshape(shape or matrix.shape)
-        return xp.broadcast_to(matrix, (steps, *matrix.shape))
+        """Matrices of each step, in a shape."""
+        first = (steps,) if t else ()
+        matrix = matrix.reshape(*first, *(shape or matrix.shape[len(first) :]))
+        return xp.broadcast_to(matrix, (steps, *matrix.shape[len(first) :]))
 
     matrices = (
         contact_response,
@@ -232,61 +245,61 @@ def _matrices_of_one_length(discrete: DiscreteModel, propagators, motion: Surfac
     if deflection_transition is None:
         matrices = (*matrices, None)
     else:
-        deflection_count = deflection_transition.shape[0]
+        deflection_count = deflection_transition.shape[-3]
         force_to_deflection = xp.einsum(
-            "lfbm,tqfbm->tlqf", deflection_force_response[..., :modes], shape
+            f"{t}lfbm,tqfbm->tlqf", deflection_force_response[..., :modes], shape
         )
         parts = [
             for_all_steps(deflection_transition, deflection_count, states),
             force_to_deflection.reshape(steps, deflection_count, size),
         ]
         if discrete.modal_command_matrix is not None:
-            responses = deflection_force_response[:, :, 0, modes:]
-            width = math.prod(responses.shape[1:])  # not -1: there may be no deflections
+            responses = deflection_force_response[..., 0, modes:]
+            width = math.prod(responses.shape[-2:])  # not -1: there may be no deflections
             parts.append(for_all_steps(responses, deflection_count, width))
         matrices = (*matrices, xp.concatenate(parts, axis=2))
     commands = node_states = None
     if discrete.modal_command_matrix is not None:
         # The model of a run with commands is a single block.
-        command_responses = of_states.input_nodes[:, :, 0, :, modes:]
+        command_responses = of_states.input_nodes[..., 0, :, modes:]
         command_count = nodes * discrete.modal_command_matrix.shape[1]
         commands = CommandMatrices(
             None
             if rows is None
-            else _command_response(discrete, command_responses, shape, rows).reshape(
+            else _command_response(discrete, command_responses, shape, rows, t).reshape(
                 steps, size, command_count
             ),
             for_all_steps(
-                xp.moveaxis(of_states.input_end[:, 0, :, modes:], 1, 0), states, command_count
+                xp.moveaxis(of_states.input_end[..., 0, :, modes:], -2, -3), states, command_count
             ),
         )
     if discrete.with_node_states:
-        force_inputs = of_states.input_nodes[:, :, 0, :, :modes]
-        force_to_node_states = xp.einsum("tqfm,cfim->tciqf", shape[..., 0, :], force_inputs)
+        force_inputs = of_states.input_nodes[..., 0, :, :modes]
+        force_to_node_states = xp.einsum(f"tqfm,{t}cfim->tciqf", shape[..., 0, :], force_inputs)
         node_states = NodeMatrices(
             for_all_steps(of_states.transition_nodes, nodes * states, states),
             force_to_node_states.reshape(steps, nodes * states, size),
-            for_all_steps(xp.moveaxis(command_responses, 1, 2), nodes * states, command_count),
+            for_all_steps(xp.moveaxis(command_responses, -3, -2), nodes * states, command_count),
         )
     springs = None
     if motion.deflection is not None:
         spring_rows = motion.deflection, motion.velocity
-        parts = [_spring_matrices(discrete, of_states, shape, rows) for rows in spring_rows]
+        parts = [_spring_matrices(discrete, of_states, shape, rows, t) for rows in spring_rows]
         springs = jax.tree.map(lambda *both: xp.stack(both, axis=1), *parts)
     return *matrices, commands, node_states, springs
 
 
-def _spring_matrices(discrete: DiscreteModel, of_states, shape, rows) -> SpringMatrices:
+def _spring_matrices(discrete: DiscreteModel, of_states, shape, rows, t) -> SpringMatrices:
     """Matrices to one motion of the surface under the wheels, deflection or velocity."""
     steps, load_count, nodes, _, modes = shape.shape
     size = load_count * nodes
-    response = xp.einsum("tpcbi,cbij->tpcbj", rows, of_states.transition_nodes)
-    by_force = xp.einsum("tpcbi,cfbim->tpcfbm", rows, of_states.input_nodes[..., :modes])
+    response = xp.einsum(f"tpcbi,{t}cbij->tpcbj", rows, of_states.transition_nodes)
+    by_force = xp.einsum(f"tpcbi,{t}cfbim->tpcfbm", rows, of_states.input_nodes[..., :modes])
     compliance = xp.einsum("tpcfbm,tqfbm->tpcqf", by_force, shape)
     commands = None
     if discrete.modal_command_matrix is not None:
-        by_command = of_states.input_nodes[:, :, 0, :, modes:]
-        commands = xp.einsum("tpci,cfiu->tpcfu", rows[..., 0, :], by_command)
+        by_command = of_states.input_nodes[..., 0, :, modes:]
+        commands = xp.einsum(f"tpci,{t}cfiu->tpcfu", rows[..., 0, :], by_command)
         commands = commands.reshape(steps, size, -1)
     states = discrete.model.state_count
     return SpringMatrices(
@@ -294,7 +307,7 @@ def _spring_matrices(discrete: DiscreteModel, of_states, shape, rows) -> SpringM
     )
 
 
-def _contact_compliance(input_nodes, shape, rows, by_factors):
+def _contact_compliance(input_nodes, shape, rows, by_factors, t):
     """Acceleration under the loads at the nodes due to contact forces of one newton.
 
     As a product of two factors where the generalised forces are fewer than the contact forces, if
@@ -302,7 +315,7 @@ def _contact_compliance(input_nodes, shape, rows, by_factors):
     """
     steps, load_count, nodes, blocks, modes = shape.shape
     size = load_count * nodes
-    response = xp.einsum("tpcbi,cfbim->tpcfbm", rows, input_nodes)
+    response = xp.einsum(f"tpcbi,{t}cfbim->tpcfbm", rows, input_nodes)
     if by_factors and load_count > blocks * modes:
         own_node = np.eye(nodes)[:, :, None, None]
         response = response + shape[:, :, :, None] * own_node
@@ -314,8 +327,8 @@ def _contact_compliance(input_nodes, shape, rows, by_factors):
     return compliance.reshape(steps, size, size)
 
 
-def _command_response(discrete: DiscreteModel, command_responses, shape, rows):
+def _command_response(discrete: DiscreteModel, command_responses, shape, rows, t):
     """Acceleration under the loads at the nodes due to commands of one at the nodes."""
-    response = xp.einsum("tpci,cfiu->tpcfu", rows[..., 0, :], command_responses)
+    response = xp.einsum(f"tpci,{t}cfiu->tpcfu", rows[..., 0, :], command_responses)
     feedthrough = xp.einsum("tpcm,mu->tpcu", shape[..., 0, :], discrete.modal_command_matrix)
     return response + feedthrough[:, :, :, None] * np.eye(shape.shape[2])[:, :, None]

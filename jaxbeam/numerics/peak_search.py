@@ -6,9 +6,16 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from jaxbeam.runtime.arrays import Array, fori_loop, optimization_barrier, stop_gradient, take, xp
+from jaxbeam.runtime.arrays import (
+    Array,
+    fori_loop,
+    optimization_barrier,
+    stop_gradient,
+    take,
+    xp,
+)
 
 ESTIMATE_ITERATIONS = 2  # of Newton's method in an estimate
 TIE_ROUNDING_UNITS = 8  # by which equal numbers may differ
@@ -19,9 +26,9 @@ NEWTON_ITERATIONS = 3  # from each start point, and once more from the best
 class Curve(NamedTuple):
     """Polynomial in 2 c - 1 and its first two derivatives: coefficients, lowest power first."""
 
-    value: list
-    slope: list
-    curvature: list
+    value: Array
+    slope: Array
+    curvature: Array
 
 
 @functools.cache
@@ -43,12 +50,21 @@ def _to_unit_interval(points: tuple[float, ...]) -> np.ndarray:
 
 def _interpolate(samples: Float[Array, "point *rest"], points: tuple[float, ...]) -> Curve:
     count = len(points)
-    rows = list(xp.tensordot(interpolation_matrix(points), samples, axes=1))
+    rows = xp.tensordot(interpolation_matrix(points), samples, axes=1)
     return Curve(rows[:count], rows[count : 2 * count - 1], rows[2 * count - 1 :])
 
 
-def horner(coefficients: list, position):
-    """Value of a polynomial by Horner's rule; coefficients with the lowest power first."""
+def polynomial(coefficients, position):
+    """Value of a polynomial; coefficients with the lowest power first.
+
+    Those of a list by Horner's rule, spelt out for programs that evaluate it often; those of an
+    array by its powers, of which programs compile sooner.
+    """
+    if not isinstance(coefficients, list):
+        count, *rest = coefficients.shape
+        more = (1,) * (xp.ndim(position) - len(rest))
+        powers = position ** np.arange(count).reshape(-1, *(1,) * xp.ndim(position))
+        return xp.sum(coefficients.reshape(count, *more, *rest) * powers, axis=0)
     value = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
         value = coefficient + position * value
@@ -59,12 +75,12 @@ def _newton_stationary_point(curve: Curve, start, step_limit: float, iterations:
     """Stationary point near the start, by Newton's method with limited steps."""
 
     def newton_step(_, position):
-        second_derivative = horner(curve.curvature, position)
+        second_derivative = polynomial(curve.curvature, position)
         singular = second_derivative == 0
         step = xp.where(
             singular,
             0.0,
-            horner(curve.slope, position) / xp.where(singular, 1.0, second_derivative),
+            polynomial(curve.slope, position) / xp.where(singular, 1.0, second_derivative),
         )
         return xp.clip(position - xp.clip(step, -step_limit, step_limit), -1.0, 1.0)
 
@@ -85,20 +101,44 @@ def max_with_ties(
 
 
 def estimate_peak(
-    samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = xp.abs
+    samples: Float[Array, "point *rest"],
+    points: tuple[float, ...],
+    magnitude: Callable = xp.abs,
+    spelt_out: bool = True,
 ) -> Float[Array, " *rest"]:
     """Estimate of the peak, searched from the largest sample only.
 
-    It tells which of many steps has the peak, which `refine_peak` then finds.
+    It tells which of many steps has the peak, which `refine_peak` then finds. Polynomials are
+    `spelt_out` in programs that search often.
     """
     magnitudes = magnitude(samples)
     largest = xp.max(magnitudes, axis=0)
     start = take(_to_unit_interval(points), xp.argmax(magnitudes, axis=0)).astype(samples.dtype)
     curve = _interpolate(samples, points)
+    curve = Curve(*map(list, curve)) if spelt_out else curve
     position = _newton_stationary_point(
         curve, start, newton_step_limit(points), iterations=ESTIMATE_ITERATIONS
     )
-    return xp.maximum(magnitude(horner(curve.value, position)), largest)
+    return xp.maximum(magnitude(polynomial(curve.value, position)), largest)
+
+
+def peak_step(
+    samples: Float[Array, "step point *rest"], points: tuple[float, ...], magnitude: Callable
+) -> tuple[Int[Array, " *rest"], Float[Array, " *rest"]]:
+    """Step that has the peak of the polynomials through the samples of each, and its estimate.
+
+    That with the largest of values at equal distances, or one of those beside it.
+    """
+    grid = np.linspace(-1.0, 1.0, START_POINTS)[:, None] ** np.arange(len(points))
+    weights = grid @ interpolation_matrix(points)[: len(points)]
+    steps = samples.shape[0]
+    largest = xp.max(magnitude(xp.einsum("gp,tp...->tg...", weights, samples)), axis=1)
+    beside = np.arange(-1, 2).reshape(-1, *(1,) * (samples.ndim - 2))
+    steps = xp.clip(xp.argmax(largest, axis=0) + beside, 0, steps - 1)
+    candidates = xp.take_along_axis(samples, steps[:, None], axis=0)
+    estimates = estimate_peak(xp.moveaxis(candidates, 1, 0), points, magnitude, spelt_out=False)
+    best = xp.argmax(estimates, axis=0)[None]
+    return xp.take_along_axis(steps, best, axis=0)[0], xp.max(estimates, axis=0)
 
 
 @jax.named_scope("peaks")
@@ -113,7 +153,7 @@ def locate_peak(
     positions = xp.concatenate(
         [starts, _newton_stationary_point(curve, starts, 2 / START_POINTS, NEWTON_ITERATIONS)]
     )
-    _, ties = max_with_ties(magnitude(horner(curve.value, positions)))
+    _, ties = max_with_ties(magnitude(polynomial(curve.value, positions)))
     position = xp.max(xp.where(ties, positions, -1.0), axis=0)
     # The magnitude is accurate to nearly rounding by now, the position to the square root of that:
     # further iterations improve it, unless the peak is at an end without stationary point nearby.
@@ -121,7 +161,7 @@ def locate_peak(
         curve, position, 2 / START_POINTS, NEWTON_ITERATIONS
     )
     _, ties_of_two = max_with_ties(
-        magnitude(horner(curve.value, xp.stack([stationary_point, position])))
+        magnitude(polynomial(curve.value, xp.stack([stationary_point, position])))
     )
     return xp.where(ties_of_two[0], stationary_point, position)
 
@@ -136,4 +176,4 @@ def refine_peak(
     """
     position = locate_peak(stop_gradient(samples), points, magnitude)
     position = optimization_barrier(stop_gradient(position))
-    return magnitude(horner(_interpolate(samples, points).value, position)), (position + 1) / 2
+    return magnitude(polynomial(_interpolate(samples, points).value, position)), (position + 1) / 2

@@ -166,6 +166,18 @@ def add_at(array, index, value) -> Any:
     return array
 
 
+def with_blocks(shape: tuple[int, ...], blocks) -> Any:
+    """Zeros of a shape with some blocks set, each at its index."""
+    blocks = list(blocks)
+    array: Any = zeros(shape, [values for _, values in blocks])
+    for index, values in blocks:
+        if is_jax(array):
+            array = array.at[index].set(values)
+        else:
+            array[index] = values
+    return array
+
+
 def put(array, index, values) -> Any:
     """Copy of an array with the rows at some indices replaced; indices beyond the end are left out.
 
@@ -328,6 +340,15 @@ def solve(matrix, right) -> Any:
         regular = np.where(singular[..., None, None], np.eye(matrix.shape[-1]), matrix)
         solution = np.linalg.solve(regular, right)
         return np.where(singular[..., None, None] if right.ndim > 1 else singular, np.nan, solution)
+
+
+def solve_conditioned(matrix, right) -> Any:
+    """`solve` of many well-conditioned systems; where any number is traced, by their inverses."""
+    if is_jax(matrix):
+        return lapack.inverses(matrix) @ right
+    if is_jax(right):
+        return solve(matrix, np.eye(matrix.shape[-1])) @ right
+    return solve(matrix, right)
 
 
 def solve_triangular(matrix, right, lower: bool, transposed: bool = False) -> Any:

@@ -8,6 +8,8 @@ from typing import Any, Generic, ParamSpec, TypeVar, overload
 
 import equinox as eqx
 import jax
+import jax.extend
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
@@ -26,6 +28,9 @@ XLA_OPTIONS = {
 PARALLEL_COMPILATION = {"xla_cpu_parallel_codegen_split_count": 1}
 # For programs whose run time is less than the compile time that optimisation costs.
 LOW_OPTIMISATION = {"xla_backend_optimization_level": 0}
+
+KEPT_PROGRAMS = 64  # of functions of traced numbers
+MAX_SLOPES = 2**24  # entries of all derivatives that are computed with the values
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -166,6 +171,7 @@ def _program_entry(function: Compiled, identity: tuple) -> _ProgramEntry:
 def clear_caches() -> None:
     """Free all programs compiled in this process; those of many cases take gigabytes."""
     jax.clear_caches()
+    _program_of.cache_clear()
     _program_entry.cache_clear()
 
 
@@ -190,24 +196,160 @@ def compiled(function: Any = None, **settings: bool | int) -> Any:
 
 
 def compiled_if_traced(function: Callable[P, R]) -> Callable[P, R]:
-    """Compute a function of known numbers at once; compile it where it is traced, as `compiled`.
+    """Compute a function of known numbers at once; compile what traced ones touch of it.
 
     The function and all that it calls use `jaxbeam.runtime.arrays`. Known arrays of JAX are handed
-    on as arrays of NumPy.
+    on as arrays of NumPy. Where some numbers are traced, whatever depends on none of them is
+    computed in NumPy, so that the program holds the rest only; results that depend on none of them
+    are arrays of NumPy.
     """
-    program = Compiled(function, {})
 
     @functools.wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         arrays, *rest = _partition((args, kwargs))
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in arrays):
-            return program(*args, **kwargs)
-        known = [None if leaf is None else np.asarray(leaf) for leaf in arrays]
-        args, kwargs = _combine(known, *rest)
-        with np.errstate(all="ignore"):  # as compiled code, which yields inf and nan
-            return function(*args, **kwargs)
+        traced = [i for i, leaf in enumerate(arrays) if isinstance(leaf, jax.core.Tracer)]
+        known = [
+            None if leaf is None or i in traced else np.asarray(leaf)
+            for i, leaf in enumerate(arrays)
+        ]
+
+        def compute(*numbers):
+            leaves = list(known)
+            for i, number in zip(traced, numbers, strict=True):
+                leaves[i] = number
+            args, kwargs = _combine(leaves, *rest)
+            with np.errstate(all="ignore"):  # as compiled code, which yields inf and nan
+                return function(*args, **kwargs)  # type: ignore[call-arg]
+
+        if not traced:
+            return compute()
+        return _compile_traced(compute, [arrays[i] for i in traced], function.__name__)
 
     return call
+
+
+def _compile_traced(compute: Callable, numbers: list, name: str) -> Any:
+    """Value of a function of traced numbers by a program; what they do not touch stays as it is."""
+    outputs: Any = None
+
+    def touched(*numbers):
+        nonlocal outputs
+        leaves, structure = jax.tree.flatten(compute(*numbers))
+        outputs = [None if isinstance(leaf, jax.Array) else leaf for leaf in leaves], structure
+        return [leaf for leaf in leaves if isinstance(leaf, jax.Array)]
+
+    closed = jax.make_jaxpr(touched)(*numbers)
+    equations = _Equations(closed.jaxpr)
+    entries = sum(out.aval.size for out in closed.jaxpr.outvars)
+    if _differentiated(numbers) and entries * sum(map(np.size, numbers)) <= MAX_SLOPES:
+        found = iter(_by_slopes(equations, closed.consts, name, 0, numbers))
+    else:
+        found = iter(_program_of(equations, name, 0, False)(closed.consts, numbers))
+    leaves, structure = outputs
+    return structure.unflatten([next(found) if leaf is None else leaf for leaf in leaves])
+
+
+def _differentiated(numbers: list) -> bool:
+    """Whether real numbers are differentiated outside of programs, so that they are known."""
+    try:
+        for number in numbers:
+            jax.extend.core.concrete_or_error(None, number)
+    except jax.errors.ConcretizationTypeError:
+        return False
+    return all(map(_is_real, numbers))
+
+
+def _by_slopes(equations: "_Equations", constants, name: str, order: int, numbers: list) -> list:
+    """Values of a program, whose derivatives are computed with them, in forward mode.
+
+    One program each for values and slopes, with options for compilation that none has inside
+    `jax.grad`, and none for the reverse pass. With an `order` above zero, derivatives of values.
+    """
+
+    @jax.custom_jvp
+    def values(numbers):
+        return run(order, numbers)
+
+    @values.defjvp
+    def _(primals, tangents):
+        *found, slopes = _by_slopes(equations, constants, name, order + 1, *primals)
+        leaves, structure = jax.tree.flatten(found)
+        along = iter(_along(slopes, *tangents))
+        none = (np.zeros(leaf.shape, jax.dtypes.float0) for leaf in leaves)
+        rates = [
+            next(along) if _is_real(leaf) else zero for leaf, zero in zip(leaves, none, strict=True)
+        ]
+        return found, structure.unflatten(rates)
+
+    def run(order, numbers):
+        inside = _is_tracing(numbers)
+        return _program_of(equations, name, order, not inside)(constants, numbers)
+
+    return values(numbers)
+
+
+@jax.jit
+def _along(slopes, tangents):
+    """Derivatives of values along tangents of numbers, from slopes by one number after another."""
+    vector = jnp.concatenate([jnp.ravel(part) for part in tangents])
+    return [jnp.tensordot(vector, slope, 1) for slope in slopes]
+
+
+def _is_real(array) -> bool:
+    return jnp.issubdtype(array.dtype, jnp.floating)
+
+
+@functools.lru_cache(maxsize=KEPT_PROGRAMS)
+def _program_of(equations: "_Equations", name: str, order: int, with_options: bool) -> Callable:
+    """Compiled function of constants and numbers, from its equations.
+
+    With an `order` above zero its last output are the slopes of the other real ones, the first
+    axis that of the numbers.
+    """
+
+    def program(constants, numbers):
+        def values(numbers):
+            return jax.core.eval_jaxpr(equations.jaxpr, constants, *numbers)
+
+        for _ in range(order):
+            values = _with_slopes(values)
+        return values(numbers)
+
+    options = {"compiler_options": xla_options()} if with_options else {}
+    return jax.jit(_renamed(program, name), **options)
+
+
+def _with_slopes(values: Callable) -> Callable:
+    """A function of numbers that also returns the slopes of its real values."""
+
+    def both(numbers):
+        vector, unravel = jax.flatten_util.ravel_pytree(numbers)
+
+        def real(vector):
+            leaves, structure = jax.tree.flatten(values(unravel(vector)))
+            return list(filter(_is_real, leaves)), structure.unflatten(leaves)
+
+        def push(direction):
+            _, slopes, found = jax.jvp(real, (vector,), (direction,), has_aux=True)
+            return slopes, found
+
+        slopes, found = jax.vmap(push, out_axes=(0, None))(jnp.eye(vector.size))
+        return [*found, slopes]
+
+    return both
+
+
+class _Equations:
+    """Equations of a program, which are equal to others that read the same."""
+
+    def __init__(self, jaxpr):
+        self.jaxpr, self.text = jaxpr, str(jaxpr)
+
+    def __hash__(self):
+        return hash(self.text)
+
+    def __eq__(self, other):
+        return self.text == other.text
 
 
 def _renamed(program, name: str):

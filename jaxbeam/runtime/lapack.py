@@ -126,6 +126,23 @@ def inv(matrix) -> Any:
     return solve(matrix, jnp.eye(matrix.shape[-1]))
 
 
+@jax.custom_jvp
+def inverses(matrix) -> Any:
+    """Inverses of well-conditioned matrices (..., row, row), whose derivatives are products."""
+    size = matrix.shape[-1]
+    if size > MAX_ELIMINATED_ROWS:
+        return solve(matrix, jnp.eye(size))
+    identity = jnp.broadcast_to(jnp.eye(size), matrix.shape)
+    augmented = jnp.moveaxis(jnp.concatenate([matrix, identity], axis=-1), (-2, -1), (0, 1))
+    return jnp.moveaxis(_eliminate(augmented), (0, 1), (-2, -1))
+
+
+@inverses.defjvp
+def _(primals, tangents):
+    inverse = inverses(*primals)
+    return inverse, -inverse @ tangents[0] @ inverse
+
+
 def solve_triangular(matrix, right, lower: bool, transposed: bool = False) -> Any:
     """Solution of a triangular system (row, column) or (row,), or of that of the transpose.
 

@@ -43,9 +43,10 @@ def sensor_extremes(sensors: Sequence[Sensor], peaks: Peaks) -> tuple[Extremes, 
     """
     up, down = xp.split(peaks.peak_deflection, 2)
     up_time, down_time = xp.split(peaks.peak_time, 2)
-    index = own_outputs(sensors)
+    index, every = own_outputs(sensors), slice(0, len(sensors))
+    if np.array_equal(index, np.arange(len(sensors))):
+        index = every  # a slice, for which programs are smaller
     extremes = Extremes(-down[index], down_time[index], up[index], up_time[index])
-    every = np.arange(len(sensors))
     is_up = up[every] >= down[every]
     deflection = xp.where(is_up, up[every], down[every])
     time = xp.where(is_up, up_time[every], down_time[every])

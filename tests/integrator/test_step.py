@@ -1,4 +1,4 @@
-"""Steps without commands: their custom derivative rule against that of each operation."""
+"""Steps without commands: as maps, and one operation after the other."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from jaxbeam.integrator.vehicles.steps import StepInput
 from jaxbeam.simulation.simulate import simulate_readings
 from tests.runs import plan_of
 
-STEPS, BATCH_SIZE = 5, 3
+STEPS, BATCH_SIZE = 5, 1
 
 
 def random_steps(blocks: int, side: int, rows: int):
@@ -58,7 +58,7 @@ def advance_plain_wheels(matrices, inertia, weight, state):
 
 
 def advance_by_operations(matrices, inertia, weight, state):
-    """The same steps, differentiated operation by operation."""
+    """The same steps, one after the other."""
     steps = StepInput(matrices, inertia, weight, None)
     after, (states, forces) = jax.lax.scan(advance, state, steps)
     return after, states, forces

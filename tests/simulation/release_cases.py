@@ -9,10 +9,8 @@ import json
 import numpy as np
 
 import jaxbeam as jb
-from tests.c_code.cases import CASES as LOOPS
-from tests.c_code.cases import rig
-from tests.test_known_and_traced import CASES as OPEN
-from tests.test_known_and_traced import CONTROLLED, LAWS, MASSES
+from tests.c_code.cases import CASES as LOOPS, rig
+from tests.test_known_and_traced import CASES as OPEN, CONTROLLED, LAWS, MASSES
 
 SAMPLES = 3  # of each history that is kept
 LOOP_NAMES = (
@@ -72,7 +70,15 @@ CASES = {
     ),
     "a half car": _road(
         jb.HalfCar(
-            3e3, 4e3, [1.5, -1.5], [200.0] * 2, [1e5] * 2, [4e3] * 2, [1e6] * 2, [0.0] * 2, speed=30.0
+            3e3,
+            4e3,
+            [1.5, -1.5],
+            [200.0] * 2,
+            [1e5] * 2,
+            [4e3] * 2,
+            [1e6] * 2,
+            [0.0] * 2,
+            speed=30.0,
         )
     ),
     "a varying force": _road(

@@ -5,14 +5,16 @@ compared at fractions of the step, the ends among them, and at the vertices of t
 three of these. `runtime/native/contact.c` does the same in C.
 """
 
+import functools
+
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES
 from jaxbeam.numerics.gauss import lagrange_coefficients
-from jaxbeam.numerics.peak_search import horner
-from jaxbeam.runtime.arrays import Array, cond, fori_loop, take, xp
+from jaxbeam.numerics.peak_search import polynomial
+from jaxbeam.runtime.arrays import Array, cond, fori_loop, is_jax, stop_gradient, take, xp
 
 ZERO_ITERATIONS = 4  # of Newton's method for the time of a loss
 # Peak nodes, and the middles between them.
@@ -58,10 +60,15 @@ def contact_minimum(
     bound = 0.5 * (most + least) + spread_factor() * (most - least)
     bound = xp.where(is_load[..., None], bound[:, :, None], -xp.inf)
 
+    whole_run = is_jax(bound) and not is_jax(lowest)
+
     def pulls_of_loads():
-        pulls = _at_fractions(by_row)
+        pulls = _at_fractions(by_row, whole_run)
         pull = xp.maximum(xp.max(pulls, axis=0), xp.max(_vertices(pulls)[0], axis=0))
         return xp.where(is_load[..., None], pull[:, :, None], -xp.inf)
+
+    if whole_run:  # no branches, each of which has its own
+        pulls_of_loads = functools.cache(pulls_of_loads)
 
     def with_smaller(lowest):
         return xp.minimum(lowest, xp.min(-pulls_of_loads(), axis=(0, 1), initial=xp.inf))
@@ -74,21 +81,28 @@ def contact_minimum(
         found = xp.minimum(first, rows.size - 1)
         of_rows = by_row.reshape(rows.size, NODE_COUNT, batch_size)
         nodes = xp.take_along_axis(of_rows, found[:, None], axis=0)[:, None]  # load, 1, node, batch
-        pulls = _at_fractions(nodes)
+        pulls = _at_fractions(nodes, whole_run)
         powers = xp.einsum("slnb,nk->kslb", nodes, lagrange_coefficients(NODE_COUNT))
-        fraction = _zero_nearby(powers, _first_loss(pulls, *_vertices(pulls)))[:, 0]
+        near = stop_gradient((powers, pulls))
+        fraction = _zero_nearby(near[0], _first_loss(near[1], *_vertices(near[1])))
+        fraction = _moving_zero(powers, fraction)[:, 0]
         step = found // is_load.shape[1]
         time = take(start, step) + take(length, step) * fraction
         return xp.minimum(lost_time, xp.where(first < rows.size, time, NEVER))
 
     # Most chunks stay above the smallest force so far; NaN is passed on.
-    lowest = cond(xp.any(~(bound <= -lowest)), with_smaller, lambda same: same, lowest)
-    loses = xp.any((lowest < 0) & (lost_time >= NEVER))
+    lowest = cond(whole_run or xp.any(~(bound <= -lowest)), with_smaller, lambda same: same, lowest)
+    loses = whole_run or xp.any((lowest < 0) & (lost_time >= NEVER))
     return lowest, cond(loses, with_first_loss, lambda same: same, lost_time)
 
 
-def _at_fractions(by_row: Float[Array, "step row node batch"]):
-    """Pulls at the FORCE_FRACTIONS, as a sum that XLA computes along with what follows it."""
+def _at_fractions(by_row: Float[Array, "step row node batch"], by_product: bool):
+    """Pulls at the FORCE_FRACTIONS, as a sum that XLA computes along with what follows it.
+
+    Or as one product, of which a program is smaller.
+    """
+    if by_product:
+        return xp.einsum("fn,slnb->fslb", force_weights_at_fractions(), by_row)
     weights = force_weights_at_fractions()[..., None, None, None]
     return sum(weights[:, node] * by_row[:, :, node] for node in range(NODE_COUNT))
 
@@ -123,6 +137,25 @@ def _first_loss(pulls, vertex, rising) -> Float[Array, "step row batch"]:
     return xp.where(pulls[0] > 0, 0.0, first)
 
 
+def _moving_zero(
+    powers: Float[Array, "power step row batch"], zero: Float[Array, "step row batch"]
+) -> Float[Array, "step row batch"]:
+    """The same zero, with the derivative of the instant at which the polynomial is zero."""
+    if not is_jax(powers):
+        return zero
+    inside = (zero > 0) & (zero < NEVER)
+    at = xp.where(inside, zero, 0.5)
+    slope = polynomial(_slopes(stop_gradient(powers)), at)
+    value = polynomial(powers, at)
+    change = (value - stop_gradient(value)) / xp.where(slope == 0, 1.0, slope)
+    return xp.where(inside, zero - change, zero)
+
+
+def _slopes(powers: Float[Array, "power *rest"]) -> Float[Array, "power_less_one *rest"]:
+    """Coefficients of the derivative of a polynomial, lowest power first."""
+    return powers[1:] * np.arange(1.0, powers.shape[0]).reshape(-1, *(1,) * (powers.ndim - 1))
+
+
 def _zero_nearby(
     powers: Float[Array, "power step row batch"], start: Float[Array, "step row batch"]
 ) -> Float[Array, "step row batch"]:
@@ -134,13 +167,13 @@ def _zero_nearby(
     inside = (start > 0) & (start < NEVER)
     first = xp.where(inside, start, 0.5)
     low, high = xp.maximum(first - FORCE_GAP, 0.0), xp.minimum(first + FORCE_GAP, 1.0)
-    slopes = [k * power for k, power in enumerate(powers)][1:]
+    slopes = _slopes(powers)
 
     def newton(_, x):
-        slope = horner(slopes, x)
-        step = horner(list(powers), x) / xp.where(slope == 0, 1.0, slope)
+        slope = polynomial(slopes, x)
+        step = polynomial(powers, x) / xp.where(slope == 0, 1.0, slope)
         return xp.clip(x - step, low, high)
 
     found = fori_loop(0, ZERO_ITERATIONS, newton, first)
-    nearer = xp.abs(horner(list(powers), found)) <= xp.abs(horner(list(powers), first))
+    nearer = xp.abs(polynomial(powers, found)) <= xp.abs(polynomial(powers, first))
     return xp.where(inside & nearer, found, start)

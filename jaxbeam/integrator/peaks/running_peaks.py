@@ -16,8 +16,16 @@ from jaxbeam.integrator.load_path import LoadPath
 from jaxbeam.integrator.peaks.contact_minimum import contact_minimum
 from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.step_matrices import StepMatrices
-from jaxbeam.numerics.peak_search import estimate_peak, max_with_ties, refine_peak
-from jaxbeam.runtime.arrays import Array, cond, optimization_barrier, take, xp
+from jaxbeam.numerics.peak_search import estimate_peak, max_with_ties, peak_step, refine_peak
+from jaxbeam.runtime.arrays import (
+    Array,
+    cond,
+    is_jax,
+    optimization_barrier,
+    stop_gradient,
+    take,
+    xp,
+)
 from jaxbeam.runtime.module import Module
 
 PEAK_MARGIN = 1.1  # upper bound of a peak over the highest of the samples around it
@@ -100,19 +108,27 @@ def update_peaks(
         outputs = xp.where(length[:, None, None] > 0, outputs, 0.0)
     samples = optimization_barrier(outputs.reshape(steps, len(PEAK_NODES), -1, batch_size))
 
+    largest = xp.max(xp.abs(samples), axis=(0, 1))
+    # Of a traced run whose steps are all in one chunk.
+    whole_run = is_jax(largest) and not is_jax(running_peaks.estimate)
+
     def updated(best):
-        estimate = optimization_barrier(
-            estimate_peak(xp.moveaxis(samples, 1, 0), PEAK_NODES, best.magnitude)
-        )
-        best_estimate, peak_step = max_with_ties(estimate)
-        peak_step = xp.max(xp.where(peak_step, np.arange(steps)[:, None, None], 0), axis=0)
+        if whole_run:
+            found = peak_step(stop_gradient(samples), PEAK_NODES, best.magnitude)
+            best_step, best_estimate = found
+        else:
+            estimate = optimization_barrier(
+                estimate_peak(xp.moveaxis(samples, 1, 0), PEAK_NODES, best.magnitude)
+            )
+            best_estimate, is_best = max_with_ties(estimate)
+            best_step = xp.max(xp.where(is_best, np.arange(steps)[:, None, None], 0), axis=0)
         better = best_estimate > best.estimate
-        chosen = xp.take_along_axis(samples, peak_step[None, None], axis=0)[0]
+        chosen = xp.take_along_axis(samples, best_step[None, None], axis=0)[0]
         return RunningPeaks(
             xp.where(better, best_estimate, best.estimate),
             xp.where(better, chosen, best.samples),
-            xp.where(better, take(start, peak_step), best.step_start),
-            xp.where(better, take(length, peak_step), best.step_length),
+            xp.where(better, take(start, best_step), best.step_start),
+            xp.where(better, take(length, best_step), best.step_length),
             best.lowest_contact_force,
             best.contact_lost_time,
             best.finite,
@@ -120,9 +136,8 @@ def update_peaks(
         )
 
     # Most chunks stay far below the peak so far and lose no contact: they skip the refinement.
-    largest = xp.max(xp.abs(samples), axis=(0, 1))
     running_peaks = cond(
-        xp.any(largest * PEAK_MARGIN > running_peaks.estimate),
+        whole_run or xp.any(largest * PEAK_MARGIN > running_peaks.estimate),
         updated,
         lambda best: best,
         running_peaks,

@@ -20,8 +20,7 @@ from jaxbeam.integrator.propagators import (
     phi_functions_of,
 )
 from jaxbeam.model.load_set import LoadSet, VehicleGroup
-from jaxbeam.numerics.batched_linalg import matmul_last
-from jaxbeam.runtime.arrays import Array, any_jax, cond, map_elements, stop_gradient, xp
+from jaxbeam.runtime.arrays import Array, cond, is_jax, map_elements, stop_gradient, xp
 from jaxbeam.runtime.module import Module
 
 
@@ -60,7 +59,7 @@ def vehicle_propagators(
     group: VehicleGroup, lengths: Float[Array, " length"]
 ) -> VehiclePropagators:
     """Propagators of the vehicles of a load over steps of the given lengths (s)."""
-    if not any_jax(group, lengths):
+    if not is_jax(lengths):
         return _propagators(group, lengths)
 
     def of_length(length):
@@ -107,49 +106,3 @@ def _propagators(group: VehicleGroup, lengths: Float[Array, " length"]) -> Vehic
         spring_states=spring_states.reshape(count, rows, states, batch_size),
         spring_surface=np.eye(rows)[..., None] - response.reshape(count, rows, rows, batch_size),
     )
-
-
-def _by_vehicle(group: VehicleGroup, surface: Float[Array, "wheel node batch"]):
-    """Values at the wheels of a load as (row, vehicle, batch)."""
-    values = surface[group.wheels].reshape(group.count, -1, surface.shape[-1])
-    return xp.swapaxes(values, 0, 1)
-
-
-def spring_forces(
-    propagators: VehiclePropagators, group: VehicleGroup, states, surface
-) -> Float[Array, "wheel node batch"]:
-    """Forces s of the springs of a load at the nodes of a step.
-
-    From the states (vehicle, state, batch) and q of the surface (wheel, node, batch).
-    """
-    forces = matmul_last(propagators.spring_surface, _by_vehicle(group, surface))
-    forces = forces - matmul_last(propagators.spring_states, xp.swapaxes(states, 0, 1))
-    return xp.swapaxes(forces, 0, 1).reshape(-1, NODE_COUNT, forces.shape[-1])
-
-
-def next_vehicle_states(
-    propagators: VehiclePropagators, group: VehicleGroup, states, surface
-) -> Float[Array, "all batch"]:
-    """States of all vehicles of a load at the end of a step; arguments as for `spring_forces`."""
-    after = matmul_last(propagators.transition, xp.swapaxes(states, 0, 1))
-    after = after + matmul_last(propagators.input, _by_vehicle(group, surface))
-    return xp.swapaxes(after, 0, 1).reshape(group.state_count, -1)
-
-
-def spring_coupling(loads: LoadSet, propagators, wheels) -> Float[Array, "row row batch"]:
-    """Matrix S between the rows (wheel and node) of some wheels; zero between vehicles."""
-    count, coupling = wheels.shape[0], None
-    if count == loads.wheel_count == 1:
-        return propagators[0].spring_surface
-    for group, part in zip(loads.wheels.vehicles, propagators, strict=True):
-        within = (wheels >= group.wheels.start) & (wheels < group.wheels.stop)
-        index = xp.where(within, wheels - group.first_wheel, 0)
-        vehicle, wheel = index // group.wheels_per_vehicle, index % group.wheels_per_vehicle
-        same = within[:, None] & within & (vehicle[:, None] == vehicle)
-        all_wheels = (group.wheels_per_vehicle, NODE_COUNT) * 2
-        rows = part.spring_surface.reshape(*all_wheels, -1)
-        rows = xp.take(xp.take(rows, wheel, axis=0), wheel, axis=2)
-        rows = xp.where(same[:, None, :, None, None], rows, 0.0)
-        coupling = rows if coupling is None else coupling + rows
-    assert coupling is not None
-    return coupling.reshape(count * NODE_COUNT, count * NODE_COUNT, -1)

@@ -8,14 +8,9 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
-from jaxbeam.integrator.vehicles.propagators import (
-    next_vehicle_states,
-    spring_coupling,
-    spring_forces,
-    vehicle_propagators,
-    vehicle_state_norm,
-)
-from jaxbeam.integrator.vehicles.steps import solve_rows
+from jaxbeam.integrator.vehicles.maps import springs_of_wheels
+from jaxbeam.integrator.vehicles.propagators import vehicle_propagators, vehicle_state_norm
+from jaxbeam.integrator.vehicles.steps import VehicleStep, vehicles_of
 from jaxbeam.model.load_set import load_set
 from tests.case.loads import reference
 
@@ -46,9 +41,10 @@ def test_a_step_is_that_of_scipy(name):
     for i, length in enumerate(LENGTHS):
         part = jax.tree.map(lambda matrix, i=i: matrix[i], propagators)
         at_nodes = np.array([surface(share) for share in GAUSS_NODES]).T[..., None]
-        forces = spring_forces(part, group, states, at_nodes)
-        after = next_vehicle_states(part, group, states, at_nodes)
-        after = after.reshape(group.count, -1)
+        own, columns = at_nodes.reshape(group.count, -1, 1), states
+        forces = part.spring_surface[..., 0] @ own - part.spring_states[..., 0] @ columns
+        forces = forces.reshape(-1, NODE_COUNT, 1)
+        after = (part.transition[..., 0] @ columns + part.input[..., 0] @ own)[..., 0]
         for vehicle in range(group.count):
             own = slice(
                 vehicle * group.wheels_per_vehicle, (vehicle + 1) * group.wheels_per_vehicle
@@ -71,13 +67,12 @@ def test_a_step_is_that_of_scipy(name):
 
 def test_springs_couple_the_wheels_of_one_vehicle_only():
     loads = load_set(jb.Case(BEAM, loads=[*VEHICLES.values(), jb.MovingMass(1.0, speed=1.0)]))
-    parts = [
-        jax.tree.map(lambda matrix: matrix[0], vehicle_propagators(group, LENGTHS))
-        for group in loads.wheels.vehicles
-    ]
+    vehicles = vehicles_of(loads, LENGTHS)
+    parts = [jax.tree.map(lambda matrix: matrix[0], part) for part in vehicles.propagators]
     # Of the half-car, quarter car, second wagon, half-car, first wagon; the mass.
-    wheels = np.array([1, 0, 8, 2, 6, 11])
-    coupling = spring_coupling(loads, parts, wheels)[..., 0]
+    wheels = np.array([[1, 0, 8, 2, 6, 11]])
+    step = VehicleStep(np.zeros(1, int), wheels, np.ones((1, 6), bool), None)
+    coupling = springs_of_wheels(vehicles, step, 1)[0][0, 0]
     blocks = coupling.reshape(6, NODE_COUNT, 6, NODE_COUNT)
     coupled = np.any(blocks != 0, axis=(1, 3))
     # The mass, which is the last, has no springs.
@@ -98,14 +93,3 @@ def test_norms_limit_the_step():
     assert 0 < soft < hard
     assert hard >= np.sqrt(1e9 / 1e3)
     assert vehicle_state_norm(load_set(jb.Case(BEAM))) == 0
-
-
-@pytest.mark.parametrize("rows", [6, 48])
-def test_contact_equations_are_solved(rows):
-    """Of few rows by an elimination that is spelt out, of many by a loop; traced and known."""
-    generator = np.random.default_rng(rows)
-    matrix = np.eye(rows)[..., None] + 0.3 / rows * generator.standard_normal((rows, rows, 3))
-    right = generator.standard_normal((rows, 3))
-    expected = np.linalg.solve(np.moveaxis(matrix, -1, 0), right.T[..., None])[..., 0].T
-    assert_allclose(solve_rows(matrix, right), expected, rtol=1e-10)
-    assert_allclose(jax.jit(solve_rows)(matrix, right), expected, rtol=1e-10)
