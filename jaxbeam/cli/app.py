@@ -20,6 +20,7 @@ from cyclopts import (
     UnusedCliTokensError,
 )
 
+from jaxbeam.cli.arguments import UsageError
 from jaxbeam.cli.commands.compare import compare
 from jaxbeam.cli.commands.describe import describe
 from jaxbeam.cli.commands.engineering.assess import assess
@@ -79,6 +80,8 @@ RENAMED_OPTIONS = {  # by command, in its new word
     "weigh": {"--most": "--max-loads"},
 }
 
+WRONG_USAGE = 2
+
 app = App(
     name="jaxbeam",
     help="Beams under moving loads: simulation, control and identification from logs.",
@@ -94,7 +97,9 @@ for _title, _commands in COMMANDS.items():
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run a command line (that of the process by default) and exit: status 0, or 1 for an error.
+    """Run a command line (that of the process by default) and exit.
+
+    The status is 0, or 1 for an error in what the words name, or 2 for one in the words themselves.
 
     An error of the user is printed as one sentence on standard error, and so is each warning. After
     Ctrl-C one sentence says what is kept, and the status is 130.
@@ -126,17 +131,17 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except UnusedCliTokensError as error:
         words, what = " ".join(error.unused_tokens or ()), " ".join(error.command_chain or ())
         print_message(f"{what} takes no further {words!r}; see jaxbeam {what} --help")
-        sys.exit(1)
+        sys.exit(WRONG_USAGE)
     except MissingArgumentError as error:
         print_message(_missing(error))
-        sys.exit(1)
+        sys.exit(WRONG_USAGE)
     except (ValueError, OSError, RuntimeError, ImportError, CycloptsError) as error:
         message = " ".join(str(error).split())
         if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
             _close_output()  # what is printed goes to a file on a full disk
             message = f"no space left on device{'' if message[:1] == '[' else f': {message}'}"
         print_message(message)
-        sys.exit(1)
+        sys.exit(WRONG_USAGE if isinstance(error, UsageError | CycloptsError) else 1)
     sys.exit(0)
 
 
@@ -161,12 +166,12 @@ def _missing(error: MissingArgumentError) -> str:
 
 
 def refuse_former_words(arguments: Sequence[str]) -> None:
-    """Check a command line. Raises ValueError for a command or option that is called otherwise."""
+    """Check a command line. Raises UsageError for a command or option that is called otherwise."""
     former = RENAMED_COMMANDS
     for word in arguments:
         name = word.partition("=")[0]
         if name in former:
-            raise ValueError(f"{name} is called {former[name]} now")
+            raise UsageError(f"{name} is called {former[name]} now")
         if former is RENAMED_COMMANDS:
             former = RENAMED_OPTIONS.get(name, {})
 

@@ -15,11 +15,15 @@ if TYPE_CHECKING:
 Bounds = tuple[float, float] | tuple[str, str]  # in SI units, or texts with units
 
 
+class UsageError(ValueError):
+    """Error in the words of a command line, not in what they name; the exit status is 2."""
+
+
 def parse_assignment(option: str, text: str) -> tuple[str, str]:
-    """Address and value of ADDRESS=VALUE. Raises ValueError if one is empty."""
+    """Address and value of ADDRESS=VALUE. Raises UsageError if one is empty."""
     address, equals, value = text.partition("=")
     if not (address and equals and value):
-        raise ValueError(f"{option} takes ADDRESS=VALUE, such as loads.0.speed=0.5, not {text!r}")
+        raise UsageError(f"{option} takes ADDRESS=VALUE, such as loads.0.speed=0.5, not {text!r}")
     return address, value
 
 
@@ -43,10 +47,10 @@ def parse_value(text: str) -> Any:
 
 
 def named_number(option: str, text: str, example: str) -> tuple[str, float]:
-    """Name and number of NAME=NUMBER. Raises ValueError, with the example, otherwise."""
+    """Name and number of NAME=NUMBER. Raises UsageError, with the example, otherwise."""
     name, numbers = named_numbers(option, text, "NAME=NUMBER", example)
     if len(numbers) != 1:
-        raise ValueError(f"{option} takes NAME=NUMBER, such as {example}, not {text!r}")
+        raise UsageError(f"{option} takes NAME=NUMBER, such as {example}, not {text!r}")
     return name, numbers[0]
 
 
@@ -55,7 +59,7 @@ def named_numbers(
 ) -> tuple[str, list[Any]]:
     """Name and numbers of NAME=NUMBER,NUMBER,...
 
-    Raises ValueError, with the form and the example, if the name is empty or a number is none.
+    Raises UsageError, with the form and the example, if the name is empty or a number is none.
     """
     name, _, value = text.partition("=")
     try:
@@ -63,20 +67,20 @@ def named_numbers(
             raise ValueError
         return name, [number(entry) for entry in value.split(",")]
     except ValueError:
-        raise ValueError(f"{option} takes {form}, such as {example}, not {text!r}") from None
+        raise UsageError(f"{option} takes {form}, such as {example}, not {text!r}") from None
 
 
 def parse_sweep_values(texts: Iterable[str]) -> dict[str, list[float] | list[str]]:
     """Values by address of ADDRESS=START:STOP:COUNT or ADDRESS=V1,V2,..., numbers or all words.
 
-    Raises ValueError for numbers among words, if a range has too many numbers, or if an address is
+    Raises UsageError for numbers among words, if a range has too many numbers, or if an address is
     named twice.
     """
     values = {}
     for text in texts:
         address, value = parse_assignment("--over", text)
         if address in values:
-            raise ValueError(f"--over names {address} twice; give all its values at once")
+            raise UsageError(f"--over names {address} twice; give all its values at once")
         if ":" in value:
             values[address] = _range_values(text, value)
         else:
@@ -94,7 +98,7 @@ def _range_values(text: str, value: str) -> list[Any]:
         return _quantity_range(text, start, *rest)
     limits = _parse_numbers("--over", text, value.split(":"))
     if len(limits) != 3 or not (limits[2] >= 1 and limits[2] % 1 == 0):
-        raise ValueError(
+        raise UsageError(
             f"--over {text}: a range is START:STOP:COUNT, such as 0.3:10:64, or a list 0.3,1,10"
         )
     import numpy as np
@@ -102,7 +106,7 @@ def _range_values(text: str, value: str) -> list[Any]:
     from jaxbeam.sweeps import MAX_RUNS
 
     if limits[2] > MAX_RUNS:
-        raise ValueError(f"--over {text}: a range may have {MAX_RUNS:.0e} values, no more")
+        raise UsageError(f"--over {text}: a range may have {MAX_RUNS:.0e} values, no more")
     return np.linspace(limits[0], limits[1], int(limits[2])).tolist()
 
 
@@ -112,7 +116,7 @@ def _quantity_range(text: str, start: str, stop: str, count: str) -> list[str]:
     if is_quantity(stop):
         last, other = number_and_unit(stop)
     if unit != other:
-        raise ValueError(
+        raise UsageError(
             f"--over {text}: both ends of a range have the same unit, as in 60 km/h:200 km/h:15"
         )
     values = _range_values(text, f"{first!r}:{last!r}:{count}")
@@ -120,10 +124,10 @@ def _quantity_range(text: str, start: str, stop: str, count: str) -> list[str]:
 
 
 def input_output_pair(text: str) -> tuple[str, str]:
-    """Input and output of INPUT:OUTPUT. Raises ValueError if one is empty."""
+    """Input and output of INPUT:OUTPUT. Raises UsageError if one is empty."""
     source, colon, output = text.partition(":")
     if not (source and colon and output):
-        raise ValueError(
+        raise UsageError(
             f"--pair takes INPUT:OUTPUT, such as actuators.0:sensors.0 or force@0.3:velocity@0.1,"
             f" not {text!r}"
         )
@@ -131,24 +135,24 @@ def input_output_pair(text: str) -> tuple[str, str]:
 
 
 def stationary_mass(text: str) -> tuple[float, float]:
-    """Position (m) and mass (kg) of POSITION=MASS. Raises ValueError if they are no two numbers."""
+    """Position (m) and mass (kg) of POSITION=MASS. Raises UsageError if they are no two numbers."""
     numbers = _parse_numbers("--mass-at", text, text.split("="))
     if len(numbers) != 2:
-        raise ValueError(f"--mass-at takes POSITION=MASS in m and kg, such as 0.3=0.5, not {text}")
+        raise UsageError(f"--mass-at takes POSITION=MASS in m and kg, such as 0.3=0.5, not {text}")
     return numbers[0], numbers[1]
 
 
 def frequency_grid(start: float, stop: float, points: int) -> list[float]:
     """Frequencies (Hz) from start to stop, logarithmically spaced.
 
-    Raises ValueError unless 0 < start < stop, and for fewer than two points.
+    Raises UsageError unless 0 < start < stop, and for fewer than two points.
     """
     if not 0 < start < stop < math.inf:
-        raise ValueError(
+        raise UsageError(
             f"--from and --to must increase from above 0 Hz; they are {start:g}, {stop:g}"
         )
     if points < 2:
-        raise ValueError(f"--points must be 2 or more; it is {points}")
+        raise UsageError(f"--points must be 2 or more; it is {points}")
     import numpy as np
 
     return np.geomspace(start, stop, points).tolist()
@@ -159,16 +163,16 @@ def split_case_and_logs(
 ) -> tuple[Path | None, list[Path]]:
     """Case file (.toml), if there is one, and logs among the files.
 
-    Raises ValueError without a log, for several cases, and for a free parameter without a case.
+    Raises UsageError without a log, for several cases, and for a free parameter without a case.
     """
     cases = [path for path in files if path.suffix == ".toml"]
     logs = [path for path in files if path.suffix != ".toml"]
     if not logs:
-        raise ValueError("identify needs at least one log: jaxbeam identify [CASE.toml] LOG...")
+        raise UsageError("identify needs at least one log: jaxbeam identify [CASE.toml] LOG...")
     if len(cases) > 1:
-        raise ValueError(f"identify fits one case, not {len(cases)}: {', '.join(map(str, cases))}")
+        raise UsageError(f"identify fits one case, not {len(cases)}: {', '.join(map(str, cases))}")
     if free_addresses and not cases:
-        raise ValueError("--free needs the case whose numbers it names: identify CASE.toml LOG...")
+        raise UsageError("--free needs the case whose numbers it names: identify CASE.toml LOG...")
     return (cases[0] if cases else None), logs
 
 
@@ -176,7 +180,7 @@ def parse_bounds(text: str, option: str = "--free") -> tuple[str, Bounds | None]
     """Address and bounds of ADDRESS or ADDRESS=LOW:HIGH; None without bounds.
 
     Bounds with units, as 8 GN m^2:12 GN m^2, stay texts until the case is read (`bounds_in_si`).
-    Raises ValueError if the bounds are no two increasing numbers, or one alone has a unit.
+    Raises UsageError if the bounds are no two increasing numbers, or one alone has a unit.
     """
     address, equals, value = text.partition("=")
     if not equals:
@@ -187,17 +191,17 @@ def parse_bounds(text: str, option: str = "--free") -> tuple[str, Bounds | None]
         return address, with_units
     bounds = _parse_numbers(option, text, entries)
     if len(bounds) != 2 or bounds[0] >= bounds[1]:
-        raise ValueError(f"{option} {text}: bounds are LOW:HIGH, such as 5:20")
+        raise UsageError(f"{option} {text}: bounds are LOW:HIGH, such as 5:20")
     return address, (bounds[0], bounds[1])
 
 
 def _both_with_units(option: str, entries: list[str]) -> tuple[str, str] | None:
-    """Two texts with units, None if none has one. Raises ValueError if only some have."""
+    """Two texts with units, None if none has one. Raises UsageError if only some have."""
     with_unit = [is_quantity(entry) for entry in entries]
     if len(entries) == 2 and all(with_unit):
         return entries[0], entries[1]
     if any(with_unit):
-        raise ValueError(f"{option}: give both numbers a unit, as in 8 GN m^2:12 GN m^2")
+        raise UsageError(f"{option}: give both numbers a unit, as in 8 GN m^2:12 GN m^2")
     return None
 
 
@@ -206,7 +210,7 @@ def bounds_in_si(
 ) -> dict[str, tuple[float, float] | None]:
     """Bounds by address in the SI units of a case.
 
-    Raises ValueError for an address that the case lacks, a unit that does not fit, and bounds that
+    Raises UsageError for an address that the case lacks, a unit that does not fit, and bounds that
     do not increase.
     """
     converted = {}
@@ -214,7 +218,7 @@ def bounds_in_si(
         if pair is not None and isinstance(pair[0], str):
             pair = pair_in_si(case, address, pair, option)
             if pair[0] >= pair[1]:
-                raise ValueError(f"{option} {address}: bounds are LOW:HIGH, such as 5:20")
+                raise UsageError(f"{option} {address}: bounds are LOW:HIGH, such as 5:20")
         converted[address] = pair
     return converted
 
@@ -222,7 +226,7 @@ def bounds_in_si(
 def pair_in_si(case: "Case", address: str, pair: Bounds, option: str) -> tuple[float, float]:
     """Two values at an address, numbers or texts with units, in the SI unit that it has in a case.
 
-    Raises ValueError for an address that the case lacks, and a unit that does not fit.
+    Raises UsageError for an address that the case lacks, and a unit that does not fit.
     """
     if not any(isinstance(value, str) for value in pair):
         return float(pair[0]), float(pair[1])
@@ -237,7 +241,7 @@ def pair_in_si(case: "Case", address: str, pair: Bounds, option: str) -> tuple[f
 def parse_prior(text: str) -> tuple[str, Bounds]:
     """Address, mean and deviation of ADDRESS=MEAN:DEVIATION, texts with units as they are.
 
-    Raises ValueError if they are no two numbers, or one alone has a unit.
+    Raises UsageError if they are no two numbers, or one alone has a unit.
     """
     address, value = parse_assignment("--prior", text)
     entries = [entry.strip() for entry in value.split(":")]
@@ -247,7 +251,7 @@ def parse_prior(text: str) -> tuple[str, Bounds]:
     try:
         mean, deviation = map(float, entries)
     except ValueError:
-        raise ValueError(
+        raise UsageError(
             "--prior takes ADDRESS=MEAN:DEVIATION, such as beam.damping_ratio=0.02:0.005, not"
             f" {text!r}"
         ) from None
@@ -255,11 +259,11 @@ def parse_prior(text: str) -> tuple[str, Bounds]:
 
 
 def parse_range(option: str, text: str, unit_and_example: str) -> tuple[float, float]:
-    """Two numbers of LOW:HIGH. Raises ValueError, with unit and example, otherwise."""
+    """Two numbers of LOW:HIGH. Raises UsageError, with unit and example, otherwise."""
     try:
         low, high = map(float, text.split(":"))
     except ValueError:
-        raise ValueError(f"{option} takes LOW:HIGH in {unit_and_example}, not {text!r}") from None
+        raise UsageError(f"{option} takes LOW:HIGH in {unit_and_example}, not {text!r}") from None
     return low, high
 
 
@@ -268,7 +272,7 @@ def _parse_numbers(option: str, text: str, entries: Sequence[str]) -> list[float
         return [float(entry) for entry in entries]
     except ValueError as error:
         word = str(error).rsplit(": ", 1)[-1]
-        raise ValueError(f"{option} {text}: {word} is not a number") from None
+        raise UsageError(f"{option} {text}: {word} is not a number") from None
 
 
 def figure_path(output: Path | None, source: Path) -> Path:
@@ -283,16 +287,16 @@ MIN_INCHES, MAX_INCHES = 1.0, 100.0
 def parse_size(text: str) -> tuple[float, float]:
     """Width and height in inches of WIDTHxHEIGHT with a unit, as 160x100mm.
 
-    Raises ValueError for other texts, and for sizes below one inch or above 100.
+    Raises UsageError for other texts, and for sizes below one inch or above 100.
     """
     found = re.fullmatch(r"(\d+\.?\d*)\s*x\s*(\d+\.?\d*)\s*(mm|cm|in)", text.strip())
     if found is None:
-        raise ValueError(
+        raise UsageError(
             f"--size takes WIDTHxHEIGHT in mm, cm or in, such as 160x100mm, not {text!r}"
         )
     width, height = (float(found.group(i)) * INCHES[found.group(3)] for i in (1, 2))
     if not MIN_INCHES <= min(width, height) <= max(width, height) <= MAX_INCHES:
-        raise ValueError(f"--size {text}: a side is 25 mm at least and 2540 mm at most")
+        raise UsageError(f"--size {text}: a side is 25 mm at least and 2540 mm at most")
     return width, height
 
 
@@ -306,7 +310,7 @@ def check_exists(kind: str, *paths: Path) -> None:
 def check_suffix(path: Path | None, suffix: str, content: str, others: Sequence[str] = ()) -> None:
     """Whether a file can be written by its suffix, before any work.
 
-    Raises ValueError if it has not the suffix of its content, nor one of the others, ImportError if
+    Raises UsageError if it has not the suffix of its content, nor one of the others, ImportError if
     the package that writes it is not installed.
     """
     if path:
@@ -314,6 +318,6 @@ def check_suffix(path: Path | None, suffix: str, content: str, others: Sequence[
 
 
 def refuse_option(is_given: bool, reason: str) -> None:
-    """Raises ValueError with the reason if an option is given that does not apply."""
+    """Raises UsageError with the reason if an option is given that does not apply."""
     if is_given:
-        raise ValueError(reason)
+        raise UsageError(reason)

@@ -19,6 +19,7 @@ from cyclopts import Parameter
 import jaxbeam as jb
 from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.cli.arguments import (
+    UsageError,
     check_suffix,
     figure_path,
     parse_assignment,
@@ -159,7 +160,7 @@ class DrawingOptions:
         """
         self.inches()
         if not 10 <= self.dpi <= 2400:
-            raise ValueError(f"--dpi must be from 10 to 2400; it is {self.dpi:g}")
+            raise UsageError(f"--dpi must be from 10 to 2400; it is {self.dpi:g}")
         for path in filter(None, paths):
             check_suffix(path, PICTURES[0], "a picture", PICTURES[1:])
 
@@ -235,7 +236,7 @@ class LabelledPictureOptions(PictureOptions):
         """
         names = [name.strip() for name in self.labels.split(",")] if self.labels else None
         if names is not None and len(names) != len(case.sensors):
-            raise ValueError(
+            raise UsageError(
                 f"--labels names {len(names)} sensors; the case has {len(case.sensors)}"
             )
         return names

@@ -227,7 +227,7 @@ def test_what_looks_wrong_is_said_before_a_run(run, folder, capsys):
         with pytest.raises(SystemExit):
             main([name, "case.toml", *more, "--set", "run.duration=1.5", "--set", "loads.0.mass=9"])
         printed = capsys.readouterr()
-        assert printed.err.count("jaxbeam: warning: the beam sags by") == 1
+        assert printed.err.count("jaxbeam: warning: loads.0.mass: the loads on the beam have") == 1
         assert "written" not in printed.out
 
 
@@ -462,3 +462,25 @@ def test_wheels_are_named_by_what_they_are_chosen_for(folder, run):
         numbers = [float(text) for text in line.split(" of 10 ")[1].split()[:3]]
         own = weights[wheel], lowest[wheel], largest[wheel]
         np.testing.assert_allclose(numbers, own, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("line", "status"),
+    [
+        ("simulate", 2),  # an argument is missing
+        ("simulate case.toml more.toml", 2),
+        ("simulate case.toml --unknown", 2),
+        ("simulate case.toml --dpi fine", 2),
+        ("simulate case.toml --set loads.0.speed", 2),
+        ("sweep case.toml --over loads.0.speed=1:2", 2),
+        ("sweep case.toml --over loads.0.speed=1,2 --resume", 2),
+        ("fly case.toml", 2),
+        ("simulate absent.toml", 1),  # what the words name is wrong
+        ("simulate case.toml --set loads.0.speed=0", 1),
+        ("simulate case.toml --set beam.heigth=1", 1),
+    ],
+)
+def test_the_status_tells_wrong_usage_from_wrong_input(folder, capsys, line, status):
+    with pytest.raises(SystemExit) as ended:
+        main(line.split())
+    assert (ended.value.code, capsys.readouterr().out) == (status, "")

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from jaxbeam.cli.arguments import (
+    UsageError,
     bounds_in_si,
     check_exists,
     parse_bounds,
@@ -80,7 +81,7 @@ def weigh(
 def _axle_count(text: str) -> int:
     """The number of axles that an option gives. Raises ValueError if it is none."""
     if not text.isdecimal():
-        raise ValueError(f"--axles takes a whole number, or auto, not {text!r}")
+        raise UsageError(f"--axles takes a whole number, or auto, not {text!r}")
     return int(text)
 
 

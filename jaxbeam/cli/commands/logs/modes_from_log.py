@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import (
+    UsageError,
     bounds_in_si,
     check_exists,
     figure_path,
@@ -242,5 +243,5 @@ def _numbers(option: str, text: str | None) -> tuple[float, ...]:
     except ValueError:
         numbers = (math.nan,)
     if not all(0 < number < math.inf for number in numbers):
-        raise ValueError(f"{option} takes frequencies in Hz, such as 50 or 50,100, not {text!r}")
+        raise UsageError(f"{option} takes frequencies in Hz, such as 50 or 50,100, not {text!r}")
     return numbers
