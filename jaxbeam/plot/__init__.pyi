@@ -1,5 +1,6 @@
 from .animation import animate as animate
 from .compare import plot_comparison as plot_comparison
+from .engineering.assessment import plot_assessment as plot_assessment
 from .engineering.influence import plot_influence as plot_influence
 from .envelope import plot_envelope as plot_envelope
 from .fit import FitPanel as FitPanel, plot_fit as plot_fit

@@ -13,7 +13,7 @@ from jaxbeam.analysis.assessment.static_checks import (
     factor_checks,
     frequency_check,
 )
-from jaxbeam.analysis.assessment.train_checks import train_checks
+from jaxbeam.analysis.assessment.train_checks import TrackState, train_checks
 from jaxbeam.analysis.sections.characteristic_points import spans
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.declared_checks import suggestion
@@ -26,8 +26,8 @@ from jaxbeam.model.sensing.mode_band import counted_frequency
 from jaxbeam.vehicles.trains import trains as library
 
 CODES = ("en1991-2",)
-TRACKS = ("ballasted", "slab")
-MAINTENANCE = ("careful", "standard")
+DECKS = ("ballasted", "slab")
+TRACKS = ("standard", "maintained")
 HSLM_A = tuple(f"HSLM-A{i}" for i in range(1, 11))
 FASTEST = 150.0  # m/s, 540 km/h: no train in service or on trial comes near
 MANY_MODES = 60  # among which those that count for accelerations are found
@@ -38,8 +38,8 @@ def assess(
     line_speed,
     *,
     code: str = "en1991-2",
-    track: str = "ballasted",
-    maintenance: str = "standard",
+    deck: str = "ballasted",
+    track: str = "standard",
     classification: float = 1.0,
     determinant_length=None,
     added_damping: float = 0.0,
@@ -51,17 +51,23 @@ def assess(
 
     Beam and supports are those of the case; its loads, sensors and run are not used. `line_speed`
     is the maximum line speed at the site, in m/s or with a unit ("250 km/h"). Limits of the deck
-    acceleration are those of a "ballasted" or "slab" `track`; "careful" or "standard" `maintenance`
-    chooses Phi_2 or Phi_3 and the share of phi''. `classification` is the factor alpha of LM71.
-    The `determinant_length` L_phi (m, table 6.2) is the span of a single span, and must be given
-    for others. `added_damping` (6.4.6.4) is added to the modal damping ratios. The dynamic analysis
-    under `trains` of the library is made where it is required (or as `dynamic` says), from
-    `lowest_speed` (m/s, by default 40) to 1.2 times the line speed, with the modes that count for
-    accelerations: up to the largest of 30 Hz, 1.5 f_1 and f_3. Numbers of the code, their clauses
-    and open sources are in `analysis/assessment/en1991_2.toml`; what has no open source is left out
-    and named in the report.
+    acceleration are those of a "ballasted" or "slab" `deck`. The state of the `track`, "standard"
+    or carefully "maintained", chooses Phi_3 or Phi_2 of LM71, and 1 + phi'' or 1 + phi''/2, by
+    which all calculated effects of the trains are multiplied (as commonly stated).
+    `classification` is the factor alpha of LM71. The `determinant_length` L_phi (m, table 6.2) is
+    the span of a single span, and must be given for others. `added_damping` (6.4.6.4) is added to
+    the modal damping ratios.
 
-    Raises ValueError for an unknown code, track, maintenance or train, a controlled case, several
+    The dynamic analysis under `trains` of the library is made where it is required (or as `dynamic`
+    says), from `lowest_speed` (m/s, by default 40) to 1.2 times the line speed, with the modes that
+    count for accelerations: up to the largest of 30 Hz, 1.5 f_1 and f_3. Moments, deflections,
+    shear forces on both sides of supports, end rotations and reactions of the trains are compared
+    with those of LM71; where they are larger the trains govern the design, which is a finding, not
+    a failed check. `effects` of the result has them for every train over speed. Numbers of the
+    code, their clauses and open sources are in `analysis/assessment/en1991_2.toml`; what has no
+    open source is left out and named in the report.
+
+    Raises ValueError for an unknown code, deck, track or train, a controlled case, several
     spans without a determinant length, a beam that can move as a rigid body, or numbers out of
     range.
 
@@ -71,8 +77,10 @@ def assess(
     >>> print(found.checks[1].subject, found.checks[1].outcome)
     dynamic analysis not required
     """
-    given = dict(track=track, maintenance=maintenance, code=code)
-    for (name, word), allowed in zip(given.items(), (TRACKS, MAINTENANCE, CODES), strict=True):
+    if track in DECKS:
+        raise ValueError(f"track is its state, {' or '.join(TRACKS)}; {track!r} is the deck")
+    given = dict(deck=deck, track=track, code=code)
+    for (name, word), allowed in zip(given.items(), (DECKS, TRACKS, CODES), strict=True):
         if word not in allowed:
             raise ValueError(f"{name} cannot be {word!r}; {suggestion(word, allowed)}")
     for train in trains:
@@ -101,14 +109,15 @@ def assess(
         frequency_check(bridge, length, frequencies[0]),
         analysis_check(length, frequencies[0], speed),
         *damping_checks(bridge, added_damping),
-        *factor_checks(length, frequencies[0], speed, maintenance),
+        *factor_checks(length, frequencies[0], speed, track),
     ]
-    is_required = checks[1].outcome == REQUIRED
+    effects, is_required = None, checks[1].outcome == REQUIRED
     if dynamic or (dynamic is None and is_required):
         highest = numbers["line_speed"]["design_factor"] * speed
         lowest = min(lowest, highest / 1.2)
-        factors = length, frequencies[0], highest, maintenance, classification
-        checks += train_checks(bridge, trains, (lowest, highest), track, factors)
+        state = TrackState(length, float(frequencies[0]), track, classification)
+        found, effects = train_checks(bridge, trains, (lowest, highest), deck, state)
+        checks += found
     left_out = list(numbers["left_out"]["items"])
     if not (dynamic or (dynamic is None and is_required)):
         left_out.insert(0, "deck acceleration and HSLM: no dynamic analysis was made")
@@ -120,8 +129,8 @@ def assess(
     inputs = {
         "line speed": f"{3.6 * speed:g} km/h",
         "determinant length": f"{length:g} m",
+        "deck": deck,
         "track": track,
-        "maintenance": maintenance,
         "classification factor": f"{classification:g}",
         "added damping": f"{added_damping:g}",
     }
@@ -133,6 +142,7 @@ def assess(
         tuple(left_out),
         tuple(numbers["left_out"]["not_in_model"]),
         clauses,
+        effects,
     )
 
 

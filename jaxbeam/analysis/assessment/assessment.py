@@ -4,11 +4,13 @@ import dataclasses
 import os
 from typing import Any
 
+from jaxbeam.analysis.assessment.train_effects import TrainEffects
 from jaxbeam.files.report import text_table
 from jaxbeam.runtime.whole_file import whole_file
 
 SATISFIED, NOT_SATISFIED, INFORMATION = "satisfied", "not satisfied", "information"
 REQUIRED, NOT_REQUIRED = "required", "not required"
+TRAINS_GOVERN, LM71_GOVERNS = "trains govern", "LM71 governs"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +39,8 @@ class CodeCheck:
 class Assessment:
     """Checks of a bridge by a code, its inputs, and what is not checked and not in the model.
 
-    `sources` are the open sources of the numbers of the code by clause.
+    `sources` are the open sources of the numbers of the code by clause, `effects` those of the
+    trains over speed, if a dynamic analysis was made.
 
     >>> import jaxbeam as jb
     >>> bridge = jb.Case(jb.Beam(25.0, 3e10, 15000.0, damping_ratio=0.01))
@@ -53,11 +56,21 @@ class Assessment:
     not_checked: tuple[str, ...]
     not_in_model: tuple[str, ...]
     sources: dict[str, str]
+    effects: TrainEffects | None = None
 
     @property
     def failed(self) -> tuple[CodeCheck, ...]:
         """Checks that are not satisfied."""
         return tuple(check for check in self.checks if check.outcome == NOT_SATISFIED)
+
+    @property
+    def governed_by_trains(self) -> tuple[str, ...]:
+        """Effects for which trains govern the design in place of LM71: a finding, no failure."""
+        return tuple(
+            check.subject.partition(", ")[2]
+            for check in self.checks
+            if check.outcome == TRAINS_GOVERN
+        )
 
     @property
     def verdict(self) -> str:
@@ -67,6 +80,8 @@ class Assessment:
             found = f"not satisfied: {subjects}"
         else:
             found = "the checks made are satisfied"
+        if self.governed_by_trains:
+            found += f"; the trains govern the design of {', '.join(self.governed_by_trains)}"
         return (
             f"{found}. This is no certificate: what is listed as not checked and not in the model"
             " remains to be shown."
@@ -74,7 +89,9 @@ class Assessment:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and texts by name."""
-        return dataclasses.asdict(self) | {"verdict": self.verdict}
+        content = dataclasses.asdict(dataclasses.replace(self, effects=None))
+        effects = None if self.effects is None else self.effects.to_dict()
+        return content | {"effects": effects, "verdict": self.verdict}
 
     def _rows(self) -> list[list[str]]:
         return [
@@ -105,6 +122,7 @@ class Assessment:
             "",
             *remarks,
             "",
+            *(["largest effects of each train:", *self.effects.lines, ""] if self.effects else []),
             "not checked:",
             *(f"  {item}" for item in self.not_checked),
             "not in the model, hence not certified:",
@@ -118,14 +136,16 @@ class Assessment:
 
     def to_markdown(self) -> str:
         """The report as Markdown, with the sources of the numbers of the code."""
-        rows = [HEADER, ["---"] * len(HEADER), *self._rows()]
-        table = ["| " + " | ".join(row) + " |" for row in rows]
+        effects = []
+        if self.effects:
+            effects = ["## Largest effects of each train", markdown_table(*self.effects.rows())]
         parts = [
             f"# {self.title}",
             f"Checks by {self.code}. {self.verdict}",
             "\n".join(f"- {line}" for line in self._inputs),
-            "\n".join(table),
+            markdown_table(HEADER, *self._rows()),
             "\n".join(f"- {c.subject}: {c.remark}" for c in self.checks if c.remark),
+            *effects,
             "## Not checked",
             "\n".join(f"- {item}" for item in self.not_checked),
             "## Not in the model, hence not certified",
@@ -135,10 +155,21 @@ class Assessment:
         ]
         return "\n\n".join(part for part in parts if part) + "\n"
 
+    def plot(self, **options):
+        """Figure of the effects over speed with limit lines; see `jaxbeam.plot.plot_assessment`."""
+        from jaxbeam.plot import plot_assessment
+
+        return plot_assessment(self, **options)
+
     def save(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write the report as Markdown. Raises FileExistsError unless `overwrite`."""
         with whole_file(path, overwrite) as beside:
             beside.write_text(self.to_markdown(), encoding="utf-8")
+
+
+def markdown_table(head: list[str], *rows: list[str]) -> str:
+    """A table in Markdown."""
+    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows))
 
 
 HEADER = ["check", "value", "limit", "unit", "outcome", "clause"]

@@ -68,11 +68,21 @@ def irregularity_factor(speed, length, frequency) -> Float[Array, "..."]:
     return xp.maximum(alpha / 100 * percent, 0.0)
 
 
-def static_dynamic_factor(length, maintenance: str) -> Float[Array, "..."]:
-    """Dynamic factor Phi_2 ("careful" maintenance) or Phi_3 ("standard") of LM71, 6.4.5.2.
+def track_factor(speed, length, frequency, track: str) -> Float[Array, "..."]:
+    """Factor of calculated dynamic effects for the state of the track: 1 + phi'' or 1 + phi''/2.
+
+    The whole phi'' for a "standard" track, half of it for one carefully "maintained"; units as in
+    `running_factor`.
+    """
+    part = code_numbers()["dynamic_factors"][track]["track_irregularity"]
+    return 1 + part * irregularity_factor(speed, length, frequency)
+
+
+def static_dynamic_factor(length, track: str) -> Float[Array, "..."]:
+    """Dynamic factor Phi_2 (carefully "maintained" track) or Phi_3 ("standard") of LM71, 6.4.5.2.
 
     The determinant length is in m.
     """
-    numbers = code_numbers()["dynamic_factors"][maintenance]
+    numbers = code_numbers()["dynamic_factors"][track]
     factor = numbers["a"] / (xp.sqrt(xp.asarray(length, float)) - 0.2) + numbers["b"]
     return xp.clip(factor, *numbers["limits"])

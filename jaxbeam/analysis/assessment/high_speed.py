@@ -1,8 +1,10 @@
 """Largest responses to trains over speed, with speeds refined around resonance."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -11,8 +13,16 @@ from jaxbeam.case.case import Case, Run
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.axles import Axles
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.integrator.forces.paths import force_paths, force_wheels
+from jaxbeam.integrator.forces.peaks import peaks_of_forces
+from jaxbeam.integrator.forces.system import force_responses, force_system
+from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import modes
+from jaxbeam.model.sensing.corrected_rows import static_correction
+from jaxbeam.model.sensing.linear_outputs import LinearOutputs, linear_outputs
+from jaxbeam.model.sensing.output_rows import SIDE_SHARE, sensor_rows
 from jaxbeam.sweeps.computation import peaks_in_memory
+from jaxbeam.sweeps.force_runner import PHASE
 from jaxbeam.sweeps.specification import sweep_specification
 from jaxbeam.vehicles.trains import trains as library
 
@@ -23,6 +33,8 @@ SETTLED = 0.01  # change of the largest response, relative, at which speeds are 
 NEAR_LARGEST = 0.8  # share of the largest response from which on a peak over speed is refined
 MAX_ROUNDS = 4
 TOLERANCE = 1e-4  # of peaks
+NEAR = 1e-6  # m, from a support to a sensor beside it
+RUNS_AT_ONCE = 8  # whose reactions are computed together
 FREE_PERIODS = 2.0  # of the first mode, simulated after a train has left
 
 
@@ -39,9 +51,17 @@ class TrainResponse(NamedTuple):
 
 
 def train_response(
-    case: Case, train: str, sensors: tuple[Sensor, ...], lowest: float, highest: float
+    case: Case,
+    train: str,
+    sensors: tuple[Sensor, ...],
+    lowest: float,
+    highest: float,
+    reactions: tuple[float, ...] = (),
 ) -> TrainResponse:
     """Peaks of sensors under a train of the library at speeds (m/s) between two, refined.
+
+    Followed by those of the reactions of the supports at some positions (m): where the beam has
+    repeated poles the sum of the shear forces on both sides, which is no smaller.
 
     First in steps of 2 %, and at the resonance speeds of the first mode; then around every peak
     near the largest one, until it changes by less than a hundredth.
@@ -59,11 +79,23 @@ def train_response(
         plan = sweep_specification(loaded, over, True, False, TOLERANCE, "double")
         found = peaks_in_memory(plan)
         columns = [found[f"peak_{s.quantity}"].to_numpy()[:, i] for i, s in enumerate(sensors)]
-        return np.stack(columns, axis=-1)
+        peaks = np.stack(columns, axis=-1)
+        if not reactions:
+            return peaks
+        values = np.stack([over[name] for name in over], axis=-1)
+        found = reaction_peaks(loaded, reactions, tuple(over), values)
+        if found is None:
+            near = [
+                [s.quantity == "shear" and abs(float(s.position) - x) < NEAR for s in sensors]
+                for x in reactions
+            ]
+            found = peaks @ np.array(near, float).T
+        return np.concatenate([peaks, found], axis=-1)
 
     speeds = _first_speeds(loaded, lowest, highest)
     count, peaks, change = speeds.size, peaks_at(speeds), np.inf
-    quantities = np.array([sensor.quantity for sensor in sensors])
+    quantities = [sensor.quantity for sensor in sensors] + ["reaction"] * len(reactions)
+    quantities = np.array(quantities)
     for _ in range(MAX_ROUNDS):
         before = _largest(peaks, quantities)
         added = _between(speeds, peaks, quantities, count)
@@ -75,6 +107,40 @@ def train_response(
         if change < SETTLED:
             break
     return TrainResponse(train, speeds, peaks, float(change))
+
+
+def reaction_peaks(
+    case: Case, positions: Sequence[float], addresses: Sequence[str], values
+) -> Float[np.ndarray, "run reaction"] | None:
+    """Largest absolute reactions (N) at positions (m) in runs that differ in values at addresses.
+
+    A reaction is the jump of the shear force, S(x+) - S(x-), in closed form under the forces of a
+    train. None where poles of the beam are repeated.
+    """
+    length, model = float(concrete(case.beam.length)), modal_model(case)
+    step, sensors, weights = 4 * SIDE_SHARE * length, [], []
+    for number, x in enumerate(positions):
+        for place, sign, beyond in ((x - step, -1.0, x == 0), (x, 1.0, x == length)):
+            if not beyond:
+                sensors.append(Sensor(place, "shear"))
+                weights.append(sign * (np.arange(len(positions)) == number))
+    rows = sensor_rows(model, case, sensors)
+    outputs = linear_outputs(model, rows, static_correction(model, case, sensors, rows))
+    assert outputs.influence is not None
+    jumps = np.array(weights).T
+    influence = eqx.tree_at(
+        lambda one: one.series, outputs.influence, outputs.influence.series @ jumps.T
+    )
+    combined = LinearOutputs(jumps @ np.asarray(outputs.rows), influence)
+    system = force_system(model, combined, np.array(positions))
+    if system is None:
+        return None
+    found, wheels = [], force_wheels(case)
+    for part in np.array_split(values, -(-len(values) // RUNS_AT_ONCE)):
+        paths = force_paths(case, wheels, addresses, part)
+        responses = force_responses(system, np.unique(paths.speed))
+        found.append(peaks_of_forces(responses, paths, PHASE).peak_deflection[:, 0])
+    return np.concatenate(found)
 
 
 def _first_speeds(case: Case, lowest: float, highest: float) -> Float[np.ndarray, " speed"]:

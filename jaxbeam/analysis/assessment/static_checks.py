@@ -86,15 +86,15 @@ def damping_checks(case: Case, added: float) -> list[CodeCheck]:
     ]
 
 
-def factor_checks(length, frequency, speed, maintenance: str) -> list[CodeCheck]:
+def factor_checks(length, frequency, speed, track: str) -> list[CodeCheck]:
     """Dynamic factors at the line speed (m/s), of real trains and of LM71."""
     annex, factors = code_numbers()["annex_c"], code_numbers()["dynamic_factors"]
     first = float(running_factor(speed, length, frequency))
     second = float(irregularity_factor(speed, length, frequency))
-    own = factors[maintenance]
+    own = factors[track]
     share = own["track_irregularity"]
-    static = float(static_dynamic_factor(length, maintenance))
-    remark = f"phi' = {first:.4g}, phi'' = {second:.4g}, of which {share:g} by the maintenance"
+    static = float(static_dynamic_factor(length, track))
+    remark = f"phi' = {first:.4g}, phi'' = {second:.4g}, of which {share:g} for the {track} track"
     return [
         CodeCheck(
             "1 + phi' + phi'' of real trains at line speed",
@@ -112,6 +112,6 @@ def factor_checks(length, frequency, speed, maintenance: str) -> list[CodeCheck]
             None,
             "1",
             INFORMATION,
-            f"{maintenance} maintenance",
+            f"{track} track",
         ),
     ]

@@ -15,11 +15,15 @@ FRONT_POSITIONS = 8001  # of the first axle of a train
 
 
 class CheckedSection(NamedTuple):
-    """Place (m) along the beam where a quantity is compared, and its name there."""
+    """Place (m) along the beam where a quantity is compared, and its name there.
+
+    Of a shear force also on which `side` of the place, "left" or "right".
+    """
 
     name: str
     quantity: str
     x: float
+    side: str = "right"
 
 
 class TabulatedLine(NamedTuple):
@@ -37,8 +41,10 @@ def tabulated_line(case: Case, section: CheckedSection) -> TabulatedLine:
     """Influence line of a section, with a point at its kink."""
     length = float(concrete(case.beam.length))
     places = np.linspace(0.0, length, LINE_POINTS)
-    places = np.unique(np.concatenate([places, [section.x], held_positions(case)]))
-    line = influence_line(case, section.x, places, quantity=section.quantity)
+    # Shear forces jump at the section: a point on both sides of it.
+    beside = section.x + 1e-9 * length * np.array([-1.0, 0.0, 1.0])
+    places = np.unique(np.concatenate([places, np.clip(beside, 0, length), held_positions(case)]))
+    line = influence_line(case, section.x, places, quantity=section.quantity, side=section.side)
     return TabulatedLine(places, np.asarray(line))
 
 

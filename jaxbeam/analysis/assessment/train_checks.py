@@ -1,14 +1,21 @@
-"""Checks of a bridge by a dynamic analysis: deck acceleration, and HSLM against LM71."""
+"""Checks of a bridge by a dynamic analysis: deck acceleration, and trains against LM71."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxbeam.analysis.assessment.assessment import NOT_SATISFIED, SATISFIED, CodeCheck
+from jaxbeam.analysis.assessment.assessment import (
+    LM71_GOVERNS,
+    NOT_SATISFIED,
+    SATISFIED,
+    TRAINS_GOVERN,
+    CodeCheck,
+)
 from jaxbeam.analysis.assessment.formulas import (
     code_numbers,
-    irregularity_factor,
     static_dynamic_factor,
+    track_factor,
 )
 from jaxbeam.analysis.assessment.high_speed import TrainResponse, train_response
 from jaxbeam.analysis.assessment.static_loads import (
@@ -17,99 +24,171 @@ from jaxbeam.analysis.assessment.static_loads import (
     largest_under_train,
     tabulated_line,
 )
+from jaxbeam.analysis.assessment.train_effects import TrainCurve, TrainEffects
 from jaxbeam.analysis.sections.characteristic_points import characteristic_points
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.model.influence import REACTION
+from jaxbeam.model.sensing.output_rows import SIDE_SHARE
 from jaxbeam.vehicles.trains import trains as library
 
 
-def train_checks(case, trains, speeds, track, factors) -> list[CodeCheck]:
-    """Deck acceleration, and each moment and deflection against LM71."""
-    points = characteristic_points(case)
-    decks = [p for p in points if not p.name.startswith("support")]
-    middles = [p for p in points if p.name.startswith("midspan")]
-    inner = [
-        p
-        for p in points
-        if p.name.startswith("support") and 0 < p.x < float(concrete(case.beam.length))
-    ]
-    sections = [
-        *(CheckedSection(f"moment at {p.name}", "moment", p.x) for p in (*middles, *inner)),
-        *(CheckedSection(f"deflection at {p.name}", "deflection", p.x) for p in middles),
-    ]
+class TrackState(NamedTuple):
+    """What the factors of the code depend on: L_phi (m), n0 (Hz), state of the track, alpha."""
+
+    length: float
+    frequency: float
+    track: str
+    classification: float
+
+
+def train_checks(
+    case: Case, trains: Sequence[str], speeds: tuple[float, float], deck: str, state: TrackState
+) -> tuple[list[CodeCheck], TrainEffects]:
+    """Deck acceleration, each section force, reaction and displacement against LM71; all curves.
+
+    Between two speeds (m/s). Calculated values are multiplied by the factor for the track.
+    """
+    decks = [p for p in characteristic_points(case) if not p.name.startswith("support")]
+    sections = checked_sections(case)
+    inner = [section for section in sections if section.quantity == REACTION]
+    measured = [section for section in sections if section.quantity != REACTION]
+    sections = [*measured, *inner]
     sensors = (
         *(Sensor(p.x, "acceleration") for p in decks),
-        *(Sensor(section.x, section.quantity) for section in sections),
+        *(Sensor(_sensor_position(case, section), section.quantity) for section in measured),
     )
-    responses = [train_response(case, train, sensors, *speeds) for train in trains]
-    return [
-        _acceleration_check(case, decks, responses, track, speeds),
-        *_section_checks(case, sections, responses, len(decks), factors),
+    reactions = tuple(section.x for section in inner)
+    responses = [train_response(case, train, sensors, *speeds, reactions) for train in trains]
+    curves = [
+        TrainCurve(
+            one.train,
+            one.speeds,
+            one.peaks
+            * np.asarray(track_factor(one.speeds, state.length, state.frequency, state.track))[
+                :, None
+            ],
+        )
+        for one in responses
     ]
-
-
-def _acceleration_check(case, decks, responses, track: str, speeds) -> CodeCheck:
-    numbers = code_numbers()["acceleration"]
-    worst = max(responses, key=lambda one: one.peaks[:, : len(decks)].max())
-    at, place = np.unravel_index(
-        np.argmax(worst.peaks[:, : len(decks)]), (worst.speeds.size, len(decks))
+    lines = [tabulated_line(case, section) for section in sections]
+    static_factor = float(static_dynamic_factor(state.length, state.track))
+    limits = [state.classification * static_factor * largest_under_lm71(line) for line in lines]
+    effects = TrainEffects(
+        (*(f"deck acceleration at {p.name}" for p in decks), *(s.name for s in sections)),
+        (*("acceleration" for _ in decks), *(s.quantity for s in sections)),
+        (*("m/s^2" for _ in decks), *map(_unit, sections)),
+        (*(code_numbers()["acceleration"][deck] for _ in decks), *limits),
+        tuple(curves),
     )
-    value = float(worst.peaks[at, place])
+    checks = [_acceleration_check(case, effects, len(decks), responses, deck, speeds, state)]
+    for i, (section, line) in enumerate(zip(sections, lines, strict=True)):
+        checks.append(_section_check(effects, len(decks) + i, section, line, responses, state))
+    return checks, effects
+
+
+def checked_sections(case: Case) -> list[CheckedSection]:
+    """Sections whose effects are compared with those of LM71.
+
+    Moments at midspans and inner supports, deflections at midspans, shear forces on both sides of
+    supports, rotations of the ends of the deck, and reactions.
+    """
+    points, length = characteristic_points(case), float(concrete(case.beam.length))
+    middles = [p for p in points if p.name.startswith("midspan")]
+    supports = [p for p in points if p.name.startswith("support")]
+    inner = [p for p in supports if 0 < p.x < length]
+    sections = [CheckedSection(f"moment at {p.name}", "moment", p.x) for p in (*middles, *inner)]
+    sections += [CheckedSection(f"deflection at {p.name}", "deflection", p.x) for p in middles]
+    for p in supports:
+        sides = [side for side, end in (("left", 0.0), ("right", length)) if p.x != end]
+        for side in sides:
+            words = f"shear {side} of {p.name}"
+            sections.append(CheckedSection(words, "shear", p.x, side))
+        if len(sides) == 1:
+            sections.append(CheckedSection(f"end rotation at {p.name}", "rotation", p.x))
+    sections += [CheckedSection(f"reaction at {p.name}", REACTION, p.x) for p in supports]
+    return sections
+
+
+def _sensor_position(case: Case, section: CheckedSection) -> float:
+    """Position (m) of a sensor for a section; shear forces are measured just right of sensors."""
+    left = section.quantity == "shear" and section.side == "left"
+    return section.x - left * 4 * SIDE_SHARE * float(concrete(case.beam.length))
+
+
+def _unit(section: CheckedSection) -> str:
+    return "N" if section.quantity == REACTION else QUANTITIES[section.quantity].unit
+
+
+def _largest(effects: TrainEffects, columns: Sequence[int]) -> tuple[int, int, int]:
+    """Numbers of curve, speed and effect of the largest value of some effects."""
+    curve = int(np.argmax(effects.largest()[:, columns].max(axis=1)))
+    values = effects.curves[curve].values[:, columns]
+    speed, column = np.unravel_index(np.argmax(values), values.shape)
+    return curve, int(speed), columns[int(column)]
+
+
+def _track_words(state: TrackState, speed: float) -> str:
+    factor = float(track_factor(speed, state.length, state.frequency, state.track))
+    phi = {"standard": "1 + phi''", "maintained": "1 + phi''/2"}[state.track]
+    return f"{phi} = {factor:.4g} for the {state.track} track included"
+
+
+def _acceleration_check(
+    case: Case,
+    effects: TrainEffects,
+    decks: int,
+    responses: list[TrainResponse],
+    deck: str,
+    speeds: tuple[float, float],
+    state: TrackState,
+) -> CodeCheck:
+    numbers = code_numbers()["acceleration"]
+    curve, at, place = _largest(effects, range(decks))
+    worst = effects.curves[curve]
+    value, speed = float(worst.values[at, place]), float(worst.speeds[at])
     change = max(one.change for one in responses)
     remark = (
-        f"{worst.train} at {3.6 * worst.speeds[at]:.4g} km/h, {decks[place].name};"
-        f" {case.beam.modes} modes count; {3.6 * speeds[0]:.4g} to {3.6 * speeds[1]:.4g} km/h, the"
-        f" last refinement of the speeds changed the largest responses by {100 * change:.2g} %"
+        f"{worst.train} at {3.6 * speed:.4g} km/h, {effects.names[place].partition(' at ')[2]};"
+        f" {_track_words(state, speed)}; {case.beam.modes} modes count; {3.6 * speeds[0]:.4g} to"
+        f" {3.6 * speeds[1]:.4g} km/h, the last refinement of the speeds changed the largest"
+        f" responses by {100 * change:.2g} %"
     )
     return CodeCheck(
-        f"deck acceleration, {track} track",
+        f"deck acceleration, {deck} track",
         numbers["clause"],
         value,
-        numbers[track],
+        numbers[deck],
         "m/s^2",
-        SATISFIED if value <= numbers[track] else NOT_SATISFIED,
+        SATISFIED if value <= numbers[deck] else NOT_SATISFIED,
         remark,
     )
 
 
-def _section_checks(
-    case: Case,
-    sections: list[CheckedSection],
+def _section_check(
+    effects: TrainEffects,
+    column: int,
+    section: CheckedSection,
+    line,
     responses: list[TrainResponse],
-    first: int,
-    factors: Any,
-) -> list[CodeCheck]:
-    """HSLM with irregularities of the track, against alpha Phi LM71, at each section."""
-    length, frequency, highest, maintenance, classification = factors
-    share = code_numbers()["dynamic_factors"][maintenance]["track_irregularity"]
-    irregular = share * float(irregularity_factor(highest, length, frequency))
-    static_factor = float(static_dynamic_factor(length, maintenance))
-    checks = []
-    for i, section in enumerate(sections):
-        line = tabulated_line(case, section)
-        limit = classification * static_factor * largest_under_lm71(line)
-        found = []
-        for one in responses:
-            train = library()[one.train]
-            static = largest_under_train(line, train.offsets, train.forces)
-            peaks = one.peaks[:, first + i]
-            at = int(np.argmax(peaks))
-            total = float(peaks[at]) + irregular * static
-            found.append((total, one.train, one.speeds[at], float(peaks[at]) / static - 1))
-        total, train, speed, increment = max(found)
-        remark = f"{train} at {3.6 * speed:.4g} km/h, phi'_dyn = {increment:.4g}"
-        governs = total > limit
-        remark += "; HSLM governs the design" if governs else "; LM71 governs the design"
-        checks.append(
-            CodeCheck(
-                f"HSLM against LM71, {section.name}",
-                "EN 1991-2, 6.4.6.5",
-                total,
-                limit,
-                "N m" if section.quantity == "moment" else "m",
-                NOT_SATISFIED if governs else SATISFIED,
-                remark,
-            )
-        )
-    return checks
+    state: TrackState,
+) -> CodeCheck:
+    """The largest effect of the trains at a section, against alpha Phi LM71: which governs."""
+    curve, at, _ = _largest(effects, [column])
+    worst = effects.curves[curve]
+    value, speed, limit = float(worst.values[at, column]), worst.speeds[at], effects.limits[column]
+    train = library()[worst.train]
+    static = largest_under_train(line, train.offsets, train.forces)
+    increment = float(responses[curve].peaks[at, column]) / static - 1
+    return CodeCheck(
+        f"trains against LM71, {section.name}",
+        "EN 1991-2, 6.4.6.5",
+        value,
+        limit,
+        effects.units[column],
+        TRAINS_GOVERN if value > limit else LM71_GOVERNS,
+        f"{worst.train} at {3.6 * speed:.4g} km/h, phi'_dyn = {increment:.4g};"
+        f" {_track_words(state, float(speed))}",
+    )

@@ -7,7 +7,7 @@ from cyclopts import Parameter
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import check_suffix
-from jaxbeam.cli.options import CaseOptions, Output
+from jaxbeam.cli.options import CaseOptions, Output, PictureOptions
 
 
 def assess(
@@ -16,8 +16,8 @@ def assess(
     *,
     line_speed: Annotated[str, Parameter(required=True)],
     code: str = "en1991-2",
-    track: str = "ballasted",
-    maintenance: str = "standard",
+    deck: str = "ballasted",
+    track: str = "standard",
     classification: float = 1.0,
     determinant_length: str | None = None,
     added_damping: float = 0.0,
@@ -25,11 +25,14 @@ def assess(
     train: tuple[str, ...] = (),
     dynamic: bool = False,
     output: Output = None,
+    pictures: PictureOptions = PictureOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Check a railway bridge by a code: dynamic factors, deck acceleration, trains against LM71.
 
-    Each check cites its clause; what the model cannot show is listed and not certified.
+    Each check cites its clause; what the model cannot show is listed and not certified. `--plot`
+    draws the effects of the trains over speed to CASE_assessment.png in this folder, or beside the
+    report.
 
     Parameters
     ----------
@@ -39,10 +42,11 @@ def assess(
         Maximum line speed at the site, as "250 km/h", or a number in m/s.
     code
         en1991-2: section 6.4 of EN 1991-2, with EN 1990, annex A2.
-    track
+    deck
         ballasted or slab.
-    maintenance
-        standard or careful.
+    track
+        State of the track: standard, or maintained with care. Calculated effects of trains are
+        multiplied by 1 + phi'' or 1 + phi''/2.
     classification
         Factor alpha of LM71.
     determinant_length
@@ -59,13 +63,14 @@ def assess(
         Write the report to this file, OUT.md.
     """
     check_suffix(output, ".md", "a report")
-    options.check_outputs(output)
+    picture = pictures.path(output, case.with_stem(f"{case.stem}_assessment"))
+    options.check_outputs(output, picture)
     found = jb.assess(
         options.read(case, judged="structure"),
         _number_or_quantity(line_speed),
         code=code,
+        deck=deck,
         track=track,
-        maintenance=maintenance,
         classification=classification,
         determinant_length=_number_or_quantity(determinant_length),
         added_damping=added_damping,
@@ -75,7 +80,9 @@ def assess(
     )
     if output:
         found.save(output, options.overwrite)
-    options.report(found.to_dict(), found.lines, output)
+    if picture:
+        pictures.save(found.plot(ax=pictures.page(), title=pictures.title), picture)
+    options.report(found.to_dict(), found.lines, output, picture)
 
 
 def _number_or_quantity(text: str | None) -> float | str | None:
