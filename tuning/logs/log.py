@@ -1,6 +1,6 @@
 """Logs of measured runs: samples in SI units, with their sensors, commands and loads."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,16 @@ from jaxbeam.case.loads.base import AbstractLoad
 
 GAP_STEPS = 1.5  # usual steps between two samples, beyond which samples are missing
 MAX_GRID_DEVIATION_STEPS = 0.25  # steps between times and an even grid, for rounded times
+MAX_SIZE = 1e30  # of a sample in its SI unit; bytes in the wrong order are larger
+# Steps (s) of a log of vibrations: slower and faster ones are times in another unit than is said.
+PLAUSIBLE_STEPS = (1.5e-5, 0.11)
+MIN_SAMPLES = 8  # of a log whose steps tell something
+USUAL_STEPS = (2e-4, 0.02)  # that a likely unit would give
+SCALES = {"ms": 1e-3, "us": 1e-6, "s": 1.0, "min": 60.0}
+
+
+class LogWarning(UserWarning):
+    """What a user must know of how a log was read, or of its times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +33,7 @@ class Log:
     index of the actuator whose command it is, None for readings; `vehicle_sensors` the index of the
     sensor on a vehicle; `loads` are those that crossed, None if unknown. Samples that are not
     `valid` (time, channel) are left out of fits, by default none. `notes` are sentences on how the
-    log was read.
+    log was read; `start` is the date and time of its first sample, if the file has one.
 
     Raises ValueError if lengths disagree, a value is not finite or times do not increase.
 
@@ -50,6 +60,7 @@ class Log:
     valid: Bool[np.ndarray, "time channel"] | None = None
     notes: tuple[str, ...] = ()
     vehicle_sensors: tuple[int | None, ...] = ()
+    start: str = ""
 
     def __post_init__(self):
         channels = self.values.shape[1]
@@ -117,6 +128,13 @@ def check_samples(
             f"{where(row)}, column {names[column]!r}: {what}; fill in what was measured, cut the "
             'log there, or leave such samples out, by missing="mask" or --mask missing'
         )
+    huge = np.argwhere(np.abs(values) > MAX_SIZE)
+    if huge.size:
+        row, column = huge[0]
+        raise ValueError(
+            f"{where(row)}, column {names[column]!r}: {values[row, column]:.3g} is no measurement;"
+            " the file is damaged, or its bytes are in the wrong order"
+        )
     if len(values) < 2:
         raise ValueError(f"{source}: a log needs at least two samples, this one has {len(values)}")
     steps = np.diff(values[:, 0])
@@ -126,3 +144,41 @@ def check_samples(
         if steps[row - 1] < 0:
             what = f"comes after {values[row - 1, 0]:.9g} s"
         raise ValueError(f"{where(row)}: time {values[row, 0]:.9g} s {what}; times must increase")
+
+
+def doubts(
+    names: Sequence[str],
+    times: Float[np.ndarray, " time"],
+    values: Float[np.ndarray, "time channel"],
+    lines: Sequence[int] | np.ndarray | None = None,
+    time_unit: str = "s",
+) -> Iterator[str]:
+    """Sentences on what looks wrong with a log: jumps and scale of its times, equal channels.
+
+    `lines` are the line numbers of the samples in the file, `time_unit` what it says of times.
+    """
+    steps = np.diff(times)
+    usual = float(np.median(steps))
+    jumps = np.flatnonzero(steps > GAP_STEPS * usual)
+    if jumps.size:
+        first, lost = jumps[0], np.sum(np.round(steps[jumps] / usual) - 1)
+        where = f", line {lines[first + 1]}" if lines is not None else ""
+        often = "" if jumps.size == 1 else f"; {jumps.size} such jumps"
+        yield (
+            f"times jump by {steps[first]:.4g} s after t = {times[first]:.6g} s{where}, with steps"
+            f" of {usual:.4g} s elsewhere{often}: about {lost:.0f} samples are missing"
+        )
+    if times.size >= MIN_SAMPLES and not PLAUSIBLE_STEPS[0] <= usual <= PLAUSIBLE_STEPS[1]:
+        given = SCALES.get(time_unit, 1.0)
+        likely = [
+            unit
+            for unit, scale in SCALES.items()
+            if unit != time_unit and USUAL_STEPS[0] <= usual / given * scale <= USUAL_STEPS[1]
+        ]
+        guess = f": are they in {likely[0]}, not in {time_unit}?" if likely else ""
+        yield f"times are {usual:.4g} s apart, {1 / usual:.4g} samples a second{guess}"
+    first_of: dict[bytes, str] = {}
+    for name, column in zip(names, values.T, strict=True):
+        other = first_of.setdefault(column.tobytes(), name)
+        if other != name and np.ptp(column) > 0:
+            yield f"{name} equals {other} in every sample: is one of them a copy?"

@@ -27,6 +27,7 @@ differ in a column called run. `read_logs` reads them all.
 
 import dataclasses
 import difflib
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -34,7 +35,7 @@ import numpy as np
 
 from tuning.logs.columns import with_named_columns, with_times
 from tuning.logs.description import LogDescription, read_description
-from tuning.logs.log import Log, check_samples
+from tuning.logs.log import Log, LogWarning, check_samples, doubts
 from tuning.logs.logger import interpolate_invalid
 from tuning.logs.readers import LogTable, is_time_name, read_tables
 from tuning.logs.readers.table import shown
@@ -64,6 +65,10 @@ def read_log(
     rate of a log without times. What is not given here is taken from the TOML file beside the log,
     then from the log itself. `run` is the name of the run in a file of several. Samples that are
     `missing` (empty cells, NaN) are refused or, with "mask", interpolated and left out of fits.
+
+    Channels with other start times or rates are aligned and resampled. A `LogWarning` says so, and
+    what else may make results wrong: channels that are left out, a recording that breaks off, jumps
+    of the times, times in another unit than the file says.
 
     Raises ValueError, naming file and line, for an empty or damaged log, unknown columns or units,
     columns without a name or a unit, cells that are not finite numbers, times that do not increase,
@@ -124,19 +129,15 @@ def read_logs(
             f"{', '.join(map(repr, tables))}"
         )
     chosen = tables if run is None else {run: tables[run]}
-    return [
-        _make_log(
-            path,
-            name if len(tables) > 1 else "",
-            table,
-            description,
-            channels,
-            declared if units is None else units,
-            time,
-            missing,
-        )
-        for name, (table, channels, declared) in chosen.items()
-    ]
+    logs = []
+    for name, (table, channels, declared) in chosen.items():
+        asked = channels, declared if units is None else units, time, missing
+        several = name if len(tables) > 1 else ""
+        log, said = _make_log(path, several, table, description, *asked)
+        for sentence in said:  # 3: blame the caller of `read_log`
+            warnings.warn(f"{log.source}: {sentence}", LogWarning, stacklevel=3)
+        logs.append(log)
+    return logs
 
 
 def _split_runs(name: str, table: LogTable) -> dict[str, LogTable]:
@@ -156,8 +157,8 @@ def _split_runs(name: str, table: LogTable) -> dict[str, LogTable]:
 
 def _make_log(
     path, run, table: LogTable, description: LogDescription, columns, units, time, missing
-) -> Log:
-    """Log of one run, in SI units."""
+) -> tuple[Log, list[str]]:
+    """Log of one run, in SI units, and what its user must know."""
     names = _check_names(path, table.names)
     time_column = _time_column(path, table, time or description.time)
     channels = list(
@@ -180,7 +181,7 @@ def _make_log(
     values = table.values[:, [names.index(name) for name in (time_column, *channels)]]
     with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is looked for below
         values = values * np.array([unit.factor for _, unit in column_units])
-    valid, notes = np.isfinite(values), list(table.notes)
+    valid, notes = np.isfinite(values), [*table.notes]
     if missing == "mask":
         values[:, 1:] = interpolate_invalid(values[:, 0], values[:, 1:], valid[:, 1:])
         notes += [
@@ -190,7 +191,12 @@ def _make_log(
         ]
     source = f"{path}:{run}" if run else str(path)
     check_samples(source, (time_column, *channels), values, table.lines)
-    return Log(
+    unit_of_times = column_units[0][0]
+    said = [
+        *table.warnings,
+        *doubts(channels, values[:, 0], values[:, 1:], table.lines, unit_of_times),
+    ]
+    log = Log(
         times=values[:, 0],
         values=values[:, 1:],
         names=tuple(channels),
@@ -203,8 +209,10 @@ def _make_log(
         vehicle_sensors=tuple(description.vehicle_sensor(name) for name in channels),
         loads=description.loads_of(run),
         valid=valid[:, 1:],
-        notes=tuple(notes),
+        notes=(*notes, *said),
+        start=table.start,
     )
+    return log, said
 
 
 def _check_texts(path, table: LogTable) -> None:
@@ -268,6 +276,8 @@ def _unit_of(
     """Unit of a column, as text and as `Unit`; an error names the `example` of one."""
     in_file = table.units[table.names.index(name)]
     text = declared.get(name) or description.unit(name) or in_file
+    if not text and table.lines is None and is_time_name(name):
+        text = "s"  # as variables of numerical programs have it; `doubts` looks at the steps
     if not text:
         raise ValueError(
             f"{path}, column {name!r}: no unit found; write it in the heading, {name} [{example}], "

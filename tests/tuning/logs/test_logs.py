@@ -180,7 +180,9 @@ def test_inconsistent_times_and_names_are_refused():
 
 def test_numbers_too_large_for_their_unit_are_missing_samples(tmp_path):
     path = tmp_path / "run.csv"
-    path.write_text("t [s],a [g]\n" + "".join(f"{t},{1e308 if t == 7 else t}\n" for t in range(20)))
+    path.write_text(
+        "t [s],a [g]\n" + "".join(f"{t / 100},{1e308 if t == 7 else t}\n" for t in range(20))
+    )
     assert "1 missing samples of a are left out" in read_log(path, missing="mask").notes
     with pytest.raises(ValueError, match="line 9, column 'a'"):
         read_log(path)

@@ -1,11 +1,14 @@
 """Logs in binary formats, written by other libraries: the same run is read from each."""
 
+import warnings
+
 import numpy as np
 import pytest
 import scipy.io
 
 from tuning import read_log, read_logs
 from tuning.logs import readers
+from tuning.logs.log import LogWarning
 
 TIMES = np.arange(40) / 500
 D1, D2 = np.sin(20 * TIMES), np.cos(30 * TIMES) - 1  # mm
@@ -140,7 +143,7 @@ def test_rows_that_name_their_run(tmp_path):
 def test_arrays_left_out_are_noted(tmp_path):
     hdf5(tmp_path / "run.h5")
     assert read_log(tmp_path / "run.h5").notes == (
-        "left out, not being 40 samples long: calibration",
+        "left out, not being 40 samples long: calibration (3)",
     )
 
 
@@ -183,13 +186,15 @@ def test_a_truncated_file_is_refused_with_one_message(tmp_path, name):
     for share in (0.2, 0.6, 0.97):
         cut.write_bytes(data[: int(share * len(data))])
         try:
-            log = read_log(cut)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", LogWarning)
+                log = read_log(cut)
         except ValueError as error:
             assert str(error).startswith(str(cut)) and "\n" not in str(error)
         else:  # samples that can be read are right, and missing ones are noted
             count = log.times.size
             np.testing.assert_allclose(log.times, TIMES[:count], atol=1e-12)
-            assert count == TIMES.size or "breaks off" in log.notes[0]
+            assert count == TIMES.size or "breaks off" in "".join(log.notes)
 
 
 @pytest.mark.parametrize("suffix", [".tdms", ".mat", ".h5", ".nc", ".parquet"])
@@ -215,12 +220,6 @@ def test_files_without_numbers(tmp_path):
     scipy.io.savemat(tmp_path / "words.mat", {"about": "nothing"})
     with pytest.raises(ValueError, match="no list of numbers in it; tables and timetables"):
         read_log(tmp_path / "words.mat")
-
-
-def test_channels_of_a_group_with_different_clocks(tmp_path):
-    tdms(tmp_path / "run.tdms", extra={"wf_increment": 0.001})
-    with pytest.raises(ValueError, match="group 'log': the channels have different times"):
-        read_log(tmp_path / "run.tdms")
 
 
 def test_formats_are_found_in_the_modules_of_the_readers():

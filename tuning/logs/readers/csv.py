@@ -5,7 +5,7 @@
 
 Lines that start with `#`, `%` or `//` are comments. Other lines above the headings are skipped; a
 line of units may follow the headings. A file without headings is read with columns that the user
-names.
+names. Dates and times of day become seconds from the first.
 """
 
 import csv
@@ -16,8 +16,19 @@ from pathlib import Path
 import numpy as np
 
 from tuning.logs.readers.headings import MAX_HEADING_ROWS, Headings, find_headings
-from tuning.logs.readers.table import LogFormat, LogTable, parse_numbers, read_text
+from tuning.logs.readers.stamps import is_stamp, seconds_of
+from tuning.logs.readers.table import (
+    CHECKED_ROWS,
+    LogFormat,
+    LogTable,
+    check_last_line,
+    check_widths,
+    parse_numbers,
+    read_text,
+)
+from tuning.logs.units import is_unit
 
+RECORD_NUMBER = "RN"  # the unit that Campbell loggers give it
 _COMMENTS = ("#", "%", "//")
 _SPACED_DECIMAL_COMMAS = re.compile(r"^\s*[-+]?\d+,\d+([eE][-+]?\d+)?\s+[-+]?\d+(,\d+)?")
 _SPACED_NUMBERS = re.compile(r"^\s*[-+]?[\d.]+([eE][-+]?\d+)?\s+[-+]?[\d.]+[\s\d.eE+-]*$")
@@ -32,9 +43,10 @@ def read_csv(path: Path) -> dict[str, LogTable]:
     Raises ValueError, naming file and line, for a row of another length, a cell that is no number,
     numbers with both decimal commas and decimal points, and for a file without numbers.
     """
+    text = read_text(path)
     numbered = [
         (number, line)
-        for number, line in enumerate(read_text(path).splitlines(), 1)
+        for number, line in enumerate(text.splitlines(), 1)
         if line.strip("\ufeff\t;, ") and not line.lstrip("\ufeff \t\"'").startswith(_COMMENTS)
     ]
     if not numbered:
@@ -42,19 +54,47 @@ def read_csv(path: Path) -> dict[str, LogTable]:
     numbers, lines = zip(*numbered, strict=True)
     separator = _separator(lines)
     top, _ = _rows(path, lines[: 2 * MAX_HEADING_ROWS], numbers, separator)
-    headings = find_headings(top)
+    headings = _campbell_headings(top) or find_headings(top)
     first = headings.first_row
     if not headings.names and first >= len(top):
         raise ValueError(f"{path}: the log is empty: it has no row of numbers")
     width = len(headings.names) or len(top[first])
-    values, numbers = _numbers(path, lines[first:], numbers[first:], separator, headings, width)
+    tail, tail_lines = _rows(
+        path, lines[first:][-CHECKED_ROWS:], numbers[first:][-CHECKED_ROWS:], separator
+    )
+    check_last_line(path, text, tail, tail_lines)
+    values, numbers, stamped, began = _numbers(
+        path, lines[first:], numbers[first:], separator, headings, width
+    )
     has_headings = bool(headings.names)
     names = headings.names or tuple(f"column {i + 1}" for i in range(values.shape[1]))
-    units = headings.units or (None,) * len(names)
+    units = list(headings.units or (None,) * len(names))
+    for i in stamped:
+        units[i] = "s"
+    # Campbell loggers count their records.
+    kept = [i for i, unit in enumerate(units) if unit != RECORD_NUMBER]
     table = LogTable(
-        names, units, values, np.array(numbers), notes=headings.notes, has_headings=has_headings
+        tuple(names[i] for i in kept),
+        tuple(units[i] for i in kept),
+        values[:, kept],
+        np.array(numbers),
+        time=names[stamped[0]] if stamped else None,
+        notes=headings.notes,
+        has_headings=has_headings,
+        start=began,
     )
     return {"": table}
+
+
+def _campbell_headings(rows) -> Headings | None:
+    """Headings of a file of Campbell loggers (TOA5): station, names, units, processing."""
+    if len(rows) < 5 or rows[0][0] != "TOA5":
+        return None
+    units = tuple(
+        unit if unit == RECORD_NUMBER or is_unit(unit) else None
+        for unit in (cell.strip() for cell in rows[2])
+    )
+    return Headings(tuple(cell.strip() for cell in rows[1]), units, 4, ())
 
 
 def _separator(lines) -> str:
@@ -85,10 +125,10 @@ def _rows(path, lines, numbers, separator):
 
 
 def _numbers(path, lines, numbers, separator, headings: Headings, width: int):
-    """Values (row, column) of the lines of numbers, and their line numbers."""
+    """Values (row, column) of the lines of numbers, their line numbers, columns of dates, start."""
     values = _fast_numbers(lines, separator, width)
     if values is not None:
-        return values, numbers
+        return values, numbers, [], ""
     rows, numbers = _rows(path, lines, numbers, separator)
     # A separator that ends every line closes the last column; it opens no new one.
     names = headings.names
@@ -98,8 +138,18 @@ def _numbers(path, lines, numbers, separator, headings: Headings, width: int):
         names = [f"column {i + 1}" for i in range(width)]
     trailing = len(names) + 1
     rows = [row[:-1] if len(row) == trailing and not row[-1].strip() else row for row in rows]
-    decimal_comma = separator != "," and _has_decimal_comma(path, rows, numbers)
-    return parse_numbers(path, names, rows, numbers, decimal_comma), numbers
+    stamped = [i for i, cell in enumerate(rows[0]) if is_stamp(cell)] if rows else []
+    rows, others, began = [list(row) for row in rows], rows, ""
+    if stamped:
+        check_widths(path, names, rows, numbers)
+        others = [[cell for i, cell in enumerate(row) if i not in stamped] for row in rows]
+    for i in stamped:
+        seconds, first = seconds_of(path, names[i], [row[i] for row in rows], numbers)
+        began = began or first
+        for row, second in zip(rows, seconds, strict=True):
+            row[i] = repr(second)
+    decimal_comma = separator != "," and _has_decimal_comma(path, others, numbers)
+    return parse_numbers(path, names, rows, numbers, decimal_comma), numbers, stamped, began
 
 
 def _fast_numbers(lines, separator, width):

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tuning.logs.clocks import clocks_by_numbers
 from tuning.logs.readers.table import (
     LogFormat,
     LogTable,
@@ -15,65 +16,74 @@ from tuning.optional import import_extra
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 MATLAB_MAGIC = b"MATLAB 7.3 MAT-file"
-_RATES = ("sample_rate", "sampling_rate", "fs")
 
 
 def read_hdf5(path: Path) -> dict[str, LogTable]:
     """Tables of an HDF5 file: one run for each group with lists of numbers, by its path.
 
     Units are the attribute `units` or `unit` of a dataset. Times are a dataset called time, or
-    follow from an attribute `sample_rate` (Hz) of the group or the file.
+    follow from a `sample_rate` or `fs` (Hz), or a `dt` (s), and a `start_time` or `t0` (s): an
+    attribute of the dataset, the group or the file, or a number in the group.
 
     Raises ValueError for a damaged file, ImportError without h5py.
     """
     h5py = import_extra("h5py", "hdf5")
     groups: dict[str, dict] = {}
     units: dict[str, dict] = {}
-    rates = {}
+    given: dict[str, dict] = {}  # numbers that stand for a clock, by group and dataset
     try:
         with h5py.File(path, "r") as file:
+            whole = _numbers_of(file.attrs)
 
             def visit(name, item):
                 numeric = isinstance(item, h5py.Dataset) and np.issubdtype(item.dtype, np.number)
-                if not numeric or item.size < 2 or name.startswith("#"):
+                if not numeric or name.startswith("#"):
                     return
                 group, _, label = name.rpartition("/")
+                if item.size == 1:
+                    number = float(np.ravel(item[()])[0])
+                    given.setdefault(group, {}).setdefault("", {})[label.lower()] = number
+                if item.size < 2:
+                    return
                 groups.setdefault(group, {})[label] = _numbers(item)
                 units.setdefault(group, {})[label] = _unit(item)
-                rates[group] = _sample_rate(item.parent) or _sample_rate(file)
+                own = given.setdefault(group, {})
+                own[""] = whole | _numbers_of(item.parent.attrs) | own.get("", {})
+                own[label] = _numbers_of(item.attrs)
 
             file.visititems(visit)
     except Exception as error:  # h5py raises many types for damaged files
         raise damaged_file_error(path, error) from None
-    return {
-        group: table_of(
-            f"{path}, group {group or '/'}", arrays, units[group], _times_function(rates[group])
+    tables = {}
+    for group, arrays in groups.items():
+        source, numbers = f"{path}, group {group or '/'}", given[group]
+        clocks = clocks_by_numbers(
+            source, {name: numbers[""] | numbers[name] for name in arrays}, list(arrays)
         )
-        for group, arrays in groups.items()
-    }
+        tables[group] = table_of(source, arrays, units[group], clocks)
+    return tables
+
+
+def _numbers_of(attributes) -> dict[str, float]:
+    """Attributes that are one number, by name in small letters."""
+    found = {name.lower(): np.ravel(np.asarray(attributes[name])) for name in attributes}
+    return {n: float(v[0]) for n, v in found.items() if v.size == 1 and v.dtype.kind in "fiu"}
 
 
 def _numbers(dataset) -> np.ndarray:
-    """Numbers of a dataset, NaN for its fill value."""
+    """Numbers of a dataset, scaled as its attributes say, NaN for its fill value."""
     values = np.asarray(dataset[()], float)
     fill = dataset.attrs.get("_FillValue")
     if fill is not None:
         values = np.where(values == np.ravel(fill)[0], np.nan, values)
+    own = _numbers_of(dataset.attrs)  # of the CF conventions
+    values = values * own.get("scale_factor", 1.0) + own.get("add_offset", 0.0)
     # MATLAB stores vectors as matrices of one column.
     return np.ravel(values) if 1 in values.shape and values.ndim == 2 else values
 
 
 def _unit(dataset) -> str | None:
     return text_attribute(dataset.attrs.get("units", dataset.attrs.get("unit")))
-
-
-def _sample_rate(group) -> float | None:
-    found = [group.attrs[name] for name in _RATES if name in group.attrs]
-    return float(np.ravel(found[0])[0]) if found else None
-
-
-def _times_function(rate: float | None):
-    return None if rate is None else lambda count: np.arange(count) / rate
 
 
 FORMAT = LogFormat("HDF5", read_hdf5, suffixes=(".h5", ".hdf5"), magics=(MAGIC, MATLAB_MAGIC))

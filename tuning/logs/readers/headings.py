@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from jaxbeam.files.spreadsheet import from_text_cell
+from tuning.logs.readers.stamps import is_stamp
 from tuning.logs.readers.table import is_time_name, parse_heading
 from tuning.logs.units import is_unit
 
@@ -66,9 +67,10 @@ def find_headings(rows: Sequence[Sequence[str]]) -> Headings:
 
 
 def is_numeric(row: Sequence[str]) -> bool:
-    """Whether all cells of a row that are not empty, at least one, are numbers."""
+    """Whether the cells of a row that are not empty are numbers, at least one, and stamps."""
     cells = [cell for cell in row if cell.strip()]
-    return bool(cells) and all(map(_is_number, cells))
+    numbers = list(map(_is_number, cells))
+    return any(numbers) and all(n or is_stamp(c) for n, c in zip(numbers, cells, strict=True))
 
 
 def _is_number(cell: str) -> bool:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.readers.table import LogFormat, LogTable, parse_numbers, read_text
+from tuning.logs.readers.table import LogFormat, LogTable, check_last_line, parse_numbers, read_text
 
 MAGIC = "LabVIEW Measurement"
 _END = "***End_of_Header***"
@@ -36,11 +36,13 @@ def read_lvm(path: Path) -> dict[str, LogTable]:
     Raises ValueError, naming file and line, for headers without end, segments with different
     channels, channels with times of their own, and cells that are no numbers.
     """
-    lines = read_text(path).splitlines()
+    text = read_text(path)
+    lines = text.splitlines()
     if not lines[0].startswith(MAGIC):
         raise ValueError(f"{path}, line 1: a LabVIEW measurement file starts with {MAGIC!r}")
     file_header, first = _file_header(path, lines)
     segments = _segments(path, lines, first, _separator(lines), file_header)
+    check_last_line(path, text, segments[-1].rows, segments[-1].lines)
     comma = file_header.get("Decimal_Separator", ["."])[0] == ","
     parts = [_columns(path, segment, comma) for segment in segments]
     names, units = parts[0][:2]
@@ -52,7 +54,22 @@ def read_lvm(path: Path) -> dict[str, LogTable]:
             )
     values = _join_segments(path, segments, [part[2] for part in parts])
     numbered = np.concatenate([segment.lines for segment in segments])
-    return {"": LogTable(("time", *names), ("s", *units), values, numbered, time="time")}
+    broken = _breaks_off(segments[-1])
+    table = LogTable(
+        ("time", *names), ("s", *units), values, numbered, time="time", warnings=broken
+    )
+    return {"": table}
+
+
+def _breaks_off(segment: _Segment) -> tuple[str, ...]:
+    """Warning about a segment with fewer rows than its header says."""
+    counts = [int(cell) for cell in segment.header.get("Samples", []) if cell.isdigit()]
+    if not counts or len(segment.rows) >= max(counts):
+        return ()
+    return (
+        f"the recording breaks off after line {segment.lines[-1]}: the last segment has"
+        f" {len(segment.rows)} of {max(counts)} samples",
+    )
 
 
 def _separator(lines) -> str:

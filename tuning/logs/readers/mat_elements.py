@@ -12,6 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbeam.runtime.input_file import max_bytes
+
 HEADER = 128  # bytes
 MATRIX, COMPRESSED = 14, 15  # types of elements
 # Bytes of one number, by the type of the element.
@@ -38,9 +40,20 @@ def check_elements(content: bytes) -> None:
     order = "<" if content[126:128] == b"IM" else ">"
     for element in _elements(content[HEADER:], order):
         if element.kind == COMPRESSED:
-            (element,) = _elements(zlib.decompress(element.data), order)
+            (element,) = _elements(_unpacked(element.data), order)
         if element.kind == MATRIX:
             _check_array(element.data, order)
+
+
+def _unpacked(data: bytes) -> bytes:
+    """Data without its compression, as far as they fit into memory."""
+    limit, unpacking = max_bytes("log"), zlib.decompressobj()
+    content = unpacking.decompress(data, limit)
+    if unpacking.unconsumed_tail:
+        raise ValueError(f"an element unpacks to more than {limit / 2**30:.3g} GB")
+    if not unpacking.eof:
+        raise ValueError("a compressed element is cut off")
+    return content
 
 
 def _elements(data: bytes, order: str) -> list[Element]:
@@ -55,6 +68,8 @@ def _elements(data: bytes, order: str) -> list[Element]:
         found.append(Element(kind, data[start : start + size]))
         # Elements begin at multiples of eight bytes, except after those that are compressed.
         offset = start + size + (0 if kind == COMPRESSED else -(start + size) % 8)
+    if 0 < len(data) - offset < 8 and any(data[offset:]):
+        raise ValueError(f"{len(data) - offset} bytes at the end are no element")
     return found
 
 

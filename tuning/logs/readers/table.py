@@ -11,10 +11,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbeam.runtime.input_file import check_input, describe_content, read_input
+from tuning.logs.clocks import Clock, join_channels
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 MAX_SHOWN = 40  # characters of a cell in a message
-TIME_NAMES = ("time", "t", "zeit", "temps", "x_value")
+MIN_CHANNEL_SHARE = 0.1  # of the samples: shorter arrays are no channels, and may be left out
+CHECKED_ROWS = 200  # at the end of a file, with which its last one is compared
+TIME_NAMES = ("time", "t", "zeit", "temps", "x_value", "timestamp")
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +26,9 @@ class LogTable:
 
     `units` are those of the columns as named in the file, or None; `lines` the line numbers of the
     rows, None for a file without lines; `time` the name of the column of times, where the format
-    defines it; `notes` sentences on how it was read. `has_headings` is False for columns without
-    names in the file, which are called column 1, column 2, ...
+    defines it; `notes` sentences on how it was read, `warnings` those that the user must know: what
+    is left out, moved or cut off. `has_headings` is False for columns without names in the file,
+    which are called column 1, column 2, ... `start` is the date and time of the first sample.
     """
 
     names: tuple[str, ...]
@@ -34,6 +38,8 @@ class LogTable:
     time: str | None = None
     notes: tuple[str, ...] = ()
     has_headings: bool = True
+    warnings: tuple[str, ...] = ()
+    start: str = ""
 
 
 class LogFormat(NamedTuple):
@@ -61,25 +67,36 @@ def table_of(
     source: str,
     arrays: Mapping[str, Any],
     units: Mapping[str, str | None],
-    times_function: Callable[[int], np.ndarray] | None = None,
-    notes: Sequence[str] = (),
+    clocks: Mapping[str, Clock] | None = None,
+    warnings: Sequence[str] = (),
 ) -> LogTable:
     """Table of the arrays of one run, by name; a name may be a heading with a unit.
 
-    An array of several columns becomes `name.0`, `name.1`, ... Arrays that are not as long as the
-    times (or else as most of the arrays) are left out, with a note. `times_function` returns the
-    times (s) of so many samples, for a run without a column of times.
+    An array of several columns becomes `name.0`, `name.1`, ... Arrays with `clocks` are joined by
+    them, where no column has times. Other arrays that are not as long as the times (or else as most
+    of the arrays) are left out, with a warning if they may be channels.
 
     Raises ValueError if there are no numbers.
     """
     arrays = {name: np.asarray(array, float) for name, array in arrays.items()}
-    length = _length(arrays)
+    has_times = any(is_time_name(parse_heading(label)[0]) for label in arrays)
+    times, said = None, list(warnings)
+    if clocks and not has_times:
+        timed = {label: _upright(arrays[label]) for label in arrays if label in clocks}
+        timed = {label: array for label, array in timed.items() if len(array) > 1}
+        if timed:
+            own = {label: clocks[label] for label in timed}
+            times, joined, moved = join_channels(source, timed, own)
+            arrays, said = arrays | joined, [*said, *moved]
+    length = _length(arrays) if times is None else times.size
     if length < 2:
         raise ValueError(f"{source}: there is no list of numbers in it")
-    names, found, columns, left_out = [], [], [], []
+    names, found, columns, left_out, lost = [], [], [], [], False
     for label, array in arrays.items():
         if length not in array.shape or array.ndim > 2:
-            left_out.append(label)
+            left_out.append(f"{label} ({' x '.join(map(str, array.shape))})")
+            lost |= max(array.shape, default=0) > MIN_CHANNEL_SHARE * length
+            lost |= label in (clocks or ()) and not has_times
             continue
         name, unit = parse_heading(label)
         flat = array.reshape(length, -1) if array.shape[0] == length else array.T
@@ -87,14 +104,22 @@ def table_of(
         names += [name] if single else [f"{name}.{i}" for i in range(flat.shape[1])]
         found += [units.get(label) or unit] * flat.shape[1]
         columns.append(flat)
-    if left_out:
-        notes = [*notes, f"left out, not being {length} samples long: {', '.join(left_out)}"]
+    others = [f"left out, not being {length} samples long: {', '.join(left_out)}"][: len(left_out)]
+    said += others if lost else []
     values, time = np.hstack(columns), None
-    if times_function is not None and not any(is_time_name(name) for name in names):
+    if times is not None:
         time = "time"
         names, found = [time, *names], ["s", *found]
-        values = np.column_stack([times_function(length), values])
-    return LogTable(tuple(names), tuple(found), values, time=time, notes=tuple(notes))
+        values = np.column_stack([times, values])
+    notes = () if lost else tuple(others)
+    return LogTable(
+        tuple(names), tuple(found), values, time=time, notes=notes, warnings=tuple(said)
+    )
+
+
+def _upright(array: np.ndarray) -> np.ndarray:
+    """An array with time along its first axis: channels that stand in rows are few."""
+    return array.T if array.ndim == 2 and array.shape[0] < array.shape[1] else array
 
 
 def is_time_name(name: str) -> bool:
@@ -180,9 +205,7 @@ def parse_numbers(
     """
     if not rows:
         raise ValueError(f"{path}: the log is empty: there are column names but no rows")
-    for row, line in zip(rows, lines, strict=True):
-        if len(row) != len(names):
-            raise ValueError(f"{path}, line {line}: {len(row)} cells for {len(names)} columns")
+    check_widths(path, names, rows, lines)
     rows = [[cell if cell.strip() else "nan" for cell in row] for row in rows]
     if decimal_comma:
         rows = [[cell.replace(",", ".") for cell in row] for row in rows]
@@ -190,6 +213,38 @@ def parse_numbers(
         return np.array(rows, dtype=float)
     except ValueError:
         raise _bad_cell(path, names, rows, lines) from None
+
+
+def check_widths(
+    path: Path, names: Sequence[str], rows: Sequence[Sequence[str]], lines: Sequence[int]
+) -> None:
+    """Check that each row has a cell for each column. Raises ValueError, naming the line."""
+    for row, line in zip(rows, lines, strict=True):
+        if len(row) != len(names):
+            raise ValueError(f"{path}, line {line}: {len(row)} cells for {len(names)} columns")
+
+
+def check_last_line(
+    path: Path, text: str, rows: Sequence[Sequence[str]], lines: Sequence[int]
+) -> None:
+    """Check that a file of text does not break off within its last row.
+
+    It does if no end of line follows and the row has fewer cells than the others, or its last cell
+    fewer decimals, which are as many in all others. Raises ValueError, naming the line.
+    """
+    if text.endswith(("\n", "\r")) or len(rows) < 3:
+        return
+    *others, last = [[cell.strip() for cell in row] for row in rows[-CHECKED_ROWS:]]
+    decimals = {len(re.split("[.,]", row[-1])[-1]) if row else 0 for row in others}
+    pointed = all(row and re.search("[.,]", row[-1]) for row in others)
+    cells = min(map(len, others))
+    is_short = pointed and len(decimals) == 1 and bool(last) and (
+        len(re.split("[.,]", last[-1])[-1]) < min(decimals) if re.search("[.,]", last[-1]) else True
+    )  # fmt: skip
+    if len(last) < cells or is_short:
+        raise ValueError(
+            f"{path}, line {lines[-1]}: the file breaks off in its last line; delete that line"
+        )
 
 
 def _bad_cell(path, names, rows, lines) -> ValueError:

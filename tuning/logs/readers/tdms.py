@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tuning.logs.clocks import Clock, clocks_of
 from tuning.logs.readers.table import (
     LogFormat,
     LogTable,
@@ -23,20 +24,22 @@ MAGIC = b"TDSm"
 def read_tdms(path: Path) -> dict[str, LogTable]:
     """Tables of a TDMS file: one run for each group with numbers, by the name of the group.
 
-    Times are a channel called time, or follow from the waveform properties `wf_increment` and
-    `wf_start_offset` of the channels; units are the property `unit_string`.
+    Times are a channel called time, or follow from the waveform properties `wf_increment`,
+    `wf_start_time` and `wf_start_offset` of the channels, which are aligned by them, with a
+    warning; units are the property `unit_string`.
 
-    Raises ValueError for a damaged file and for channels of a group that differ in their times,
+    Raises ValueError for a damaged file and for channels of a group without a time in common,
     ImportError without npTDMS.
     """
     nptdms = import_extra("nptdms", "tdms")
     try:
         with _silenced(nptdms):
-            file = nptdms.TdmsFile.read(path)
+            with open(path, "rb") as opened:  # by name, an old .tdms_index beside it would be read
+                file = nptdms.TdmsFile.read(opened)
             groups = {group.name: _channels(group) for group in file.groups()}
     except Exception as error:  # npTDMS raises many types for damaged files
         raise damaged_file_error(path, error) from None
-    notes = ["the recording breaks off within a segment"] if _is_truncated(file) else []
+    broken = ["the recording breaks off within a segment"] if _is_truncated(file) else []
     runs = {}
     for name, channels in groups.items():
         numeric = {label: channel[:] for label, channel in channels.items()}
@@ -44,8 +47,8 @@ def read_tdms(path: Path) -> dict[str, LogTable]:
         if numeric:
             source = f"{path}, group {name!r}"
             units = {a: text_attribute(channels[a].properties.get("unit_string")) for a in numeric}
-            clock = _times_function(source, {a: channels[a] for a in numeric})
-            runs[name] = table_of(source, numeric, units, clock, notes)
+            clocks = _clocks({a: channels[a] for a in numeric})
+            runs[name] = table_of(source, numeric, units, clocks, broken)
     return runs
 
 
@@ -71,22 +74,23 @@ def _is_truncated(file) -> bool:
     return bool(file.file_status.incomplete_final_segment)
 
 
-def _times_function(source, channels):
-    """Function from a number of samples to times (s), from waveform properties, or None."""
-    grids = {
-        (p["wf_increment"], p.get("wf_start_offset", 0.0))
-        for name, channel in channels.items()
-        if not is_time_name(name) and "wf_increment" in (p := channel.properties)
-    }
-    if len(grids) > 1:
-        raise ValueError(
-            f"{source}: the channels have different times; resample them to common times, or save "
-            "them to separate groups"
-        )
-    if not grids:
+def _clocks(channels) -> dict[str, Clock] | None:
+    """Clocks of channels by their waveform properties; None if no channel has them."""
+    starts, steps, dates = {}, {}, {}
+    for name, channel in channels.items():
+        properties = channel.properties
+        starts[name] = float(properties.get("wf_start_offset", 0.0))
+        if "wf_increment" in properties and not is_time_name(name):
+            steps[name] = float(properties["wf_increment"])
+            if isinstance(properties.get("wf_start_time"), np.datetime64):
+                dates[name] = properties["wf_start_time"]
+    if not steps:
         return None
-    ((step, start),) = grids
-    return lambda count: start + step * np.arange(count)
+    if len(dates) == len(steps):  # of some only, it tells nothing of the others
+        first = min(dates.values())
+        for name, date in dates.items():
+            starts[name] += (date - first) / np.timedelta64(1, "s")
+    return clocks_of([name for name in channels if not is_time_name(name)], starts, steps)
 
 
 FORMAT = LogFormat("LabVIEW (TDMS)", read_tdms, suffixes=(".tdms",), magics=(MAGIC,))

@@ -69,6 +69,12 @@ def _text(cell, origin) -> str:
         return ""
     if _is_date(cell):
         return repr((cell - origin).total_seconds())
+    if isinstance(cell, datetime.timedelta):
+        return repr(cell.total_seconds())
+    if isinstance(cell, datetime.time):
+        return repr(3600 * cell.hour + 60 * cell.minute + cell.second + 1e-6 * cell.microsecond)
+    if isinstance(cell, datetime.date):
+        return cell.isoformat()
     return cell.replace("_x000D_", "\r") if isinstance(cell, str) else repr(float(cell))
 
 

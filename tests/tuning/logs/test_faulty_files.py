@@ -1,0 +1,417 @@
+"""Files that are cut off, and times that are wrong: aligned and told, or refused in one sentence.
+
+The right values are those of the functions of which the files are samples.
+"""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+import scipy.io
+
+from tuning import read_log, read_logs
+from tuning.logs.log import Log, LogWarning
+from tuning.logs.readers.stamps import seconds_of
+
+STEP = 0.005
+TIMES = STEP * np.arange(400)
+
+
+def signal(times):
+    return np.sin(20 * times)
+
+
+def read_warned(path, message, **options):
+    """Log that is read with warnings, one of which is as said; all are in its notes."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        log = read_log(path, **options)
+    assert all(one.category is LogWarning for one in caught)
+    said = [str(one.message).removeprefix(f"{log.source}: ") for one in caught]
+    assert set(said) <= set(log.notes)
+    assert any(re.search(message, one) for one in said), said
+    return log
+
+
+def tdms(path, channels):
+    """Channels of values and properties."""
+    nptdms = pytest.importorskip("nptdms")
+    objects = [
+        nptdms.ChannelObject("log", name, values, {"unit_string": "mm"} | properties)
+        for name, (values, properties) in channels.items()
+    ]
+    with nptdms.TdmsWriter(path) as writer:
+        writer.write_segment(objects)
+
+
+def clock(start="2024-03-31T00:59:50", offset=0.0, step=STEP):
+    """Waveform properties: the start is a second and more before clocks are put forward."""
+    date = np.datetime64(start, "us") + np.timedelta64(round(1e6 * offset), "us")
+    return {"wf_start_time": date, "wf_increment": step}
+
+
+@pytest.mark.parametrize("key", ["wf_start_time", "wf_start_offset"])
+@pytest.mark.parametrize(("offset", "atol"), [(0.5, 1e-9), (0.5025, 2.5e-5)])
+def test_channels_that_start_at_different_times_are_aligned(tmp_path, key, offset, atol):
+    """One function of time, of which the second channel has later samples, also half a step.
+
+    Dates of the file are whole microseconds, in which the function changes by 2e-5.
+    """
+    later = clock(offset=offset) if key == "wf_start_time" else clock() | {key: offset}
+    path = tmp_path / "run.tdms"
+    tdms(path, {"a": (signal(TIMES), clock()), "b": (signal(TIMES + offset), later)})
+    log = read_warned(path, r"different times \(a 0 to 1.995 s, b 0.5.* to .* aligned")
+    assert log.times[0] == pytest.approx(np.ceil(offset / STEP) * STEP)
+    assert log.times[-1] == pytest.approx(1.995)
+    np.testing.assert_allclose(1e3 * log.values[:, 0], signal(log.times), atol=1e-12)
+    np.testing.assert_allclose(1e3 * log.values[:, 1], signal(log.times), atol=atol)
+
+
+def test_channels_of_different_rates_are_interpolated_to_the_highest(tmp_path):
+    path, slow = tmp_path / "run.tdms", 4 * STEP
+    tdms(
+        path,
+        {"a": (signal(slow * np.arange(100)), clock(step=slow)), "b": (signal(TIMES), clock())},
+    )
+    log = read_warned(path, r"interpolated to 200 Hz, from .* a \(50 Hz, 0 s\)")
+    assert log.names == ("a", "b") and log.sample_rate == pytest.approx(200.0)
+    # The error of a cubic spline is 5/384 h^4 w^4 = 3.3e-4, more near its ends.
+    error = np.abs(1e3 * log.values[:, 0] - signal(log.times))
+    assert error[20:-20].max() < 3.4e-4 and error.max() < 2e-3
+    np.testing.assert_allclose(1e3 * log.values[:, 1], signal(log.times), atol=1e-12)
+
+
+def test_channels_without_a_time_in_common_are_refused(tmp_path):
+    tdms(tmp_path / "run.tdms", {"a": (TIMES, clock()), "b": (TIMES, clock(offset=100.0))})
+    with pytest.raises(ValueError, match=r"group 'log': its channels have no time in common: a 0"):
+        read_log(tmp_path / "run.tdms")
+
+
+def test_a_shorter_channel_is_read_as_far_as_it_goes(tmp_path):
+    tdms(tmp_path / "run.tdms", {"a": (signal(TIMES), clock()), "b": (TIMES[:300], clock())})
+    log = read_warned(tmp_path / "run.tdms", "from 0 to 1.495 s, which they have in common")
+    assert log.values.shape == (300, 2)
+
+
+def test_an_index_beside_a_file_is_not_believed(tmp_path):
+    """LabVIEW writes one; that of an earlier file would give other channels."""
+    tdms(tmp_path / "run.tdms", {"a": (signal(TIMES), clock())})
+    (tmp_path / "run.tdms_index").write_bytes(b"TDSh and nothing else")
+    np.testing.assert_allclose(1e3 * read_log(tmp_path / "run.tdms").values[:, 0], signal(TIMES))
+
+
+def binary_set(number, start):
+    """A response of type 58b in a universal file, as the format says."""
+    data = (number * signal(TIMES + start)).astype("<f8").tobytes()
+    lines = [
+        "    -1",
+        f"{58:6d}b{1:6d}{2:6d}{11:12d}{len(data):12d}{0:6d}{0:6d}{0:12d}{0:12d}",
+        *["NONE"] * 5,
+        f"{1:5d}{0:10d}{0:5d}{0:10d} {'NONE':10}{number:10d}{3:4d} {'NONE':10}{0:10d}{0:4d}",
+        f"{4:10d}{TIMES.size:10d}{1:10d}{start:13.5e}{STEP:13.5e}{0.0:13.5e}",
+        f"{17:10d}{0:5d}{0:5d}{0:5d} {'NONE':20} {'s':20}",
+        f"{8:10d}{0:5d}{0:5d}{0:5d} {'NONE':20} {'mm':20}",
+        *[f"{0:10d}{0:5d}{0:5d}{0:5d} {'NONE':20} {'NONE':20}"] * 2,
+    ]
+    return "\n".join([*lines, ""]).encode() + data + b"\n    -1\n"
+
+
+def universal_file(path, count=3, starts=(0.0, 0.0, 0.0), binary=True):
+    """Responses 1z, 2z, ..., the i-th i times as large."""
+    pyuff = pytest.importorskip("pyuff")
+    if binary:  # pyuff 2.5 leaves a binary file open
+        path.write_bytes(b"".join(binary_set(i + 1, starts[i]) for i in range(count)))
+        return
+    for i in range(count):
+        times = TIMES + starts[i]
+        function = pyuff.prepare_58(
+            return_full_dict=True, binary=0, id1="a", id2="", id3="", id4="", id5="",
+            func_type=1, ver_num=1, load_case_id=0, rsp_ent_name="", rsp_node=i + 1, rsp_dir=3,
+            ref_ent_name="", ref_node=0, ref_dir=0, ord_data_type=4, num_pts=times.size,
+            abscissa_spacing=1, abscissa_min=starts[i], abscissa_inc=STEP, z_axis_value=0.0,
+            ordinate_spec_data_type=8, ordinate_axis_units_lab="mm", x=times,
+            data=(i + 1) * signal(times), orddenom_spec_data_type=0,
+        )  # fmt: skip
+        function = {key: value for key, value in function.items() if value is not None}
+        pyuff.UFF(str(path)).write_sets(function, mode="add" if i else "overwrite")
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_a_universal_file_that_is_cut_off_names_the_channel(tmp_path, binary):
+    path = tmp_path / "run.uff"
+    universal_file(path, binary=binary)
+    data = path.read_bytes()
+    third = data.rfind(b"    -1\n    58")
+    line = data.count(b"\n", 0, third) + 1
+    for place in (third + 900, third + 2000):
+        path.write_bytes(data[:place])
+        said = f"breaks off within data set 3, line {line}, of the channel 3z, which is left out"
+        log = read_warned(path, said)
+        assert log.names == ("1z", "2z")
+    path.write_bytes(data[: third + 100])
+    assert read_warned(path, "breaks off within data set 3").names == ("1z", "2z")
+    path.write_bytes(data[: data.find(b"    -1\n    58", 100) - 200])
+    with pytest.raises(ValueError, match="no functions of type 58, a response over time; the file"):
+        read_log(path)
+
+
+def test_responses_of_a_universal_file_are_aligned(tmp_path):
+    universal_file(tmp_path / "run.uff", count=2, starts=(0.0, 0.5))
+    log = read_warned(tmp_path / "run.uff", "aligned by them")
+    assert log.names == ("1z", "2z") and log.times[0] == pytest.approx(0.5, abs=1e-6)
+    np.testing.assert_allclose(1e3 * log.values, signal(log.times)[:, None] * [1, 2], atol=1e-5)
+
+
+def csv(path, times, name="time [s]", form="{:.6f},{:.6f}\n"):
+    path.write_text(f"{name},w [mm]\n" + "".join(form.format(t, signal(t)) for t in times))
+    return path
+
+
+def test_a_jump_of_times_is_told_with_its_line(tmp_path):
+    path = csv(tmp_path / "run.csv", np.where(TIMES < 1, TIMES, TIMES + 5))
+    said = r"jump by 5.005 s after t = 0.995 s, line 202, with steps of 0.005 s .* 1000 samples"
+    assert read_warned(path, said).times.size == 400
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "said"),
+    [
+        ("time [s]", 1e3, "5 s apart, 0.2 samples a second: are they in ms, not in s?"),
+        ("time [s]", 1e6, "5000 s apart, 0.0002 samples a second: are they in us, not in s?"),
+        ("time [ms]", 1.0, "5e-06 s apart, 2e.05 samples a second: are they in s, not in ms?"),
+        ("time [min]", 1.0, "0.3 s apart, 3.333 samples a second: are they in s, not in min?"),
+    ],
+)
+def test_times_in_another_unit_than_the_file_says(tmp_path, name, scale, said):
+    read_warned(csv(tmp_path / "run.csv", scale * TIMES, name), said.replace("?", r"\?"))
+
+
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        (np.where(TIMES < 1, TIMES, TIMES - 0.5), "line 202: time 0.5 s comes after 0.995 s"),
+        (np.where(TIMES[7] == TIMES, TIMES[6], TIMES), "line 9: time 0.03 s is repeated"),
+    ],
+)
+def test_times_that_go_back_or_stand_are_refused(tmp_path, times, said):
+    with pytest.raises(ValueError, match=rf"run.csv, {said}"):
+        read_log(csv(tmp_path / "run.csv", times))
+
+
+def test_rates_in_kilohertz_are_told(tmp_path):
+    np.savetxt(tmp_path / "run.csv", signal(TIMES), header="w [mm]", comments="")
+    read_warned(tmp_path / "run.csv", "5 s apart, 0.2 samples a second: are they in ms", rate=0.2)
+
+
+def test_a_text_file_that_is_cut_off_is_refused(tmp_path):
+    path = csv(tmp_path / "run.csv", TIMES)
+    text = path.read_text()
+    for cut in (-1, -4, -8, -12):  # the end of the line alone, decimals, the number, the column
+        path.write_text(text[:cut])
+        if cut == -1:
+            assert read_log(path).times.size == TIMES.size
+            continue
+        with pytest.raises(ValueError, match=r"line 401: the file breaks off in its last line"):
+            read_log(path)
+    # Numbers of any length may end anywhere.
+    path.write_text("time [s],w [mm]\n" + "\n".join(f"{t},{signal(t)}" for t in TIMES))
+    assert read_log(path).times.size == TIMES.size
+
+
+def test_a_labview_file_with_fewer_samples_than_it_says(tmp_path):
+    head = "LabVIEW Measurement\nSeparator\tTab\nX_Columns\tOne\n***End_of_Header***\n\n"
+    head += "Channels\t1\nSamples\t400\nY_Unit_Label\tmm\nX0\t0\nDelta_X\t0.005\n"
+    head += "***End_of_Header***\nX_Value\tw\tComment\n"
+    rows = [f"{t:.6f}\t{signal(t):.6f}\n" for t in TIMES]
+    path = tmp_path / "run.lvm"
+    path.write_text(head + "".join(rows))
+    assert read_log(path).times.size == 400
+    path.write_text(head + "".join(rows[:250]))
+    read_warned(path, "breaks off after line 262: the last segment has 250 of 400 samples")
+
+
+def test_bytes_in_the_wrong_order_are_refused(tmp_path):
+    """Doubles that are read in the wrong order are of any size."""
+    swapped = signal(TIMES[1:]).astype(">f8").view("<f8")
+    scipy.io.savemat(tmp_path / "run.mat", {"t": TIMES[1:], "w": np.nan_to_num(swapped)})
+    with pytest.raises(ValueError, match=r"run.mat, sample \d+, column 'w': .* is no measurement"):
+        read_log(tmp_path / "run.mat", units="mm")
+    # A universal file says its order.
+    universal_file(tmp_path / "run.uff", count=1)
+    data = (tmp_path / "run.uff").read_bytes()
+    assert b"58b     1" in data
+    (tmp_path / "run.uff").write_bytes(data.replace(b"58b     1", b"58b     2"))
+    with pytest.raises(ValueError, match="is no measurement"):
+        read_log(tmp_path / "run.uff")
+
+
+def test_a_copied_channel_is_told(tmp_path):
+    tdms(tmp_path / "run.tdms", {n: (signal(TIMES), clock()) for n in "ab"})
+    read_warned(tmp_path / "run.tdms", "b equals a in every sample: is one of them a copy")
+
+
+def test_variables_of_another_dimension_are_no_channels(tmp_path):
+    """Two axes of as many times: of a netCDF file only one is that of a run."""
+    with scipy.io.netcdf_file(tmp_path / "run.nc", "w") as file:
+        for axis, shift in (("time", 0.0), ("time2", 7.0)):
+            file.createDimension(axis, TIMES.size)
+            variable = file.createVariable(axis, "d", (axis,))
+            variable[:], variable.units = TIMES + shift, "s"
+            channel = file.createVariable(f"w_{axis}", "h", (axis,))
+            channel[:], channel.units = np.round(1e4 * signal(TIMES)), "mm"
+            channel.scale_factor = 1e-4
+    log = read_log(tmp_path / "run.nc")
+    assert log.names == ("w_time",)
+    np.testing.assert_allclose(1e3 * log.values[:, 0], signal(TIMES), atol=6e-5)
+
+
+def test_times_since_a_date_are_from_the_first(tmp_path):
+    with scipy.io.netcdf_file(tmp_path / "run.nc", "w") as file:
+        file.createDimension("time", TIMES.size)
+        for name, values, unit in (
+            ("time", 1e9 + 1e3 * TIMES, "milliseconds since 2020-01-01"),
+            ("w", signal(TIMES), "mm"),
+        ):
+            variable = file.createVariable(name, "d", ("time",))
+            variable[:], variable.units = values, unit
+    np.testing.assert_allclose(read_log(tmp_path / "run.nc").times, TIMES, atol=1e-7)
+
+
+def test_datasets_have_rates_and_starts_of_their_own(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        file["a [mm]"], file["b [mm]"] = signal(TIMES), signal(0.1 + 2 * TIMES)
+        file["a [mm]"].attrs["fs"], file["b [mm]"].attrs["dt"] = 200.0, 0.01
+        file["b [mm]"].attrs["t0"] = 0.1
+    log = read_warned(tmp_path / "run.h5", r"interpolated to 200 Hz, .* b \[mm\] \(100 Hz, 0.1 s\)")
+    np.testing.assert_allclose(1e3 * log.values, signal(log.times)[:, None] * [1, 1], atol=1e-4)
+
+
+@pytest.mark.parametrize("ending", ["mat", "h5"])
+def test_channels_in_rows_with_a_rate(tmp_path, ending):
+    values, path = np.stack([signal(TIMES), signal(2 * TIMES)]), tmp_path / f"run.{ending}"
+    if ending == "mat":
+        scipy.io.savemat(path, {"acc": values, "Fs": 200})
+    else:
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "w") as file:
+            file["acc"], file["fs"] = values, 200
+    log = read_log(path, units="g")
+    assert log.names == ("acc.0", "acc.1") and log.sample_rate == pytest.approx(200.0)
+    np.testing.assert_allclose(log.values.T, 9.80665 * values, atol=1e-12)
+
+
+def test_rates_that_contradict_each_other(tmp_path):
+    scipy.io.savemat(tmp_path / "run.mat", {"acc": signal(TIMES), "fs": 200.0, "dt": 0.01})
+    with pytest.raises(ValueError, match="run.mat: the sampling rates and steps of acc contradict"):
+        read_log(tmp_path / "run.mat", units="g")
+    scipy.io.savemat(tmp_path / "run.mat", {"acc": signal(TIMES), "fs": 0.0})
+    with pytest.raises(ValueError, match="rate or step of acc is not positive"):
+        read_log(tmp_path / "run.mat", units="g")
+
+
+def test_a_matlab_file_that_is_cut_off(tmp_path):
+    path = tmp_path / "run.mat"
+    for compressed in (False, True):
+        scipy.io.savemat(path, {"t": TIMES, "w": signal(TIMES)}, do_compression=compressed)
+        data = path.read_bytes()
+        for end in (-3, -50, len(data) // 2):
+            path.write_bytes(data[:end])
+            with pytest.raises(ValueError, match=r"run.mat: the file is damaged or cut off"):
+                read_log(path, units="mm")
+
+
+STAMPS = {
+    "iso": "2024-05-14T23:59:59.{0:03d}000+02:00",
+    "iso without zone": "2024-05-14 23:59:59.{0:03d}",
+    "utc": "2024-05-14T23:59:59.{0:03d}Z",
+    "german": "14.05.2024 23:59:59.{0:03d}",
+    "british": "14/05/2024 23:59:59.{0:03d}",
+    "american": "5/14/2024 11:59:59.{0:03d} PM",
+    "time of day": "23:59:59.{0:03d}",
+}
+
+
+@pytest.mark.parametrize("form", STAMPS)
+@pytest.mark.parametrize("separator", [",", ";"])
+def test_dates_and_times_are_seconds_from_the_first_sample(tmp_path, form, separator):
+    path = tmp_path / "run.csv"
+    rows = [f"{STAMPS[form].format(5 * i)}{separator}{signal(TIMES[i]):.6f}" for i in range(200)]
+    if separator == ";" and form == "german":
+        rows = [
+            f"{row.partition(';')[0]};{row.partition(';')[2].replace('.', ',')}" for row in rows
+        ]
+    path.write_text(f"Zeitstempel{separator}w [mm]\n" + "\n".join(rows) + "\n")
+    log = read_log(path)
+    np.testing.assert_allclose(log.times, TIMES[:200], atol=1e-9)
+    np.testing.assert_allclose(1e3 * log.values[:, 0], signal(log.times), atol=1e-6)
+    assert log.start.startswith(("2024-05-14T23:59:59", "23:59:59.000"))
+
+
+def test_times_of_day_and_dates_go_over_midnight(tmp_path):
+    stamps = ["23:59:59.5", "23:59:59.75", "0:00:00.0", "0:00:00.25"]
+    seconds, _ = seconds_of(tmp_path, "t", stamps, [1, 2, 3, 4])
+    np.testing.assert_allclose(seconds, [0, 0.25, 0.5, 0.75])
+    stamps = ["31.12.2023 23:59:59", "01.01.2024 00:00:01"]
+    assert seconds_of(tmp_path, "t", stamps, [1, 2])[0] == [0.0, 2.0]
+    with pytest.raises(ValueError, match="line 2, column 't': '7' is no date and time"):
+        seconds_of(tmp_path, "t", ["0:00:01", "7"], [1, 2])
+    with pytest.raises(ValueError, match="whether the day or the month comes first"):
+        seconds_of(tmp_path, "t", ["1/2/2024 0:00", "2/2/2024 0:00"], [1, 2])
+    with pytest.raises(ValueError, match="line 1.*dates and times: "):
+        seconds_of(tmp_path, "t", ["31.02.2024 0:00"], [1])
+
+
+def test_a_file_of_a_campbell_logger(tmp_path):
+    rows = [f'"2024-05-14 09:30:{t:06.3f}",{i},{signal(t):.6f},"NAN"' for i, t in enumerate(TIMES)]
+    head = '"TOA5","S","CR6","1","OS","P","1","Dyn"\n"TIMESTAMP","RECORD","w","a"\n'
+    head += '"TS","RN","mm","m/s^2"\n"","","Smp","Smp"\n'
+    (tmp_path / "run.dat").write_text(head + "\n".join(rows) + "\n")
+    log = read_log(tmp_path / "run.dat", columns=["w"])
+    np.testing.assert_allclose(log.times, TIMES, atol=1e-9)
+    np.testing.assert_allclose(1e3 * log.values[:, 0], signal(TIMES), atol=1e-6)
+
+
+def test_dates_of_a_workbook(tmp_path):
+    import datetime
+
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    sheet = book.active
+    sheet.append(["Zeit", "w [mm]"])
+    for i in range(100):
+        moment = datetime.datetime(2024, 5, 14, 9, 30) + datetime.timedelta(seconds=0.01 * i)
+        sheet.append([moment.time(), signal(0.01 * i)])
+    book.save(tmp_path / "run.xlsx")
+    log = read_log(tmp_path / "run.xlsx", units={"Zeit": "s"})
+    np.testing.assert_allclose(log.times - log.times[0], 0.01 * np.arange(100), atol=1e-6)
+
+
+def test_every_cut_of_every_format_is_told_or_refused(tmp_path):
+    """No cut leaves wrong numbers without a word: what is read is right, and less of it is told."""
+    files = {"run.uff": universal_file, "run.csv": lambda p: csv(p, TIMES)}
+    files["run.tdms"] = lambda p: tdms(p, {n: (signal(TIMES), clock()) for n in "a"})
+    files["run.mat"] = lambda p: scipy.io.savemat(p, {"t": TIMES, "w": signal(TIMES)})
+    for name, write in files.items():
+        write(tmp_path / name)
+        data = (tmp_path / name).read_bytes()
+        for end in np.linspace(10, len(data) - 2, 23).astype(int):
+            cut = tmp_path / f"cut_{name}"
+            cut.write_bytes(data[:end])
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                try:
+                    logs = read_logs(cut, units="mm")
+                except ValueError as error:
+                    assert str(error).startswith(str(cut)) and "\n" not in str(error)
+                    continue
+            assert caught or name == "run.csv", (name, end)
+            for log in logs:
+                expected = signal(log.times)[:, None] * np.arange(1, log.values.shape[1] + 1)
+                np.testing.assert_allclose(1e3 * log.values, expected, atol=1e-5)
+
+
+def test_logs_made_in_python_are_not_warned_of():
+    log = Log(60 * TIMES, signal(TIMES)[:, None], ("w",), ("deflection",), ("m",))
+    assert log.start == ""
