@@ -99,6 +99,7 @@ TEXTS = {
 }
 
 
+@pytest.mark.filterwarnings("ignore::tuning.logs.log.LogWarning")
 @pytest.mark.parametrize("name", [*TEXTS, *readers.FORMATS])
 def test_damaged_log_is_read_or_refused(folder, name, capfd):
     path = folder / name
