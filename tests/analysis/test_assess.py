@@ -240,3 +240,39 @@ def test_refusals():
     )
     with pytest.raises(ValueError, match="active control cannot be certified"):
         jb.assess(controlled, 40.0)
+
+
+def test_peaks_after_the_last_axle_count():
+    """Two axles above the critical speed: the largest deflection is in free vibration.
+
+    One mode q'' + 2 z w q' + w^2 q = 2 F / (m L) sin(v t pi / L), in closed form; the sine goes on
+    after the exit, and one that begins there takes it back.
+    """
+    length, mass, ratio, speed = 25.0, 15e3, 0.01, 250.0
+    case = jb.Case(jb.Beam(length, 3e10, mass, damping_ratio=ratio, modes=1))
+    w, train = (np.pi / length) ** 2 * np.sqrt(3e10 / mass), trains()["HL93-tandem"]
+    drive, damped = np.pi * speed / length, w * np.sqrt(1 - ratio**2)
+    size = (w**2 - drive**2) ** 2 + (2 * ratio * w * drive) ** 2
+    sine, cosine = (w**2 - drive**2) / size, -2 * ratio * w * drive / size
+
+    def response(s):
+        s = np.maximum(s, 0.0)
+        other = -(sine * drive + ratio * w * cosine) / damped
+        free = -cosine * np.cos(damped * s) + other * np.sin(damped * s)
+        forced = sine * np.sin(drive * s) + cosine * np.cos(drive * s)
+        return forced + np.exp(-ratio * w * s) * free
+
+    last = (length + train.offsets[-1]) / speed
+    t = np.linspace(0.0, last + 0.6, 40001)
+    q = sum(
+        2 * force / (mass * length) * (response(t - d / speed) + response(t - (d + length) / speed))
+        for d, force in zip(
+            train.offsets, np.broadcast_to(train.forces, train.offsets.shape), strict=True
+        )
+    )
+    before, after = np.abs(q[t <= last]).max(), np.abs(q[t > last]).max()
+    assert after > 1.05 * before
+    found = train_response(
+        case, "HL93-tandem", (jb.Sensor(length / 2),), speed, speed * 1.001
+    )  # fmt: skip
+    assert_allclose(found.peaks[found.speeds == speed, 0], after, rtol=1e-3)

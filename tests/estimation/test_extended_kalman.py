@@ -144,3 +144,18 @@ def test_errors(settings, loads, message):
     case = dataclasses.replace(crossing(*loads), controller=law)
     with pytest.raises(ValueError, match=message):
         check_case(case)
+
+
+@pytest.mark.parametrize("start", [0.02, 0.05, 0.3])
+def test_initial_covariance_of_a_load_on_its_way(start):
+    """Of x = x_0 + v (t - t_0): variance s_x^2 + (t - t_0)^2 s_v^2, covariance (t - t_0) s_v^2."""
+    case = crossing(jb.MovingMass(mass=0.4, speed=2.0, entry_time=0.02))
+    law = dataclasses.replace(FOLLOWS, position_deviation=np.array(0.01))
+    found = law._covariance(jb.state_space(case), np.asarray(start))
+    since = start - 0.02
+    expected = [
+        [0.01**2 + since**2 * 0.3**2, since * 0.3**2, 0.0],
+        [since * 0.3**2, 0.3**2, 0.0],
+        [0.0, 0.0, 0.15**2],
+    ]
+    assert_allclose(found, expected, rtol=1e-12, atol=1e-18)

@@ -13,6 +13,8 @@ import jaxbeam as jb
 from jaxbeam.case.case import replace
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.sensing.corrected_rows import static_correction
+from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.static_correction import (
     bending_moment,
     residual_actuator_gain,
@@ -232,3 +234,46 @@ def test_wheels_on_the_ground_do_not_bend_the_beam():
         run=jb.Run(0.4, 50.0),
     )
     assert_allclose(corrected_deflection(jb.simulate(case), np.array([0.0, 3.0])), 0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("quantity", ["moment", "shear", "curvature"])
+@pytest.mark.parametrize("part", ["support", "spring"])
+def test_dampers_in_corrected_rows_by_a_long_series(part, quantity):
+    """What a damper at a presses on the modes left out: -c w'(a) by the series of a pinned beam.
+
+    A moment row of the modes left out is row_i(x) phi_i(a) / k_i, summed over 200 000 modes; the
+    spring is so weak that the modes are those of the beam.
+    """
+    length, stiffness, mass, modes = 1.3, 2.0, 0.7, 3
+    at, x, damping = 0.52, 0.33, 0.8
+    sensor = jb.Sensor(x, quantity)
+    case = jb.Case(
+        jb.Beam(length, stiffness, mass, modes=modes),
+        supports=[jb.Support(at, stiffness=1e-9, damping=damping)] if part == "support" else [],
+        actuators=[jb.SpringDamper(at, damping=damping)] if part == "spring" else [],
+        sensors=[sensor],
+        loads=[jb.MovingForce(force=1.0, speed=1.0)],
+        run=jb.Run(1.0),
+    )
+    model = modal_model(case, mesh_layout(case), True)
+    outputs = sensor_rows(model, case, (sensor,))
+    found = static_correction(model, case, (sensor,), outputs).rows.rates[0]
+    order = np.arange(1, 200_001) * np.pi / length
+
+    def shape(i, place):
+        return np.sqrt(2 / (mass * length)) * np.sin(order[i] * place)
+
+    every, kept = np.arange(200_000), np.arange(modes)
+    bend = np.sqrt(2 / (mass * length)) * (
+        order**3 * np.cos(order * x) if quantity == "shear" else order**2 * np.sin(order * x)
+    )
+    factor = outputs.rows[0, 0] / bend[0]  # sign and E I of the quantity
+    k = stiffness / mass * order**4
+    left_out = every[modes:]
+    residual = np.sum((factor * bend * shape(every, at) / k)[left_out])
+    signs = np.sign(np.asarray(model.shapes(np.array(at), (0,))[0]) * shape(kept, at))
+    expected = -damping * residual * shape(kept, at) * signs
+    scale = np.abs(expected).max()
+    assert scale > 1e-3
+    # The third derivative converges with the square of the number of modes.
+    assert_allclose(found, expected * signs[0], rtol=0, atol=1e-4 * scale)

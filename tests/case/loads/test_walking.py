@@ -169,3 +169,29 @@ def test_a_given_force_below_zero_is_no_loss_of_contact():
     )
     mass = jb.MovingMass(mass=10.0, speed=3.0)
     assert load_set(case_of(load, mass)).prescribed.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("step_time", [0.0, 0.13, -0.4])
+@pytest.mark.parametrize("activity", ["walking", "jogging"])
+def test_force_histories_begin_with_a_step_at_its_time(activity, step_time):
+    """A later step delays the force: P(t) = P_0(t - step_time), not P_0(t + step_time)."""
+    pace, t = 2.3, np.linspace(0.0, 1.7, 18)
+    at_zero, later = (
+        jb.Pedestrian(pace=pace, speed=1.5, activity=activity, step_time=own)
+        for own in (0.0, step_time)
+    )
+    found = later.force_histories()[0].at(t)
+    assert_allclose(found, at_zero.force_histories()[0].at(t - step_time), atol=1e-9)
+    factors, phases = (
+        (walking_factors(np.array(pace)), np.zeros(4))
+        if activity == "walking"
+        else jogging_factors(np.array(pace), contact_time(np.array(pace)), 4)
+    )
+    expected = [
+        700.0 * sum(
+            factors[n] * np.sin(2 * np.pi * (n + 1) * pace * (s - step_time) + phases[n])
+            for n in range(4)
+        )
+        for s in t
+    ]  # fmt: skip
+    assert_allclose(found, expected, atol=1e-9)

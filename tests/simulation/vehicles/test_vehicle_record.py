@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.simulation.labels import contact_sentence, wheel_labels
@@ -89,3 +89,46 @@ def test_wheels_that_would_have_to_pull_are_named():
     many = contact_sentence(CASE, 2.0 - 0.1 * np.arange(16), np.ones(16), np.ones(16))
     assert many.count("loses contact, first at") == 4
     assert many.startswith("load 1 wheel 5 ") and many.endswith("; 12 more wheels lose contact")
+
+
+@pytest.mark.parametrize("speed", [2.0, -2.0])
+def test_a_body_on_a_slope_is_inclined_as_it_is(speed):
+    """Readings forward and behind on a slope of 1 %, begun in equilibrium on it at t = 0.
+
+    Half a second later it climbs, or descends, steadily: heights are those of the road under each
+    sensor but for the start, which lasts. The wheels are 2 m before the end at t = 0.
+    """
+    x = np.linspace(-60.0, 80.0, 15)
+    car = jb.HalfCar(
+        speed=speed,
+        body_mass=1000.0,
+        body_inertia=1500.0,
+        axle_positions=[1.5, -1.2],
+        axle_masses=[50.0, 60.0],
+        suspension_stiffness=[4e4, 5e4],
+        suspension_damping=[4e3, 4e3],
+        tyre_stiffness=[2e5, 2e5],
+        tyre_damping=[100.0, 100.0],
+        entry_time=1.0,
+        deceleration=0.05,
+    )
+    places = 2.0, 0.0, -3.0
+    case = jb.Case(
+        jb.Beam(20.0, 1e16, 1e6, damping_ratio=0.5, modes=1),
+        loads=[car],
+        profile=jb.TableProfile(positions=x, point_heights=0.01 * x + 0.3),
+        vehicle_sensors=[jb.VehicleSensor(quantity="displacement", position=p) for p in places],
+        run=jb.Run(3.0, sample_rate=10.0),
+    )
+    record = jb.simulate(case)
+    # Steady speed before the entry at 1 s, at which braking begins: 2 t - 0.05 (t - 1)^2 / 2.
+    t = np.asarray(record.times)
+    way = 2.0 * (t - 1.0) - 0.025 * np.maximum(t - 1.0, 0.0) ** 2
+    forward = np.sign(speed)
+    wheel = way if speed > 0 else 20.0 - way
+    road = [0.01 * (wheel + forward * (p - 1.5)) + 0.3 for p in places]
+    readings = np.asarray(record.vehicle_readings)
+    assert_allclose(readings[0], [own[0] for own in road], atol=1e-4)  # in equilibrium, at rest
+    assert_allclose(record.body_velocity[0], 0.0, atol=1e-12)
+    assert_allclose(readings[-1], [own[-1] for own in road], atol=1e-4)
+    assert_allclose(readings[:, 0] - readings[:, 2], forward * 0.05, atol=1e-3)
