@@ -115,7 +115,8 @@ class AbstractVehicleLoad(AbstractLoad):
     """Load with the numbers of a trajectory as keyword arguments, for loads of several numbers.
 
     The first wheel is at `start_position`, by default at the end of the beam at which it enters, at
-    `entry_time`. It starts at rest in static equilibrium at t = 0, on its way with `speed`.
+    `entry_time`. At t = 0 it is in static equilibrium on the heights of the profile under its
+    wheels, on its way with `speed`, which is constant until `entry_time`.
     """
 
     speed: Float[Array, ""] | None = number(
