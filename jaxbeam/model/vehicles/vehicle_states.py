@@ -8,7 +8,7 @@ from jaxbeam.runtime.arrays import Array, xp
 
 
 def initial_vehicle_states(loads: LoadSet) -> Float[Array, "state batch"] | None:
-    """States of all vehicles at t = 0: in equilibrium on the profile's heights; None without any."""
+    """States of all vehicles at t = 0: in equilibrium on the profile; None without any."""
     wheels = loads.wheels
     if not wheels.vehicles:
         return None
