@@ -1,0 +1,167 @@
+"""Where along the beam a quantity is taken: the positions, their sides, and extremes between them.
+
+Ends, supports, hinges, changes of section, actuators, sensors and loads that stand are positions
+beside a grid. What jumps there, as shear forces and moments, is taken on both sides. Between
+positions the extremes are refined until they no longer change.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxbeam.case.beam_parts.properties import segment_edges
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.trajectory import NEVER
+from jaxbeam.model.layout import NODE_TOLERANCE, actuator_terms, node_positions
+from jaxbeam.model.load_set import load_set
+from jaxbeam.model.sensing.output_rows import SIDE_SHARE
+from jaxbeam.runtime.arrays import Array, any_traced, set_at, xp
+
+GRID = 101  # equally spaced positions
+SETTLED = 1e-4  # change of an extreme, relative to it, at which positions are dense enough
+LEAST_SIZE = 1e-3  # of the largest value, below which an extreme need not settle
+MAX_ROUNDS = 8
+CANDIDATES = 6  # peaks along the beam that are refined at a time
+INNER = np.array([0.2, 0.4, 0.6, 0.8])  # of an interval beside a peak
+
+
+def special_positions(case: Case) -> Float[Array, " place"]:
+    """Positions (m) of ends, supports, hinges, changes of section, actuators, sensors and loads.
+
+    Loads are those that stand on the beam for good.
+    """
+    length, loads = case.beam.length, load_set(case)
+    places = [
+        *node_positions(case),
+        *segment_edges(case.beam),
+        *(hinge.position for hinge in case.beam.hinges),
+        *(place for place, _, _ in actuator_terms(case)),
+        *(sensor.position for sensor in case.sensors),
+    ]
+    enter, leave = loads.entry_exit_times().T
+    stands = (enter < NEVER) & (leave >= NEVER)
+    standing = xp.where(stands, loads.kinematics(xp.full((), NEVER))[0], 0.0)
+    return xp.clip(xp.concatenate([xp.stack(places), standing]), 0.0, length)
+
+
+def positions_along(case: Case, count: int = GRID) -> Float[Array, " position"]:
+    """Ascending positions (m): `count` equally spaced ones, and the special ones.
+
+    Grid points that are special ones but for rounding are left out, where the numbers are known.
+    """
+    special, grid = special_positions(case), case.beam.length * np.linspace(0.0, 1.0, count)
+    if not is_concrete(special):
+        return xp.sort(xp.concatenate([special, grid]))
+    special = np.unique(concrete(special))
+    grid = concrete(grid)
+    return np.sort(np.concatenate([special, grid[~_is_among(case, grid, special)]]))
+
+
+def _is_among(case: Case, x, places) -> np.ndarray:
+    """Whether known positions are among some ascending places."""
+    after = np.clip(np.searchsorted(places, x), 1, len(places) - 1)
+    distance = np.minimum(np.abs(x - places[after - 1]), np.abs(x - places[after]))
+    return distance <= NODE_TOLERANCE * float(concrete(case.beam.length))
+
+
+class Sections(NamedTuple):
+    """Points (m) at which a quantity is computed for positions: them, then those left of some.
+
+    A quantity that jumps at a position has its value to the right of it there.
+    """
+
+    points: Float[Array, " point"]
+    left_of: Int[np.ndarray, " left"]
+
+    def largest(self, values: Float[Array, "*rest point"]) -> Float[Array, "*rest position"]:
+        """Larger of the values on both sides of each position."""
+        return self._of_sides(values, xp.maximum)
+
+    def smallest(self, values: Float[Array, "*rest point"]) -> Float[Array, "*rest position"]:
+        """Smaller of the values on both sides of each position."""
+        return self._of_sides(values, xp.minimum)
+
+    def _of_sides(self, values, choose: Callable):
+        count = values.shape[-1] - self.left_of.size
+        right, left = values[..., :count], values[..., count:]
+        at = np.s_[..., self.left_of]
+        return set_at(right, at, choose(right[..., self.left_of], left)) if count else right
+
+
+def sections(case: Case, x: Float[Array, " position"], quantity: str) -> Sections:
+    """Sections at which a quantity is computed for positions x (m) of an envelope.
+
+    Shear forces are taken on both sides of all positions, as a load may be at any; moments and
+    other derivatives of the deflection on both sides of the special ones.
+    """
+    order, left = QUANTITIES[quantity].x_derivative, np.zeros(0, int)
+    if order == 3 or (order and not is_concrete((x, special_positions(case)))):
+        left = np.arange(x.shape[0])
+    elif order:
+        places = np.unique(concrete(special_positions(case)))
+        left = np.flatnonzero(_is_among(case, concrete(x), places))
+    beside = xp.clip(x[left] - 2 * SIDE_SHARE * case.beam.length, 0.0, case.beam.length)
+    return Sections(xp.concatenate([x, beside]), left)
+
+
+def refined(
+    case: Case,
+    evaluate: Callable[[Float[Array, " position"]], Any],
+    curves: Callable[[Any], tuple],
+    places: Float[np.ndarray, " place"] = np.zeros(0),
+) -> tuple[Float[Array, " position"], Any]:
+    """Positions (m) of `positions_along` and further ones around extremes, and what is there.
+
+    `evaluate` returns a tree of arrays with an axis of positions first, of which `curves` gives the
+    values (position, curve) whose maxima are refined, the size of each curve, and known places (m),
+    of loads, near maxima. More `places` are positions from the start. Traced numbers are not
+    refined.
+    """
+    x = positions_along(case)
+    x = xp.sort(xp.concatenate([x, places])) if len(places) else x
+    found = evaluate(x)
+    if any_traced(x, found):
+        return x, found
+    x, change = np.asarray(x), np.inf
+    for _ in range(MAX_ROUNDS):
+        values, sizes, near = curves(found)
+        values = np.asarray(values)
+        if not np.all(np.isfinite(values)):  # a run that diverges
+            break
+        top, floor = np.max(values, axis=0), LEAST_SIZE * np.asarray(sizes)
+        open_curves = np.flatnonzero((change > SETTLED) & (top > floor))
+        added = [_beside_peaks(x, values[:, i], near[i]) for i in open_curves]
+        added = np.unique(np.concatenate([np.zeros(0), *added]))
+        if not added.size:
+            break
+        more = evaluate(added)
+        order = np.argsort(np.concatenate([x, added]), kind="stable")
+        x = np.concatenate([x, added])[order]
+        found = jax.tree.map(lambda a, b: np.concatenate([a, b])[order], found, more)
+        grown = np.max(np.asarray(curves(found)[0]), axis=0)
+        change = np.where(top > floor, (grown - top) / np.maximum(np.abs(grown), floor), 0.0)
+        change = np.broadcast_to(change, top.shape)
+    return x, found
+
+
+def _beside_peaks(x, values, near) -> Float[np.ndarray, " added"]:
+    """Positions in the intervals beside the peaks of a curve that may exceed its largest value."""
+    padded = np.concatenate([[-np.inf], values, [-np.inf]])
+    falls = values - padded[:-2], values - padded[2:]
+    steps = np.where(np.isfinite(falls), np.abs(falls), 0.0).max(axis=0)
+    is_peak = (falls[0] >= 0) & (falls[1] >= 0) & (steps > 0)
+    reach = np.where(is_peak, values + steps / 2, -np.inf)
+    chosen = np.argsort(-reach, kind="stable")[:CANDIDATES]
+    chosen = chosen[reach[chosen] >= values.max()]
+    added = []
+    for i in chosen:
+        left, right = x[max(i - 1, 0)], x[min(i + 1, x.size - 1)]
+        inside = near[i][(near[i] > left) & (near[i] < right) & (near[i] != x[i])]
+        added += [left + INNER * (x[i] - left), x[i] + INNER * (right - x[i]), inside]
+    added = np.unique(np.concatenate([np.zeros(0), *added]))
+    return added[~np.isin(added, x)]
