@@ -19,10 +19,10 @@ from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.layout import NODE_TOLERANCE, actuator_terms, node_positions
 from jaxbeam.model.load_set import load_set
-from jaxbeam.model.sensing.output_rows import SIDE_SHARE
 from jaxbeam.runtime.arrays import Array, any_traced, set_at, xp
 
 GRID = 101  # equally spaced positions
+LEFT_SHARE = 1e-7  # of the length, from a position to the section left of it: steps end at both
 SETTLED = 1e-4  # change of an extreme, relative to it, at which positions are dense enough
 LEAST_SIZE = 1e-3  # of the largest value, below which an extreme need not settle
 MAX_ROUNDS = 8
@@ -100,12 +100,13 @@ def sections(case: Case, x: Float[Array, " position"], quantity: str) -> Section
     other derivatives of the deflection on both sides of the special ones.
     """
     order, left = QUANTITIES[quantity].x_derivative, np.zeros(0, int)
-    if order == 3 or (order and not is_concrete((x, special_positions(case)))):
+    places = special_positions(case)
+    if order == 3 or (order and not (is_concrete(x) and is_concrete(places))):
         left = np.arange(x.shape[0])
     elif order:
-        places = np.unique(concrete(special_positions(case)))
+        places = np.unique(concrete(places))
         left = np.flatnonzero(_is_among(case, concrete(x), places))
-    beside = xp.clip(x[left] - 2 * SIDE_SHARE * case.beam.length, 0.0, case.beam.length)
+    beside = xp.clip(x[left] - LEFT_SHARE * case.beam.length, 0.0, case.beam.length)
     return Sections(xp.concatenate([x, beside]), left)
 
 
@@ -113,7 +114,7 @@ def refined(
     case: Case,
     evaluate: Callable[[Float[Array, " position"]], Any],
     curves: Callable[[Any], tuple],
-    places: Float[np.ndarray, " place"] = np.zeros(0),
+    places: Float[np.ndarray, " place"] | tuple = (),
 ) -> tuple[Float[Array, " position"], Any]:
     """Positions (m) of `positions_along` and further ones around extremes, and what is there.
 
@@ -123,45 +124,44 @@ def refined(
     refined.
     """
     x = positions_along(case)
-    x = xp.sort(xp.concatenate([x, places])) if len(places) else x
+    x = np.union1d(x, places) if len(places) else x
     found = evaluate(x)
     if any_traced(x, found):
         return x, found
-    x, change = np.asarray(x), np.inf
+    x = np.asarray(x)
     for _ in range(MAX_ROUNDS):
         values, sizes, near = curves(found)
-        values = np.asarray(values)
+        values, sizes = np.asarray(values), np.broadcast_to(sizes, values.shape[1:])
         if not np.all(np.isfinite(values)):  # a run that diverges
             break
-        top, floor = np.max(values, axis=0), LEAST_SIZE * np.asarray(sizes)
-        open_curves = np.flatnonzero((change > SETTLED) & (top > floor))
-        added = [_beside_peaks(x, values[:, i], near[i]) for i in open_curves]
-        added = np.unique(np.concatenate([np.zeros(0), *added]))
+        peaks = [_beside_peaks(x, *one) for one in zip(values.T, sizes, near, strict=True)]
+        added = np.unique(np.concatenate([np.zeros(0), *peaks]))
         if not added.size:
             break
         more = evaluate(added)
         order = np.argsort(np.concatenate([x, added]), kind="stable")
         x = np.concatenate([x, added])[order]
-        found = jax.tree.map(lambda a, b: np.concatenate([a, b])[order], found, more)
-        grown = np.max(np.asarray(curves(found)[0]), axis=0)
-        change = np.where(top > floor, (grown - top) / np.maximum(np.abs(grown), floor), 0.0)
-        change = np.broadcast_to(change, top.shape)
+        found = jax.tree.map(lambda a, b, i=order: np.concatenate([a, b])[i], found, more)
     return x, found
 
 
-def _beside_peaks(x, values, near) -> Float[np.ndarray, " added"]:
-    """Positions in the intervals beside the peaks of a curve that may exceed its largest value."""
+def _beside_peaks(x, values, size, near) -> Float[np.ndarray, " added"]:
+    """Positions in the intervals beside the peaks of a curve that may exceed its largest value.
+
+    By more than a settled part of it: between a peak and its neighbours a curve rises by half of
+    what it falls to them, at most about.
+    """
+    top = values.max()
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
-    falls = values - padded[:-2], values - padded[2:]
+    falls = np.stack([values - padded[:-2], values - padded[2:]])
     steps = np.where(np.isfinite(falls), np.abs(falls), 0.0).max(axis=0)
-    is_peak = (falls[0] >= 0) & (falls[1] >= 0) & (steps > 0)
-    reach = np.where(is_peak, values + steps / 2, -np.inf)
+    reach = np.where(np.all(falls >= 0, axis=0), values + steps / 2, -np.inf)
     chosen = np.argsort(-reach, kind="stable")[:CANDIDATES]
-    chosen = chosen[reach[chosen] >= values.max()]
+    chosen = chosen[reach[chosen] > top + SETTLED * max(abs(top), LEAST_SIZE * size)]
     added = []
     for i in chosen:
         left, right = x[max(i - 1, 0)], x[min(i + 1, x.size - 1)]
-        inside = near[i][(near[i] > left) & (near[i] < right) & (near[i] != x[i])]
+        inside = near[i][(near[i] > left) & (near[i] < right)]
         added += [left + INNER * (x[i] - left), x[i] + INNER * (right - x[i]), inside]
     added = np.unique(np.concatenate([np.zeros(0), *added]))
     return added[~np.isin(added, x)]

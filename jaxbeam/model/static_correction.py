@@ -8,6 +8,7 @@ deflection is small; curvature and third derivative, hence section forces, need 
 from typing import NamedTuple
 
 import jax
+import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.beam_parts.properties import has
@@ -22,7 +23,7 @@ from jaxbeam.model.statics import (
     validated_layout,
 )
 from jaxbeam.model.theory.sections import rigidity_at
-from jaxbeam.runtime.arrays import Array, solve, xp
+from jaxbeam.runtime.arrays import Array, is_known, set_at, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 
 
@@ -117,12 +118,7 @@ def corrected_history(
     if not is_supported(case, layout):
         return history
     if case.loads:
-        on_beam = xp.isfinite(motion.load_position)
-        positions = xp.where(on_beam, motion.load_position, 0.0)
-        residual = _residual_flexibility(case, x, positions, derivative, layout)
-        # Wheels of vehicles press on the ground, too.
-        forces = xp.where(on_beam, motion.contact_force, 0.0)
-        history = history + xp.einsum("tl,tl...->t...", forces, residual)
+        history = history + _loads_history(case, motion, x, derivative, layout)
     for support in case.supports:
         if support.damping is not None:
             velocity = motion.rates @ modes.shapes(support.position)
@@ -133,6 +129,24 @@ def corrected_history(
         forces = port_forces(case, modes, motion)
         history = history + xp.tensordot(forces.T, residual, axes=1)
     return history
+
+
+def _loads_history(case: Case, motion: Motion, x, derivative: int, layout: Layout):
+    """Residual of the modes under the contact forces, (time, *position)."""
+    on_beam = xp.isfinite(motion.load_position)  # wheels of vehicles press on the ground, too
+    if not all(map(is_known, jax.tree.leaves((case, motion, x)))):
+        positions = xp.where(on_beam, motion.load_position, 0.0)
+        residual = _residual_flexibility(case, x, positions, derivative, layout)
+        return xp.einsum("tl,tl...->t...", xp.where(on_beam, motion.contact_force, 0.0), residual)
+    time, load = np.nonzero(on_beam)
+    positions, forces = motion.load_position[time, load], motion.contact_force[time, load]
+    residual = _residual_flexibility(case, x, positions, derivative, layout)
+    history = xp.zeros((on_beam.shape[0], *x.shape))
+    if not time.size:
+        return history
+    starts = np.flatnonzero(np.diff(time, prepend=-1))
+    values = forces.reshape(-1, *(1,) * x.ndim) * residual
+    return set_at(history, time[starts], np.add.reduceat(values, starts, axis=0))
 
 
 def port_forces(

@@ -24,8 +24,23 @@ from jaxbeam.runtime.compiling import compiled_if_traced
 # cubic (flexibility) of a cubic (trajectory) times a table of forces, a polynomial of degree ten.
 # Half a period of a sine is interpolated to 1e-7 of its amplitude.
 PEAK_POSITIONS = tuple(float(share) for share in np.linspace(0, 1, 11))
-BREAK_SHARE = 1e-10  # of the way to the middle of an interval, by which wheels keep off its ends
 BLOCK = 4_000_000  # values of lines under all wheels at a time
+END_SHARE = 1e-5  # of an interval, by which its ends are left out
+# Positions from the middle at which samples are taken, and what takes them to PEAK_POSITIONS: the
+# first two terms of the Taylor series of their polynomial.
+WITHIN = (1 - 2 * END_SHARE) * (np.array(PEAK_POSITIONS) - 0.5)
+
+
+def _to_ends() -> Float[np.ndarray, "point point"]:
+    x = 2 * np.array(PEAK_POSITIONS) - 1
+    powers = np.arange(x.size)
+    slopes = powers * x[:, None] ** np.maximum(powers - 1, 0)
+    derivative = slopes @ np.linalg.inv(x[:, None] ** powers)
+    step = (2 * END_SHARE * x)[:, None]
+    return step * derivative + step**2 / 2 * (derivative @ derivative)
+
+
+TO_ENDS = _to_ends()
 
 
 @compiled_if_traced
@@ -156,11 +171,9 @@ def peak_under_loads(
     samples, estimates = [], []
     for part in np.array_split(np.arange(starts.shape[0]), -(-size // BLOCK)):
         middle = (starts[part] + ends[part]) / 2
-        within = starts[part] + (ends[part] - starts[part]) * np.array(PEAK_POSITIONS)[:, None]
-        position = xp.clip(loads.kinematics(within)[0], 0.0, length)
-        centre = xp.clip(loads.kinematics(middle)[0], 0.0, length)
         # At a break, where the line of a shear force jumps, the side on which the wheel is.
-        position = position + BREAK_SHARE * (centre[:, None] - position)
+        within = middle + (ends[part] - starts[part]) * WITHIN[:, None]
+        position = xp.clip(loads.kinematics(within)[0], 0.0, length)
         forces = loads.varying_weight(within)[..., 0]
         active = (windows[:, :1] < middle) & (middle < windows[:, 1:])
         if is_known(active):
@@ -170,6 +183,7 @@ def peak_under_loads(
         force = (forces[:, at, wheel] * active[wheel, at])[..., None]
         total = xp.zeros((len(PEAK_POSITIONS), part.size, count))
         total = add_at(total, np.s_[:, at], force * line(position[wheel, :, at].T))
+        total = total + xp.tensordot(TO_ENDS, total, axes=1)
         estimate = estimate_peak(total, PEAK_POSITIONS)
         best = xp.argmax(estimate, axis=0)[None]
         estimates.append(xp.take_along_axis(estimate, best, axis=0)[0])

@@ -9,18 +9,18 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.display.views import TableViews
 from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.model.along_beam import refined, sections
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.static_correction import Motion
-from jaxbeam.runtime.arrays import Array, take, xp
+from jaxbeam.runtime.arrays import Array, any_traced, known, take, xp
 from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.module import Module
-from jaxbeam.simulation.section_forces import SIDES, history, shear_force
+from jaxbeam.simulation.section_forces import history
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
 
-MAX_ENTRIES = 4_000_000  # of the influence of all loads at all times on one part of the positions
-DEFAULT_POSITIONS = 101
+MAX_ENTRIES = 4_000_000  # of the influence of all loads on all positions and modes in one block
 
 
 class RecordEnvelope(TableViews, Module):
@@ -99,54 +99,70 @@ def record_envelope(
     section_modulus=None,
     coincident: str = "",
 ) -> RecordEnvelope:
-    """Envelope of a quantity at positions (m), by default equally spaced; see `Record.envelope`.
+    """Envelope of a quantity at positions (m), by default those of `refined`.
 
-    Of shear forces on both sides of each position. Raises ValueError as `history` does.
+    See `Record.envelope`. Raises ValueError as `history` does.
     """
-    if positions is None:
-        positions = case.beam.length * np.linspace(0.0, 1.0, DEFAULT_POSITIONS)
-    positions = xp.asarray(positions, float)
-    size = max(1, times.shape[0] * len(case.loads))
-    parts = -(-positions.shape[0] * size // MAX_ENTRIES)
     parameters = fibre_distance, section_modulus
-    found: list[list] = []
-    for part in np.array_split(np.arange(positions.shape[0]), parts):
-        x = positions[part]
+    if not any_traced(case, modes, motion, times):
+        case, modes, motion, times = known((case, modes, motion, times))
 
-        def sides_of(name, x=x):
-            """Histories (side, time, position) at the positions of this part."""
-            if name == "shear":
-                return xp.stack([shear_force(case, modes, motion, x, side) for side in SIDES])
-            return history(case, modes, motion, x, name, *parameters)[None]
+    def at(x):
+        return _envelope_at(case, modes, motion, times, x, quantity, coincident, parameters)
 
-        sides, other = sides_of(quantity), None
+    def curves(found: RecordEnvelope):
+        values = xp.stack([-found.smallest, found.largest], axis=-1)
+        places = found.smallest_load_position, found.largest_load_position
+        return values, xp.max(xp.abs(values)), tuple(map(np.asarray, places))
+
+    if positions is not None:
+        return at(xp.asarray(positions, float))
+    return refined(case, at, curves)[1]
+
+
+def _envelope_at(case, modes, motion, times, x, quantity, coincident, parameters):
+    """Envelope at positions x (m), in blocks of samples."""
+    points, beside = sections(case, x, quantity), sections(case, x, coincident or quantity)
+    size = max(1, len(case.loads), motion.load_position.shape[1])
+    size *= points.points.shape[0] + motion.coordinates.shape[1]
+    count = -(-times.shape[0] * size // MAX_ENTRIES)
+    found: dict[float, tuple] = {}
+    for block in np.array_split(np.arange(times.shape[0]), min(count, times.shape[0])):
+        own = Motion(*(part[block] for part in motion))
+        values = history(case, modes, own, points.points, quantity, *parameters)
+        other = None
         if coincident:
-            every = sides_of(coincident)
-            larger = xp.abs(every[0]) >= xp.abs(every[-1])
-            other = xp.where(larger, every[0], every[-1])
-        low, high = (_extremes(sign * sides, times, motion, other, sign) for sign in (-1.0, 1.0))
-        found.append([*low[:3], *high[:3], *low[3:], *high[3:]])
-    low, low_time, low_place, high, high_time, high_place, *others = map(
-        xp.concatenate, zip(*found, strict=True)
-    )
-    with_low, with_high = others or (None, None)
+            every = history(case, modes, own, beside.points, coincident, *parameters)
+            most, least = beside.largest(every), beside.smallest(every)
+            other = xp.where(xp.abs(most) >= xp.abs(least), most, least)
+        for sign, curve in ((-1.0, -points.smallest(values)), (1.0, points.largest(values))):
+            new = _extremes(curve, times[block], own, other)
+            found[sign] = _larger(found[sign], new) if sign in found else new
+    (low, *of_low), (high, *of_high) = found[-1.0], found[1.0]
+    others = (of_low.pop(), of_high.pop()) if coincident else (None, None)
     return RecordEnvelope(
-        *(positions, low, low_time, low_place, high, high_time, high_place, quantity),
-        smallest_coincident=with_low,
-        largest_coincident=with_high,
+        *(x, -low, *of_low, high, *of_high, quantity),
+        smallest_coincident=others[0],
+        largest_coincident=others[1],
         coincident=coincident,
     )
 
 
-def _extremes(values, times, motion: Motion, other, sign: float):
-    """Largest of values (side, time, position) with a sign, its time, and the loads then.
+def _extremes(values, times, motion: Motion, other) -> tuple:
+    """Largest of values (time, position), its time, and the positions of the loads then.
 
     Followed by another quantity (time, position) there and then, unless it is None.
     """
-    highest = xp.max(values, axis=0)
-    index = xp.argmax(highest, axis=0)
-    value = xp.take_along_axis(highest, index[None], axis=0)[0]
-    extremes = [sign * value, take(times, index), take(motion.load_position, index)]
-    if other is not None:
-        extremes.append(xp.take_along_axis(other, index[None], axis=0)[0])
-    return extremes
+    index = xp.argmax(values, axis=0)
+    found = (xp.take_along_axis(values, index[None], axis=0)[0], take(times, index))
+    found += (take(motion.load_position, index),)
+    return found if other is None else (*found, xp.take_along_axis(other, index[None], axis=0)[0])
+
+
+def _larger(one: tuple, other: tuple) -> tuple:
+    """Of two results of `_extremes` the one with the larger value, at each position."""
+    is_larger = other[0] > one[0]
+    return tuple(
+        xp.where(is_larger[:, None] if a.ndim == 2 else is_larger, b, a)
+        for a, b in zip(one, other, strict=True)
+    )

@@ -68,7 +68,7 @@ def test_deflections_are_those_between_samples_nearly():
 
 def test_positions_in_parts_and_traced_numbers(slow, monkeypatch):
     whole = slow.envelope("moment")
-    assert whole.positions.shape == (101,)
+    assert 101 <= whole.positions.shape[0] < 200
     times = np.linspace(0, 120, 41)
     plan = integration_plan(SLOW, times)
 
@@ -82,3 +82,72 @@ def test_positions_in_parts_and_traced_numbers(slow, monkeypatch):
     parts = slow.envelope("moment")
     for one, other in zip(*map(jax.tree.leaves, (parts, whole)), strict=True):
         assert_allclose(one, other, rtol=1e-10, atol=1e-6)
+
+
+# The extremes along the beam: peaks over piers
+
+SPANS = 25.0, 35.0, 25.0
+PIERS = np.cumsum(SPANS)[:2]
+CONTINUOUS = jb.Case(
+    jb.Beam(sum(SPANS), flexural_rigidity=3e10, mass_per_length=1e4, damping_ratio=0.1, modes=8),
+    supports=[jb.Support(x) for x in PIERS],
+    loads=[jb.MovingForce(force=3e5, speed=0.5)],
+    run=jb.Run(172.0, sample_rate=10.0),
+)
+
+
+def pier_moments(force, y) -> np.ndarray:
+    """Moments at both piers under a force at y, by the three-moment equation (Clapeyron)."""
+    starts, right = np.concatenate([[0.0], PIERS]), np.zeros(2)
+    for i, (start, length) in enumerate(zip(starts, SPANS, strict=True)):
+        if start <= y <= start + length:
+            a, b = y - start, start + length - y
+            if i < 2:
+                right[i] -= force * a * (length**2 - a**2) / length
+            if i > 0:
+                right[i - 1] -= force * b * (length**2 - b**2) / length
+    first, middle, last = SPANS
+    matrix = [[2 * (first + middle), middle], [middle, 2 * (middle + last)]]
+    return np.linalg.solve(matrix, right)
+
+
+def test_peaks_over_piers_of_a_slow_force():
+    """25 and 60 m are on no grid of 101 positions of 85 m: these miss 1.5 to 4 %."""
+    record = jb.simulate(CONTINUOUS)
+    found = record.envelope("moment")
+    moments = np.array([pier_moments(3e5, y) for y in np.linspace(0.0, 85.0, 3401)])
+    assert_allclose(found.smallest.min(), moments.min(), rtol=5e-4)
+    at_pier = np.isin(found.positions, PIERS)
+    assert_allclose(found.smallest[at_pier], moments.min(axis=0), rtol=5e-4)
+    assert_allclose(found.largest[at_pier], moments.max(axis=0), rtol=2e-3)
+    at_piers = np.asarray(record.bending_moment(PIERS))
+    assert_allclose(found.smallest.min(), at_piers.min(), rtol=1e-12)
+    grid = record.envelope("moment", np.linspace(0.0, 85.0, 101))
+    assert grid.smallest.min() > 0.99 * found.smallest.min()
+    dense = record.envelope("moment", np.linspace(30.0, 55.0, 2501))  # in the middle span
+    assert_allclose(found.largest.max(), dense.largest.max(), rtol=1e-4)
+
+
+def test_shear_on_both_sides_of_piers():
+    """Left of a pier -P with the force there, right of it P, and at the ends P."""
+    case = replace(CONTINUOUS, {"run.sample_rate": 40.0})
+    found = jb.simulate(case).envelope("shear")
+    at_piers = np.isin(found.positions, PIERS)
+    assert_allclose(found.largest[at_piers], 3e5, rtol=2e-3)
+    assert_allclose(found.smallest[at_piers], -3e5, rtol=2e-3)
+
+
+def test_envelopes_between_samples_have_the_same_extremes():
+    """At 20 m/s, from samples and between them, over a pier and in the middle span."""
+    case = replace(CONTINUOUS, {"loads.0.speed": 20.0, "run.duration": 5.0})
+    case = replace(case, {"run.sample_rate": 1000.0, "beam.damping_ratio": 0.01})
+    record = jb.simulate(case).envelope("moment")
+    case = replace(case, {"run.sample_rate": 50.0})
+    exact = jb.envelope(case, quantity="moment")
+    assert_allclose(exact.lowest.min(), record.smallest.min(), rtol=1e-4)
+    assert_allclose(exact.highest.max(), record.largest.max(), rtol=2e-4)
+    assert set(PIERS) <= set(np.asarray(exact.positions))
+    shear = jb.envelope(case, [25.0, 24.99, 25.01], quantity="shear")
+    assert_allclose(shear.lowest[0], shear.lowest[1], rtol=1e-3)  # the left side
+    assert_allclose(shear.highest[0], shear.highest[2], rtol=1e-3)  # the right side
+    assert shear.highest[0] > 10 * shear.highest[1]

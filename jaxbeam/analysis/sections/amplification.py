@@ -1,8 +1,9 @@
 """Envelopes along the beam, and dynamic amplification over static loading, of any quantity."""
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Iterator
 
+import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
@@ -10,19 +11,21 @@ from jaxbeam.case.declared_checks import check_on_beam, suggestion
 from jaxbeam.case.quantities import QUANTITIES, quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.integrate import integrate_peaks
+from jaxbeam.model.along_beam import refined, sections
 from jaxbeam.model.influence import static_peak
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
+from jaxbeam.runtime.module import Module
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
 from jaxbeam.simulation.simulate import integration_setup
 
 AMPLIFIED = tuple(name for name, entry in QUANTITIES.items() if not entry.time_derivative)
 
 
-class Envelope(NamedTuple):
-    """Lowest and highest value of a quantity at given positions: at most zero, and at least zero.
+class Envelope(Module):
+    """Lowest and highest value of a quantity at `positions` (m): at most zero, and at least zero.
 
-    In m for deflections.
+    In m for deflections. It unpacks as lowest and highest.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(jb.Beam(0.6, 12.0, 0.5), loads=[jb.MovingMass(mass=0.1, speed=1.0)])
@@ -33,11 +36,15 @@ class Envelope(NamedTuple):
 
     lowest: Float[Array, " position"]
     highest: Float[Array, " position"]
+    positions: Float[Array, " position"]
+
+    def __iter__(self) -> Iterator[Float[Array, " position"]]:
+        return iter((self.lowest, self.highest))
 
 
 def envelope(
     case: Case,
-    x,
+    x=None,
     tolerance: float = TOLERANCE,
     *,
     quantity: str = "deflection",
@@ -46,10 +53,13 @@ def envelope(
 ) -> Envelope:
     """Lowest and highest value of a quantity at positions x (m) during a run, between samples too.
 
-    By default the deflection in m; other quantities are those of sensors, in their units, moments
-    and the like statically corrected. Free vibration and control are included; histories are not
-    stored. The beam starts at rest, so zero is always among the values. `tolerance` is relative to
-    the largest deflection. Strain needs `fibre_distance` (m), stress `section_modulus` (m^3).
+    Without x at the positions of `Record.envelope`: the special ones, a grid, and more around the
+    extremes along the beam until they change by less than 1e-4. What jumps at a position, as shear
+    forces at supports, is taken on both sides. By default the deflection in m; other quantities are
+    those of sensors, in their units, moments and the like statically corrected. Free vibration and
+    control are included; histories are not stored. The beam starts at rest, so zero is always among
+    the values. `tolerance` is relative to the largest deflection. Strain needs `fibre_distance`
+    (m), stress `section_modulus` (m^3).
 
     Raises ValueError for an invalid case, positions off the beam, an unknown quantity or one whose
     parameter is missing, RuntimeError if no time step meets the tolerance.
@@ -64,13 +74,26 @@ def envelope(
     -2.00 mm
     """
     quantity_of(quantity, fibre_distance, section_modulus)
-    x = xp.asarray(x, float)
-    plan = integration_plan(case, tolerance=tolerance)
-    check_on_beam("x", x, case.beam.length)
-    parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
-    sensors = tuple(Sensor(one, quantity, **parameters) for one in x)
+    plan = dataclasses.replace(integration_plan(case, tolerance=tolerance), error=0.0)
     calculate = _open_loop_envelope if case.controller is None else _closed_loop_envelope
-    return calculate(case, dataclasses.replace(plan, error=0.0), sample_times(case), sensors)
+
+    parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
+
+    def at(x):
+        points = sections(case, x, quantity)
+        sensors = tuple(Sensor(point, quantity, **parameters) for point in points.points)
+        lowest, highest = calculate(case, plan, sample_times(case), sensors)
+        return Envelope(points.smallest(lowest), points.largest(highest), x)
+
+    def curves(found):
+        values = xp.stack([-found.lowest, found.highest], axis=-1)
+        return values, xp.max(xp.abs(values)), [np.zeros((values.shape[0], 0))] * 2
+
+    if x is None:
+        return refined(case, at, curves)[1]
+    x = xp.asarray(x, float)
+    check_on_beam("x", x, case.beam.length)
+    return at(x)
 
 
 def _envelope(case, plan, times, sensors):
@@ -79,7 +102,7 @@ def _envelope(case, plan, times, sensors):
         discrete, loads, max_loads=plan.shapes.max_loads, policy=policy
     )
     highest, lowest = xp.split(running_peaks.refined_peak()[0][:, 0], 2)
-    return Envelope(-lowest, highest)
+    return -lowest, highest
 
 
 _open_loop_envelope = compiled_if_traced(_envelope)
@@ -119,4 +142,10 @@ def amplification(
         raise ValueError(f"no amplification of {quantity!r}; {suggestion(quantity, AMPLIFIED)}")
     quantity_of(quantity, **parameters)
     lowest, highest = envelope(case, x, tolerance, quantity=quantity, **parameters)
-    return xp.maximum(-lowest, highest) / static_peak(case, x, quantity=quantity, **parameters)
+    return xp.maximum(-lowest, highest) / static_amplified(case, x, quantity, **parameters)
+
+
+def static_amplified(case: Case, x, quantity: str, **parameters) -> Float[Array, " position"]:
+    """Largest absolute static value at positions x (m), on both sides: see `amplification`."""
+    points = sections(case, xp.asarray(x, float), quantity)
+    return points.largest(static_peak(case, points.points, quantity=quantity, **parameters))
