@@ -59,7 +59,7 @@ def positions_along(case: Case, count: int = GRID) -> Float[Array, " position"]:
         return xp.sort(xp.concatenate([special, grid]))
     special = np.unique(concrete(special))
     grid = concrete(grid)
-    return np.sort(np.concatenate([special, grid[~_is_among(case, grid, special)]]))
+    return xp.asarray(np.union1d(special, grid[~_is_among(case, grid, special)]))
 
 
 def _is_among(case: Case, x, places) -> np.ndarray:
@@ -127,7 +127,7 @@ def refined(
     x = np.union1d(x, places) if len(places) else x
     found = evaluate(x)
     if any_traced(x, found):
-        return x, found
+        return xp.asarray(x), found
     x = np.asarray(x)
     for _ in range(MAX_ROUNDS):
         values, sizes, near = curves(found)
@@ -142,7 +142,7 @@ def refined(
         order = np.argsort(np.concatenate([x, added]), kind="stable")
         x = np.concatenate([x, added])[order]
         found = jax.tree.map(lambda a, b, i=order: np.concatenate([a, b])[i], found, more)
-    return x, found
+    return xp.asarray(x), found
 
 
 def _beside_peaks(x, values, size, near) -> Float[np.ndarray, " added"]:
