@@ -36,7 +36,7 @@ class PlausibilityWarning(UserWarning):
     ...     warnings.simplefilter("always", jb.PlausibilityWarning)
     ...     found = jb.modes(jb.Case(beam))
     >>> print(str(shown[0].message).split(" under")[0])
-    beam.flexural_rigidity: the beam sags by 2.488 m
+    beam.flexural_rigidity: the beam sags by 24.94 m
     """
 
 

@@ -406,7 +406,7 @@ LOADS = (
     Range(
         of_parts("loads", "speed", kinds=("pedestrian", "crowd")),
         0.2,
-        8.0,
+        12.0,
         "a person moves at {value:.3g} m/s",
         "is it in m/s?",
         "is it in m/s, not in km/h?",
