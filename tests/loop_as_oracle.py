@@ -1,5 +1,6 @@
 """Conversion of a case with a controller to the independent closed loop of `oracles`."""
 
+import jax
 import numpy as np
 
 from jaxbeam.case.actuators.shaker import Shaker
@@ -33,7 +34,20 @@ def parts_of(case: Case) -> tuple[Span | TwoSpans, list, list, list]:
         for load in case.loads
     ]
     actuators = [_actuator(actuator) for actuator in case.actuators]
-    return span_of(case), loads, actuators, [_sensor(sensor) for sensor in case.sensors]
+    sensors = [_sensor(sensor, *_way(case, i, sensor)) for i, sensor in enumerate(case.sensors)]
+    return span_of(case), loads, actuators, sensors
+
+
+def _way(case: Case, number: int, part) -> tuple[list[bool], list[float]]:
+    """Which readings of a sensor, or commands (number -1), are lost, and their random delays."""
+
+    def uniform(stream):
+        key = jax.random.fold_in(jax.random.key(case.run.seed), number + 1)
+        return np.asarray(jax.random.uniform(jax.random.fold_in(key, stream), 10_000))
+
+    losses = [] if part.dropout is None else uniform(1) < float(part.dropout)
+    late = [] if part.jitter is None else uniform(2) * float(part.jitter)
+    return list(losses), list(late)
 
 
 def expected(case: Case, times, law: closed_loop.Law | None = None) -> closed_loop.Motion:
@@ -42,7 +56,9 @@ def expected(case: Case, times, law: closed_loop.Law | None = None) -> closed_lo
     if controller.period is not None:
         delay = _number(controller.delay) or 0.0
         period = float(controller.period)
-        clock = closed_loop.Clock(period, delay, _number(controller.resolution))
+        clock = closed_loop.Clock(
+            period, delay, _number(controller.resolution), *_way(case, -1, controller)
+        )
     breakpoints = controller.breakpoints(case)
     return closed_loop.respond(
         *parts_of(case),
@@ -69,7 +85,7 @@ def _actuator(actuator) -> closed_loop.Actuator:
     )
 
 
-def _sensor(sensor) -> closed_loop.Sensor:
+def _sensor(sensor, lost, late) -> closed_loop.Sensor:
     filter = {}
     if sensor.filter is not None:
         analogue = sensor.filter.realisation == "analogue"
@@ -84,6 +100,8 @@ def _sensor(sensor) -> closed_loop.Sensor:
         _number(sensor.resolution),
         period=_number(sensor.sampling_period),
         delay=_number(sensor.delay) or 0.0,
+        lost=lost,
+        late=late,
         **filter,
     )
 

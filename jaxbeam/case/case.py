@@ -37,7 +37,9 @@ from jaxbeam.runtime.module import Module
 
 
 class Run(ReprWithUnits):
-    """Duration of a run, sampling rate of its record, gravity, and seed of the sensor noise.
+    """Duration of a run, sampling rate of its record, gravity, and seed of what is random.
+
+    Noise, lost readings and commands, and their random delays have random numbers of their own.
 
     >>> import jaxbeam as jb
     >>> run = jb.Run(duration=1.5, sample_rate=200.0)
@@ -53,7 +55,7 @@ class Run(ReprWithUnits):
     gravity: Float[Array, ""] = number(
         "m/s^2", "acceleration of gravity", NOT_NEGATIVE, default=9.81
     )
-    seed: int = count("seed of the noise of the sensors", minimum=0, default=0)
+    seed: int = count("seed of noise, dropout and jitter", minimum=0, default=0)
 
 
 class Case(Module):

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.case.display.arguments import ExplainsArguments
 from jaxbeam.case.display.parts import ReprWithUnits
-from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, number
+from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, PROBABILITY, number
 from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.module import Module
 
@@ -28,12 +28,23 @@ class Measurement(NamedTuple):
 
     `state` is the true state of the plant in the order of `state_space`, for laws that assume full
     state information; no sensor measures it. `command` is the last command of the actuators, after
-    limits and resolution.
+    limits and resolution. `present` is False for the sensors whose reading is missing at the
+    sample, in whose place `readings` have the last one that came; None if none is missing.
     """
 
     readings: Float[Array, " sensor"]
     state: Float[Array, " state"]
     command: Command
+    present: Bool[Array, " sensor"] | None = None
+
+    def innovation(self, predicted: Float[Array, " sensor"]) -> Float[Array, " sensor"]:
+        """Readings less predicted ones; zero where a reading is missing."""
+        innovation = self.readings - predicted
+        return innovation if self.present is None else xp.where(self.present, innovation, 0.0)
+
+    def complete(self, sensors: Sequence[int]) -> Bool[Array, ""] | bool:
+        """Whether the readings of some sensors are all present."""
+        return True if self.present is None else xp.all(self.present[np.array(sensors, int)])
 
 
 class ControllerFilter(Module):
@@ -149,8 +160,7 @@ class LawOfCommanded(AbstractSampledLaw, AbstractContinuousLaw):
         return self.law.rates(state, self._own(measurement), own, t)
 
     def _own(self, measurement: Measurement) -> Measurement:
-        command = measurement.command[np.array(self.active)]
-        return Measurement(measurement.readings, measurement.state, command)
+        return measurement._replace(command=measurement.command[np.array(self.active)])
 
     def _all(self, command) -> Command:
         return set_at(xp.zeros(self.count), np.array(self.active), command)
@@ -167,9 +177,12 @@ class AbstractController(ReprWithUnits, Module, metaclass=ExplainsArguments):
     With a sampling `period` (s) its law acts at 0, period, 2 period, ...; a command begins `delay`
     (s) later and is held until the next one. Without a period the law acts in continuous time.
     Commands are rounded to `resolution` and kept within the limits of the actuators by the closed
-    loop. Where `nominal_plant` is given, the law is designed for that plant instead of the plant
-    of its case; no key of a case file. Settings and laws have entries for the actuators that take
-    commands (`Case.driven`), not for springs and dampers among them.
+    loop. With the probability `dropout` a command is lost on its way, so that the last one stays;
+    the others begin up to `jitter` (s) later, equally distributed, and not at all after a newer
+    one. Both are drawn by the seed of the run, and the law does not know of them. Where
+    `nominal_plant` is given, the law is designed for that plant instead of the plant of its case;
+    no key of a case file. Settings and laws have entries for the actuators that take commands
+    (`Case.driven`), not for springs and dampers among them.
 
     To add a controller, write a file in `jaxbeam.control` with a subclass that names its `kind`.
     """
@@ -185,6 +198,12 @@ class AbstractController(ReprWithUnits, Module, metaclass=ExplainsArguments):
     )
     resolution: Float[Array, ""] | None = number(
         "unit of a command", "step between commands", POSITIVE, default=None, kw_only=True
+    )
+    dropout: Float[Array, ""] | None = number(
+        "1", "probability that a command is lost", PROBABILITY, default=None, kw_only=True
+    )
+    jitter: Float[Array, ""] | None = number(
+        "s", "largest random delay of a command", NOT_NEGATIVE, default=None, kw_only=True
     )
     nominal_plant: Any = eqx.field(default=None, kw_only=True)
 

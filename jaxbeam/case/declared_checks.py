@@ -20,6 +20,7 @@ from jaxbeam.case.fields import (
     NOT_NEGATIVE,
     ON_BEAM,
     POSITIVE,
+    PROBABILITY,
     concrete,
     describe_shape,
     fits_shape,
@@ -185,7 +186,11 @@ def _check_number(address: str, value: Any, field: dataclasses.Field) -> None:
     for name, x in zip(names, numbers.flat, strict=True):
         if not np.isfinite(x):
             raise ValueError(f"{name} must be a finite number; it is {x}")
-        if (constraint == POSITIVE and x <= 0) or (constraint == NOT_NEGATIVE and x < 0):
+        if (
+            (constraint == POSITIVE and x <= 0)
+            or (constraint == NOT_NEGATIVE and x < 0)
+            or (constraint == PROBABILITY and not 0 <= x < 1)
+        ):
             raise ValueError(f"{name} must {constraint}; it is {x:g}{unit}")
         if abs(x) > LARGEST or (constraint == POSITIVE and x < SMALLEST):
             bound = f"at most {LARGEST:g}" if abs(x) > LARGEST else f"at least {SMALLEST:g}"

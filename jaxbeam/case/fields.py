@@ -43,6 +43,7 @@ POSITIVE = "be positive"
 NOT_NEGATIVE = "not be negative"
 ON_BEAM = "lie on the beam"
 INCREASING = "increase"
+PROBABILITY = "lie from 0 to below 1"
 
 
 def number(unit: str, meaning: str, constraint: str = "", **options):

@@ -128,11 +128,12 @@ def filter_history(
     filter_state: Float[Array, "section 2 *batch"],
     samples: Float[Array, "time *batch"],
     new_samples: Bool[Array, " time"] | None = None,
+    output_before: Float[Array, " *batch"] | None = None,
 ) -> Float[Array, "time *batch"]:
     """Output of a digital filter for a history of samples, from an initial state.
 
     With `new_samples`, only the samples marked True enter the filter, and its output is held in
-    between; the first must be True.
+    between; until the first it is the `output_before`.
     """
 
     def step(carry, at):
@@ -144,7 +145,8 @@ def filter_history(
             next_state = xp.where(new, next_state, state)
         return (output, next_state), output
 
-    start = (xp.zeros(samples.shape[1:]), filter_state)
+    before = xp.zeros(samples.shape[1:]) if output_before is None else output_before
+    start = (before, filter_state)
     return scan(step, start, (samples, new_samples))[1]
 
 

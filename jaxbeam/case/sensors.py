@@ -10,6 +10,7 @@ from jaxbeam.case.fields import (
     NOT_NEGATIVE,
     ON_BEAM,
     POSITIVE,
+    PROBABILITY,
     choice,
     concrete,
     is_concrete,
@@ -30,7 +31,10 @@ class Sensor(ReprWithUnits, Module):
     axis, `moment` the bending moment, positive where the beam sags, `shear` its x-derivative, and
     `stress` the moment over the `section_modulus`. `name` is the label in results. `offset` and
     noise are added to the quantity; the reading is limited to the range and rounded to the
-    resolution (see `jaxbeam.model.sensing.sensor_signals`). What is left out is ideal.
+    resolution (see `jaxbeam.model.sensing.sensor_signals`). With the probability `dropout` a
+    reading is lost: the last one stays, and a controller knows that it is missing. The others are
+    up to `jitter` older than `delay`, equally distributed. Both are drawn by the seed of the run.
+    What is left out is ideal.
 
     >>> import jaxbeam as jb
     >>> sensor = jb.Sensor(0.3, quantity="strain", fibre_distance=0.0025, name="midspan")
@@ -71,6 +75,12 @@ class Sensor(ReprWithUnits, Module):
         default="all",
     )
     name: str = choice("label in results; its number and quantity if left out", default="")
+    dropout: Float[Array, ""] | None = number(
+        "1", "probability that a reading is lost", PROBABILITY, default=None, kw_only=True
+    )
+    jitter: Float[Array, ""] | None = number(
+        "s", "largest random delay of a reading", NOT_NEGATIVE, default=None, kw_only=True
+    )
 
     def __post_init__(self):
         for name in ("offset", "noise", "range", "resolution"):
@@ -102,7 +112,7 @@ class Sensor(ReprWithUnits, Module):
         """What of it exists at samples only, each as the subject of an error message."""
         if self.has_digital_filter:
             yield f"{address}.filter, which is digital,"
-        for name in ("sampling_period", "delay", "noise", "resolution"):
+        for name in ("sampling_period", "delay", "noise", "resolution", "dropout", "jitter"):
             if getattr(self, name) is not None:
                 yield f"{address}.{name}"
         if self.has_feedthrough:

@@ -301,7 +301,7 @@ def _check_outside_patches(address: str, sensor: Sensor, case: Case) -> None:
 
 def _sampled_features(case: Case) -> Iterator[str]:
     """What a controller in continuous time cannot have, nor its actuators and sensors."""
-    for name in ("delay", "resolution"):
+    for name in ("delay", "resolution", "dropout", "jitter"):
         if getattr(case.controller, name) is not None:
             yield f"controller.{name}"
     for i, actuator in enumerate(case.actuators):

@@ -136,7 +136,8 @@ class ConfirmedFeedforwardLaw(FeedforwardLaw):
     """The law with commands for those loads alone that a sensor has shown.
 
     Its state says of each load whether a deflection sensor has read less than -`confirmation` (m)
-    since its second gate, within the first CONFIRMATION_SHARE of its crossing.
+    since its second gate, within the first CONFIRMATION_SHARE of its crossing; a missing reading
+    shows nothing.
     """
 
     confirmation: Float[Array, ""]
@@ -146,7 +147,11 @@ class ConfirmedFeedforwardLaw(FeedforwardLaw):
         return xp.zeros(self.gate_times.shape[0], bool)
 
     def step(self, state, measurement, t):
-        lowest = xp.min(measurement.readings[np.array(self.sensors)])
+        own = np.array(self.sensors)
+        readings = measurement.readings[own]
+        if measurement.present is not None:
+            readings = xp.where(measurement.present[own], readings, 0.0)
+        lowest = xp.min(readings)
         passed = t >= self.gate_times[:, 1]
         early = self.distances(t) <= CONFIRMATION_SHARE * self.length
         confirmed = state | (passed & early & (lowest <= -self.confirmation))

@@ -77,7 +77,7 @@ class AbstractLoadIdentifier(AbstractLoadSource):
     positions spaced evenly along the beam, by the modes of the design model (exact ones:
     `jaxbeam.model.statics.influence_line`); `static_lift` is the static deflection there per unit
     of each command, `offset` the offset of the readings (m). `until` is the share of the crossing
-    up to which samples are used.
+    up to which samples are used. Samples at which a deflection is missing are left out.
     """
 
     length: Float[Array, ""]
@@ -101,7 +101,8 @@ class AbstractLoadIdentifier(AbstractLoadSource):
     def update(self, state, measurement, t):
         readings = measurement.readings[np.array(self.sensor_indices)] - self.offset
         deflections = readings - self.static_lift @ measurement.command
-        sums = state + self.increments(state, deflections, t)
+        increments = self.increments(state, deflections, t)
+        sums = state + xp.where(measurement.complete(self.sensor_indices), increments, 0.0)
         return self.estimate(sums, t), sums
 
     def fitted_mass(self, cross_sum, square_sum) -> Float[Array, ""]:

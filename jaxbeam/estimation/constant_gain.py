@@ -12,6 +12,8 @@ from jaxbeam.runtime.arrays import Array, xp
 class ConstantGainFilter(AbstractSampledFilter):
     """x = prediction + gain (y - C prediction - D u - offset), with the `transition` of a period.
 
+    A missing reading corrects nothing.
+
     The first `plant_states` states x are those of the plant; states of the sensors may follow. The
     state of the filter is x and the command of the last sample.
     """
@@ -29,7 +31,7 @@ class ConstantGainFilter(AbstractSampledFilter):
     def update(self, state, measurement, t):
         x, command = state[0], measurement.command
         x = self.transition.predict(x, state[1], command)
-        innovation = measurement.readings - self.offset - self.C @ x - self.D @ command
+        innovation = measurement.innovation(self.offset + self.C @ x + self.D @ command)
         x = x + self.gain @ innovation
         return Estimate(x[: self.plant_states]), (x, command)
 

@@ -46,6 +46,9 @@ class OneStepPrediction(NamedTuple):
 class CrossingFilter(AbstractSampledFilter):
     """Time-varying Kalman filter; its covariance is propagated during the run.
 
+    A missing reading corrects nothing; covariance and gains stay those of complete readings, so
+    that they are known before a run.
+
     The first `plant_states` states x are those of the plant; those of analogue filters follow, of
     the vehicles, the weights of the loads, and those of the sensors (see `sensor_chain`). `scale`
     is the size of the states before those of the sensors, `noise_intensity` that of the white noise
@@ -103,7 +106,7 @@ class CrossingFilter(AbstractSampledFilter):
         prediction = self.predict(state, measurement.command, t)
         noise = self.sensor_chain.noise_covariance
         gain, covariance = corrected(prediction.covariance, prediction.C, noise)
-        x = prediction.x + gain @ (measurement.readings - prediction.readings)
+        x = prediction.x + gain @ measurement.innovation(prediction.readings)
         return self.estimate(x, t), FilterState(x, covariance, measurement.command)
 
     def estimate(self, x: Float[Array, " state"], t: Float[Array, ""]) -> Estimate:

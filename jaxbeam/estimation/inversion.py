@@ -30,7 +30,8 @@ class Inversion(AbstractEstimator):
     By least squares where there are more sensors of deflection than modes; the least-norm solution
     where there are fewer. Other sensors are not used. Rates are differences between samples,
     smoothed by a first-order lag of `time_constant`. States of actuators follow from the commands.
-    Loads are not modelled.
+    Loads are not modelled. While a deflection is missing coordinates and rates stay; the next
+    difference is over the time since the last complete readings.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -84,6 +85,7 @@ class Inversion(AbstractEstimator):
             actuator_transition,
             sensor_offsets(plant),
             *system.B.shape,
+            tuple(np.flatnonzero(deflection_outputs(system)).tolist()),
         )
 
     def validate(self, case, system):
@@ -113,7 +115,10 @@ class Inversion(AbstractEstimator):
 
 
 class InversionFilter(AbstractSampledFilter):
-    """Inverse of the mode shapes, and lagged differences; its state is x and the last command.
+    """Inverse of the mode shapes, and lagged differences.
+
+    Its state is x, the last command, and the periods to the next sample since the readings that x
+    has.
 
     `difference_gain` (1/s) is the weight of a difference of coordinates in the rates, `period` (s)
     the time between samples; `actuator_transition` is that of the states of actuators over a
@@ -127,20 +132,27 @@ class InversionFilter(AbstractSampledFilter):
     offset: Float[Array, " sensor"]
     plant_states: int = eqx.field(static=True)
     commands: int = eqx.field(static=True)
+    sensors: tuple[int, ...] = eqx.field(static=True)
 
     def initial_state(self):
-        return xp.zeros(self.plant_states), xp.zeros(self.commands)
+        return xp.zeros(self.plant_states), xp.zeros(self.commands), xp.ones(())
 
     def update(self, state, measurement, t):
-        x, previous_command = state
+        x, previous_command, periods = state
         modes, command = self.mode_shape_inverse.shape[0], measurement.command
         previous, rates = x[:modes], x[modes : 2 * modes]
         coordinates = self.mode_shape_inverse @ (measurement.readings - self.offset)
         smoothing = 1 - self.difference_gain * self.period
-        parts = [coordinates, smoothing * rates + self.difference_gain * (coordinates - previous)]
+        new_rates = smoothing * rates + self.difference_gain * (coordinates - previous) / periods
+        parts = [coordinates, new_rates]
+        if measurement.present is not None:
+            complete = measurement.complete(self.sensors)
+            pairs = (coordinates, previous), (new_rates, rates)
+            parts = [xp.where(complete, *pair) for pair in pairs]
+            periods = xp.where(complete, 1.0, periods + 1)
         if self.actuator_transition is not None:
             beam, actuator_states = x[: 2 * modes], x[2 * modes :]
             inputs = (xp.concatenate([beam, each]) for each in (previous_command, command))
             parts.append(self.actuator_transition.predict(actuator_states, *inputs))
         x = xp.concatenate(parts)
-        return Estimate(x), (x, command)
+        return Estimate(x), (x, command, periods)

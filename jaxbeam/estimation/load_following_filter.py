@@ -63,8 +63,10 @@ class LoadFollowingFilter(AbstractSampledFilter):
         C, D, slopes = self._readings(x, command)
         readings = C @ x + D @ command + sensor_offsets(self.filtered.plant)
         rows = add_at(C, np.s_[:, self._numbers], slopes)
+        if measurement.present is not None:  # a missing reading corrects neither x nor covariance
+            rows = xp.where(measurement.present[:, None], rows, 0.0)
         gain, covariance = corrected(covariance, rows, self.sensor_chain.noise_covariance)
-        x = x + gain @ (measurement.readings - readings)
+        x = x + gain @ measurement.innovation(readings)
         return self._estimate(x), FollowingState(x, covariance, command)
 
     def predict(

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, axis_names
+from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, PROBABILITY, axis_names
 from jaxbeam.case.limits import MAX_COUNTS
 from jaxbeam.case.profiles.table import TableProfile
 from jaxbeam.case.quantities import OF_QUANTITY
@@ -114,6 +114,8 @@ def _number(key: Key) -> dict[str, Any]:
         one["exclusiveMinimum"] = 0
     elif key.constraint == NOT_NEGATIVE:
         one["minimum"] = 0
+    elif key.constraint == PROBABILITY:
+        one |= {"minimum": 0, "exclusiveMaximum": 1}
     axes = axis_names(key.field).split()
     if axes and axes[0].startswith("*"):
         return {"anyOf": [one, {"type": "array", "items": one}]}

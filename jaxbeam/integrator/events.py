@@ -5,11 +5,12 @@ Events of the loads are added by the time grid (`time_grid`); their times may be
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.module import Module
@@ -26,7 +27,10 @@ class EventSchedule(Module):
     control sample at an event and `reading` that of the reading of each sensor, -1 for none.
     `reading_age` is the number of readings made since the one that is available at an event,
     `command_age` the number of commands made since the one that takes effect, -1 for none;
-    `max_age` and `max_waiting` are their maxima. A sensor makes at most `max_readings`.
+    `max_age` and `max_waiting` are their maxima. A sensor makes at most `max_readings`. Lost
+    readings and commands are left out; `missing` says that the reading due last has been lost, and
+    `assumed_age` is the number of commands made since the one that acts at a sample according to a
+    law that does not know of losses and random delays. Both are None without these.
     """
 
     times: Float[Array, " event"]
@@ -37,6 +41,8 @@ class EventSchedule(Module):
     command_age: Int[Array, " event"] | None = None
     reading: Int[Array, "event sensor"] | None = None
     reading_age: Int[Array, "event sensor"] | None = None
+    missing: Bool[Array, "event sensor"] | None = None
+    assumed_age: Int[Array, ""] | None = None
     max_age: int = eqx.field(static=True, default=0)
     max_waiting: int = eqx.field(static=True, default=0)
     max_readings: int = eqx.field(static=True, default=0)
@@ -68,36 +74,58 @@ def sample_schedule(
     return EventSchedule(times, length_index, lengths, sample_events)
 
 
+class Transmission(NamedTuple):
+    """Times (s) at which readings of a sensor, or commands, begin their way and arrive.
+
+    `lost` are those that do not arrive, None for none.
+    """
+
+    sent: Float[np.ndarray, " number"]
+    arrival: Float[np.ndarray, " number"]
+    lost: Bool[np.ndarray, " number"] | None = None
+
+    @property
+    def is_lost(self) -> Bool[np.ndarray, " number"]:
+        """Whether each does not arrive."""
+        return np.zeros(self.sent.size, bool) if self.lost is None else self.lost
+
+    @property
+    def received(self) -> Int[np.ndarray, " received"]:
+        """Numbers of those that arrive."""
+        return np.flatnonzero(~self.is_lost)
+
+
 def controller_schedule(
     sample_times: Float[np.ndarray, " time"],
-    control_times: Float[np.ndarray, " control_sample"],
-    delay: float,
-    arrival_times: list[Float[np.ndarray, "_"]],
-    sensor_delays: list[float],
+    commands: Transmission,
+    readings: list[Transmission],
     breakpoints: Float[np.ndarray, " breakpoint"],
     end: float | None = None,
+    assumed_age: int | None = None,
 ) -> EventSchedule:
     """Schedule of a run with a controller, from rest at zero to the `end` (s).
 
     By default it ends with the last sample, before which it never does.
 
-    The controller acts at `control_times` (s), and its commands take effect `delay` (s) later. The
-    readings of each sensor are available at its `arrival_times` (s), taken from the signal
-    `sensor_delays` (s) before. `breakpoints` (s) are those of prescribed commands.
+    The controller acts when its `commands` are sent, which take effect as they arrive, but not
+    after a newer one. The `readings` of each sensor are those of the signal when they are sent;
+    they are available as they arrive, in their order. `breakpoints` (s) are those of prescribed
+    commands.
     """
     end = float(sample_times[-1] if end is None else max(end, sample_times[-1]))
-    signal_times = [
-        arrivals - lag for arrivals, lag in zip(arrival_times, sensor_delays, strict=True)
-    ]
+    control_times, begun = commands.sent, commands.received
+    earliest_later = np.minimum.accumulate(np.append(commands.arrival[begun], np.inf)[::-1])[::-1]
+    begun = begun[commands.arrival[begun] < earliest_later[1:]]
     all_times = np.sort(
         np.concatenate(
             [
                 np.array([0.0, end]),
                 sample_times,
                 control_times,
-                control_times + delay,
+                commands.arrival[begun],
+                commands.arrival[commands.is_lost],
                 breakpoints,
-                *signal_times,
+                *[each.sent[each.received] for each in readings],
             ]
         )
     )
@@ -118,30 +146,46 @@ def controller_schedule(
             np.searchsorted(times, wanted_times - SAME_TIME_SHARE * end), 0, times.size - 1
         )
 
-    def number_at_events(wanted_times):
-        numbers = np.full(times.size, -1)
-        in_run = np.flatnonzero(
-            (wanted_times >= -SAME_TIME_SHARE * end) & (wanted_times <= end * (1 + SAME_TIME_SHARE))
-        )
-        numbers[event_indices(wanted_times[in_run])] = in_run
-        return numbers
+    def in_run(wanted_times, numbers):
+        wanted = wanted_times[numbers]
+        tolerance = SAME_TIME_SHARE * end
+        return numbers[(wanted >= -tolerance) & (wanted <= end + tolerance)]
 
-    def latest_number(due):
-        return np.maximum.accumulate(due)
+    def number_at_events(wanted_times, numbers):
+        at_events, numbers = np.full(times.size, -1), in_run(wanted_times, numbers)
+        at_events[event_indices(wanted_times[numbers])] = numbers
+        return at_events
 
-    control_sample, command_start = (
-        number_at_events(control_times),
-        number_at_events(control_times + delay),
-    )
-    command_lag = np.where(command_start >= 0, latest_number(control_sample) - command_start, -1)
-    reading_index = [number_at_events(times) for times in signal_times]
-    latest_arrival = [
-        np.searchsorted(arrivals, times + SAME_TIME_SHARE * end, side="right") - 1
-        for arrivals in arrival_times
-    ]
-    # Readings of signals before the run are those at rest, which fill the buffer at the start.
-    pairs = zip(reading_index, latest_arrival, strict=True)
-    reading_lag = [np.maximum(latest_number(made) - here, 0) for made, here in pairs]
+    def newest_at_events(arrivals, numbers):
+        arrived = np.searchsorted(arrivals[numbers], times + SAME_TIME_SHARE * end, side="right")
+        return np.append(numbers, -1)[arrived - 1]
+
+    control_sample = number_at_events(control_times, np.arange(control_times.size))
+    command_start = number_at_events(commands.arrival, begun)
+    # In place of a lost command the last one begins again.
+    is_lost = number_at_events(commands.arrival, np.flatnonzero(commands.is_lost)) >= 0
+    again = newest_at_events(commands.arrival, begun)
+    command_start = np.where(is_lost & (command_start < 0), again, command_start)
+    newest_sample = np.maximum.accumulate(control_sample)
+    command_lag = np.where(command_start >= 0, newest_sample - command_start, -1)
+    reading_index, reading_lag = [], []
+    for each in readings:
+        number = number_at_events(each.sent, each.received)
+        # Readings of signals before the run are those at rest, which fill the buffer at the start.
+        made, order = np.cumsum(number >= 0), np.full(each.sent.size + 1, -1)
+        made_in_run = in_run(each.sent, each.received)
+        order[made_in_run] = made[event_indices(each.sent[made_in_run])] - 1
+        newest = newest_at_events(each.arrival, each.received)
+        reading_index.append(number)
+        reading_lag.append(np.maximum(made - 1 - order[newest], 0))
+    missing = None
+    if any(each.lost is not None for each in readings):
+        missing = [
+            np.append(each.is_lost, False)[
+                newest_at_events(each.arrival, np.arange(each.sent.size))
+            ]
+            for each in readings
+        ]
     gaps = np.diff(times)
     lengths, length_index = np.unique(
         np.round(gaps / (1e-2 * SAME_TIME_SHARE * end)), return_inverse=True
@@ -150,8 +194,8 @@ def controller_schedule(
         length_index = np.arange(gaps.size)
     mean_lengths = np.bincount(length_index, gaps) / np.bincount(length_index)
 
-    def stack_columns(parts):
-        return xp.asarray(np.array(parts).reshape(len(parts), times.size).T, int)
+    def stack_columns(parts, kind=int):
+        return xp.asarray(np.array(parts).reshape(len(parts), times.size).T, kind)
 
     return EventSchedule(
         xp.asarray(times),
@@ -162,9 +206,11 @@ def controller_schedule(
         command_age=xp.asarray(command_lag),
         reading=stack_columns(reading_index),
         reading_age=stack_columns(reading_lag),
+        missing=None if missing is None else stack_columns(missing, bool),
+        assumed_age=None if assumed_age is None else xp.asarray(assumed_age),
         max_age=int(max((part.max() for part in reading_lag), default=0)),
-        max_waiting=int(command_lag.max(initial=0)),
-        max_readings=max((arrivals.size for arrivals in arrival_times), default=0),
+        max_waiting=int(command_lag.max(initial=assumed_age or 0)),
+        max_readings=max((each.sent.size for each in readings), default=0),
     )
 
 

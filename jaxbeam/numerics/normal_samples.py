@@ -1,8 +1,10 @@
-"""Standard normal samples: those of `jax.random.normal`, computed without compiling.
+"""Uniform and standard normal samples: those of `jax.random`, computed without compiling.
 
 The generator is Threefry 2x32 (Salmon et al., SC11, 2011): a hash of a key and a counter, so that
 a sample depends on nothing but its key and its index.
 """
+
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Float, UInt32
@@ -19,13 +21,22 @@ def normal_samples(seed: int, stream: int, count: int) -> Float[np.ndarray, " sa
     """
     from scipy.special import erfinv  # 0.1 s, and most cases have no noise
 
-    key = _hash(_words(np.array([seed])), _words(np.array([stream])))
+    share, lowest = uniform_samples(seed, (stream,), count), np.nextafter(-1.0, 0.0)
+    return np.sqrt(2) * erfinv(np.maximum(lowest, share * (1 - lowest) + lowest))
+
+
+def uniform_samples(seed: int, streams: Iterable[int], count: int) -> Float[np.ndarray, " sample"]:
+    """Samples from 0 to below 1 of a stream within streams, which numbers tell apart.
+
+    Those of `jax.random.uniform`, whose key is folded with each of the numbers.
+    """
+    key = _words(np.array([seed]))
+    for stream in streams:
+        key = _hash(key, _words(np.array([stream])))
     high, low = _hash(key, _words(np.arange(count)))
     bits = (high.astype(np.uint64) << np.uint64(32)) | low
-    # The upper 52 bits as the fraction of a number from 1 to 2, hence from -1 to 1.
-    share = ((bits >> np.uint64(12)) | np.uint64(0x3FF0000000000000)).view(float) - 1
-    lowest = np.nextafter(-1.0, 0.0)
-    return np.sqrt(2) * erfinv(np.maximum(lowest, share * (1 - lowest) + lowest))
+    # The upper 52 bits as the fraction of a number from 1 to 2.
+    return ((bits >> np.uint64(12)) | np.uint64(0x3FF0000000000000)).view(float) - 1
 
 
 def _words(numbers: np.ndarray) -> UInt32[np.ndarray, "2 number"]:

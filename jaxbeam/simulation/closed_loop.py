@@ -4,6 +4,8 @@ A controller with a sampling period acts at samples (`sampled_loop`), one withou
 continuous time (`continuous_loop`).
 """
 
+import math
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +13,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw
 from jaxbeam.case.fields import concrete
-from jaxbeam.integrator.events import EventSchedule, controller_schedule
+from jaxbeam.integrator.events import EventSchedule, Transmission, controller_schedule
 from jaxbeam.integrator.growth import load_amplitude
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
@@ -19,11 +21,14 @@ from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensing.sensor_signals import noise_samples, sensor_sections
+from jaxbeam.model.sensing.transmission import COMMANDS, sent_readings
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import Array, any_jax, block_diag, xp
 from jaxbeam.simulation.commands.path import command_path
 from jaxbeam.simulation.continuous_loop import ContinuousLoop
 from jaxbeam.simulation.sampled_loop import SampledLoop
+
+SAME_TIME_SHARE = 1e-9  # of a period
 
 
 def loop_schedule(
@@ -37,26 +42,36 @@ def loop_schedule(
     breakpoints = controller.breakpoints(case)
     breakpoints = np.zeros(0) if breakpoints is None else concrete(breakpoints)
     if controller.period is None:
-        return controller_schedule(samples, np.zeros(0), 0.0, [], [], breakpoints, end)
+        none = Transmission(np.zeros(0), np.zeros(0))
+        return controller_schedule(samples, none, [], breakpoints, end)
 
     def sampling_times(period):
         return np.arange(int(np.floor(end / period * (1 + 1e-12))) + 1) * period
 
-    period = float(concrete(controller.period))
-    sampling_periods = [
-        period if s.sampling_period is None else concrete(s.sampling_period) for s in case.sensors
-    ]
-    delays = [0.0 if s.delay is None else float(concrete(s.delay)) for s in case.sensors]
-    delay = 0.0 if controller.delay is None else float(concrete(controller.delay))
-    return controller_schedule(
-        samples,
-        sampling_times(period),
-        delay,
-        [sampling_times(float(p)) for p in sampling_periods],
-        delays,
-        breakpoints,
-        end,
-    )
+    def delays_and_losses(number, part, times):
+        losses, late = sent_readings(case.run.seed, number, part, times.size)
+        delay = 0.0 if part.delay is None else float(concrete(part.delay))
+        delays = delay if late is None else delay + concrete(late)
+        return delays, None if losses is None else concrete(losses).astype(bool)
+
+    readings = []
+    for i, sensor in enumerate(case.sensors):
+        own = controller.period if sensor.sampling_period is None else sensor.sampling_period
+        arrivals = sampling_times(float(concrete(own)))
+        delays, losses = delays_and_losses(i, sensor, arrivals)
+        readings.append(Transmission(arrivals - delays, arrivals, losses))
+    sent = sampling_times(float(concrete(controller.period)))
+    delays, losses = delays_and_losses(COMMANDS, controller, sent)
+    commands, assumed_age = Transmission(sent, sent + delays, losses), None
+    if controller.dropout is not None or controller.jitter is not None:
+        assumed_age = command_lag(case) - 1
+    return controller_schedule(samples, commands, readings, breakpoints, end, assumed_age)
+
+
+def command_lag(case: Case) -> int:
+    """Samples from the one of a command to the first at which it acts already."""
+    delay = 0.0 if case.controller.delay is None else float(concrete(case.controller.delay))
+    return math.floor(delay / float(concrete(case.controller.period)) + SAME_TIME_SHARE) + 1
 
 
 def closed_loop(

@@ -109,9 +109,8 @@ class SampledLoop(AbstractInputPolicy):
         def step(inputs):
             law_state, commands, failures = inputs
             available = self._available_readings(readings, event)
-            command, law_state, solved = self._step_law(
-                law_state, available, state, self.path.known_to_law(commands), info.start
-            )
+            acting = self.path.known_to_law(commands, schedule.assumed_age)
+            command, law_state, solved = self._step_law(law_state, available, state, acting, info)
             return law_state, self.path.send(commands, command), failures + ~solved
 
         law_state, commands, failures = cond(
@@ -158,11 +157,13 @@ class SampledLoop(AbstractInputPolicy):
         contact = contact_at(self.model, self.loads, time, state, command)
         return self.measured_rows.with_accelerations(signals, contact.modal_acceleration)
 
-    def _step_law(self, law_state, readings, state, command, time):
+    def _step_law(self, law_state, readings, state, command, info):
         """Step of the law for each run of the batch."""
+        missing = self.schedule.missing
+        present = None if missing is None else ~take(missing, info.event)
 
         def step(law_state, *measured):
-            return self.law.step(law_state, Measurement(*measured), time)
+            return self.law.step(law_state, Measurement(*measured, present), info.start)
 
         plant_state = self.plant.from_modal(state[: self.plant.modal_model.state_count])
         return vmap(step, in_axes=-1, out_axes=-1)(law_state, readings, plant_state, command)

@@ -47,8 +47,8 @@ PRECISIONS = ("double", "single")
 
 # Numbers that determine the schedule of a closed loop.
 SCHEDULE_ADDRESS = re.compile(
-    r"run\.(duration|sample_rate)|controller\.(period|delay|times\.\d+)"
-    r"|sensors\.(\d+|\*)\.(sampling_period|delay)"
+    r"run\.(duration|sample_rate)|controller\.(period|delay|dropout|jitter|times\.\d+)"
+    r"|sensors\.(\d+|\*)\.(sampling_period|delay|dropout|jitter)"
 )
 
 

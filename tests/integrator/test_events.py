@@ -6,7 +6,12 @@ import pytest
 from hypothesis import given, strategies as st
 from numpy.testing import assert_allclose
 
-from jaxbeam.integrator.events import controller_schedule, sample_schedule, stack_schedules
+from jaxbeam.integrator.events import (
+    Transmission,
+    controller_schedule,
+    sample_schedule,
+    stack_schedules,
+)
 
 MILLI = 1e-3
 
@@ -27,12 +32,11 @@ def test_commands_and_readings_come_when_they_are_due(
     control_instants = MILLI * np.arange(0, end + 1, period)
     sensor_instants = MILLI * np.arange(0, end + 1, sensor_period)
     breakpoints = np.array([0.0777])
+    sent = sensor_instants - MILLI * sensor_delay
     found = controller_schedule(
         samples,
-        control_instants,
-        MILLI * delay,
-        [sensor_instants],
-        [MILLI * sensor_delay],
+        Transmission(control_instants, control_instants + MILLI * delay),
+        [Transmission(sent, sensor_instants)],
         breakpoints,
     )
     times = np.asarray(found.times)
@@ -64,6 +68,48 @@ def test_commands_and_readings_come_when_they_are_due(
     assert np.sum(np.asarray(found.command_age) >= 0) == np.sum(
         control_instants + MILLI * delay <= end * MILLI + 1e-9
     )
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_losses_and_random_delays(seed):
+    """Against a replay event by event: what has arrived, and what acts; overtaken ones do not."""
+    random = np.random.default_rng(seed)
+    instants = 5 * MILLI * np.arange(41)
+    late = (0.0, 3.0, 17.0)[seed % 3] * MILLI
+    lost = random.uniform(size=(2, 41)) < (0.0, 0.4)[seed % 2]
+    sent = instants - 2 * MILLI - late * random.uniform(size=41)
+    begin = instants + late * random.uniform(size=41)
+    commands, readings = (
+        Transmission(instants, begin, lost[0]),
+        Transmission(sent, instants, lost[1]),
+    )
+    found = controller_schedule(instants, commands, [readings], np.zeros(0), assumed_age=1)
+    assert found.max_waiting >= int(found.assumed_age) == 1
+    made, history, acts = [], [-1] * (found.max_age + 1), -1
+    for event, time in enumerate(np.asarray(found.times)):
+        near = np.abs(np.stack([sent, begin, instants]) - time) < 1e-9
+        if np.any(near[0] & ~lost[1]):
+            history.insert(0, int(found.reading[event, 0]))
+            assert near[0][history[0]] and not lost[1][history[0]]
+        else:
+            assert found.reading[event, 0] == -1
+        if np.any(near[2]):
+            made.insert(0, int(np.argmax(near[2])))
+        due = np.flatnonzero(instants <= time + 1e-9)
+        received = due[~lost[1][due] & (sent[due] >= 0)]
+        expected = received[-1] if received.size else -1
+        # A reading of a signal before the run is that at rest.
+        arrived = due[~lost[1][due]]
+        expected = expected if arrived.size and sent[arrived[-1]] >= 0 else -1
+        assert history[int(found.reading_age[event, 0])] == expected
+        assert bool(found.missing[event, 0]) == lost[1][due[-1]]
+        begun = np.flatnonzero((begin <= time + 1e-9) & ~lost[0])
+        acts = max(begun, default=-1)
+        age = int(found.command_age[event])
+        if age >= 0:
+            assert made[age] == acts
+        elif np.any(near[1] & ~lost[0]):
+            assert np.argmax(near[1]) < acts  # overtaken
 
 
 def test_schedules_of_one_shape_are_stacked():

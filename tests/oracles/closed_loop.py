@@ -55,6 +55,8 @@ class Sensor:
     analogue: bool = False
     period: float | None = None
     delay: float = 0.0
+    lost: Sequence[bool] = ()  # whether each reading is lost
+    late: Sequence[float] = ()  # s, added to the delay of each reading
 
     def row(self, span: Span) -> np.ndarray:
         """Row from the modal coordinates, rates or accelerations to the signal."""
@@ -73,11 +75,16 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Clock:
-    """Sampling period, delay (s) and resolution of the commands of a sampled controller."""
+    """Sampling period, delay (s) and resolution of the commands of a sampled controller.
+
+    `lost` commands never begin, `late` (s) is added to the delay of each.
+    """
 
     period: float
     delay: float = 0.0
     resolution: float | None = None
+    lost: Sequence[bool] = ()
+    late: Sequence[float] = ()
 
 
 @dataclass(frozen=True)
@@ -216,23 +223,24 @@ class _Loop:
         self.plant, self.law, self.clock = plant, law, clock
         count = len(plant.actuators)
         self.active_command, self.last_command = np.zeros(count), np.zeros(count)
-        self.delayed_commands = {}
+        self.delayed_commands, self.begun = {}, -1
         self.sample_numbers, self.readings, self.digital = [], [], []
-        self.control_instants, self.times = set(), []
+        self.control_instants, self.times = {}, []
         if clock is None:
             return
         instants = clock.period * np.arange(int(end / clock.period + 1e-9) + 1)
-        self.control_instants = {round(t, DIGITS) for t in instants}
-        self.times = [*instants, *(instants + clock.delay)]
+        self.control_instants = {round(t, DIGITS): k for k, t in enumerate(instants)}
+        self.times = [*instants, *(t + self._delay(k, clock) for k, t in enumerate(instants))]
         for sensor in plant.sensors:
             period = sensor.period or clock.period
             numbers = range(int(end / period + 1e-9) + 1)
-            samples = {round(k * period - sensor.delay, DIGITS): k for k in numbers}
+            arriving = [k for k in numbers if not (len(sensor.lost) and sensor.lost[k])]
+            samples = {round(k * period - self._delay(k, sensor), DIGITS): k for k in arriving}
             self.sample_numbers.append(samples)
             self.times += list(samples)
             rest = sensor.convert(0.0)
             # Time at which each reading arrives, and its value: at rest until it is taken.
-            self.readings.append([(k * period, rest) for k in numbers])
+            self.readings.append({-1: (-np.inf, rest)} | {k: (k * period, rest) for k in arriving})
             if sensor.order and not sensor.analogue:
                 sos = scipy.signal.butter(sensor.order, sensor.cutoff, fs=1 / period, output="sos")
                 self.digital.append([sos, scipy.signal.sosfilt_zi(sos) * rest])
@@ -247,12 +255,23 @@ class _Loop:
         if t in self.control_instants:
             law_output = self.law(self.arrived_readings(t), state[: self.plant.controlled], t)
             self.last_command = self._limited(law_output, self.last_command)
-            self.delayed_commands[round(t + self.clock.delay, DIGITS)] = self.last_command
-        self.active_command = self.delayed_commands.pop(t, self.active_command)
+            number = self.control_instants[t]
+            if not (len(self.clock.lost) and self.clock.lost[number]):
+                begin = round(t + self._delay(number, self.clock), DIGITS)
+                self.delayed_commands[begin] = number, self.last_command
+        number, command = self.delayed_commands.pop(t, (-1, self.active_command))
+        if number > self.begun:
+            self.begun, self.active_command = number, command
+
+    @staticmethod
+    def _delay(number, part):
+        """Delay of a command or of a reading of a number."""
+        return part.delay + (part.late[number] if len(part.late) else 0.0)
 
     def arrived_readings(self, t):
         """The newest reading of each sensor that has arrived."""
-        return np.array([max(r for r in each if r[0] <= t + 1e-11)[1] for each in self.readings])
+        arrived = [max(r for r in each.values() if r[0] <= t + 1e-11) for each in self.readings]
+        return np.array([value for _, value in arrived])
 
     def _read(self, i, sensor, number, t, state, active):
         if sensor.quantity == "acceleration":

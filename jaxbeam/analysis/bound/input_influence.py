@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import discrete_model
-from jaxbeam.integrator.events import EventSchedule, controller_schedule
+from jaxbeam.integrator.events import EventSchedule, Transmission, controller_schedule
 from jaxbeam.integrator.input_policy import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.propagators import NODE_COUNT
@@ -109,7 +109,7 @@ def input_influence(
     uncontrolled_case = dataclasses.replace(case, controller=None)
     shapes = static_shapes(uncontrolled_case)
     step, *_ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
-    schedule = controller_schedule(times, hold_times, 0.0, [], [], np.zeros(0))
+    schedule = controller_schedule(times, Transmission(hold_times, hold_times), [], np.zeros(0))
     substeps = steps_per_interval(np.diff(times).max(), step)
     # Runs with hold -1 (the unforced one) or a hold after the end (padding) have no command; those
     # of a first one after the end are disturbed by the profile alone, as all with a command are.

@@ -39,7 +39,7 @@ class SettledFilter(AbstractSampledFilter):
         predicted = self.filter.predict(
             FilterState(x, no_covariance, command), measurement.command, self.t, self.model
         )
-        x = predicted.x + self.gain @ (measurement.readings - predicted.readings)
+        x = predicted.x + self.gain @ measurement.innovation(predicted.readings)
         return self.filter.estimate(x, self.t), (x, measurement.command)
 
 

@@ -39,7 +39,8 @@ class AdaptiveGPC(GPC):
     `more_delay` periods of delay, of filters and sensors, say, are allowed for beyond those of the
     design. Up to `until` (s) the commands are a probe, a pseudorandom binary sequence of the
     amplitude `probe`, if that is given, and the plant is identified; then it stays as it is. Let no
-    load cross before: it would be taken for the plant. Without `until` identification goes on.
+    load cross before: it would be taken for the plant. Without `until` identification goes on. It
+    pauses while a reading is missing, now or among the past ones of the model.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -114,12 +115,16 @@ class AdaptiveGPC(GPC):
 
 
 class AdaptiveState(NamedTuple):
-    """Coefficients, their covariance over the noise's variance, past readings and commands."""
+    """Coefficients, their covariance over the noise's variance, past readings and commands.
+
+    `complete` is the number of samples with complete readings, up to the last one.
+    """
 
     coefficients: Float[Array, " parameter"]
     covariance: Square
     readings: Float[Array, "past output"]
     commands: Float[Array, "past actuator"]
+    complete: Float[Array, ""]
 
 
 class AdaptiveGPCLaw(AbstractSampledLaw):
@@ -147,8 +152,9 @@ class AdaptiveGPCLaw(AbstractSampledLaw):
     def initial_state(self):
         past = self.powers + 1
         commands = xp.zeros((past, self.probe.shape[0]))
+        readings = xp.zeros((past, self.outputs))
         return AdaptiveState(
-            self.start, self.start_covariance, xp.zeros((past, self.outputs)), commands
+            self.start, self.start_covariance, readings, commands, xp.asarray(float(past))
         )
 
     def model(self, state: AdaptiveState) -> PolynomialModel:
@@ -163,12 +169,14 @@ class AdaptiveGPCLaw(AbstractSampledLaw):
         identified = self.identified(state, readings, commands)
         sample = xp.floor(t / self.period + 0.5).astype(int)
         # Increments need two readings, and the model's past; before, everything is at rest.
-        active = (t <= self.until) & (sample > 0)
+        now_complete = measurement.complete(range(self.outputs))
+        complete = xp.where(now_complete, state.complete + 1.0, 0.0)
+        active = (t <= self.until) & (sample > 0) & (complete > self.powers + 1)
         coefficients, covariance = (
             xp.where(active, new, old) for new, old in zip(identified, state[:2], strict=True)
         )
         readings = xp.concatenate([readings[None], state.readings[:-1]])
-        state = AdaptiveState(coefficients, covariance, readings, commands)
+        state = AdaptiveState(coefficients, covariance, readings, commands, complete)
         gains = predictive_gains(
             self.model(state), self.horizons, self.output_weights, self.move_weights, self.reference
         )

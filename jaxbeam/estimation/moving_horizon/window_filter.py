@@ -57,6 +57,7 @@ class WindowFilter(AbstractSampledFilter):
 
     `rows` give the bounded deflections (m) from the states; they are bounded by `deflection_limit`
     in the last `window` samples, the present one included. `weight_rows` give the weights (N).
+    Missing readings are those of the `filter`.
     """
 
     filter: CrossingFilter
@@ -91,7 +92,7 @@ class WindowFilter(AbstractSampledFilter):
         covariance = symmetric_part(matrix @ state.covariance @ matrix.T + noise)
         readings = C @ x + D @ command + sensor_offsets(self.filter.filtered.plant)
         gain, covariance = corrected(covariance, rows, self.filter.sensor_chain.noise_covariance)
-        mean = mean + gain @ (measurement.readings - readings)
+        mean = mean + gain @ measurement.innovation(readings)
         within = self._within_bounds(mean, covariance)[: C.shape[-1]]
         return self.filter.estimate(within, t), WindowState(mean, covariance, command)
 

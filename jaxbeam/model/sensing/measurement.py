@@ -11,6 +11,7 @@ from jaxbeam.model.sensing.sensor_signals import (
     sampled_readings,
     to_reading,
 )
+from jaxbeam.model.sensing.transmission import sent_readings
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 
@@ -24,13 +25,14 @@ def sensor_readings(
 ) -> Float[Array, "time sensor"]:
     """Readings of the sensors of a case (SI units) from the motion of its modes.
 
-    The `times` (s) are needed for sensors with a filter, a delay or a sampling period. `noisy`
-    readings include noise drawn with the run's seed; predictions to compare with logs do without.
+    The `times` (s) are needed for sensors whose readings depend on more than the present. `noisy`
+    readings include noise, losses and random delays by the run's seed; predictions to compare with
+    logs do without.
 
     Raises ValueError, naming the sensor, as `sampled_readings` does and for missing times.
     """
     samples = motion.coordinates.shape[0]
-    noisy = noisy and any(sensor.noise is not None for sensor in case.sensors)
+    random, noisy = noisy, noisy and any(sensor.noise is not None for sensor in case.sensors)
     noise = noise_samples(case.run.seed, len(case.sensors), samples) if noisy else None
     columns = []
     for i, sensor in enumerate(case.sensors):
@@ -41,15 +43,17 @@ def sensor_readings(
             continue
         if times is None:
             raise ValueError(
-                f"sensors.{i} has a filter, a delay or a sampling period: its readings need times"
+                f"sensors.{i} has a filter, a delay, a sampling period, dropout or jitter: its"
+                " readings need times"
             )
         rates_of_change = None
         if not (sensor.has_feedthrough or sensor.bends):
             rates = motion._replace(coordinates=motion.rates, rates=motion.accelerations)
             rates_of_change = sensor_history(case, modes, rates, sensor)
         try:
+            way = sent_readings(case.run.seed, i, sensor, samples) if random else (None, None)
             columns.append(
-                sampled_readings(sensor, times, values, rates_of_change, noise_of_sensor)
+                sampled_readings(sensor, times, values, rates_of_change, noise_of_sensor, *way)
             )
         except ValueError as error:
             raise ValueError(f"sensors.{i}: {error}") from None

@@ -1,14 +1,15 @@
 """Sensor model: from the true value of a quantity to the readings of a sensor.
 
-In this order: analogue filter; sampling of the signal `delay` before; offset and noise; range and
-resolution; digital filter of the samples. `filtered_reading` makes a single reading from a sampled
-value; `sampled_readings` makes all readings of a history, with analogue filter, delay and clock.
+In this order: analogue filter; sampling of the signal `delay` and a random delay before; offset and
+noise; range and resolution; loss; digital filter of the samples that are not lost.
+`filtered_reading` makes a single reading from a sampled value; `sampled_readings` makes all
+readings of a history, with analogue filter, delay, clock and losses.
 """
 
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.filters import (
@@ -27,6 +28,7 @@ from jaxbeam.numerics.normal_samples import normal_samples
 from jaxbeam.runtime.arrays import Array, scan, stop_gradient, take, xp
 
 CLOCK_TOLERANCE_PERIODS = 1e-6  # a time this much before a sampling instant counts as at it
+IDENTITY = np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])  # a filter that changes nothing
 
 AnySensor = Sensor | VehicleSensor
 Sections = Float[Array, "section 6 ..."] | None  # None: no digital filter
@@ -87,7 +89,8 @@ def noise_samples(seed: int, sensors: int, samples: int) -> Float[Array, "sample
 
 def needs_times(sensor: AnySensor) -> bool:
     """Whether readings depend on more than the simultaneous true value, hence on the times."""
-    return not (sensor.filter is None and sensor.sampling_period is None and sensor.delay is None)
+    timed = sensor.filter, sensor.sampling_period, sensor.delay, sensor.dropout, sensor.jitter
+    return any(part is not None for part in timed)
 
 
 def sampled_readings(
@@ -96,13 +99,16 @@ def sampled_readings(
     values: Float[Array, " time"],
     rates: Float[Array, " time"] | None,
     noise: Float[Array, " time"] | None = None,
+    losses: Bool[Array, " time"] | None = None,
+    late: Float[Array, " time"] | None = None,
 ) -> Float[Array, " time"]:
     """Latest reading of a sensor at ascending times (s), from the true values and their rates.
 
     Between the times the signal is the cubic Hermite interpolant of values and rates, linear
     without rates; before the first time it is constant. The sensor is sampled at the first time
-    and every sampling period after it, or at each of the times if it has none; `noise` holds a
-    standard normal sample for each reading.
+    and every sampling period after it, or at each of the times if it has none. `noise` holds a
+    standard normal sample for each reading, `losses` whether it is lost, so that the last one stays
+    (at first the value at the first time), `late` how much older than the delay it is (s).
 
     Raises ValueError if a filter needs equally spaced times and these are not; if a digital filter
     would need readings between the times; if its cutoff is not below half the sampling frequency.
@@ -118,18 +124,24 @@ def sampled_readings(
         )
         sample_times = times[0] + sensor.sampling_period * sample_index
         new_reading = xp.concatenate([xp.ones(1, bool), xp.diff(sample_index) > 0])
-        noise = None if noise is None else take(noise, xp.cumsum(new_reading) - 1)
-    sampled = values
-    if sensor.sampling_period is not None or sensor.delay is not None:
-        signal_times = sample_times if sensor.delay is None else sample_times - sensor.delay
+        number = xp.cumsum(new_reading) - 1
+        noise, losses, late = (
+            None if each is None else take(each, number) for each in (noise, losses, late)
+        )
+    sampled, delays = values, [delay for delay in (sensor.delay, late) if delay is not None]
+    if sensor.sampling_period is not None or delays:
+        signal_times = sample_times - sum(delays)
         sampled = evaluate_cubics(times, hermite_cubics(times, values, rates), signal_times)
     readings = to_reading(sensor, sampled, noise)
     sections = sensor_sections(sensor, spacing)
+    if losses is not None:
+        new_reading = ~losses if new_reading is None else new_reading & ~losses
+        sections = IDENTITY if sections is None else sections
     if sections is None:
         return readings
-    return filter_history(
-        sections, initial_filter_state(sensor, sections, values[0]), readings, new_reading
-    )
+    start = initial_filter_state(sensor, sections, values[0])
+    before = to_reading(sensor, values[0])
+    return filter_history(sections, start, readings, new_reading, before)
 
 
 def _apply_filter(filter: Filter, times, spacing, values, rates):

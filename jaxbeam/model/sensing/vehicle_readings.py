@@ -28,7 +28,7 @@ def vehicle_readings(
 ) -> Float[Array, "time sensor"]:
     """Readings of the vehicle sensors of a case (SI units) at times (s).
 
-    `noisy` readings include noise drawn with the run's seed.
+    `noisy` readings include noise, losses and random delays by the run's seed.
 
     Raises ValueError, naming the sensor, as `sampled_readings` does.
     """
@@ -42,7 +42,8 @@ def vehicle_readings(
             columns.append(to_reading(sensor, values, noise))
             continue
         try:
-            columns.append(sampled_readings(sensor, times, values, None, noise))
+            way = sent_readings(case.run.seed, number, sensor, samples) if noisy else (None, None)
+            columns.append(sampled_readings(sensor, times, values, None, noise, *way))
         except ValueError as error:
             raise ValueError(f"vehicle_sensors.{i}: {error}") from None
     return xp.array(columns).reshape(-1, samples).T

@@ -74,8 +74,13 @@ class CommandPath(Module):
         """Commands that act on the beam."""
         return _outputs(self.operators, memory.states, memory.command)
 
-    def known_to_law(self, memory: CommandMemory) -> Commands:
-        """Present commands as a law of linear actuators knows them."""
+    def known_to_law(self, memory: CommandMemory, age=None) -> Commands:
+        """Present commands as a law of linear actuators knows them.
+
+        With an `age`, those made so many commands ago, whether they arrived or not.
+        """
+        if age is not None:
+            return take(memory.queue if memory.assumed is None else memory.assumed_queue, age)
         return memory.command if memory.assumed is None else memory.assumed
 
     def send(self, memory: CommandMemory, wanted: Commands) -> CommandMemory:

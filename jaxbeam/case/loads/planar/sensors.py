@@ -5,7 +5,15 @@ from typing import ClassVar
 from jaxtyping import Float
 
 from jaxbeam.case.display.parts import ReprWithUnits
-from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, count, number, part
+from jaxbeam.case.fields import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    PROBABILITY,
+    choice,
+    count,
+    number,
+    part,
+)
 from jaxbeam.case.filters import Filter
 from jaxbeam.case.quantities import BODY_QUANTITIES, OF_QUANTITY, QUANTITIES
 from jaxbeam.case.reading.units import in_si
@@ -53,6 +61,12 @@ class VehicleSensor(ReprWithUnits, Module):
     )
     delay: Float[Array, ""] | None = number(
         "s", "from motion to reading", NOT_NEGATIVE, default=None
+    )
+    dropout: Float[Array, ""] | None = number(
+        "1", "probability that a reading is lost", PROBABILITY, default=None, kw_only=True
+    )
+    jitter: Float[Array, ""] | None = number(
+        "s", "largest random delay of a reading", NOT_NEGATIVE, default=None, kw_only=True
     )
 
     def __post_init__(self):
