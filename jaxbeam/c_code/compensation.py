@@ -37,10 +37,12 @@ class Compensation:
                     values = getattr(operator.hysteresis, number)
                     names[f"{part}_{number}"] = code.constant(f"{part}_{number}_{i}", values)
                 zeros = np.zeros(plays)
-                names[part] = code.state(f"{part}_plays_{i}", zeros, f"plays of actuator {i}")
+                meaning, restarts = f"plays of actuator {i}", False
+                names[part] = code.state(f"{part}_plays_{i}", zeros, meaning, restarts)
                 if lags:
                     name, zeros = f"{part}_lags_{i}", np.zeros(lags)
-                    names[f"{part}_lags"] = code.state(name, zeros, f"creep of actuator {i}")
+                    meaning = f"creep of actuator {i}"
+                    names[f"{part}_lags"] = code.state(name, zeros, meaning, restarts)
             names["tried"] = code.work(f"tried_plays_{i}", plays)
             self.names[i] = names
             command = f"{code.output}[{i}]"

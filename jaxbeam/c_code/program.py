@@ -1,5 +1,6 @@
 """Program in C of the controller of a case: source, header, recorded samples, loop that checks."""
 
+import dataclasses
 import os
 from pathlib import Path
 from typing import NamedTuple
@@ -9,7 +10,6 @@ import numpy as np
 from jaxbeam.c_code.compensation import Compensation
 from jaxbeam.c_code.recorded_loop import (
     RecordedLoop,
-    command_lag,
     designs_compiled,
     filters_in_program,
     recorded_loop,
@@ -26,11 +26,16 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.control.state_controller import AbstractStateController
 from jaxbeam.control.state_law import SampledStateLaw, TrueState
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensing.sensor_signals import initial_filter_state
+from jaxbeam.model.sensing.sensor_signals import (
+    initial_filter_state,
+    possible_readings,
+    to_reading,
+)
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import known
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.simulation.closed_loop import command_lag
 from jaxbeam.simulation.commands.limits import command_ranges
 
 MAX_SAMPLES = 2000  # recorded ones, of the start of the run
@@ -116,32 +121,73 @@ _designed_compiled = compiled(_design)
 
 
 def _source(case: Case) -> CSource:
-    """Code that begins with the readings, behind the digital filters of their sensors."""
+    """Code that begins with the readings, behind the digital filters of their sensors.
+
+    One that is missing leaves the last in its place, and the filter as it is.
+    """
     period, duration = (float(concrete(x)) for x in (case.controller.period, case.run.duration))
     samples = int(np.floor(duration / period * (1 + 1e-12))) + 1
     code = CSource(len(case.sensors), len(case.actuators), period, samples)
     code.compiles = designs_compiled(case.controller)
-    code.work("reading", len(case.sensors), "readings behind the digital filters")
-    code.state("acting", np.zeros(len(case.actuators)), "commands that act at the sample")
-    code.work("wanted", len(case.actuators), "commands of the law, before the limits")
+    at_rest = [to_reading(sensor, 0.0) for sensor in case.sensors]
+    code.state("reading", at_rest, "last readings, behind the digital filters")
+    code.work("present", len(case.sensors), "which of them are new: 1, or 0 for a missing one")
+    commands = len(case.actuators)
+    code.state("acting", np.zeros(commands), "commands that act at the sample", restarts=False)
+    code.work("wanted", commands, "commands of the law, before the limits")
+    filters = filters_in_program(case)
     if case.sensors:
-        code.add(f"copy({code.readings}, measurements, {code.sensors});")
-    for i, sections in enumerate(filters_in_program(case)):
+        # A reading that comes filtered may be beyond the range of its samples.
+        ranges = [
+            possible_readings(
+                dataclasses.replace(sensor, range=None)
+                if sensor.has_digital_filter and sections is None
+                else sensor
+            )
+            for sensor, sections in zip(case.sensors, filters, strict=True)
+        ]
+        lowest, highest = (
+            code.constant(f"{name}_reading", ends)
+            for name, ends in zip(("lowest", "highest"), np.transpose(ranges), strict=True)
+        )
+        arguments = f"{code.readings}, {code.present}, measurements, {lowest}, {highest}"
+        code.add(f"receive({arguments}, {code.sensors});", 3 * code.sensors)
+    for i, sections in enumerate(filters):
         if sections is None:
             continue
         count = len(sections)
         start = initial_filter_state(case.sensors[i], sections, 0.0)
         states = code.state(f"filter_{i}", start, f"states of the filter of sensor {i}")
         filter, reading = code.constant(f"filter_{i}", sections), f"{code.readings}[{i}]"
-        code.add(f"{reading} = filter_sample({filter}, {count}, {states}, {reading});", 9 * count)
+        code.add(
+            f"if ({code.present}[{i}] > 0)\n"
+            f"    {reading} = filter_sample({filter}, {count}, {states}, {reading});",
+            9 * count + 1,
+        )
     return code
 
 
 def _write_limits(case: Case, code: CSource) -> None:
-    """Resolution, limits and rate limits of the commands, and the delay until they act."""
+    """Resolution, limits and rate limits of the commands, and the delay until they act.
+
+    Where a number of the law is not finite, it starts again, and the last command of it stays.
+    """
     actuators, lag = code.actuators, command_lag(case)
     low, high, rate = (np.asarray(part) for part in command_ranges(case))
-    latest = code.state("sent", np.zeros(actuators * lag), "last commands, the latest first")
+    last = code.state("last_wanted", np.zeros(actuators), "last of these", restarts=False)
+    numbers = sum(member.size for member in code.members.values() if member.restarts)
+    code.add(
+        f"""
+/* A law with a number that is not finite starts again, and its last command stays */
+if (!is_finite(s) || !all_finite({code.output}, {actuators})) {{
+    restart(s);
+    copy({code.output}, {last}, {actuators});
+}}
+copy({last}, {code.output}, {actuators});""",
+        2 * (numbers + actuators),
+    )
+    zeros, meaning = np.zeros(actuators * lag), "last commands, the latest first"
+    latest = code.state("sent", zeros, meaning, restarts=False)
     compensation = Compensation(case, code)
     compensation.write_inverse()
     code.add("/* Commands as the actuators receive them */")
@@ -166,9 +212,8 @@ def _write_limits(case: Case, code: CSource) -> None:
     code.add(f"copy(commands, {code.output}, {actuators});")
     queues, known_queue = [(latest, code.output)], latest
     if compensation.operators:
-        known_queue = code.state(
-            "known", np.zeros(actuators * lag), "what acts of them, the latest first"
-        )
+        meaning = "what acts of them, the latest first"
+        known_queue = code.state("known", zeros, meaning, restarts=False)
         acting = code.work("acts", actuators, "what acts of the commands")
         compensation.write_model(acting)
         queues.append((known_queue, acting))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep, Measurement
+from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.filters import filter_step
 from jaxbeam.case.sensors import Sensor
@@ -19,12 +20,16 @@ from jaxbeam.integrator.integrate import (
     longest_force_step,
     max_stable_step,
 )
-from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import Layout
-from jaxbeam.model.sensing.sensor_signals import Sections, initial_filter_state, sensor_sections
-from jaxbeam.runtime.arrays import Array, any_jax, known, vmap, xp
+from jaxbeam.model.sensing.sensor_signals import (
+    Sections,
+    initial_filter_state,
+    sensor_sections,
+    to_reading,
+)
+from jaxbeam.runtime.arrays import Array, any_jax, known, take, vmap, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import (
@@ -32,16 +37,17 @@ from jaxbeam.simulation.integration_plan import (
     static_shapes,
     steps_per_interval,
 )
+from jaxbeam.simulation.sampled_loop import SampledLoop
 from jaxbeam.simulation.simulate import integration_setup
 
 MIN_COMPILED = 300  # samples from which compilation pays
-SAME_TIME_SHARE = 1e-9  # of a period
 
 
 class RecordedLoop(NamedTuple):
     """Samples of a loop: times (s), readings before their digital filters, states of the plant.
 
-    `commands` are those that the law gives at each sample, after limits and resolution.
+    Missing readings are NaN. `commands` are those that the law gives at each sample, after limits
+    and resolution.
     """
 
     times: Float[np.ndarray, " sample"]
@@ -51,7 +57,10 @@ class RecordedLoop(NamedTuple):
 
 
 class FilteredLaw(AbstractSampledLaw):
-    """A law behind the digital filters of its sensors, which start from rest."""
+    """A law behind the digital filters of its sensors, which start from rest.
+
+    For a missing sample a filter waits, and its last output stays.
+    """
 
     law: AbstractSampledLaw
     sections: tuple[Sections, ...]
@@ -59,27 +68,43 @@ class FilteredLaw(AbstractSampledLaw):
 
     def initial_state(self):
         pairs = zip(self.sensors, self.sections, strict=True)
-        return self.law.initial_state(), [initial_filter_state(*pair, 0.0) for pair in pairs]
+        filter_states = [initial_filter_state(*pair, 0.0) for pair in pairs]
+        at_rest = [to_reading(sensor, 0.0) for sensor in self.sensors]
+        return self.law.initial_state(), filter_states, xp.array(at_rest)
 
     def tabulated(self, times):
         return dataclasses.replace(self, law=self.law.tabulated(times))
 
     def step(self, state, measurement, t):
-        law_state, filter_states = state
+        law_state, filter_states, last = state
         readings, after = [], []
-        for sections, filter_state, reading in zip(
-            self.sections, filter_states, measurement.readings, strict=True
-        ):
+        for i, sections in enumerate(self.sections):
+            reading, filter_state = measurement.readings[i], filter_states[i]
             if sections is not None:
-                reading, filter_state = filter_step(sections, filter_state, reading)
+                found = filter_step(sections, filter_state, reading)
+                if measurement.present is not None:
+                    is_new, before = measurement.present[i], (last[i], filter_state)
+                    found = (xp.where(is_new, *pair) for pair in zip(found, before, strict=True))
+                reading, filter_state = found
             readings.append(reading)
             after.append(filter_state)
-        filtered = xp.stack(readings) if readings else measurement.readings
-        measurement = Measurement(filtered, measurement.state, measurement.command)
+        if readings:
+            measurement = measurement._replace(readings=xp.stack(readings))
         step = self.law.step(law_state, measurement, t)
         if not any_jax(measurement):  # also of laws that use JAX for known numbers
             step = known(step)
-        return ControlStep(step.command, (step.state, after), step.solved)
+        return ControlStep(step.command, (step.state, after, measurement.readings), step.solved)
+
+
+class _Recorder(SampledLoop):
+    """A sampled loop whose observations are readings, NaN where missing, and commands sent last."""
+
+    def observe(self, memory, info):
+        readings = self._available_readings(memory.readings, info.event)
+        if self.schedule.missing is not None:
+            missing = take(self.schedule.missing, info.event)[:, None]
+            readings = xp.where(missing, xp.nan, readings)
+        return readings, memory.commands.queue[0]
 
 
 class _DesignedController(AbstractController):
@@ -118,12 +143,6 @@ def filters_in_program(case: Case) -> tuple[Sections, ...]:
     )
 
 
-def command_lag(case: Case) -> int:
-    """Samples from the one of a command to the first at which it acts already."""
-    delay = 0.0 if case.controller.delay is None else float(concrete(case.controller.delay))
-    return math.floor(delay / float(concrete(case.controller.period)) + SAME_TIME_SHARE) + 1
-
-
 def recorded_loop(case: Case, law: AbstractSampledLaw, max_samples: int) -> RecordedLoop:
     """Loop of a case with a designed law, over the run or its first samples.
 
@@ -135,17 +154,13 @@ def recorded_loop(case: Case, law: AbstractSampledLaw, max_samples: int) -> Reco
         for sensor, part in zip(case.sensors, sections, strict=True)
     )
     period, duration = (float(concrete(x)) for x in (controller.period, case.run.duration))
-    # The command of a sample is read where it acts, up to a whole delay later.
-    delay = 0.0 if controller.delay is None else float(concrete(controller.delay))
-    later = math.ceil(delay / period - SAME_TIME_SHARE)
-    count = min(math.floor(duration / period * (1 + 1e-12)) + 1, max_samples + later)
-    times = np.arange(max(count, later + 2)) * period
+    count = min(math.floor(duration / period * (1 + 1e-12)) + 1, max_samples)
+    times = np.arange(count + 1) * period
     many = len(times) >= MIN_COMPILED
     is_compiled = designs_compiled(controller) or (controller.runs_compiled and many)
+    settings = "period", "delay", "resolution", "dropout", "jitter"
     recorded = _DesignedController(
-        period=controller.period,
-        delay=controller.delay,
-        resolution=controller.resolution,
+        **{name: getattr(controller, name) for name in settings},
         law_to_run=FilteredLaw(law, sections, case.sensors),
         is_compiled=is_compiled,
     )
@@ -155,10 +170,9 @@ def recorded_loop(case: Case, law: AbstractSampledLaw, max_samples: int) -> Reco
     plan = _plan(case, times)
     run = _run_compiled if is_compiled else _run
     readings, states, commands = (np.asarray(part) for part in run(case, plan, times))
-    if not all(np.isfinite(part).all() for part in (readings, states, commands)):
+    if not all(np.isfinite(part).all() for part in (states, commands)):
         raise ValueError("the closed loop diverges, so that there are no commands to check it by")
-    end = len(times) - later
-    return RecordedLoop(times[:end], readings[:end], states[:end], commands[later:])
+    return RecordedLoop(times[:-1], readings[:-1], states[:-1], commands[:-1])
 
 
 def _plan(case: Case, times: Float[np.ndarray, " sample"]) -> IntegrationPlan:
@@ -180,15 +194,15 @@ def _longest_step(case: Case, layout: Layout) -> Array:
 def _run_loop(case: Case, plan: IntegrationPlan, times) -> tuple[Array, Array, Array]:
     """Readings, states of the plant and commands sent to the actuators at the samples."""
     discrete, loads, policy, sample_steps, steps = integration_setup(case, plan, times, None)
-    _, states, commands, observed, _ = integrate_history(
+    policy = _Recorder(**{field.name: getattr(policy, field.name) for field in fields(policy)})
+    _, states, _, (readings, commands), _ = integrate_history(
         discrete, loads, max_loads=plan.shapes.max_loads, steps=steps, policy=policy
     )
     plant = policy.plant
     states = states[sample_steps, : plant.modal_model.state_count, 0]
-    held = commands[..., 0].reshape(commands.shape[0], NODE_COUNT, -1)
-    sample_steps = xp.minimum(sample_steps, held.shape[0] - 1)
-    sent = held[:, 0] if observed[2] is None else observed[2][..., 0]
-    return observed[0][sample_steps, ..., 0], vmap(plant.from_modal)(states), sent[sample_steps]
+    sample_steps = xp.minimum(sample_steps, len(readings) - 1)  # no step starts at the end
+    sampled = readings[sample_steps, :, 0], commands[sample_steps, :, 0]
+    return sampled[0], vmap(plant.from_modal)(states), sampled[1]
 
 
 _run = compiled_if_traced(_run_loop)

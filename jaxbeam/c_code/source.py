@@ -19,11 +19,15 @@ REAL_BYTES, INT_BYTES = 8, 4  # in double precision
 
 
 class Member(NamedTuple):
-    """Member of the state in C: number of entries, values after a reset (None: none), meaning."""
+    """Member of the state in C: number of entries, values after a reset (None: none), meaning.
+
+    With `restarts` it is set to its start, too, if a number of the law is not finite.
+    """
 
     size: int
     start: Float[np.ndarray, " entry"] | None
     comment: str
+    restarts: bool = False
 
 
 class CSource:
@@ -31,11 +35,13 @@ class CSource:
 
     `readings`, `command`, `time` and `output` are the C expressions of the readings of the sensors,
     of the command that acts at the sample, of the time (s), and of the command that the law has to
-    write. `true_state` is that of a given state, if `given_states` is not zero: a law that takes
-    one sets that number.
+    write. `present` is positive for each sensor whose reading came; else the last one is in its
+    place, and a sentence in `missing` says what else the law does. `given_states` is the number of
+    states that follow the readings among the measurements: a law that takes any sets it.
     """
 
-    readings, command, time, output = "s->reading", "s->acting", "t", "s->wanted"
+    readings, present = "s->reading", "s->present"
+    command, time, output = "s->acting", "t", "s->wanted"
 
     compiles = False  # whether numbers of the law at samples are worth a compilation
 
@@ -52,20 +58,16 @@ class CSource:
         self.variables: list[str] = []
         self.lines: list[str] = []
         self.notes: list[str] = []
+        self.missing: list[str] = []
         self.operations = 0
 
-    @property
-    def true_state(self) -> str:
-        """C expression of the given state: it follows the readings of the sensors."""
-        return f"(measurements + {self.sensors})"
-
     def constant(self, name: str, values) -> str:
-        """Constant array of numbers; its name in C, which is unique."""
+        """Constant array of numbers; its name in C, which is unique. Of one number its value."""
         array = np.asarray(values)
         kind = int if array.dtype.kind in "iub" else float
         name = _unique(name, self.constants)
         self.constants[name] = np.ravel(array).astype(kind)
-        return name
+        return name if array.ndim else f"{name}[0]"
 
     def per_sample(self, name: str, values: Num[np.ndarray, "sample *entry"]) -> str:
         """Constant arrays, one for each sample; the C expression of that of the present sample.
@@ -92,12 +94,15 @@ class CSource:
             self.lines[:0] = [line]
             self.operations += 4
 
-    def state(self, name: str, start, comment: str) -> str:
-        """Array in the state that keeps its values between samples; its C expression."""
+    def state(self, name: str, start, comment: str, restarts: bool = True) -> str:
+        """Array in the state that keeps its values between samples; its C expression.
+
+        It goes back to its start if a number of the law is not finite, unless it `restarts` never.
+        """
         values = np.ravel(np.asarray(start, float))
         name = _unique(name, self.members)
-        self.members[name] = Member(values.size, values, comment)
-        return f"s->{name}"
+        self.members[name] = Member(values.size, values, comment, restarts)
+        return f"s->{name}" if np.ndim(start) else f"s->{name}[0]"
 
     def work(self, name: str, size: int, comment: str = "work space") -> str:
         """Array in the state for intermediate results; its C expression."""
@@ -118,7 +123,8 @@ class CSource:
         self.gate_loads, self.gate_times = len(gate_times), np.asarray(gate_times, float)
         self.counter("passages_1", "loads that have passed the first gate")
         self.counter("passages_2", "loads that have passed the second gate")
-        return self.state("gate_times", np.full(2 * len(gate_times), 1e30), "s, NEVER before")
+        never = np.full(2 * len(gate_times), 1e30)
+        return self.state("gate_times", never, "s, NEVER before", restarts=False)
 
     def add(self, text: str, operations: int = 0) -> None:
         """Add statements of a step, which take at most a number of operations."""
@@ -201,4 +207,5 @@ def interpolation_operations(points: int) -> int:
 
 def array_text(values: Float[np.ndarray, " entry"] | Int[np.ndarray, " entry"]) -> str:
     """Numbers of an array in C, separated by commas; exact in double precision."""
-    return ", ".join(repr(value) for value in values.tolist())
+    names = {"nan": "NAN", "inf": "INFINITY", "-inf": "-INFINITY"}  # of math.h
+    return ", ".join(names.get(repr(value), repr(value)) for value in values.tolist())

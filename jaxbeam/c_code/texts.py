@@ -44,12 +44,13 @@ typedef struct {{
 {_lines(members)}
 }} {name}_state;
 
-/* Start of a run, at rest. */
+/* Start of a run, at rest: states, delays and filters. */
 void {name}_reset({name}_state *s);
 {_gate_prototype(name, code)}
 /* One sample: commands from the measurements at a time t (s from the start of the run).
    {_measurements(code)}
-   Commands are rounded and limited: send them to the actuators as they are. */
+   Commands are rounded and limited: send them to the actuators as they are.
+{_missing_lines(code)} */
 void {name}_step({name}_state *s, const {name}_real *measurements, {name}_real t,
      {" " * len(name)}      {name}_real *commands);
 
@@ -62,7 +63,9 @@ def source_text(name: str, title: list[str], code: CSource) -> str:
     constants = []
     for constant, values in code.constants.items():
         kind = "int" if values.dtype.kind == "i" else "real"
-        constants.append(_wrapped(f"static const {kind} {constant}[] = {{{array_text(values)}}};"))
+        constants.append(
+            _wrapped(f"static const {kind} {constant}[] = {{{array_text(values) or '0'}}};")
+        )
     body = "\n".join(code.lines)
     indices = [i for i in ("i", "j", "sample") if _uses(body, i)]
     declared = [f"    int {', '.join(indices)};"] if indices else []
@@ -73,15 +76,21 @@ def source_text(name: str, title: list[str], code: CSource) -> str:
 
 #include <math.h>
 
+#ifdef __FAST_MATH__
+#error "missing readings are NaN, which -ffast-math takes for numbers: compile without it"
+#endif
+
 typedef {name}_real real;
 
 {_lines(constants)}
 
 {(chr(10) * 2).join(code.helper_texts())}
 
+{_restart_functions(name, code)}
 void {name}_reset({name}_state *s)
 {{
-{_lines(_reset_lines(code))}
+{_lines(_reset_lines(code, False))}
+    restart(s);
 }}
 {_gate_function(name, code)}
 void {name}_step({name}_state *s, const real *measurements, real t, real *commands)
@@ -200,7 +209,9 @@ def _gate_function(name: str, code: CSource) -> str:
     return f"""
 void {name}_gate({name}_state *s, int gate, real t)
 {{
-    const int load = (gate ? s->passages_2++ : s->passages_1++) % {code.gate_loads};
+    int load;
+    if (!all_finite(&t, 1)) return;
+    load = (gate ? s->passages_2++ : s->passages_1++) % {code.gate_loads};
     s->gate_times[2 * load + gate] = t;
     if (gate) return;
     {" ".join(["s->gate_times[2 * load + 1] = (real)1e30;", *code.first_gate_lines])}
@@ -208,10 +219,45 @@ void {name}_gate({name}_state *s, int gate, real t)
 """
 
 
-def _reset_lines(code: CSource) -> list[str]:
-    """Statements that set the state to its start."""
+def _restart_functions(name: str, code: CSource) -> str:
+    """Functions that set the law to its start, and say whether all its numbers are finite."""
+    restarting = [
+        f"all_finite(s->{key}, {part.size})"
+        for key, part in code.members.items()
+        if part.restarts and part.size
+    ]
+    separator, unused = "\n        && ", [] if restarting else ["    (void)s;"]
+    return f"""/* Start of the law: what is set from outside, and commands on their way, stay. */
+static void restart({name}_state *s)
+{{
+{_lines([*unused, *_reset_lines(code, True)])}
+}}
+
+static int is_finite(const {name}_state *s)
+{{
+{_lines([*unused, f"    return {separator.join(restarting or ['1'])};"])}
+}}
+"""
+
+
+def _missing_lines(code: CSource) -> str:
+    """What a step does where a reading is missing, as lines of a comment."""
+    sentences = [
+        "A reading that is no number, or outside the range of its sensor, is missing: give NAN for"
+        " one that did not come in time, and call the step once a period even if none came; one"
+        " that comes late counts in the next step. The last reading stays in the place of a missing"
+        " one, filters wait, and commands stay within their limits.",
+        *dict.fromkeys(code.missing),
+        "If a number of the law is not finite, it starts again and its last command stays.",
+    ]
+    return textwrap.fill(" ".join(sentences), 97, initial_indent="   ", subsequent_indent="   ")
+
+
+def _reset_lines(code: CSource, restarts: bool) -> list[str]:
+    """Statements that set the state to its start: what restarts, or all else."""
     lines, loops = [], False
-    for name, part in code.members.items():
+    members = {key: part for key, part in code.members.items() if part.restarts == restarts}
+    for name, part in members.items():
         start = np.zeros(part.size) if part.start is None else part.start
         if part.size and np.all(start == start[0]) and part.size > 2:
             loops = True
@@ -221,7 +267,7 @@ def _reset_lines(code: CSource) -> list[str]:
             lines += [
                 f"    s->{name}[{i}] = {array_text(start[i : i + 1])};" for i in range(part.size)
             ]
-    lines += [f"    s->{name} = 0;" for name in code.counters]
+    lines += [] if restarts else [f"    s->{name} = 0;" for name in code.counters]
     return ["    int i;", *lines] if loops else lines
 
 

@@ -1,5 +1,6 @@
 """Controller of a case, step by step from readings to commands, for co-simulation."""
 
+import jax
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -9,9 +10,11 @@ from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.sensor_signals import (
+    MAX_READING,
     filtered_reading,
     initial_filter_state,
     sensor_sections,
+    to_reading,
 )
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import known
@@ -24,10 +27,13 @@ class ControllerSteps:
     """Law of a case at its samples, with estimator, filters, limits and delay.
 
     Readings are those of ideal sensors in SI units; offset, range, resolution and digital filter
-    are part of it, noise is not. A command is held until the next one begins.
+    are part of it, noise is not. A reading that is NaN or infinite is missing: the last one stays
+    in its place, and the law knows. A law with a number that is not finite starts again, and its
+    last command stays. A command is held until the next one begins.
 
     Raises ValueError for an invalid case, one without a controller that samples, sensors with an
-    analogue filter, a delay or a sampling period of their own, and a law that uses the true state.
+    analogue filter, a delay or a sampling period of their own, dropout or jitter, and a law that
+    uses the true state.
 
     >>> import jaxbeam as jb
     >>> from jaxbeam.fmi import ControllerSteps
@@ -53,15 +59,11 @@ class ControllerSteps:
         self._period = float(controller.period)
         self._delay = 0.0 if controller.delay is None else float(controller.delay)
         plant = state_space(case, layout=mesh_layout(case))
-        self._law = known(controller.law(plant))
+        self._law, self._wanted = known(controller.law(plant)), np.zeros(len(case.actuators))
         self._sections = [sensor_sections(sensor, self._period) for sensor in case.sensors]
-        self._filters = [
-            initial_filter_state(sensor, part, np.zeros(()))
-            for sensor, part in zip(case.sensors, self._sections, strict=True)
-        ]
         self._path = command_path(case)
         self._memory = self._path.start(1, round(np.ceil(self._delay / self._period)))
-        self._state = self._law.initial_state()
+        self._restart()
         self._unknown = np.full(len(plant.states), np.nan)
         self._sample = 0
         self._waiting: list[tuple[float, np.ndarray]] = []
@@ -88,19 +90,30 @@ class ControllerSteps:
 
     def _take_sample(self, due: float, readings) -> None:
         """Step of the law at a sample, whose commands wait for the delay."""
-        filtered = []
-        for i, (sensor, part) in enumerate(zip(self._sensors, self._sections, strict=True)):
-            reading, self._filters[i] = filtered_reading(
-                sensor, part, self._filters[i], readings[i]
+        present = np.abs(readings) <= MAX_READING
+        for i in np.flatnonzero(present):
+            self._readings[i], self._filters[i] = filtered_reading(
+                self._sensors[i], self._sections[i], self._filters[i], readings[i]
             )
-            filtered.append(reading)
         known_commands = self._path.known_to_law(self._memory)[:, 0]
-        measurement = Measurement(np.array(filtered), self._unknown, known_commands)
+        measurement = Measurement(self._readings.copy(), self._unknown, known_commands, present)
         found = self._law.step(self._state, measurement, np.asarray(due))
-        self._state = found.state
-        self._memory = self._path.send(self._memory, np.asarray(found.command)[:, None])
+        self._state, command = found.state, np.asarray(found.command)
+        numbers = [*jax.tree.leaves((self._state, self._filters)), self._readings, command]
+        if all(np.all(np.abs(part) <= MAX_READING) for part in numbers):
+            self._wanted = command
+        else:
+            self._restart()
+        self._memory = self._path.send(self._memory, self._wanted[:, None])
         self._waiting.append((due + self._delay, np.array(self._memory.queue[0][:, 0])))
         self._sample += 1
+
+    def _restart(self) -> None:
+        """Law, filters and readings at rest."""
+        pairs = list(zip(self._sensors, self._sections, strict=True))
+        self._state = self._law.initial_state()
+        self._filters = [initial_filter_state(*pair, np.zeros(())) for pair in pairs]
+        self._readings = np.array([to_reading(sensor, 0.0) for sensor, _ in pairs])
 
     def _check_state(self) -> None:
         """Raise ValueError if the first command depends on the true state."""
@@ -120,9 +133,17 @@ class ControllerSteps:
                 ("an analogue filter", analogue),
                 ("a delay", sensor.delay is not None),
                 ("a sampling period", sensor.sampling_period is not None),
+                ("a dropout", sensor.dropout is not None),
+                ("a jitter", sensor.jitter is not None),
             ):
                 if given:
                     raise ValueError(
                         f"sensors.{i} has {name} of its own, which belongs to the other unit:"
                         " leave it out of the controller that is exported"
                     )
+        for name in ("dropout", "jitter"):
+            if getattr(case.controller, name) is not None:
+                raise ValueError(
+                    f"controller.{name} belongs to the line between the units: leave it out of the"
+                    " controller that is exported"
+                )

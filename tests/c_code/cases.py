@@ -208,7 +208,7 @@ CASES = {
             hard_limit=3e-3,
             terminal="dual-mode",
             terminal_periods=6,
-            terminal_weight=1e-3,
+            terminal_weight=1.0,
             period=PERIOD,
         )
     ),

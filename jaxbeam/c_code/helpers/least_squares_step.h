@@ -1,19 +1,21 @@
-/* Recursive least squares: coefficients and covariance P (over nothing but the noise's variance)
-   after a number, row coefficients + noise. Work: count. */
-static void least_squares_step(real *coefficients, real *P, const real *row, real number,
-                               real variance, int count, real *spread)
+/* Recursive least squares: coefficients and a square root S of their covariance S S' after a number,
+   row coefficients + noise of a standard deviation. Work: 2 count. */
+static void least_squares_step(real *coefficients, real *S, const real *row, real number,
+                               real deviation, int count, real *work)
 {
-    real error = number, size = variance;
+    real *along = work, *spread = work + count;
+    real error = number, size = deviation * deviation, scale;
     int i, j;
     for (i = 0; i < count; i++) {
-        spread[i] = 0;
-        for (j = 0; j < count; j++) spread[i] += P[i * count + j] * row[j];
+        along[i] = 0;
+        for (j = 0; j < count; j++) along[i] += S[j * count + i] * row[j];
         error -= row[i] * coefficients[i];
-        size += row[i] * spread[i];
+        size += along[i] * along[i];
     }
+    multiply(spread, S, along, count, count);
+    scale = size + deviation * sqrt(size);
     for (i = 0; i < count; i++) {
-        const real gain = spread[i] / size;
-        coefficients[i] += gain * error;
-        for (j = 0; j < count; j++) P[i * count + j] -= gain * spread[j];
+        coefficients[i] += spread[i] / size * error;
+        for (j = 0; j < count; j++) S[i * count + j] -= spread[i] * (along[j] / scale);
     }
 }

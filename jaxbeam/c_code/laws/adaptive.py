@@ -13,17 +13,19 @@ def _(law: AdaptiveGPCLaw, code: CSource) -> None:
     count, past, (first, horizon, moves) = np.size(law.start), law.powers + 1, law.horizons
     until, period = float(law.until), float(law.period)
     coefficients = code.state("coefficients", law.start, "a, then B by powers")
-    covariance = code.state("covariance", law.start_covariance, "covariance of the coefficients")
+    root = code.state("root", law.start_root, "square root S of their covariance S S'")
     readings = code.state("past_readings", np.zeros(past * outputs), "the latest first")
     commands = code.state("past_commands", np.zeros(past * actuators), "the latest first")
+    complete = code.state("complete", [float(past)], "samples with complete readings until now")
+    code.missing.append("Identification pauses while one is missing or among the past readings.")
     changes = code.work("past_moves", powers * actuators, "changes of commands, the latest first")
     row = code.work("row", count, "what the coefficients multiply")
-    spread = code.work("spread", count, "covariance x row")
+    spread = code.work("spread", 2 * count, "S' row, S S' row")
     n = moves * actuators
     size = horizon * outputs * (1 + actuators) + n * (n + 2)
     work = code.work("prediction", size, "predicted outputs, normal equations")
     move = code.work("move", actuators, "first move")
-    start_trace = float(np.trace(law.start_covariance))
+    start_trace = float(np.sum(np.asarray(law.start_root) ** 2))
     code.add(
         f"""
 /* Past commands, and their changes */
@@ -32,10 +34,14 @@ copy({commands}, {code.command}, {actuators});
 for (i = 0; i < {powers * actuators}; i++)
     {changes}[i] = {commands}[i] - {commands}[i + {actuators}];
 /* Recursive least squares with forgetting, from changes of readings and commands */
-if ({"1" if np.isinf(until) else f"t <= (real){until!r}"} && t >= (real){period / 2!r}) {{
+{complete}[0] = {complete}[0] < {past} ? {complete}[0] + 1 : {past + 1};
+for (i = 0; i < {outputs}; i++)
+    if (!({code.present}[i] > 0)) {complete}[0] = 0;
+if ({"1" if np.isinf(until) else f"t <= (real){until!r}"} && t >= (real){period / 2!r}
+    && {complete}[0] > {past}) {{
     real trace = 0;
     int k, o;
-    for (i = 0; i < {count * count}; i++) {covariance}[i] /= (real){float(law.forgetting)!r};
+    for (i = 0; i < {count * count}; i++) {root}[i] /= (real){float(law.forgetting) ** 0.5!r};
     for (o = 0; o < {outputs}; o++) {{
         for (i = 0; i < {count}; i++) {row}[i] = 0;
         for (i = 0; i < {powers}; i++) {{
@@ -44,27 +50,22 @@ if ({"1" if np.isinf(until) else f"t <= (real){until!r}"} && t >= (real){period 
                 {row}[{powers} + (i * {outputs} + o) * {actuators} + k] =
                     {changes}[i * {actuators} + k];
         }}
-        least_squares_step({coefficients}, {covariance}, {row},
-                           {code.readings}[o] - {readings}[o], (real){float(law.noise) ** 2!r},
-                           {count}, {spread});
+        least_squares_step({coefficients}, {root}, {row}, {code.readings}[o] - {readings}[o],
+                           (real){float(law.noise)!r}, {count}, {spread});
     }}
-    for (i = 0; i < {count}; i++) trace += {covariance}[i * {count + 1}];
-    trace = trace > (real){start_trace!r} ? trace / (real){start_trace!r} : 1;
-    for (i = 0; i < {count}; i++)
-        for (k = 0; k <= i; k++) {{
-            real *upper = {covariance} + k * {count} + i, *lower = {covariance} + i * {count} + k;
-            *upper = *lower = (*upper + *lower) / 2 / trace;
-        }}
+    for (i = 0; i < {count * count}; i++) trace += {root}[i] * {root}[i];
+    if (trace > (real){start_trace!r})
+        for (i = 0; i < {count * count}; i++) {root}[i] /= sqrt(trace / (real){start_trace!r});
 }}
 for (i = {past * outputs - 1}; i >= {outputs}; i--) {readings}[i] = {readings}[i - {outputs}];
 copy({readings}, {code.readings}, {outputs});""",
         powers * actuators
-        + 2
+        + 5
+        + outputs
         + count * count
-        + outputs * (powers + 1 + 4 * count * count + 7 * count)
-        + count
-        + 2
-        + 3 * (count * (count + 1) // 2),
+        + outputs * (powers + 6 + 6 * count * count + 7 * count)
+        + 5 * count * count
+        + 1,
     )
     weights = code.constant("output_weights", law.output_weights)
     move_weights = code.constant("move_weights", law.move_weights)

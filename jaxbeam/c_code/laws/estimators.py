@@ -10,12 +10,21 @@ from jaxbeam.control.state_law import TrueState
 from jaxbeam.estimation.constant_gain import ConstantGainFilter
 from jaxbeam.estimation.inversion import InversionFilter
 from jaxbeam.estimation.sampled_plant import Transition
+from jaxbeam.model.sensing.sensor_signals import MAX_READING
 
 
 @write_filter.register
 def _(filter: TrueState, code: CSource) -> EstimateCode:
-    code.given_states = np.shape(filter.state_map)[0]
-    return EstimateCode(code.true_state, code.given_states)
+    states = code.given_states = np.shape(filter.state_map)[0]
+    given = code.state("given", np.zeros(states), "last given states")
+    lowest, highest = (
+        code.constant(f"given_{name}", np.full(states, end))
+        for name, end in (("lowest", -MAX_READING), ("highest", MAX_READING))
+    )
+    present = code.work("given_present", states, "which of them are present")
+    measured = f"measurements + {code.sensors}"
+    code.add(f"receive({given}, {present}, {measured}, {lowest}, {highest}, {states});", 3 * states)
+    return EstimateCode(given, states)
 
 
 @write_filter.register
@@ -43,6 +52,9 @@ def _(filter: InversionFilter, code: CSource) -> EstimateCode:
         _write_actuator_states(code, filter, x, modes)
     gain = float(filter.difference_gain)
     smoothing = 1 - gain * float(filter.period)
+    periods = code.state("periods", [1.0], "periods since the last complete deflections, and one")
+    own, count = code.constant("deflection_sensors", filter.sensors), len(filter.sensors)
+    code.missing.append("The estimate stays while a deflection is missing.")
     code.add(
         f"/* Estimate: coordinates from the deflections, rates from their differences */\n"
         f"for (i = 0; i < {sensors}; i++) {reading}[i] = {code.readings}[i] - {offset}[i];",
@@ -51,12 +63,18 @@ def _(filter: InversionFilter, code: CSource) -> EstimateCode:
     code.multiply(coordinate, inverse, reading, modes, sensors)
     code.add(
         f"""
-for (i = 0; i < {modes}; i++) {{
-    {x}[{modes} + i] = (real){smoothing!r} * {x}[{modes} + i]
-                       + (real){gain!r} * ({coordinate}[i] - {x}[i]);
-    {x}[i] = {coordinate}[i];
+for (i = 0; i < {count}; i++)
+    if (!({code.present}[{own}[i]] > 0)) break;
+if (i < {count}) {periods}[0] += 1;
+else {{
+    for (i = 0; i < {modes}; i++) {{
+        {x}[{modes} + i] = (real){smoothing!r} * {x}[{modes} + i]
+                           + (real){gain!r} * ({coordinate}[i] - {x}[i]) / {periods}[0];
+        {x}[i] = {coordinate}[i];
+    }}
+    {periods}[0] = 1;
 }}""",
-        4 * modes,
+        5 * modes + count + 1,
     )
     return EstimateCode(x, filter.plant_states)
 
@@ -108,6 +126,8 @@ def write_filter_step(code: CSource, model: FilterModel, offset, x: str) -> None
     if np.any(model.D):
         D = code.per_sample("filter_D", model.D)
         code.multiply_add(innovation, D, code.command, sensors, code.actuators, -1)
+    code.add(f"drop_missing({innovation}, {code.present}, {sensors});", sensors)
+    code.missing.append("The estimate is predicted by the model, and not corrected by it.")
     gain = code.per_sample("filter_gain", model.gain)
     code.multiply_add(x, gain, innovation, states, sensors)
 

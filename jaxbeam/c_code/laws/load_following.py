@@ -168,6 +168,9 @@ for (i = 0; i < {sensors}; i++) {{
              - {w["values"]}[({1 + numbers} + k) * {sensors} + i])
             / (2 * {c["steps"]}[k]);
     {w["innovation"]}[i] = {code.readings}[i] - {c["offset"]}[i] - {w["values"]}[i];
+    if ({code.present}[i] > 0) continue;
+    {w["innovation"]}[i] = 0;
+    for (k = 0; k < {size}; k++) {w["rows"]}[i * {size} + k] = 0;
 }}
 kalman_correction({x}, {P}, {w["rows"]}, {c["variance"]}, {w["innovation"]}, {sensors}, {size},
                   {w["correction_work"]});
@@ -175,6 +178,7 @@ copy({last}, {code.command}, {commands});
 }}""",
         _operations(size, joint, modes, loads, commands, sensors, len(spans), c),
     )
+    code.missing.append("The estimate is predicted by the model, and not corrected by it.")
     weights = code.work("weights", loads, "estimated weights, zero off the beam (N)")
     length = float(plant.case.beam.length)
     code.add(
@@ -285,6 +289,6 @@ def _operations(size, joint, modes, loads, commands, sensors, parts, c) -> int:
         + parts * with_noise
         + covariance
         + numbers * 3 * (size + sensors)
-        + 2 * sensors
+        + 3 * sensors
         + correction
     )

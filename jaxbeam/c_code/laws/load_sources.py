@@ -18,7 +18,8 @@ from jaxbeam.control.load_identifiers import (
 @write_load_source.register
 def _(source: GivenLoad, code: CSource) -> LoadCode:
     numbers = np.nan_to_num([source.mass, source.speed, source.entry_time])  # NaN: not used
-    load = code.state("load", numbers, "mass (kg), speed (m/s), entry (s) of the load; settable")
+    meaning = "mass (kg), speed (m/s), entry (s) of the load; settable"
+    load = code.state("load", numbers, meaning, restarts=False)
     return LoadCode(f"{load}[0]", f"{load}[1]", f"{load}[2]", "1", "1")
 
 
@@ -26,6 +27,7 @@ def _deflections(source: AbstractLoadIdentifier, code: CSource) -> str:
     """Deflections due to the load alone: readings less offset and static lift."""
     sensors, actuators = np.shape(source.static_lift)
     deflection = code.work("deflection", sensors, "deflections due to the load (m)")
+    code.missing.append("Samples at which a deflection is missing do not identify the load.")
     offset = code.constant("reading_offset", source.offset)
     indices = code.constant("deflection_sensor", np.array(source.sensor_indices))
     lift = code.constant("static_lift", source.static_lift)
@@ -36,6 +38,12 @@ def _deflections(source: AbstractLoadIdentifier, code: CSource) -> str:
         sensors,
     )
     code.multiply_add(deflection, lift, code.command, sensors, actuators, -1)
+    code.variables += [each for each in ("int complete",) if each not in code.variables]
+    code.add(
+        f"complete = 1;\nfor (i = 0; i < {sensors}; i++)\n"
+        f"    if (!({code.present}[{indices}[i]] > 0)) complete = 0;",
+        sensors,
+    )
     return deflection
 
 
@@ -59,7 +67,7 @@ if (t >= {times}[1]) {{
     const real entry = {times}[1] + ((speed < 0 ? {length} : 0) - (real){far!r}) / speed;
     const real share = (t - entry) * fabs(speed) / {length};
     if (share >= (real){float(source.until)!r}) {load}[4] = 1;
-    else if (share > 0) {{
+    else if (share > 0 && complete) {{
         const real place = (speed < 0 ? 1 - share : share) * {positions - 1};
         const int left = place < {positions - 2} ? (int)place : {positions - 2};
         for (i = 0; i < {sensors}; i++) {{
@@ -98,7 +106,7 @@ def _(source: DeflectionIdentifier, code: CSource) -> LoadCode:
     code.add(
         f"""
 load_from_sums({load}, {sums}, t, {settings});
-if ({load}[4] <= 0) {{
+if (complete && {load}[4] <= 0) {{
     add_deflections({sums}, {arguments}, t, {length}, (real){float(source.threshold)!r});
     load_from_sums({load}, {sums}, t, {settings});
 }}""",

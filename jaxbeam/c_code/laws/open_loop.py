@@ -15,6 +15,7 @@ from jaxbeam.control.prescribed import Prescribed
 @write_law.register
 def _(law: Prescribed, code: CSource) -> None:
     actuators = code.actuators
+    code.missing.append("No reading is used.")
     offsets = code.constant("offsets", law.offsets)
     code.add(f"/* Prescribed commands */\ncopy({code.output}, {offsets}, {actuators});")
     if law.amplitudes is not None and law.frequencies is not None:
@@ -46,6 +47,7 @@ for (i = 0; i < {actuators}; i++) {{
 
 @write_law.register
 def _(law: FeedforwardLaw, code: CSource) -> None:
+    code.missing.append("No reading is used.")
     _write_feedforward(law, code)
 
 
@@ -54,8 +56,10 @@ def _(law: ConfirmedFeedforwardLaw, code: CSource) -> None:
     never = np.full(len(law.gate_times), -1e30)
     states = code.state("confirmed", never, "second gate's times (s) of loads that a sensor showed")
     shown = " || ".join(
-        f"{code.readings}[{i}] <= (real)-{float(law.confirmation)!r}" for i in law.sensors
+        f"({code.present}[{i}] > 0 && {code.readings}[{i}] <= (real)-{float(law.confirmation)!r})"
+        for i in law.sensors
     )
+    code.missing.append("It shows no load.")
     limit = CONFIRMATION_SHARE * float(law.length)
     _write_feedforward(
         law,
@@ -65,7 +69,7 @@ def _(law: ConfirmedFeedforwardLaw, code: CSource) -> None:
         && {{distance}} + (t - second) * fabs(speed) <= (real){limit!r})
         {states}[j] = second;
     if ({states}[j] < second) continue;""",
-        len(law.sensors) + 7,
+        2 * len(law.sensors) + 7,
     )
 
 

@@ -126,7 +126,8 @@ def _(law: GainSchedule, code: CSource, estimate: EstimateCode) -> None:
         code.add(f"copy({place}, {code.constant('load_weights', known)}, {weights});")
     if law.load_feedforward and estimate.weights is not None:
         code.add(f"copy({place}, {estimate.weights}, {estimate.wheels});")
-    times = code.state("crossing", [law.start, law.end], "s, start and end; settable")
+    numbers, meaning = [law.start, law.end], "s, start and end; settable"
+    times = code.state("crossing", numbers, meaning, restarts=False)
     code.add(
         f"""
 /* u = -K(t) x, from the first entry to the last exit by the table */

@@ -5,7 +5,10 @@ section 2.2) follow the polynomials of `gpc` from increments of readings and com
 
     dy(k) = -a_1 dy(k - 1) - ... + B_1 du(k - 1) + B_2 du(k - 2) + ...,
 
-in which a steady load is not seen. Lift and delay of the plant follow from the polynomials.
+in which a steady load is not seen. Lift and delay of the plant follow from the polynomials. The
+covariance is kept as a product of square roots (Potter's algorithm: Bierman, Factorization Methods
+for Discrete Sequential Estimation, 1977, section V.2): the difference of two covariances, almost
+equal where the noise is small, loses twice as many digits.
 """
 
 import functools
@@ -22,7 +25,6 @@ from jaxbeam.control.predictive.gpc import (
     PolynomialModel,
     predictive_gains,
 )
-from jaxbeam.numerics.matrices import symmetric_part
 from jaxbeam.runtime.arrays import Array, take, xp
 
 PROBE_BITS = 7  # of the shift register of the probing sequence, which repeats after 127 samples
@@ -101,7 +103,7 @@ class AdaptiveGPC(GPC):
         probe = xp.zeros(actuators) if self.probe is None else self.probe
         return AdaptiveGPCLaw(
             start,
-            xp.diag(deviations**2),
+            xp.diag(deviations),
             self.forgetting,
             self.measurement_noise,
             self.period,
@@ -115,13 +117,13 @@ class AdaptiveGPC(GPC):
 
 
 class AdaptiveState(NamedTuple):
-    """Coefficients, their covariance over the noise's variance, past readings and commands.
+    """Coefficients, a square root S of their covariance S S', past readings and commands.
 
-    `complete` is the number of samples with complete readings, up to the last one.
+    `complete` is the number of samples with complete readings until now, of a few at most.
     """
 
     coefficients: Float[Array, " parameter"]
-    covariance: Square
+    root: Square
     readings: Float[Array, "past output"]
     commands: Float[Array, "past actuator"]
     complete: Float[Array, ""]
@@ -131,7 +133,7 @@ class AdaptiveGPCLaw(AbstractSampledLaw):
     """Self-tuning law: the gains are those of the model identified so far."""
 
     start: Float[Array, " parameter"]
-    start_covariance: Square
+    start_root: Square
     forgetting: Float[Array, ""]
     noise: Float[Array, ""]
     period: Float[Array, ""]
@@ -154,7 +156,7 @@ class AdaptiveGPCLaw(AbstractSampledLaw):
         commands = xp.zeros((past, self.probe.shape[0]))
         readings = xp.zeros((past, self.outputs))
         return AdaptiveState(
-            self.start, self.start_covariance, readings, commands, xp.asarray(float(past))
+            self.start, self.start_root, readings, commands, xp.asarray(float(past))
         )
 
     def model(self, state: AdaptiveState) -> PolynomialModel:
@@ -170,13 +172,14 @@ class AdaptiveGPCLaw(AbstractSampledLaw):
         sample = xp.floor(t / self.period + 0.5).astype(int)
         # Increments need two readings, and the model's past; before, everything is at rest.
         now_complete = measurement.complete(range(self.outputs))
-        complete = xp.where(now_complete, state.complete + 1.0, 0.0)
-        active = (t <= self.until) & (sample > 0) & (complete > self.powers + 1)
-        coefficients, covariance = (
+        past = self.powers + 1
+        complete = xp.where(now_complete, xp.minimum(state.complete + 1.0, past + 1.0), 0.0)
+        active = (t <= self.until) & (sample > 0) & (complete > past)
+        coefficients, root = (
             xp.where(active, new, old) for new, old in zip(identified, state[:2], strict=True)
         )
         readings = xp.concatenate([readings[None], state.readings[:-1]])
-        state = AdaptiveState(coefficients, covariance, readings, commands, complete)
+        state = AdaptiveState(coefficients, root, readings, commands, complete)
         gains = predictive_gains(
             self.model(state), self.horizons, self.output_weights, self.move_weights, self.reference
         )
@@ -192,24 +195,24 @@ class AdaptiveGPCLaw(AbstractSampledLaw):
     def identified(
         self, state: AdaptiveState, readings: Float[Array, " output"], commands
     ) -> tuple[Float[Array, " parameter"], Square]:
-        """Coefficients and their covariance after new readings, one output after the other."""
+        """Coefficients and the root of their covariance after new readings, one by one."""
         powers, actuators = self.powers, self.probe.shape[0]
         moves = -xp.diff(commands, axis=0)[:powers]
         increments = -xp.diff(state.readings, axis=0)[:powers]
-        coefficients, covariance = state.coefficients, state.covariance / self.forgetting
+        coefficients, root = state.coefficients, state.root / xp.sqrt(self.forgetting)
         for output in range(self.outputs):
             of_output = (np.arange(self.outputs) == output)[None, :, None]
             numerators = xp.where(of_output, moves[:, None, :], 0.0)
             numerators = xp.broadcast_to(numerators, (powers, self.outputs, actuators))
             row = xp.concatenate([-increments[:, output], numerators.reshape(-1)])
             error = readings[output] - state.readings[0, output] - row @ coefficients
-            spread = covariance @ row
-            gain = spread / (self.noise**2 + row @ spread)
-            coefficients = coefficients + gain * error
-            covariance = covariance - gain[:, None] * spread
+            along = root.T @ row
+            spread, size = root @ along, self.noise**2 + along @ along
+            coefficients = coefficients + spread / size * error
+            root = root - spread[:, None] * (along / (size + self.noise * xp.sqrt(size)))
         # Without excitation, forgetting would let the covariance grow without limit.
-        excess = xp.trace(covariance) / xp.trace(self.start_covariance)
-        return coefficients, symmetric_part(covariance) / xp.maximum(excess, 1.0)
+        excess = xp.sum(root**2) / xp.sum(self.start_root**2)
+        return coefficients, root / xp.sqrt(xp.maximum(excess, 1.0))
 
 
 def parameters(model: PolynomialModel) -> Float[Array, " parameter"]:

@@ -162,12 +162,25 @@ def dual_mode_terminal(
     """Terminal cost and set of a regulator, for a prediction with a number of `states`.
 
     The first of them are those of the plant, the others, of vehicles and of a delay, are left out.
+    The `weight` of a soft set is relative to the `limit_cost`.
     """
     size, count = regulator.loop.shape[0], regulator.gain.shape[0]
     plant = xp.eye(size - count, 2 * states + count, k=states)
     command = xp.eye(count, 2 * states + count, k=2 * states)
     end_map = xp.concatenate([plant, command])
+    weight = None if weight is None else weight * limit_cost(regulator)
     return Terminal(end_map, regulator.cost, regulator.rows(periods), weight)
+
+
+def limit_cost(regulator: TerminalRegulator) -> Float[Array, ""]:
+    """Least cost z'P z (m^2) of a state from which the regulator meets a limit; 1 without limits.
+
+    On a row l z = 1 it is 1 / (l P^-1 l').
+    """
+    if not regulator.limits.shape[0]:
+        return xp.ones(())
+    spread = xp.linalg.solve(regulator.cost, regulator.limits.T)
+    return 1 / xp.max(xp.sum(regulator.limits.T * spread, axis=0))
 
 
 def incremental_terminal(

@@ -29,6 +29,8 @@ from jaxbeam.runtime.arrays import Array, scan, stop_gradient, take, xp
 
 CLOCK_TOLERANCE_PERIODS = 1e-6  # a time this much before a sampling instant counts as at it
 IDENTITY = np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])  # a filter that changes nothing
+MAX_READING = 1e30  # beyond it a reading is none
+RANGE_TOLERANCE = 1e-6  # of the largest reading, in single precision
 
 AnySensor = Sensor | VehicleSensor
 Sections = Float[Array, "section 6 ..."] | None  # None: no digital filter
@@ -79,6 +81,20 @@ def to_reading(sensor: AnySensor, value, noise=None) -> Float[Array, "..."]:
         rounded = sensor.resolution * xp.round(reading / sensor.resolution)
         reading = reading + stop_gradient(rounded - reading)
     return reading
+
+
+def possible_readings(sensor: AnySensor) -> tuple[float, float]:
+    """Lowest and highest sample that a sensor can give before its digital filter.
+
+    What is not between them, or no number, is a missing reading.
+    """
+    if sensor.range is None:
+        return -MAX_READING, MAX_READING
+    low, high = (float(end) for end in concrete(sensor.range))
+    beyond = RANGE_TOLERANCE * max(abs(low), abs(high))
+    if sensor.resolution is not None:
+        beyond += float(concrete(sensor.resolution)) / 2
+    return low - beyond, high + beyond
 
 
 def noise_samples(seed: int, sensors: int, samples: int) -> Float[Array, "sample sensor"]:

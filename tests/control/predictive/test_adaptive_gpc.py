@@ -86,10 +86,10 @@ def test_coefficients_are_those_of_weighted_batch_least_squares():
     commands, readings = signals(12, a, b, 1e-6)
     law = designed(dataclasses.replace(ADAPTIVE, measurement_noise=1e-5))
     # The covariance is kept below that of the start; here it is not to reach it.
-    unlimited = dataclasses.replace(law, start_covariance=1e3 * law.start_covariance)
+    unlimited = dataclasses.replace(law, start_root=1e3 * law.start_root)
     found = probed(unlimited, commands, readings, law.initial_state())[-1].coefficients
-    kept = np.diag(law.start_covariance) > 0
-    prior = np.diag(0.98**11 / np.diag(law.start_covariance)[kept])
+    kept = np.diag(law.start_root) > 0
+    prior = np.diag(0.98**11 / np.diag(law.start_root)[kept] ** 2)
     dy, du = np.diff(readings, prepend=0.0), np.diff(commands, prepend=0.0)
     normal, right = prior, prior @ np.asarray(law.start)[kept]
     for k in range(1, 12):
@@ -111,9 +111,9 @@ def test_covariance_is_capped_without_excitation():
     """
     law = designed(dataclasses.replace(ADAPTIVE, until=None, probe=None, measurement_noise=1e-5))
     quiet = probed(law, np.zeros(400), np.zeros(400))[-1]
-    assert_allclose(quiet.covariance, law.start_covariance, rtol=1e-9)
-    kept = np.diag(law.start_covariance) > 0
-    start = law.start_covariance[np.ix_(kept, kept)]
+    assert_allclose(quiet.root, law.start_root, rtol=1e-9)
+    kept = np.diag(law.start_root) > 0
+    start = (law.start_root @ law.start_root.T)[np.ix_(kept, kept)]
     commands, readings = signals(100, *plant_by_scipy(8.0, 1))
     commands[7:], readings[7:] = commands[6], readings[6]
     states = probed(law, commands, readings)
@@ -126,7 +126,7 @@ def test_covariance_is_capped_without_excitation():
         covariance = np.linalg.inv(information)
         excess = np.trace(covariance) / np.trace(start)
         covariance, capped = covariance / max(excess, 1.0), capped + (excess > 1)
-        found = np.asarray(states[k].covariance)[np.ix_(kept, kept)]
+        found = np.asarray(states[k].root @ states[k].root.T)[np.ix_(kept, kept)]
         assert_allclose(found, covariance, rtol=1e-6, atol=1e-9 * np.max(np.abs(start)))
     assert 0 < capped < 99  # both happened
 

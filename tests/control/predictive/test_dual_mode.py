@@ -1,5 +1,6 @@
 """Dual-mode predictive control: its terminal set and cost against scipy's regulator and motions."""
 
+import dataclasses
 import functools
 
 import jax
@@ -13,6 +14,7 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.estimator import Estimate
 from jaxbeam.case.validation import check_case
+from jaxbeam.control.predictive.mpc import TerminalSetWarning
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.optimisation.qp import solve_qp
 from tests.differences import central
@@ -107,7 +109,7 @@ def test_terminal_set_is_all_from_where_the_regulator_keeps_its_limits(name):
 def test_first_command_is_that_of_the_regulator_where_no_limit_is_near(name, horizon):
     """At any horizon, also where a soft set is asked for."""
     regulated = Regulated(**KINDS[name])
-    for weight in (None, 1e-3):
+    for weight in (None, 1e5):
         sizes = {"horizon": horizon, "moves": horizon, "terminal_weight": weight}
         law = law_of(name, **sizes)
         x, command = RNG.normal(size=4) * [1e-6, 1e-6, 1e-4, 1e-4], np.array([0.02])
@@ -175,7 +177,7 @@ def edge_of_feasible(law, direction):
 
 
 def test_soft_set_is_left_only_where_it_cannot_be_reached():
-    hard, soft = (law_of("limits of commands", terminal_weight=weight) for weight in (None, 1e-3))
+    hard, soft = (law_of("limits of commands", terminal_weight=weight) for weight in (None, 1e5))
     direction, none = np.array([1e-4, -2e-5, 1e-3, 2e-3]), np.zeros(1)
     edge = edge_of_feasible(hard, direction)
     within, without = solution(hard, edge, none)[0], law_of("limits of commands")
@@ -187,6 +189,41 @@ def test_soft_set_is_left_only_where_it_cannot_be_reached():
     beyond = solution(soft, 1.5 * edge, none)
     assert beyond[1] and beyond[0][-1] > 1e-3
     assert not solution(hard, 1.5 * edge, none)[1]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_weights_are_relative_to_the_least_cost_of_a_state_at_a_limit(name):
+    """By scipy's regulator: no state at a limit of its motion costs less, and one costs that."""
+    regulated, terminal = Regulated(**KINDS[name]), law_of(name, terminal_weight=2.0).terminal
+    scale = terminal.weight / 2
+    directions = RNG.normal(size=(300, 5)) @ np.linalg.cholesky(np.linalg.inv(regulated.P)).T
+    at_limits = directions / [[regulated.worst(z, 30)] for z in directions]
+    costs = np.einsum("ri,ij,rj->r", at_limits, regulated.P, at_limits)
+    assert scale <= np.min(costs) * (1 + 1e-6)
+    nearest = np.linalg.solve(regulated.P, np.asarray(terminal.rows).T).T
+    nearest = nearest / [[regulated.worst(z, 30)] for z in nearest]
+    costs = np.einsum("ri,ij,rj->r", nearest, regulated.P, nearest)
+    assert_allclose(np.min(costs), scale, rtol=1e-6)
+
+
+@pytest.mark.parametrize("weight", [1.0, 3.0])
+def test_recommended_weights_do_not_raise_the_peak(weight):
+    """Under a mass for which the set is out of reach."""
+    peaks = {
+        name: np.max(jb.simulate(dual_case(**settings)).peak_deflection)
+        for name, settings in {
+            "none": {"terminal": "none"},
+            "soft": {"terminal_weight": weight},
+        }.items()
+    }
+    assert peaks["soft"] < 1.005 * peaks["none"]
+
+
+@pytest.mark.parametrize("weight", [None, 4.0, 300.0])
+def test_sets_that_outweigh_deflections_are_warned_of(weight):
+    with pytest.warns(TerminalSetWarning, match="terminal set out of reach"):
+        check_case(dual_case(terminal_weight=weight))
+    check_case(dataclasses.replace(dual_case(terminal_weight=weight), loads=()))
 
 
 @pytest.mark.parametrize(
@@ -206,7 +243,7 @@ def test_errors_of_settings(settings, words):
 
 def test_run_of_a_crossing_with_three_deflections_and_one_actuator():
     """The set is soft under the load; deflection and command then go to zero."""
-    record = jb.simulate(dual_case(terminal_weight=1e-3, modes=1))
+    record = jb.simulate(dual_case(terminal_weight=1.0, modes=1))
     assert record.failures[-1] == 0
     assert_allclose(record.command[-1], 0.0, atol=1e-2)
     assert np.max(np.abs(record.command)) > 1.0
