@@ -38,7 +38,8 @@ class ExtendedKalman(AbstractKalmanEstimator):
 
     White forces of intensity `process_noise` act on the (mass-normalised) modes; each reading has
     white noise of standard deviation `measurement_noise`. Filters and delays of the sensors are
-    modelled as by `Kalman`. Loads are masses or forces of one wheel, without a profile.
+    modelled as by `Kalman`. A missing reading corrects neither estimate nor covariance. Loads are
+    masses or forces of one wheel, without a profile.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(

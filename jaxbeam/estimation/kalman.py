@@ -42,7 +42,8 @@ class Kalman(AbstractKalmanEstimator):
     plant, so that innovations are white. Noise is that of the samples: behind a digital filter it
     is coloured. The beam is at rest one period before the first sample. Not modelled are sampling
     periods of the sensors' own, nor the direct effect of the white forces on accelerometers. Modes
-    that no sensor observes need damping: their estimate is that of the model.
+    that no sensor observes need damping: their estimate is that of the model. A missing reading
+    corrects nothing; the gains stay those of complete readings.
 
     Without a period the filter acts in continuous time (Kalman-Bucy): the noise of readings is
     white with the `measurement_intensity`, that of samples with variance intensity / period; the

@@ -23,7 +23,7 @@ class Observer(AbstractEstimator):
     The error in the states of the beam decays with the given `poles`, or with those of the beam
     times `speed` (eq. 4.4 of the thesis; sampled, a pole p becomes exp(p period)). States of
     actuators follow from the commands, uncorrected. Loads are not modelled and bias the estimate;
-    nor are filters and delays of the sensors.
+    nor are filters and delays of the sensors. A missing reading corrects nothing.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(

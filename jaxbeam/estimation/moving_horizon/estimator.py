@@ -23,7 +23,8 @@ class MovingHorizon(AbstractKalmanEstimator):
     whose weights are "estimated" (N, of each wheel), and the `deflection_limit` at the sensors,
     whatever they measure, in all samples of the window.
 
-    A weight stays as it is, so that bounds of weights alone give the same at any window.
+    A weight stays as it is, so that bounds of weights alone give the same at any window. A missing
+    reading corrects nothing; the gains stay those of complete readings.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
