@@ -78,13 +78,15 @@ class Inversion(AbstractEstimator):
             0.0 if self.time_constant is None else xp.exp(-timing.period / self.time_constant)
         )
         difference_gain = (1 - xp.asarray(smoothing, float)) / timing.period
+        plant_states, commands = system.B.shape
         return InversionFilter(
             inverse,
             difference_gain,
             timing.period,
             actuator_transition,
             sensor_offsets(plant),
-            *system.B.shape,
+            plant_states,
+            commands,
             tuple(np.flatnonzero(deflection_outputs(system)).tolist()),
         )
 

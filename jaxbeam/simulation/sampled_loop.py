@@ -163,7 +163,8 @@ class SampledLoop(AbstractInputPolicy):
         present = None if missing is None else ~take(missing, info.event)
 
         def step(law_state, *measured):
-            return self.law.step(law_state, Measurement(*measured, present), info.start)
+            measurement = Measurement(*measured)._replace(present=present)
+            return self.law.step(law_state, measurement, info.start)
 
         plant_state = self.plant.from_modal(state[: self.plant.modal_model.state_count])
         return vmap(step, in_axes=-1, out_axes=-1)(law_state, readings, plant_state, command)

@@ -114,6 +114,22 @@ def test_readings_without_a_controller():
     assert np.max(np.abs(late - ideal)) > 0.02 * np.max(np.abs(ideal))
 
 
+def test_readings_in_vehicles():
+    """Lost ones repeat the last one; random numbers follow those of the sensors on the beam."""
+    case = jb.Case(
+        SPAN,
+        sensors=[jb.Sensor(0.3)],
+        loads=[jb.QuarterCar(0.05, 0.02, 60.0, 0.6, 400.0, 0.1, speed=5.0)],
+        vehicle_sensors=[jb.VehicleSensor(), jb.VehicleSensor(dropout=0.5)],
+        run=jb.Run(0.1, 500.0, seed=2),
+    )
+    ideal, lossy = jb.simulate(case).vehicle_readings.T
+    lost = uniform(2, 2, 1, ideal.size) < 0.5
+    newest = np.maximum.accumulate(np.where(lost, 0, np.arange(ideal.size)))
+    assert_array_equal(lossy[~lost], ideal[~lost])
+    assert_array_equal(lossy, lossy[newest])
+
+
 ERRORS = [
     ({"sensors.0.dropout": 1.0}, "sensors.0.dropout must lie from 0 to below 1; it is 1"),
     ({"controller.dropout": -0.1}, "controller.dropout must lie from 0 to below 1; it is -0.1"),

@@ -8,6 +8,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.loads.planar.sensors import VehicleSensor
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.sensing.sensor_signals import needs_times, sampled_readings, to_reading
+from jaxbeam.model.sensing.transmission import sent_readings
 from jaxbeam.numerics.normal_samples import normal_samples
 from jaxbeam.runtime.arrays import Array, xp
 
