@@ -145,13 +145,16 @@ class InversionFilter(AbstractSampledFilter):
         previous, rates = x[:modes], x[modes : 2 * modes]
         coordinates = self.mode_shape_inverse @ (measurement.readings - self.offset)
         smoothing = 1 - self.difference_gain * self.period
-        new_rates = smoothing * rates + self.difference_gain * (coordinates - previous) / periods
-        parts = [coordinates, new_rates]
-        if measurement.present is not None:
-            complete = measurement.complete(self.sensors)
-            pairs = (coordinates, previous), (new_rates, rates)
-            parts = [xp.where(complete, *pair) for pair in pairs]
+        change = coordinates - previous
+        if measurement.present is None:
+            periods = xp.ones(())
+        else:
+            complete, change = measurement.complete(self.sensors), change / periods
             periods = xp.where(complete, 1.0, periods + 1)
+        parts = [coordinates, smoothing * rates + self.difference_gain * change]
+        if measurement.present is not None:
+            pairs = zip(parts, (previous, rates), strict=True)
+            parts = [xp.where(complete, *pair) for pair in pairs]
         if self.actuator_transition is not None:
             beam, actuator_states = x[: 2 * modes], x[2 * modes :]
             inputs = (xp.concatenate([beam, each]) for each in (previous_command, command))

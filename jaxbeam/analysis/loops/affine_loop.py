@@ -28,7 +28,8 @@ class LinearLaw(AbstractSampledLaw):
         return np.zeros(self.matrix.shape[-2] - self.commands)
 
     def step(self, state, measurement, t):
-        after = apply(self.matrix, xp.concatenate([state, *measurement]))
+        measured = measurement.readings, measurement.state, measurement.command
+        after = apply(self.matrix, xp.concatenate([state, *measured]))
         return ControlStep(after[: self.commands], after[self.commands :])
 
 

@@ -16,7 +16,7 @@ def _(law: AdaptiveGPCLaw, code: CSource) -> None:
     root = code.state("root", law.start_root, "square root S of their covariance S S'")
     readings = code.state("past_readings", np.zeros(past * outputs), "the latest first")
     commands = code.state("past_commands", np.zeros(past * actuators), "the latest first")
-    complete = code.state("complete", [float(past)], "samples with complete readings until now")
+    complete = code.state("complete", [past + 1.0], "samples with complete readings until now")
     code.missing.append("Identification pauses while one is missing or among the past readings.")
     changes = code.work("past_moves", powers * actuators, "changes of commands, the latest first")
     row = code.work("row", count, "what the coefficients multiply")

@@ -156,7 +156,7 @@ class AdaptiveGPCLaw(AbstractSampledLaw):
         commands = xp.zeros((past, self.probe.shape[0]))
         readings = xp.zeros((past, self.outputs))
         return AdaptiveState(
-            self.start, self.start_root, readings, commands, xp.asarray(float(past))
+            self.start, self.start_root, readings, commands, xp.asarray(past + 1.0)
         )
 
     def model(self, state: AdaptiveState) -> PolynomialModel:
