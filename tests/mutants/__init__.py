@@ -1,0 +1,1 @@
+"""Test of the tests: changed code (mutants) that they should notice."""

@@ -1,0 +1,181 @@
+"""Change the code at random places, and see whether the tests that should notice do.
+
+    python -m tests.mutants --seed 1 --count 40 [--only model] [--seconds 3600]
+
+needs the group `mutants` (cosmic-ray). Mutants are drawn with the seed from the files of
+`targets.toml`, in a copy of the repository; each is told to its own tests, the quick ones of a file
+and those named one by one. A file whose tests fail without a change, or take too long, is an error.
+Mutants in `left.toml` may survive, with the reason given there; the exit status is 1 if more than
+LARGEST_SHARE of the others do.
+"""
+
+import argparse
+import fnmatch
+import os
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
+
+FOLDER, ROOT = Path(__file__).parent, Path(__file__).parents[2]
+LARGEST_SHARE = 0.1  # of mutants that may survive
+COPIED = "jaxbeam", "tuning", "experiments", "tests", "examples", "docs", "pyproject.toml"
+# Operators that change numbers or branches; others change what is no code of the library's own.
+ARITHMETIC = ("Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "Mul_Add", "Pow_Mul")
+COMPARISONS = ("Lt_LtE", "LtE_Lt", "Gt_GtE", "GtE_Gt", "Lt_GtE", "Gt_LtE", "Eq_NotEq")
+OPERATORS = (
+    *(f"core/ReplaceBinaryOperator_{name}" for name in ARITHMETIC),
+    *(f"core/ReplaceComparisonOperator_{name}" for name in COMPARISONS),
+    "core/ReplaceUnaryOperator_Delete_USub",
+    "core/ReplaceUnaryOperator_Delete_Not",
+    "core/ReplaceAndWithOr",
+    "core/ReplaceOrWithAnd",
+    "core/ReplaceTrueWithFalse",
+    "core/ReplaceFalseWithTrue",
+    "core/NumberReplacer",
+)
+
+
+class Mutant(NamedTuple):
+    """A change of a file: its line before and after, and the code of the whole file after it."""
+
+    file: str
+    before: str
+    after: str
+    code: str
+
+
+def targets() -> dict[str, list[str]]:
+    """Tests of each file of the library that has some, by its path."""
+    patterns = tomllib.loads((FOLDER / "targets.toml").read_text())["targets"]
+    found = {}
+    for path in sorted((ROOT / "jaxbeam").rglob("*.py")):
+        name = path.relative_to(ROOT).as_posix()
+        pattern = next((p for p in patterns if fnmatch.fnmatch(name, p)), None)
+        if pattern is not None and path.name != "__init__.py":
+            found[name] = patterns[pattern]
+    return found
+
+
+def left_ones() -> list[dict[str, str]]:
+    """Mutants that may survive. Raises ValueError for one whose line is no longer there."""
+    entries = tomllib.loads((FOLDER / "left.toml").read_text()).get("mutants", [])
+    for entry in entries:
+        lines = (ROOT / entry["file"]).read_text().splitlines()
+        if not entry["why"] or entry["before"] not in (line.strip() for line in lines):
+            raise ValueError(f"left.toml: {entry['file']} has no line {entry['before']!r}")
+    return entries
+
+
+def mutants_of(name: str) -> list[Mutant]:
+    """All mutants of a file, in order."""
+    from cosmic_ray.ast import ast_nodes, get_ast
+    from cosmic_ray.mutating import mutate_code
+    from cosmic_ray.plugins import get_operator
+
+    code, found = (ROOT / name).read_text(), []
+    tree = get_ast(code)
+    for operator in (get_operator(each)() for each in OPERATORS):
+        count = sum(len(list(operator.mutation_positions(node))) for node in ast_nodes(tree))
+        for occurrence in range(count):
+            changed = mutate_code(code, operator, occurrence)
+            lines = zip(code.splitlines(), changed.splitlines(), strict=True)
+            pair = next(((a.strip(), b.strip()) for a, b in lines if a != b), None)
+            if pair is not None and _changes_numbers(pair[0]):
+                found.append(Mutant(name, *pair, changed))
+    return found
+
+
+def _changes_numbers(line: str) -> bool:
+    """Whether a line may hold numbers of results: no import, declaration, message or signature."""
+    no_code = "import ", "from ", "def ", "class ", "@", 'f"', '"', "raise ", "#"
+    return not line.startswith(no_code) and " Float[" not in line and "warn" not in line
+
+
+class Copy:
+    """Copy of the repository in which files may be changed."""
+
+    def __init__(self, folder: str):
+        self.folder = Path(folder)
+        for name in COPIED:
+            source, place = ROOT / name, self.folder / name
+            if source.is_dir():
+                shutil.copytree(source, place, ignore=shutil.ignore_patterns("__pycache__"))
+            else:
+                shutil.copy(source, place)
+
+    def passes(self, tests: list[str], limit: float) -> bool:
+        """Whether all of some tests pass within a limit (s)."""
+        whole = [test for test in tests if "::" not in test]
+        single = [test for test in tests if "::" in test]
+        runs = [[*whole, "-m", "not slow"]] if whole else []
+        return all(self._run(run, limit) for run in (*runs, *([single] if single else [])))
+
+    def _run(self, arguments: list[str], limit: float) -> bool:
+        command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "-p", "no:cacheprovider"]
+        environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
+        try:
+            done = subprocess.run(
+                [*command, *arguments],
+                cwd=self.folder,
+                env=environment,
+                timeout=limit,
+                capture_output=True,
+            )
+        except subprocess.TimeoutExpired:
+            return False
+        return done.returncode == 0
+
+
+def main() -> int:
+    """Run the mutants that the command line asks for; the exit status."""
+    parser = argparse.ArgumentParser(description="Changes of the code that tests should notice.")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--count", type=int, default=40, help="mutants")
+    parser.add_argument("--only", default="", help="part of the paths of the files")
+    parser.add_argument("--limit", type=float, default=600.0, help="s, for the tests of one mutant")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="after which none begins")
+    options = parser.parse_args()
+    left = {(each["file"], each["before"], each["after"]) for each in left_ones()}
+    tests = {name: own for name, own in targets().items() if options.only in name}
+    drawn = random.Random(options.seed).choices(
+        list(tests), [(ROOT / name).stat().st_size for name in tests], k=options.count
+    )
+    end, tried, survived, healthy = time.monotonic() + options.seconds, 0, [], {}
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Copy(folder)
+        for i, name in enumerate(drawn):
+            if time.monotonic() > end:
+                break
+            some = mutants_of(name)
+            if not some:
+                continue
+            mutant = random.Random(f"{options.seed} {i}").choice(some)
+            key = tuple(tests[name])
+            if key not in healthy:
+                healthy[key] = copy.passes(tests[name], options.limit)
+            if not healthy[key]:
+                print(f"error: without a change the tests of {name} fail", flush=True)
+                return 2
+            place = copy.folder / name
+            place.write_text(mutant.code)
+            lives = copy.passes(tests[name], options.limit)
+            place.write_text((ROOT / name).read_text())
+            allowed = mutant[:3] in left
+            tried += not allowed
+            if lives and not allowed:
+                survived.append(mutant)
+            word = "survives" if lives else "killed"
+            print(f"{word:8s} {name}: {mutant.before}  ->  {mutant.after}", flush=True)
+    share = len(survived) / max(tried, 1)
+    print(f"{len(survived)} of {tried} mutants survive ({share:.0%}); seed {options.seed}")
+    return int(share > LARGEST_SHARE)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
