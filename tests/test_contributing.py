@@ -48,8 +48,10 @@ def test_commands_exist(command):
     assert run == "run"
     tool = {"sphinx-build": "sphinx"}.get(tool, tool)
     if tool == "python":
-        flag, module = options
-        assert flag == "-m" and (ROOT / f"{module.replace('.', '/')}.py").exists()
+        flag, module, *_ = options
+        path = ROOT / module.replace(".", "/")
+        files = path.with_suffix(".py"), path / "__main__.py"
+        assert flag == "-m" and any(file.exists() for file in files)
         return
     groups = tomllib.loads((ROOT / "pyproject.toml").read_text())
     declared = (
