@@ -68,7 +68,7 @@ MATERIAL = (
 WEIGHTS = (
     Range(
         values.gravity,
-        1.2,
+        0.5,
         30.0,
         "it is {value:.4g} m/s^2",
         "is it in m/s^2, 9.81 on earth, not in g?",
