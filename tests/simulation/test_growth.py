@@ -123,7 +123,7 @@ def test_a_loop_without_gain_is_the_beam_without_a_loop():
     warned = (
         jb.check(SOFT).warnings, jb.check(dataclasses.replace(SOFT, controller=None)).warnings
     )  # fmt: skip
-    assert warned[0] == warned[1] and "more than its length" in warned[0][0]
+    assert warned[0] == warned[1] and "more than its length" in warned[0][-1]
 
 
 def test_bounded_loops_beyond_the_length_by_the_oracle():

@@ -142,7 +142,6 @@ BEAM = (
         "the beam sags by {sag:.4g} m under its loads, {share}",
         "is it in {unit}, and are masses of loads in kg, forces in N?",
         cause="stiffness",
-        unless=("weight",),
     ),
     Range(
         values.rise_of_loads,
