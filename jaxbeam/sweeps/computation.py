@@ -192,6 +192,7 @@ def _to_dataset(
     attributes = {
         "title": case.title,
         "case": json.dumps(specification.case_dict),
+        "failed_runs": int(failed.sum()),
     }
     return labelled_dataset(variables, coordinates, attributes)
 

@@ -31,7 +31,12 @@ from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.static_correction import is_supported
 from jaxbeam.runtime.remembering import remembered_within
 from jaxbeam.sweeps.batches import Batches, values_at
-from jaxbeam.sweeps.step_size import REFINEMENT, relative_changes, stratified_sample
+from jaxbeam.sweeps.step_size import (
+    REFINEMENT,
+    largest_error,
+    relative_changes,
+    stratified_sample,
+)
 
 MIN_WHEELS = 8  # of a row; below, integration in batches takes less time
 LEAST_TOLERANCE = 1e-8  # above the error of the eigenvectors
@@ -98,8 +103,7 @@ class ForceRunner:
             lambda phase: self._peaks(sample, phase), (PHASE, PHASE / REFINEMENT)
         )
         coarse, fine = (trial.peak_deflection for trial in trials)
-        error = float(np.nanmax(relative_changes(coarse, fine), initial=0.0))
-        return np.full(count, PHASE), error
+        return np.full(count, PHASE), largest_error(relative_changes(coarse, fine))
 
     def run_count(self, block: int) -> int:
         """Number of runs in a block."""

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.sweeps.blocks import Runner
+from jaxbeam.sweeps.step_size import largest_error
 
 OF_SENSORS = {"peak_deflection": -1, "peak_time": -1, "deflection": -1}  # axis of the sensors
 
@@ -33,7 +34,7 @@ class SensorGroups:
         """Step sizes (s) of all batches that suit all sensors, and the estimated error of peaks."""
         found = [runner.choose_step_sizes() for runner in self.runners]
         steps, errors = zip(*found, strict=True)
-        return np.min(steps, axis=0), max(errors)
+        return np.min(steps, axis=0), largest_error(errors)
 
     def block_function(
         self, steps: Float[np.ndarray, " path"], trials: None = None

@@ -10,7 +10,7 @@ mass near its critical speed is ten times that of a slightly slower one.
 from collections.abc import Callable, Iterable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import ArrayLike, Float, Int
 
 from jaxbeam.case.quantities import QUANTITIES
 
@@ -98,7 +98,12 @@ def step_errors(peaks: PeaksFunction, batches, steps) -> Float[np.ndarray, " pat
 
 def rounding_error(exact: Float[np.ndarray, "path batch sensor"], rounded: np.ndarray) -> float:
     """Largest relative error of peaks in single precision, over the runs that do not fail."""
-    return float(np.nanmax(relative_changes(rounded, exact), initial=0.0))
+    return largest_error(relative_changes(rounded, exact))
+
+
+def largest_error(errors: ArrayLike) -> float:
+    """Largest of some errors that is known; NaN if none is, as of runs that all fail."""
+    return float(np.fmax.reduce(np.asarray(errors, float), initial=np.nan))
 
 
 def stratified_sample(
@@ -158,7 +163,7 @@ def choose_step_sizes(
     The search over `crossing_rates` (1/s), among the batches of the largest `masses` (kg), starts
     from `initial_steps` (s) and is limited by `max_steps` (s). The steps are then checked on the
     batches `checked`, by default a stratified sample. Raises RuntimeError if no step meets the
-    tolerance.
+    tolerance. The error is NaN if all runs fail.
     """
     target_error = tolerance / SAFETY_FACTOR
     chosen = log_spaced_sample(crossing_rates, masses, count)
@@ -168,7 +173,7 @@ def choose_step_sizes(
     if not np.all(valid_steps > 0):
         raise _no_step_error(tolerance)
     if not succeeds.any():
-        return np.minimum(initial_steps, max_steps), 0.0
+        return np.minimum(initial_steps, max_steps), np.nan
     chosen, valid_steps = chosen[succeeds], valid_steps[succeeds]
     start = np.minimum(initial_steps, max_steps)
     step_ratio = _interpolate_conservatively(
@@ -185,7 +190,7 @@ def choose_step_sizes(
         error[fails] = found
         fails, known = error > target_error, ~np.isnan(error)  # NaN: no run succeeds
         if not fails.any():
-            return steps, SAFETY_FACTOR * float(np.nanmax(error, initial=0.0))
+            return steps, SAFETY_FACTOR * largest_error(error)
         with np.errstate(divide="ignore"):
             factor = np.maximum(0.7, 0.92 * (target_error / error) ** (1 / CONVERGENCE_ORDER))
         # Only up to the next batches of the sample, whose steps are short enough.

@@ -15,6 +15,7 @@ from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.runtime.interrupts import keeping
 from jaxbeam.simulation.integration_plan import TOLERANCE
 from jaxbeam.sweeps.computation import compute_sweep
+from jaxbeam.sweeps.failures import warn_of_failures
 from jaxbeam.sweeps.specification import sweep_specification
 from jaxbeam.sweeps.stores.store import read_dataset
 from jaxbeam.sweeps.stores.writing import writing
@@ -66,8 +67,10 @@ def sweep(
     `peak_deflection` (..., sensor) in m and its time in s (for sensors of other quantities
     `peak_acceleration` and so on, each NaN at the others), the smallest contact force in N and the
     time of its first negative value in s (..., load), and `failed`, which marks runs that are not
-    finite; their results are NaN. With a controller, `controller_failures` counts its steps without
-    a solution. With `histories`, `deflection` (..., time, sensor) in m is at the run's sample rate.
+    finite; their results are NaN. There is a warning of such runs, the attribute `failed_runs` is
+    their number, and `error_estimate` is NaN where all runs fail. With a controller,
+    `controller_failures` counts its steps without a solution. With `histories`, `deflection`
+    (..., time, sensor) in m is at the run's sample rate.
 
     Runs are computed in blocks on all cores, compiled once, with the longest time steps whose
     relative errors of peaks are below `tolerance`. Errors are measured on a stratified random
@@ -123,16 +126,19 @@ def sweep(
         with tqdm(total=plan.count, unit="run", disable=not progress, file=sys.stderr) as bar:
             return compute(plan, folder, state, client, bar)
 
-    if store is None:
-        return computed(None, "new")
-    with writing(Path(store).absolute(), plan.fingerprint(), resume, overwrite) as place:
-        if place.state == "complete":
-            return read_dataset(place.folder)
+    def stored(path: Path) -> "xarray.Dataset":
+        with writing(path.absolute(), plan.fingerprint(), resume, overwrite) as place:
+            if place.state == "complete":
+                return read_dataset(place.folder)
 
-        def kept() -> str:
-            again = "the same command goes on" if overwrite else "resume it, with --resume"
-            unfinished = (place.folder / "zarr.json").exists()
-            return f"finished blocks are kept in {os.fspath(store)}: {again}" if unfinished else ""
+            def kept() -> str:
+                again = "the same command goes on" if overwrite else "resume it, with --resume"
+                unfinished = (place.folder / "zarr.json").exists()
+                return f"finished blocks are kept in {path}: {again}" if unfinished else ""
 
-        with keeping(kept):
-            return computed(*place)
+            with keeping(kept):
+                return computed(*place)
+
+    dataset = computed(None, "new") if store is None else stored(Path(store))
+    warn_of_failures(dataset)
+    return dataset

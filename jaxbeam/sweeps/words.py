@@ -26,6 +26,7 @@ from jaxbeam.files.case_file import case_to_dict, with_settings
 from jaxbeam.sweeps import MAX_RUNS
 from jaxbeam.sweeps.computation import compute_sweep, count_as_done, worst_runs
 from jaxbeam.sweeps.specification import SweepSpecification, sweep_specification
+from jaxbeam.sweeps.step_size import largest_error
 from jaxbeam.sweeps.stores import store as sweep_store
 from jaxbeam.sweeps.stores.zarr_files import (
     BLOCKS_GROUP,
@@ -90,7 +91,8 @@ class WordSweep:
         return joined.transpose(*self.dims, ...).assign_attrs(
             title=self.case.title,
             case=json.dumps(case_to_dict(self.case)),
-            error_estimate=max(part.error_estimate for part in datasets),
+            error_estimate=largest_error([part.error_estimate for part in datasets]),
+            failed_runs=sum(int(part.failed_runs) for part in datasets),
         )
 
 

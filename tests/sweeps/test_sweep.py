@@ -18,13 +18,17 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxbeam as jb
 from jaxbeam.case import declared_checks
 from jaxbeam.case.case import replace
+from jaxbeam.integrator.forces.peaks import peaks_of_forces
+from jaxbeam.integrator.peaks.running_peaks import Peaks
 from jaxbeam.integrator.time_grid import event_places, grid_by_step_length
 from jaxbeam.model.influence import static_peak
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.sweeps import force_runner
 from jaxbeam.sweeps.batches import make_batches
 from jaxbeam.sweeps.blocks import Runner
+from jaxbeam.sweeps.failures import FailedRunsWarning
 from jaxbeam.sweeps.path_times import path_times
 
 CASE = jb.Case(
@@ -40,6 +44,10 @@ MASSES, SPEEDS = [0.1, 0.4, 0.9], [1.5, 4.0]
 def single_run_peaks(values) -> np.ndarray:
     """Peaks of one simulation."""
     return np.asarray(jb.simulate(jb.replace(CASE, values)).peak_deflection)
+
+
+OF_PLAUSIBILITY = "jaxbeam.model.plausibility.check.PlausibilityWarning"
+IMPLAUSIBLE = pytest.mark.filterwarnings(f"ignore::{OF_PLAUSIBILITY}")
 
 
 def sweep(over, **options) -> xarray.Dataset:
@@ -145,15 +153,43 @@ def test_histories_on_request():
     assert_allclose(found.deflection[1, 0], record.deflection, atol=1e-10)
 
 
+@IMPLAUSIBLE
 def test_failed_run_is_marked_and_changes_no_other(monkeypatch):
     """An infinite weight, which is refused otherwise, makes one run fail."""
     monkeypatch.setattr(declared_checks, "LARGEST", np.inf)
     masses, gravity = [*MASSES, 100.0], [9.81, 9.81, 9.81, 1e308]
-    dataset = sweep({"loads.0.mass": masses, "run.gravity": gravity}, paired=True)
+    with pytest.warns(FailedRunsWarning, match="1 of 4 runs failed, the first at loads"):
+        dataset = sweep({"loads.0.mass": masses, "run.gravity": gravity}, paired=True)
+    assert dataset.failed_runs == 1 and 0 < dataset.error_estimate < 1e-7
     assert dataset.failed.values.tolist() == [False, False, False, True]
     assert np.isnan(dataset.peak_deflection[-1]).all()
     without_failure = sweep({"loads.0.mass": MASSES, "run.gravity": gravity[:3]}, paired=True)
     assert_allclose(dataset.peak_deflection[:-1], without_failure.peak_deflection, rtol=1e-12)
+
+
+@IMPLAUSIBLE
+@pytest.mark.parametrize("by_forces", [False, True], ids=["integrated", "in closed form"])
+def test_runs_that_all_fail_are_told(by_forces, monkeypatch, tmp_path):
+    """In memory and in a store, also when its complete results are read again; their error is NaN.
+
+    Infinite weights, which are refused otherwise; motions that are not finite.
+    """
+    monkeypatch.setattr(declared_checks, "LARGEST", np.inf)
+
+    def no_peaks(*given):
+        return Peaks(*(np.full_like(part, np.nan) for part in peaks_of_forces(*given)))
+
+    monkeypatch.setattr(force_runner, "peaks_of_forces", no_peaks)
+    case, over = CASE, {"run.gravity": [1e308], "loads.0.mass": [100.0, 200.0]}
+    if by_forces:
+        train = jb.Axles(speed=2.0, offsets=0.01 * np.arange(9), forces=[0.1] * 9)
+        case, over = dataclasses.replace(CASE, loads=[train]), {"loads.0.speed": [1.0, 2.0]}
+    store = {"store": tmp_path / "runs.zarr", "resume": True}
+    for options in ({}, store, store):
+        with pytest.warns(FailedRunsWarning, match="all 2 runs failed, the first at"):
+            found = jb.sweep(case, over, progress=False, **options)
+        assert found.failed.all() and found.failed_runs == 2 and np.isnan(found.error_estimate)
+        assert np.isnan(found.peak_deflection).all()
 
 
 def test_store_holds_the_returned_dataset(grid_dataset, tmp_path):

@@ -22,6 +22,7 @@ from jaxbeam.model.sensing.corrected_rows import static_correction
 from jaxbeam.model.sensing.linear_outputs import LinearOutputs, linear_outputs
 from jaxbeam.model.sensing.output_rows import SIDE_SHARE, sensor_rows
 from jaxbeam.sweeps.computation import peaks_in_memory
+from jaxbeam.sweeps.failures import failure_sentence
 from jaxbeam.sweeps.force_runner import PHASE
 from jaxbeam.sweeps.specification import sweep_specification
 from jaxbeam.vehicles.trains import trains as library
@@ -64,7 +65,8 @@ def train_response(
     repeated poles the sum of the shear forces on both sides, which is no smaller.
 
     First in steps of 2 %, and at the resonance speeds of the first mode; then around every peak
-    near the largest one, until it changes by less than a hundredth.
+    near the largest one, until it changes by less than a hundredth. Raises RuntimeError if a run
+    fails.
     """
     offsets, forces = library()[train].offsets, library()[train].forces
     load = Axles(speed=highest, offsets=offsets, forces=forces)
@@ -78,6 +80,8 @@ def train_response(
         over = {"loads.0.speed": speeds, "run.duration": way / speeds + free}
         plan = sweep_specification(loaded, over, True, False, TOLERANCE, "double")
         found = peaks_in_memory(plan)
+        if found.failed_runs:
+            raise RuntimeError(f"under {train} {failure_sentence(found)}")
         columns = [found[f"peak_{s.quantity}"].to_numpy()[:, i] for i, s in enumerate(sensors)]
         peaks = np.stack(columns, axis=-1)
         if not reactions:

@@ -125,6 +125,8 @@ def sweep(
         {
             "values": values,
             "dimensions": dimensions,
+            "failed_runs": int(results.failed.sum()),
+            "error_estimate": float(results.error_estimate),
             **numbers,
             "plausibility": plausibility,
         },
