@@ -7,10 +7,10 @@ sample may have larger errors where the response changes sharply from run to run
 mass near its critical speed is ten times that of a slightly slower one.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
-from jaxtyping import ArrayLike, Float, Int
+from jaxtyping import Float, Int
 
 from jaxbeam.case.quantities import QUANTITIES
 
@@ -101,7 +101,7 @@ def rounding_error(exact: Float[np.ndarray, "path batch sensor"], rounded: np.nd
     return largest_error(relative_changes(rounded, exact))
 
 
-def largest_error(errors: ArrayLike) -> float:
+def largest_error(errors: Sequence[float] | np.ndarray) -> float:
     """Largest of some errors that is known; NaN if none is, as of runs that all fail."""
     return float(np.fmax.reduce(np.asarray(errors, float), initial=np.nan))
 
