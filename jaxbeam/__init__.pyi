@@ -129,7 +129,8 @@ from .model.static_correction import bending_moment as bending_moment, shear_for
 from .model.statics import static_deflection as static_deflection
 from .simulation.coil_history import coil_history as coil_history
 from .simulation.corrected_deflection import corrected_deflection as corrected_deflection
-from .simulation.record import Record as Record
+from .simulation.record import Record as Record, Result as Result
 from .simulation.simulate import simulate as simulate
+from .simulation.simulator import Simulator as Simulator
 from .simulation.stored_record import read_record as read_record
 from .sweeps.sweep import sweep as sweep

@@ -168,7 +168,8 @@ def _key_name(key) -> str:
     return str(getattr(key, "name", getattr(key, "idx", getattr(key, "key", key))))
 
 
-def _leaves_by_address(case: Case) -> dict[str, Any]:
+def leaves_by_address(case: Case) -> dict[str, Any]:
+    """Arrays of a case by address, in the order of its leaves."""
     leaves, structure = jax.tree.flatten(case)
     return dict(zip(_addresses_of(structure), leaves, strict=True))
 
@@ -197,7 +198,7 @@ def addresses(case: Case) -> dict[str, Float[Array, "..."]]:
     2.0
     """
     numbers = {}
-    for address, leaf in _leaves_by_address(case).items():
+    for address, leaf in leaves_by_address(case).items():
         numbers[address] = leaf
         if xp.ndim(leaf):
             entries = np.ndindex(xp.shape(leaf))
@@ -240,7 +241,7 @@ def own_addresses(case: Case, address: str) -> list[str]:
 
     Raises ValueError, with the nearest address of the case, if one of them has no number.
     """
-    return _own_addresses(case, address, _leaves_by_address(case))
+    return _own_addresses(case, address, leaves_by_address(case))
 
 
 def _own_addresses(case: Case, address: str, leaves: dict[str, Any]) -> list[str]:
@@ -265,7 +266,7 @@ def value_at(case: Case, address: str) -> Float[Array, "..."]:
     Raises ValueError, with the nearest address of the case, if there is none, and if the numbers
     for which the address stands differ.
     """
-    leaves, values = _leaves_by_address(case), []
+    leaves, values = leaves_by_address(case), []
     for one in _own_addresses(case, address, leaves):
         parent, entry = _parent_and_entry(one, leaves)
         values.append(leaves[parent][entry] if entry else leaves[parent])

@@ -143,7 +143,9 @@ def _chunk_function(
     known all are one chunk, whose matrices are known then, too.
     """
 
-    chunk_steps = chunk_length(discrete, loads, max_loads, any_jax(loads, policy) and steps)
+    chunk_steps = chunk_length(
+        discrete, loads, max_loads, any_jax(discrete, loads, policy) and steps
+    )
     vehicles = vehicles_of(loads, discrete.grid.lengths)
 
     def chunk(state, memory, running_peaks: Any, first_step):

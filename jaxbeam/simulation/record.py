@@ -1,10 +1,11 @@
 """Record of one simulated run: histories, section forces, peaks, error; as xarray and netCDF."""
 
+import enum
 from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
@@ -26,6 +27,20 @@ if TYPE_CHECKING:
     pass
 
 
+class Result(enum.IntFlag):
+    """What is wrong with a run: none or several, as one number that programs can return.
+
+    `CONTACT_LOST`: a contact force is tensile, at which the load would lift off. `STEPS_TOO_LONG`:
+    the error estimate is above the tolerance. `DIVERGED`: the closed loop has grown beyond all
+    bounds. `OUT_OF_RANGE`: a number is outside of the range for which the steps were chosen.
+    """
+
+    CONTACT_LOST = 1
+    STEPS_TOO_LONG = 2
+    DIVERGED = 4
+    OUT_OF_RANGE = 8
+
+
 class Record(RecordViews):
     """Record of one simulated run.
 
@@ -42,7 +57,8 @@ class Record(RecordViews):
     so are the peaks. `error_estimate` of the time steps is relative to the largest deflection,
     `step_errors` to the largest value of what each sensor measures. `controller_readings` are the
     readings that a sampled controller has received, None without one; `acting_command` are the
-    commands behind hysteresis and creep of the actuators, None if no actuator has any.
+    commands behind hysteresis and creep of the actuators, None if no actuator has any. `result` is
+    zero or the sum of what is wrong with the run (see `Result`), None for stored records.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -85,6 +101,7 @@ class Record(RecordViews):
     steps: int = eqx.field(static=True)
     controller_readings: Float[Array, "time sensor"] | None = None
     acting_command: Float[Array, "time actuator"] | None = None
+    result: Int[Array, ""] | None = None
 
     @property
     def bodies(self) -> list[str]:

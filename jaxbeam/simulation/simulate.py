@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -44,7 +45,8 @@ from jaxbeam.simulation.integration_plan import (
     sample_times,
 )
 from jaxbeam.simulation.motion.at_samples import motion_at
-from jaxbeam.simulation.record import Record
+from jaxbeam.simulation.record import Record, Result
+from jaxbeam.simulation.varied_plan import traced_ranges, varied_plan, within
 
 MAX_SHORTENINGS = 3  # of steps whose peaks are not exact enough,
 LARGEST_SHORTENING = 4.0  # each by so much at most
@@ -67,9 +69,12 @@ def simulate(
     collocation. Samples are at the sample rate of the run, which ends at its duration, or at
     ascending `times` (s), with the last of which it then ends. Samples do not depend on the time
     step, peaks not on the sample rate. Differentiable in every number of the case, forward and in
-    reverse. Inside `jit` or `vmap`, give a `plan` made outside by
-    `jaxbeam.simulation.integration_plan.integration_plan`. A plan is for the times and the parts of
-    one case, and for other numbers near those of it; the error that it states is for its own.
+    reverse. Inside `jit`, `vmap` and other transformations steps are chosen from what is known:
+    from the values that `vmap` and `grad` have; under `jit` for masses up to that of the beam,
+    forces, and speeds up to four times the slowest that crosses. For other traced numbers prepare a
+    `jaxbeam.Simulator`, with their ranges. `record.result` then tells what is wrong with a run. A
+    `plan` is for the times and the parts of one case, and for other numbers near those of it; the
+    error that it states is for its own.
 
     Raises ValueError for an invalid case or times and for a plan of another case, RuntimeError if
     no time step meets the tolerance; warns (ContactLossWarning) of negative contact forces, and,
@@ -86,43 +91,91 @@ def simulate(
     """
     if times is not None:
         check_times(times)
-    first_records: dict[int, Record] = {}
-    if plan is None:
-        warn_if_implausible(case if times is None else _until(case, times))
-    given, plan = (
-        plan,
-        plan or integration_plan(case, times, tolerance, _first_run(case, times, first_records)),
-    )
-    times = sample_times(case) if times is None else xp.asarray(times, float)
-    if given is not None:
+    sampling = case.run.duration, case.run.sample_rate
+    if not is_concrete_tree(sampling if times is None else () if plan else times):
+        raise ValueError(
+            "times, or run.duration and run.sample_rate without them, must be known numbers, not"
+            " traced by jax.jit or vmap: they fix the number of samples"
+        )
+    inside, first_records = np.ones((), bool), {}
+    if plan is not None:
         if tolerance != TOLERANCE and plan.error > tolerance:
             raise ValueError(
                 f"the plan has an error of {plan.error:.1e}, more than the tolerance of"
                 f" {tolerance:g}: give one of them only"
             )
-        plan = check_plan(case, plan, times)
-    sensor_errors = plan.sensor_errors or (np.nan,) * len(case.sensors)
-    errors = xp.asarray(plan.error), xp.asarray(sensor_errors, float)
-    record = first_records.get(plan.substeps)
-    if record is not None:
-        record = dataclasses.replace(
-            record,
-            error_estimate=record.error_estimate + errors[0],
-            step_errors=record.step_errors + errors[1],
-        )
+        samples = sample_times(case) if times is None else times
+        plan = check_plan(case, plan, xp.asarray(samples, float))
+    elif is_concrete_tree(case):
+        warn_if_implausible(case if times is None else _until(case, times))
+        first_run = _first_run(case, times, first_records)
+        plan = integration_plan(case, times, tolerance, first_run)
+        if not any_jax(case, times):
+            return _with_warning(_refined(case, plan, times, tolerance, first_records))
     else:
-        record = _run(case, plan, times, errors)
-    if given is None and not any_jax(case, times):
-        for _ in range(MAX_SHORTENINGS):
-            shorter = _substeps_for_peaks(record, plan, tolerance)
-            if shorter == plan.substeps:
-                break
-            plan = dataclasses.replace(plan, substeps=shorter)
-            record = _run(case, plan, times, errors)
+        middle, ranges = traced_ranges(case)
+        plan, inside = varied_plan(middle, ranges, times, tolerance), within(case, ranges)
+    return simulate_planned(case, plan, times, tolerance, inside)
+
+
+def is_concrete_tree(tree) -> bool:
+    """Whether no number of a tree is traced by `jit` or `vmap`; numbers of `grad` are known."""
+    return all(map(is_concrete, jax.tree.leaves(tree)))
+
+
+def simulate_planned(case: Case, plan: IntegrationPlan, times, tolerance: float, inside) -> Record:
+    """Record of a run by a plan, whose error is added; whether its numbers are `inside` ranges."""
+    times = sample_times(case) if times is None else xp.asarray(times, float)
+    return _with_warning(_run(case, plan, times, tolerance, inside))
+
+
+def _refined(case: Case, plan: IntegrationPlan, times, tolerance: float, records) -> Record:
+    """Record of known numbers, with steps that are shortened until its peaks are exact enough."""
+    times, inside = sample_times(case) if times is None else xp.asarray(times, float), np.True_
+    record = records.get(plan.substeps)
+    if record is None:
+        record = _run(case, plan, times, tolerance, inside)
+    else:
+        record = _with_result(record, _errors_of(case, plan), tolerance, inside)
+    for _ in range(MAX_SHORTENINGS):
+        shorter = _substeps_for_peaks(record, plan, tolerance)
+        if shorter == plan.substeps:
+            break
+        plan = dataclasses.replace(plan, substeps=shorter)
+        record = _run(case, plan, times, tolerance, inside)
+    return record
+
+
+def _errors_of(case: Case, plan: IntegrationPlan) -> Float[np.ndarray, " all"]:
+    """Errors of the steps of a plan: of the deflection, then of what each sensor measures."""
+    return np.array([plan.error, *(plan.sensor_errors or (np.nan,) * len(case.sensors))])
+
+
+def _with_result(record: Record, errors, tolerance: float, inside) -> Record:
+    """The record with errors of the steps added, and with its `Result`."""
+    # As arrays: of single numbers each value would have a program of its own.
+    of_steps = record.error_estimate + errors[:1]
+    lost = xp.isfinite(record.contact_lost_time) & ~load_set(record.case).prescribed
+    flags = {
+        Result.CONTACT_LOST: xp.any(lost),
+        Result.STEPS_TOO_LONG: xp.any(of_steps > tolerance),
+        Result.DIVERGED: xp.any(xp.isnan(record.coordinates)),
+        Result.OUT_OF_RANGE: xp.logical_not(inside),
+    }
+    return dataclasses.replace(
+        record,
+        error_estimate=of_steps.reshape(()),
+        step_errors=record.step_errors + errors[1:],
+        result=sum(int(flag) * xp.asarray(is_set, int) for flag, is_set in flags.items()),
+    )
+
+
+def _with_warning(record: Record) -> Record:
+    """The same record; warns of loads that lose contact, if their numbers are known."""
     if is_concrete(record.contact_lost_time):
-        lost = np.isfinite(concrete(record.contact_lost_time)) & ~load_set(case).prescribed
+        lost = np.isfinite(concrete(record.contact_lost_time)) & ~load_set(record.case).prescribed
         if lost.any() and np.isnan(concrete(record.diverged_time)):
-            warnings.warn(record.verdict, ContactLossWarning, stacklevel=2)
+            warnings.warn(record.verdict, ContactLossWarning, stacklevel=3)
     return record
 
 
@@ -132,11 +185,12 @@ def _until(case: Case, times) -> Case:
     return dataclasses.replace(case, run=run)
 
 
-def _run(case: Case, plan: IntegrationPlan, times, errors) -> Record:
+def _run(case: Case, plan: IntegrationPlan, times, tolerance: float, inside) -> Record:
     """Record of a planned run; plans that differ in their errors only share compiled programs."""
     is_compiled = plan.schedule is not None and runs_compiled(case, plan.schedule)
     simulate_record = _simulate_compiled if is_compiled else _simulate
-    return simulate_record(case, plan.without_statements(), times, errors)
+    errors = _errors_of(case, plan)
+    return simulate_record(case, plan.without_statements(), times, errors, tolerance, inside)
 
 
 def _substeps_for_peaks(record: Record, plan: IntegrationPlan, tolerance: float) -> int:
@@ -179,18 +233,21 @@ def _simulate_first(case: Case, plan: IntegrationPlan, times, policy):
         none = xp.zeros((events, *part.shape[1:]))
         return put(none, xp.where(event < 0, events, event), part)
 
-    no_errors = xp.zeros(()), xp.zeros(len(case.sensors))  # of steps
-    record = _record(case, integration, times, no_errors)
+    record = _record(case, integration, times)
     states = beam_and_vehicles(case, plan.shapes, policy, at_events(integration.states[:-1]))
     return record, states, at_events(integration.commands)
 
 
-def _simulate_record(case: Case, plan: IntegrationPlan, times, errors) -> Record:
+def _simulate_record(
+    case: Case, plan: IntegrationPlan, times, errors, tolerance: float, inside
+) -> Record:
     monitored = monitored_sensors(case.sensors)
-    return _record(case, run_integration(case, plan, times, monitored), times, errors)
+    record = _record(case, run_integration(case, plan, times, monitored), times)
+    return _with_result(record, errors, tolerance, inside)
 
 
-def _record(case: Case, integration: "Integration", times, errors) -> Record:
+def _record(case: Case, integration: "Integration", times) -> Record:
+    """Record of a run, whose errors are those of its peaks only."""
     outputs = integration.outputs
     peaks = Peaks(*(part[0] for part in integration.running_peaks.peaks()))
     extremes, peaks = sensor_extremes(case.sensors, peaks)
@@ -210,8 +267,8 @@ def _record(case: Case, integration: "Integration", times, errors) -> Record:
         **peaks._asdict(),
         **extremes._asdict(),
         contact_lost_position=lost_positions,
-        error_estimate=xp.where(diverged, xp.nan, errors[0] + of_peaks[0]),
-        step_errors=xp.where(diverged, xp.nan, errors[1] + of_peaks[1]),
+        error_estimate=xp.where(diverged, xp.nan, of_peaks[0]),
+        step_errors=xp.where(diverged, xp.nan, of_peaks[1]),
         steps=integration.steps,
     )
 

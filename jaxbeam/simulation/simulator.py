@@ -1,0 +1,83 @@
+"""A run that is prepared once and simulated for many values of some of its numbers."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.case.case import Case, replace
+from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.runtime.arrays import Array, any_traced, xp
+from jaxbeam.runtime.module import Module
+from jaxbeam.simulation.integration_plan import TOLERANCE, IntegrationPlan
+from jaxbeam.simulation.record import Record
+from jaxbeam.simulation.simulate import simulate_planned
+from jaxbeam.simulation.varied_plan import declared_ranges, varied_plan, within
+
+
+class Simulator(Module):
+    """Simulation of a case as a function of the numbers at some addresses.
+
+    `vary` lists addresses, or maps each to its range (low, high) in SI units; without a range it is
+    from half to twice the number of the case. Time steps are chosen once, for the ends of the
+    ranges. Called with values, as a mapping or in the order of `vary`, it returns the record of
+    `jaxbeam.simulate`, under `jit`, `vmap`, `grad`, `jvp`, `hessian`, `lax.map` and inside `scan`
+    too. Whatever does not depend on traced values is computed in NumPy. `record.result` tells
+    what is wrong with a run (see `jaxbeam.simulation.record.Result`).
+
+    Raises ValueError for an invalid case, unknown addresses, ranges in which positions change their
+    order, and when called outside of transformations with values beyond their ranges.
+
+    >>> import jax, jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> case = jb.Case(
+    ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingMass(mass=0.5, speed=2.0)]
+    ... )
+    >>> sim = jb.Simulator(case, vary={"loads.0.mass": (0.1, 0.5)})
+    >>> print(f"{1e3 * sim([0.5]).peak_deflection[0]:.2f} mm")
+    2.00 mm
+    """
+
+    case: Case
+    ranges: dict[str, tuple[Float[Array, "..."], Float[Array, "..."]]]
+    plan: IntegrationPlan
+    times: Float[Array, " time"] | None
+    tolerance: float = eqx.field(static=True)
+
+    def __init__(self, case: Case, vary: Any = (), times=None, tolerance: float = TOLERANCE):
+        if any_traced(case, times):
+            raise ValueError(
+                "a Simulator chooses time steps from the numbers of its case: make it outside of"
+                " jax.jit, vmap and grad, and call it with the traced values"
+            )
+        self.case, self.tolerance = case, float(tolerance)
+        self.times = None if times is None else np.asarray(times, float)
+        self.ranges = declared_ranges(case, vary)
+        timing = [
+            a for a in self.ranges if times is None and a in ("run.duration", "run.sample_rate")
+        ]
+        if timing:
+            raise ValueError(f"{timing[0]} fixes the number of samples: give times if it varies")
+        self.plan = varied_plan(case, self.ranges, self.times, self.tolerance)
+
+    def __call__(self, values: Mapping[str, Any] | Any = ()) -> Record:
+        """Record for some values in SI units, by address or in the order of the addresses."""
+        if not isinstance(values, Mapping):
+            listed = isinstance(values, list | tuple) or xp.ndim(values) > 0
+            values = values if listed else [values]
+            values = dict(zip(self.ranges, values, strict=True))
+        unknown = [address for address in values if address not in self.ranges]
+        if unknown:
+            raise ValueError(f"{unknown[0]} does not vary: it is none of {', '.join(self.ranges)}")
+        case = replace(self.case, values)
+        inside = within(case, self.ranges)
+        if is_concrete(inside) and not concrete(inside):
+            named = {a: both for a, both in self.ranges.items() if not within(case, {a: both})}
+            address, (low, high) = next(iter(named.items()))
+            raise ValueError(
+                f"{address} is out of the range for which the steps were chosen, {low} to {high}:"
+                f" give jb.Simulator a wider one"
+            )
+        return simulate_planned(case, self.plan, self.times, self.tolerance, inside)
