@@ -360,9 +360,10 @@ def _has_entry(leaf, entry: tuple[int, ...]) -> bool:
 def concrete_case(case: Case) -> Case:
     """The case with concrete numbers, also while it is differentiated.
 
-    Raises `jax.errors.ConcretizationTypeError` if it is traced by `jit` or `vmap`.
+    Raises `jaxbeam.case.fields.TracedNumberError` if it is traced by `jit` or `vmap`.
     """
-    return jax.tree.map(lambda leaf: concrete(leaf), case)
+    found = [concrete(leaf, address) for address, leaf in leaves_by_address(case).items()]
+    return jax.tree.unflatten(jax.tree.structure(case), found)
 
 
 def structure_of(case: Case) -> Case:

@@ -121,11 +121,28 @@ def is_concrete(value) -> bool:
     return True
 
 
-def concrete(value) -> np.ndarray:
+class TracedNumberError(jax.errors.ConcretizationTypeError):
+    """A number must be known, but is traced by a transformation, in one sentence."""
+
+    def __init__(self, what: str, why: str):
+        sentence = (
+            f"{what} is traced by jax.jit, vmap or another transformation and must be a known"
+            f" number: {why}"
+        )
+        TypeError.__init__(self, sentence)
+
+
+def concrete(
+    value, what: str = "a number of the case", why: str = "shapes, checks or steps depend on it"
+) -> np.ndarray:
     """A value as an array of floats, also while it is differentiated (`grad`, `jvp`).
 
-    Raises `jax.errors.ConcretizationTypeError` if it is traced by `jit` or `vmap`.
+    Raises TracedNumberError if it is traced by `jit` or `vmap`: `what` it is, and `why` it must be
+    known.
     """
     if isinstance(value, jax.core.Tracer):
-        value = jax.extend.core.concrete_or_error(None, value)
+        try:
+            value = jax.extend.core.concrete_or_error(None, value)
+        except jax.errors.ConcretizationTypeError:
+            raise TracedNumberError(what, why) from None
     return np.asarray(value, float)

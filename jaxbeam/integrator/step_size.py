@@ -261,7 +261,7 @@ def run_of_grid(
 def trial_positions(case: Case) -> Float[np.ndarray, " position"]:
     """Positions (m) at which errors are measured: twice as many as modes, lest some are missed."""
     count = max(LEAST_TRIAL_POSITIONS, 2 * case.beam.modes)
-    return float(concrete(case.beam.length)) * (np.arange(count) + 0.5) / count
+    return case.beam.length * (np.arange(count) + 0.5) / count
 
 
 def trial_deflections(case: Case, model: ModalModel, states):

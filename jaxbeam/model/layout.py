@@ -139,8 +139,10 @@ def _stiffened_sections(case: Case) -> list:
 
 def find_layout(case: Case) -> Layout:
     """Layout of nodes and elements of a case; its numbers must be concrete (not inside `jit`)."""
-    length = float(concrete(case.beam.length))
-    positions = np.array([float(concrete(x)) / length for x in node_positions(case)])
+    why = "it decides the order of supports and patches; or pass the layout, where one is taken"
+    length = float(concrete(case.beam.length, "beam.length", why))
+    places = [concrete(x, "a position along the beam", why) for x in node_positions(case)]
+    positions = np.array([float(place) / length for place in places])
     nodes: list[list[int]] = []
     for index in np.argsort(positions, kind="stable"):
         if nodes and positions[index] - positions[nodes[-1][0]] < NODE_TOLERANCE:

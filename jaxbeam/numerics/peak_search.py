@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from jaxbeam.runtime.arrays import (
     Array,
     fori_loop,
+    is_jax,
     optimization_barrier,
     stop_gradient,
     take,
@@ -63,7 +64,8 @@ def polynomial(coefficients, position):
     if not isinstance(coefficients, list):
         count, *rest = coefficients.shape
         more = (1,) * (xp.ndim(position) - len(rest))
-        powers = position ** np.arange(count).reshape(-1, *(1,) * xp.ndim(position))
+        exponents = np.arange(count, dtype=float).reshape(-1, *(1,) * xp.ndim(position))
+        powers = position**exponents
         return xp.sum(coefficients.reshape(count, *more, *rest) * powers, axis=0)
     value = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
@@ -171,9 +173,17 @@ def refine_peak(
 ) -> tuple[Float[Array, " *rest"], ...]:
     """Largest magnitude of the polynomial through the samples, and its position in [0, 1].
 
-    `points` are the positions in [0, 1] of the samples, ascending and with both ends. The
-    derivative is that at a fixed position, exact for a peak inside the curve or at a fixed end.
+    `points` are the positions in [0, 1] of the samples, ascending and with both ends. Inside the
+    curve the position has the derivative of a stationary point, so that second derivatives of the
+    magnitude are those of the moving peak; at an end it is fixed.
     """
     position = locate_peak(stop_gradient(samples), points, magnitude)
     position = optimization_barrier(stop_gradient(position))
-    return magnitude(polynomial(_interpolate(samples, points).value, position)), (position + 1) / 2
+    curve = _interpolate(samples, points)
+    if is_jax(samples):
+        slope = polynomial(curve.slope, position)
+        curvature = stop_gradient(polynomial(curve.curvature, position))
+        moves = (xp.abs(position) < 1) & (curvature != 0)
+        change = (slope - stop_gradient(slope)) / xp.where(moves, curvature, 1.0)
+        position = position - xp.where(moves, change, 0.0)
+    return magnitude(polynomial(curve.value, position)), (position + 1) / 2

@@ -242,9 +242,10 @@ def _compile_traced(compute: Callable, numbers: list, name: str) -> Any:
     equations = _Equations(closed.jaxpr)
     entries = sum(out.aval.size for out in closed.jaxpr.outvars)
     if _differentiated(numbers) and entries * sum(map(np.size, numbers)) <= MAX_SLOPES:
-        found = iter(_by_slopes(equations, closed.consts, name, 0, numbers))
+        found = _by_slopes(equations, closed.consts, name, 0, numbers)
     else:
-        found = iter(_program_of(equations, name, 0, False)(closed.consts, numbers))
+        found = _mapped(equations, closed.consts, name, numbers)
+    found = iter(found)
     leaves, structure = outputs
     return structure.unflatten([next(found) if leaf is None else leaf for leaf in leaves])
 
@@ -257,6 +258,25 @@ def _differentiated(numbers: list) -> bool:
     except jax.errors.ConcretizationTypeError:
         return False
     return all(map(_is_real, numbers))
+
+
+def _mapped(equations: "_Equations", constants, name: str, numbers: list) -> list:
+    """Values of a program; under `vmap` outside of programs those of a batch, compiled as such."""
+
+    def inside(numbers):
+        return _program_of(equations, name, 0, False)(constants, numbers)
+
+    if any(not hasattr(n, "batch_dim") or isinstance(n.val, jax.core.Tracer) for n in numbers):
+        return inside(numbers)
+    values = jax.custom_batching.custom_vmap(inside)
+
+    @values.def_vmap
+    def _(_, batched, numbers):
+        mapped = tuple(0 if is_batched else None for is_batched in batched[0])
+        found = _program_of(equations, name, 0, True, mapped)(constants, numbers)
+        return found, [True] * len(found)
+
+    return values(numbers)
 
 
 def _by_slopes(equations: "_Equations", constants, name: str, order: int, numbers: list) -> list:
@@ -300,11 +320,17 @@ def _is_real(array) -> bool:
 
 
 @functools.lru_cache(maxsize=KEPT_PROGRAMS)
-def _program_of(equations: "_Equations", name: str, order: int, with_options: bool) -> Callable:
+def _program_of(
+    equations: "_Equations",
+    name: str,
+    order: int,
+    with_options: bool,
+    mapped: tuple[int | None, ...] = (),
+) -> Callable:
     """Compiled function of constants and numbers, from its equations.
 
     With an `order` above zero its last output are the slopes of the other real ones, the first
-    axis that of the numbers.
+    axis that of the numbers. `mapped` are the axes of the numbers of a batch, if they are of one.
     """
 
     def program(constants, numbers):
@@ -313,7 +339,7 @@ def _program_of(equations: "_Equations", name: str, order: int, with_options: bo
 
         for _ in range(order):
             values = _with_slopes(values)
-        return values(numbers)
+        return (jax.vmap(values, (list(mapped),)) if mapped else values)(numbers)
 
     options = {"compiler_options": xla_options()} if with_options else {}
     return jax.jit(_renamed(program, name), **options)

@@ -19,7 +19,7 @@ from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation.integration_plan import IntegrationPlan, common_plan, integration_plan
 
-Range = tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]
+Range = tuple[Float[Array, "..."], Float[Array, "..."]]
 MARGIN = 2.0  # a number without a range is within this factor of that of the case
 MOST_ENDS = 8  # of ranges that are tried one by one; of more, all lower and all upper ends
 STEPS_OF_MANY = 2  # times as many steps where ends are tried together

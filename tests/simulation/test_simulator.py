@@ -1,0 +1,127 @@
+"""Runs inside of transformations: prepared once, or as they come, without a plan."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from tests.differences import central
+
+CASE = jb.Case(
+    jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.01, modes=3),
+    sensors=[jb.Sensor(0.3)],
+    loads=[jb.MovingMass(mass=0.3, speed=2.0)],
+    run=jb.Run(0.4, 100.0),
+)
+MASS, RIGIDITY = "loads.0.mass", "beam.flexural_rigidity"
+SIMULATOR = jb.Simulator(CASE, {MASS: (0.1, 0.4)})
+
+
+def peak_of(mass):
+    return jb.simulate(jb.replace(CASE, {MASS: mass})).peak_deflection[0]
+
+
+def test_a_simulator_gives_the_record_of_simulate():
+    record, plain = SIMULATOR([0.2]), jb.simulate(jb.replace(CASE, {MASS: 0.2}))
+    assert_allclose(record.deflection, plain.deflection, atol=1e-6 * plain.peak_deflection[0])
+    assert record.result == 0
+    assert SIMULATOR({MASS: 0.2}).peak_deflection == record.peak_deflection
+    assert SIMULATOR(0.2).peak_deflection == record.peak_deflection
+
+
+def test_masses_need_no_plan_under_jit_and_vmap():
+    masses = np.array([0.1, 0.2, 0.3])
+    expected = [peak_of(mass) for mass in masses]
+    assert_allclose(jax.vmap(peak_of)(masses), expected, rtol=1e-7)
+    assert_allclose(jax.jit(peak_of)(0.2), expected[1], rtol=1e-7)
+
+
+def test_a_simulator_works_under_transformations():
+    def misfit(mass):
+        record = SIMULATOR([mass])
+        return jnp.sum(record.deflection**2) / 1e-6 + record.peak_deflection[0] / 1e-3
+
+    slope = central(lambda x: misfit(x[0]), [0.2], 1e-4)[0]
+    assert_allclose(jax.grad(misfit)(0.2), slope, rtol=1e-6)
+    assert_allclose(jax.jit(jax.grad(misfit))(0.2), slope, rtol=1e-6)
+    assert_allclose(jax.jit(jax.vmap(misfit))(jnp.array([0.2]))[0], misfit(0.2), rtol=1e-9)
+    total = jax.lax.scan(lambda sum_, m: (sum_ + misfit(m), None), 0.0, jnp.array([0.2, 0.3]))[0]
+    assert_allclose(total, misfit(0.2) + misfit(0.3), rtol=1e-9)
+
+
+@pytest.mark.parametrize("varied", [(MASS,), (MASS, RIGIDITY)], ids=["mass", "rigidity too"])
+def test_second_derivatives_are_those_of_a_peak_that_moves(varied):
+    simulator = jb.Simulator(CASE, varied)
+    point = np.array([float(jb.addresses(CASE)[address]) for address in varied])
+
+    def peak(values):
+        return simulator(values * point).peak_deflection[0] / 1e-3
+
+    found = jax.hessian(peak)(jnp.ones(len(varied)))
+    assert_allclose(found, found.T, rtol=1e-8)
+    assert_allclose(found, central(jax.grad(peak), np.ones(len(varied)), 1e-3), rtol=1e-5)
+
+
+def test_a_run_under_jit_says_what_is_wrong_with_it():
+    result = jax.jit(lambda mass: SIMULATOR([mass]).result)
+    assert jb.Result(int(result(0.2))) == jb.Result(0)
+    assert jb.Result(int(result(0.5))) == jb.Result.OUT_OF_RANGE
+    with pytest.raises(ValueError, match="out of the range for which the steps were chosen"):
+        SIMULATOR([0.5])
+
+
+WRONG = {
+    "unknown rigidity": (
+        lambda x: jb.simulate(jb.replace(CASE, {RIGIDITY: x})),
+        r"beam.flexural_rigidity is traced by jax.jit.*jb.Simulator\(case, vary=",
+    ),
+    "traced times": (lambda x: jb.simulate(CASE, jnp.arange(3) * x), "times, or run.duration"),
+    "traced duration": (
+        lambda x: jb.simulate(jb.replace(CASE, {"run.duration": x})),
+        "times, or run.duration",
+    ),
+    "a simulator within": (
+        lambda x: jb.Simulator(jb.replace(CASE, {RIGIDITY: x})),
+        "make it outside of",
+    ),
+    "modes without a layout": (
+        lambda x: jb.modes(jb.replace(CASE, {"beam.length": x})).stiffness,
+        "beam.length is traced by jax.jit.* order of supports",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_must_be_known_is_said_in_one_sentence(name):
+    function, message = WRONG[name]
+    with pytest.raises((ValueError, TypeError), match=message) as raised:
+        jax.jit(lambda x: jax.tree.leaves(function(x))[0])(1.0)
+    assert len(str(raised.value).split("\n")) == 1
+
+
+def test_wrong_uses_of_a_simulator_are_said():
+    with pytest.raises(ValueError, match="does not vary"):
+        SIMULATOR({"loads.0.speed": 1.0})
+    with pytest.raises(ValueError, match=r"must be \(low, high\)"):
+        jb.Simulator(CASE, {MASS: (2.0, 1.0)})
+    with pytest.raises(ValueError, match="fixes the number of samples"):
+        jb.Simulator(CASE, ("run.duration",))
+
+
+@pytest.mark.parametrize(("address", "most"), [(MASS, 1100), (RIGIDITY, 1800)])
+def test_programs_hold_only_what_varies(address, most):
+    """Equations of whole records; all stages of a run are 4000."""
+    simulator = jb.Simulator(CASE, (address,))
+    value = float(jb.addresses(CASE)[address])
+    program = jax.make_jaxpr(lambda x: jax.tree.leaves(simulator([x])))(value)
+    assert equations(program.jaxpr) < most
+
+
+def equations(jaxpr) -> int:
+    """Number of equations of a program, with those of its loops and branches."""
+    parameters = [list(equation.params.values()) for equation in jaxpr.eqns]
+    inner = jax.tree.leaves(parameters, is_leaf=lambda part: hasattr(part, "eqns"))
+    programs = (getattr(part, "jaxpr", part) for part in inner)
+    return len(jaxpr.eqns) + sum(equations(part) for part in programs if hasattr(part, "eqns"))
