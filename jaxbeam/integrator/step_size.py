@@ -31,6 +31,7 @@ from jaxbeam.integrator.time_grid import (
 )
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
+from jaxbeam.runtime.arrays import Array
 
 MAX_TRIALS = 40  # step sizes tried
 CONVERGENCE_ORDER = 9  # assumed order of the error in the step; the true order is higher
@@ -258,7 +259,7 @@ def run_of_grid(
     return np.append(starts, grid.boundaries[-1]), np.asarray(states)
 
 
-def trial_positions(case: Case) -> Float[np.ndarray, " position"]:
+def trial_positions(case: Case) -> Float[Array, " position"]:
     """Positions (m) at which errors are measured: twice as many as modes, lest some are missed."""
     count = max(LEAST_TRIAL_POSITIONS, 2 * case.beam.modes)
     return case.beam.length * (np.arange(count) + 0.5) / count

@@ -12,14 +12,14 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from jaxbeam.case.case import Case, leaves_by_address, own_addresses, replace, value_at
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation.integration_plan import IntegrationPlan, common_plan, integration_plan
 
-Range = tuple[Float[Array, "..."], Float[Array, "..."]]
+Range = tuple[Any, Any]  # lowest and highest value, arrays of the shape of the number
 MARGIN = 2.0  # a number without a range is within this factor of that of the case
 MOST_ENDS = 8  # of ranges that are tried one by one; of more, all lower and all upper ends
 STEPS_OF_MANY = 2  # times as many steps where ends are tried together
