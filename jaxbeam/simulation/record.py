@@ -58,7 +58,7 @@ class Record(RecordViews):
     `step_errors` to the largest value of what each sensor measures. `controller_readings` are the
     readings that a sampled controller has received, None without one; `acting_command` are the
     commands behind hysteresis and creep of the actuators, None if no actuator has any. `result` is
-    zero or the sum of what is wrong with the run (see `Result`), None for stored records.
+    zero, or the sum of what is wrong with the run (see `Result`).
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(

@@ -58,6 +58,7 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
         raise ValueError(f"not a record of jaxbeam: it lacks {', '.join(missing)}")
     values = {name: xp.asarray(dataset[name].values) for name in _STORED_VARIABLES}
     layout, acting = mesh_layout(case), dataset.variables.get("acting_command")
+    result = dataset.attrs.get("result")  # since release 0.3.0
     return Record(
         case=case,
         modes=Modes(
@@ -74,6 +75,7 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
         steps=int(dataset.attrs["steps"]),
         controller_readings=xp.asarray(dataset["measured"].values) if _is_sampled(case) else None,
         acting_command=None if acting is None else xp.asarray(acting.values),
+        result=None if result is None else xp.asarray(int(result)),
         **values,
     )
 

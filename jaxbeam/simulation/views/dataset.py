@@ -65,6 +65,7 @@ def dataset_parts(
         "title": case.title,
         "case": json.dumps(case_to_dict(case)),
         "error_estimate": float(value("error_estimate")),
+        **({} if value("result") is None else {"result": int(value("result"))}),
         "steps": value("steps"),
         "verdict": value("verdict"),
     }
