@@ -1,8 +1,10 @@
-"""Largest counts in a case: more would take days or all memory, and are refused before any work."""
+"""Largest counts in a case: more would take days or all memory, and are refused before any work.
 
+No heavy imports: files are checked before anything is.
+"""
+
+import math
 from typing import Any
-
-import numpy as np
 
 # By the key of a list of parts, or of a whole number, wherever it stands in a case.
 MAX_COUNTS = {
@@ -61,6 +63,6 @@ def check_entries(address: str, value: Any) -> None:
 
     Raises ValueError with the largest allowed.
     """
-    size = len(value) if isinstance(value, list) else int(np.prod(np.shape(value)))
+    size = len(value) if isinstance(value, list) else math.prod(getattr(value, "shape", ()))
     if size > MAX_ENTRIES:
         raise ValueError(f"{address} has {size} numbers; {MAX_ENTRIES} are the most")

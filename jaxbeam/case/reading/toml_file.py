@@ -3,11 +3,14 @@
 import os
 import re
 import tomllib
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from jaxbeam.case.limits import check_length
 from jaxbeam.runtime.input_file import read_text_input
 
+_LISTED = re.compile(r"^[ \t]*\[\[[ \t]*(\w+)[ \t]*\]\]", re.MULTILINE)  # [[sensors]]
 MAX_DEPTH = 32  # of tables and lists within each other; no file that people write comes near
 
 
@@ -21,9 +24,14 @@ def read_toml(
 
     A file that another one names at an `address` must be `below` the folder of that one. Raises
     OSError if the file cannot be read, ValueError if it is elsewhere, too large, not UTF-8, not
-    valid TOML, or nested without end; both name the file.
+    valid TOML, nested without end, or has more tables than a case may have; both name the file.
     """
     text = read_text_input(path, what, below, address)
+    try:
+        for name, count in Counter(_LISTED.findall(text)).items():
+            check_length(name, count)  # to parse so many would take long
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     try:
         content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # RecursionError: lists nested without end
