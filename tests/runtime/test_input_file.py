@@ -1,5 +1,6 @@
 """Files that are read: which are refused before they are opened, and what is said of them."""
 
+import ast
 import io
 import os
 import socket
@@ -14,6 +15,7 @@ from jaxbeam.files.case_file import load_case_with
 from jaxbeam.files.export import read_gains
 from jaxbeam.runtime import input_file
 from jaxbeam.runtime.input_file import describe_content, read_input
+from tests.modules import module_files, parse
 from tuning.checkpoint import read_arrays
 
 BEAM = "[beam]\nlength = 25.0\nflexural_rigidity = 4.8e10\nmass_per_length = 18358.0\n"
@@ -229,3 +231,35 @@ def test_descriptions():
     assert describe_content("Brücke".encode()) == "text"
     assert describe_content(("ü" * 5000).encode()[:4096] + b"\xc3") == "text"
     assert describe_content("Brücke".encode("cp1252") * 900) == "binary data of an unknown kind"
+
+
+# Modules that open files of the package, of the system or of the cache, or after `check_input`.
+BY_THEMSELVES = (
+    "jaxbeam.runtime.",
+    "jaxbeam.vehicles.",
+    "jaxbeam.c_code.source",
+    "jaxbeam.analysis.assessment.formulas",
+    "jaxbeam.case.loads.planar.files",
+    "jaxbeam.cli.",
+    "jaxbeam.files.export.files",
+    "jaxbeam.files.zarr_codecs",
+    "tuning.logs.readers.table",
+    "tuning.logs.readers.tdms",
+)
+
+
+def test_no_other_module_opens_files_to_read():
+    wrong = []
+    for module, path in module_files().items():
+        if not module.startswith(("jaxbeam", "tuning")) or module.startswith(BY_THEMSELVES):
+            continue
+        for node in ast.walk(parse(path)):
+            if not isinstance(node, ast.Call):
+                continue
+            name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            modes = [one.value for one in node.args if isinstance(one, ast.Constant)]
+            writes = name == "open" and any(set(str(mode)) & set("wax") for mode in modes)
+            if name in ("read_text", "read_bytes", "open") and not writes:
+                wrong.append(f"{module}: {ast.unparse(node)[:80]}")
+    helpers = ("read_bytes(path", "read_text(path")  # those of `tuning.logs.readers.table`
+    assert [one for one in wrong if not one.partition(": ")[2].startswith(helpers)] == []
