@@ -124,7 +124,9 @@ def refined(
     refined.
     """
     x = positions_along(case)
-    x = np.union1d(x, places) if len(places) else x
+    if len(places):
+        places = np.asarray(places)
+        x = np.union1d(x, places[~_is_among(case, places, np.asarray(x))])
     found = evaluate(x)
     if any_traced(x, found):
         return xp.asarray(x), found

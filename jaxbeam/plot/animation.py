@@ -10,6 +10,7 @@ from PIL import Image
 
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.model.along_beam import positions_along
 from jaxbeam.model.load_set import load_set
 from jaxbeam.plot.schematic import (
     ACTUATOR_MARKER,
@@ -102,8 +103,7 @@ def animate(
 def _beam_axes(axes, record):
     """Draw the beam; returns a function that draws it at a sample."""
     case = record.case
-    length = float(concrete(case.beam.length))
-    x = np.linspace(0, length, 201)
+    x = np.asarray(positions_along(case, 201))
     sensor_positions = np.array([float(concrete(sensor.position)) for sensor in case.sensors])
     beam = np.asarray(record.at(jnp.asarray(x)))
     factor, unit = unit_scale(beam, "m")

@@ -7,6 +7,7 @@ from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
+from jaxbeam.model.along_beam import positions_along
 from jaxbeam.model.modes import Modes, modes as find_modes
 from jaxbeam.plot.schematic import draw_supports
 from jaxbeam.plot.style import (
@@ -40,7 +41,7 @@ def plot_modes(
     """
     modes = find_modes(case) if modes is None else modes
     length = float(concrete(case.beam.length))
-    x = np.linspace(0, length, 401)
+    x = np.asarray(positions_along(case, 401))
     shapes = np.asarray(modes.shapes(jnp.asarray(x)))
     shapes = 0.36 * shapes / np.max(np.abs(shapes), axis=0)
     count = shapes.shape[1]

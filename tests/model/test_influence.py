@@ -6,6 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.analysis.sections.influence_table import influence_table
 from jaxbeam.model.modes import mesh_layout
 from tests.differences import central
 
@@ -78,3 +79,19 @@ def test_refusals():
         jb.influence_line(ONE, 1.0, P, quantity="momnet")
     with pytest.raises(ValueError, match="side must be 'left' or 'right'"):
         jb.influence_line(ONE, 1.0, P, quantity="shear", side="up")
+
+
+def test_tables_have_the_extremes_of_lines():
+    """Two spans of 11 and 9 m, off the grid: support moments, and both sides of a shear force."""
+    case = jb.Case(jb.Beam(20.0, 6.0, 1.0), supports=[jb.Support(11.0)])
+    found = influence_table(case)
+    moment = found.columns["moment at support 2 (m)"]
+    # Three-moment equation: -l a (1 - a^2) l / (2 (l + m)) at a = 1 / sqrt(3) of the span l.
+    expected = -11.0 * 11.0 * (2 / 3 / np.sqrt(3)) / (2 * 20.0)
+    assert_allclose(moment.min(), expected, rtol=1e-4)
+    one = jb.Case(jb.Beam(20.0, 6.0, 1.0))
+    shear = influence_table(one, ("shear",), (7.13,)).columns["shear at 7.13 m (1)"]
+    assert_allclose([shear.min(), shear.max()], [-7.13 / 20, 12.87 / 20], rtol=1e-6)
+    at = influence_table(one, ("moment",), (7.13,))
+    assert_allclose(at.values.max(), 7.13 * 12.87 / 20, rtol=1e-9)
+    assert np.all(np.diff(at.positions) > 0)

@@ -10,8 +10,8 @@ from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.model.along_beam import LEFT_SHARE, refined
 from jaxbeam.model.influence import (
-    DEFAULT_POSITIONS,
     REACTION,
     held_positions,
     influence_line,
@@ -57,23 +57,44 @@ def influence_table(
 
     By default moments at midspans and over supports that bend, deflections at midspans, and
     reactions; one quantity alone is at all characteristic points, a reaction at all supports.
-    Shear forces are those right of a section (at the right end, left of it). Raises ValueError as
-    `influence_line` does.
+    Shear forces are those right of a section (at the right end, left of it). Positions of the load
+    are by default those of `model.along_beam`, with more around the extremes of each line. Raises
+    ValueError as `influence_line` does.
     """
-    length = float(concrete(case.beam.length))
+    parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
+    lines = _sections(case, quantities, x)
+
+    def at(positions) -> dict[str, np.ndarray]:
+        columns = [
+            influence_line(case, place, positions, quantity=quantity, **parameters)
+            for quantity, _, place in lines
+        ]
+        return {"values": np.stack(list(map(np.asarray, columns)), axis=-1)}
+
+    def curves(found):
+        values = found["values"]
+        sizes, near = np.abs(values).max(axis=0), np.zeros((values.shape[0], 0))
+        both = np.concatenate([values, -values], axis=-1)
+        return both, np.concatenate([sizes, sizes]), [near] * both.shape[-1]
+
     if load_positions is None:
-        grid = np.linspace(0.0, length, DEFAULT_POSITIONS)
-        load_positions = np.unique(np.concatenate([grid, held_positions(case), np.array(x)]))
-    positions = np.asarray(load_positions, float)
-    lines, values = [], []
-    for quantity, place, at in _sections(case, quantities, x):
-        parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
-        line = influence_line(case, at, positions, quantity=quantity, **parameters)
-        unit = "N" if quantity == REACTION else QUANTITIES[quantity].unit
-        lines.append((quantity, PER_NEWTON.get(unit, f"{unit}/N"), place))
-        values.append(np.asarray(line))
-    names, units, places = zip(*lines, strict=True)
-    return InfluenceTable(positions, np.stack(values, axis=-1), names, units, places)
+        # A shear force jumps by the load as it passes the section: a position on each side.
+        length = float(concrete(case.beam.length))
+        own = np.array([place for _, _, place in lines])
+        beside = [min(p + LEFT_SHARE * length, length) for q, _, p in lines if q == "shear"]
+        found_at, found = refined(case, at, curves, np.concatenate([own, beside]))
+        positions = np.asarray(found_at)
+    else:
+        positions = np.asarray(load_positions, float)
+        found = at(positions)
+    units = ["N" if q == REACTION else QUANTITIES[q].unit for q, _, _ in lines]
+    return InfluenceTable(
+        positions,
+        found["values"],
+        tuple(quantity for quantity, _, _ in lines),
+        tuple(PER_NEWTON.get(unit, f"{unit}/N") for unit in units),
+        tuple(name for _, name, _ in lines),
+    )
 
 
 def _sections(case: Case, quantities, x) -> list[tuple[str, str, float]]:

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 GRAVITY = 9.81  # m/s^2, of vehicles without a case
 FAST = 5.0  # m/s, from where speeds are in km/h too
-POSITIONS = 401  # of sections at which moments are looked for
 MAX_LOADS = 6  # of a case that are described
 MAX_WHEELS = 12  # of a load of a case with a row each
 
@@ -121,6 +120,7 @@ def settlement_words(case: "Case") -> list[str]:
     import numpy as np
 
     from jaxbeam.case.display.prefixes import with_prefix
+    from jaxbeam.model.along_beam import positions_along, sections
     from jaxbeam.model.settlement import has_settlement, settled_beam
     from jaxbeam.model.static_correction import bending_moment
 
@@ -131,8 +131,8 @@ def settlement_words(case: "Case") -> list[str]:
         for i, support in enumerate(case.supports)
         if support.settlement is not None
     ]
-    places = [float(support.position) for support in case.supports]
-    x = np.append(np.linspace(0.0, float(case.beam.length), POSITIONS), places)
+    x = positions_along(case)
+    x = sections(case, x, "moment").points
     moments = np.array(bending_moment(case, x, settled_beam(case).field(x, 2)))
     moments[np.abs(moments) < 1e-9 * np.abs(moments).max()] = 0.0  # rounding errors
     low, high = (with_prefix(float(one), "N m") for one in (moments.min(), moments.max()))
