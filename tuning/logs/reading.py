@@ -179,6 +179,18 @@ def _make_log(
             f"{path}: the column of times, {time_column!r}, has the unit {column_units[0][0]!r}"
         )
     values = table.values[:, [names.index(name) for name in (time_column, *channels)]]
+    clocks = [i for i, (_, found) in enumerate(column_units) if i and found.quantity == "time"]
+    if clocks:  # of channels that have times of their own
+        scaled = values * np.array([found.factor for _, found in column_units])
+        for i in clocks:
+            if not np.allclose(scaled[:, i], scaled[:, 0], rtol=1e-9, atol=1e-9, equal_nan=True):
+                raise ValueError(
+                    f"{path}: the columns {time_column!r} and {channels[i - 1]!r} are both times"
+                    " and differ; read the channels of each by themselves, by time= and columns="
+                )
+        kept = [i for i in range(len(column_units)) if i not in clocks]
+        values, column_units = values[:, kept], [column_units[i] for i in kept]
+        channels = [channels[i - 1] for i in kept[1:]]
     with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is looked for below
         values = values * np.array([unit.factor for _, unit in column_units])
     valid, notes = np.isfinite(values), [*table.notes]

@@ -246,6 +246,50 @@ def test_bytes_in_the_wrong_order_are_refused(tmp_path):
         read_log(tmp_path / "run.uff")
 
 
+def test_two_columns_of_times_are_one_or_are_refused(tmp_path):
+    path = tmp_path / "run.csv"
+    rows = [[t, signal(t), 1e3 * t, -signal(t)] for t in TIMES]
+    text = "ta [s],a [mm],tb [ms],b [mm]\n"
+    path.write_text(text + "".join(",".join(map(repr, map(float, row))) + "\n" for row in rows))
+    log = read_log(path)
+    assert log.names == ("a", "b")
+    np.testing.assert_allclose(1e3 * log.values[:, 1], -signal(TIMES))
+    rows = [[*row[:2], row[2] + 500.0, row[3]] for row in rows]
+    path.write_text(text + "".join(",".join(map(repr, map(float, row))) + "\n" for row in rows))
+    with pytest.raises(ValueError, match=r"run.csv: the columns 'ta' and 'tb' are both times and"):
+        read_log(path)
+    assert read_log(path, time="tb", columns=["b"]).times[0] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("X0\t0\t0.5", "X0 is 0 and 0.5"),
+        ("X0\t0\t0\nTime\t09:30:00\t09:30:00.5", "Time is 09:30:00 and 09:30:00.5"),
+        ("X0\t0\t0\nDelta_X\t0.005\t0.01", "Delta_X is 0.005 and 0.01"),
+    ],
+)
+def test_channels_of_a_labview_file_that_start_at_different_times(tmp_path, row, said):
+    head = "LabVIEW Measurement\nSeparator\tTab\nX_Columns\tNo\n***End_of_Header***\n\n"
+    head += f"Channels\t2\nY_Unit_Label\tmm\tmm\nDelta_X\t0.005\t0.005\n{row}\n"
+    head += "***End_of_Header***\nX_Value\ta\tb\tComment\n"
+    rows = [f"\t{signal(t):.6f}\t{-signal(t):.6f}\n" for t in TIMES]
+    (tmp_path / "run.lvm").write_text(head + "".join(rows))
+    with pytest.raises(ValueError, match=f"line 1.: the channels a and b have .*: {said}; save"):
+        read_log(tmp_path / "run.lvm")
+
+
+def test_starts_of_datasets_may_be_dates(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        file.attrs["sample_rate"] = 200.0
+        file["a [mm]"], file["b [mm]"] = signal(TIMES), -signal(0.5 + TIMES)
+        file["a [mm]"].attrs["start_time"] = "2024-03-31T02:59:59.500+02:00"
+        file["b [mm]"].attrs["start_time"] = "2024-03-31T01:00:00Z"
+    log = read_warned(tmp_path / "run.h5", "aligned by them, and read from 0.5 to 1.995 s")
+    np.testing.assert_allclose(1e3 * log.values, signal(log.times)[:, None] * [1, -1], atol=1e-5)
+
+
 def test_a_copied_channel_is_told(tmp_path):
     tdms(tmp_path / "run.tdms", {n: (signal(TIMES), clock()) for n in "ab"})
     read_warned(tmp_path / "run.tdms", "b equals a in every sample: is one of them a copy")

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.clocks import clocks_by_numbers
+from tuning.logs.clocks import STARTS, clocks_by_numbers
+from tuning.logs.readers.stamps import epoch_seconds, is_stamp
 from tuning.logs.readers.table import (
     LogFormat,
     LogTable,
@@ -65,9 +66,16 @@ def read_hdf5(path: Path) -> dict[str, LogTable]:
 
 
 def _numbers_of(attributes) -> dict[str, float]:
-    """Attributes that are one number, by name in small letters."""
-    found = {name.lower(): np.ravel(np.asarray(attributes[name])) for name in attributes}
-    return {n: float(v[0]) for n, v in found.items() if v.size == 1 and v.dtype.kind in "fiu"}
+    """Attributes that are one number, by name in small letters; dates of starts in s."""
+    numbers = {}
+    for name in attributes:
+        value = np.ravel(np.asarray(attributes[name]))
+        text = text_attribute(attributes[name])
+        if value.size == 1 and value.dtype.kind in "fiu":
+            numbers[name.lower()] = float(value[0])
+        elif name.lower() in STARTS and text and is_stamp(text):
+            numbers[name.lower()] = epoch_seconds(text)
+    return numbers
 
 
 def _numbers(dataset) -> np.ndarray:

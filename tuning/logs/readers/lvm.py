@@ -142,6 +142,7 @@ def _columns(path, segment: _Segment, decimal_comma: bool):
     rows = [[row[i] if i < len(row) else "" for i in used] for row in segment.rows]
     names = tuple(headings[i] for i in channels)
     values = parse_numbers(path, [headings[i] for i in used], rows, segment.lines, decimal_comma)
+    _check_starts(path, segment, names, decimal_comma)
     times = values[:, : len(used) - len(channels)]
     if without_times:
         times = _implicit_times(path, segment, decimal_comma)
@@ -154,6 +155,28 @@ def _columns(path, segment: _Segment, decimal_comma: bool):
     labels = segment.header.get("Y_Unit_Label", [])
     units = tuple((labels[i] if i < len(labels) else "") or None for i in range(len(channels)))
     return names, units, np.hstack([times[:, :1], values[:, -len(channels) :]])
+
+
+def _check_starts(path, segment: _Segment, names, decimal_comma: bool) -> None:
+    """Raise ValueError for channels that start at different times, by the header of a segment."""
+    for key in ("X0", "Date", "Time", "Delta_X"):
+        cells = [cell for cell in segment.header.get(key, [])[: len(names)] if cell]
+        if decimal_comma and key in ("X0", "Delta_X"):
+            cells = [cell.replace(",", ".") for cell in cells]
+        differ = next((i for i, cell in enumerate(cells) if not _alike(cell, cells[0])), None)
+        if differ is not None:
+            raise ValueError(
+                f"{path}, line {segment.lines[0]}: the channels {names[0]} and {names[differ]} have"
+                f" different times: {key} is {cells[0]} and {cells[differ]}; save them to separate"
+                " files"
+            )
+
+
+def _alike(cell: str, other: str) -> bool:
+    try:
+        return abs(float(cell) - float(other)) <= 1e-6 * abs(float(other))
+    except ValueError:
+        return cell == other
 
 
 def _implicit_times(path, segment: _Segment, decimal_comma: bool):

@@ -62,6 +62,15 @@ def seconds_of(
     return relative, cells[0].strip()
 
 
+def epoch_seconds(stamp: str) -> float:
+    """Seconds from 1970 (of UTC without a zone) of a date and time, 0 for a time of day alone."""
+    found = _STAMP.fullmatch(stamp.strip())
+    if found is None:
+        return 0.0
+    moment = _moment(found, _order([found]))
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
 def _order(found) -> str:
     """Order of year, month and day in dates."""
     if len(found[0]["a"]) == 4:
