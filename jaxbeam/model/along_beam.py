@@ -106,8 +106,16 @@ def sections(case: Case, x: Float[Array, " position"], quantity: str) -> Section
     elif order:
         places = np.unique(concrete(places))
         left = np.flatnonzero(_is_among(case, concrete(x), places))
-    beside = xp.clip(x[left] - LEFT_SHARE * case.beam.length, 0.0, case.beam.length)
-    return Sections(xp.concatenate([x, beside]), left)
+    return Sections(xp.concatenate([x, left_of(case, x[left])]), left)
+
+
+def left_of(case: Case, x) -> Float[Array, "*position"]:
+    """Positions (m) of sensors just left of positions x (m), 0 m at the left end.
+
+    Further away than a wheel moves in the shortest step: there a shear force jumps between steps.
+    """
+    length = case.beam.length
+    return xp.clip(xp.asarray(x, float) - LEFT_SHARE * length, 0.0, length)
 
 
 def refined(

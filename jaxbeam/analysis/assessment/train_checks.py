@@ -30,8 +30,8 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.model.along_beam import left_of
 from jaxbeam.model.influence import REACTION
-from jaxbeam.model.sensing.output_rows import SIDE_SHARE
 from jaxbeam.vehicles.trains import trains as library
 
 
@@ -115,7 +115,7 @@ def checked_sections(case: Case) -> list[CheckedSection]:
 def _sensor_position(case: Case, section: CheckedSection) -> float:
     """Position (m) of a sensor for a section; shear forces are measured just right of sensors."""
     left = section.quantity == "shear" and section.side == "left"
-    return section.x - left * 4 * SIDE_SHARE * float(concrete(case.beam.length))
+    return float(left_of(case, section.x)) if left else section.x
 
 
 def _unit(section: CheckedSection) -> str:
