@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, take, xp
 from jaxbeam.runtime.module import Module
 
 SAME_TIME_SHARE = 1e-9  # of the duration: closer times are one event
@@ -31,6 +31,11 @@ class EventSchedule(Module):
     readings and commands are left out; `missing` says that the reading due last has been lost, and
     `assumed_age` is the number of commands made since the one that acts at a sample according to a
     law that does not know of losses and random delays. Both are None without these.
+
+    In a schedule that moves with the numbers of the case, no two actions share an event, and
+    `source` is the index of each event's time among those that `moved` is given, -1 for a time
+    that stays. `merging` (s) is added to it, by less than SAME_TIME_SHARE, so that times that were
+    equal but for rounding are; `source_counts` are the numbers of times of each kind of action.
     """
 
     times: Float[Array, " event"]
@@ -43,9 +48,18 @@ class EventSchedule(Module):
     reading_age: Int[Array, "event sensor"] | None = None
     missing: Bool[Array, "event sensor"] | None = None
     assumed_age: Int[Array, ""] | None = None
+    source: Int[Array, " event"] | None = None
+    merging: Float[Array, " event"] | None = None
     max_age: int = eqx.field(static=True, default=0)
     max_waiting: int = eqx.field(static=True, default=0)
     max_readings: int = eqx.field(static=True, default=0)
+    source_counts: tuple[int, ...] = eqx.field(static=True, default=())
+
+    def moved(self, times: Float[Array, " time"]) -> "EventSchedule":
+        """The schedule with these times (s) of its actions, in the order of `source`."""
+        own = take(times, xp.maximum(self.source, 0)) + self.merging
+        times = xp.where(self.source < 0, self.times, own)
+        return dataclasses.replace(self, times=times, lengths=xp.diff(times))
 
 
 def sample_schedule(
@@ -102,6 +116,7 @@ def controller_schedule(
     breakpoints: Float[np.ndarray, " breakpoint"],
     end: float | None = None,
     assumed_age: int | None = None,
+    moving: bool = False,
 ) -> EventSchedule:
     """Schedule of a run with a controller, from rest at zero to the `end` (s).
 
@@ -111,6 +126,10 @@ def controller_schedule(
     after a newer one. The `readings` of each sensor are those of the signal when they are sent;
     they are available as they arrive, in their order. `breakpoints` (s) are those of prescribed
     commands.
+
+    A `moving` schedule has its actions at separate events, those at one time in the order in which
+    they take place: breakpoints, readings of each sensor, control, commands, samples, end. In this
+    order `EventSchedule.moved` takes their times.
     """
     end = float(sample_times[-1] if end is None else max(end, sample_times[-1]))
     control_times, begun = commands.sent, commands.received
@@ -141,40 +160,73 @@ def controller_schedule(
         times,
     )
 
-    def event_indices(wanted_times):
-        return np.clip(
-            np.searchsorted(times, wanted_times - SAME_TIME_SHARE * end), 0, times.size - 1
-        )
-
-    def in_run(wanted_times, numbers):
-        wanted = wanted_times[numbers]
+    def in_run(kind, numbers):
+        wanted = kinds[kind][numbers]
         tolerance = SAME_TIME_SHARE * end
         return numbers[(wanted >= -tolerance) & (wanted <= end + tolerance)]
 
-    def number_at_events(wanted_times, numbers):
-        at_events, numbers = np.full(times.size, -1), in_run(wanted_times, numbers)
-        at_events[event_indices(wanted_times[numbers])] = numbers
+    merged_times, sensors = times, len(readings)
+    kinds = [breakpoints, *(each.sent for each in readings), control_times, commands.arrival]
+    kinds += [sample_times, np.array([end])]
+    control, command, sample = 1 + sensors, 2 + sensors, 3 + sensors
+    used = [np.arange(times.size) for times in kinds]
+    used[1:control] = [each.received for each in readings]
+    used[command] = np.sort(np.append(begun, np.flatnonzero(commands.is_lost)))
+    source = merging = None
+
+    def instants(wanted_times):
+        found = np.searchsorted(merged_times, wanted_times - SAME_TIME_SHARE * end)
+        return np.clip(found, 0, merged_times.size - 1)
+
+    if moving:
+        # A row of instant and kind for each event; the first event is the start of the run.
+        rows = [
+            np.stack([at := instants(kinds[i][in_run(i, used[i])]), np.full(at.size, i)], axis=1)
+            for i in range(len(kinds))
+        ]
+        rows = np.unique(np.concatenate([[[0, -1]], *rows]), axis=0)
+        times = times[rows[:, 0]]
+        source, merging = np.full(len(rows), -1), np.zeros(len(rows))
+
+    def event_indices(kind, numbers):
+        found = instants(kinds[kind][numbers])
+        if not moving:
+            return found
+        own = np.flatnonzero(rows[:, 1] == kind)
+        return own[np.searchsorted(rows[own, 0], found)]
+
+    def number_at_events(kind, numbers):
+        at_events, numbers = np.full(times.size, -1), in_run(kind, numbers)
+        at_events[event_indices(kind, numbers)] = numbers
         return at_events
+
+    if moving:
+        firsts = np.cumsum([0, *(each.size for each in kinds)])
+        for i, numbers in enumerate(used):
+            at_events = number_at_events(i, numbers)
+            has = np.flatnonzero(at_events >= 0)
+            source[has] = firsts[i] + at_events[has]
+            merging[has] = times[has] - kinds[i][at_events[has]]
 
     def newest_at_events(arrivals, numbers):
         arrived = np.searchsorted(arrivals[numbers], times + SAME_TIME_SHARE * end, side="right")
         return np.append(numbers, -1)[arrived - 1]
 
-    control_sample = number_at_events(control_times, np.arange(control_times.size))
-    command_start = number_at_events(commands.arrival, begun)
+    control_sample = number_at_events(control, used[control])
+    command_start = number_at_events(command, begun)
     # In place of a lost command the last one begins again.
-    is_lost = number_at_events(commands.arrival, np.flatnonzero(commands.is_lost)) >= 0
+    is_lost = number_at_events(command, np.flatnonzero(commands.is_lost)) >= 0
     again = newest_at_events(commands.arrival, begun)
     command_start = np.where(is_lost & (command_start < 0), again, command_start)
     newest_sample = np.maximum.accumulate(control_sample)
     command_lag = np.where(command_start >= 0, newest_sample - command_start, -1)
     reading_index, reading_lag = [], []
-    for each in readings:
-        number = number_at_events(each.sent, each.received)
+    for i, each in enumerate(readings, 1):
+        number = number_at_events(i, each.received)
         # Readings of signals before the run are those at rest, which fill the buffer at the start.
         made, order = np.cumsum(number >= 0), np.full(each.sent.size + 1, -1)
-        made_in_run = in_run(each.sent, each.received)
-        order[made_in_run] = made[event_indices(each.sent[made_in_run])] - 1
+        made_in_run = in_run(i, each.received)
+        order[made_in_run] = made[event_indices(i, made_in_run)] - 1
         newest = newest_at_events(each.arrival, each.received)
         reading_index.append(number)
         reading_lag.append(np.maximum(made - 1 - order[newest], 0))
@@ -190,7 +242,7 @@ def controller_schedule(
     lengths, length_index = np.unique(
         np.round(gaps / (1e-2 * SAME_TIME_SHARE * end)), return_inverse=True
     )
-    if lengths.size > MAX_DISTINCT_GAPS:
+    if moving or lengths.size > MAX_DISTINCT_GAPS:
         length_index = np.arange(gaps.size)
     mean_lengths = np.bincount(length_index, gaps) / np.bincount(length_index)
 
@@ -201,16 +253,19 @@ def controller_schedule(
         xp.asarray(times),
         xp.asarray(length_index),
         xp.asarray(mean_lengths),
-        xp.asarray(event_indices(sample_times)),
+        xp.asarray(event_indices(sample, used[sample])),
         control_sample=xp.asarray(control_sample),
         command_age=xp.asarray(command_lag),
         reading=stack_columns(reading_index),
         reading_age=stack_columns(reading_lag),
         missing=None if missing is None else stack_columns(missing, bool),
         assumed_age=None if assumed_age is None else xp.asarray(assumed_age),
+        source=None if source is None else xp.asarray(source),
+        merging=None if merging is None else xp.asarray(merging),
         max_age=int(max((part.max() for part in reading_lag), default=0)),
         max_waiting=int(command_lag.max(initial=assumed_age or 0)),
         max_readings=max((each.sent.size for each in readings), default=0),
+        source_counts=tuple(each.size for each in kinds) if moving else (),
     )
 
 

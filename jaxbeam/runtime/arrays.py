@@ -277,6 +277,22 @@ class custom_jvp:
         return self.traced.defjvp(rule)
 
 
+def not_differentiated(value: Any, reason: str) -> Any:
+    """The value, of which derivatives raise ValueError with a reason."""
+    if not is_jax(value):
+        return value
+
+    @jax.custom_jvp
+    def itself(value):
+        return value
+
+    @itself.defjvp
+    def _(primals, tangents):
+        raise ValueError(reason)
+
+    return itself(value)
+
+
 def fori_loop(start: int, end: int, step: Callable, carry) -> Any:
     """`jax.lax.fori_loop`."""
     return scan(lambda carry, i: (step(i, carry), None), carry, np.arange(start, end))[0]

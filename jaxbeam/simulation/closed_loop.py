@@ -4,9 +4,12 @@ A controller with a sampling period acts at samples (`sampled_loop`), one withou
 continuous time (`continuous_loop`).
 """
 
+import dataclasses
 import math
+from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -23,27 +26,37 @@ from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensing.sensor_signals import noise_samples, sensor_sections
 from jaxbeam.model.sensing.transmission import COMMANDS, sent_readings
 from jaxbeam.model.state_space import state_space
-from jaxbeam.runtime.arrays import Array, any_jax, block_diag, xp
+from jaxbeam.runtime.arrays import Array, any_jax, block_diag, not_differentiated, xp
 from jaxbeam.simulation.commands.path import command_path
 from jaxbeam.simulation.continuous_loop import ContinuousLoop
 from jaxbeam.simulation.sampled_loop import SampledLoop
 
 SAME_TIME_SHARE = 1e-9  # of a period
+MOVING = "period", "delay", "sampling_period", "jitter", "times"  # numbers that move events
+FIXED = (
+    "periods, delays and times of samples are fixed by a plan made without tracing them:"
+    " differentiate without a plan, or make it with moving=True"
+)
+LOST = "what is lost changes at once with a dropout, which has no derivative: compare several"
 
 
 def loop_schedule(
-    case: Case, samples: Float[np.ndarray, " time"], end: float | None = None
+    case: Case,
+    samples: Float[np.ndarray, " time"],
+    end: float | None = None,
+    moving: bool = False,
 ) -> EventSchedule:
     """Events of control, sensors and commands of a case up to the `end` (s) of the run.
 
-    By default it ends with the last of the saved samples (s).
+    By default it ends with the last of the saved samples (s). A `moving` schedule is for
+    derivatives by its times (`moved_schedule`).
     """
     controller, end = case.controller, float(samples[-1] if end is None else max(end, samples[-1]))
     breakpoints = controller.breakpoints(case)
     breakpoints = np.zeros(0) if breakpoints is None else concrete(breakpoints)
     if controller.period is None:
         none = Transmission(np.zeros(0), np.zeros(0))
-        return controller_schedule(samples, none, [], breakpoints, end)
+        return controller_schedule(samples, none, [], breakpoints, end, moving=moving)
 
     def sampling_times(period):
         return np.arange(int(np.floor(end / period * (1 + 1e-12))) + 1) * period
@@ -65,7 +78,84 @@ def loop_schedule(
     commands, assumed_age = Transmission(sent, sent + delays, losses), None
     if controller.dropout is not None or controller.jitter is not None:
         assumed_age = command_lag(case) - 1
-    return controller_schedule(samples, commands, readings, breakpoints, end, assumed_age)
+    parts = samples, commands, readings, breakpoints, end, assumed_age
+    return controller_schedule(*parts, moving)
+
+
+def moved_schedule(
+    case: Case, schedule: EventSchedule, samples: Float[Array, " time"], to_duration: bool
+) -> EventSchedule:
+    """A moving schedule at the times (s) that the case has, as long as their order stays.
+
+    The run ends with the last of the `samples` (s) or `to_duration`.
+    """
+    controller, (of_table, *counts, _, _) = case.controller, schedule.source_counts
+    breakpoints = xp.zeros(of_table)
+    if controller.open_loop and of_table:
+        breakpoints = xp.asarray(controller.breakpoints(case))
+    elif of_table:  # those of a filter, whose gain has kinks there but no jumps
+        kept = xp.where(schedule.source < of_table, -1, schedule.source)
+        schedule = dataclasses.replace(schedule, source=kept)
+
+    def delays(number, part, count):
+        late = sent_readings(case.run.seed, number, part, count)[1]
+        delay = 0.0 if part.delay is None else part.delay
+        return delay if late is None else delay + late
+
+    times = [breakpoints]
+    if controller.period is not None:
+        for i, (sensor, count) in enumerate(zip(case.sensors, counts, strict=False)):
+            own = controller.period if sensor.sampling_period is None else sensor.sampling_period
+            times.append(xp.arange(count) * own - delays(i, sensor, count))
+        sent = xp.arange(counts[-1]) * controller.period
+        times += [sent, sent + delays(COMMANDS, controller, counts[-1])]
+    end = samples[-1]
+    if to_duration:
+        end = xp.maximum(case.run.duration, end)
+    return schedule.moved(xp.concatenate([*times, samples, end[None]]))
+
+
+def moves_events(case: Case, times=None) -> bool:
+    """Whether the times of a controlled run are traced, perhaps for a derivative by them."""
+    controller = case.controller
+    numbers = [case.run.duration, case.run.sample_rate, times]
+    if controller.open_loop and controller.period is None:
+        numbers.append(controller.breakpoints(case))
+    for part in (controller, *case.sensors):
+        numbers += [getattr(part, name, None) for name in MOVING]
+    return any(isinstance(number, jax.core.Tracer) for number in numbers)
+
+
+def with_fixed_losses(case: Case) -> Case:
+    """The case, of which derivatives by a `dropout` raise ValueError."""
+    return _fixed(case, LOST, "dropout")
+
+
+def with_fixed_events(case: Case, times) -> tuple[Case, Any]:
+    """The case and the times of its samples, without derivatives by what moves events.
+
+    Differentiating by these raises ValueError.
+    """
+    if not moves_events(case, times):
+        return case, times
+    case = _fixed(case, FIXED, *MOVING)
+    values = {name: getattr(case.run, name) for name in ("duration", "sample_rate")}
+    values = {name: not_differentiated(value, FIXED) for name, value in values.items()}
+    changed = dataclasses.replace(case, run=dataclasses.replace(case.run, **values))
+    return changed, not_differentiated(times, FIXED)
+
+
+def _fixed(case: Case, reason: str, *names: str) -> Case:
+    """The case, of which derivatives by numbers of controller and sensors raise ValueError."""
+
+    def fixed(part):
+        values = {name: getattr(part, name, None) for name in names}
+        traced = {n: v for n, v in values.items() if isinstance(v, jax.core.Tracer)}
+        changes = {name: not_differentiated(value, reason) for name, value in traced.items()}
+        return dataclasses.replace(part, **changes) if changes else part
+
+    parts = fixed(case.controller), tuple(map(fixed, case.sensors))
+    return dataclasses.replace(case, controller=parts[0], sensors=parts[1])
 
 
 def command_lag(case: Case) -> int:

@@ -46,7 +46,7 @@ from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, any_jax, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.module import Module
-from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
+from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule, moves_events
 from jaxbeam.simulation.errors import step_errors
 from jaxbeam.simulation.plan_origin import (
     PlanOrigin,
@@ -106,18 +106,22 @@ def integration_plan(
     times: Float[Array, " time"] | None = None,
     tolerance: float = TOLERANCE,
     first_run: FirstRun | None = None,
+    moving: bool = False,
 ) -> IntegrationPlan:
     """Integration plan of a case with concrete numbers, for samples at `times` (s).
 
     Default times are those of the run, which ends at its duration. `tolerance` is relative to the
     largest deflection. A `first_run` with the longest steps may take the place of the first trial
-    run of a controlled case that is not compiled. Raises ValueError for an invalid case,
+    run of a controlled case that is not compiled. A `moving` plan of a controlled case holds for
+    other periods, delays and times of samples too, as long as the order of events stays; so is
+    made, for derivatives, where these are traced. Raises ValueError for an invalid case,
     RuntimeError if no time step meets the tolerance.
     """
     check_tolerance(tolerance)
     if times is not None:
         check_times(times)
     check_case(case)
+    moving = case.controller is not None and (moving or moves_events(case, times))
     case = concrete_case(case)
     shapes = static_shapes(case)
     to_duration = times is None
@@ -128,7 +132,8 @@ def integration_plan(
         schedule = loop_schedule(case, samples, end)
 
         def plan(substeps, error, errors=()):
-            parts = shapes, substeps, 0, False, error, schedule, to_duration, errors
+            planned = loop_schedule(case, samples, end, True) if moving else schedule
+            parts = shapes, substeps, 0, False, error, planned, to_duration, errors
             return IntegrationPlan(*parts, origin)
 
         def run_first(substeps, policy):
@@ -178,7 +183,8 @@ def check_plan(case: Case, plan: IntegrationPlan, times) -> IntegrationPlan:
     if plan.schedule is not None:
         with contextlib.suppress(jax.errors.ConcretizationTypeError):  # of traced events
             end = float(concrete(case.run.duration)) if plan.to_duration else None
-            check_same_events(plan.schedule, loop_schedule(case, concrete(times), end))
+            moving = plan.schedule.source is not None
+            check_same_events(plan.schedule, loop_schedule(case, concrete(times), end, moving))
     if same:
         return plan
     return dataclasses.replace(
@@ -278,7 +284,9 @@ def sample_times(case: Case) -> Float[Array, " time"]:
             f" {duration * rate:.3g} samples{of_sensors}, more than {limit:.0e}: lower one of them"
         )
     intervals = int(np.floor(duration * rate * (1 + 1e-12)))
-    return xp.arange(intervals + 1) / rate if intervals else xp.array([0.0, duration])
+    if not intervals:
+        return xp.stack([xp.zeros(()), xp.asarray(case.run.duration)])
+    return xp.arange(intervals + 1) / case.run.sample_rate
 
 
 def _choose_substeps(

@@ -28,7 +28,7 @@ from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readin
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, any_jax, put, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
-from jaxbeam.simulation.closed_loop import closed_loop
+from jaxbeam.simulation.closed_loop import closed_loop, moved_schedule, with_fixed_events
 from jaxbeam.simulation.commands.limits import acting_ranges
 from jaxbeam.simulation.errors import peak_errors
 from jaxbeam.simulation.extremes import monitored_sensors, sensor_extremes
@@ -380,6 +380,10 @@ def integration_setup(
         schedule = run_schedule(case, times, *choices)
     else:
         schedule = plan.schedule
+        if schedule.source is None:
+            case, times = with_fixed_events(case, times)
+        else:
+            schedule = moved_schedule(case, schedule, times, plan.to_duration)
         policy = policy or closed_loop(case, layout, loads, schedule, noisy)
         model = policy.model
     places = None if monitored is None else corrected_places(case, model, monitored)
