@@ -82,8 +82,7 @@ class LogPrediction:
         self.fixed_offsets = fixed * (1 - self.shifts.sum(axis=0))
         # Ones where a column of the table is a parameter.
         self.selection = (self.which[..., None] == np.arange(len(addresses))).astype(float)
-        # Plans that differ in their errors only share compiled programs.
-        self.plan = dataclasses.replace(plan, error=0.0, sensor_errors=())
+        self.plan = plan.without_statements()  # so that fits share compiled programs
         self.runs = stack_cases(cases), jnp.asarray(times), schedule
 
     def predict(self, values: Float[Array, " parameter"]) -> Float[Array, "log time channel"]:
