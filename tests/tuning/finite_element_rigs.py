@@ -27,6 +27,11 @@ UNITS = {"deflection": "m", "acceleration": "m/s^2"}
 YIELDING, SAGGING = 1e6, 4e4
 MOMENT, AMPLIFIER = 8.292e-4, 200.0  # N m/V
 SHAKER = {"position": 0.5, "stiffness": 3500.0, "damping": 80.0, "force_per_volt": 4.6}
+FITTED = {
+    jb.Patch: ("correction",),
+    jb.Shaker: tuple(SHAKER)[1:],
+    jb.SpringDamper: ("stiffness", "damping"),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +46,7 @@ class Plant:
     def readings(self, times, commands, loaded=True):
         """Readings (time, sensor); commands (time, actuator) are linear between samples."""
         model = finite_elements.assemble(self.beam)
-        rows = [self._row(model, actuator) for actuator in self.case.actuators]
+        rows = [self._row(model, actuator) for actuator in self.case.driven]
 
         def force(t):
             columns = zip(rows, commands.T, strict=True)
@@ -121,7 +126,7 @@ def plant(
     for i, stiffness in enumerate(supports.values()):
         truth |= {f"supports.{i}.stiffness": stiffness} if stiffness == SAGGING else {}
     for i, actuator in enumerate(actuators):
-        names = ("correction",) if isinstance(actuator, jb.Patch) else tuple(SHAKER)[1:]
+        names = FITTED[type(actuator)]
         truth |= {f"actuators.{i}.{name}": float(getattr(actuator, name)) for name in names}
     return Plant(beam, case, truth)
 
@@ -137,7 +142,7 @@ class SimulatedIdentification:
     """Readings of a plant, and one compiled least-squares problem in all its parameters."""
 
     def __init__(self, rig: Plant):
-        self.truth, count = rig.truth, len(rig.case.actuators)
+        self.truth, count = rig.truth, len(rig.case.driven)
         times = np.arange(round(0.8 * RATE)) / RATE
         phases = 90.0 * np.arange(count)
         commands = np.stack(
