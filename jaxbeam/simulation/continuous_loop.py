@@ -16,6 +16,7 @@ from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, scan, vmap, xp
 from jaxbeam.simulation.commands.limits import limit_commands
 
+SHORTEST_STEP = 1e-12  # s, and of the time: far above the rounding of times
 NEWTON_ITERATIONS = 4  # for the commands of a step; one suffices for a linear law
 
 
@@ -39,7 +40,9 @@ class ContinuousLoop(AbstractInputPolicy):
         return xp.zeros((self.model.command_matrix.shape[1], batch_size))
 
     def inputs(self, memory, state, info: StepInfo, states):
-        times = info.start + info.length * GAUSS_NODES
+        # In a step of no length, commands that jump at its start have jumped.
+        length = xp.maximum(info.length, SHORTEST_STEP * (1 + info.start))
+        times = info.start + length * GAUSS_NODES
         if not self.implicit:
             commands = self._open_loop_commands(times)[..., None]
             commands = xp.broadcast_to(commands, (*commands.shape[:2], state.shape[-1]))

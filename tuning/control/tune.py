@@ -157,12 +157,6 @@ def check_arguments(
     both = sorted(varied & set(free))
     if both:
         raise ValueError(f"{both[0]} is free, but differs from run to run: leave out one of these")
-    for address in free:
-        if address.endswith(("period", "delay")):
-            raise ValueError(
-                f"{address} cannot be free: it decides when the loop acts, and so the steps of the"
-                " integration; tune for several of its values and compare"
-            )
 
 
 class TuningProblem:

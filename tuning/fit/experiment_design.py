@@ -21,6 +21,7 @@ from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.integration_plan import IntegrationPlan, integration_plan, sample_times
 from jaxbeam.simulation.simulate import simulate_readings
 from tuning.fit.dataset import SIMULATION_TOLERANCE
+from tuning.parameters.free import check_continuous
 
 START_COUNT = 5  # of the search, as there may be several local minima
 
@@ -78,8 +79,8 @@ def design_experiment(
     readings; the search has exact gradients, too, and several starts. `noise` is the standard
     deviation (SI) of a sample of sensors without a noise of their own.
 
-    Raises ValueError for unknown addresses, a choice that is free as well, and bounds that exclude
-    the value in the case.
+    Raises ValueError for unknown addresses, a number that decides when samples are taken, a choice
+    that is free as well, and bounds that exclude the value in the case.
 
     >>> import jaxbeam as jb
     >>> import tuning
@@ -175,6 +176,7 @@ def _check_arguments(case: Case, free, over, target) -> None:
     for address in (*free, *over):
         if concrete(value_at(case, address)).ndim:
             raise ValueError(f"{address} is a list; name its entries, {address}.0 and so on")
+        check_continuous(case, address)
     for address, (low, high) in over.items():
         value = float(concrete(value_at(case, address)))
         if address in free:

@@ -14,6 +14,12 @@ from jaxbeam.case.joint_addresses import ALL, overlap
 from jaxbeam.runtime.arrays import Array, xp
 from tuning.parameters.prior import Prior, as_prior
 
+# Numbers that decide when samples are taken, or when commands begin or bend.
+SAMPLING = re.compile(
+    r"run\.(duration|sample_rate)|(vehicle_)?sensors\.[^.]+\.sampling_period"
+    r"|controller\.(period|delay|times\.\d+)"
+)
+SENSOR_DELAY = re.compile(r"sensors\.[^.]+\.delay")
 LOG_ADDRESS = re.compile(r"logs\.(\d+)\.(.+)")
 BOUND_MARGIN = 1e-3  # of the typical size: how far a start on a bound is moved in
 
@@ -131,16 +137,38 @@ def free_parameters(
     the distance of the bounds, or else the start itself; that of an offset is the
     `largest_reading`, that of an entry time the duration.
 
-    Raises ValueError for an unknown address, a list, an address that is free twice, bounds that
-    exclude the start, or a start of zero without bounds.
+    Raises ValueError for an unknown address, a list, an address that is free twice or decides when
+    samples are taken, bounds that exclude the start, or a start of zero without bounds.
     """
     if not bounds:
         raise ValueError("name at least one address as free")
     bounds = _expand_log_addresses(bounds, len(cases))
     _check_unique(list(bounds), cases)
+    for address in bounds:
+        case, local_address = _locate(cases, address)
+        check_continuous(case, local_address)
     return [
         _free_parameter(cases, address, pair, largest_reading) for address, pair in bounds.items()
     ]
+
+
+def check_continuous(case: Case, address: str) -> None:
+    """Raises ValueError for a number that a search by derivatives cannot change.
+
+    It decides when samples are taken, which a search keeps, or how they are rounded.
+    """
+    own_delay = SENSOR_DELAY.fullmatch(address)
+    sampled = case.controller is not None and case.controller.period is not None
+    if SAMPLING.fullmatch(address) or (own_delay and sampled):
+        raise ValueError(
+            f"{address} cannot be free: it decides when samples are taken or commands begin, which"
+            " a search keeps; compare several of its values"
+        )
+    if address.endswith(".resolution"):
+        raise ValueError(
+            f"{address} cannot be free: what is rounded to it jumps, so that it has no derivative;"
+            " compare several of its values"
+        )
 
 
 def _expand_log_addresses(bounds: dict[str, Any], logs: int) -> dict[str, Any]:

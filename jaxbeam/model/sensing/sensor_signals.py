@@ -25,12 +25,17 @@ from jaxbeam.case.loads.planar.sensors import VehicleSensor
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.numerics.discretisation import c2d, evaluate_cubics, hermite_cubics
 from jaxbeam.numerics.normal_samples import normal_samples
-from jaxbeam.runtime.arrays import Array, scan, stop_gradient, take, xp
+from jaxbeam.runtime.arrays import Array, not_differentiated, scan, stop_gradient, take, xp
 
 CLOCK_TOLERANCE_PERIODS = 1e-6  # a time this much before a sampling instant counts as at it
 IDENTITY = np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])  # a filter that changes nothing
 MAX_READING = 1e30  # beyond it a reading is none
 RANGE_TOLERANCE = 1e-6  # of the largest reading, in single precision
+
+ROUNDED = (
+    "what is rounded to a resolution jumps with it, so that it has no derivative: compare several"
+    " of its values"
+)
 
 AnySensor = Sensor | VehicleSensor
 Sections = Float[Array, "section 6 ..."] | None  # None: no digital filter
@@ -70,7 +75,8 @@ def to_reading(sensor: AnySensor, value, noise=None) -> Float[Array, "..."]:
     """Reading before the digital filter: offset, noise, range and resolution applied to the value.
 
     Derivatives are zero where the range clips; through rounding they are those of the unrounded
-    reading (straight-through estimator), since those of the rounded one are zero.
+    reading (straight-through estimator), since those of the rounded one are zero. Derivatives by
+    the resolution raise ValueError.
     """
     reading = value + sensor.offset
     if sensor.noise is not None and noise is not None:
@@ -78,7 +84,8 @@ def to_reading(sensor: AnySensor, value, noise=None) -> Float[Array, "..."]:
     if sensor.range is not None:
         reading = xp.clip(reading, sensor.range[0], sensor.range[1])
     if sensor.resolution is not None:
-        rounded = sensor.resolution * xp.round(reading / sensor.resolution)
+        step = not_differentiated(sensor.resolution, ROUNDED)
+        rounded = step * xp.round(reading / step)
         reading = reading + stop_gradient(rounded - reading)
     return reading
 

@@ -3,7 +3,8 @@
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.runtime.arrays import Array, stop_gradient, xp
+from jaxbeam.model.sensing.sensor_signals import ROUNDED
+from jaxbeam.runtime.arrays import Array, not_differentiated, stop_gradient, xp
 
 CommandRanges = tuple[Float[Array, " actuator"], ...]
 
@@ -51,11 +52,13 @@ def limit_commands(
     """Commands rounded to the resolution of the controller, then limited by each actuator.
 
     Rate limits apply over a sampling period from the `previous` commands. `ranges` are what
-    `command_ranges` returns, computed again if left out. Derivatives ignore the rounding.
+    `command_ranges` returns, computed again if left out. Derivatives ignore the rounding; those by
+    the resolution raise ValueError.
     """
     controller = case.controller
     if controller.resolution is not None:
-        rounded = controller.resolution * xp.round(commands / controller.resolution)
+        step = not_differentiated(controller.resolution, ROUNDED)
+        rounded = step * xp.round(commands / step)
         commands = commands + stop_gradient(rounded - commands)
     low, high, rate = (
         part.reshape(-1, *[1] * (commands.ndim - 1)) for part in ranges or command_ranges(case)
