@@ -28,7 +28,12 @@ from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readin
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, any_jax, put, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
-from jaxbeam.simulation.closed_loop import closed_loop, moved_schedule, with_fixed_events
+from jaxbeam.simulation.closed_loop import (
+    closed_loop,
+    moved_schedule,
+    with_fixed_events,
+    with_fixed_losses,
+)
 from jaxbeam.simulation.commands.limits import acting_ranges
 from jaxbeam.simulation.errors import peak_errors
 from jaxbeam.simulation.extremes import monitored_sensors, sensor_extremes
@@ -380,6 +385,7 @@ def integration_setup(
         schedule = run_schedule(case, times, *choices)
     else:
         schedule = plan.schedule
+        case = with_fixed_losses(case)
         if schedule.source is None:
             case, times = with_fixed_events(case, times)
         else:

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.case import value_at
-from jaxbeam.integrator.events import controller_schedule
+from jaxbeam.integrator.events import Transmission, controller_schedule
 from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import ContactLossWarning
 
@@ -120,9 +120,9 @@ def test_rounding_refuses_derivatives_by_the_resolution(address):
 def test_actions_at_one_time_are_separate_events_in_their_order():
     """A reading, control, a command without delay, and a sample at 0, 0.1, 0.2 s."""
     times = np.arange(3) * 0.1
-    rest = [times], [0.0], np.zeros(0)
-    merged = controller_schedule(times, times, 0.0, *rest)
-    schedule = controller_schedule(times, times, 0.0, *rest, moving=True)
+    at_once = Transmission(times, times)
+    merged = controller_schedule(times, at_once, [at_once], np.zeros(0))
+    schedule = controller_schedule(times, at_once, [at_once], np.zeros(0), moving=True)
     assert merged.times.size == 3 and merged.source is None
     np.testing.assert_allclose(schedule.times, [0.0, *np.repeat(times, 4), 0.2])
     nothing = [-1, -1, -1, -1]

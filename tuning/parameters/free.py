@@ -16,8 +16,8 @@ from tuning.parameters.prior import Prior, as_prior
 
 # Numbers that decide when samples are taken, or when commands begin or bend.
 SAMPLING = re.compile(
-    r"run\.(duration|sample_rate)|(vehicle_)?sensors\.[^.]+\.sampling_period"
-    r"|controller\.(period|delay|times\.\d+)"
+    r"run\.(duration|sample_rate)|(vehicle_)?sensors\.[^.]+\.(sampling_period|dropout|jitter)"
+    r"|controller\.(period|delay|dropout|jitter|times\.\d+)"
 )
 SENSOR_DELAY = re.compile(r"sensors\.[^.]+\.delay")
 LOG_ADDRESS = re.compile(r"logs\.(\d+)\.(.+)")
