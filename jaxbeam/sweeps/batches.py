@@ -15,7 +15,9 @@ from jaxbeam.case.case import Case, replace, unit_at, value_at
 from jaxbeam.model.modes import Layout, mesh_layout
 
 PATH_UNITS = {"m", "m/s", "s", "m/s^2"}  # of numbers of a load on which its path may depend
-MAX_BATCH_SIZE = 256  # runs; more exceed the cache of the processor
+# Runs on one path, about, in a batch: many more exceed the cache of the processor. They are split
+# evenly, as runs that fill a batch up take as long as others.
+BATCH_SIZE, MAX_BATCH_SIZE = 256, 384
 
 # Numbers that decide the order of positions, or the degrees and parts of a beam not uniform.
 POSITION_ADDRESS = re.compile(
@@ -64,7 +66,9 @@ def make_batches(
     order = np.lexsort((np.zeros(len(runs)), *shared_values.T[::-1]))
     new_path = np.any(np.diff(shared_values[order], axis=0) != 0, axis=1)
     runs_by_path = np.split(order, np.flatnonzero(new_path) + 1)
-    batch_size = min(most, max(part.size for part in runs_by_path))
+    largest = max(part.size for part in runs_by_path)
+    parts = max(-(-largest // most), round(largest / BATCH_SIZE), 1)
+    batch_size = -(-largest // parts)
     rows = [
         part[i : i + batch_size] for part in runs_by_path for i in range(0, part.size, batch_size)
     ]

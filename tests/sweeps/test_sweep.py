@@ -297,6 +297,15 @@ def test_every_run_is_in_one_batch(count, paths, seed):
     assert_array_equal(batches.batched_values[..., 0][mask], masses[batches.run_index[mask]])
 
 
+@pytest.mark.parametrize("count", [255, 256, 257, 384, 385, 512, 513, 1000])
+def test_hardly_a_run_of_a_batch_is_padding(count):
+    values = np.stack([np.repeat([1.0, 2.0], count), np.arange(2.0 * count)], axis=1)
+    batches = make_batches(["loads.0.speed", "loads.0.mass"], values, ["loads.0.mass"])
+    assert batches.run_index.size <= 1.01 * 2 * count and batches.run_index.shape[1] <= 384
+    few = make_batches(["loads.0.speed", "loads.0.mass"], values, ["loads.0.mass"], most=10)
+    assert few.run_index.shape[1] <= 10
+
+
 def test_progress_bar_is_on_standard_error(capfd):
     jb.sweep(CASE, {"loads.0.mass": MASSES, "loads.0.speed": SPEEDS})
     captured = capfd.readouterr()

@@ -16,6 +16,7 @@ from jaxbeam.case.case import Case, crossing_times, replace, stack_cases, value_
 from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
+from jaxbeam.runtime.memory import block_memory
 from jaxbeam.simulation.integration_plan import (
     IntegrationPlan,
     common_plan,
@@ -32,6 +33,7 @@ PEAK_TOLERANCE = 1e-4  # of the largest deflection
 # Runs without control of a batch that is not compiled: each takes 0.03 to 0.14 s (3 and 6 modes), a
 # program of them 5 s to compile.
 MAX_KNOWN_RUNS = 60
+STATE_COPIES = 4  # of the states of all steps of a run, while its history is computed
 
 
 class RunSet(eqx.Module):
@@ -191,7 +193,17 @@ def _uncontrolled_histories(cases: list[Case], times, positions, quantities) -> 
     if len(cases) <= MAX_KNOWN_RUNS:
         found = [_known_histories(case, *wanted) for case in without_controller]
         return jax.tree.map(lambda *runs: np.stack(runs), *found)
-    return jax.tree.map(np.asarray, _histories(stack_cases(without_controller), *wanted))
+    at_once = runs_at_once(without_controller[0], times, plan)
+    parts = [without_controller[first : first + at_once] for first in range(0, len(cases), at_once)]
+    parts[-1] += parts[0][: len(parts[0]) - len(parts[-1])]  # all of one shape, for one program
+    found = [jax.tree.map(np.asarray, _histories(stack_cases(part), *wanted)) for part in parts]
+    return jax.tree.map(lambda *some: np.concatenate(some)[: len(cases)], *found)
+
+
+def runs_at_once(case: Case, times, plan: IntegrationPlan) -> int:
+    """Number of runs of a case whose histories are computed together, as memory allows it."""
+    run_bytes = 8.0 * STATE_COPIES * len(times) * plan.substeps * 2 * case.beam.modes
+    return max(1, int(block_memory() / run_bytes))
 
 
 _known_histories = compiled_if_traced(simulate_histories)

@@ -6,14 +6,24 @@ A bridge of 25 m, five modes, damping 1 %; peaks of deflection, acceleration and
 with their truncation errors. The script knows the modes of the pinned beam, and propagates them
 exactly for forces that are linear in time between samples 0.5 ms apart; it computes two of the
 runs, and is scaled. Its modal sums have no static correction, so that moments are not compared.
+Then HSLM-A1 with 161 sensors, and the assessment of a haunched bridge, each in a process of its own
+with its peak memory.
 """
 
+import argparse
+import json
 import time
 
 import numpy as np
 
 import jaxbeam as jb
-from experiments.benchmarks.common import parser, print_row, print_table
+from experiments.benchmarks.common import (
+    measure_in_subprocess,
+    parser,
+    peak_memory,
+    print_row,
+    print_table,
+)
 
 LENGTH, RIGIDITY, MASS, DAMPING, MODES = 25.0, 3.05e10, 15000.0, 0.01, 5
 DURATION, INTERVAL = 12.0, 5e-4  # s
@@ -89,17 +99,57 @@ def measure(speeds: np.ndarray) -> dict[str, float]:
     return found | {"difference": float(difference)}
 
 
+def haunched_bridge() -> jb.Case:
+    """Three spans of 40, 60 and 40 m, twice as stiff over the piers."""
+    stiffness = [2.5e11, 5e11, 2.5e11, 5e11, 2.5e11]
+    segments = [
+        jb.Segment(length, [left, right - left], 18e3)
+        for length, left, right in zip(
+            [40.0, 30.0, 30.0, 40.0], stiffness[:-1], stiffness[1:], strict=True
+        )
+    ]
+    beam = jb.Beam(140.0, damping_ratio=0.01, segments=segments)
+    return jb.Case(beam, supports=[jb.Support(40.0), jb.Support(100.0)])
+
+
+LARGE = ("161 deflections", "161 moments", "assessment")
+
+
+def measure_large(name: str, count: int) -> dict[str, float]:
+    """Processor seconds and peak memory (MiB) of one of the `LARGE` tasks at a number of speeds."""
+    start = time.process_time()
+    if name == "assessment":
+        jb.assess(haunched_bridge(), 60.0, determinant_length=56.0, trains=TRAINS[:1], dynamic=True)
+    else:
+        quantity = name.split()[1].rstrip("s")
+        x = np.linspace(0.0, LENGTH, 163)[1:-1]
+        sensors = tuple(jb.Sensor(float(place), quantity) for place in x)
+        case = jb.Case(bridge().beam, sensors=sensors, loads=bridge().loads, run=bridge().run)
+        jb.sweep(case, {"loads.0.speed": np.linspace(40.0, 90.0, count)}, progress=False)
+    return {"processor": time.process_time() - start, "memory": peak_memory()}
+
+
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     options = parser(__doc__)
     options.add_argument("--speeds", type=int, default=101, help="number of speeds")
-    count = options.parse_args().speeds
+    options.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
+    arguments = options.parse_args()
+    count = arguments.speeds
+    if arguments.measure:
+        name, speeds = arguments.measure
+        print(json.dumps(measure_large(name, int(speeds))))
+        return
     found = measure(np.linspace(40.0, 90.0, count))
     print(f"{len(TRAINS)} trains at {count} speeds\n")
     print_table(["", "wall (s)", "processor (s)"])
     print_row(["`jb.sweep`", f"{found['wall']:.2f}", f"{found['processor']:.2f}"])
     print_row(["the script, scaled", "", f"{found['script']:.0f}"])
-    print(f"\nlargest difference of peaks: {found['difference']:.1e}")
+    print(f"\nlargest difference of peaks: {found['difference']:.1e}\n")
+    print_table([f"HSLM-A1 at {count} speeds", "processor (s)", "peak memory (MiB)"])
+    for name in LARGE:
+        one = measure_in_subprocess("experiments.benchmarks.trains", name, count)
+        print_row([name, f"{one['processor']:.1f}", f"{one['memory']:.0f}"])
 
 
 if __name__ == "__main__":

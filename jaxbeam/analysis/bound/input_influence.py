@@ -28,12 +28,13 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
+from jaxbeam.runtime.memory import block_memory, free_memory, size_text
 from jaxbeam.runtime.module import Module
 from jaxbeam.simulation.integration_plan import steps_per_interval
 
 TOLERANCE = 1e-9  # relative to the largest deflection
-MAX_BATCH_SIZE = 1024  # unit commands at once; more take gigabytes
-MAX_RESPONSE_SIZE = 3e8  # numbers in `response`: 2.4 GB
+MAX_BATCH_SIZE = 1024  # unit commands at once; fewer where memory is short
+COPIES = 3  # of the states of all steps of a run, while they are integrated
 
 
 class InputInfluence(Module):
@@ -90,8 +91,8 @@ def input_influence(
     The controller of the case, if any, is left out. Times are at most `spacing` (s) apart; the
     starts of all holds and the end of the run are among them.
 
-    Raises ValueError if the response has more than MAX_RESPONSE_SIZE numbers, RuntimeError if no
-    time step meets TOLERANCE.
+    Raises ValueError if the response takes more than half of the memory that is free, RuntimeError
+    if no time step meets TOLERANCE.
     """
     duration = float(case.run.duration)
     count = max(1, int(np.ceil(duration / period * (1 - 1e-12))))
@@ -100,11 +101,12 @@ def input_influence(
     times = np.append(np.arange(count * steps_per_hold) * (period / steps_per_hold), duration)
     times = times[(times < duration * (1 - 1e-9)) | (times == duration)]
     actuators = len(case.actuators)
-    size = times.size * case.beam.modes * count * actuators
-    if size > MAX_RESPONSE_SIZE:
+    size, memory = 8.0 * times.size * case.beam.modes * count * actuators, free_memory()
+    if size > memory / 2:
         raise ValueError(
-            f"responses to {count} holds at {times.size} times exceed the memory; hold commands for"
-            f" longer than {period:g} s, or lower run.sample_rate"
+            f"responses to {count} holds at {times.size} times take {size_text(size)}, more than"
+            f" half of the {size_text(memory)} of memory that are free; hold commands for longer"
+            f" than {period:g} s, or lower run.sample_rate"
         )
     uncontrolled_case = dataclasses.replace(case, controller=None)
     shapes = static_shapes(uncontrolled_case)
@@ -115,7 +117,9 @@ def input_influence(
     # of a first one after the end are disturbed by the profile alone, as all with a command are.
     hold_index = np.append([-1, count], np.repeat(np.arange(count), actuators))
     actuator_index = np.append([0, 0], np.tile(np.arange(actuators), count))
-    batch_size = min(MAX_BATCH_SIZE, hold_index.size)
+    run_bytes = 8.0 * COPIES * times.size * substeps * 2 * case.beam.modes
+    allowed = max(1, int(block_memory() / run_bytes))
+    batch_size = min(MAX_BATCH_SIZE, hold_index.size, allowed)
     padding = -hold_index.size % batch_size
     hold_index, actuator_index = (
         np.append(hold_index, np.full(padding, count)),

@@ -249,7 +249,7 @@ ERRORS = {
     "positions.1 must lie on the beam": lambda: bound(patched(), positions=[0.1, 0.7]),
     "must be positive": lambda: bound(patched(), period=-0.01),
     "longer than the run": lambda: bound(patched(), period=1.0),
-    "exceed the memory": lambda: bound(patched(), period=1e-4, spacing=1e-5),
+    "half of the .* that are free": lambda: bound(patched(), period=1e-5, spacing=1e-6),
     "neither differentiated nor compiled": lambda: jax.grad(
         lambda mass: bound(jb.replace(patched(), {"loads.0.mass": mass})).peak
     )(0.5),
