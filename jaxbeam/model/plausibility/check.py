@@ -4,6 +4,7 @@ Wrong units make a case that computes and means nothing: E I in kN m^2, a speed 
 t. What follows from them (first frequency, static deflection, mass ratio, critical speed) shows it.
 """
 
+import collections
 import contextvars
 import dataclasses
 import math
@@ -68,9 +69,13 @@ def warn_if_implausible(case: Case, found: Modes | None = None) -> None:
     """Warn of what looks wrong in a case, whose modes may be `found`; if it is traced, of nothing.
 
     Python shows each sentence once in a process, as all come from one place. An invalid case, or
-    one that has no modes, is left to the work that follows.
+    one that has no modes, is left to the work that follows; a case whose numbers are of the sizes
+    of one without a warning is not judged again, so that a loop over runs does not pay for it.
     """
     if _SHOWN.get() or not known_numbers(case):
+        return
+    sizes = _sizes(case)
+    if sizes in _PLAUSIBLE:
         return
     try:
         if found is None:
@@ -82,6 +87,8 @@ def warn_if_implausible(case: Case, found: Modes | None = None) -> None:
         return
     for sentence in sentences:
         warnings.warn(sentence, PlausibilityWarning, stacklevel=1)
+    if not sentences:
+        _PLAUSIBLE.append(sizes)
 
 
 def leave_warnings_to_caller() -> None:
@@ -89,6 +96,14 @@ def leave_warnings_to_caller() -> None:
     _SHOWN.set(True)
 
 
+def _sizes(case: Case) -> tuple:
+    """Structure of a case, and signs and powers of two of its numbers."""
+    numbers, structure = jax.tree.flatten(case)
+    values = np.concatenate([np.ravel(number) for number in numbers])
+    return structure, np.sign(values).tobytes(), np.frexp(values)[1].tobytes()
+
+
+_PLAUSIBLE = collections.deque(maxlen=64)  # sizes of the latest cases without a warning
 _SHOWN = contextvars.ContextVar("plausibility_shown", default=False)
 
 
