@@ -87,7 +87,7 @@ class Inversion(AbstractEstimator):
             sensor_offsets(plant),
             plant_states,
             commands,
-            tuple(np.flatnonzero(deflection_outputs(system)).tolist()),
+            tuple(int(i) for i in deflection_outputs(system)),
         )
 
     def validate(self, case, system):

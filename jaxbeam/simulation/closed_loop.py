@@ -24,7 +24,7 @@ from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensing.sensor_signals import noise_samples, sensor_sections
-from jaxbeam.model.sensing.transmission import COMMANDS, sent_readings
+from jaxbeam.model.sensing.transmission import COMMANDS, refuse_derivatives, sent_readings
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import Array, any_jax, block_diag, not_differentiated, xp
 from jaxbeam.simulation.commands.path import command_path
@@ -64,8 +64,8 @@ def loop_schedule(
     def delays_and_losses(number, part, times):
         losses, late = sent_readings(case.run.seed, number, part, times.size)
         delay = 0.0 if part.delay is None else float(concrete(part.delay))
-        delays = delay if late is None else delay + concrete(late)
-        return delays, None if losses is None else concrete(losses).astype(bool)
+        delay = delay if late is None else delay + concrete(late)
+        return delay, None if losses is None else concrete(losses).astype(bool)
 
     readings = []
     for i, sensor in enumerate(case.sensors):
@@ -173,6 +173,8 @@ def closed_loop(
     the interface for samples, or for continuous time if it has no period.
     """
     plant, controller = state_space(case, layout=layout), case.controller
+    for part in (controller, *case.sensors):  # the schedule has them as they are
+        refuse_derivatives(part)
     law = controller.law(plant)  # once: the design may solve Riccati equations
     interface = AbstractContinuousLaw if controller.period is None else AbstractSampledLaw
     if not isinstance(law, interface):

@@ -130,6 +130,18 @@ def test_readings_in_vehicles():
     assert_array_equal(lossy, lossy[newest])
 
 
+@pytest.mark.parametrize("address", ["sensors.0.dropout", "sensors.0.jitter", "controller.jitter"])
+def test_derivatives_by_what_is_random_are_refused(address):
+    run = jb.Run(0.02, 400.0)
+    case = loop([jb.Sensor(0.2, dropout=0.1, jitter=1e-3), jb.Sensor(0.4)], run)
+
+    def peak(value):
+        return jb.simulate(jb.replace(case, {address: value})).peak_deflection[0]
+
+    with pytest.raises(ValueError, match="drawn by a seed and jumps with the"):
+        jax.grad(peak)(1e-3)
+
+
 ERRORS = [
     ({"sensors.0.dropout": 1.0}, "sensors.0.dropout must lie from 0 to below 1; it is 1"),
     ({"controller.dropout": -0.1}, "controller.dropout must lie from 0 to below 1; it is -0.1"),

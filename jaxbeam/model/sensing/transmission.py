@@ -2,13 +2,41 @@
 
 from typing import Any
 
+import jax
 from jaxtyping import Bool, Float
 
 from jaxbeam.numerics.normal_samples import uniform_samples
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, is_jax, xp
 
 COMMANDS = -1  # the number that stands for the commands, among those of the sensors
 LOSSES, DELAYS = 1, 2  # streams of random numbers within that of a sensor or of the commands
+
+NO_DERIVATIVE = (
+    "what {1} is drawn by a seed and jumps with the {0}, so that there is no derivative by it:"
+    " compare several of its values"
+)
+
+
+def without_derivative(value: Any, reason: str) -> Any:
+    """The value, of which derivatives raise ValueError with a reason."""
+    if not is_jax(value):
+        return value
+
+    @jax.custom_jvp
+    def itself(value):
+        return value
+
+    @itself.defjvp
+    def _(primals, tangents):
+        raise ValueError(reason)
+
+    return itself(value)
+
+
+def refuse_derivatives(part: Any) -> None:
+    """Raise ValueError if there are derivatives by dropout or jitter of a part of a loop."""
+    for name, what in (("dropout", "is lost"), ("jitter", "is late in a loop")):
+        without_derivative(getattr(part, name), NO_DERIVATIVE.format(name, what))
 
 
 def sent_readings(
@@ -17,10 +45,12 @@ def sent_readings(
     """Which of the first readings of a sensor are lost, and their random delays (s); None for none.
 
     `part` has `dropout` and `jitter`: a sensor of this number, or a controller for its COMMANDS.
+    Derivatives by the dropout raise ValueError.
     """
     losses = late = None
     if part.dropout is not None:
-        losses = xp.asarray(uniform_samples(seed, (number + 1, LOSSES), count)) < part.dropout
+        dropout = without_derivative(part.dropout, NO_DERIVATIVE.format("dropout", "is lost"))
+        losses = xp.asarray(uniform_samples(seed, (number + 1, LOSSES), count)) < dropout
     if part.jitter is not None:
         late = part.jitter * uniform_samples(seed, (number + 1, DELAYS), count)
     return losses, late
