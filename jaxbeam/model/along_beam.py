@@ -49,15 +49,17 @@ def special_positions(case: Case) -> Float[Array, " place"]:
     return xp.clip(xp.concatenate([xp.stack(places), standing]), 0.0, length)
 
 
-def positions_along(case: Case, count: int = GRID) -> Float[Array, " position"]:
-    """Ascending positions (m): `count` equally spaced ones, and the special ones.
+def positions_along(
+    case: Case, count: int = GRID, places: Float[np.ndarray, " place"] | tuple = ()
+) -> Float[Array, " position"]:
+    """Ascending positions (m): `count` equally spaced ones, the special ones and known `places`.
 
     Grid points that are special ones but for rounding are left out, where the numbers are known.
     """
     special, grid = special_positions(case), case.beam.length * np.linspace(0.0, 1.0, count)
     if not is_concrete(special):
         return xp.sort(xp.concatenate([special, grid]))
-    special = np.unique(concrete(special))
+    special = np.unique(np.concatenate([concrete(special), places]))
     grid = concrete(grid)
     return xp.asarray(np.union1d(special, grid[~_is_among(case, grid, special)]))
 
@@ -122,19 +124,15 @@ def refined(
     case: Case,
     evaluate: Callable[[Float[Array, " position"]], Any],
     curves: Callable[[Any], tuple],
-    places: Float[np.ndarray, " place"] | tuple = (),
-) -> tuple[Float[Array, " position"], Any]:
-    """Positions (m) of `positions_along` and further ones around extremes, and what is there.
+    x: Float[Array, " position"] | None = None,
+) -> tuple[Float[Array, " refined"], Any]:
+    """Positions x (m), by default `positions_along`, further ones at extremes, and what is there.
 
     `evaluate` returns a tree of arrays with an axis of positions first, of which `curves` gives the
     values (position, curve) whose maxima are refined, the size of each curve, and known places (m),
-    of loads, near maxima. More `places` are positions from the start. Traced numbers are not
-    refined.
+    of loads, near maxima. Traced numbers are not refined.
     """
-    x = positions_along(case)
-    if len(places):
-        places = np.asarray(places)
-        x = np.union1d(x, places[~_is_among(case, places, np.asarray(x))])
+    x = positions_along(case) if x is None else x
     found = evaluate(x)
     if any_traced(x, found):
         return xp.asarray(x), found
@@ -158,8 +156,8 @@ def refined(
 def _beside_peaks(x, values, size, near) -> Float[np.ndarray, " added"]:
     """Positions in the intervals beside the peaks of a curve that may exceed its largest value.
 
-    By more than a settled part of it: between a peak and its neighbours a curve rises by half of
-    what it falls to them, at most about.
+    By more than a settled part of it, unless that is next to nothing of its size: between a peak
+    and its neighbours a curve rises by half of what it falls to them, at most about.
     """
     top = values.max()
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
@@ -167,7 +165,8 @@ def _beside_peaks(x, values, size, near) -> Float[np.ndarray, " added"]:
     steps = np.where(np.isfinite(falls), np.abs(falls), 0.0).max(axis=0)
     reach = np.where(np.all(falls >= 0, axis=0), values + steps / 2, -np.inf)
     chosen = np.argsort(-reach, kind="stable")[:CANDIDATES]
-    chosen = chosen[reach[chosen] > top + SETTLED * max(abs(top), LEAST_SIZE * size)]
+    enough = top * (1 + SETTLED) if top > LEAST_SIZE * size else np.inf
+    chosen = chosen[reach[chosen] > enough]
     added = []
     for i in chosen:
         left, right = x[max(i - 1, 0)], x[min(i + 1, x.size - 1)]

@@ -276,3 +276,20 @@ def test_peaks_after_the_last_axle_count():
         case, "HL93-tandem", (jb.Sensor(length / 2),), speed, speed * 1.001
     )  # fmt: skip
     assert_allclose(found.peaks[found.speeds == speed, 0], after, rtol=1e-3)
+
+
+def test_largest_moments_of_spans_are_checked():
+    """Those of all positions of LM71 on a fine grid; within 0.01 % of them, above midspan's."""
+    for case, a, b in ((TWO_SPANS, 0.0, 20.0), (BRIDGE, 0.0, 25.0)):
+        named = [s for s in checked_sections(case) if s.name.startswith("largest moment in span 1")]
+        grid = np.linspace(a, b, 51)[1:-1]
+        moments = []
+        for x in (*grid, *(s.x for s in named), (a + b) / 2):
+            line = tabulated_line(case, CheckedSection("", "moment", float(x)))
+            sagging = line._replace(values=np.maximum(line.values, 0.0))
+            moments.append(largest_under_lm71(sagging))
+        assert len(named) == 1
+        assert moments[-2] > max(moments[:-2]) * (1 - 1e-4)
+        assert moments[-2] > moments[-1]
+    (section,) = (s for s in checked_sections(TWO_SPANS) if "span 1, at" in s.name)
+    assert 0.38 * 20.0 < section.x < 0.45 * 20.0

@@ -6,12 +6,15 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.analysis.assessment.formulas import code_numbers
+from jaxbeam.analysis.sections.characteristic_points import spans
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
+from jaxbeam.model.along_beam import SETTLED, refined
 from jaxbeam.model.influence import held_positions, influence_line
 
 LINE_POINTS = 801  # along the beam, between which influence lines are linear
 FRONT_POSITIONS = 8001  # of the first axle of a train
+SPAN_POSITIONS = 11  # of a span, between which its largest moment is searched
 
 
 class CheckedSection(NamedTuple):
@@ -46,6 +49,30 @@ def tabulated_line(case: Case, section: CheckedSection) -> TabulatedLine:
     places = np.unique(np.concatenate([places, np.clip(beside, 0, length), held_positions(case)]))
     line = influence_line(case, section.x, places, quantity=section.quantity, side=section.side)
     return TabulatedLine(places, np.asarray(line))
+
+
+def largest_moments(case: Case) -> list[CheckedSection]:
+    """Sections of the largest sagging moments of spans under LM71, where midspans have less.
+
+    In the end spans of continuous beams they are at about 0.4 of the span.
+    """
+
+    def at(x):
+        lines = [tabulated_line(case, CheckedSection("", "moment", float(one))) for one in x]
+        positive = (TabulatedLine(line.positions, np.maximum(line.values, 0.0)) for line in lines)
+        return np.array([largest_under_lm71(line) for line in positive])
+
+    def curves(found):
+        return found[:, None], np.max(np.abs(found)), [np.zeros((found.size, 0))]
+
+    sections = []
+    for i, (a, b) in enumerate(spans(case), 1):
+        x, found = refined(case, at, curves, np.linspace(a, b, SPAN_POSITIONS))
+        best = int(np.argmax(found))
+        if found[best] > (1 + SETTLED) * found[np.argmin(np.abs(x - (a + b) / 2))]:
+            name = f"largest moment in span {i}, at {x[best]:.4g} m"
+            sections.append(CheckedSection(name, "moment", float(x[best])))
+    return sections
 
 
 def largest_under_train(line: TabulatedLine, offsets, forces) -> float:

@@ -20,6 +20,7 @@ from jaxbeam.analysis.assessment.formulas import (
 from jaxbeam.analysis.assessment.high_speed import TrainResponse, train_response
 from jaxbeam.analysis.assessment.static_loads import (
     CheckedSection,
+    largest_moments,
     largest_under_lm71,
     largest_under_train,
     tabulated_line,
@@ -92,14 +93,15 @@ def train_checks(
 def checked_sections(case: Case) -> list[CheckedSection]:
     """Sections whose effects are compared with those of LM71.
 
-    Moments at midspans and inner supports, deflections at midspans, shear forces on both sides of
-    supports, rotations of the ends of the deck, and reactions.
+    Moments at midspans and inner supports, and where a span has its largest; deflections at
+    midspans, shear forces on both sides of supports, rotations of the ends of the deck, reactions.
     """
     points, length = characteristic_points(case), float(concrete(case.beam.length))
     middles = [p for p in points if p.name.startswith("midspan")]
     supports = [p for p in points if p.name.startswith("support")]
     inner = [p for p in supports if 0 < p.x < length]
     sections = [CheckedSection(f"moment at {p.name}", "moment", p.x) for p in (*middles, *inner)]
+    sections += largest_moments(case)
     sections += [CheckedSection(f"deflection at {p.name}", "deflection", p.x) for p in middles]
     for p in supports:
         sides = [side for side, end in (("left", 0.0), ("right", length)) if p.x != end]

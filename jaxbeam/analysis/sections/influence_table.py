@@ -10,7 +10,7 @@ from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
-from jaxbeam.model.along_beam import LEFT_SHARE, refined
+from jaxbeam.model.along_beam import LEFT_SHARE, positions_along, refined
 from jaxbeam.model.influence import (
     REACTION,
     held_positions,
@@ -82,7 +82,8 @@ def influence_table(
         length = float(concrete(case.beam.length))
         own = np.array([place for _, _, place in lines])
         beside = [min(p + LEFT_SHARE * length, length) for q, _, p in lines if q == "shear"]
-        found_at, found = refined(case, at, curves, np.concatenate([own, beside]))
+        start = positions_along(case, places=np.concatenate([own, beside]))
+        found_at, found = refined(case, at, curves, start)
         positions = np.asarray(found_at)
     else:
         positions = np.asarray(load_positions, float)
