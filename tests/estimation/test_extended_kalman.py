@@ -159,3 +159,8 @@ def test_initial_covariance_of_a_load_on_its_way(start):
         [0.0, 0.0, 0.15**2],
     ]
     assert_allclose(found, expected, rtol=1e-12, atol=1e-18)
+
+
+def test_loads_lighter_than_a_newton_are_followed():
+    case = crossing(jb.MovingForce(force=0.4, speed=2.0))
+    assert FOLLOWS.validate(case, None) is None
