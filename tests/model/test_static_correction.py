@@ -257,7 +257,9 @@ def test_dampers_in_corrected_rows_by_a_long_series(part, quantity):
     )
     model = modal_model(case, mesh_layout(case), True)
     outputs = sensor_rows(model, case, (sensor,))
-    found = static_correction(model, case, (sensor,), outputs).rows.rates[0]
+    correction = static_correction(model, case, (sensor,), outputs)
+    found, place = correction.rows.rates[0], np.array(at)
+    influence = correction.influence.of_forces_at(place, place)[0]
     order = np.arange(1, 200_001) * np.pi / length
 
     def shape(i, place):
@@ -275,5 +277,7 @@ def test_dampers_in_corrected_rows_by_a_long_series(part, quantity):
     expected = -damping * residual * shape(kept, at) * signs
     scale = np.abs(expected).max()
     assert scale > 1e-3
+    # That of a load there, per newton upwards, is the same series.
+    assert_allclose(influence, residual * signs[0], rtol=1e-4)
     # The third derivative converges with the square of the number of modes.
     assert_allclose(found, expected * signs[0], rtol=0, atol=1e-4 * scale)
