@@ -69,3 +69,18 @@ def test_other_beams_have_no_closed_form():
     clamped = jb.Beam(25.0, 3.0e10, 15000.0, ends="clamped-clamped", modes=1)
     assert cancellation_speeds(jb.Case(clamped), 10.0, 100.0) == []
     assert cancellation_speeds(jb.Case(BEAM, supports=[jb.Support(10.0)]), 10.0, 100.0) == []
+
+
+@pytest.mark.parametrize(("lowest", "highest"), [(10.0, 60.0), (22.0, 178.0), (12.5, 20.0)])
+def test_every_speed_between_two_and_no_other(lowest, highest):
+    """2 L f_k / (k + 2 i) and d f_k / i by brute force over a hundred orders."""
+    for mode in (1, 2):
+        frequency = mode**2 * np.pi / (2 * 25.0**2) * np.sqrt(3.0e10 / 15000.0)
+        for found, length, orders in (
+            (cancellation_speeds(CASE, lowest, highest, count=2), 50.0, range(mode + 2, 100, 2)),
+            (resonance_speeds(CASE, 18.0, lowest, highest, count=2), 18.0, range(1, 100)),
+        ):
+            # Orders k - 2, k - 4, ... > 0 are none for the first two modes.
+            expected = [length * frequency / i for i in orders]
+            expected = [speed for speed in expected if lowest <= speed <= highest]
+            assert_allclose([one.speed for one in found if one.mode == mode], expected, rtol=1e-9)
