@@ -75,13 +75,19 @@ def quantity_of(
     """The quantity of a name.
 
     Raises ValueError for an unknown name, for a quantity at a fibre without the distance (m) of the
-    fibre, and for a stress without the section modulus (m^3).
+    fibre, for a stress without the section modulus (m^3), and for a rate of a curvature, whose sum
+    of modes would need the rates of all forces on the beam.
     """
     if name not in QUANTITIES:
         raise ValueError(f"no quantity {name!r}; there are {', '.join(QUANTITIES)}")
     quantity = QUANTITIES[name]
     if quantity.at_fibre and fibre_distance is None:
         raise ValueError(f"{name} needs fibre_distance, the height above the neutral axis in m")
+    if quantity.x_derivative >= 2 and quantity.time_derivative:
+        raise ValueError(
+            f"{name} is a rate of a curvature, which has no static correction: take differences of"
+            " the curvature over time"
+        )
     if quantity.over_modulus and section_modulus is None:
         raise ValueError(f"{name} needs section_modulus, bending moment over stress in m^3")
     return quantity

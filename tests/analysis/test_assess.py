@@ -100,6 +100,10 @@ def test_characteristic_points():
         *("support 1", "quarter 1", "midspan 1", "three quarters 1", "support 2"),
         *("quarter 2", "midspan 2", "three quarters 2", "support 3"),
     ]
+    hinged = dataclasses.replace(TWO_SPANS.beam, hinges=[jb.Hinge(26.0)])
+    hinged = dataclasses.replace(TWO_SPANS, beam=hinged)
+    points = {point.name: point.x for point in characteristic_points(hinged)}
+    assert points["hinge 1"] == 26.0 and len(points) == len(names) + 1
     overhang = dataclasses.replace(TWO_SPANS, beam=jb.Beam(40.0, 3e10, 15e3, ends="pinned-free"))
     assert [p.name for p in characteristic_points(overhang)][-2:] == [
         "three quarters 2",

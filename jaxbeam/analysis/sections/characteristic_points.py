@@ -23,7 +23,7 @@ def spans(case: Case) -> list[tuple[float, float]]:
 
 
 def characteristic_points(case: Case) -> list[CharacteristicPoint]:
-    """Supports, quarter points and midspans of all spans, and free ends, from left to right.
+    """Supports, quarter points and midspans of all spans, hinges and free ends, left to right.
 
     Spans and supports are counted from 1; of an overhang the points are those of a span.
 
@@ -37,6 +37,8 @@ def characteristic_points(case: Case) -> list[CharacteristicPoint]:
     for i, (a, b) in enumerate(spans(case), 1):
         for name, share in (("quarter", 0.25), ("midspan", 0.5), ("three quarters", 0.75)):
             points.append(CharacteristicPoint(f"{name} {i}", a + share * (b - a)))
+    hinges = sorted(float(concrete(hinge.position)) for hinge in case.beam.hinges)
+    points += [CharacteristicPoint(f"hinge {i}", x) for i, x in enumerate(hinges, 1)]
     for name, x in (("left end", 0.0), ("right end", length)):
         if x not in held:
             points.append(CharacteristicPoint(name, x))

@@ -78,6 +78,14 @@ def test_a_quantity_is_declared_by_one_entry(monkeypatch):
     assert rows.time_derivatives == (1,) and jb.Sensor(0.45, "rotation_rate").unit == "rad/s"
 
 
+def test_rates_of_curvatures_are_refused(monkeypatch):
+    """Curvatures are statically corrected; the rate of their correction is not known."""
+    monkeypatch.setitem(QUANTITIES, "strain_rate", Quantity("1/s", 2, 1, at_fibre=True))
+    sentence = "strain_rate is a rate of a curvature, which has no static correction"
+    with pytest.raises(ValueError, match=sentence):
+        sensor_rows(modal_model(CASE), CASE, [jb.Sensor(0.45, "strain_rate", fibre_distance=0.01)])
+
+
 def test_unknown_quantities_and_missing_fibres_are_refused():
     with pytest.raises(ValueError, match="no quantity 'torsion'; there are deflection, velocity"):
         quantity_of("torsion")
