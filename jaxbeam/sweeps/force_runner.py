@@ -164,6 +164,8 @@ def output_groups(case: Case) -> list[list[int]]:
     with the places of such sensors: few of them are together, neighbours first.
     """
     order = sorted(range(len(case.sensors)), key=lambda i: float(case.sensors[i].position))
+    if len(order) <= CORRECTED_AT_ONCE:
+        return [order]
     groups = []
     for bends, most in ((False, OUTPUTS_AT_ONCE), (True, CORRECTED_AT_ONCE)):
         own = [i for i in order if case.sensors[i].bends == bends]
