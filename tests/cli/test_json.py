@@ -103,6 +103,8 @@ KEYS = {
     "sweep case.toml --over loads.0.mass=0.3,0.5": {
         "values": {"loads.0.mass": None},
         "dimensions": None,
+        "failed_runs": None,
+        "error_estimate": None,
         "peak_deflection": None,
         "plausibility": PLAUSIBILITY,
     },
