@@ -71,7 +71,7 @@ def _is_among(case: Case, x, places) -> np.ndarray:
     return distance <= NODE_TOLERANCE * float(concrete(case.beam.length))
 
 
-class Sections(NamedTuple):
+class EnvelopeSections(NamedTuple):
     """Points (m) at which a quantity is computed for positions: them, then those left of some.
 
     A quantity that jumps at a position has its value to the right of it there.
@@ -95,8 +95,8 @@ class Sections(NamedTuple):
         return set_at(right, at, choose(right[..., self.left_of], left)) if count else right
 
 
-def sections(case: Case, x: Float[Array, " position"], quantity: str) -> Sections:
-    """Sections at which a quantity is computed for positions x (m) of an envelope.
+def sections(case: Case, x: Float[Array, " position"], quantity: str) -> EnvelopeSections:
+    """EnvelopeSections at which a quantity is computed for positions x (m) of an envelope.
 
     Shear forces are taken on both sides of all positions, as a load may be at any; moments and
     other derivatives of the deflection on both sides of the special ones.
@@ -108,7 +108,7 @@ def sections(case: Case, x: Float[Array, " position"], quantity: str) -> Section
     elif order:
         places = np.unique(concrete(places))
         left = np.flatnonzero(_is_among(case, concrete(x), places))
-    return Sections(xp.concatenate([x, left_of(case, x[left])]), left)
+    return EnvelopeSections(xp.concatenate([x, left_of(case, x[left])]), left)
 
 
 def left_of(case: Case, x) -> Float[Array, "*position"]:

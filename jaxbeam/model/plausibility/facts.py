@@ -15,7 +15,7 @@ from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.plausibility.numbers import POSITIONS, Plausibility, compliance
-from jaxbeam.model.plausibility.stages import Stage, stages
+from jaxbeam.model.plausibility.stages import SuspensionStage, stages
 
 PROFILE_POSITIONS = 301
 LEAST_BRIDGE = 3.0  # m: shorter beams are rigs, of other sizes and speeds
@@ -67,7 +67,7 @@ class Facts:
                 yield f"loads.{i}", load
 
     @functools.cached_property
-    def stages(self) -> list[Stage]:
+    def stages(self) -> list[SuspensionStage]:
         """Springs and dampers of all vehicles."""
         return [stage for address, load in self.loads() for stage in stages(address, load)]
 

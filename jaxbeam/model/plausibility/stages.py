@@ -10,7 +10,7 @@ from jaxbeam.case.loads.base import AbstractLoad
 UNIT_GRAVITY = np.ones(())
 
 
-class Stage(NamedTuple):
+class SuspensionStage(NamedTuple):
     """Spring (N/m) and damper (N s/m) of a vehicle with their addresses, and mass carried (kg)."""
 
     spring: str
@@ -20,7 +20,7 @@ class Stage(NamedTuple):
     carried: float
 
 
-def stages(address: str, load: AbstractLoad) -> Iterator[Stage]:
+def stages(address: str, load: AbstractLoad) -> Iterator[SuspensionStage]:
     """Stages of a vehicle at an address, from below; none of loads without springs."""
     vehicle: Any = load
     match load.kind:
@@ -45,7 +45,7 @@ def stages(address: str, load: AbstractLoad) -> Iterator[Stage]:
             yield from _planar_stages(address, vehicle)
 
 
-def _planar_stages(address: str, vehicle: Any) -> Iterator[Stage]:
+def _planar_stages(address: str, vehicle: Any) -> Iterator[SuspensionStage]:
     model = vehicle.vehicle(UNIT_GRAVITY)
     for part in ("tyre", "suspension"):
         for i, axle in enumerate(vehicle.axles):
@@ -76,15 +76,17 @@ def _sag_at(vehicle: Any, motion: dict[str, float], name: str, position) -> floa
     return motion[name] + lever * motion.get(f"{name} pitch", 0.0)
 
 
-def _stage(address: str, part: Any, names: tuple[str, str], carried: float) -> Stage:
+def _stage(address: str, part: Any, names: tuple[str, str], carried: float) -> SuspensionStage:
     spring, damper = (f"{address}.{name}" for name in names)
     stiffness, damping = (float(getattr(part, name)) for name in names)
-    return Stage(spring, damper, stiffness, damping, carried)
+    return SuspensionStage(spring, damper, stiffness, damping, carried)
 
 
-def _per_axle(address: str, part: Any, names: tuple[str, str], carried) -> Iterator[Stage]:
+def _per_axle(
+    address: str, part: Any, names: tuple[str, str], carried
+) -> Iterator[SuspensionStage]:
     stiffness, damping = (np.ravel(getattr(part, name)) for name in names)
     for i, mass in enumerate(carried):
         entry = f".{i}" if np.ndim(getattr(part, names[0])) else ""
         spring, damper = (f"{address}.{name}{entry}" for name in names)
-        yield Stage(spring, damper, float(stiffness[i]), float(damping[i]), float(mass))
+        yield SuspensionStage(spring, damper, float(stiffness[i]), float(damping[i]), float(mass))
