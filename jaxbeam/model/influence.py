@@ -113,8 +113,8 @@ def static_peak(
     ... )
     >>> print(f"{1e3 * jb.static_peak(case, 0.3):.2f} mm")
     1.89 mm
-    >>> print(f"{jb.static_peak(case, 0.3, quantity='moment'):.4f} N m")  # m g L / 4
-    0.7358 N m
+    >>> print(f"{jb.static_peak(case, 0.3, quantity='moment'):.3f} N m")  # m g L / 4
+    0.736 N m
     """
     x = xp.asarray(x, float)
     kind = _checked_kind(case, x, _Kind(quantity, derivative, side))
