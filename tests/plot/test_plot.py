@@ -272,12 +272,6 @@ def test_labels_do_not_overlap():
     assert separate_labels([], 1.0).shape == (0,)
 
 
-@pytest.mark.parametrize(("old", "new"), jaxbeam.plot.OLD_NAMES.items())
-def test_old_names_warn(old, new):
-    with pytest.warns(DeprecationWarning, match=f"{old} is called jaxbeam.plot.{new} now"):
-        assert getattr(jaxbeam.plot, old) is getattr(jaxbeam.plot, new)
-
-
 def test_labels_stay_within_limits():
     found = separate_labels([1.0, 1.0, 1.0, 9.0], 1.0, (0.0, 10.0))
     assert_allclose(found, [0.5, 1.5, 2.5, 9.0])
