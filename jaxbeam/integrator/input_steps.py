@@ -9,7 +9,10 @@ from jaxbeam.integrator.input_policy import StepInfo
 from jaxbeam.integrator.propagators import GAUSS_NODES
 from jaxbeam.integrator.step_maps import step_maps
 from jaxbeam.integrator.vehicles.steps import StepInput, Vehicles
-from jaxbeam.runtime.arrays import any_jax, collapse, xp
+from jaxbeam.runtime.arrays import any_jax, any_traced, collapse, xp
+from jaxbeam.runtime.compiling import compiled
+
+BLOCK_STEPS = 64  # of a law in continuous time, which a program advances together
 
 
 def advance_with_inputs(policy, vehicles: Vehicles | None, steps: StepInput, infos, state, memory):
@@ -31,6 +34,26 @@ def advance_with_inputs(policy, vehicles: Vehicles | None, steps: StepInput, inf
 
 def _advance_traced(policy, maps, infos, state, memory):
     """Final state and memory; states and commands (step, batch, column); observations."""
+    steps = (maps.states, maps.nodes), infos
+    start = jax.tree.map(jnp.asarray, (state, memory))  # even if all numbers are known
+    if not policy.implicit or any_traced(steps, start, policy):
+        after, (sources, observed) = _scan_steps(policy, steps, start)
+        return after, sources, observed
+    # Blocks of equal length share one program; the last is filled up by repetitions of its step.
+    count, found, carry = len(infos.start), [], start
+    index = np.minimum(np.arange(-(-count // BLOCK_STEPS) * BLOCK_STEPS), count - 1)
+    for block in index.reshape(-1, BLOCK_STEPS):
+        own = jax.tree.map(lambda part, block=block: part[block], steps)
+        carry, (sources, _) = _scan_block(policy, own, carry)
+        found.append(np.asarray(sources))
+    sources, (state, memory) = np.concatenate(found), carry
+    if count < len(sources):
+        state = sources[count, :, : state.shape[0]].T
+    return (np.asarray(state), np.asarray(memory)), sources[:count], None
+
+
+def _scan_steps(policy, steps, start):
+    """Final (state, memory) of steps; states and commands before each, and observations."""
 
     def one_step(carry, step):
         state, memory = carry
@@ -49,10 +72,10 @@ def _advance_traced(policy, maps, infos, state, memory):
         after = xp.where(within, after, xp.nan)
         return (after, memory), (sources, policy.observe(memory, info))
 
-    steps = (maps.states, maps.nodes), infos
-    start = jax.tree.map(jnp.asarray, (state, memory))  # even if all numbers are known
-    after, (sources, observed) = jax.lax.scan(one_step, start, steps)
-    return after, sources, observed
+    return jax.lax.scan(one_step, start, steps)
+
+
+_scan_block = compiled(_scan_steps)
 
 
 def _advance_known(policy, of_states, infos, state, memory):

@@ -331,8 +331,14 @@ def integrate_at_events(
     The number of steps between events may be traced. The state at the last event is zero, unless a
     step with a policy starts there. Forward mode only.
     """
-    chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy)
     grid = discrete.grid
+    if policy is not None and policy.implicit and not any_jax(grid):
+        steps = int(grid.step_count)
+        _, states, *_ = integrate_history(
+            discrete, loads, max_loads=max_loads, steps=steps, policy=policy
+        )
+        return states[np.append(0, grid.cumulative_counts)[grid.event_panels]]
+    chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy)
 
     def next_chunk(carry):
         state, memory, kept, first_step = carry

@@ -12,6 +12,18 @@ import jaxbeam as jb
 from tests.c_code.cases import CASES as LOOPS, rig
 from tests.test_known_and_traced import CASES as OPEN, CONTROLLED, LAWS, MASSES
 
+# Cases whose peaks 0.2.0 found less exactly, by up to 9e-4 of an acceleration: steps are shorter
+# now. Their numbers are later ones, nearer in every part to those with a tolerance of 1e-10.
+MORE_EXACT = (
+    "open: forces",
+    "a quarter car",
+    "axles with masses",
+    "a half car",
+    "a varying force",
+    "two vehicles meet",
+    "a mass on a ramp",
+    "a load within the run",
+)
 SAMPLES = 3  # of each history that is kept
 LOOP_NAMES = (
     "feedback",

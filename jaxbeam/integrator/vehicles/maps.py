@@ -120,7 +120,8 @@ def _state_maps(vehicles: Vehicles, step: StepInput, surface):
         parts,
     )
     by_row = by_wheel.reshape(steps, batch, -1, columns)
-    by_row = add_at(by_row, np.s_[..., -1:], _profile(vehicles, step.vehicles, batch))
+    if step.vehicles.surface is not None:
+        by_row = add_at(by_row, np.s_[..., -1:], _profile(vehicles, step.vehicles, batch))
     maps, first = [], states
     for group, part in zip(loads.wheels.vehicles, vehicles.propagators, strict=True):
         transition, to_end = (
