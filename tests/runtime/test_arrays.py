@@ -76,6 +76,16 @@ FUNCTIONS = {
     ),
     "solve": (arrays.solve, FACTOR, MATRIX),
     "solve, stacked": (arrays.solve, np.stack([FACTOR, FACTOR.T]), np.stack([MATRIX, MATRIX**2])),
+    "solve_conditioned": (
+        arrays.solve_conditioned,
+        np.stack([FACTOR, FACTOR.T]),
+        np.stack([MATRIX, MATRIX**2]),
+    ),
+    "with_blocks": (
+        lambda a, b: arrays.with_blocks((6, 9), [(np.s_[:4, :3], a), (np.s_[4:, 3:], b[:2, :6])]),
+        np.ones((4, 3)),
+        np.ones((4, 7)),
+    ),
     "cholesky": (arrays.cholesky, FACTOR @ FACTOR.T),
     "cholesky, not positive definite": (arrays.cholesky, np.diag([1.0, -1.0])),
     "expm": (expm, FACTOR / 7 - np.eye(4)),

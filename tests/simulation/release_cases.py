@@ -13,7 +13,8 @@ from tests.c_code.cases import CASES as LOOPS, rig
 from tests.test_known_and_traced import CASES as OPEN, CONTROLLED, LAWS, MASSES
 
 # Cases whose peaks 0.2.0 found less exactly, by up to 9e-4 of an acceleration: steps are shorter
-# now. Their numbers are later ones, nearer in every part to those with a tolerance of 1e-10.
+# now. Their numbers are later ones, nearer to those with a tolerance of 1e-10 in every part but the
+# largest acceleration and contact force of the mass on a ramp, which differ by up to 7e-6.
 MORE_EXACT = (
     "open: forces",
     "a quarter car",
@@ -23,6 +24,7 @@ MORE_EXACT = (
     "two vehicles meet",
     "a mass on a ramp",
     "a load within the run",
+    "an oscillator that brakes",
 )
 SAMPLES = 3  # of each history that is kept
 LOOP_NAMES = (
