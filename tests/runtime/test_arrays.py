@@ -81,6 +81,7 @@ FUNCTIONS = {
         np.stack([FACTOR, FACTOR.T]),
         np.stack([MATRIX, MATRIX**2]),
     ),
+    "not_differentiated": (lambda a: arrays.not_differentiated(a, "a reason"), VECTOR),
     "with_blocks": (
         lambda a, b: arrays.with_blocks((6, 9), [(np.s_[:4, :3], a), (np.s_[4:, 3:], b[:2, :6])]),
         np.ones((4, 3)),
