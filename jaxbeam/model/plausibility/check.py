@@ -99,7 +99,7 @@ def leave_warnings_to_caller() -> None:
 def _sizes(case: Case) -> tuple:
     """Structure of a case, and signs and powers of two of its numbers."""
     numbers, structure = jax.tree.flatten(case)
-    values = np.concatenate([np.ravel(number) for number in numbers])
+    values = np.concatenate([np.ravel(concrete(number)) for number in numbers])
     return structure, np.sign(values).tobytes(), np.frexp(values)[1].tobytes()
 
 
