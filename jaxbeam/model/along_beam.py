@@ -136,21 +136,21 @@ def refined(
     found = evaluate(x)
     if any_traced(x, found):
         return xp.asarray(x), found
-    x = np.asarray(x)
+    refined_x = np.asarray(x)
     for _ in range(MAX_ROUNDS):
         values, sizes, near = curves(found)
         values, sizes = np.asarray(values), np.broadcast_to(sizes, values.shape[1:])
         if not np.all(np.isfinite(values)):  # a run that diverges
             break
-        peaks = [_beside_peaks(x, *one) for one in zip(values.T, sizes, near, strict=True)]
+        peaks = [_beside_peaks(refined_x, *one) for one in zip(values.T, sizes, near, strict=True)]
         added = np.unique(np.concatenate([np.zeros(0), *peaks]))
         if not added.size:
             break
         more = evaluate(added)
-        order = np.argsort(np.concatenate([x, added]), kind="stable")
-        x = np.concatenate([x, added])[order]
+        order = np.argsort(np.concatenate([refined_x, added]), kind="stable")
+        refined_x = np.concatenate([refined_x, added])[order]
         found = jax.tree.map(lambda a, b, i=order: np.concatenate([a, b])[i], found, more)
-    return xp.asarray(x), found
+    return xp.asarray(refined_x), found
 
 
 def _beside_peaks(x, values, size, near) -> Float[np.ndarray, " added"]:
