@@ -53,7 +53,7 @@ def test_what_is_public_is_documented_with_what_it_raises(name):
 @pytest.mark.parametrize("name", sorted(EXAMPLES))
 def test_examples_in_docstrings_print_what_they_show(name, tmp_path, monkeypatch):
     """In a folder with the fit that examples read."""
-    shutil.copy(ROOT / "tests" / "data" / "release_0_1_0" / "fit.npz", tmp_path)
+    shutil.copy(ROOT / "tests" / "data" / "release_0_2_0" / "fit.npz", tmp_path)
     monkeypatch.chdir(tmp_path)
     results = doctest.testmod(importlib.import_module(name.removesuffix(".__init__")))
     assert results.attempted and not results.failed

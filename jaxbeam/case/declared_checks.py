@@ -205,6 +205,8 @@ def _all_allowed(numbers: np.ndarray, constraint: str) -> bool:
         return False
     if constraint == POSITIVE:
         return bool(np.all(numbers >= SMALLEST))
+    if constraint == PROBABILITY:
+        return bool(np.all((numbers >= 0) & (numbers < 1)))
     if constraint == NOT_NEGATIVE:
         return bool(np.all(numbers >= 0))
     return constraint != INCREASING or not np.any(numbers[1:] <= numbers[:-1])

@@ -62,12 +62,13 @@ def named_numbers(
     Raises UsageError, with the form and the example, if the name is empty or a number is none.
     """
     name, _, value = text.partition("=")
+    refusal = UsageError(f"{option} takes {form}, such as {example}, not {text!r}")
+    if not name:
+        raise refusal
     try:
-        if not name:
-            raise ValueError
         return name, [number(entry) for entry in value.split(",")]
     except ValueError:
-        raise UsageError(f"{option} takes {form}, such as {example}, not {text!r}") from None
+        raise refusal from None
 
 
 def parse_sweep_values(texts: Iterable[str]) -> dict[str, list[float] | list[str]]:

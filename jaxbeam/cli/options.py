@@ -155,7 +155,7 @@ class DrawingOptions:
     def check(self, *paths: Path | None) -> None:
         """Check the options and files of pictures, before any work.
 
-        Raises ValueError for a size without a unit, too many or no dots per inch, and for a file of
+        Raises UsageError for a size without a unit, too many or no dots per inch, and for a file of
         another ending than .png, .svg and .pdf.
         """
         self.inches()
@@ -232,7 +232,7 @@ class LabelledPictureOptions(PictureOptions):
     def sensor_labels(self, case: "jb.Case") -> list[str] | None:
         """Names of the sensors of a case in pictures, None if left out.
 
-        Raises ValueError for another number of names than sensors.
+        Raises UsageError for another number of names than sensors.
         """
         names = [name.strip() for name in self.labels.split(",")] if self.labels else None
         if names is not None and len(names) != len(case.sensors):

@@ -278,7 +278,7 @@ class custom_jvp:
 
 
 def not_differentiated(value: Any, reason: str) -> Any:
-    """The value, of which derivatives raise ValueError with a reason."""
+    """The value. Raises ValueError, with a reason, if it is differentiated."""
     if not is_jax(value):
         return value
 

@@ -24,7 +24,12 @@ from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
 from jaxbeam.model.sensing.sensor_signals import noise_samples, sensor_sections
-from jaxbeam.model.sensing.transmission import COMMANDS, refuse_derivatives, sent_readings
+from jaxbeam.model.sensing.transmission import (
+    COMMANDS,
+    NO_DERIVATIVE,
+    refuse_derivatives,
+    sent_readings,
+)
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import Array, any_jax, block_diag, not_differentiated, xp
 from jaxbeam.simulation.commands.path import command_path
@@ -37,7 +42,7 @@ FIXED = (
     "periods, delays and times of samples are fixed by a plan made without tracing them:"
     " differentiate without a plan, or make it with moving=True"
 )
-LOST = "what is lost changes at once with a dropout, which has no derivative: compare several"
+LOST = NO_DERIVATIVE.format("dropout", "is lost")
 
 
 def loop_schedule(

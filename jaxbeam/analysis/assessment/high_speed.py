@@ -77,6 +77,7 @@ def train_response(
     free = FREE_PERIODS / float(concrete(modes(case).frequencies)[0])
 
     def peaks_at(speeds) -> Float[np.ndarray, "speed sensor"]:
+        """Peaks at speeds (m/s). Raises RuntimeError if a run fails."""
         over = {"loads.0.speed": speeds, "run.duration": way / speeds + free}
         plan = sweep_specification(loaded, over, True, False, TOLERANCE, "double")
         found = peaks_in_memory(plan)

@@ -2,11 +2,10 @@
 
 from typing import Any
 
-import jax
 from jaxtyping import Bool, Float
 
 from jaxbeam.numerics.normal_samples import uniform_samples
-from jaxbeam.runtime.arrays import Array, is_jax, xp
+from jaxbeam.runtime.arrays import Array, not_differentiated, xp
 
 COMMANDS = -1  # the number that stands for the commands, among those of the sensors
 LOSSES, DELAYS = 1, 2  # streams of random numbers within that of a sensor or of the commands
@@ -17,26 +16,10 @@ NO_DERIVATIVE = (
 )
 
 
-def without_derivative(value: Any, reason: str) -> Any:
-    """The value, of which derivatives raise ValueError with a reason."""
-    if not is_jax(value):
-        return value
-
-    @jax.custom_jvp
-    def itself(value):
-        return value
-
-    @itself.defjvp
-    def _(primals, tangents):
-        raise ValueError(reason)
-
-    return itself(value)
-
-
 def refuse_derivatives(part: Any) -> None:
     """Raise ValueError if there are derivatives by dropout or jitter of a part of a loop."""
     for name, what in (("dropout", "is lost"), ("jitter", "is late in a loop")):
-        without_derivative(getattr(part, name), NO_DERIVATIVE.format(name, what))
+        not_differentiated(getattr(part, name), NO_DERIVATIVE.format(name, what))
 
 
 def sent_readings(
@@ -49,7 +32,7 @@ def sent_readings(
     """
     losses = late = None
     if part.dropout is not None:
-        dropout = without_derivative(part.dropout, NO_DERIVATIVE.format("dropout", "is lost"))
+        dropout = not_differentiated(part.dropout, NO_DERIVATIVE.format("dropout", "is lost"))
         losses = xp.asarray(uniform_samples(seed, (number + 1, LOSSES), count)) < dropout
     if part.jitter is not None:
         late = part.jitter * uniform_samples(seed, (number + 1, DELAYS), count)
