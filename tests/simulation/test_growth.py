@@ -136,9 +136,11 @@ def test_bounded_loops_beyond_the_length_by_the_oracle():
     assert_allclose(found, truth, rtol=0, atol=1e-6 * np.abs(truth).max())
 
 
+@pytest.mark.filterwarnings("ignore::jaxbeam.sweeps.failures.FailedRunsWarning")
 def test_sweeps_fail_where_the_loop_diverges_only():
     gains = np.array([0.0, 10.0, 1e5])
     runs = jb.sweep(SOFT, {"controller.gains.0": gains}, progress=False)
+    assert runs.attrs["failed_runs"] == 1
     assert runs.failed.values.tolist() == [False, False, True]
     for gain, peak in zip(gains[:2], runs.peak_deflection.values[:2], strict=True):
         single = jb.simulate(jb.replace(SOFT, {"controller.gains.0": gain})).peak_deflection
