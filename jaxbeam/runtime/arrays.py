@@ -290,7 +290,8 @@ def not_differentiated(value: Any, reason: str) -> Any:
     def _(primals, tangents):
         raise ValueError(reason)
 
-    return itself(value)
+    # Batched numbers may hold an array of NumPy, which `custom_jvp` refuses; a sum is one of JAX.
+    return itself(value + 0)
 
 
 def fori_loop(start: int, end: int, step: Callable, carry) -> Any:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import logging
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ import jaxbeam as jb
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
+from jaxbeam.sweeps.failures import FailedRunsWarning
 from tests.differences import central
 from tests.loop_as_oracle import expected
 
@@ -100,7 +102,9 @@ def sweep_and_compilations():
     jax.config.update("jax_log_compiles", True)  # in all threads; its context is for one
     try:
         over = {"controller.gains.0": GAINS, "loads.0.mass": MASSES}
-        dataset = jb.sweep(UNBOUNDED, over, progress=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FailedRunsWarning)
+            dataset = jb.sweep(UNBOUNDED, over, progress=False)
     finally:
         jax.config.update("jax_log_compiles", False)
         logger.removeHandler(handler)
@@ -109,6 +113,7 @@ def sweep_and_compilations():
 
 def test_only_diverging_runs_of_a_sweep_fail(sweep_and_compilations):
     dataset, compilations = sweep_and_compilations
+    assert dataset.attrs["failed_runs"] == 2
     assert_array_equal(dataset.failed, [[False, False], [True, True], [False, False]])
     assert np.isnan(dataset.peak_deflection[1]).all()
     assert len(compilations) == 1

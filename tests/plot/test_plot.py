@@ -335,6 +335,6 @@ def test_every_figure_may_take_the_place_of_axes():
 def test_envelope_and_modes_on_axes(record):
     left, right = Figure().subplots(1, 2)
     record.plot_envelope("moment", ax=left)
-    assert len(lines_of(left, 101)) == 2
+    assert len(lines_of(left, record.envelope("moment").positions.size)) == 2
     plot_modes(CASE, ax=right, title="shapes")
     assert right.get_title(loc="left") == "shapes" and len(lines_of(right, 401)) == 2

@@ -91,7 +91,7 @@ def test_other_runs_share_the_programs(run_set):
     assert jax.tree.structure(unnamed[0]) == jax.tree.structure(unnamed[1])
     assert run_set.error != other.error
     record = other.records({})[0]
-    assert np.array_equal(record.step_errors, other.sensor_errors)
+    assert np.all(record.step_errors >= other.sensor_errors)  # with those of peaks between steps
 
 
 def test_gradients_of_the_objectives(run_set):
