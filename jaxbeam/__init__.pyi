@@ -120,7 +120,7 @@ from .model.frequency_response import (
     receptance as receptance,
 )
 from .model.influence import influence_line as influence_line, static_peak as static_peak
-from .model.plausibility.check import PlausibilityWarning as PlausibilityWarning, check as check
+from .model.plausibility.check import check as check
 from .model.plausibility.checked_modes import modes as modes
 from .model.plausibility.numbers import Plausibility as Plausibility
 from .model.settlement import settlement_response as settlement_response

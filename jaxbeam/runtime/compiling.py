@@ -240,8 +240,10 @@ def _compile_traced(compute: Callable, numbers: list, name: str) -> Any:
 
     closed = jax.make_jaxpr(touched)(*numbers)
     equations = _Equations(closed.jaxpr)
-    entries = sum(out.aval.size for out in closed.jaxpr.outvars)
-    if _differentiated(numbers) and entries * sum(map(np.size, numbers)) <= MAX_SLOPES:
+    outs = [out.aval for out in closed.jaxpr.outvars]
+    entries = sum(out.size for out in outs) * sum(map(np.size, numbers))
+    has_complex = any(jnp.issubdtype(out.dtype, jnp.complexfloating) for out in outs)
+    if _differentiated(numbers) and not has_complex and entries <= MAX_SLOPES:
         found = _by_slopes(equations, closed.consts, name, 0, numbers)
     else:
         found = _mapped(equations, closed.consts, name, numbers)

@@ -14,6 +14,7 @@ import pytest
 import jaxbeam as jb
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.plausibility.check import PlausibilityWarning
 from tests.modules import ROOT
 
 BRIDGE = dict(length=25.0, flexural_rigidity=30e9, mass_per_length=15e3, damping_ratio=0.015)
@@ -518,7 +519,7 @@ def test_functions_warn_before_they_work(name, tmp_path):
     with warnings.catch_warnings(record=True) as shown:
         warnings.simplefilter("default")
         work[name]()
-    said = [str(one.message) for one in shown if one.category is jb.PlausibilityWarning]
+    said = [str(one.message) for one in shown if one.category is PlausibilityWarning]
     assert len(said) == len(set(said)) > 0
     assert said[0].startswith("beam.flexural_rigidity: the beam sags by")
 
@@ -531,16 +532,16 @@ def test_fits_and_tuning_warn_before_they_work(monkeypatch):
     log = tuning.Log(np.arange(5.0), np.ones((5, 1)), ("w",), ("deflection",), ("m",), "log", (0,))
     loads = tuning.LoadCases(({"loads.0.mass": 2e4},), ({"loads.0.mass": 3e4},))
     with warnings.catch_warnings():
-        warnings.simplefilter("error", jb.PlausibilityWarning)
-        with pytest.raises(jb.PlausibilityWarning, match="not in kN m"):
+        warnings.simplefilter("error", PlausibilityWarning)
+        with pytest.raises(PlausibilityWarning, match="not in kN m"):
             tuning.identify(case, [log], "beam.flexural_rigidity")
-        with pytest.raises(jb.PlausibilityWarning, match="not in kN m"):
+        with pytest.raises(PlausibilityWarning, match="not in kN m"):
             tuning.tune(case, {"controller.gains.0": (0.0, 1.0)}, loads, progress=False)
 
 
 def test_a_sweep_is_judged_at_its_ends():
     case = bridge()
-    with pytest.warns(jb.PlausibilityWarning, match=r"loads.0.speed: 200 m/s is 720 km/h"):
+    with pytest.warns(PlausibilityWarning, match=r"loads.0.speed: 200 m/s is 720 km/h"):
         jb.sweep(case, {"loads.0.speed": [20.0, 200.0]}, progress=False)
 
 
@@ -553,10 +554,10 @@ def test_traced_numbers_are_not_judged():
         return jb.modes(jb.Case(beam), layout=mesh_layout(case)).frequencies[0]
 
     with warnings.catch_warnings():
-        warnings.simplefilter("error", jb.PlausibilityWarning)
+        warnings.simplefilter("error", PlausibilityWarning)
         assert jax.jit(first)(30e6) > 0
         assert jax.vmap(first)(np.array([30e6, 31e6])).shape == (2,)
-    with pytest.warns(jb.PlausibilityWarning, match="not in kN m"):
+    with pytest.warns(PlausibilityWarning, match="not in kN m"):
         jax.grad(first)(30e6)
 
 

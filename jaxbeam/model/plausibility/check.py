@@ -32,9 +32,10 @@ class PlausibilityWarning(UserWarning):
 
     >>> import warnings
     >>> import jaxbeam as jb
+    >>> from jaxbeam.model.plausibility.check import PlausibilityWarning
     >>> beam = jb.Beam(25.0, flexural_rigidity=30e6, mass_per_length=15e3)  # kN m^2!
     >>> with warnings.catch_warnings(record=True) as shown:
-    ...     warnings.simplefilter("always", jb.PlausibilityWarning)
+    ...     warnings.simplefilter("always", PlausibilityWarning)
     ...     found = jb.modes(jb.Case(beam))
     >>> print(str(shown[0].message).split(" under")[0])
     beam.flexural_rigidity: the beam sags by 24.94 m

@@ -96,7 +96,7 @@ def test_list(capsys):
     with pytest.raises(SystemExit, match="0"):
         main(["reproduce", "--list"])
     assert "frequencies" in capsys.readouterr().out
-    with pytest.raises(SystemExit, match="1"):
+    with pytest.raises(SystemExit, match="2"):
         main(["reproduce"])
     assert "--list" in capsys.readouterr().err
 

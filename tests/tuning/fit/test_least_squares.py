@@ -133,11 +133,6 @@ def test_scales(scale):
     np.testing.assert_allclose([value_at(y) for y in shares], expected, rtol=1e-9)
 
 
-def test_the_old_word_for_a_linear_scale_warns():
-    with pytest.warns(DeprecationWarning, match="the scale 'plain' is called 'linear' now"):
-        assert Prior(scale="plain") == Prior()
-
-
 @pytest.mark.parametrize(
     "given, words",
     [
