@@ -66,6 +66,7 @@ class AbstractStateController(AbstractController):
         return case.loads if self.design is None else self.design.design_loads(case)
 
     def design_law(self, plant):
+        plant = plant.of_driven()
         design_plant = self.design_plant(plant)
         law = self.design_state_law(plant, design_plant)
         estimated = self.estimator is not None and self.estimator.has_vehicles
