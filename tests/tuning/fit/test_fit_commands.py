@@ -39,7 +39,7 @@ def test_weighing(call, tmp_path, monkeypatch):
     code, out, _ = call("weigh case.toml log.csv --speeds 0.5:3 --json")
     assert json.loads(out) == {"loads": [1.0, 1.0]}
     code, _, err = call("weigh case.toml log.csv --speeds fast")
-    assert code == 1 and "--speeds takes LOW:HIGH in m/s, such as 0.5:3, not 'fast'" in err
+    assert code == 2 and "--speeds takes LOW:HIGH in m/s, such as 0.5:3, not 'fast'" in err
 
 
 def test_models_compared_and_held_out_logs(call, tmp_path, monkeypatch):
@@ -59,7 +59,7 @@ def test_models_compared_and_held_out_logs(call, tmp_path, monkeypatch):
     assert header.split() == ["model", "parameters", "log", "likelihood", "AIC", "BIC", "weight"]
     assert first.split()[:2] == ["one", "1"] and second.split()[:2] == ["three", "3"]
     assert float(first.split()[4]) == pytest.approx(tuning.compare_fits(fits)[0].bic, rel=1e-5)
-    (tmp_path / "new.csv").write_text("t [s],a [mm],b [mm]\n0,1,1\n1,2,2\n2,1,1\n")
+    (tmp_path / "new.csv").write_text("t [s],a [mm],b [mm]\n0,1,3\n1,2,2\n2,1,1\n")
     code, out, _ = call("compare-models one.npz --held-out new.csv")
     assert out == "one: new: predicted; residuals are 1.1 times the noise at most\n"
     result = json.loads(call("compare-models three.npz one.npz --held-out new.csv --json")[1])
@@ -110,7 +110,7 @@ def test_fit_to_responses(call, monkeypatch):
     line = "identify-responses case.toml new.csv --free beam.flexural_rigidity=5:20"
     assert "new.csv" in call(line)[2]
     with open("new.csv", "w") as file:
-        file.write("t [s],a [mm],b [mm]\n0,1,1\n1,2,2\n2,1,1\n")
+        file.write("t [s],a [mm],b [mm]\n0,1,3\n1,2,2\n2,1,1\n")
     code, out, err = call(f"{line} --segment 4 -o fit.toml")
     assert code == 0, err
     assert arguments == {
