@@ -98,4 +98,4 @@ REFUSED = [
 @pytest.mark.parametrize(("options", "message"), REFUSED)
 def test_wrong_options_end_in_one_error_message(call, options, message):
     code, out, err = call(f"identify case.toml runs.csv {options}")
-    assert code == 1 and out == "" and message in err and err.count("\n") == 1
+    assert code in (1, 2) and out == "" and message in err and err.count("\n") == 1
