@@ -205,7 +205,9 @@ def _of_information(information, unknowns) -> LeastErrors:
     scale = 1 / np.sqrt(np.diag(information) + 1e-300)
     product = np.outer(scale, scale)
     inverse = np.linalg.pinv(information * product, rcond=MIN_DIRECTION, hermitian=True)
-    deviations = np.sqrt(np.diag(inverse * product)).reshape(unknowns.shape)
+    # A variance of nothing may be below zero by rounding, which differs between processors.
+    variances = np.maximum(np.diag(inverse * product), 0.0)
+    deviations = np.sqrt(variances).reshape(unknowns.shape)
     return LeastErrors(deviations[:, 0], deviations[:, 1])
 
 
