@@ -31,7 +31,7 @@ FED_BACK = jb.Case(
     actuators=[jb.PointForce(0.3)],
     sensors=[jb.Sensor(0.3)],
     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
-    controller=jb.Feedback([200.0], period=2e-3),
+    controller=jb.Feedback(gains=[200.0], period=2e-3),
     run=jb.Run(0.3, 500.0),
 )
 CONTINUOUS = jb.Case(
@@ -39,11 +39,18 @@ CONTINUOUS = jb.Case(
     actuators=[jb.PointForce(0.3)],
     sensors=[jb.Sensor(0.3)],
     loads=[
-        jb.Oscillator(0.3, 400.0, 0.5, speed=2.0),
-        jb.QuarterCar(0.2, 0.05, 300.0, 0.5, 3e3, speed=1.5),
+        jb.Oscillator(mass=0.3, stiffness=400.0, damping=0.5, speed=2.0),
+        jb.QuarterCar(
+            body_mass=0.2,
+            axle_mass=0.05,
+            suspension_stiffness=300.0,
+            suspension_damping=0.5,
+            tyre_stiffness=3e3,
+            speed=1.5,
+        ),
     ],
     profile=jb.TableProfile([0.0, 0.2, 0.4, 0.6], [0.0, 1e-4, -1e-4, 0.0]),
-    controller=jb.Feedback([200.0]),
+    controller=jb.Feedback(gains=[200.0]),
     run=jb.Run(0.5, 200.0),
 )
 
