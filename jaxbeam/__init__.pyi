@@ -1,3 +1,4 @@
+from . import api as api
 from .analysis.assessment.assess import assess as assess
 from .analysis.assessment.assessment import Assessment as Assessment, CodeCheck as CodeCheck
 from .analysis.bound.bound import bound as bound

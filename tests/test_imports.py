@@ -24,7 +24,7 @@ jaxbeam.rigs  jaxbeam.simulation
 jaxbeam.sweeps  jaxbeam.c_code  jaxbeam.fmi
 jaxbeam.analysis
 jaxbeam.plot
-jaxbeam
+jaxbeam  jaxbeam.api
 tuning.checkpoint  tuning.optional
 tuning.logs
 tuning.parameters  tuning.modal

@@ -5,6 +5,7 @@ import importlib
 import inspect
 import json
 from pathlib import Path
+from types import ModuleType
 
 from plain_docstrings import as_text
 
@@ -33,6 +34,7 @@ GROUPS = {
         "jaxbeam.sweeps",
     ),
     "analysis": ("Analysis of runs", "jaxbeam.analysis"),
+    "applications": ("Parts of applications: jaxbeam.api", "jaxbeam.api"),
     "logs": ("Logs and their modes", "tuning.logs", "tuning.modal"),
     "fits": ("Fits, their uncertainty, and weighing", "tuning"),
     "tuning": ("Tuning of controllers", "tuning.control"),
@@ -86,9 +88,22 @@ def public_names() -> dict[str, list[tuple[str, str]]]:
     for package in (jaxbeam, tuning, jaxbeam.plot):
         for name in sorted(package.__all__, key=str.lower):
             one = getattr(package, name)
-            pages[group_of(one.__module__)].append((package.__name__, name))
+            if inspect.ismodule(one):
+                found = own_names(one)
+                pages[group_of(one.__name__)] += [(one.__name__, inner) for inner in found]
+            else:
+                pages[group_of(one.__module__)].append((package.__name__, name))
     pages["interfaces"] = INTERFACES
     return pages
+
+
+def own_names(module: ModuleType) -> list[str]:
+    """Public functions and classes that a module defines."""
+    return [
+        name
+        for name, one in vars(module).items()
+        if not name.startswith("_") and getattr(one, "__module__", "") == module.__name__
+    ]
 
 
 def api_page(title: str, names: list[tuple[str, str]]) -> str:

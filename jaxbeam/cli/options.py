@@ -7,7 +7,6 @@ printed within a few tenths of a second; a test checks it.
 import dataclasses
 import itertools
 import json
-import math
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -66,7 +65,7 @@ class PrintOptions:
     def report(self, content: dict[str, Any], lines: Iterable[str], *written: Path | None) -> None:
         """Print the content as JSON, or else the lines and the names of the files written."""
         if self.json_:
-            print(json.dumps(plain(content), indent=2, allow_nan=False))
+            print(json.dumps(jb.api.plain(content), indent=2, allow_nan=False))
             return
         for line in lines:
             print(line)
@@ -131,11 +130,10 @@ class CaseOptions(OutputOptions):
         }
         enable_compile_cache()
         from jaxbeam.case.case import structure_of
-        from jaxbeam.files.case_file import load_case_with
         from jaxbeam.model.plausibility.check import leave_warnings_to_caller
 
         leave_warnings_to_caller()
-        case = load_case_with(path, changes)
+        case = jb.api.load_case(path, changes)
         if judged:
             print_warnings(jb.check(case if judged == "case" else structure_of(case)))
         return case
@@ -255,19 +253,13 @@ def print_plausibility(
     if not options.json_:
         print(f"plausibility: {found}", flush=True)
     print_warnings(found)
-    return numbers_of(found)
+    return jb.api.content(found)
 
 
 def print_warnings(found: "jb.Plausibility") -> None:
     """Print what looks wrong in a case."""
     for warning in found.warnings:
         print_message(f"warning: {warning}")
-
-
-def numbers_of(found: "jb.Plausibility") -> dict[str, Any]:
-    """Numbers and warnings of plausibility by their names in JSON (SI units)."""
-    names = ("span_over_deflection", "speed_ratio")
-    return dataclasses.asdict(found) | {name: getattr(found, name) for name in names}
 
 
 def enable_compile_cache() -> None:
@@ -289,14 +281,3 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[str]:
 def print_message(message: str) -> None:
     """Print an error, a warning or a remark on standard error."""
     print(f"jaxbeam: {message}", file=sys.stderr)
-
-
-def plain(value: Any) -> Any:
-    """Value of JSON types: arrays as lists, keys as strings, None for infinite and NaN."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {str(key): plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -4,6 +4,7 @@ Keys follow from the fields of the classes, kinds from the classes that declare 
 `jaxbeam.case`, `jaxbeam.control` or `jaxbeam.estimation`: nothing is registered here.
 """
 
+import copy
 import dataclasses
 import inspect
 import os
@@ -53,28 +54,48 @@ def load_case(path: str | os.PathLike) -> Case:
     >>> print(jb.load_case(path).beam.length)
     25.0
     """
-    case = read_case(path)
-    try:
-        check_case(case)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+    case = load_case_with(path, {})
     warn_if_implausible(case)
     return case
 
 
-def read_case(path: str | os.PathLike, named: Mapping[str, Any] = MappingProxyType({})) -> Case:
-    """The case of a TOML file, whose values are not validated yet.
+def load_case_with(path: str | os.PathLike, settings: Mapping[str, Any]) -> Case:
+    """The case of a file with other entries at some addresses, validated as it is then.
 
-    Files that the user has `named` by address, at profile.file or loads.0.model, take the place of
-    those in the case, and may be anywhere. Raises ValueError and OSError as `load_case`, but for
-    the errors of `check_case`.
+    Raises ValueError as `case_from_tables`, with the file; OSError if the file cannot be read.
     """
     content = read_toml(path)
     try:
-        find_vehicle_files(content.get("loads"), Path(path).parent, named=named)
-        return case_from_dict(with_profile_file(content, path, named.get("profile.file")))
+        case = _from_tables(content, Path(path).parent, settings)
+        if not settings:
+            check_case(case)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+    return _with_further_settings(case, settings)
+
+
+def case_from_tables(content: Mapping[str, Any], folder: Path, settings: Mapping[str, Any]) -> Case:
+    """The validated case of the tables of a case file with other entries at some addresses.
+
+    Files that the tables name are below the `folder`. `settings` are those of `with_settings`, and
+    may name files in the place of those, at profile.file or loads.0.model, which may be anywhere.
+    Raises as `case_from_dict` and `with_settings`.
+    """
+    case = _from_tables(copy.deepcopy(dict(content)), folder, settings)
+    if not settings:
+        check_case(case)
+    return _with_further_settings(case, settings)
+
+
+def _from_tables(content: dict[str, Any], folder: Path, named: Mapping[str, Any]) -> Case:
+    """The case of some tables, not validated yet, with `named` files in the place of theirs."""
+    find_vehicle_files(content.get("loads"), folder, named=named)
+    return case_from_dict(with_profile_file(content, folder, named.get("profile.file")))
+
+
+def _with_further_settings(case: Case, settings: Mapping[str, Any]) -> Case:
+    others = {address: value for address, value in settings.items() if address != "profile.file"}
+    return with_settings(case, others) if settings else case
 
 
 def find_vehicle_files(
@@ -113,8 +134,7 @@ def load_controller(path: str | os.PathLike) -> AbstractController:
         if "controller" not in content:
             raise ValueError("has no controller; write a table [controller]")
         if set(content) - {"title", "controller"}:
-            find_vehicle_files(content.get("loads"), Path(path).parent)
-            case_from_dict(with_profile_file(content, path))  # to validate the other tables
+            _from_tables(content, Path(path).parent, {})  # to validate the other tables
         return _read_key("controller", content["controller"])
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
@@ -186,18 +206,6 @@ def case_to_dict(case: Case, whole: bool = False) -> dict[str, Any]:
         elif not listed and value is not None:
             content[key] = _write_part(key, value, part_class, whole)
     return content
-
-
-def load_case_with(path: str | os.PathLike, settings: dict[str, Any]) -> Case:
-    """The case of a file with other entries at some addresses, validated as it is then.
-
-    `settings` are those of `with_settings`; `profile.file` names a file with a profile. Raises as
-    `load_case` and `with_settings`.
-    """
-    if not settings:
-        return load_case(path)
-    others = {address: value for address, value in settings.items() if address != "profile.file"}
-    return with_settings(read_case(path, settings), others)
 
 
 def with_settings(case: Case, settings: dict[str, Any]) -> Case:

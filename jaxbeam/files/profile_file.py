@@ -29,13 +29,11 @@ def profile_from_file(path: str | os.PathLike) -> TableProfile:
     return TableProfile(positions, heights)
 
 
-def with_profile_file(
-    content: dict[str, Any], path: str | os.PathLike, named: Any = None
-) -> dict[str, Any]:
+def with_profile_file(content: dict[str, Any], folder: Path, named: Any = None) -> dict[str, Any]:
     """Tables of a case file with the points of the profile in place of the file that has them.
 
-    `path` is that of the case file, below whose folder the profile must be; one that the user has
-    `named` beside the case file takes its place, and may be anywhere. Raises ValueError and OSError
+    The file must be below the `folder` of the case; one that the user has `named` beside the case
+    takes its place, and may be anywhere. Raises ValueError and OSError
     as `profile_from_file` does, and ValueError for a table with both points and a file.
     """
     profile = content.get("profile", {} if named is not None else None)
@@ -54,7 +52,6 @@ def with_profile_file(
     for key in POINTS:
         if key in table:
             raise ValueError(f"profile has both a file and {key}; leave one out")
-    folder = Path(path).parent
     table["positions"], table["point_heights"] = _read_points(folder / name, folder)
     return content | {"profile": table}
 

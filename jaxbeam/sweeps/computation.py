@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
-from tqdm import tqdm
 
 from jaxbeam.case.case import Case, unit_at
 from jaxbeam.case.display.addresses import address_words
@@ -23,6 +22,7 @@ from jaxbeam.runtime.arrays import collapse
 from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.garbage import rare_collections
 from jaxbeam.runtime.memory import size_text
+from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.simulation.integration_plan import sample_times
 from jaxbeam.simulation.result_variables import SWEEP_VARIABLES, sensor_coordinates
 from jaxbeam.sweeps import cluster
@@ -41,7 +41,7 @@ def compute_sweep(
     path: Path | None,
     state: str,
     client: Any,
-    progress_bar: tqdm,
+    progress_bar: ProgressBar,
     estimates: bool = True,
 ) -> "xarray.Dataset":
     """Dataset of a sweep, with `estimates` of its truncation errors.
@@ -56,7 +56,7 @@ def compute_sweep(
     runner, steps, error, block_store = _begun(specification, path, state, progress_bar)
     missing = block_store.missing()
     remaining = sum(runner.run_count(block) for block in missing)
-    count_as_done(progress_bar, specification.count - remaining)
+    progress_bar.skip(specification.count - remaining)
     if missing:
         within = size_text(specification.block_bytes)
         progress_bar.set_postfix_str(f"blocks of {runner.run_count(0)}, each within {within}")
@@ -79,12 +79,12 @@ def compute_sweep(
 
 def peaks_in_memory(specification: SweepSpecification) -> "xarray.Dataset":
     """Dataset of a sweep that is not stored, without estimated truncation errors."""
-    with tqdm(disable=True) as progress_bar:
+    with ProgressBar(specification.count, "run", shown=False) as progress_bar:
         return compute_sweep(specification, None, "new", None, progress_bar, estimates=False)
 
 
 def _begun(
-    specification: SweepSpecification, path: Path | None, state: str, progress_bar: tqdm
+    specification: SweepSpecification, path: Path | None, state: str, progress_bar: ProgressBar
 ) -> "tuple[AnyRunner, Float[np.ndarray, ' path'], float, BlockStore]":
     """Runner, step sizes (s), estimated error and store of a sweep, new or to be continued."""
     if path is not None and state == "resume":
@@ -117,15 +117,6 @@ def _new_runner(specification: SweepSpecification) -> tuple[AnyRunner, bool]:
         if native_peaks.available():
             return runner, True
     return specification.runner(native=False), False
-
-
-def count_as_done(progress_bar: tqdm, runs: int) -> None:
-    """Count runs of an earlier attempt as done; they do not add to the rate."""
-    if progress_bar.disable:
-        return
-    progress_bar.initial += runs
-    progress_bar.n += runs
-    progress_bar.refresh()
 
 
 def _compute(runner: AnyRunner, blocks: list[int], steps, block_store: BlockStore) -> Iterator[int]:

@@ -1,18 +1,17 @@
 """Sweep of a case over the values at any addresses, in a grid or paired, as an xarray dataset."""
 
 import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from tqdm import tqdm
 
 from jaxbeam.case.case import Case, unit_at
 from jaxbeam.case.reading.units import in_si
 from jaxbeam.files.case_file import with_settings
 from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.runtime.interrupts import keeping
+from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.simulation.integration_plan import TOLERANCE
 from jaxbeam.sweeps.computation import compute_sweep
 from jaxbeam.sweeps.failures import warn_of_failures
@@ -123,7 +122,7 @@ def sweep(
     compute = compute_word_sweep if words else compute_sweep
 
     def computed(folder: Path | None, state: str) -> "xarray.Dataset":
-        with tqdm(total=plan.count, unit="run", disable=not progress, file=sys.stderr) as bar:
+        with ProgressBar(plan.count, "run", shown=progress) as bar:
             return compute(plan, folder, state, client, bar)
 
     def stored(path: Path) -> "xarray.Dataset":

@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
-from tqdm import tqdm
 
 from jaxbeam.case.case import Case, addresses
 from jaxbeam.case.display.addresses import address_words
 from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.joint_addresses import ALL
 from jaxbeam.files.case_file import case_to_dict, with_settings
+from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.sweeps import MAX_RUNS
-from jaxbeam.sweeps.computation import compute_sweep, count_as_done, worst_runs
+from jaxbeam.sweeps.computation import compute_sweep, worst_runs
 from jaxbeam.sweeps.specification import SweepSpecification, sweep_specification
 from jaxbeam.sweeps.step_size import largest_error
 from jaxbeam.sweeps.stores import store as sweep_store
@@ -182,7 +182,7 @@ def compute_word_sweep(
     path: Path | None,
     state: str,
     client: Any,
-    progress_bar: tqdm,
+    progress_bar: ProgressBar,
 ) -> "xarray.Dataset":
     """Dataset of a sweep over words, one word after the other (see `compute_sweep`)."""
     fingerprint = plan.fingerprint()
@@ -221,7 +221,7 @@ def _compute_part(part, path, client, progress_bar) -> "xarray.Dataset":
     """Dataset of the sweep of numbers for one combination of words."""
     found = None if path is None else sweep_store.status(path)
     if path is not None and found == ("complete", part.fingerprint()):
-        count_as_done(progress_bar, part.count)
+        progress_bar.skip(part.count)
         return sweep_store.read_dataset(path)
     if found and found[1] != part.fingerprint():
         raise ValueError(f"{path} is not the part of its sweep that its place says")

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from tqdm import tqdm
 
 from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.progress import ProgressBar
 from tuning.checkpoint import NO_CHECKPOINT, Checkpoint
 from tuning.control.objective import Objective, WeightsAndLimits
 from tuning.control.optimisers import AbstractOptimiser, optimiser
@@ -160,7 +160,8 @@ class Optimisation:
         if kept is not None:
             state = state.restored(kept)
         total = self.steps
-        with tqdm(total=total, initial=state.step, desc="tuning", disable=not progress) as bar:
+        bar = ProgressBar(total, "step", shown=progress, initial=state.step, desc="tuning")
+        with bar:
             while state.step < total:
                 state = self._step(state, target, seed)
                 bar.update()

@@ -28,17 +28,25 @@ def read_toml(
     """
     text = read_text_input(path, what, below, address)
     try:
-        for name, count in Counter(_LISTED.findall(text)).items():
-            check_length(name, count)  # to parse so many would take long
+        return parse_toml(text, quoted=below is None)  # nothing of other files
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def parse_toml(text: str, quoted: bool = True) -> dict[str, Any]:
+    """Tables of a text, validated as TOML only.
+
+    Raises ValueError as `read_toml`, with a hint on a wrong value, which may be `quoted` in it.
+    """
+    for name, count in Counter(_LISTED.findall(text)).items():
+        check_length(name, count)  # to parse so many would take long
     try:
         content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # RecursionError: lists nested without end
-        hint = _hint(text, str(error)) if below is None else ""  # quotes nothing of other files
-        raise ValueError(f"{path}: not valid TOML: {error}{hint}") from None
+        hint = _hint(text, str(error)) if quoted else ""
+        raise ValueError(f"not valid TOML: {error}{hint}") from None
     if _depth_exceeds(content, MAX_DEPTH):
-        raise ValueError(f"{path}: tables or lists are nested more than {MAX_DEPTH} deep")
+        raise ValueError(f"tables or lists are nested more than {MAX_DEPTH} deep")
     return content
 
 

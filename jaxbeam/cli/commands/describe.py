@@ -9,7 +9,6 @@ from jaxbeam.cli.options import (
     DrawingOptions,
     OutputOptions,
     PrintOptions,
-    numbers_of,
     table,
 )
 
@@ -98,7 +97,7 @@ def _about_case(path: str) -> tuple[dict[str, Any], list[str]]:
     if found.critical_speed is not None:
         lines.append(f"critical speed: {_speed(found.critical_speed)}")
     lines += [*_load_times(case), *_sensor_words(case), f"plausibility: {found}"]
-    numbers = numbers_of(found) | {"frequencies_hz": frequencies}
+    numbers = jb.api.content(found) | {"frequencies_hz": frequencies}
     return {"case": numbers}, lines
 
 

@@ -4,7 +4,6 @@ import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import check_suffix
@@ -72,11 +71,8 @@ def simulate(
 
         look = {"title": pictures.title, "size": pictures.inches()}
         write_animation(record, animate, overwrite=options.overwrite, **look)
-    from jaxbeam.analysis.sections.record_amplification import record_amplification
-
-    derived = _Derived(record_amplification(record), _truncation_errors(record))
-    content = _to_dict(record, derived) | {"plausibility": plausibility}
-    lines = _lines(record, derived)
+    content = jb.api.content(record) | {"plausibility": plausibility}
+    lines = _lines(record, content["sensors"])
     for words in settlement_words(parsed_case):
         lines.append(f"{words}; sensors read changes from there")
     controller = parsed_case.controller
@@ -89,89 +85,18 @@ def simulate(
     options.report(content, lines, output, picture, animate)
 
 
-class _Derived(NamedTuple):
-    """What is computed from a record, by sensor; None where it is not known."""
-
-    amplification: Sequence[float | None]
-    truncation_errors: Sequence[float | None]
-
-
-def _to_dict(record: "jb.Record", derived: _Derived) -> dict:
-    """Numbers of a record by their names in JSON (SI units)."""
-    from jaxbeam.case.sensors import sensor_labels
-
-    sensors = record.case.sensors
-    peaks = zip(sensors, record.peak_deflection, strict=True)
-    content = {
-        "sensors": [
-            {"name": label, "quantity": s.quantity, "unit": s.unit, "position": s.position}
-            | extremes
-            | {"dynamic_amplification": factor, "step_error": steps, "truncation_error": modes}
-            for label, s, extremes, factor, steps, modes in zip(
-                sensor_labels(sensors),
-                sensors,
-                _extremes_of_sensors(record),
-                derived.amplification,
-                _known(record.step_errors),
-                derived.truncation_errors,
-                strict=True,
-            )
-        ],
-        # None at sensors of other quantities.
-        "peak_deflection": [peak if s.quantity == "deflection" else None for s, peak in peaks],
-        "lowest_contact_force": record.lowest_contact_force,
-        "largest_contact_force": record.contact_force.max(axis=0),
-        "wheel_unloading": jb.wheel_unloading(record),
-        "contact_lost_time": record.contact_lost_time,
-        "error_estimate": record.error_estimate,
-        "steps": record.steps,
-    }
-    ride = _ride(record)
-    if ride is not None:
-        content["ride"] = {
-            "body": ride.bodies,
-            "weighted_rms": ride.weighted_rms,
-            "vibration_dose": ride.vibration_dose,
-            "sperling_index": ride.sperling_index,
-        }
-    if record.case.controller is not None:
-        content |= {
-            "peak_command": record.peak_command,
-            "effort": record.effort,
-            "saturated": record.saturated.mean(axis=0),
-        }
-    return content | {"verdict": record.verdict}
-
-
-def _truncation_errors(record: "jb.Record") -> list[float | None]:
-    """What the modes left out change at each sensor; None where it is not known."""
-    if record.case.controller is not None:
-        return [None] * len(record.case.sensors)
-    return _known(record.truncation_errors)
-
-
-def _known(errors) -> list[float | None]:
-    """Errors, None for those that are not known."""
-    return [float(error) if error == error else None for error in errors]
-
-
-def _extremes_of_sensors(record: "jb.Record") -> list[dict[str, float]]:
-    """Smallest and largest value of each sensor and their times, by name."""
-    names, columns = zip(*record.extremes._asdict().items(), strict=True)
-    return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
-
-
 def _wheel_lines(record: "jb.Record") -> list[str]:
     """Table of contact forces by wheel; of loads of many wheels those with an extreme."""
     import numpy as np
 
+    from jaxbeam.analysis.ride import wheel_unloading
     from jaxbeam.model.load_set import load_set
     from jaxbeam.simulation.labels import wheel_labels
 
     loads, labels = load_set(record.case), wheel_labels(record.case)
     static, lowest = np.asarray(loads.weight)[:, 0], np.asarray(record.lowest_contact_force)
     largest = np.max(record.contact_force, axis=0, initial=0.0)
-    unloading = np.asarray(jb.wheel_unloading(record))
+    unloading = np.asarray(wheel_unloading(record))
     load_of_wheel, rows = np.array(loads.load_of_wheel), []
     for load in np.unique(load_of_wheel):
         wheels = np.flatnonzero(load_of_wheel == load)
@@ -220,7 +145,7 @@ def _body_lines(record: "jb.Record") -> list[str]:
     motion = np.max(np.abs(record.body_displacement), axis=0)
     shaking = np.max(np.abs(record.body_acceleration), axis=0)
     columns = {name: [motion[i], shaking[i]] for i, name in enumerate(names)}
-    ride = _ride(record)
+    ride = jb.api.ride_of(record)
     if ride is not None:
         measures = ride.weighted_rms, ride.vibration_dose, ride.sperling_index
         for name, *values in zip(ride.bodies, *measures, strict=True):
@@ -239,41 +164,29 @@ def _body_lines(record: "jb.Record") -> list[str]:
     return table(header, rows)
 
 
-def _ride(record: "jb.Record") -> "jb.RideMeasures | None":
-    """Ride measures of the bodies, None without any or with too few samples a second for them."""
-    if not record.bodies or float(record.case.run.sample_rate) < 160:
-        return None
-    return jb.ride_measures(record)
-
-
-def _lines(record: "jb.Record", derived: _Derived) -> list[str]:
-    sensors = record.case.sensors
+def _lines(record: "jb.Record", sensors: Sequence[dict]) -> list[str]:
+    """Verdict and tables of a record, whose sensors are given as `jb.api.content` has them."""
     rows = [
         (
-            sensor.name or str(i),
-            f"{sensor.position:.4g}",
-            f"{sensor.quantity} ({sensor.unit})" if sensor.unit != "1" else sensor.quantity,
-            *(f"{extremes[name]:.6g}" for name in ("smallest", "smallest_time")),
-            *(f"{extremes[name]:.6g}" for name in ("largest", "largest_time")),
+            record.case.sensors[i].name or str(i),
+            f"{sensor['position']:.4g}",
+            sensor["quantity"] + (f" ({sensor['unit']})" if sensor["unit"] != "1" else ""),
+            *(f"{sensor[name]:.6g}" for name in ("smallest", "smallest_time")),
+            *(f"{sensor[name]:.6g}" for name in ("largest", "largest_time")),
         )
-        for i, (sensor, extremes) in enumerate(
-            zip(sensors, _extremes_of_sensors(record), strict=True)
-        )
+        for i, sensor in enumerate(sensors)
     ]
     header = ("sensor", "position (m)", "quantity", "smallest", "at (s)", "largest", "at (s)")
-    errors = {
-        "error of steps": _known(record.step_errors),
-        "error of truncation": derived.truncation_errors,
-    }
-    for name, shares in errors.items():
-        if any(share is not None for share in shares):
-            header = (*header, name)
-            words = ("-" if share is None else f"{share:.1e}" for share in shares)
+    for title, name, digits in (
+        ("error of steps", "step_error", ".1e"),
+        ("error of truncation", "truncation_error", ".1e"),
+        ("dynamic amplification", "dynamic_amplification", ".4g"),
+    ):
+        values = [sensor[name] for sensor in sensors]
+        if any(value is not None for value in values):
+            header = (*header, title)
+            words = ("-" if value is None else f"{value:{digits}}" for value in values)
             rows = [(*row, word) for row, word in zip(rows, words, strict=True)]
-    if any(factor is not None for factor in derived.amplification):
-        header = (*header, "dynamic amplification")
-        factors = ("-" if factor is None else f"{factor:.4g}" for factor in derived.amplification)
-        rows = [(*row, factor) for row, factor in zip(rows, factors, strict=True)]
     lines = [
         record.verdict,
         *table(header, rows),

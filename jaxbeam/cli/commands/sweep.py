@@ -116,20 +116,8 @@ def sweep(
         look = {"title": pictures.title, "labels": labels}
         figure = plot_sweep(results, ax=pictures.page(), **look)
         pictures.save(figure, picture)
-    values = {address: results[address].values.tolist() for address in values}  # in SI units
-    peaks = {str(name): results[name] for name in results if str(name).startswith("peak_")}
-    del peaks["peak_time"]
-    numbers = {name: found.values for name, found in peaks.items()}
-    dimensions = results["peak_time"].dims
     options.report(
-        {
-            "values": values,
-            "dimensions": dimensions,
-            "failed_runs": int(results.failed.sum()),
-            "error_estimate": float(results.error_estimate),
-            **numbers,
-            "plausibility": plausibility,
-        },
+        jb.api.content(results) | {"plausibility": plausibility},
         _lines(parsed_case, results, list(values)),
         output,
         picture,

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import jaxbeam as jb
-from jaxbeam.cli.options import CaseOptions, numbers_of, print_warnings
+from jaxbeam.cli.options import CaseOptions, print_warnings
 
 
 def check(case: Path, /, *, options: CaseOptions = CaseOptions()) -> None:
@@ -18,4 +18,4 @@ def check(case: Path, /, *, options: CaseOptions = CaseOptions()) -> None:
     print_warnings(found)
     number = len(found.warnings)
     words = "nothing looks wrong" if not number else f"{number} warning{'s' * (number > 1)}"
-    options.report(numbers_of(found), [f"plausibility: {found}", words])
+    options.report(jb.api.content(found), [f"plausibility: {found}", words])
