@@ -6,14 +6,19 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
+from numpy.polynomial import chebyshev
 
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.profiles.base import AbstractProfile, Heights
 from jaxbeam.case.profiles.smooth_step import smooth_step
-from jaxbeam.runtime.arrays import Array, checkpoint, scan, xp, zeros
+from jaxbeam.runtime.arrays import Array, checkpoint, is_known, scan, xp, zeros
 
 DIRECT_SIZE = 100_000  # cosines that are computed at once; more than these wave by wave
 BLOCK = 16  # waves at once then: memory does not grow with their number
+# Of known numbers the sum is interpolated on panels of so many rad of its shortest wave, with so
+# many Chebyshev points each: their series of a cosine ends at J_24(4) = 2e-17.
+PANEL_PHASE, PANEL_POINTS = 8.0, 24
+POSITIONS_AT_ONCE = 4096
 
 
 class AbstractSpectralProfile(AbstractProfile):
@@ -69,6 +74,12 @@ def sum_of_cosines(
     count = wavenumbers.shape[0]
     if x.size * count <= DIRECT_SIZE:
         return _sum_at_once(x, *waves)
+    if all(map(is_known, (x, *waves))):
+        half = 0.5 * PANEL_PHASE / (2 * np.pi * np.max(np.abs(wavenumbers)))
+        with np.errstate(all="ignore"):  # of positions that are not finite
+            panels = np.ptp(x) / (2 * half)
+        if 2 * PANEL_POINTS * (1 + panels) <= x.size:
+            return _interpolated_sum(x, waves, half)
     padding = np.zeros(-count % BLOCK)
     blocks = tuple(xp.concatenate([wave, padding]).reshape(-1, BLOCK) for wave in waves)
     sum_of_block = checkpoint(_sum_at_once, jax.checkpoint_policies.nothing_saveable)
@@ -87,6 +98,33 @@ def _sum_at_once(x, wavenumbers, amplitudes, phases) -> Heights:
     angles = x[..., None] * k + phases
     even = xp.cos(angles) @ xp.stack([amplitudes, -amplitudes * k**2], axis=1)
     return even[..., 0], xp.sin(angles) @ (-amplitudes * k), even[..., 1]
+
+
+def _interpolated_sum(x: np.ndarray, waves, half: float) -> Heights:
+    """The same at many known positions, interpolated on panels of a `half` length (m).
+
+    The waves at the Chebyshev points of all panels are products of those at their centres and of
+    those at the points of one: few cosines, and products of matrices.
+    """
+    wavenumbers, amplitudes, phases = waves
+    k, first = 2 * np.pi * wavenumbers, np.min(x)
+    panel = ((x - first) / (2 * half)).astype(int).ravel()
+    centres = first + half * (2 * np.arange(panel.max() + 1) + 1)
+    at_centres = np.exp(1j * (centres[:, None] * k + phases))
+    at_points = np.exp(1j * half * np.outer(k, chebyshev.chebpts1(PANEL_POINTS)))
+    factors = (amplitudes, 1j * k * amplitudes, -(k**2) * amplitudes)
+    values = np.stack([((at_centres * one) @ at_points).real for one in factors], axis=2)
+    points = chebyshev.chebvander(chebyshev.chebpts1(PANEL_POINTS), PANEL_POINTS - 1)
+    series = np.where(np.arange(PANEL_POINTS) == 0, 1.0, 2.0)[:, None] / PANEL_POINTS * points.T
+    series = series @ values
+    local = (x.ravel() - centres[panel]) / half
+    found = np.empty((x.size, 3))
+    for start in range(0, x.size, POSITIONS_AT_ONCE):
+        here = slice(start, start + POSITIONS_AT_ONCE)
+        table = chebyshev.chebvander(local[here], PANEL_POINTS - 1)
+        found[here] = (table[:, None] @ series[panel[here]])[:, 0]
+    height, slope, curvature = found.T.reshape(3, *x.shape)
+    return height, slope, curvature
 
 
 def _switched(x, switch_on, heights) -> Heights:

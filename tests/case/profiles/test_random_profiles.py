@@ -173,6 +173,20 @@ def test_many_waves_are_summed_by_blocks():
     assert_allclose(gradient, np.cos(angles).sum(axis=1), rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.parametrize("shape", [(3, 4000), (40, 50, 6)])
+def test_sums_at_close_positions_are_interpolated(shape):
+    """Equal to the plain sum to rounding, at both ends of the panels too, derivatives too."""
+    rng = np.random.default_rng(2)
+    n, amplitudes, phases = np.geomspace(0.01, 3.0, 80), rng.normal(size=80), rng.uniform(0, 6, 80)
+    x = rng.uniform(-30.0, 40.0, shape)
+    angles = 2 * np.pi * n * x[..., None] + phases
+    k = 2 * np.pi * n
+    parts = np.cos(angles), -k * np.sin(angles), -(k**2) * np.cos(angles)
+    for found, part in zip(sum_of_cosines(x, n, amplitudes, phases), parts, strict=True):
+        expected = part @ amplitudes
+        assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
 def test_profiles_are_batched():
     """Over the roughness of a road, as a sweep does."""
     profile, x = jb.ISO8608Profile("A", 5), np.linspace(0.0, 10.0, 7)
