@@ -59,8 +59,9 @@ def _count_below(omega: float, members: list, springs: np.ndarray, free: np.ndar
     starts = 2 * np.append(0, np.cumsum(pieces))  # degrees of freedom (deflection, slope) per node
     stiffness = np.zeros((starts[-1] + 2, starts[-1] + 2))
     for k, n, start, (length, rigidity, _) in zip(wave, pieces, starts, members, strict=False):
+        piece = _piece(k * length / n, length / n, rigidity)
         for at in range(int(start), int(start) + 2 * n, 2):
-            stiffness[at : at + 4, at : at + 4] += _piece(k * length / n, length / n, rigidity)
+            stiffness[at : at + 4, at : at + 4] += piece
     ends = (starts[:, None] + [0, 1]).ravel()  # degrees of freedom with springs and restraints
     np.add.at(stiffness, (ends, ends), springs)
     kept = np.setdiff1d(np.arange(len(stiffness)), np.delete(ends, free))
