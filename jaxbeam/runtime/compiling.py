@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.runtime import compile_cache
+from jaxbeam.runtime.interpreter import Program, compile_cost, run_cost
 from jaxbeam.runtime.program_key import program_name
 
 # XLA's newer code generator for CPUs takes twice as long to compile the programs here, and its
@@ -329,10 +330,12 @@ def _program_of(
     with_options: bool,
     mapped: tuple[int | None, ...] = (),
 ) -> Callable:
-    """Compiled function of constants and numbers, from its equations.
+    """Function of constants and numbers, from its equations.
 
     With an `order` above zero its last output are the slopes of the other real ones, the first
     axis that of the numbers. `mapped` are the axes of the numbers of a batch, if they are of one.
+    Part of another program, or `with_options` for compilation one of its own, which is compiled
+    once that has become cheaper than to compute it in NumPy.
     """
 
     def program(constants, numbers):
@@ -344,7 +347,28 @@ def _program_of(
         return (jax.vmap(values, (list(mapped),)) if mapped else values)(numbers)
 
     options = {"compiler_options": xla_options()} if with_options else {}
-    return jax.jit(_renamed(program, name), **options)
+    jitted = jax.jit(_renamed(program, name), **options)
+    return _InterpretedFirst(jitted) if with_options else jitted
+
+
+class _InterpretedFirst:
+    """A function under `jax.jit`, computed in NumPy as long as that takes less time altogether."""
+
+    def __init__(self, jitted):
+        self.jitted, self.spent, self.traced, self.program = jitted, 0.0, None, None
+
+    def __call__(self, *args):
+        if self.traced is None:
+            self.traced = self.jitted.trace(*args)
+            self.cost = run_cost(self.traced.jaxpr.jaxpr)
+            self.price = compile_cost(self.traced.jaxpr.jaxpr)
+        self.spent += self.cost
+        if self.spent > self.price:
+            return self.jitted(*args)
+        self.program = self.program or Program(self.traced.jaxpr)
+        found = self.program(*jax.tree.leaves(args))
+        structure = jax.tree.structure(self.traced.out_info)
+        return structure.unflatten(map(jnp.asarray, found))
 
 
 def _with_slopes(values: Callable) -> Callable:

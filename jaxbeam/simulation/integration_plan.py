@@ -271,8 +271,16 @@ def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> Integr
 def sample_times(case: Case) -> Float[Array, " time"]:
     """Times (s) of the samples of a run: from 0 to its duration at its sample rate.
 
-    A run too short for a second sample has one at its end. Raises ValueError if there are more than
-    MAX_SAMPLES, or of all sensors together than MAX_SAMPLED.
+    A run too short for a second sample has one at its end. Raises ValueError as `sample_count`.
+    """
+    return times_of_samples(case, sample_count(case))
+
+
+def sample_count(case: Case) -> int:
+    """Number of samples of a run, from its duration and its sample rate.
+
+    Raises ValueError if there are more than MAX_SAMPLES, or of all sensors together than
+    MAX_SAMPLED.
     """
     duration, rate = float(concrete(case.run.duration)), float(concrete(case.run.sample_rate))
     channels = max(1, len(case.sensors))
@@ -283,10 +291,14 @@ def sample_times(case: Case) -> Float[Array, " time"]:
             f"run.duration ({duration:g} s) and run.sample_rate ({rate:g} Hz) make"
             f" {duration * rate:.3g} samples{of_sensors}, more than {limit:.0e}: lower one of them"
         )
-    intervals = int(np.floor(duration * rate * (1 + 1e-12)))
-    if not intervals:
+    return int(np.floor(duration * rate * (1 + 1e-12))) + 1
+
+
+def times_of_samples(case: Case, count: int) -> Float[Array, " time"]:
+    """Times (s) of so many samples of a run; 0 and the end of one too short for a second."""
+    if count == 1:
         return xp.stack([xp.zeros(()), xp.asarray(case.run.duration)])
-    return xp.arange(intervals + 1) / case.run.sample_rate
+    return xp.arange(count) / case.run.sample_rate
 
 
 def _choose_substeps(

@@ -47,7 +47,9 @@ from jaxbeam.simulation.integration_plan import (
     integration_plan,
     run_schedule,
     runs_compiled,
+    sample_count,
     sample_times,
+    times_of_samples,
 )
 from jaxbeam.simulation.motion.at_samples import motion_at
 from jaxbeam.simulation.record import Record, Result
@@ -130,7 +132,8 @@ def is_concrete_tree(tree) -> bool:
 
 def simulate_planned(case: Case, plan: IntegrationPlan, times, tolerance: float, inside) -> Record:
     """Record of a run by a plan, whose error is added; whether its numbers are `inside` ranges."""
-    times = sample_times(case) if times is None else xp.asarray(times, float)
+    # Their number, so that a program of a traced run has its two numbers, not all times.
+    times = sample_count(case) if times is None else xp.asarray(times, float)
     return _with_warning(_run(case, plan, times, tolerance, inside))
 
 
@@ -246,6 +249,7 @@ def _simulate_first(case: Case, plan: IntegrationPlan, times, policy):
 def _simulate_record(
     case: Case, plan: IntegrationPlan, times, errors, tolerance: float, inside
 ) -> Record:
+    times = times_of_samples(case, times) if isinstance(times, int) else times
     monitored = monitored_sensors(case.sensors)
     record = _record(case, run_integration(case, plan, times, monitored), times)
     return _with_result(record, errors, tolerance, inside)

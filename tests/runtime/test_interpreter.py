@@ -1,0 +1,258 @@
+"""Programs in NumPy, equation by equation, against the same programs compiled by XLA."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from numpy.testing import assert_allclose
+
+from jaxbeam.runtime import interpreter
+from jaxbeam.runtime.interpreter import Program, compile_cost, run_cost
+from jaxbeam.runtime.lapack import _solve as solve
+
+RANDOM = np.random.default_rng(20)
+A, B = RANDOM.normal(size=(2, 3, 4)), RANDOM.normal(size=(2, 3, 4))
+SQUARE = RANDOM.normal(size=(4, 3, 3)) + 3 * np.eye(3)
+FLAT, WHERE = RANDOM.normal(size=6), np.array([[4, 0], [-7, 9], [2, 2]])
+WHOLE, BITS = np.array([7, -7, 3]), np.array([True, False, True])
+
+
+@jax.custom_vjp
+def optimized(x):
+    return jnp.square(x)
+
+
+optimized.defvjp(lambda x: (x**2, x), lambda x, slope: 2 * x * slope)
+
+FUNCTIONS = {
+    "arithmetic": (lambda a, b: jnp.sign(a) * abs(b) - a / b + jnp.maximum(a, b) % 0.3, A, B),
+    "whole numbers": (lambda a: [lax.div(a, 2), lax.rem(a, 2), a**3, -a, jnp.sum(a)], WHOLE),
+    "bits": (lambda a, b: [a & b, a | b, a ^ b, ~a, jnp.sum(a)], BITS, BITS[::-1]),
+    "bits of numbers": (lambda a: [a & 6, ~a, a == 7, a >= 3, a <= 3], WHOLE),
+    "powers": (lambda a: [a**2, a**-3, a**5, abs(a) ** 1.7, jnp.exp2(a), lax.rsqrt(a**2)], A),
+    "angles": (
+        lambda a: [
+            jnp.arcsin(a / 9),
+            jnp.arccos(a / 9),
+            jnp.sin(a),
+            jnp.cos(a),
+            jnp.tan(a),
+            jnp.arctan2(a, 2.0),
+            jnp.arctan(a),
+        ],
+        A,
+    ),
+    "hyperbolic": (
+        lambda a: [
+            jnp.tanh(a),
+            jnp.sinh(a),
+            jnp.cosh(a),
+            jnp.arcsinh(a),
+            jnp.arctanh(a / 9),
+            jnp.arccosh(2 + a**2),
+        ],
+        A,
+    ),
+    "logarithms": (
+        lambda a: [jnp.log1p(a**2), jnp.log(abs(a)), jnp.expm1(a), jnp.cbrt(a), jnp.sqrt(abs(a))],
+        A,
+    ),
+    "rounding": (lambda a: [jnp.floor(a), jnp.ceil(a), jnp.isfinite(1 / (a - a)), a + 0], A),
+    "choices": (
+        lambda a: [jnp.where(a > 0, a, 0.0), jnp.clip(a, -0.5, 0.5), lax.select_n(a > 1, a, -a)],
+        A,
+    ),
+    "one of three": (lambda a, k: lax.select_n(k, a, 2 * a, 3 * a), FLAT[:3], np.array([2, 0, 1])),
+    "complex numbers": (
+        lambda a: [(lax.complex(a, 2 * a) ** 2).real, jnp.conj(lax.complex(a, a)).imag],
+        A,
+    ),
+    "types": (lambda a: [a.astype(int), a.astype(bool), (1j * a).real], 3 * A),
+    "shapes": (
+        lambda a: [a.T, a[:, ::-1], a[1, ::2, 1:3], a.reshape(4, -1), jnp.squeeze(a[:1])],
+        A,
+    ),
+    "parts": (
+        lambda a, b: [jnp.stack([a, b]), jnp.concatenate([a, b], 1), jnp.split(a, [1, 2], axis=1)],
+        A,
+        B,
+    ),
+    "repeats": (lambda a: [jnp.tile(a, (1, 2, 1)), jnp.broadcast_to(a[:, None], (2, 5, 3, 4))], A),
+    "padding": (
+        lambda a: [
+            lax.pad(a, 1.0, [(1, 0, 2), (0, -1, 0)]),
+            lax.pad(a, 0.0, [(-1, 2, 1), (0,) * 3]),
+        ],
+        A[0],
+    ),
+    "counting": (lambda a: a * jnp.arange(4) + lax.broadcasted_iota(int, (3, 4), 0), A),
+    "products": (
+        lambda a, b: [
+            jnp.einsum("abc,abd->cd", a, b),
+            jnp.einsum("abc,dbc->bad", a, b),
+            jnp.tensordot(a, b, 3),
+            a[0] @ b[0].T,
+        ],
+        A,
+        B,
+    ),
+    "products of nothing": (lambda a: jnp.einsum("ab,bc->ac", a[:, :0], a[:0]), A[0]),
+    "sums": (
+        lambda a: [a.sum((0, 2)), a.prod(1), a.max(), a.min(0), (a > 0).any(1), (a > 0).all()],
+        A,
+    ),
+    "running sums": (
+        lambda a: [
+            jnp.cumsum(a, 1),
+            lax.cumsum(a, 2, True),
+            jnp.cumprod(a, 0),
+            lax.cummax(a, 1),
+            lax.cummin(a),
+        ],
+        A,
+    ),
+    "positions": (
+        lambda a: [jnp.argmax(a, 1), jnp.argmin(a, 2), jnp.argmax(a.at[0].set(jnp.nan))],
+        A,
+    ),
+    "order": (lambda a: [jnp.sort(a, 1), jnp.argsort(a, 0), lax.sort((a, -a), num_keys=2)], A),
+    "entries": (
+        lambda a, i: [a[i], a[i, 1], a[:, [0, 2]], jnp.take(a, i, mode="clip")],
+        A[0],
+        WHERE,
+    ),
+    "entries or none": (
+        lambda a, i: [a.at[i].get(mode="fill"), a.at[i, 1:3].get(mode="fill", fill_value=2.0)],
+        A[0],
+        WHERE,
+    ),
+    "whole entries or none": (
+        lambda a, i: [a.at[i].get(mode="fill"), (a > 0).at[i].get(mode="fill")],
+        WHOLE,
+        WHERE,
+    ),
+    "entries along an axis": (
+        lambda a, i: [
+            jnp.take_along_axis(a, i, axis=0),
+            jax.vmap(lambda own, at: own[at])(a, i),
+        ],
+        A[0],
+        np.array([[0, 1, 2, 1], [2, 2, 0, 0], [1, 0, 1, 2]]),
+    ),
+    "set entries": (
+        lambda a, i: [
+            a.at[i[0]].set(0.0),
+            a.at[i, 1].add(2.0),
+            a.at[i, 1:3].multiply(2.0),
+            a.at[:, 1].set(a[:, 0]),
+            a.at[i[:, 0]].max(a[:3] + 1),
+            a.at[i].min(0.0, mode="drop"),
+            a.at[1].set(7.0),
+        ],
+        A[0],
+        WHERE,
+    ),
+    "set entries of a batch": (
+        jax.vmap(lambda a, i: a.at[i].add(a[i], mode="drop")),
+        A[0],
+        np.array([[0, 1], [9, 1], [2, 2]]),
+    ),
+    "windows": (
+        lambda a, i: [
+            lax.dynamic_slice(a, (i, 2), (2, 2)),
+            lax.dynamic_update_slice(a, a[:2, :2] + 1, (i, 9)),
+            jax.vmap(lambda at: lax.dynamic_slice(a, (at, 0), (2, 3)))(jnp.arange(3) + i - i),
+        ],
+        A[0],
+        np.array(1),
+    ),
+    "factors": (
+        lambda m: [jnp.linalg.cholesky(m @ m.mT), jnp.linalg.eigh(m + m.mT)[0]],
+        SQUARE,
+    ),
+    "no factor": (lambda m: jnp.linalg.cholesky(-m @ m.mT), SQUARE[0]),
+    "systems": (
+        lambda m: [
+            jnp.linalg.solve(m[0], m[1]),
+            lax.linalg.triangular_solve(m, m, left_side=True, lower=True, transpose_a=True),
+            lax.linalg.triangular_solve(m, m, unit_diagonal=True),
+        ],
+        SQUARE,
+    ),
+    "loops": (
+        lambda a: [
+            lax.scan(lambda sum_, x: (sum_ + x, sum_ * x), 0.0, a),
+            lax.scan(lambda sum_, x: (sum_ - x, None), 1.0, a, reverse=True),
+            lax.fori_loop(0, 5, lambda i, x: x * 0.5 + i, a),
+            lax.while_loop(lambda x: x.sum() < 10, lambda x: x + 1, a),
+        ],
+        FLAT,
+    ),
+    "branches": (
+        lambda a: [
+            lax.cond(a[0] > 0, jnp.sin, jnp.cos, a),
+            lax.cond(a[0] < 0, jnp.sin, jnp.cos, a),
+            lax.switch(7, [jnp.sin, jnp.cos], a),
+            lax.platform_dependent(a, cpu=jnp.sin, default=jnp.cos),
+        ],
+        FLAT,
+    ),
+    "other programs": (
+        lambda a: [
+            jax.jit(jnp.sin)(a),
+            jax.checkpoint(jnp.cos)(a),
+            jax.nn.relu(a),
+            lax.exp(a),
+            solve(np.eye(6), a),
+            optimized(a),
+            jnp.copy(a),
+            lax.stop_gradient(a),
+            lax.optimization_barrier(a),
+        ],
+        FLAT,
+    ),
+    "random numbers": (lambda seed: jax.random.normal(jax.random.key(seed), (3,)), np.array(3)),
+    "a derivative": (
+        jax.grad(lambda a: jnp.linalg.solve(jnp.outer(a, a) + jnp.eye(6), a)[0]),
+        FLAT,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_each_primitive_is_that_of_xla(name):
+    function, *arrays = FUNCTIONS[name]
+    expected = jax.tree.leaves(jax.jit(function)(*arrays))
+    found = Program(jax.make_jaxpr(function)(*arrays))(*arrays)
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        assert_allclose(one, other, rtol=1e-12, atol=1e-13)
+        assert np.shape(one) == other.shape
+        assert np.asarray(one).dtype == other.dtype
+
+
+def test_all_rules_are_tested():
+    tested = set()
+
+    def note(jaxpr):
+        tested.update(equation.primitive.name for equation in jaxpr.eqns)
+        for equation in jaxpr.eqns:
+            for part in interpreter._programs_of(equation):
+                note(part)
+
+    for function, *arrays in FUNCTIONS.values():
+        note(jax.make_jaxpr(function)(*arrays).jaxpr)
+    rules = {*interpreter.ELEMENTWISE, *interpreter.WITH_PARAMETERS, *interpreter.OPENED}
+    assert rules <= tested
+
+
+def test_costs_are_those_of_all_trips():
+    def loop(count):
+        def function(x):
+            return lax.scan(lambda y, _: (jnp.sin(y), None), x, None, count)[0]
+
+        return jax.make_jaxpr(function)(1.0).jaxpr
+
+    assert run_cost(loop(100)) > 40 * run_cost(loop(2))
+    assert compile_cost(loop(100)) == compile_cost(loop(2))
