@@ -76,18 +76,9 @@ from .control.load_identification import (
     LoadIdentification as LoadIdentification,
     identified_load as identified_load,
 )
-from .control.optimal.crossing_lqr import (
-    AugmentedLQR as AugmentedLQR,
-    FiniteLQR as FiniteLQR,
-    StepLQR as StepLQR,
-)
 from .control.optimal.h_infinity import HInfinity as HInfinity
-from .control.optimal.integral_lqr import IntegralLQR as IntegralLQR
 from .control.optimal.lqr import LQR as LQR
-from .control.optimal.position_lqr import PositionLQR as PositionLQR
-from .control.optimal.sampled_lqr import DiscreteLQR as DiscreteLQR
 from .control.optimal.sampling_loss import sampling_limit as sampling_limit
-from .control.optimal.scheduled_lqr import ScheduledLQR as ScheduledLQR
 from .control.output_feedback import OutputFeedback as OutputFeedback
 from .control.predictive.adaptive_gpc import AdaptiveGPC as AdaptiveGPC
 from .control.predictive.gpc import GPC as GPC

@@ -264,10 +264,12 @@ NOISE = {"process_noise": 0.02, "measurement_noise": 1e-4}
 PREDICTIVE = {"horizon": 4, "moves": 2, "move_weight": 1e-7, "period": 0.005, "positions": [0.5]}
 LAWS = {
     "feedback": jb.Feedback(gains=[2e3], period=0.005),
-    "LQR": jb.DiscreteLQR(**WEIGHTS),
-    "loads ignored by the filter": jb.DiscreteLQR(**WEIGHTS, estimator=jb.Kalman(**NOISE)),
-    "loads known by the filter": jb.DiscreteLQR(
-        **WEIGHTS, delay=0.001, estimator=jb.Kalman(**NOISE, loads="known")
+    "LQR": jb.LQR(**WEIGHTS, sampling="exact"),
+    "loads ignored by the filter": jb.LQR(
+        **WEIGHTS, estimator=jb.Kalman(**NOISE), sampling="exact"
+    ),
+    "loads known by the filter": jb.LQR(
+        **WEIGHTS, delay=0.001, estimator=jb.Kalman(**NOISE, loads="known"), sampling="exact"
     ),
     "weights estimated, fed forward": jb.MPC(
         **PREDICTIVE,

@@ -73,21 +73,35 @@ CONTROLLERS = {
     "lqr, Kalman filter, loads estimated": jb.LQR(
         **WEIGHTS, estimator=jb.Kalman(**NOISE, loads="estimated", weight_deviation=2.0)
     ),
-    "dlqr": jb.DiscreteLQR(**WEIGHTS),
-    "lqr-integral": jb.IntegralLQR(**WEIGHTS, integral_weight=[1e9], reference=[0.0]),
-    "lqr-step": jb.StepLQR(**FINITE_HORIZON),
-    "lqr-finite": jb.FiniteLQR(**FINITE_HORIZON),
-    "lqr-augmented": jb.AugmentedLQR(**FINITE_HORIZON),
-    "lqr-scheduled, load identified": jb.ScheduledLQR(
-        **FINITE_HORIZON, **SCHEDULE_GRID, load_identification=GATE_IDENTIFICATION
+    "lqr, exact sampling": jb.LQR(**WEIGHTS, sampling="exact"),
+    "lqr, integral action": jb.LQR(
+        **WEIGHTS, integral_weight=[1e9], reference=[0.0], sampling="exact"
     ),
-    "lqr-position, Kalman filter, loads known": jb.PositionLQR(
-        **FINITE_HORIZON, **SCHEDULE_GRID, estimator=jb.Kalman(**NOISE, loads="known")
+    "lqr, frozen plant": jb.LQR(**FINITE_HORIZON, horizon="frozen"),
+    "lqr over the crossing": jb.LQR(**FINITE_HORIZON, horizon="crossing"),
+    "lqr over the crossing, augmented": jb.LQR(
+        **FINITE_HORIZON, horizon="crossing", augmented="loads"
     ),
-    "lqr-position, extended Kalman filter": jb.PositionLQR(
+    "lqr, scheduled by the identified load": jb.LQR(
+        **FINITE_HORIZON,
+        **SCHEDULE_GRID,
+        load_identification=GATE_IDENTIFICATION,
+        horizon="crossing",
+        schedule="load",
+    ),
+    "lqr by positions, Kalman filter, loads known": jb.LQR(
+        **FINITE_HORIZON,
+        **SCHEDULE_GRID,
+        estimator=jb.Kalman(**NOISE, loads="known"),
+        horizon="crossing",
+        schedule="positions",
+    ),
+    "lqr by positions, extended Kalman filter": jb.LQR(
         **FINITE_HORIZON,
         **SCHEDULE_GRID,
         estimator=jb.ExtendedKalman(**NOISE, mass_deviation=0.1, speed_deviation=0.1),
+        horizon="crossing",
+        schedule="positions",
     ),
     "gpc": jb.GPC(**GPC),
     "gpc-adaptive": jb.AdaptiveGPC(**GPC, until=0.1, measurement_noise=1e-6),

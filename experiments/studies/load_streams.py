@@ -1,4 +1,4 @@
-"""AugmentedLQR for three masses on the beam: sensitivity of the peak to errors of prediction.
+"""Regulator with known weights for three masses: sensitivity of the peak to prediction errors.
 
 Beyond the thesis, whose augmented regulator (5.8) is designed for one mass. Here it is designed for
 three, and its gains follow the predicted entry times. These, or the predicted masses, are wrong by
@@ -45,7 +45,9 @@ def regulator(entry_time_error: float = 0.0, mass_error: float = 0.0) -> Abstrac
     design_model = DesignModel(
         mass=[MASS * (1 + mass_error)] * 3, entry_time=ENTRY_TIMES + entry_time_error
     )
-    return jb.AugmentedLQR(**WEIGHTS, design=design_model, entries="predicted")
+    return jb.LQR(
+        **WEIGHTS, design=design_model, entries="predicted", horizon="crossing", augmented="loads"
+    )
 
 
 def run(load_rig) -> ExperimentResult:
@@ -57,7 +59,7 @@ def run(load_rig) -> ExperimentResult:
         return jb.simulate(case, plan=plan_with_steps(case, STEPS))
 
     uncontrolled = simulated(None)
-    without_feedforward = simulated(jb.FiniteLQR(**WEIGHTS))
+    without_feedforward = simulated(jb.LQR(**WEIGHTS, horizon="crossing"))
 
     def peak_reduction(record) -> float:
         return float(

@@ -26,7 +26,7 @@ from jaxbeam.case.fields import (
     fits_shape,
     is_concrete,
 )
-from jaxbeam.case.former_words import WORDS
+from jaxbeam.case.former_words import KINDS, WORDS
 from jaxbeam.case.kinds import kinds
 from jaxbeam.case.limits import check_count, check_entries, check_length
 from jaxbeam.case.quantities import OF_QUANTITY
@@ -62,6 +62,9 @@ def suggestion(word: str, allowed: Iterable[str]) -> str:
     allowed = list(allowed)
     if WORDS.get(word) in allowed:
         return f"it is called {WORDS[word]!r} now"
+    kind, options = KINDS.get(word, (None, ""))
+    if kind in allowed:
+        return f"it is kind {kind!r} with {options} now"
     nearest = difflib.get_close_matches(word, allowed, n=1)
     return f"did you mean {nearest[0]!r}?" if nearest else f"it may be {', '.join(allowed)}"
 

@@ -8,6 +8,13 @@ NAMES = {  # of the package jaxbeam
     "Recognition": "LoadIdentification",
     "Relief": "InternalModel",
     "recognised": "identified_load",
+    "DiscreteLQR": "LQR(sampling='exact')",
+    "IntegralLQR": "LQR(sampling='exact', integral_weight=...)",
+    "StepLQR": "LQR(horizon='frozen')",
+    "FiniteLQR": "LQR(horizon='crossing')",
+    "AugmentedLQR": "LQR(horizon='crossing', augmented='loads')",
+    "ScheduledLQR": "LQR(horizon='crossing', schedule='load')",
+    "PositionLQR": "LQR(horizon='crossing', schedule='positions')",
 }
 WORDS = {  # kinds and keys of case files, parts of addresses
     "passage": "feedforward",
@@ -16,6 +23,15 @@ WORDS = {  # kinds and keys of case files, parts of addresses
     "places": "positions",
     "place_weight": "position_weight",
     "reach": "max_delay_periods",
+}
+KINDS = {  # that are options of another kind
+    "dlqr": ("lqr", 'sampling = "exact"'),
+    "lqr-integral": ("lqr", 'sampling = "exact"'),
+    "lqr-step": ("lqr", 'horizon = "frozen"'),
+    "lqr-finite": ("lqr", 'horizon = "crossing"'),
+    "lqr-augmented": ("lqr", 'horizon = "crossing" and augmented = "loads"'),
+    "lqr-scheduled": ("lqr", 'horizon = "crossing" and schedule = "load"'),
+    "lqr-position": ("lqr", 'horizon = "crossing" and schedule = "positions"'),
 }
 # Words of case files that attributes in Python cannot have, and those that they have; both stay.
 FILE_KEYS = {"class": "road_class", "heights": "point_heights"}

@@ -30,8 +30,8 @@ class ExtendedKalman(AbstractKalmanEstimator):
     start from those of the design (`controller.design` may give it others than the case has), with
     standard deviations `mass_deviation`, `speed_deviation` and `position_deviation`; the speed
     changes by a white acceleration of intensity `acceleration_noise`. What is known has deviation
-    zero. Laws whose tables are read by the positions of the loads, as `lqr-position`, take those of
-    the estimate; laws that feed forward weights take the estimated ones.
+    zero. Laws whose tables are read by the positions of the loads, as `lqr` with schedule
+    "positions", take those of the estimate; laws that feed forward weights take the estimated ones.
 
     With an uncertain entry and nearly exact readings the filter is too sure of its linearisation,
     and may stay at a wrong mass. State more `measurement_noise` than the sensors have there.

@@ -19,7 +19,7 @@ from jaxbeam.analysis.stability import _assignment, _tracked_branches, frozen_po
 from jaxbeam.analysis.stability_limits import stability_limit
 from jaxbeam.case.controller import AbstractSampledLaw, ControlStep
 from jaxbeam.control.design_model import DesignModel
-from jaxbeam.control.optimal.gain_schedules import GainSchedule
+from jaxbeam.control.optimal.crossing_gains import GainSchedule
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.gain_table import GainTable
 from tests.modules import DATA

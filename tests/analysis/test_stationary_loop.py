@@ -123,11 +123,12 @@ def observed_case(loads: str, nominal_force: float = FORCE) -> jb.Case:
     estimator = jb.Kalman(
         process_noise=0.1, measurement_noise=1e-5, loads=loads, weight_deviation=weight_deviation
     )
-    controller = jb.DiscreteLQR(
+    controller = jb.LQR(
         state_weight=[1e6, 1e6, 0.0, 0.0, 0.0],
         command_weight=[1e-2],
         period=PERIOD,
         estimator=estimator,
+        sampling="exact",
     )
     case = dataclasses.replace(lagging_case(), controller=controller)
     nominal = jb.state_space(jb.replace(case, {"actuators.0.force_per_volt": nominal_force}))

@@ -6,9 +6,7 @@ import jaxbeam as jb
 from jaxbeam.case.case import Run
 from jaxbeam.control.feedback import Feedback
 from jaxbeam.control.load_identification import LoadIdentification
-from jaxbeam.control.optimal.crossing_lqr import FiniteLQR
-from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
-from jaxbeam.control.optimal.scheduled_lqr import ScheduledLQR
+from jaxbeam.control.optimal.lqr import LQR
 from jaxbeam.control.output_feedback import OutputFeedback
 from jaxbeam.control.prescribed import Prescribed
 from jaxbeam.control.scheduled_feedback import ScheduledFeedback
@@ -147,7 +145,9 @@ CASES = {
     ),
     "state": rig(jb.StateFeedback(np.full((2, 5), 2.0), period=PERIOD)),
     "lqr-observer": rig(jb.LQR(**WEIGHTS, estimator=jb.Observer(speed=3.0))),
-    "dlqr-kalman": rig(DiscreteLQR(**WEIGHTS, delay=2e-3, estimator=KALMAN), sensors=FILTERED),
+    "dlqr-kalman": rig(
+        LQR(**WEIGHTS, delay=2e-3, estimator=KALMAN, sampling="exact"), sensors=FILTERED
+    ),
     "lqr-inversion": rig(jb.LQR(**WEIGHTS, estimator=jb.Inversion(1e-2), delay=2 * PERIOD)),
     "mpc": rig(jb.MPC(8, 3, [1e-10, 1e-10], estimator=KALMAN, period=PERIOD, delay=1e-3)),
     "gpc": rig(
@@ -163,8 +163,13 @@ CASES = {
         ],
     ),
     "compensation-kalman": rig(
-        DiscreteLQR(
-            [1e4, 1e2, 1.0, 0.1], [1e-2, 1e-2], period=PERIOD, delay=2e-3, estimator=KALMAN
+        LQR(
+            [1e4, 1e2, 1.0, 0.1],
+            [1e-2, 1e-2],
+            period=PERIOD,
+            delay=2e-3,
+            estimator=KALMAN,
+            sampling="exact",
         ),
         actuators=[
             jb.Patch(0.2, 0.3, 0.15, compensation=jb.Hysteresis([0.0, 0.1], [0.8, 0.3])),
@@ -313,16 +318,20 @@ DESIGNED_TABLES = {
         jb.MPC(3, 1, 1e-10, loads="known", estimator=KALMAN, period=PERIOD),
         **SHORT | {"loads": [jb.Oscillator(0.3, 900.0, 2.0, speed=15.0)]},
     ),
-    "lqr-finite": rig(FiniteLQR(**WEAK, points=60, after="fade", fade_time=0.02, estimator=KALMAN)),
+    "lqr-finite": rig(
+        LQR(**WEAK, points=60, after="fade", fade_time=0.02, estimator=KALMAN, horizon="crossing")
+    ),
     "lqr-scheduled": rig(
-        ScheduledLQR(
+        LQR(
             **WEIGHTS,
             masses=[0.2, 0.5],
             speeds=[2.0, 3.0],
             points=60,
-            loads="known",
+            augmented="loads",
             load_identification=LoadIdentification(gates=[-0.05, 0.05]),
             estimator=jb.Observer(speed=3.0),
+            horizon="crossing",
+            schedule="load",
         )
     ),
 }

@@ -9,9 +9,8 @@ import numpy as np
 import jaxbeam as jb
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.load_identification import LoadIdentification
-from jaxbeam.control.optimal.gain_schedules import GainSchedule
-from jaxbeam.control.optimal.position_lqr import PositionGainLaw
-from jaxbeam.control.optimal.scheduled_lqr import ScheduledGainLaw
+from jaxbeam.control.optimal.crossing_gains import GainSchedule
+from jaxbeam.control.optimal.load_tables import PositionGainLaw, ScheduledGainLaw
 from jaxbeam.control.predictive.prediction import SampledPlant
 from jaxbeam.control.predictive.preview import Preview
 from jaxbeam.control.state_law import SampledStateLaw, TrueState

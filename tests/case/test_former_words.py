@@ -1,7 +1,9 @@
 """Former words of case files, addresses, arguments and the package name the present ones."""
 
+import re
 import subprocess
 import sys
+import tomllib
 
 import pytest
 
@@ -10,6 +12,7 @@ from jaxbeam.case import former_words
 from jaxbeam.case.case import addresses
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.kinds import kinds
+from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict
 
 CASE = {
@@ -30,7 +33,9 @@ def test_present_words_exist():
     words, classes = former_words.WORDS, kinds(AbstractController)
     assert {words["passage"], words["relief"]} <= set(classes)
     assert not words.keys() & set(classes)
-    assert set(former_words.NAMES.values()) <= set(jb.__all__)
+    assert {name.partition("(")[0] for name in former_words.NAMES.values()} <= set(jb.__all__)
+    assert not former_words.KINDS.keys() & set(classes)
+    assert {kind for kind, _ in former_words.KINDS.values()} <= set(classes)
     assert not set(former_words.NAMES) & set(jb.__all__)
 
 
@@ -44,6 +49,20 @@ def test_former_words_are_refused():
         jb.ScheduledFeedback(masses=[0.2], gains=[[2e3]], period=0.01, recognition=None)
     with pytest.raises(TypeError, match="LQR has no places; it is called 'positions' now"):
         jb.LQR([1.0], [1.0], places=[0.3])
+
+
+@pytest.mark.parametrize(("old", "present"), former_words.KINDS.items())
+def test_former_kinds_are_options_of_others(old, present):
+    """Of which the case file is written as the sentence says."""
+    kind, options = present
+    message = re.escape(f"controller.kind cannot be {old!r}; it is kind {kind!r} with {options}")
+    weights = {"state_weight": [1e4, 1.0], "command_weight": [1e-3]}
+    with pytest.raises(ValueError, match=message):
+        with_controller(kind=old, **weights)
+    if kind == "lqr":
+        further = {"masses": [0.2, 0.4]} if "schedule" in options else {}
+        settings = tomllib.loads(options.replace(" and ", "\n"))
+        check_case(with_controller(kind=kind, **weights, **settings, **further))
 
 
 def test_former_addresses_are_refused():
@@ -60,7 +79,7 @@ def test_former_addresses_are_refused():
 
 @pytest.mark.parametrize(("old", "new"), former_words.NAMES.items())
 def test_former_names_of_the_package_are_refused(old, new):
-    with pytest.raises(AttributeError, match=f"jaxbeam.{old} is called jaxbeam.{new} now"):
+    with pytest.raises(AttributeError, match=re.escape(f"{old} is called jaxbeam.{new} now")):
         getattr(jb, old)
 
 

@@ -126,7 +126,7 @@ def test_errors_of_controllers(changes, message):
 
 TABLES = [
     ({"kind": "feedbak", "gains": [1.0]}, "controller.kind cannot be 'feedbak'; did you mean"),
-    ({"gains": [1.0]}, "controller.kind is missing; it may be dlqr, "),
+    ({"gains": [1.0]}, "controller.kind is missing; it may be feedback, "),
     ({"kind": "feedback", "gain": [1.0]}, "controller has no key 'gain'; did you mean 'gains'?"),
     ({"kind": "feedback"}, "controller.gains is missing; give the one gain for each actuator"),
     ({"kind": "feedback", "gains": 1.0}, "controller.gains must be a list of numbers, not 1.0"),

@@ -21,9 +21,7 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.cli import main
 from jaxbeam.control.feedback import Feedback
-from jaxbeam.control.optimal.crossing_lqr import FiniteLQR
-from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
-from jaxbeam.control.optimal.scheduled_lqr import ScheduledLQR
+from jaxbeam.control.optimal.lqr import LQR
 from jaxbeam.files.export import Gains, export_gains, read_gains, write_gains
 from jaxbeam.model.modes import mesh_layout
 
@@ -184,7 +182,7 @@ def shaker_case(controller):
 
 @pytest.fixture(scope="module")
 def sampled():
-    case = shaker_case(DiscreteLQR(**WEIGHTS, delay=1e-3))
+    case = shaker_case(LQR(**WEIGHTS, delay=1e-3, sampling="exact"))
     return case, export_gains(case)
 
 
@@ -206,7 +204,7 @@ def test_command_line_exports_the_designed_gains(sampled, tmp_path, capsys):
 
 
 def test_table_has_the_gains_of_the_design():
-    case = shaker_case(FiniteLQR(**WEIGHTS, points=210, after="hold"))
+    case = shaker_case(LQR(**WEIGHTS, points=210, after="hold", horizon="crossing"))
     gains, layout = export_gains(case, 51), mesh_layout(case)
 
     @eqx.filter_jit
@@ -224,7 +222,7 @@ def test_gain_family_gives_the_commands_of_the_controller(between, tmp_path):
     """Between masses of the grid, along the crossing, and during the decay after it."""
     end = {"terminal_weight": [1e3, 1e2, 0.1, 0.01, 1e-3], "after": "fade", "fade_time": 0.05}
     family = {"masses": [0.2, 0.4], "between": between, "loads": "known"}
-    controller = ScheduledLQR(**WEIGHTS, **end, **family, points=210)
+    controller = LQR(**WEIGHTS, **end, **family, points=210, horizon="crossing", schedule="load")
     case = jb.replace(shaker_case(controller), {"loads.0.mass": 0.25})
     write_gains(export_gains(case, 11), tmp_path / "gains.csv")
     gains, layout = read_gains(tmp_path / "gains.csv"), mesh_layout(case)

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
-from jaxbeam.control.optimal.crossing_lqr import FiniteLQR
+from jaxbeam.control.optimal.lqr import LQR
 
 SHARES = np.array([0.0, 0.123, 0.25, 0.377, 0.5, 0.61, 0.75, 0.9, 0.97, 0.9999])
 
@@ -21,7 +21,9 @@ def one_span():
         actuators=[shaker],
         loads=[jb.MovingMass(mass=0.509, speed=1.0)],
     )
-    return case, FiniteLQR([1000.0, 100.0, 0.1, 0.01, 0.0], [9e-5], coordinates="sine")
+    return case, LQR(
+        [1000.0, 100.0, 0.1, 0.01, 0.0], [9e-5], coordinates="sine", horizon="crossing"
+    )
 
 
 def two_spans():
@@ -36,7 +38,9 @@ def two_spans():
         patches,
         loads=[jb.MovingMass(mass=0.509, speed=2.0)],
     )
-    return case, FiniteLQR([1e6] * 2 + [10.0] * 2, [1e-3, 1e-3], terminal_weight=[1e4] * 4)
+    return case, LQR(
+        [1e6] * 2 + [10.0] * 2, [1e-3, 1e-3], terminal_weight=[1e4] * 4, horizon="crossing"
+    )
 
 
 @pytest.mark.parametrize("rig", [one_span, two_spans])
@@ -149,7 +153,7 @@ def test_gains_are_accurate_between_breakpoints_too(seven_modes, phase_step, err
         jb.Beam(0.6, RIGIDITY, DENSITY, 0.03, modes=7),
         actuators=[jb.PointForce(0.25)],
         loads=[jb.MovingMass(mass=MASS, speed=SPEED)],
-        controller=FiniteLQR(WEIGHTS, [COMMAND_WEIGHT], points=points),
+        controller=LQR(WEIGHTS, [COMMAND_WEIGHT], points=points, horizon="crossing"),
     )
     found = jax.jit(
         lambda: jax.vmap(case.controller.gain_table(jb.state_space(case)))(FINE_SHARES)

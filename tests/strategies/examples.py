@@ -83,19 +83,28 @@ WEIGHTS, PERIOD = controlled.WEIGHTS, controlled.PERIOD
 PREDICTIVE = {"horizon": 4, "moves": 2, "move_weight": 1e-9, "period": PERIOD}
 ONE_EACH = {"actuators": [jb.PointForce(0.3)], "sensors": [jb.Sensor(0.3)]}
 CONTROLLED |= {
-    "lqr-step": controlled.rig(jb.StepLQR(**WEIGHTS, points=60)),
+    "lqr-step": controlled.rig(jb.LQR(**WEIGHTS, points=60, horizon="frozen")),
     "lqr-augmented": controlled.rig(
-        jb.AugmentedLQR(**WEIGHTS, points=60, estimator=jb.MovingHorizon(0.02, 1e-5))
+        jb.LQR(
+            **WEIGHTS,
+            points=60,
+            estimator=jb.MovingHorizon(0.02, 1e-5),
+            horizon="crossing",
+            augmented="loads",
+        )
     ),
-    "lqr-position": controlled.rig(jb.PositionLQR(**WEIGHTS, masses=[0.3], points=60)),
+    "lqr-position": controlled.rig(
+        jb.LQR(**WEIGHTS, masses=[0.3], points=60, horizon="crossing", schedule="positions")
+    ),
     "lqr-integral": controlled.rig(
-        jb.IntegralLQR(
+        jb.LQR(
             [1e4, 1e2, 1.0, 0.1],
             [1e-4, 1e-3],
             positions=[0.3, 0.4],
             integral_weight=[1.0, 2.0],
             reference=[1e-4, 0.0],
             period=PERIOD,
+            sampling="exact",
         )
     ),
     "kalman-extended": controlled.rig(

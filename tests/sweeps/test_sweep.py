@@ -272,7 +272,7 @@ def test_other_errors_are_named():
 
 def test_each_run_has_the_controller_designed_for_its_loads():
     beam = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=1)
-    law = jb.StepLQR(state_weight=[1e3, 1.0], command_weight=[1e-2], points=40)
+    law = jb.LQR(state_weight=[1e3, 1.0], command_weight=[1e-2], points=40, horizon="frozen")
     case = jb.Case(
         beam, actuators=[jb.PointForce(0.3)], sensors=[jb.Sensor(0.3)],
         loads=[jb.MovingMass(mass=0.2, speed=2.0)], controller=law,

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.control.optimal.lqr import AbstractRegulator
+from jaxbeam.control.optimal.lqr import LQR
 from jaxbeam.files.report import text_table
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
@@ -86,7 +86,7 @@ def tune_reduced(
     1 of 2 states
     """
     controller = case.controller
-    if not isinstance(controller, AbstractRegulator):
+    if not isinstance(controller, LQR):
         raise ValueError("only regulators, such as kind 'lqr', have states to leave out")
     states = int(controller.state_weight.shape[0])
     if not 1 <= keep < states:

@@ -56,8 +56,8 @@ loads = "known"
 """
 CONTROLLERS = {
     "feedback": 'kind = "feedback"\ngains = [2e3, 2e3]\nperiod = 0.001\n',
-    "LQR": f'kind = "dlqr"{WEIGHTS}',
-    "LQR with Kalman filter": f'kind = "dlqr"{WEIGHTS}{KALMAN}',
+    "LQR": f'kind = "lqr"\nsampling = "exact"{WEIGHTS}',
+    "LQR with Kalman filter": f'kind = "lqr"\nsampling = "exact"{WEIGHTS}{KALMAN}',
     "MPC": 'kind = "mpc"\nhorizon = 6\nmoves = 4\nmove_weight = 1e-11\nloads = "known"\n'
     "period = 0.001\n",
 }

@@ -25,7 +25,11 @@ ALL_STATES, FIRST_MODE = [1.0] * 7, [1.0, 0, 0, 0, 0, 0, 0]
 STEPS_PER_SAMPLE = {jb.Shaker: 2, jb.Electrodynamic: 6}
 SENSOR = 1  # at 0.25 m
 NO_CONTROL = "no control"
-LAWS = {"time-invariant": jb.LQR, "time-varying": jb.FiniteLQR, "augmented": jb.AugmentedLQR}
+LAWS = {
+    "time-invariant": {},
+    "time-varying": {"horizon": "crossing"},
+    "augmented": {"horizon": "crossing", "augmented": "loads"},
+}
 
 
 class RegulatorInterpretation(NamedTuple):
@@ -59,7 +63,8 @@ def regulator(
     `kind` is a key of LAWS, `feedback` the share of each state that is fed back, and `damping`
     (N s/m) that of the suspension in the design, as in the plant if left out.
     """
-    return LAWS[kind](
+    return jb.LQR(
+        **LAWS[kind],
         state_weight=STATE_WEIGHTS,
         command_weight=[command_weight],
         feedback=feedback,

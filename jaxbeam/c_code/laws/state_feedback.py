@@ -13,9 +13,8 @@ from jaxbeam.c_code.writers import (
     write_load_source,
     write_state_law,
 )
-from jaxbeam.control.optimal.gain_schedules import GainSchedule
-from jaxbeam.control.optimal.position_lqr import PositionGainLaw
-from jaxbeam.control.optimal.scheduled_lqr import ScheduledGainLaw
+from jaxbeam.control.optimal.crossing_gains import GainSchedule
+from jaxbeam.control.optimal.load_tables import PositionGainLaw, ScheduledGainLaw
 from jaxbeam.control.sliding_mode import SlidingModeLaw
 from jaxbeam.control.state_law import GainLaw, SampledStateLaw
 

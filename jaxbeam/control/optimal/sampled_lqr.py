@@ -1,14 +1,11 @@
-"""Discrete linear-quadratic regulator: commands are held from sample to sample."""
+"""Regulators designed for commands that are held from sample to sample, with integral action."""
 
-from typing import ClassVar
-
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.fields import NOT_NEGATIVE, concrete, is_concrete, number
-from jaxbeam.control.optimal.lqr import AbstractRegulator
-from jaxbeam.control.state_law import GainLaw
-from jaxbeam.estimation.sampled_plant import sample_timing
+from jaxbeam.case.controller import ControlStep
+from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance, exponential_and_gramian
 from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square, symmetric_part
@@ -20,80 +17,37 @@ AugmentedSquare = Float[Array, "augmented augmented"]
 AugmentedInputs = Float[Array, "augmented input"]
 
 
-class DiscreteLQR(AbstractRegulator):
-    """Time-invariant regulator for the plant without loads, designed for held commands.
+def sampled_gain(
+    plant: Plant,
+    Q: Square,
+    R: InputWeight,
+    period: Float[Array, ""],
+    input_delay: Float[Array, ""] | None,
+    rate_weight: Float[Array, " actuator"] | None,
+    integral_weight: Float[Array, " output"] | None,
+) -> Float[Array, "actuator column"]:
+    """Gain designed for a plant without its loads, whose commands are held for a period (s).
 
-    It minimises the same integral as `LQR`, over commands that are held for a `period` and begin a
-    `delay` after the sample: weights have the same meaning at every period, the cost includes the
-    motion between samples, and the gain tends to that of `LQR` as the period shrinks.
-    `input_rate_weight` adds the changes of the command, as rates over a period. With it or a delay,
-    the last command, as limited by the actuators, is fed back too.
-
-    >>> import jaxbeam as jb
-    >>> case = jb.Case(
-    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
-    ...     actuators=[jb.PointForce(0.3)],
-    ...     sensors=[jb.Sensor(0.3)],
-    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
-    ...     controller=jb.DiscreteLQR(
-    ...         state_weight=[1e7, 10.0], command_weight=[1e-3], period=0.005
-    ...     ),
-    ...     run=jb.Run(0.15),
-    ... )
-    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
-    0.537 mm
+    Its columns are those of the states; of the last command, with a delay or a weight of the rate
+    of commands; and of the integrals of the errors of the first sensors, if these have weights.
     """
-
-    kind: ClassVar[str] = "dlqr"
-
-    input_rate_weight: Float[Array, " actuator"] | None = number(
-        "s^2/unit of a command^2",
-        "weight of the rate of change of each command",
-        NOT_NEGATIVE,
-        default=None,
-    )
-
-    @property
-    def feeds_back_command(self) -> bool:
-        """Whether the last command is fed back too."""
-        return self.delay is not None or self.input_rate_weight is not None
-
-    def sampled_gain(self, plant: Plant) -> Float[Array, "actuator column"]:
-        """Gain designed for a plant, for its states and, if it is fed back, the last command."""
-        system, timing = plant.unloaded, sample_timing(self)
-        Q, R = self.weights(plant)
-        A, B, Q, R, N = discrete_lq_problem(
-            system.A, system.B, Q, R, timing.period, timing.input_delay
-        )
-        if self.input_rate_weight is not None:
-            rate_cost = xp.diag(self.input_rate_weight) / timing.period
-            states, commands = system.B.shape
-            Q = add_at(Q, np.s_[states:, states:], rate_cost)
-            N = add_at(N, np.s_[states:], -rate_cost)
-            R = R + rate_cost
-        if not self.feeds_back_command:
-            states = system.A.shape[0]
-            A, B, Q, N = A[:states, :states], B[:states], Q[:states, :states], N[:states]
-        return dlqr(A, B, Q, R, N)[0]
-
-    def design_state_law(self, plant, design_plant):
-        gain = self.sampled_gain(design_plant)
-        command_shares = xp.ones(gain.shape[1] - self.feedback_shares.shape[0])
-        shares = xp.concatenate([self.feedback_shares, command_shares])
-        return GainLaw(gain * shares, self.feeds_back_command)
-
-    def validate(self, case):
-        if self.period is None:
-            return "period must be given: kind 'dlqr' is designed for commands held that long"
-        concrete_delay = (
-            self.delay is not None and is_concrete(self.delay) and is_concrete(self.period)
-        )
-        if concrete_delay and concrete(self.delay) >= concrete(self.period):
-            return "delay must be less than the period: the design allows for one pending command"
-        rate = self.input_rate_weight
-        if rate is not None and rate.shape[0] != len(case.driven):
-            return f"input_rate_weight must have {len(case.driven)} entries, not {rate.shape[0]}"
-        return super().validate(case)
+    system = plant.unloaded
+    states = system.A.shape[0]
+    A, B, Q, R, N = discrete_lq_problem(system.A, system.B, Q, R, period, input_delay)
+    if rate_weight is not None:
+        rate_cost = xp.diag(rate_weight) / period
+        Q = add_at(Q, np.s_[states:, states:], rate_cost)
+        N = add_at(N, np.s_[states:], -rate_cost)
+        R = R + rate_cost
+    if input_delay is None and rate_weight is None:
+        A, B, Q, N = A[:states, :states], B[:states], Q[:states, :states], N[:states]
+    if integral_weight is not None:
+        outputs = integral_weight.shape[0]
+        rows = xp.pad(system.C[:outputs], ((0, 0), (0, A.shape[0] - states)))
+        A = xp.block([[A, xp.zeros((A.shape[0], outputs))], [period * rows, xp.eye(outputs)]])
+        B, N = (xp.pad(part, ((0, outputs), (0, 0))) for part in (B, N))
+        Q = block_diag(Q, period * xp.diag(integral_weight))
+    return dlqr(A, B, Q, R, N)[0]
 
 
 def discrete_lq_problem(
@@ -144,3 +98,28 @@ def discrete_lq_problem(
         cost[state_count:, state_count:],
         cost[:state_count, state_count:],
     )
+
+
+class IntegralLaw(AbstractStateLaw):
+    """u = -K (x, last command, e) with the integrals e of the errors as the state of the law.
+
+    `limits` (actuator, 2) are those of the commands, within which e goes on; `shares` those of the
+    states that are fed back.
+    """
+
+    gain: Float[Array, "actuator column"]
+    shares: Float[Array, " state"]
+    reference: Float[Array, " output"]
+    period: Float[Array, ""]
+    limits: Float[Array, "actuator 2"]
+    feeds_back_command: bool = eqx.field(static=True)
+
+    def initial_state(self):
+        return xp.zeros_like(self.reference)
+
+    def step(self, state, estimate, measurement, t):
+        last = measurement.command if self.feeds_back_command else xp.zeros(0)
+        command = -self.gain @ xp.concatenate([self.shares * estimate.state, last, state])
+        within = xp.all((command >= self.limits[:, 0]) & (command <= self.limits[:, 1]))
+        error = measurement.readings[: self.reference.shape[0]] - self.reference
+        return ControlStep(command, state + xp.where(within, self.period, 0.0) * error)

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbeam.control.optimal.crossing_plant import crossing_plant
+from jaxbeam.control.optimal.crossing_gains import crossing_plant
 from jaxbeam.control.predictive.prediction import SampledPlant
 from jaxbeam.model.state_space import Plant
 from jaxbeam.model.vehicles.contact_rows import vehicle_system

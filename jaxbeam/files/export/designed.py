@@ -12,11 +12,9 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.kinds import kinds
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.optimal.crossing_lqr import AbstractCrossingRegulator
-from jaxbeam.control.optimal.gain_schedules import GainSchedule
+from jaxbeam.control.optimal.crossing_gains import GainSchedule
+from jaxbeam.control.optimal.load_tables import ScheduledGainLaw
 from jaxbeam.control.optimal.lqr import LQR
-from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
-from jaxbeam.control.optimal.scheduled_lqr import ScheduledGainLaw, ScheduledLQR
 from jaxbeam.control.state_feedback import StateFeedback
 from jaxbeam.control.state_law import AbstractStateLaw, GainLaw
 from jaxbeam.estimation.constant_gain import ConstantGainFilter
@@ -32,7 +30,7 @@ from jaxbeam.model.vehicles.vehicle_states import vehicle_signals
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 
-EXPORTABLE = (LQR, DiscreteLQR, StateFeedback, AbstractCrossingRegulator)
+EXPORTABLE = (LQR, StateFeedback)
 
 
 def export_gains(case: Case, points: int = 1001) -> Gains:
@@ -57,7 +55,13 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
             "controller.kind cannot be exported: tables are made of"
             f" {', '.join(words[:-1])} and {words[-1]}"
         )
-    varies = isinstance(law, AbstractCrossingRegulator)
+    is_lqr = isinstance(law, LQR)
+    if is_lqr and (law.schedule == "positions" or law.reference is not None):
+        raise ValueError(
+            "controller cannot be exported as tables: leave out schedule = 'positions' and integral"
+            " action, or write C code"
+        )
+    varies = is_lqr and law.varies
     if law.period is None:
         raise ValueError("controller.period is missing: a real controller samples; give its period")
     estimator_settings = law.estimator
@@ -91,7 +95,7 @@ def export_gains(case: Case, points: int = 1001) -> Gains:
         period=float(concrete(law.period)),
         crossing_time=float(design.crossing_time),
         decay_time=np.inf if decay_time is None else float(concrete(decay_time)),
-        interpolation=law.between if isinstance(law, ScheduledLQR) else "interpolated",
+        interpolation=law.between if is_lqr else "interpolated",
         columns=tuple(tuple(column) for column in columns),
         commands=tuple(tuple(command) for command in commands),
         estimator=np.asarray(design.estimator),
@@ -106,7 +110,7 @@ def _further_columns(case: Case) -> tuple:
     """
     loads = load_set(case)
     weights = tuple((f"load_{i}", "N") for i in range(loads.wheel_count))
-    vehicles = () if isinstance(case.controller, ScheduledLQR) else vehicle_signals(loads)
+    vehicles = () if case.controller.schedule == "load" else vehicle_signals(loads)
     return (*vehicles, *weights, ("known_disturbance", "1"))
 
 

@@ -10,9 +10,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
-from jaxbeam.control.optimal.crossing_lqr import finite_horizon_gains
-from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR
-from jaxbeam.control.optimal.scheduled_lqr import ScheduledLQR
+from jaxbeam.control.optimal.lqr import LQR
 from jaxbeam.estimation.kalman import Kalman
 from jaxbeam.estimation.observer import Observer
 from jaxbeam.estimation.sampled_plant import sample_timing
@@ -23,11 +21,11 @@ WEIGHTS = {"state_weight": [4e5, 1e5, 10.0, 1.0, 0.0], "command_weight": [1e-3]}
 GRID = {"masses": [0.2, 0.4]}
 LAWS = {
     "lqr": jb.LQR(**WEIGHTS),
-    "dlqr": DiscreteLQR(**WEIGHTS, period=2e-3),
-    "lqr-step": jb.StepLQR(**WEIGHTS, points=4),
-    "lqr-finite": jb.FiniteLQR(**WEIGHTS, points=60),
-    "lqr-augmented": jb.AugmentedLQR(**WEIGHTS, points=60),
-    "lqr-scheduled": ScheduledLQR(**WEIGHTS, **GRID, points=60),
+    "dlqr": LQR(**WEIGHTS, period=2e-3, sampling="exact"),
+    "lqr-step": jb.LQR(**WEIGHTS, points=4, horizon="frozen"),
+    "lqr-finite": jb.LQR(**WEIGHTS, points=60, horizon="crossing"),
+    "lqr-augmented": jb.LQR(**WEIGHTS, points=60, horizon="crossing", augmented="loads"),
+    "lqr-scheduled": LQR(**WEIGHTS, **GRID, points=60, horizon="crossing", schedule="load"),
 }
 # A mass, a speed, a weight of a state, one of the command, and a parameter of the plant.
 ADDRESSES = (
@@ -105,13 +103,13 @@ ACTUATORS = {
 def test_batched_designs_with_shared_parameters(actuator, varied):
     """Only one parameter varies; reverse-mode derivatives too."""
     part, states = ACTUATORS[actuator]
-    law = jb.FiniteLQR(WEIGHTS["state_weight"][:states], [1e-3], points=20)
+    law = jb.LQR(WEIGHTS["state_weight"][:states], [1e-3], points=20, horizon="crossing")
     case = dataclasses.replace(beam_case(law), actuators=[part])
     layout, start = mesh_layout(case), float(jb.addresses(case)[varied])
 
     def coefficients(share):
         changed = jb.replace(case, {varied: share * start})
-        return finite_horizon_gains(changed.controller, jb.state_space(changed, layout=layout))[
+        return changed.controller.crossing_gains(jb.state_space(changed, layout=layout))[
             0
         ].coefficients
 

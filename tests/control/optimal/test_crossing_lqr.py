@@ -16,7 +16,7 @@ from scipy.interpolate import BarycentricInterpolator
 from scipy.linalg import block_diag, solve_continuous_are
 
 import jaxbeam as jb
-from jaxbeam.control.optimal.crossing_lqr import AugmentedLQR, StepLQR
+from jaxbeam.control.optimal.lqr import LQR
 from jaxbeam.simulation.closed_loop import loop_schedule
 from tests.differences import central
 from tests.runs import plan_of
@@ -111,7 +111,7 @@ def optimum():
 
 
 def test_optimal_gains_for_overlapping_masses(optimum):
-    law = AugmentedLQR(**WEIGHTS, points=300)
+    law = LQR(**WEIGHTS, points=300, horizon="crossing", augmented="loads")
     model = jb.state_space(beam_case(), "sine")
     gains = jax.jit(lambda shares: jax.vmap(law.gain_table(model))(shares))(TIMES / EVENTS[-1])[
         :, 0
@@ -149,21 +149,23 @@ def test_loop_with_gains_of_the_frozen_plant():
     uncontrolled_deflection = (
         integrate_between_events(uncontrolled, np.zeros(2 * MODES), 1e-8)[:, :MODES] @ shape
     )
-    record = jb.simulate(beam_case(StepLQR(**WEIGHTS, points=60)), jnp.asarray(TIMES))
+    record = jb.simulate(beam_case(LQR(**WEIGHTS, points=60, horizon="frozen")), jnp.asarray(TIMES))
     peak = np.max(np.abs(deflection))
     assert_allclose(record.deflection[:, 0] / peak, deflection / peak, atol=1e-6)
     assert peak < 0.8 * np.max(np.abs(uncontrolled_deflection))
 
 
-@pytest.mark.parametrize("kind", [StepLQR, AugmentedLQR])
-def test_derivatives_of_a_loop_through_the_design_of_its_gains(kind):
+@pytest.mark.parametrize(
+    "options", [{"horizon": "frozen"}, {"horizon": "crossing", "augmented": "loads"}]
+)
+def test_derivatives_of_a_loop_through_the_design_of_its_gains(options):
     sizes = {
         "controller.state_weight.0": 4e5,
         "controller.command_weight.0": 1e-3,
         "beam.flexural_rigidity": RIGIDITY,
         "loads.1.mass": MASSES[1],
     }
-    case = beam_case(kind(**WEIGHTS, points=70))
+    case = beam_case(LQR(**WEIGHTS, **options, points=70))
     times = jnp.asarray(TIMES)
     schedule = loop_schedule(case, TIMES)
     plan = dataclasses.replace(plan_of(case, substeps=2, even=False), schedule=schedule)

@@ -15,8 +15,7 @@ from scipy.integrate import simpson, solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
-from jaxbeam.control.optimal.crossing_lqr import finite_horizon_gains
-from jaxbeam.control.optimal.gain_schedules import crossing_events
+from jaxbeam.control.optimal.crossing_gains import crossing_events
 from jaxbeam.control.state_law import TrueState
 from jaxbeam.estimation.sampled_plant import SampleTiming
 from jaxbeam.estimation.simulated_vehicles import SampledWithVehicles
@@ -119,7 +118,10 @@ def test_the_augmented_plant_is_the_vehicle_on_its_profile():
 
 
 def test_gains_are_those_of_the_riccati_equation(optimum):
-    law, times = jb.AugmentedLQR(**WEIGHTS, points=200), np.linspace(0.01, END - 0.01, 23)
+    law, times = (
+        jb.LQR(**WEIGHTS, points=200, horizon="crossing", augmented="loads"),
+        np.linspace(0.01, END - 0.01, 23),
+    )
     gains = np.array(jax.vmap(law.gain_table(jb.state_space(beam_case())))(times / END)[:, 0])
     expected = np.array([plant(t)[1][:, 0] @ optimum(t) / 1e-2 for t in times])
     size = np.max(np.abs(expected), axis=0)
@@ -128,7 +130,7 @@ def test_gains_are_those_of_the_riccati_equation(optimum):
 
 
 def test_gains_by_the_coupled_and_the_general_method():
-    law, plant = jb.FiniteLQR(**WEIGHTS, points=200), jb.state_space(beam_case())
+    law, plant = jb.LQR(**WEIGHTS, points=200, horizon="crossing"), jb.state_space(beam_case())
     tables = law.gain_table(plant), _table_of_the_general_method(law, plant)
     shares = np.linspace(0.02, 0.98, 13)
     found, expected = (np.array(jax.vmap(table)(shares)) for table in tables)
@@ -152,14 +154,16 @@ def _table_of_the_general_method(law, plant):
 def test_the_simulated_cost_is_the_optimal_one():
     weights = WEIGHTS | {"state_weight": [0.0] * 4}
     expected = START @ riccati(DEFLECTION)(0.0) @ START
-    law = jb.AugmentedLQR(**weights, points=200)
-    P = finite_horizon_gains(law, jb.state_space(beam_case()))[1][0]
+    law = jb.LQR(**weights, points=200, horizon="crossing", augmented="loads")
+    P = law.crossing_gains(jb.state_space(beam_case()))[1][0]
     assert_allclose(START @ np.asarray(P) @ START, expected, rtol=1e-7)
     assert_allclose(simulated_cost(law), expected, rtol=1e-5)
     # That of the vehicle's weight alone, as if it were a force, costs more.
     force = jb.MovingForce(mass=CAR.body_mass + CAR.axle_mass, speed=SPEED)
     design = jb.state_space(beam_case(force, profile=None))
-    worse = jb.AugmentedLQR(**weights, points=200, nominal_plant=design)
+    worse = jb.LQR(
+        **weights, points=200, nominal_plant=design, horizon="crossing", augmented="loads"
+    )
     assert simulated_cost(worse) > 1.001 * expected
 
 
@@ -175,7 +179,7 @@ def simulated_cost(law) -> float:
     ("stiffness", "damping", "limit"), [(2e5, 40.0, jb.MovingMass), (1e-4, 0.0, jb.MovingForce)]
 )
 def test_stiff_vehicles_are_masses_and_soft_ones_forces(stiffness, damping, limit):
-    law = jb.AugmentedLQR(**WEIGHTS, points=200)
+    law = jb.LQR(**WEIGHTS, points=200, horizon="crossing", augmented="loads")
     loads = [
         jb.Oscillator(mass=0.3, stiffness=stiffness, damping=damping, speed=SPEED),
         limit(mass=0.3, speed=SPEED),
@@ -186,7 +190,7 @@ def test_stiff_vehicles_are_masses_and_soft_ones_forces(stiffness, damping, limi
 
 
 def test_a_sampled_law_with_an_estimator_has_the_vehicle():
-    law = jb.AugmentedLQR(**WEIGHTS, points=200, period=0.005)
+    law = jb.LQR(**WEIGHTS, points=200, period=0.005, horizon="crossing", augmented="loads")
     case = beam_case(controller=law)
     kalman = jb.Kalman(process_noise=[1e-6] * 2, measurement_noise=1e-6, loads="known")
     observed = dataclasses.replace(law, estimator=kalman)
@@ -217,7 +221,10 @@ def test_simulated_vehicles_follow_the_true_beam():
 
 
 def test_gradient_of_the_cost_by_the_suspension():
-    law, layout = jb.AugmentedLQR(**WEIGHTS, points=60), mesh_layout(beam_case())
+    law, layout = (
+        jb.LQR(**WEIGHTS, points=60, horizon="crossing", augmented="loads"),
+        mesh_layout(beam_case()),
+    )
 
     def cost(logs):
         car = jb.QuarterCar(
@@ -230,7 +237,7 @@ def test_gradient_of_the_cost_by_the_suspension():
             speed=SPEED,
         )
         plant = jb.state_space(beam_case(car), layout=layout)
-        P = finite_horizon_gains(law, plant)[1][0]
+        P = law.crossing_gains(plant)[1][0]
         return START @ P @ START
 
     found = jax.jit(jax.grad(cost))(jax.numpy.zeros(2))

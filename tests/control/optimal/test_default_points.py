@@ -32,7 +32,7 @@ def loop():
         actuators=[jb.PointForce(0.25)],
         sensors=[jb.Sensor(0.3)],
         loads=[jb.MovingMass(mass=0.5, speed=1.0)],
-        controller=jb.StepLQR(STATES, COMMANDS),
+        controller=jb.LQR(STATES, COMMANDS, horizon="frozen"),
         run=jb.Run(0.7),
     )
 

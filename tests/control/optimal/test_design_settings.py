@@ -62,8 +62,13 @@ def test_design_without_suspension(monkeypatch):
 
 def test_design_with_another_mass_and_speed():
     """The gain is that for the position of the load, with mass and speed of the design."""
-    law = jb.StepLQR(
-        STATES, [9e-5], coordinates="sine", points=300, design=DesignModel(mass=0.3, speed=0.8)
+    law = jb.LQR(
+        STATES,
+        [9e-5],
+        coordinates="sine",
+        points=300,
+        design=DesignModel(mass=0.3, speed=0.8),
+        horizon="frozen",
     )
     loops = []
     for x in SPEED * TIMES:
@@ -73,10 +78,12 @@ def test_design_with_another_mass_and_speed():
 
 
 def test_time_invariant_regulator_after_the_crossing():
-    law = jb.StepLQR(STATES, [9e-5], coordinates="sine", points=100, after="time-invariant")
+    law = jb.LQR(
+        STATES, [9e-5], coordinates="sine", points=100, after="time-invariant", horizon="frozen"
+    )
     A, B = state_matrices(0.0, 0.0, 0.0, 4.6)
     assert_poles(shaker_case(law), [1.2], [A - B @ gain(A, B)])  # the load leaves at 1.09 s
-    without_regulator = jb.StepLQR(STATES, [9e-5], coordinates="sine", points=100)
+    without_regulator = jb.LQR(STATES, [9e-5], coordinates="sine", points=100, horizon="frozen")
     assert_poles(shaker_case(without_regulator), [1.2], [A])
 
 

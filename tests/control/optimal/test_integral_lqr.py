@@ -18,9 +18,9 @@ PERIOD, PLACE, SENSOR, MODES = 0.004, 0.22, 0.3, 2
 STATES, COMMAND, INTEGRAL, REFERENCE = [1e4, 1e4, 1.0, 1.0], [1e-2], [1e9], [1e-4]
 
 
-def tracking(**settings) -> jb.IntegralLQR:
+def tracking(**settings) -> jb.LQR:
     given = {"integral_weight": INTEGRAL, "reference": REFERENCE, "period": PERIOD} | settings
-    return jb.IntegralLQR(STATES, COMMAND, **given)
+    return jb.LQR(STATES, COMMAND, **given, sampling="exact")
 
 
 def beam_case(law, loads=(), limits=None, duration=2.0) -> jb.Case:
@@ -62,7 +62,7 @@ def expected_gain():
 
 def test_gain_against_scipy():
     plant = jb.state_space(beam_case(tracking()))
-    found, expected = tracking().augmented_gain(plant), expected_gain()
+    found, expected = tracking().time_invariant_gain(plant), expected_gain()
     assert_allclose(found, expected, rtol=1e-6, atol=1e-8 * np.abs(expected).max())
 
 
@@ -94,7 +94,7 @@ def test_derivative_by_the_weight_of_the_integral():
 
     def gain(logarithm):
         law = tracking(integral_weight=jnp.asarray(INTEGRAL) * jnp.exp(logarithm))
-        return law.augmented_gain(plant)[0]
+        return law.time_invariant_gain(plant)[0]
 
     found, expected = jax.jacfwd(gain)(0.0), central(gain, 0.0, 1e-3)[:, 0]
     assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
@@ -104,7 +104,7 @@ def test_derivative_by_the_weight_of_the_integral():
     ("settings", "message"),
     [
         ({"period": None}, "period must be given"),
-        ({"reference": [0.0, 0.0]}, "integral_weight must have an entry for each of 2 references"),
+        ({"reference": [0.0, 0.0]}, "integral_weight must have an entry for each of 2 reference"),
         (
             {"reference": [0.0, 0.0], "integral_weight": [1.0, 1.0]},
             "reference must have at most 1 entries",

@@ -12,12 +12,6 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.design_model import DesignModel
-from jaxbeam.control.optimal.crossing_lqr import (
-    AugmentedLQR,
-    FiniteLQR,
-    StepLQR,
-    finite_horizon_gains,
-)
 from jaxbeam.control.optimal.lqr import LQR
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from tests.modules import DATA
@@ -63,15 +57,15 @@ def test_time_invariant_gain(model):
 
 
 @pytest.mark.parametrize(
-    ("kind", "points", "name"),
+    ("options", "points", "name"),
     [
-        (StepLQR, 200, "step_by_step_gains"),
-        (FiniteLQR, 1200, "finite_time_gains"),
-        (AugmentedLQR, 1200, "augmented_finite_time_gains"),
+        ({"horizon": "frozen"}, 200, "step_by_step_gains"),
+        ({"horizon": "crossing"}, 1200, "finite_time_gains"),
+        ({"horizon": "crossing", "augmented": "loads"}, 1200, "augmented_finite_time_gains"),
     ],
 )
-def test_gains_over_the_crossing(model, kind, points, name):
-    gains = gains_at(kind(**WEIGHTS, points=points), model)[:, 0]
+def test_gains_over_the_crossing(model, options, points, name):
+    gains = gains_at(LQR(**WEIGHTS, **options, points=points), model)[:, 0]
     assert_allclose(gains, REFERENCE[name], rtol=1e-6)
 
 
@@ -79,8 +73,20 @@ def test_gains_over_the_crossing(model, kind, points, name):
     ("controller", "name"),
     [
         (LQR(**WEIGHTS, feedback=PARTIAL_FEEDBACK, design=DESIGN), "time_invariant"),
-        (FiniteLQR(**WEIGHTS, feedback=PARTIAL_FEEDBACK, design=DESIGN), "finite_time"),
-        (AugmentedLQR(**WEIGHTS, feedback=PARTIAL_FEEDBACK, design=DESIGN), "augmented"),
+        (
+            LQR(**WEIGHTS, feedback=PARTIAL_FEEDBACK, design=DESIGN, horizon="crossing"),
+            "finite_time",
+        ),
+        (
+            LQR(
+                **WEIGHTS,
+                feedback=PARTIAL_FEEDBACK,
+                design=DESIGN,
+                horizon="crossing",
+                augmented="loads",
+            ),
+            "augmented",
+        ),
     ],
 )
 def test_closed_loops(controller, name):
@@ -102,10 +108,10 @@ def test_closed_loops(controller, name):
 
 def test_cost_of_the_optimal_gain(model):
     """z0' P z0 is the cost of the run from z0, and no change of the gains lowers it."""
-    regulator = FiniteLQR(**WEIGHTS, points=400)
+    regulator = LQR(**WEIGHTS, points=400, horizon="crossing")
     Q, R = regulator.weights(model)
     start = jnp.array([1e-3, -2e-4, 1e-4, 0.02, 0.01, -0.03, 0.3])
-    table, costs = eqx.filter_jit(lambda m: finite_horizon_gains(regulator, m))(model)
+    table, costs = eqx.filter_jit(lambda m: regulator.crossing_gains(m))(model)
     end = 0.6 / 0.55
     times = jnp.linspace(0.0, end, 40001)  # a lag of 0.1 ms, by the Runge-Kutta method
     step = times[1]
@@ -143,7 +149,14 @@ def test_cost_of_the_optimal_gain(model):
 
 
 def test_case_file_keeps_the_controller():
-    controller = AugmentedLQR(**WEIGHTS, feedback=PARTIAL_FEEDBACK, design=DESIGN, after="hold")
+    controller = LQR(
+        **WEIGHTS,
+        feedback=PARTIAL_FEEDBACK,
+        design=DESIGN,
+        after="hold",
+        horizon="crossing",
+        augmented="loads",
+    )
     case = beam_case(controller, 2.5)
     check_case(case)
     restored = case_from_dict(case_to_dict(case))
@@ -152,7 +165,7 @@ def test_case_file_keeps_the_controller():
 
 def test_intervals_needed_follow_from_the_modes_of_the_design():
     few = DesignModel(modes=1)
-    check_case(beam_case(FiniteLQR([1.0] * 3, [1.0], points=100, design=few)))
+    check_case(beam_case(LQR([1.0] * 3, [1.0], points=100, design=few, horizon="crossing")))
 
 
 @pytest.mark.parametrize(
@@ -171,7 +184,17 @@ def test_intervals_needed_follow_from_the_modes_of_the_design():
             LQR([1.0] * 7, [1.0], design=DesignModel(correction=0.3)),
             "design.correction has no effect",
         ),
-        (FiniteLQR([1.0] * 7, [1.0], points=100), "points must be at least"),
+        (LQR([1.0] * 7, [1.0], points=100, horizon="crossing"), "points must be at least"),
+        (LQR([1.0] * 7, [1.0], points=100), "points has no effect with horizon = 'infinite'"),
+        (
+            LQR([1.0] * 7, [1.0], horizon="frozen", augmented="loads"),
+            "augmented has no effect with horizon = 'frozen': leave it out, or take horizon = 'cro",
+        ),
+        (LQR([1.0] * 7, [1.0], input_rate_weight=[1.0]), "input_rate_weight has no effect with"),
+        (
+            LQR([1.0] * 7, [1.0], horizon="crossing", schedule="load"),
+            "masses must be given with schedule = 'load'",
+        ),
     ],
 )
 def test_errors_of_settings(controller, message):

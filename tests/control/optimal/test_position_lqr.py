@@ -13,8 +13,8 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.estimator import Estimate
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.optimal.gain_schedules import GainSchedule
-from jaxbeam.control.optimal.position_lqr import PositionGainLaw
+from jaxbeam.control.optimal.crossing_gains import GainSchedule
+from jaxbeam.control.optimal.load_tables import PositionGainLaw
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.gain_table import GainTable
@@ -109,8 +109,8 @@ def test_derivative_by_masses_and_time():
 
 
 def regulators():
-    single = jb.FiniteLQR(**WEIGHTS)
-    return single, jb.PositionLQR(**WEIGHTS, masses=[0.3], loads="ignored")
+    single = jb.LQR(**WEIGHTS, horizon="crossing")
+    return single, jb.LQR(**WEIGHTS, masses=[0.3], horizon="crossing", schedule="positions")
 
 
 def test_one_load_of_the_design_at_constant_speed():
@@ -135,14 +135,16 @@ def test_one_load_of_the_design_at_constant_speed():
         (
             {},
             (BRAKING, jb.MovingMass(mass=0.2, speed=-1.0)),
-            "kind needs loads that all travel in one direction",
+            "schedule needs loads that all travel in one direction",
         ),
         ({"masses": []}, (BRAKING,), "masses must list at least one"),
         ({"entries": "predicted"}, (BRAKING,), "entries must be 'measured'"),
-        ({}, (jb.Oscillator(0.3, 900.0, 2.0, speed=15.0),), "kind needs loads of one wheel"),
+        ({}, (jb.Oscillator(0.3, 900.0, 2.0, speed=15.0),), "schedule needs loads of one wheel"),
     ],
 )
 def test_errors_of_settings(settings, loads, message):
-    law = jb.PositionLQR(**WEIGHTS, **({"masses": [0.2]} | settings))
+    law = jb.LQR(
+        **WEIGHTS, **({"masses": [0.2]} | settings), horizon="crossing", schedule="positions"
+    )
     with pytest.raises(ValueError, match=f"^controller.{message}"):
         check_case(beam_case(law, loads))

@@ -15,8 +15,7 @@ from scipy.linalg import block_diag
 import jaxbeam as jb
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.design_model import DesignModel
-from jaxbeam.control.optimal.crossing_lqr import AugmentedLQR
-from jaxbeam.control.optimal.scheduled_lqr import ScheduledLQR
+from jaxbeam.control.optimal.lqr import LQR
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.simulation.closed_loop import loop_schedule
 from tests.control.optimal.test_crossing_lqr import (
@@ -44,7 +43,14 @@ FINE_TIMES = np.union1d(TIMES, np.linspace(0.0, EVENTS[-1], 801))
 PREDICTION = DesignModel(
     mass=PREDICTED["masses"], speed=PREDICTED["speeds"], entry_time=PREDICTED["entries"]
 )
-LAW = AugmentedLQR(**WEIGHTS, points=300, design=PREDICTION, entries="predicted")
+LAW = LQR(
+    **WEIGHTS,
+    points=300,
+    design=PREDICTION,
+    entries="predicted",
+    horizon="crossing",
+    augmented="loads",
+)
 
 
 def events(speeds, entries):
@@ -149,6 +155,13 @@ def test_errors_of_predicted_entries():
     with pytest.raises(ValueError, match=r"design\.entry_time has no effect"):
         check_case(dataclasses.replace(case, controller=late))
     single_load = dataclasses.replace(beam_case(), loads=beam_case().loads[:1])
-    law = ScheduledLQR(**WEIGHTS, masses=[0.3], points=300, entries="predicted")
+    law = LQR(
+        **WEIGHTS,
+        masses=[0.3],
+        points=300,
+        entries="predicted",
+        horizon="crossing",
+        schedule="load",
+    )
     with pytest.raises(ValueError, match="entries must be 'measured'"):
         check_case(dataclasses.replace(single_load, controller=law))

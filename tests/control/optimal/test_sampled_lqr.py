@@ -16,7 +16,7 @@ from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.validation import check_case
 from jaxbeam.cli import main
 from jaxbeam.control.optimal.lqr import LQR
-from jaxbeam.control.optimal.sampled_lqr import DiscreteLQR, discrete_lq_problem
+from jaxbeam.control.optimal.sampled_lqr import discrete_lq_problem
 from jaxbeam.control.optimal.sampling_loss import SamplingWarning, sampled_reachability
 from jaxbeam.model.modes import mesh_layout
 
@@ -52,8 +52,7 @@ def model():
 
 @eqx.filter_jit
 def designed_gain(controller, plant):
-    sampled = isinstance(controller, DiscreteLQR)
-    return controller.sampled_gain(plant) if sampled else controller.time_invariant_gain(plant)
+    return controller.time_invariant_gain(plant)
 
 
 def assert_close(found, expected, tolerance):
@@ -110,7 +109,7 @@ def test_gain_against_scipy_and_python_control(model, period):
     Q, N, R = cost[:7, :7], cost[:7, 7:], cost[7:, 7:]
     P = scipy.linalg.solve_discrete_are(A, B, Q, R, s=N)
     expected = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A + N.T)
-    found = designed_gain(DiscreteLQR(**WEIGHTS, period=period), model)
+    found = designed_gain(LQR(**WEIGHTS, period=period, sampling="exact"), model)
     assert_close(found, expected, 1e-6)
     assert_close(found, control.dlqr(A, B, Q, R, N)[0], 1e-6)
 
@@ -119,7 +118,9 @@ def test_gain_tends_to_that_of_the_continuous_regulator(model):
     """Holding delays by half a period: the difference is of first order."""
     exact = designed_gain(LQR(**WEIGHTS), model)
     double, period_difference = (
-        np.max(np.abs(designed_gain(DiscreteLQR(**WEIGHTS, period=period), model) - exact))
+        np.max(
+            np.abs(designed_gain(LQR(**WEIGHTS, period=period, sampling="exact"), model) - exact)
+        )
         / np.max(np.abs(exact))
         for period in (2e-6, 1e-6)
     )
@@ -130,7 +131,7 @@ def test_gain_tends_to_that_of_the_continuous_regulator(model):
 @pytest.mark.parametrize("options", [{"delay": 1.5e-3}, {"input_rate_weight": [1e-6]}, {}])
 def test_gain_has_the_least_cost(model, options):
     """The cost of runs from an initial state, integrated independently, is least for the gain."""
-    law = DiscreteLQR(**WEIGHTS, period=2e-3, **options)
+    law = LQR(**WEIGHTS, period=2e-3, **options, sampling="exact")
     gain = np.asarray(designed_gain(law, model))
     plant = model.unloaded
     A, B = np.asarray(plant.A), np.asarray(plant.B)
@@ -213,7 +214,7 @@ def test_controllability_is_lost_at_the_sampling_limit():
     moved = []
     for share in (0.5, 1.0):
         sampled = plant.discretize(share * limit)
-        gain = designed_gain(DiscreteLQR(**weights, period=share * limit), model)
+        gain = designed_gain(LQR(**weights, period=share * limit, sampling="exact"), model)
         moved.append(
             np.abs(np.linalg.eigvals(sampled.A - sampled.B @ gain)).max() / open_loop_radius**share
         )
@@ -223,7 +224,7 @@ def test_controllability_is_lost_at_the_sampling_limit():
 
 def test_slow_sampling_warns(tmp_path, capsys):
     """In Python by a warning, on the command line by one sentence, before the run."""
-    slow = beam_case(DiscreteLQR(**WEIGHTS, period=5e-3))
+    slow = beam_case(LQR(**WEIGHTS, period=5e-3, sampling="exact"))
     with pytest.warns(
         SamplingWarning,
         match="the mode at .* Hz is hardly controllable at a period of .* limit is pi",
@@ -231,7 +232,7 @@ def test_slow_sampling_warns(tmp_path, capsys):
         check_case(slow)
     with pytest.warns(SamplingWarning):
         check_case(beam_case(LQR(**WEIGHTS, period=5e-3)))
-    check_case(beam_case(DiscreteLQR(**WEIGHTS, period=2e-3)))
+    check_case(beam_case(LQR(**WEIGHTS, period=2e-3, sampling="exact")))
     path = tmp_path / "slow.toml"
     jb.save_case(slow, path)
     with warnings.catch_warnings(), pytest.raises(SystemExit) as ended:
@@ -253,12 +254,12 @@ def test_slow_sampling_warns(tmp_path, capsys):
 )
 def test_errors_of_settings(options, message):
     with pytest.raises(ValueError, match=message):
-        check_case(beam_case(DiscreteLQR(**WEIGHTS, **options)))
+        check_case(beam_case(LQR(**WEIGHTS, **options, sampling="exact")))
 
 
 def test_poles_of_the_loop_are_those_of_the_design(model):
     """Eigenvalues of the transition over a period, delay and rate weight included."""
-    law = DiscreteLQR(**WEIGHTS, period=2e-3, delay=5e-4, input_rate_weight=[1e-8])
+    law = LQR(**WEIGHTS, period=2e-3, delay=5e-4, input_rate_weight=[1e-8], sampling="exact")
     plant, (Q, R) = model.unloaded, law.weights(model)
     state, _ = integrate(*map(np.asarray, (plant.A, plant.B, Q, R)), (5e-4, 1.5e-3))
     transition, input_matrix = (

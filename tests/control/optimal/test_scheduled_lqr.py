@@ -12,9 +12,8 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.optimal.crossing_lqr import FiniteLQR
-from jaxbeam.control.optimal.gain_schedules import GainSchedule
-from jaxbeam.control.optimal.scheduled_lqr import ScheduledLQR
+from jaxbeam.control.optimal.crossing_gains import GainSchedule
+from jaxbeam.control.optimal.lqr import LQR
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.statics import influence_line, static_deflection_per_command
@@ -69,8 +68,10 @@ def test_commands_are_interpolated_between_designs():
     """
     shares = [0.1, 0.6, 1.0 + 0.05 / 0.6]
     end = {"terminal_weight": [1e3, 1e2, 0.1, 0.01, 1e-3]}
-    scheduled = ScheduledLQR(**WEIGHTS, **GRID, **end, after="fade", fade_time=0.05)
-    single = FiniteLQR(**WEIGHTS, **end, after="hold")
+    scheduled = LQR(
+        **WEIGHTS, **GRID, **end, after="fade", fade_time=0.05, horizon="crossing", schedule="load"
+    )
+    single = LQR(**WEIGHTS, **end, after="hold", horizon="crossing")
     single_designs = {
         (m, v): commands(single, shares, m, v) * [1.0, 1.0, np.exp(-1.0 / v)]
         for m in GRID["masses"]
@@ -107,8 +108,13 @@ def test_load_is_identified_from_gates_in_the_loop(speed):
     gates = GATE_IDENTIFICATION.gates if speed > 0 else 0.6 - GATE_IDENTIFICATION.gates
     identification = dataclasses.replace(GATE_IDENTIFICATION, gates=gates)
     gentle = WEIGHTS | {"command_weight": [1e-2], "period": 2e-3}
-    law = ScheduledLQR(
-        **gentle, masses=[0.2, 0.6], speeds=[0.5, 1.0], load_identification=identification
+    law = LQR(
+        **gentle,
+        masses=[0.2, 0.6],
+        speeds=[0.5, 1.0],
+        load_identification=identification,
+        horizon="crossing",
+        schedule="load",
     )
     record = jb.simulate(beam_case(law, 0.5, speed, duration=1.1, sample_rate=500.0))
     passed = 0.2 - 0.05 / 0.8
@@ -124,7 +130,7 @@ def test_load_is_identified_from_gates_in_the_loop(speed):
 def test_commands_follow_the_identified_load():
     """With the static readings of a mass, commands tend to those for the given mass."""
     grid = {"masses": [0.2, 0.6], "speeds": [0.5, 1.0]}
-    given = ScheduledLQR(**WEIGHTS, **grid)
+    given = LQR(**WEIGHTS, **grid, horizon="crossing", schedule="load")
     law = dataclasses.replace(
         given, period=jnp.asarray(4e-3), load_identification=GATE_IDENTIFICATION
     )
@@ -202,8 +208,13 @@ def test_speed_and_mass_from_deflections_without_gates():
 def test_load_is_identified_without_gates_in_the_loop():
     identification = jb.LoadIdentification(threshold=2e-5, until=0.4)
     gentle = WEIGHTS | {"command_weight": [1e-2], "period": 2e-3}
-    law = ScheduledLQR(
-        **gentle, masses=[0.2, 0.6], speeds=[0.5, 1.0], load_identification=identification
+    law = LQR(
+        **gentle,
+        masses=[0.2, 0.6],
+        speeds=[0.5, 1.0],
+        load_identification=identification,
+        horizon="crossing",
+        schedule="load",
     )
     record = jb.simulate(beam_case(law, 0.5, 0.8, duration=1.1, sample_rate=500.0))
     before = np.asarray(record.times) < 0.2 + 0.3 * 0.75
@@ -253,7 +264,14 @@ def test_influence_lines_and_lift_are_static():
 
 def test_case_file_keeps_the_controller():
     case = beam_case(
-        ScheduledLQR(**WEIGHTS, **GRID, period=4e-3, load_identification=GATE_IDENTIFICATION)
+        LQR(
+            **WEIGHTS,
+            **GRID,
+            period=4e-3,
+            load_identification=GATE_IDENTIFICATION,
+            horizon="crossing",
+            schedule="load",
+        )
     )
     check_case(case)
     assert eqx.tree_equal(case, case_from_dict(case_to_dict(case)))
@@ -286,11 +304,13 @@ def test_case_file_keeps_the_controller():
 )
 def test_errors_of_settings(options, message):
     with pytest.raises(ValueError, match=message):
-        check_case(beam_case(ScheduledLQR(**WEIGHTS, **(GRID | options))))
+        check_case(
+            beam_case(LQR(**WEIGHTS, **(GRID | options), horizon="crossing", schedule="load"))
+        )
 
 
 def test_several_loads_are_refused():
-    case = beam_case(ScheduledLQR(**WEIGHTS, **GRID))
+    case = beam_case(LQR(**WEIGHTS, **GRID, horizon="crossing", schedule="load"))
     twice = eqx.tree_at(lambda c: c.loads, case, case.loads * 2)
-    with pytest.raises(ValueError, match="kind needs a single load"):
+    with pytest.raises(ValueError, match="schedule needs a single load"):
         check_case(twice)

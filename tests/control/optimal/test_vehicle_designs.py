@@ -12,7 +12,7 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.estimator import Estimate
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.optimal.scheduled_lqr import with_crossing_load
+from jaxbeam.control.optimal.load_tables import with_crossing_load
 from tests.control.optimal import test_crossing_vehicles as crossing
 
 MODES, STATES = crossing.MODES, 2 * crossing.MODES + 4
@@ -21,7 +21,7 @@ POINTS = 40
 
 
 def test_step_by_step_gains_feed_back_the_vehicle():
-    law = jb.StepLQR(**crossing.WEIGHTS, points=POINTS)
+    law = jb.LQR(**crossing.WEIGHTS, points=POINTS, horizon="frozen")
     plant = jb.state_space(crossing.beam_case())
     shares = np.array([0.13, 0.5, 0.77])
     found = np.asarray(jax.jit(jax.vmap(law.gain_table(plant)))(shares))[:, 0]
@@ -36,8 +36,8 @@ def test_step_by_step_gains_feed_back_the_vehicle():
 
 def test_vehicles_without_damping_are_refused():
     bouncing = jb.Oscillator(mass=0.3, stiffness=100.0, damping=0.0, speed=2.0)
-    case = crossing.beam_case(bouncing, jb.StepLQR(**SETTINGS), profile=None)
-    with pytest.raises(ValueError, match="kind needs vehicles with damping: loads.0 has a motion"):
+    case = crossing.beam_case(bouncing, jb.LQR(**SETTINGS, horizon="frozen"), profile=None)
+    with pytest.raises(ValueError, match="horizon needs vehicles with damping: loads.0 has"):
         check_case(case)
 
 
@@ -56,14 +56,20 @@ def test_a_scheduled_vehicle_is_similar():
     assert_allclose(found.augmented_start, expected.augmented_start, rtol=1e-12)
 
 
-@pytest.mark.parametrize("loads", ["ignored", "known"])
-def test_a_scheduled_design_at_the_mass_of_the_load_is_that_of_the_crossing(loads):
+@pytest.mark.parametrize("augmented", ["none", "loads"])
+def test_a_scheduled_design_at_the_mass_of_the_load_is_that_of_the_crossing(augmented):
     mass = crossing.CAR.body_mass + crossing.CAR.axle_mass
-    scheduled = jb.ScheduledLQR(
-        **crossing.WEIGHTS, masses=[mass, 2 * mass], points=POINTS, loads=loads, period=0.01
+    scheduled = jb.LQR(
+        **crossing.WEIGHTS,
+        masses=[mass, 2 * mass],
+        points=POINTS,
+        augmented=augmented,
+        period=0.01,
+        horizon="crossing",
+        schedule="load",
     )
-    kind = jb.FiniteLQR if loads == "ignored" else jb.AugmentedLQR
-    single = kind(**crossing.WEIGHTS, points=POINTS, period=0.01)
+    options = {"horizon": "crossing", "augmented": augmented}
+    single = jb.LQR(**crossing.WEIGHTS, points=POINTS, period=0.01, **options)
     plant = jb.state_space(crossing.beam_case())
     laws = [law.design_state_law(plant, plant) for law in (scheduled, single)]
     assert laws[0].needs_vehicles

@@ -69,7 +69,7 @@ LOOPS = {
         },
     ),
     "sampled regulator": (
-        jb.DiscreteLQR(**REGULATOR),
+        jb.LQR(**REGULATOR, sampling="exact"),
         {"controller.state_weight.0": 1e4, "controller.command_weight.0": 1e-3},
     ),
     "state": (
@@ -77,11 +77,18 @@ LOOPS = {
         {"controller.gain.0.0": 2000.0, "controller.gain.0.1": 20.0},
     ),
     "finite": (
-        jb.FiniteLQR(**REGULATOR, points=24),
+        jb.LQR(**REGULATOR, points=24, horizon="crossing"),
         {"controller.state_weight.0": 1e4, "controller.command_weight.0": 1e-3},
     ),
     "scheduled": (
-        jb.ScheduledLQR(**REGULATOR, points=24, masses=[0.2, 0.4], speeds=[1.0, 2.0]),
+        jb.LQR(
+            **REGULATOR,
+            points=24,
+            masses=[0.2, 0.4],
+            speeds=[1.0, 2.0],
+            horizon="crossing",
+            schedule="load",
+        ),
         {"controller.state_weight.0": 1e4, "controller.masses.0": 0.2},
     ),
     "scheduled feedback": (

@@ -1,112 +1,122 @@
-"""Finite-horizon gains of one load, read at the measured positions of any number of loads.
+"""Finite-horizon gains of several masses and speeds, read by one load or by several.
 
-Chapter 8 of the thesis leaves open how gains computed for single masses serve several, and cars of
-varying speed. Here the gains K of the state are averaged over the loads on the beam with their
+A table holds designs k(m, v) of single loads. The law of section 5.3 of the thesis follows one
+load, given or identified. Chapter 8 leaves open how such gains serve several loads, and cars of
+varying speed: here the gains K of the state are averaged over the loads on the beam with their
 masses as weights, and the commands for their weights W, fed forward by the gains K_f, are added:
 
     u = -(sum of m_i K(m_i, v_i, x_i) / sum of m_i) z - sum of K_f(m_i, v_i, x_i) W_i
 """
 
 import dataclasses
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.estimator import EstimatedLoads
-from jaxbeam.case.fields import INCREASING, choice, concrete, is_concrete, number
-from jaxbeam.case.loads.base import trajectory
 from jaxbeam.case.loads.mass import MovingMass
-from jaxbeam.control.optimal.crossing_lqr import AbstractFiniteHorizonRegulator, interval_error
-from jaxbeam.control.optimal.gain_schedules import GainSchedule
-from jaxbeam.control.optimal.scheduled_lqr import with_crossing_load
+from jaxbeam.control.load_identifiers import AbstractLoadSource
+from jaxbeam.control.optimal.crossing_gains import GainSchedule
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.model.load_set import LoadSet, load_set
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.model.state_space import Plant
+from jaxbeam.runtime.arrays import Array
 
 
-class PositionLQR(AbstractFiniteHorizonRegulator):
-    """Optimal gains of single loads, read by the positions of one load or several.
+def designs_of(
+    schedule: Callable[[Plant], GainSchedule],
+    plant: Plant,
+    masses: Float[Array, " mass"],
+    speeds: Float[Array, " speed"],
+) -> GainSchedule:
+    """Gain schedules (mass, speed) of a design plant whose load has other masses and speeds."""
 
-    A `FiniteLQR` is designed for each of the `masses` and `speeds` (magnitudes; that of the first
-    load in the design if left out), alone on the beam at constant speed. Each load of the case
-    reads the tables, interpolated linearly, at its measured position and present speed, which may
-    change, rather than at a time. Of several loads on the beam the gains of the state are averaged
-    with their masses as weights; with loads "known" the commands for their weights, in proportion
-    to the masses, are added. With none on the beam, `after` holds for those that have left. An
-    estimator that follows the loads, `kalman-extended`, gives their masses, positions and speeds.
+    def design(mass, speed):
+        return schedule(with_crossing_load(plant, mass, speed))
 
-    >>> import jaxbeam as jb
-    >>> weights = {"state_weight": [1e4, 1.0], "command_weight": [1e-3]}
-    >>> print(jb.PositionLQR(**weights, masses=[0.2, 0.4], loads="known").masses)
-    [0.2 0.4]
+    over_speeds = jax.vmap(design, (None, 0))
+    return jax.vmap(over_speeds, (0, None))(jnp.asarray(masses), jnp.asarray(speeds))
+
+
+def with_crossing_load(plant: Plant, mass, speed) -> Plant:
+    """Plant with another mass (kg) at another constant speed (m/s), in the same direction.
+
+    A vehicle of another mass is a similar one, of the same frequencies.
+    """
+    load, gravity = plant.case.loads[0], plant.case.run.gravity
+    changed = eqx.tree_at(
+        lambda x: (x.speed, x.deceleration), load, (jnp.sign(load.speed) * speed, jnp.zeros(()))
+    )
+    case = eqx.tree_at(lambda c: c.loads, plant.case, (changed,))
+    loads = load_set(case, plant.modal_model.modes.layout)
+    wheels = loads.wheels.scaled(mass / load.total_mass(gravity))
+    return dataclasses.replace(plant, case=case, loads=dataclasses.replace(loads, wheels=wheels))
+
+
+def with_single_mass(plant: Plant, direction: Float[Array, ""]) -> Plant:
+    """Plant under a mass of 1 kg alone, which travels at 1 m/s in a direction (1 or -1)."""
+    load = (MovingMass(mass=1.0, speed=direction),)
+    case = eqx.tree_at(lambda c: c.loads, plant.case, load)
+    loads = load_set(case, plant.modal_model.modes.layout)
+    return dataclasses.replace(plant, case=case, loads=loads)
+
+
+class ScheduledGainLaw(AbstractStateLaw):
+    """Gain schedules (mass, speed) and the source of the load, whose state is that of the law.
+
+    `design_speed` (m/s) is the speed of the load in the design. What is fed forward are weights in
+    proportion to the mass and, with a profile, the constant 1.
     """
 
-    kind: ClassVar[str] = "lqr-position"
-
-    masses: Float[Array, " mass"] = number("kg", "masses of the designs", INCREASING, kw_only=True)
-    speeds: Float[Array, " speed"] | None = number(
-        "m/s", "speeds of the designs", INCREASING, default=None
-    )
-    loads: str = choice("weights of the loads", "ignored", "known", default="ignored")
+    schedules: GainSchedule
+    masses: Float[Array, " mass"]
+    speeds: Float[Array, " speed"]
+    length: Float[Array, ""]
+    design_speed: Float[Array, ""]
+    load_source: AbstractLoadSource
+    nearest: bool = eqx.field(static=True)
+    weight_count: int = eqx.field(static=True)
 
     @property
-    def load_feedforward(self) -> bool:
-        return self.loads == "known"
+    def needs_vehicles(self):
+        return self.schedules.needs_vehicles
 
-    def design_state_law(self, plant, design_plant):
-        case, direction = design_plant.case, plant.loads.trajectories[0].direction()
-        case = eqx.tree_at(lambda c: c.loads, case, (MovingMass(mass=1.0, speed=direction),))
-        loads = load_set(case, design_plant.modal_model.modes.layout)
-        alone = dataclasses.replace(design_plant, case=case, loads=loads)
-        speeds = self.speeds
-        if speeds is None:
-            speeds = xp.abs(design_plant.case.loads[0].speed)[None]
+    def initial_state(self):
+        return self.load_source.initial_state()
 
-        def design(mass, speed):
-            return self.gain_schedule(alone, with_crossing_load(alone, mass, speed))
+    def step(self, state, estimate, measurement, t):
+        load, state = self.load_source.update(state, measurement, t)
+        mass = jnp.where(load.mass_identified, load.mass, self.masses[0])
+        speed, entry = jnp.abs(load.speed), load.entry_time
+        end = entry + self.length / speed
+        # In proportion to the mass between the designs, which differ in it alone.
+        clamped_mass = jnp.clip(mass, self.masses[0], self.masses[-1])
+        lightest = self.schedules.load_weights[0, 0]
+        constant = jnp.arange(lightest.shape[0]) >= self.weight_count
+        load_weights = jnp.where(constant, lightest, lightest * clamped_mass / self.masses[0])
 
-        schedules = jax.vmap(jax.vmap(design, (None, 0)), (0, None))(
-            jnp.asarray(self.masses), jnp.asarray(speeds)
-        )
-        gravity = plant.case.run.gravity
-        masses = jnp.stack([jnp.asarray(load.total_mass(gravity)) for load in plant.case.loads])
-        return PositionGainLaw(
-            schedules, self.masses, speeds, masses, masses * gravity, plant.loads
-        )
+        def command_of(schedule):
+            stretched = dataclasses.replace(
+                schedule, load_weights=load_weights, start=entry, end=end
+            )
+            return stretched.step((), estimate, measurement, t).command
 
-    def validate(self, case):
-        gravity = case.run.gravity
-        if case.profile is not None:
-            return "kind is for beams without a profile; take 'lqr-scheduled' or 'lqr-augmented'"
-        for i, load in enumerate(case.loads):
-            vehicle = load.vehicle(gravity)
-            if load.total_mass(gravity) is None:
-                return f"kind needs loads with a mass; loads.{i} has none"
-            if vehicle.names or vehicle.offsets.shape[0] != 1:
-                return f"kind needs loads of one wheel; loads.{i} has more: take 'lqr-augmented'"
-        if case.loads and case.loads[0].speed is None and self.speeds is None:
-            return "speeds must be given where the first load has a table of positions"
-        paths = [trajectory(load, case.beam.length) for load in case.loads]
-        directions = [path.direction() for path in paths]
-        if all(map(is_concrete, directions)) and len({float(concrete(x)) for x in directions}) > 1:
-            return "kind needs loads that all travel in one direction; take 'lqr-augmented'"
-        for name in ("masses", "speeds"):
-            values = getattr(self, name)
-            if values is not None and (
-                values.size == 0 or (is_concrete(values) and bool(np.any(concrete(values) <= 0)))
-            ):
-                return f"{name} must list at least one, and positive ones"
-        if self.entries == "predicted":
-            return "entries must be 'measured': the tables are read by the positions of the loads"
-        error = None
-        if case.loads and self.speeds is not None:
-            error = interval_error(self, case, self.speeds[0])
-        return error or super().validate(case)
+        commands = jax.vmap(jax.vmap(command_of))(self.schedules)
+        shares = self._interpolation(self.masses, mass), self._interpolation(self.speeds, speed)
+        command = jnp.einsum("m,v,mva->a", *shares, commands)
+        return ControlStep(jnp.where(load.speed_identified, command, 0.0), state)
+
+    def _interpolation(self, grid, value) -> Float[Array, " design"]:
+        """Weight of each design of a grid at a value."""
+        if self.nearest:
+            return jax.nn.one_hot(jnp.argmin(jnp.abs(grid - value)), grid.shape[0], dtype=float)
+        unit_vectors = jnp.eye(grid.shape[0])
+        return jax.vmap(lambda weights: jnp.interp(value, grid, weights))(unit_vectors)
 
 
 class ReadLoads(NamedTuple):
