@@ -132,6 +132,7 @@ def _clear_compiled():
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
     """Cases of tests have numbers of any size: they are judged where that is tested alone."""
+    shape_checks.calls.clear()
     from jaxbeam.model.plausibility import check
 
     judged = "test_plausibility.py", "test_docstrings.py", "test_growth.py"

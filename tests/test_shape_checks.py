@@ -57,6 +57,16 @@ def test_other_shapes_are_refused(call):
         call()
 
 
+def test_of_many_calls_some_are_checked():
+    refused = 0
+    for _ in range(1000):
+        try:
+            square(jnp.zeros(3))
+        except BeartypeCallHintViolation:
+            refused += 1
+    assert refused == 50 + 10
+
+
 def test_computed_sizes_are_checked():
     """Sizes in braces are those of the arguments, which only jaxtyping's own wrapper knows."""
 
