@@ -65,7 +65,6 @@ from .case.profiles.table import TableProfile as TableProfile
 from .case.sensors import Sensor as Sensor
 from .control.compensators import (
     PD as PD,
-    Lead as Lead,
     PositivePositionFeedback as PositivePositionFeedback,
 )
 from .control.feedback import Feedback as Feedback

@@ -58,7 +58,6 @@ CONTROLLERS = {
     "output-feedback": jb.OutputFeedback(gains=[[2e3] * 5], period=PERIOD),
     "sliding-mode": jb.SlidingMode(rate=30.0, reaching_rate=10.0, layer=0.1, period=PERIOD),
     "pd": jb.PD(gains=[2e3], rate_gains=20.0, lag=0.02, period=PERIOD),
-    "lead": jb.Lead(gains=[2e3], zero=2.0, pole=8.0, period=PERIOD),
     "ppf": jb.PositivePositionFeedback(
         gains=[800.0], frequency=17.0, damping_ratio=0.3, period=PERIOD
     ),

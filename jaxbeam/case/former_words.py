@@ -8,6 +8,7 @@ NAMES = {  # of the package jaxbeam
     "Recognition": "LoadIdentification",
     "Relief": "InternalModel",
     "recognised": "identified_load",
+    "Lead": "PD(lag=1 / p, rate_gains=gains / z - gains / p)",
     "DiscreteLQR": "LQR(sampling='exact')",
     "IntegralLQR": "LQR(sampling='exact', integral_weight=...)",
     "StepLQR": "LQR(horizon='frozen')",
@@ -25,6 +26,10 @@ WORDS = {  # kinds and keys of case files, parts of addresses
     "reach": "max_delay_periods",
 }
 KINDS = {  # that are options of another kind
+    "lead": (
+        "pd",
+        "lag = 1 / p and rate_gains = gains / z - gains / p (zero z and pole p in rad/s)",
+    ),
     "dlqr": ("lqr", 'sampling = "exact"'),
     "lqr-integral": ("lqr", 'sampling = "exact"'),
     "lqr-step": ("lqr", 'horizon = "frozen"'),

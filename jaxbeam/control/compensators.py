@@ -1,4 +1,4 @@
-"""Collocated compensators: PD, lead, positive position feedback.
+"""Collocated compensators: PD, which is also a phase lead, and positive position feedback.
 
 Each is given by its transfer function. With a period it is discretised by the bilinear transform,
 so that a stable filter is stable at every period; in continuous time its states are integrated
@@ -118,6 +118,8 @@ class ContinuousCompensator(AbstractContinuousLaw):
 class PD(AbstractCompensator):
     """Proportional feedback and a smoothed rate: u = -(g + r s / (lag s + 1)) y.
 
+    With the lag 1 / p and r = g / z - g / p it is a phase lead, u = -g (1 + s / z) / (1 + s / p) y.
+
     >>> import jaxbeam as jb
     >>> case = jb.Case(
     ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=2),
@@ -143,37 +145,6 @@ class PD(AbstractCompensator):
     def transfer_function(self):
         rate_numerator = self.gains * self.lag + self.rate_gains
         return self._per_loop(-self.gains, -rate_numerator), self._per_loop(1.0, self.lag)
-
-
-class Lead(AbstractCompensator):
-    """Phase lead: u = -g (1 + s / z) / (1 + s / p) y; a phase lag if the zero z is above p.
-
-    >>> import jaxbeam as jb
-    >>> case = jb.Case(
-    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=2),
-    ...     actuators=[jb.PointForce(0.3)],
-    ...     sensors=[jb.Sensor(0.3)],
-    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
-    ...     controller=jb.Lead(gains=[2e3], zero=20.0, pole=80.0, period=0.005),
-    ...     run=jb.Run(0.15),
-    ... )
-    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
-    0.900 mm
-    """
-
-    kind: ClassVar[str] = "lead"
-
-    zero: Float[Array, " *actuator"] = number(
-        "Hz", "corner frequency of the zero, where the gain starts to rise", POSITIVE
-    )
-    pole: Float[Array, " *actuator"] = number(
-        "Hz", "corner frequency of the pole, where the gain stops to rise", POSITIVE
-    )
-
-    def transfer_function(self):
-        zero_time, pole_time = (1 / (2 * xp.pi * part) for part in (self.zero, self.pole))
-        numerator = self._per_loop(-self.gains, -self.gains * zero_time)
-        return numerator, self._per_loop(1.0, pole_time)
 
 
 class PositivePositionFeedback(AbstractCompensator):

@@ -50,6 +50,7 @@ TWO_LOADS = [
 ]
 ESTIMATED = jb.Kalman(0.02, 1e-5, loads="estimated", weight_deviation=1.0)
 SHORT = {"loads": [jb.MovingMass(mass=0.4, speed=15.0)], "run": Run(duration=0.06)}
+LEAD_LAG = 1 / (2 * np.pi * np.array([20.0, 30.0]))  # s, of poles at 20 and 30 Hz
 CASES = {
     "feedback": rig(Feedback([2e3, 1e3], higher_gains=[[1e8, 2e8]], period=PERIOD)),
     "spring": rig(
@@ -66,7 +67,14 @@ CASES = {
         sensors=LATE,
     ),
     "pd": rig(jb.PD([2e3, 1e3], rate_gains=[10.0, 5.0], lag=1e-2, period=PERIOD)),
-    "lead": rig(jb.Lead([2e3, 1e3], zero=5.0, pole=[20.0, 30.0], period=PERIOD)),
+    "lead": rig(
+        jb.PD(
+            [2e3, 1e3],
+            rate_gains=np.array([2e3, 1e3]) * (1 / (10 * np.pi) - LEAD_LAG),
+            lag=LEAD_LAG,
+            period=PERIOD,
+        )
+    ),
     "ppf": rig(
         jb.PositivePositionFeedback([1e3, 1e3], 8.0, damping_ratio=0.3, period=PERIOD, delay=1e-3)
     ),

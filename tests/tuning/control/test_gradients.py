@@ -47,10 +47,6 @@ LOOPS = {
         jb.PD([3000.0], rate_gains=20.0, lag=0.02, period=0.01),
         {"controller.gains.0": 3000.0, "controller.rate_gains": 20.0, "controller.lag": 0.02},
     ),
-    "lead": (
-        jb.Lead([3000.0], zero=2.0, pole=8.0, period=0.01),
-        {"controller.gains.0": 3000.0, "controller.zero": 2.0, "controller.pole": 8.0},
-    ),
     "ppf": (
         jb.PositivePositionFeedback([800.0], frequency=17.0, damping_ratio=0.3, period=0.01),
         {"controller.frequency": 17.0, "controller.damping_ratio": 0.3},
