@@ -26,6 +26,7 @@ from jaxbeam.integrator.peaks.contact_minimum import (
     force_weights_at_fractions,
     spread_factor,
 )
+from jaxbeam.integrator.peaks.end_forces import END_FRACTIONS
 from jaxbeam.integrator.peaks.monitored_rows import bounds_by_energy
 from jaxbeam.integrator.peaks.running_peaks import PEAK_MARGIN, Peaks
 from jaxbeam.integrator.propagators import (
@@ -38,12 +39,13 @@ from jaxbeam.integrator.propagators import (
 from jaxbeam.integrator.step_matrices import CHUNK_STEPS
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.layout import is_uniform
-from jaxbeam.model.load_set import WheelSet
+from jaxbeam.model.load_set import LoadSet, WheelSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.corrected_rows import StaticCorrection
 from jaxbeam.model.sensing.linear_outputs import linear_outputs
 from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.model.settlement import has_settlement
+from jaxbeam.model.vehicles.vehicle_states import initial_vehicle_states
 from jaxbeam.numerics.gauss import lagrange_coefficients
 from jaxbeam.numerics.peak_search import (
     ESTIMATE_ITERATIONS,
@@ -103,17 +105,18 @@ def chosen_for(case: Case, runs: int) -> bool:
 def supports(case: Case) -> bool:
     """Whether the C integrator can compute the peaks of a case."""
     plain = (
-        case.controller is None
-        and case.profile is None
-        and not has_settlement(case)
-        and not may_have_kinks(case)
-        and not any(load.force_histories() for load in case.loads)
+        case.controller is None and not has_settlement(case) and not may_have_kinks(case)
     )
     # The static influence is then a polynomial in each step.
     return plain and (
         not any(sensor.bends for sensor in case.sensors)
         or (is_uniform(case) and not case.actuators)
     )
+
+
+def has_courses(case: Case) -> bool:
+    """Whether the C integrator needs the `inputs_over_time` of a case, which NumPy computes."""
+    return case.profile is not None or any(load.force_histories() for load in case.loads)
 
 
 def available() -> bool:
@@ -156,6 +159,9 @@ class NativeInputs(NamedTuple):
     output_bounds: Float[Array, "task output block"]
     influence_breaks: Float[Array, "task break"] | None
     influence_series: Float[Array, "task piece term output"] | None
+    surface: Float[Array, "task step motion_node"] | None = None
+    load_forces: Float[Array, "task step wheel_node run"] | None = None
+    initial_vehicles: Float[Array, "task state run"] | None = None
 
 
 class _Argument(ctypes.Structure):
@@ -212,6 +218,37 @@ def batch_inputs(
         "vehicle_input_matrix": _vehicle_matrices(wheels, "B"),
         "vehicle_output_matrix": _vehicle_matrices(wheels, "H"),
     }
+
+
+def inputs_over_time(
+    loads: LoadSet,
+    starts: Float[np.ndarray, " panel"],
+    counts: Int[np.ndarray, " panel"],
+    lengths: Float[np.ndarray, " panel"],
+) -> dict[str, np.ndarray]:
+    """Those of the `NativeInputs` of a batch that are functions of time, of known numbers.
+
+    Steps are so many a panel, from its start (s), of a length (s). `surface` is the motion of the
+    profile under all wheels, `load_forces` forces in addition to their weights, both at the Gauss
+    nodes and then at the ends of the steps.
+    """
+    panel = np.repeat(np.arange(len(counts)), counts)
+    number = np.arange(len(panel)) - np.repeat(np.cumsum(counts) - counts, counts)
+    length = lengths[panel, None]
+    times = starts[panel, None] + length * (number[:, None] + [*GAUSS_NODES, *END_FRACTIONS])
+    inputs, wheels = {}, loads.wheels
+    if not loads.massless and loads.profile is not None:
+        motions: Any = loads.surface_motion(*loads.kinematics(times))
+        surface = np.moveaxis(np.stack(motions, axis=1), 2, 0)  # step, wheel, motion, node
+        inputs["surface"] = surface.reshape(len(panel), -1)
+        if wheels.vehicles:
+            inputs["initial_vehicles"] = initial_vehicle_states(loads)
+    if wheels.histories:
+        forces = np.zeros((len(panel), loads.wheel_count, times.shape[1], wheels.weight.shape[1]))
+        for wheel, history in wheels.histories.items():
+            forces[:, wheel] = history.at(times)
+        inputs["load_forces"] = forces.reshape(len(panel), -1, forces.shape[-1])
+    return inputs
 
 
 def integrate_peaks(max_loads: int, mask: Bool[np.ndarray, " task"], inputs: NativeInputs) -> Peaks:

@@ -75,15 +75,17 @@ class Runner:
         self.trials = Trials()
         self.most_inputs = most_inputs
         self._set_block_size(most_batches)
-        # Loads, settings of the run and controllers do not change the model, which all batches then
+        # Loads, profiles, settings of the run and controllers do not change the model, which all batches then
         # share; not on several devices, each of which has the models of its part of a block.
-        leaves_model_unchanged = ("loads.", "run.", "controller.")
+        leaves_model_unchanged = ("loads.", "profile.", "run.", "controller.")
         same_model = all(
             name.startswith(leaves_model_unchanged) for name in batches.shared_addresses
         )
         self.known_model = known_model(case) if same_model and self.devices == 1 else None
         self.program = self._make_program(native)
         self.known_inputs = self._known_inputs() if native else None
+        if native and self.known_inputs is None and native_peaks.has_courses(case):
+            self.program = self._make_program(native=False)
         # More threads than cores where some wait for others.
         waiting = self.known_inputs is None
         self.pool = ThreadPoolExecutor((os.cpu_count() or 1) * (2 if waiting else 1))
@@ -181,7 +183,9 @@ class Runner:
 
         Raises RuntimeError if no time step meets the tolerance.
         """
-        count = _round_up(MIN_TRIAL_BATCHES, self.trial_batches)
+        count = MIN_TRIAL_BATCHES
+        if self.known_inputs is None:  # calls of a program take equally many
+            count = _round_up(count, self.trial_batches)
 
         def peaks(batch_indices, steps, extra_steps, single=False):
             results = self._trial_results(batch_indices, steps, extra_steps, single)

@@ -1,5 +1,6 @@
 """What the C integrator needs to know of batches that share a model, without a compiler."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from jaxtyping import Float, Int
 from jaxbeam.case.case import Case, concrete_case, structure_of
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.time_grid import event_places, grid_between_events
+from jaxbeam.model.load_set import WheelSet, load_set
 from jaxbeam.model.modal_model import ModalModel, has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.corrected_rows import corrected_places
@@ -90,7 +92,32 @@ class KnownInputs:
         with np.errstate(all="ignore"):
             loads = self._loads(batch_indices)
             found = vectorised(of_batch)(*events, max_steps, extra_steps, *loads)
+        if native_peaks.has_courses(self.program.case):
+            found |= self._over_time(batch_indices, loads[1], found)
         return native_peaks.NativeInputs(**self.of_model, **found)
+
+    def _over_time(self, batch_indices, wheels: WheelSet, found) -> dict[str, np.ndarray]:
+        """Inputs of batches that are functions of time, for the steps that have been found.
+
+        Zero after the last step of a batch.
+        """
+        panels = zip(
+            *(found[name] for name in ("panel_starts", "step_counts", "step_lengths")), strict=True
+        )
+        of_batches = []
+        for row, (batch, of_panels) in enumerate(zip(batch_indices, panels, strict=True)):
+            case = self.program.case_with(self.batches.shared_values[batch])
+            own = jax.tree.map(lambda part, row=row: part[row], wheels)
+            loads = dataclasses.replace(load_set(case, self.program.shapes.layout), wheels=own)
+            of_batches.append(native_peaks.inputs_over_time(loads, *of_panels))
+        steps, inputs = int(found["step_counts"].sum(axis=1).max()), {}
+        for name in of_batches[0]:
+            parts = [of_batch[name] for of_batch in of_batches]
+            count = parts[0].shape[0] if name == "initial_vehicles" else steps
+            inputs[name] = np.zeros((len(parts), count, *parts[0].shape[1:]))
+            for row, part in enumerate(parts):
+                inputs[name][row, : len(part)] = part
+        return inputs
 
     def of_blocks(
         self, max_steps: Float[np.ndarray, " path"], batches_per_block: int, most_batches: int

@@ -20,8 +20,8 @@ void end_forces(const Workspace *w, const Step *step, const Group *g);
 /* Times of the first entry of a wheel of a vehicle and of the last exit. */
 void set_vehicle_times(Workspace *w);
 
-/* Whether a vehicle is between its entry and its exit in a step; others are at rest or do not
- * return. */
+/* Whether vehicles move in a step, and may yet press on the beam: between their first entry and
+ * their last exit, on a profile from the start. */
 int vehicles_move(const Workspace *w, const Step *step);
 
 /* States of vehicles at the end of a step; its contact forces follow the state of the beam. */

@@ -12,7 +12,9 @@
 static void reset(Workspace *w) {
     const size_t batch_size = (size_t)w->batch_size, sampled = (size_t)w->positions * batch_size;
     memset(w->state, 0, 8 * (size_t)w->states * batch_size);
-    memset(w->vehicle_state, 0, 8 * (size_t)w->vehicle_states * batch_size);
+    const size_t vehicle_bytes = 8 * (size_t)w->vehicle_states * batch_size;
+    if (w->has_initial) memcpy(w->vehicle_state, w->inputs[INITIAL_VEHICLES], vehicle_bytes);
+    else memset(w->vehicle_state, 0, vehicle_bytes);
     for (size_t i = 0; i < batch_size; i += REGISTER_WIDTH)
         w->vehicle_panel[i / REGISTER_WIDTH] = -1;
     memset(w->peak_samples, 0, 8 * PEAK_POINTS * sampled);
@@ -25,15 +27,16 @@ static void reset(Workspace *w) {
 }
 
 /* Steps of the next chunk, with their matrices; returns their number. `done` steps of the panel
- * precede it. */
-static int next_chunk(Workspace *w, int *panel, int64_t *done) {
+ * and `before` of the task precede it. */
+static int next_chunk(Workspace *w, int *panel, int64_t *done, int64_t before) {
     int count = 0;
     while (count < CHUNK_STEPS && *panel < w->panels) {
         if (*done >= panel_steps(w, *panel)) {
             ++*panel, *done = 0;
             continue;
         }
-        Step *step = w->steps + count++;
+        Step *step = w->steps + count;
+        step->number = before + count++;
         step->panel = *panel, step->length = w->inputs[STEP_LENGTHS][*panel];
         step->start = w->inputs[PANEL_STARTS][*panel] + (double)(*done)++ * step->length;
         step->transition = w->transition + (size_t)*panel * transition_size(w);
@@ -60,8 +63,8 @@ static void integrate_task(Workspace *w) {
     set_vehicle_times(w);
     const double exit_time = last_exit(w);
     int panel = 0;
-    int64_t done = 0;
-    for (int steps; (steps = next_chunk(w, &panel, &done));) {
+    int64_t done = 0, before = 0;
+    for (int steps; (steps = next_chunk(w, &panel, &done, before)); before += steps) {
         for (ptrdiff_t first = 0; first < w->batch_size;) {
             int groups = 0;
             for (; groups < INTERLEAVED_GROUPS && first < w->batch_size;
@@ -138,6 +141,10 @@ int integrate_peaks(int64_t max_loads, const Array *arguments, double *const *ou
                            .batch_size = sizes[INERTIA][2],
                            .groups_of_vehicles = (int)sizes[VEHICLES][1],
                            .vehicles = arguments[VEHICLES].numbers,
+                           .has_surface = sizes[SURFACE][1] > 0,
+                           .has_forces = sizes[LOAD_FORCES][1] > 0,
+                           .has_initial = sizes[INITIAL_VEHICLES][1] > 0,
+                           .forced_runs = sizes[LOAD_FORCES][3],
                            .outputs = outputs};
     Workspace *w = &workspace;
     derive_sizes(w);

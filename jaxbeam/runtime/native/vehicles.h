@@ -1,17 +1,28 @@
-/* Vehicles on the beam: integrator/vehicles/propagators.py and steps.py, without a profile. Their
- * springs press on the beam with s = S q - O z, from the forces q = k y + c y' of the beam at the
- * nodes and their states z at the start of a step. Blocks of S and O belong to wheels. */
+/* Vehicles: integrator/vehicles/propagators.py and steps.py. Their springs press on the beam with
+ * s = S q - O z, from the forces q = k y + c y' of beam and profile at the nodes and their states z
+ * at the start of a step. Blocks of S and O belong to wheels. */
 
 #pragma once
 
 #include "matrices.h"
 #include "vehicle_layout.h"
 
-/* Whether a vehicle is between its entry and its exit in a step; others are at rest or do not
- * return. */
 int vehicles_move(const Workspace *w, const Step *step) {
     const double middle = step->start + step->length / 2;
-    return w->first_vehicle_entry < middle && middle < w->last_vehicle_exit;
+    return (w->has_surface || w->first_vehicle_entry < middle) && middle < w->last_vehicle_exit;
+}
+
+/* Forces of the profile on the springs of all wheels at the nodes. */
+static void press_by_profile(const Workspace *w, const Step *step, const Group *g) {
+    for (int wheel = 0; wheel < w->loads; wheel++) {
+        const ptrdiff_t at = wheel * w->batch_size + g->first;
+        const Register stiffness = load(w->inputs[STIFFNESS] + at, g->count),
+                       damping = load(w->inputs[DAMPING] + at, g->count);
+        const double *height = profile_motion(w, step, wheel, HEIGHT),
+                     *rate = profile_motion(w, step, wheel, HEIGHT_RATE);
+        for (int k = 0; k < NODES; k++)
+            g->profile[wheel * NODES + k] = stiffness * height[k] + damping * rate[k];
+    }
 }
 
 /* Times of the first entry of a wheel of a vehicle and of the last exit. */
@@ -52,6 +63,7 @@ static inline ALWAYS_INLINE void add_vehicles(const Workspace *w, const Step *st
                                   damping * step->contact_compliance[VELOCITY][j];
         }
     }
+    if (w->has_surface) press_by_profile(w, step, g);
     const Register *z = g->vehicle_state;
     Register *start = vehicles_of(w, g), pressed[NODES];
     for (int group = 0; group < w->groups_of_vehicles; group++) {
@@ -76,6 +88,12 @@ static inline ALWAYS_INLINE void add_vehicles(const Workspace *w, const Step *st
                     add_matrix_product(pressed, press, NODES, surface + t * NODES, NODES, 1);
                     for (int k = 0; k < NODES; k++) right[s * NODES + k] -= pressed[k];
                 }
+                if (!w->has_surface) continue;
+                memset(pressed, 0, sizeof pressed);
+                for (int v = 0; v < wheels; v++)
+                    add_matrix_product(pressed, of.press + (u * wheels + v) * NODES * NODES, NODES,
+                                       g->profile + (first + v) * NODES, NODES, 1);
+                for (int k = 0; k < NODES; k++) right[s * NODES + k] -= pressed[k];
             }
     }
 }
@@ -88,6 +106,8 @@ void propagate_vehicles(const Workspace *w, const Step *step, Group *g) {
     memset(next, 0, (size_t)w->vehicle_states * sizeof *next);
     if (rows)
         add_matrix_product(surface, g->impedance, rows, g->state + w->states, rows, 1);
+    else if (w->has_surface)
+        press_by_profile(w, step, g); /* which no contact forces needed */
     for (int group = 0; group < w->groups_of_vehicles; group++) {
         const int64_t *numbers = w->vehicles + group * VEHICLE_NUMBERS;
         const int states = (int)numbers[STATES], wheels = (int)numbers[WHEELS];
@@ -101,6 +121,10 @@ void propagate_vehicles(const Workspace *w, const Step *step, Group *g) {
                 add_matrix_product(next, of.input + v * states * NODES, states, surface + s * NODES,
                                    NODES, 1);
             }
+            for (int v = 0; w->has_surface && v < wheels; v++)
+                add_matrix_product(next, of.input + v * states * NODES, states,
+                                   g->profile + (numbers[FIRST_WHEEL] + i * wheels + v) * NODES,
+                                   NODES, 1);
         }
     }
     Register *former = g->vehicle_state;

@@ -47,6 +47,9 @@ enum {
     OUTPUT_BOUNDS,
     INFLUENCE_BREAKS,
     INFLUENCE_SERIES,
+    SURFACE,
+    LOAD_FORCES,
+    INITIAL_VEHICLES,
     GAUSS_NODES,
     LAGRANGE_COEFFICIENTS,
     INTERPOLATION,
@@ -63,12 +66,16 @@ enum { FIRST_WHEEL, WHEELS, STATES, COUNT, VEHICLE_NUMBERS };
 /* Motions of the beam under a wheel; the last two are those that springs of vehicles need. */
 enum { ACCELERATION, DEFLECTION, VELOCITY, MOTIONS };
 
+/* Motions of the profile under a wheel, in the order of SURFACE: (step, wheel, motion, path node). */
+enum { HEIGHT, HEIGHT_RATE, HEIGHT_SECOND_RATE, SURFACE_MOTIONS };
+
 /* A step and its matrices, stored by columns: contact response (state, row), contact compliance
  * (row, row), both of each motion, force response (row, state), sample rows (state, row and end,
  * sample). Rows are the Gauss nodes of all loads on the beam. Outputs that follow forces at once use
  * those at the ends of the step, too, two for each load: end response (end, state, load) and
  * compliance (end, load, load). */
 typedef struct {
+    int64_t number; /* among all steps of the task */
     int panel, loads, rows, ends;
     double start, length;
     const double *transition;
@@ -78,13 +85,13 @@ typedef struct {
 } Step;
 
 /* Runs that fill a register; contact forces follow the state in memory, then those at the ends of
- * the step. Vehicles: their states, the forces q of the beam on the springs of the rows, and these
- * per contact force. */
+ * the step. Vehicles: their states, the forces q of the beam on the springs of the rows, these per
+ * contact force, and those of the profile on the springs of all wheels. */
 typedef struct {
     ptrdiff_t first;
     int count;
     Register *state, *next_state, *matrix, *end_forces;
-    Register *vehicle_state, *next_vehicle_state, *surface, *impedance;
+    Register *vehicle_state, *next_vehicle_state, *surface, *impedance, *profile;
     Register *samples; /* (step, sample, position) */
     /* (step, position): largest of the samples, and bound of the curve between them */
     Register *sample_peak, *peak_bound;
@@ -99,6 +106,8 @@ typedef struct {
      * vehicles, the largest numbers of one, registers of the propagators of all loads. */
     int groups_of_vehicles, motions, vehicle_states, most_states, most_wheels, vehicle_registers;
     const int64_t *vehicles;
+    int has_surface, has_forces, has_initial;
+    int64_t forced_runs; /* runs with forces over time of their own: all, or one for all */
     ptrdiff_t batch_size;
     const double *inputs[ARGUMENT_COUNT];
     double *const *outputs;
@@ -215,6 +224,7 @@ static size_t partition_workspace(Workspace *w, uintptr_t start) {
         g->next_vehicle_state = allocate(start, &used, (size_t)w->vehicle_states * REGISTER_WIDTH);
         g->surface = allocate(start, &used, MOTIONS * rows * REGISTER_WIDTH);
         g->impedance = allocate(start, &used, rows * rows * REGISTER_WIDTH);
+        g->profile = allocate(start, &used, (size_t)w->loads * NODES * REGISTER_WIDTH);
     }
     for (int t = 0; t < CHUNK_STEPS; t++) {
         Step *step = w->steps + t;
@@ -265,6 +275,14 @@ static void set_inputs(Workspace *w, const Array *arguments, int64_t task) {
 
 static int64_t panel_steps(const Workspace *w, int panel) {
     return ((const int64_t *)w->inputs[STEP_COUNTS])[panel];
+}
+
+/* Motion of the profile at the path nodes under a wheel, NULL without a profile. */
+static const double *profile_motion(const Workspace *w, const Step *step, int64_t wheel,
+                                    int motion) {
+    if (!w->has_surface) return NULL;
+    return w->inputs[SURFACE] +
+           ((step->number * w->loads + wheel) * SURFACE_MOTIONS + motion) * PATH_NODES;
 }
 
 /* Number of runs of the group that begins with the run `first`. */
