@@ -104,9 +104,7 @@ def chosen_for(case: Case, runs: int) -> bool:
 
 def supports(case: Case) -> bool:
     """Whether the C integrator can compute the peaks of a case."""
-    plain = (
-        case.controller is None and not has_settlement(case) and not may_have_kinks(case)
-    )
+    plain = case.controller is None and not has_settlement(case) and not may_have_kinks(case)
     # The static influence is then a polynomial in each step.
     return plain and (
         not any(sensor.bends for sensor in case.sensors)
@@ -222,13 +220,13 @@ def batch_inputs(
 
 def inputs_over_time(
     loads: LoadSet,
-    starts: Float[np.ndarray, " panel"],
+    starts: Float[np.ndarray, " boundary"],
     counts: Int[np.ndarray, " panel"],
-    lengths: Float[np.ndarray, " panel"],
+    lengths: Float[np.ndarray, " length"],
 ) -> dict[str, np.ndarray]:
     """Those of the `NativeInputs` of a batch that are functions of time, of known numbers.
 
-    Steps are so many a panel, from its start (s), of a length (s). `surface` is the motion of the
+    Steps are so many a panel, from its start (s), of its length (s). `surface` is the motion of the
     profile under all wheels, `load_forces` forces in addition to their weights, both at the Gauss
     nodes and then at the ends of the steps.
     """

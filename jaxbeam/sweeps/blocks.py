@@ -75,8 +75,8 @@ class Runner:
         self.trials = Trials()
         self.most_inputs = most_inputs
         self._set_block_size(most_batches)
-        # Loads, profiles, settings of the run and controllers do not change the model, which all batches then
-        # share; not on several devices, each of which has the models of its part of a block.
+        # Loads, profiles, settings of the run and controllers do not change the model, which all
+        # batches then share; not on several devices, each of which has the models of its part.
         leaves_model_unchanged = ("loads.", "profile.", "run.", "controller.")
         same_model = all(
             name.startswith(leaves_model_unchanged) for name in batches.shared_addresses
@@ -234,7 +234,7 @@ class Runner:
         def compute(block: int) -> dict[str, np.ndarray]:
             batch_indices = self._batches_of(block)
             known = known_results.known(batch_indices, steps[batch_indices])
-            results = integrate(block, ~known)
+            results = {} if known.all() else integrate(block, ~known)
             if not known.any():
                 return results
             return known_results.completed(results, batch_indices, known)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import threading
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -132,6 +133,8 @@ class KnownInputs:
         blocks = min(-(-count // batches_per_block), most)
         group_size = blocks * batches_per_block
 
+        lock = threading.Lock()  # threads that ask for the same group wait for it
+
         @functools.lru_cache(maxsize=4)  # blocks are taken in their order, by few threads
         def of_group(group: int) -> native_peaks.NativeInputs:
             batch_indices = np.arange(group * group_size, (group + 1) * group_size) % count
@@ -141,9 +144,10 @@ class KnownInputs:
         def of_block(block: int) -> native_peaks.NativeInputs:
             group, place = divmod(block, blocks)
             rows = slice(place * batches_per_block, (place + 1) * batches_per_block)
-            return inputs_of_rows(of_group(group), rows)
+            with lock:
+                inputs = of_group(group)
+            return inputs_of_rows(inputs, rows)
 
-        of_group(0)  # before threads ask for it
         return of_block
 
     def _loads(self, batch_indices):

@@ -37,9 +37,12 @@ class Trials:
         batch_indices: Int[np.ndarray, " path"],
         known: Bool[np.ndarray, " path"],
     ) -> dict[str, np.ndarray]:
-        """Results (path, batch, ...) of batches with those that are known."""
+        """Results (path, batch, ...) of batches with those that are known; they may be all."""
+        own = {row: self._latest[int(batch_indices[row])][1] for row in np.flatnonzero(known)}
+        if known.all():
+            return {name: np.stack([one[name] for one in own.values()]) for name in own[0]}
         results = {name: np.array(values) for name, values in results.items()}
-        for row in np.flatnonzero(known):
-            for name, values in self._latest[int(batch_indices[row])][1].items():
+        for row, of_batch in own.items():
+            for name, values in of_batch.items():
                 results[name][row] = values
         return results

@@ -73,6 +73,17 @@ LONG = jb.Case(
     ],
     run=jb.Run(2.0),
 )
+# Masses on a rough road and forces that vary, whose moments follow the contact forces at once.
+ROUGH = dataclasses.replace(
+    PLAIN,
+    sensors=[jb.Sensor(0.3), jb.Sensor(0.2, "moment"), jb.Sensor(0.4, "shear")],
+    loads=[
+        jb.MovingMass(mass=0.5, speed=1.0),
+        jb.MovingMass(mass=0.2, speed=-1.5),
+        jb.VaryingForce(force_times=[0.1, 0.3], forces=[1.0, 4.0], speed=0.8),
+    ],
+    profile=jb.SineProfile(amplitude=2e-4, wavelength=0.15),
+)
 # Other quantities, on a beam whose modes are coupled by a damper.
 QUANTITIES = ("velocity", "acceleration", "strain", "moment", "shear")
 MEASURED = dataclasses.replace(
@@ -128,6 +139,18 @@ def test_results_equal_those_of_xla(case, over):
     assert_allclose(native.peak_time, plain.peak_time, atol=2e-7)
     # They differ by rounding, or the sweep did not use C.
     assert np.any(native.peak_deflection != plain.peak_deflection)
+
+
+@pytest.mark.parametrize("over", [{"loads.0.mass": [0.1, 0.5]}, {"profile.amplitude": [1e-4]}])
+def test_peaks_on_rough_roads_equal_those_of_single_runs(over):
+    assert native_peaks.supports(ROUGH)
+    found = jb.sweep(ROUGH, over, tolerance=1e-8, progress=False)
+    ((address, values),) = over.items()
+    for i, value in enumerate(values):
+        record = jb.simulate(jb.replace(ROUGH, {address: value}), tolerance=1e-9)
+        largest = np.maximum(np.abs(record.smallest), record.largest)
+        for n, quantity in enumerate(["deflection", "moment", "shear"]):
+            assert_allclose(found[f"peak_{quantity}"][i, n], largest[n], rtol=2e-8)
 
 
 def test_peaks_of_every_quantity_equal_those_of_a_single_run():
