@@ -82,7 +82,7 @@ def export_c(case: Case, name: str) -> CProgram:
     except NoCCodeError as error:
         kind = kind_of(type(controller)) or type(controller).__name__
         raise ValueError(f"controller.kind {kind!r} cannot be exported as C: {error}") from None
-    _write_limits(case, code)
+    received = _write_limits(case, code)
     loop = recorded_loop(case, law, MAX_SAMPLES)
     given = _given_states(law, loop, code)
     gate_events = _gate_events(code, float(loop.times[-1]))
@@ -91,7 +91,7 @@ def export_c(case: Case, name: str) -> CProgram:
         f"{name}.h": header_text(name, title, code),
         f"{name}.c": source_text(name, title, code),
         f"{name}_samples.h": samples_text(name, loop, given, gate_events),
-        f"{name}_check.c": check_text(name, code),
+        f"{name}_check.c": check_text(name, code, received),
     }
     return CProgram(files, code.operations, code.state_bytes, code.constant_bytes, len(loop.times))
 
@@ -167,10 +167,12 @@ def _source(case: Case) -> CSource:
     return code
 
 
-def _write_limits(case: Case, code: CSource) -> None:
+def _write_limits(case: Case, code: CSource) -> tuple[str, ...]:
     """Resolution, limits and rate limits of the commands, and the delay until they act.
 
-    Where a number of the law is not finite, it starts again, and the last command of it stays.
+    The members of the state that are the last commands as the actuators received them; none where
+    hysteresis or creep of the actuators is compensated, whose states follow from them. Where a
+    number of the law is not finite, it starts again, and the last command of it stays.
     """
     actuators, lag = code.actuators, command_lag(case)
     low, high, rate = (np.asarray(part) for part in command_ranges(case))
@@ -225,6 +227,9 @@ copy({last}, {code.output}, {actuators});""",
             )
         code.add(f"copy({queue}, {newest}, {actuators});")
     code.add(f"copy({code.command}, {known_queue} + {actuators * (lag - 1)}, {actuators});")
+    if compensation.operators:
+        return ()
+    return ("sent",) if lag > 1 else ("sent", "acting")
 
 
 def _given_states(law, loop: RecordedLoop, code: CSource) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import re
 import textwrap
+from collections.abc import Sequence
 from importlib.metadata import version
 
 import numpy as np
@@ -122,9 +123,23 @@ enum {{ SAMPLES = {len(loop.times)}, GATE_EVENTS = {len(gate_events)} }};
 """
 
 
-def check_text(name: str, code: CSource) -> str:
-    """Loop over the recorded samples, which compares the commands with those expected."""
+def check_text(name: str, code: CSource, received: Sequence[str]) -> str:
+    """Loop over the recorded samples, which compares the commands with those expected.
+
+    Members `received` of the state have the commands that the actuators received last. They become
+    the recorded ones: a law may be unstable by itself, where only the loop is stable, and would
+    multiply the rounding of its own commands from sample to sample.
+    """
     big = name.upper()
+    receive = "".join(
+        f"\n            state.{member}[i] += ({name}_real)(expected - (double)commands[i]);"
+        for member in received
+    )
+    if receive:
+        receive = (
+            "\n            /* The actuators received the recorded command: without the loop a"
+            f"\n               law may be unstable, and multiply its own rounding. */{receive}"
+        )
     gates = ""
     if code.gate_loads:
         gates = f"""
@@ -163,7 +178,7 @@ int main(void)
             const double expected = sample_commands[k * {big}_COMMANDS + i];
             const double difference = fabs((double)commands[i] - expected);
             if (!(difference <= error)) error = difference;
-            if (fabs(expected) > largest) largest = fabs(expected);
+            if (fabs(expected) > largest) largest = fabs(expected);{receive}
         }}
     }}
     printf("%d samples, largest command %.6g, largest error %.3g of it, %d bytes of state\\n",

@@ -21,6 +21,7 @@ SIZES = [
     ("lqr-inversion", 1, 1),
     ("lqr-inversion", 2, 3),
     ("dlqr-kalman", 1, 3),
+    ("mpc", 2, 2),  # unstable by itself: only the loop is stable
     ("gpc", 1, 3),
     ("gpc-adaptive", 1, 1),
     ("gpc-adaptive", 1, 2),
