@@ -46,7 +46,7 @@ from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, any_jax, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.module import Module
-from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule, moves_events
+from jaxbeam.simulation.closed_loop import closed_loop, known_loop, loop_schedule, moves_events
 from jaxbeam.simulation.errors import step_errors
 from jaxbeam.simulation.plan_origin import (
     PlanOrigin,
@@ -324,9 +324,9 @@ def _choose_substeps(
     check_step_count(schedule.times.size * interval / step, step)
     min_substeps = steps_per_interval(interval, step)
 
-    is_compiled = runs_compiled(case, schedule)
+    is_compiled = runs_compiled(schedule)
     trial_run = _compiled_trial_run if is_compiled else _known_trial_run
-    policy = None if is_compiled else _known_loop(case, shapes, schedule)
+    policy = None if is_compiled else known_loop(case, shapes.layout, schedule)
 
     model = modal_model(case, shapes.layout, shapes.coupled)
     least = rounding_deflection(case, model, load_set(case))
@@ -381,18 +381,12 @@ def _sensor_errors(case: Case, shapes: StaticShapes, trial: StepTrial | None) ->
     return tuple(map(float, errors))
 
 
-def runs_compiled(case: Case, schedule: EventSchedule) -> bool:
+def runs_compiled(schedule: EventSchedule) -> bool:
     """Whether runs of a controlled case are compiled although its numbers are known.
 
     In NumPy each event takes a fraction of a millisecond, in a program a hundredth of that.
     """
-    return case.controller.runs_compiled or schedule.times.shape[0] > MAX_KNOWN_EVENTS
-
-
-@compiled_if_traced
-def _known_loop(case, shapes, schedule):
-    """Input policy of all trial runs."""
-    return closed_loop(case, shapes.layout, load_set(case, shapes.layout), schedule)
+    return schedule.times.shape[0] > MAX_KNOWN_EVENTS
 
 
 def beam_and_vehicles(

@@ -30,6 +30,7 @@ from jaxbeam.runtime.arrays import Array, any_jax, put, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import (
     closed_loop,
+    known_loop,
     moved_schedule,
     with_fixed_events,
     with_fixed_losses,
@@ -39,7 +40,6 @@ from jaxbeam.simulation.errors import peak_errors
 from jaxbeam.simulation.extremes import monitored_sensors, sensor_extremes
 from jaxbeam.simulation.integration_plan import (
     TOLERANCE,
-    FirstRun,
     IntegrationPlan,
     beam_and_vehicles,
     check_plan,
@@ -104,7 +104,7 @@ def simulate(
             "times, or run.duration and run.sample_rate without them, must be known numbers, not"
             " traced by jax.jit or vmap: they fix the number of samples"
         )
-    inside, first_records = np.ones((), bool), {}
+    inside = np.ones((), bool)
     if plan is not None:
         if tolerance != TOLERANCE and plan.error > tolerance:
             raise ValueError(
@@ -115,10 +115,10 @@ def simulate(
         plan = check_plan(case, plan, xp.asarray(samples, float))
     elif is_concrete_tree(case):
         warn_if_implausible(case if times is None else _until(case, times))
-        first_run = _first_run(case, times, first_records)
-        plan = integration_plan(case, times, tolerance, first_run)
-        if not any_jax(case, times):
-            return _with_warning(_refined(case, plan, times, tolerance, first_records))
+        first = None if any_jax(case, times) else _FirstRun(case, times)
+        plan = integration_plan(case, times, tolerance, first)
+        if first is not None:
+            return _with_warning(_refined(case, plan, times, tolerance, first))
     else:
         middle, ranges = traced_ranges(case)
         plan, inside = varied_plan(middle, ranges, times, tolerance), within(case, ranges)
@@ -137,20 +137,21 @@ def simulate_planned(case: Case, plan: IntegrationPlan, times, tolerance: float,
     return _with_warning(_run(case, plan, times, tolerance, inside))
 
 
-def _refined(case: Case, plan: IntegrationPlan, times, tolerance: float, records) -> Record:
+def _refined(
+    case: Case, plan: IntegrationPlan, times, tolerance: float, first: "_FirstRun"
+) -> Record:
     """Record of known numbers, with steps that are shortened until its peaks are exact enough."""
     times, inside = sample_times(case) if times is None else xp.asarray(times, float), np.True_
-    record = records.get(plan.substeps)
-    if record is None:
-        record = _run(case, plan, times, tolerance, inside)
+    if first.record is None or first.substeps != plan.substeps:
+        record = _run(case, plan, times, tolerance, inside, first.policy)
     else:
-        record = _with_result(record, _errors_of(case, plan), tolerance, inside)
+        record = _with_result(first.record, _errors_of(case, plan), tolerance, inside)
     for _ in range(MAX_SHORTENINGS):
         shorter = _substeps_for_peaks(record, plan, tolerance)
         if shorter == plan.substeps:
             break
         plan = dataclasses.replace(plan, substeps=shorter)
-        record = _run(case, plan, times, tolerance, inside)
+        record = _run(case, plan, times, tolerance, inside, first.policy)
     return record
 
 
@@ -193,12 +194,18 @@ def _until(case: Case, times) -> Case:
     return dataclasses.replace(case, run=run)
 
 
-def _run(case: Case, plan: IntegrationPlan, times, tolerance: float, inside) -> Record:
-    """Record of a planned run; plans that differ in their errors only share compiled programs."""
-    is_compiled = plan.schedule is not None and runs_compiled(case, plan.schedule)
+def _run(case: Case, plan: IntegrationPlan, times, tolerance: float, inside, policy=None) -> Record:
+    """Record of a planned run; plans that differ in their errors only share compiled programs.
+
+    The input `policy` is that of the case if it is None.
+    """
+    is_compiled = plan.schedule is not None and runs_compiled(plan.schedule)
     simulate_record = _simulate_compiled if is_compiled else _simulate
+    if policy is None and not (plan.schedule is None or is_compiled or any_jax(case, times)):
+        policy = known_loop(case, plan.shapes.layout, plan.schedule)
     errors = _errors_of(case, plan)
-    return simulate_record(case, plan.without_statements(), times, errors, tolerance, inside)
+    plan = plan.without_statements()
+    return simulate_record(case, plan, times, errors, tolerance, inside, policy)
 
 
 def _substeps_for_peaks(record: Record, plan: IntegrationPlan, tolerance: float) -> int:
@@ -212,21 +219,21 @@ def _substeps_for_peaks(record: Record, plan: IntegrationPlan, tolerance: float)
     return int(np.ceil(factor * plan.substeps))
 
 
-def _first_run(case: Case, times, records: dict[int, Record]) -> FirstRun | None:
-    """Run that puts its record among the `records`, by its steps between events; None if traced.
+class _FirstRun:
+    """Run that keeps its input policy, and its record, which has so many steps between events.
 
     So the last trial run is that of the result, wherever the longest steps suffice.
     """
-    if any_jax(case, times):
-        return None
 
-    def run(plan, policy):
-        samples = sample_times(case) if times is None else xp.asarray(times, float)
-        record, states, commands = _simulate_first(case, plan, samples, policy)
-        records[plan.substeps] = record
+    def __init__(self, case: Case, times):
+        self.case, self.times = case, times
+        self.record, self.substeps, self.policy = None, 0, None
+
+    def __call__(self, plan: IntegrationPlan, policy) -> tuple[Array, Array]:
+        samples = sample_times(self.case) if self.times is None else xp.asarray(self.times, float)
+        self.record, states, commands = _simulate_first(self.case, plan, samples, policy)
+        self.substeps, self.policy = plan.substeps, policy
         return states, commands
-
-    return run
 
 
 @compiled_if_traced
@@ -247,11 +254,12 @@ def _simulate_first(case: Case, plan: IntegrationPlan, times, policy):
 
 
 def _simulate_record(
-    case: Case, plan: IntegrationPlan, times, errors, tolerance: float, inside
+    case: Case, plan: IntegrationPlan, times, errors, tolerance: float, inside, policy=None
 ) -> Record:
     times = times_of_samples(case, times) if isinstance(times, int) else times
     monitored = monitored_sensors(case.sensors)
-    record = _record(case, run_integration(case, plan, times, monitored), times)
+    integration = run_integration(case, plan, times, monitored, policy=policy)
+    record = _record(case, integration, times)
     return _with_result(record, errors, tolerance, inside)
 
 

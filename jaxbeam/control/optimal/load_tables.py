@@ -15,6 +15,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.controller import ControlStep
@@ -25,7 +26,7 @@ from jaxbeam.control.optimal.crossing_gains import GainSchedule
 from jaxbeam.control.state_law import AbstractStateLaw
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.state_space import Plant
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, vmap, xp
 
 
 def designs_of(
@@ -91,14 +92,14 @@ class ScheduledGainLaw(AbstractStateLaw):
 
     def step(self, state, estimate, measurement, t):
         load, state = self.load_source.update(state, measurement, t)
-        mass = jnp.where(load.mass_identified, load.mass, self.masses[0])
-        speed, entry = jnp.abs(load.speed), load.entry_time
+        mass = xp.where(load.mass_identified, load.mass, self.masses[0])
+        speed, entry = xp.abs(load.speed), load.entry_time
         end = entry + self.length / speed
         # In proportion to the mass between the designs, which differ in it alone.
-        clamped_mass = jnp.clip(mass, self.masses[0], self.masses[-1])
+        clamped_mass = xp.clip(mass, self.masses[0], self.masses[-1])
         lightest = self.schedules.load_weights[0, 0]
-        constant = jnp.arange(lightest.shape[0]) >= self.weight_count
-        load_weights = jnp.where(constant, lightest, lightest * clamped_mass / self.masses[0])
+        constant = xp.arange(lightest.shape[0]) >= self.weight_count
+        load_weights = xp.where(constant, lightest, lightest * clamped_mass / self.masses[0])
 
         def command_of(schedule):
             stretched = dataclasses.replace(
@@ -106,17 +107,17 @@ class ScheduledGainLaw(AbstractStateLaw):
             )
             return stretched.step((), estimate, measurement, t).command
 
-        commands = jax.vmap(jax.vmap(command_of))(self.schedules)
+        commands = vmap(vmap(command_of))(self.schedules)
         shares = self._interpolation(self.masses, mass), self._interpolation(self.speeds, speed)
-        command = jnp.einsum("m,v,mva->a", *shares, commands)
-        return ControlStep(jnp.where(load.speed_identified, command, 0.0), state)
+        command = xp.einsum("m,v,mva->a", *shares, commands)
+        return ControlStep(xp.where(load.speed_identified, command, 0.0), state)
 
     def _interpolation(self, grid, value) -> Float[Array, " design"]:
         """Weight of each design of a grid at a value."""
         if self.nearest:
-            return jax.nn.one_hot(jnp.argmin(jnp.abs(grid - value)), grid.shape[0], dtype=float)
-        unit_vectors = jnp.eye(grid.shape[0])
-        return jax.vmap(lambda weights: jnp.interp(value, grid, weights))(unit_vectors)
+            return xp.asarray(np.arange(grid.shape[0]) == xp.argmin(xp.abs(grid - value)), float)
+        unit_vectors = np.eye(grid.shape[0])
+        return vmap(lambda weights: xp.interp(value, grid, weights))(unit_vectors)
 
 
 class ReadLoads(NamedTuple):
@@ -151,19 +152,19 @@ class PositionGainLaw(AbstractStateLaw):
         """The loads of the case at t (s)."""
         positions, speeds, _ = self.load_set.kinematics(t)
         entry, leave = self.load_set.entry_exit_times().T
-        clock = jnp.where(t < leave, jnp.clip(self._share(positions), 0.0, 1.0), 1.0 + t - leave)
-        clock = jnp.where(t < entry, -1.0, clock)
+        clock = xp.where(t < leave, xp.clip(self._share(positions), 0.0, 1.0), 1.0 + t - leave)
+        clock = xp.where(t < entry, -1.0, clock)
         on_beam = (entry <= t) & (t < leave)
-        return ReadLoads(clock, jnp.abs(speeds), on_beam, self.load_masses, self.load_weights)
+        return ReadLoads(clock, xp.abs(speeds), on_beam, self.load_masses, self.load_weights)
 
     def estimated_loads(self, loads: EstimatedLoads) -> ReadLoads:
         """The loads as an estimator follows them; they have left at their present speed."""
-        share, speeds = self._share(loads.positions), jnp.abs(loads.speeds)
+        share, speeds = self._share(loads.positions), xp.abs(loads.speeds)
         length = self.load_set.trajectories[0].length
-        since_exit = jnp.maximum(share - 1.0, 0.0) * length
+        since_exit = xp.maximum(share - 1.0, 0.0) * length
         moving = speeds > 0
-        since_exit = jnp.where(moving, since_exit / jnp.where(moving, speeds, 1.0), 0.0)
-        clock = jnp.where(share < 0, -1.0, jnp.minimum(share, 1.0) + since_exit)
+        since_exit = xp.where(moving, since_exit / xp.where(moving, speeds, 1.0), 0.0)
+        clock = xp.where(share < 0, -1.0, xp.minimum(share, 1.0) + since_exit)
         on_beam = (share >= 0) & (share < 1)
         weights = loads.masses * self.load_weights / self.load_masses
         return ReadLoads(clock, speeds, on_beam, loads.masses, weights)
@@ -172,36 +173,36 @@ class PositionGainLaw(AbstractStateLaw):
         """Share of the beam that loads at positions (m) have travelled."""
         path = self.load_set.trajectories[0]
         share = positions / path.length
-        return jnp.where(path.direction() < 0, 1.0 - share, share)
+        return xp.where(path.direction() < 0, 1.0 - share, share)
 
     def load_gains(self, loads: ReadLoads) -> Float[Array, "load actuator column"]:
         """Gain that each load reads, as if it were alone."""
 
         def of_load(clock, mass, speed):
             def gain(schedule):
-                start, end = jnp.zeros(()), jnp.ones(())
+                start, end = xp.zeros(()), xp.ones(())
                 return dataclasses.replace(schedule, start=start, end=end).gain(clock)
 
-            gains = jax.vmap(jax.vmap(gain))(self.schedules)
+            gains = vmap(vmap(gain))(self.schedules)
             shares = _hat_weights(self.masses, mass), _hat_weights(self.speeds, speed)
-            return jnp.einsum("m,v,mvac->ac", *shares, gains)
+            return xp.einsum("m,v,mvac->ac", *shares, gains)
 
-        return jax.vmap(of_load)(loads.clock, loads.masses, loads.speeds)
+        return vmap(of_load)(loads.clock, loads.masses, loads.speeds)
 
     def combined(
         self, loads: ReadLoads
     ) -> tuple[Float[Array, "actuator state"], Float[Array, " actuator"]]:
         """Gain of the state, and commands that are fed forward, for some loads."""
         gains, on_beam = self.load_gains(loads), loads.on_beam
-        counted = jnp.where(jnp.any(on_beam), on_beam, loads.clock >= 1)
-        shares = jnp.where(counted, loads.masses, 0.0)
-        total = jnp.sum(shares)
-        shares = shares / jnp.where(total > 0, total, 1.0)
+        counted = xp.where(xp.any(on_beam), on_beam, loads.clock >= 1)
+        shares = xp.where(counted, loads.masses, 0.0)
+        total = xp.sum(shares)
+        shares = shares / xp.where(total > 0, total, 1.0)
         states = gains.shape[-1] - self.schedules.load_weights.shape[-1]
-        forward = jnp.zeros(gains.shape[1])
+        forward = xp.zeros(gains.shape[1])
         if self.schedules.load_feedforward:
-            forward = -jnp.where(on_beam, loads.weights, 0.0) @ gains[..., states]
-        return jnp.einsum("l,lac->ac", shares, gains[..., :states]), forward
+            forward = -xp.where(on_beam, loads.weights, 0.0) @ gains[..., states]
+        return xp.einsum("l,lac->ac", shares, gains[..., :states]), forward
 
     def step(self, state, estimate, measurement, t):
         followed = estimate.loads
@@ -212,4 +213,4 @@ class PositionGainLaw(AbstractStateLaw):
 
 def _hat_weights(grid, value) -> Float[Array, " design"]:
     """Weights of the designs of a grid in linear interpolation at a value."""
-    return jax.vmap(lambda unit: jnp.interp(value, grid, unit))(jnp.eye(grid.shape[0]))
+    return vmap(lambda unit: xp.interp(value, grid, unit))(np.eye(grid.shape[0]))
