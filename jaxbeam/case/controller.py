@@ -214,9 +214,9 @@ class AbstractController(ReprWithUnits, Module, metaclass=ExplainsArguments):
 
     @property
     def runs_compiled(self) -> bool:
-        """Whether runs are compiled even if all numbers are known.
+        """Whether designs are compiled even if all numbers are known.
 
-        True where the steps of the law take longer in NumPy than its program takes to compile.
+        True where they take longer in NumPy than their program takes to compile.
         """
         return False
 
