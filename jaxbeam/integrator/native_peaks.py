@@ -11,6 +11,7 @@ results, and rules of derivatives that no sweep needs; and compile after the C.
 
 import ctypes
 import sys
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -58,6 +59,7 @@ from jaxbeam.numerics.peak_search import (
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.native_library import Library
 
+PATH_NODES = NODE_COUNT + len(END_FRACTIONS)
 MIN_RUNS_TO_COMPILE = 1000  # smaller sweeps do not wait for a compiler
 PADDING = 8  # doubles in the widest vector register
 C_MACROS = {
@@ -219,34 +221,55 @@ def batch_inputs(
 
 
 def inputs_over_time(
-    loads: LoadSet,
-    starts: Float[np.ndarray, " boundary"],
-    counts: Int[np.ndarray, " panel"],
-    lengths: Float[np.ndarray, " length"],
+    batches: Sequence[LoadSet],
+    starts: Float[np.ndarray, "batch boundary"],
+    counts: Int[np.ndarray, "batch panel"],
+    lengths: Float[np.ndarray, "batch length"],
+    one_profile: bool,
 ) -> dict[str, np.ndarray]:
-    """Those of the `NativeInputs` of a batch that are functions of time, of known numbers.
+    """Those of the `NativeInputs` that are functions of time, of batches of known numbers.
 
     Steps are so many a panel, from its start (s), of its length (s). `surface` is the motion of the
     profile under all wheels, `load_forces` forces in addition to their weights, both at the Gauss
-    nodes and then at the ends of the steps.
+    nodes and then at the ends of the steps; zero after the last step of a batch. Batches with
+    `one_profile` are computed together.
     """
+    all_times = [_path_nodes(*of_batch) for of_batch in zip(starts, counts, lengths, strict=True)]
+    steps, first, inputs = max(map(len, all_times)), batches[0], {}
+    if first.wheels.histories:
+        runs = first.weight.shape[1]
+        forces = np.zeros((len(batches), steps, first.wheel_count, PATH_NODES, runs))
+        for row, (loads, times) in enumerate(zip(batches, all_times, strict=True)):
+            for wheel, history in loads.wheels.histories.items():
+                forces[row, : len(times), wheel] = history.at(times)
+        inputs["load_forces"] = forces.reshape(len(batches), steps, -1, runs)
+    if first.profile is None or all(loads.massless for loads in batches):
+        return inputs
+    surface = np.zeros((len(batches), steps, first.wheel_count, 3, PATH_NODES))
+    paths = [loads.kinematics(times) for loads, times in zip(batches, all_times, strict=True)]
+    groups = [range(len(batches))] if one_profile else [[row] for row in range(len(batches))]
+    for group in groups:
+        flat = [np.concatenate([paths[row][i].ravel() for row in group]) for i in range(3)]
+        motion: Any = np.stack(batches[group[0]].surface_motion(*flat))
+        for row, part in zip(
+            group,
+            np.split(motion, np.cumsum([paths[row][0].size for row in group])[:-1], axis=1),
+            strict=True,
+        ):
+            by_wheel = part.reshape(3, *paths[row][0].shape)
+            surface[row, : len(all_times[row])] = np.moveaxis(by_wheel, 2, 0).swapaxes(1, 2)
+    inputs["surface"] = surface.reshape(len(batches), steps, -1)
+    if first.wheels.vehicles:
+        inputs["initial_vehicles"] = np.stack([initial_vehicle_states(loads) for loads in batches])
+    return inputs
+
+
+def _path_nodes(starts, counts, lengths) -> Float[np.ndarray, "step node"]:
+    """Times (s) of the Gauss nodes of all steps of a grid, and of their ends."""
     panel = np.repeat(np.arange(len(counts)), counts)
     number = np.arange(len(panel)) - np.repeat(np.cumsum(counts) - counts, counts)
-    length = lengths[panel, None]
-    times = starts[panel, None] + length * (number[:, None] + [*GAUSS_NODES, *END_FRACTIONS])
-    inputs, wheels = {}, loads.wheels
-    if not loads.massless and loads.profile is not None:
-        motions: Any = loads.surface_motion(*loads.kinematics(times))
-        surface = np.moveaxis(np.stack(motions, axis=1), 2, 0)  # step, wheel, motion, node
-        inputs["surface"] = surface.reshape(len(panel), -1)
-        if wheels.vehicles:
-            inputs["initial_vehicles"] = initial_vehicle_states(loads)
-    if wheels.histories:
-        forces = np.zeros((len(panel), loads.wheel_count, times.shape[1], wheels.weight.shape[1]))
-        for wheel, history in wheels.histories.items():
-            forces[:, wheel] = history.at(times)
-        inputs["load_forces"] = forces.reshape(len(panel), -1, forces.shape[-1])
-    return inputs
+    fractions = np.array([*GAUSS_NODES, *END_FRACTIONS])
+    return starts[panel, None] + lengths[panel, None] * (number[:, None] + fractions)
 
 
 def integrate_peaks(max_loads: int, mask: Bool[np.ndarray, " task"], inputs: NativeInputs) -> Peaks:

@@ -98,27 +98,16 @@ class KnownInputs:
         return native_peaks.NativeInputs(**self.of_model, **found)
 
     def _over_time(self, batch_indices, wheels: WheelSet, found) -> dict[str, np.ndarray]:
-        """Inputs of batches that are functions of time, for the steps that have been found.
-
-        Zero after the last step of a batch.
-        """
-        panels = zip(
-            *(found[name] for name in ("panel_starts", "step_counts", "step_lengths")), strict=True
-        )
-        of_batches = []
-        for row, (batch, of_panels) in enumerate(zip(batch_indices, panels, strict=True)):
+        """Inputs of batches that are functions of time, for the steps that have been found."""
+        batches = []
+        for row, batch in enumerate(batch_indices):
             case = self.program.case_with(self.batches.shared_values[batch])
             own = jax.tree.map(lambda part, row=row: part[row], wheels)
-            loads = dataclasses.replace(load_set(case, self.program.shapes.layout), wheels=own)
-            of_batches.append(native_peaks.inputs_over_time(loads, *of_panels))
-        steps, inputs = int(found["step_counts"].sum(axis=1).max()), {}
-        for name in of_batches[0]:
-            parts = [of_batch[name] for of_batch in of_batches]
-            count = parts[0].shape[0] if name == "initial_vehicles" else steps
-            inputs[name] = np.zeros((len(parts), count, *parts[0].shape[1:]))
-            for row, part in enumerate(parts):
-                inputs[name][row, : len(part)] = part
-        return inputs
+            loads = load_set(case, self.program.shapes.layout)
+            batches.append(dataclasses.replace(loads, wheels=own))
+        panels = (found[name] for name in ("panel_starts", "step_counts", "step_lengths"))
+        swept = any(name.startswith("profile.") for name in self.batches.shared_addresses)
+        return native_peaks.inputs_over_time(batches, *panels, one_profile=not swept)
 
     def of_blocks(
         self, max_steps: Float[np.ndarray, " path"], batches_per_block: int, most_batches: int

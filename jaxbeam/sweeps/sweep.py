@@ -62,7 +62,8 @@ def sweep(
     address, or with `paired` the first of each, the second, and so on along `run`. An address such
     as `loads.*.speed` is the speed of all loads. A list of words, as trains of the library at
     `loads.0.train` or models of vehicles at `loads.0.model`, makes a case of each, and a dimension
-    with the words as labels; wheels that a train does not have are NaN. The dataset has
+    with the words as labels; wheels that a train does not have are NaN. So do whole numbers, as
+    seeds at `profile.seed`. The dataset has
     `peak_deflection` (..., sensor) in m and its time in s (for sensors of other quantities
     `peak_acceleration` and so on, each NaN at the others), the smallest contact force in N and the
     time of its first negative value in s (..., load), and `failed`, which marks runs that are not

@@ -1,20 +1,19 @@
-"""Sweeps over words, as names of trains: a sweep of numbers for each, joined in one dataset.
+"""Sweeps over words, as names of trains, and counts, as seeds: a sweep of numbers for each, joined.
 
-A word changes the structure of a case, so that each combination of words is a case of its own, with
-its own sweep of numbers and, in a store, a store of its own within `blocks`. Cases that have equal
-structures once the words are written out as numbers share compiled programs: trains with as many
-axles.
+A word or a count may change the structure of a case, so that each combination is a case of its own,
+with its own sweep of numbers and, in a store, a store of its own within `blocks`. Cases that have
+equal structures once the words are written out as numbers share compiled programs: trains with as
+many axles, roads of several seeds.
 """
 
 import dataclasses
 import hashlib
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import numpy as np
 
 from jaxbeam.case.case import Case, addresses
@@ -40,16 +39,19 @@ if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
 
 
+Words = tuple[str, ...] | tuple[int, ...]
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class WordSweep:
-    """Words at addresses of a case, and the sweep of numbers for each combination of them.
+    """Words and counts at addresses of a case, and the sweep of numbers for each combination.
 
     `cases` have the words, `sweeps` the same cases with numbers in their place, both in the order
     of all combinations, the last word first. `dims` are the dimensions of the results.
     """
 
     case: Case
-    words: dict[str, tuple[str, ...]]
+    words: dict[str, Words]
     dims: tuple[str, ...]
     cases: list[Case]
     sweeps: list[SweepSpecification]
@@ -96,31 +98,50 @@ class WordSweep:
         )
 
 
-def split_words(
-    case: Case, over: dict[str, Any]
-) -> tuple[dict[str, tuple[str, ...]], dict[str, Any]]:
+def split_words(case: Case, over: dict[str, Any]) -> tuple[dict[str, Words], dict[str, Any]]:
     """Words by address, in present words, and values by address of the others.
 
-    Words are values that are text, at an address that has no number. Raises ValueError for numbers
-    among them.
+    Words are values that are text, at an address that has no number; counts are among them. Raises
+    ValueError for numbers among words, and for counts that are not whole.
     """
-    numbers_of_case, words, others = addresses(case), {}, {}
+    numbers_of_case = addresses(case)
+    words: dict[str, Words] = {}
+    others: dict[str, Any] = {}
     for address, given in over.items():
         values = np.atleast_1d(np.asarray(given, object)).ravel()
         current = attribute_address(address)
         is_word = [isinstance(value, str) for value in values]
-        if not any(is_word) or current.replace(ALL, "0") in numbers_of_case:
+        first = current.replace(ALL, "0")
+        if first in numbers_of_case:
             others[address] = given
         elif all(is_word):
             words[current] = tuple(map(str, values))
-        else:
+        elif any(is_word):
             raise ValueError(f"{address} takes a list of words or of numbers, not both in one")
+        elif _is_count(case, first):
+            parts = [value for value in values if not float(value).is_integer()]
+            if parts:
+                raise ValueError(f"{address} takes whole numbers, not {parts[0]:g}")
+            words[current] = tuple(map(int, values))
+        else:
+            others[address] = given
     return words, others
+
+
+def _is_count(case: Case, address: str) -> bool:
+    """Whether a case has a whole number that is no number of its equations at an address."""
+    entry: Any = case_to_dict(case, whole=True)
+    for key in address.split("."):
+        if isinstance(entry, list):
+            entry = entry[int(key)] if key.isdigit() and int(key) < len(entry) else None
+        else:
+            entry = entry.get(key) if isinstance(entry, dict) else None
+    return isinstance(entry, int) and not isinstance(entry, bool)
 
 
 def word_sweep(
     case: Case,
-    words: dict[str, tuple[str, ...]],
+    words: dict[str, Words],
     over: dict[str, Any],
     order: Sequence[str],
     paired: bool,
@@ -147,7 +168,7 @@ def word_sweep(
         try:
             sweeps.append(
                 sweep_specification(
-                    with_numbers(changed),
+                    with_numbers(changed, over),
                     numbers,
                     False,
                     histories,
@@ -171,10 +192,15 @@ def word_sweep(
     return plan
 
 
-def with_numbers(case: Case) -> Case:
-    """The case with numbers in place of names of the library, where they mean the same."""
-    loads = tuple(load.by_numbers() for load in case.loads)
-    return eqx.tree_at(lambda c: c.loads, case, loads) if loads else case
+def with_numbers(case: Case, over: Collection[str] = ()) -> Case:
+    """The case with numbers in place of names of the library and seeds, where they mean the same.
+
+    Not those of a profile with swept numbers, which are `over` its own addresses.
+    """
+    loads, profile = tuple(load.by_numbers() for load in case.loads), case.profile
+    if profile is not None and not any(address.startswith("profile.") for address in over):
+        profile = profile.by_numbers()
+    return dataclasses.replace(case, loads=loads, profile=profile)
 
 
 def compute_word_sweep(

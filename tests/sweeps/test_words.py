@@ -1,7 +1,9 @@
 """Sweeps over words: trains and vehicles of the library, in one dataset and one store."""
 
+import dataclasses
 import json
 
+import jax
 import numpy as np
 import pytest
 import xarray
@@ -165,3 +167,33 @@ def test_one_speed_for_all_loads():
 def test_words_that_are_refused(over, options, message):
     with pytest.raises(ValueError, match=message):
         sweep(over, **options)
+
+
+def test_seeds_and_counts_are_swept_as_words():
+    """With fractiles over the seeds; numbers of the profile may vary beside them."""
+    case = dataclasses.replace(
+        CASE,
+        loads=[jb.MovingMass(mass=2e4, speed=20.0)],
+        profile=jb.ISO8608Profile("A", seed=0, scale=0.1, highest_wavenumber=1.0),
+    )
+    over = {"profile.seed": [3, 5.0], "beam.modes": [1, 2], "profile.scale": [0.1, 0.2]}
+    found = sweep(over, case)
+    assert found.peak_deflection.shape == (2, 2, 2, 1)
+    assert found["profile.seed"].values.tolist() == [3, 5]
+    settings = {"profile.seed": 5, "beam.modes": 2, "profile.scale": 0.2}
+    single = jb.simulate(with_settings(case, settings)).peak_deflection
+    assert_allclose(found.peak_deflection.sel(settings), single, rtol=1e-5)
+    half = found.peak_deflection.quantile(0.5, "profile.seed")
+    assert_allclose(half, found.peak_deflection.mean("profile.seed"))
+    with pytest.raises(ValueError, match=r"profile\.seed takes whole numbers, not 1\.5"):
+        sweep({"profile.seed": [1, 1.5]}, case)
+
+
+def test_profiles_of_several_seeds_have_one_structure():
+    case = dataclasses.replace(CASE, profile=jb.ISO8608Profile("C", seed=0))
+    first, second = (
+        with_numbers(with_settings(case, {"profile.seed": seed})).profile for seed in (1, 2)
+    )
+    assert jax.tree.structure(first) == jax.tree.structure(second)
+    kept = with_numbers(case, ["profile.scale"]).profile
+    assert isinstance(kept, jb.ISO8608Profile)

@@ -18,6 +18,7 @@ BLOCK = 16  # waves at once then: memory does not grow with their number
 # Of known numbers the sum is interpolated on panels of so many rad of its shortest wave, with so
 # many Chebyshev points each: their series of a cosine ends at J_24(4) = 2e-17.
 PANEL_PHASE, PANEL_POINTS = 8.0, 24
+LEAST_INTERPOLATED, LEAST_POSITIONS = 50_000, 4  # cosines in all, positions a panel
 POSITIONS_AT_ONCE = 4096
 
 
@@ -72,14 +73,14 @@ def sum_of_cosines(
     """
     waves = (wavenumbers, amplitudes, phases)
     count = wavenumbers.shape[0]
-    if x.size * count <= DIRECT_SIZE:
-        return _sum_at_once(x, *waves)
-    if all(map(is_known, (x, *waves))):
+    if x.size * count >= LEAST_INTERPOLATED and all(map(is_known, (x, *waves))):
         half = 0.5 * PANEL_PHASE / (2 * np.pi * np.max(np.abs(wavenumbers)))
         with np.errstate(all="ignore"):  # of positions that are not finite
             panels = np.ptp(x) / (2 * half)
-        if 2 * PANEL_POINTS * (1 + panels) <= x.size:
+        if LEAST_POSITIONS * (1 + panels) <= x.size:
             return _interpolated_sum(x, waves, half)
+    if x.size * count <= DIRECT_SIZE:
+        return _sum_at_once(x, *waves)
     padding = np.zeros(-count % BLOCK)
     blocks = tuple(xp.concatenate([wave, padding]).reshape(-1, BLOCK) for wave in waves)
     sum_of_block = checkpoint(_sum_at_once, jax.checkpoint_policies.nothing_saveable)

@@ -116,9 +116,9 @@ def test_peaks_are_those_of_the_steps_in_numpy(name):
     def inputs_of_one(model, grid, outputs, loads):
         of_model = native_peaks.model_inputs(model, outputs, None)
         of_batch = native_peaks.batch_inputs(grid, loads.cubics(), loads.wheels)
-        of_panels = grid.boundaries, grid.counts, grid.lengths
-        of_batch |= native_peaks.inputs_over_time(loads, *of_panels)
         one = jax.tree.map(lambda part: np.asarray(part)[None], of_model | of_batch)
+        of_panels = (one[name] for name in ("panel_starts", "step_counts", "step_lengths"))
+        one |= native_peaks.inputs_over_time([loads], *of_panels, one_profile=True)
         return native_peaks.NativeInputs(**one)
 
     @settings(max_examples=4, phases=[Phase.generate])
