@@ -35,6 +35,7 @@ experiments.thesis  experiments.demo
 experiments.studies
 experiments.benchmarks
 experiments.validation  experiments
+jaxbeam.app
 jaxbeam.cli
 jaxbeam.__main__
 """

@@ -21,6 +21,7 @@ from cyclopts import (
 )
 
 from jaxbeam.cli.arguments import UsageError
+from jaxbeam.cli.commands.app import app as app_command
 from jaxbeam.cli.commands.compare import compare
 from jaxbeam.cli.commands.describe import describe
 from jaxbeam.cli.commands.engineering.assess import assess
@@ -54,7 +55,7 @@ COMMANDS = {
         compare_models,
         design_experiment,
     ),
-    "Other": (demo, reproduce, schema, native),
+    "Other": (app_command, demo, reproduce, schema, native),
 }
 
 # Words of former versions, which are refused by a sentence that names the present ones.

@@ -93,6 +93,7 @@ def _value(key: Key, definitions: dict[str, Any]) -> dict[str, Any]:
     value: dict[str, Any] = {"description": key.meaning + unit.replace(OF_QUANTITY, "its unit")}
     if key.is_number:
         value |= _number(key)
+        value |= {"x-unit": key.unit} if unit else {}
     elif key.is_count:
         value |= {"type": "integer", "minimum": key.field.metadata["minimum"]}
         value |= {"maximum": MAX_COUNTS[key.name]} if key.name in MAX_COUNTS else {}

@@ -1,0 +1,231 @@
+"""Thin server of the page: loopback only, a token for each question, JSON in, JSON or arrays out."""
+
+import hmac
+import json
+import secrets
+import socket
+import struct
+import webbrowser
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+import jaxbeam as jb
+from jaxbeam.app import take_away, views
+from jaxbeam.app.workspace import MAX_BYTES, Workspace
+from jaxbeam.case.loads.planar.files import vehicle_names
+from jaxbeam.vehicles.trains import trains
+
+STATIC = Path(__file__).parent / "static"
+LOOPBACK = "127.0.0.1"
+HEADERS = {
+    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self';"
+    " img-src 'self' blob: data:; connect-src 'self'; base-uri 'none'; form-action 'none';"
+    " frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "no-store",
+}
+
+
+class Guard:
+    """Refuses what does not come from the page itself: other hosts, other origins, no token.
+
+    The `Host` is compared against rebinding of names, the `Origin` and `Sec-Fetch-Site` against
+    other pages in the same browser. Bodies above the limit are refused before they are read.
+    """
+
+    def __init__(self, app: Any, token: str, port: int, max_bytes: int):
+        self._app, self._token, self._max_bytes = app, token, max_bytes
+        self._hosts = {f"{name}:{port}" for name in (LOOPBACK, "localhost")}
+
+    async def __call__(self, scope, receive, send) -> None:
+        """Answer a question, or refuse it."""
+        if scope["type"] != "http":
+            return
+        request = Request(scope)
+        refusal = self._refusal(request)
+        if refusal is not None:
+            await JSONResponse({"problem": {"message": refusal[1]}}, refusal[0], HEADERS)(
+                scope, receive, send
+            )
+            return
+        received = 0
+
+        async def limited():
+            nonlocal received
+            message = await receive()
+            received += len(message.get("body", b""))
+            if received > self._max_bytes:  # of a body that does not tell its length
+                return {"type": "http.disconnect"}
+            return message
+
+        async def with_headers(message):
+            if message["type"] == "http.response.start":
+                own = {name.decode().lower() for name, _ in message["headers"]}
+                message["headers"] += [
+                    (name.encode(), value.encode())
+                    for name, value in HEADERS.items()
+                    if name not in own
+                ]
+            await send(message)
+
+        await self._app(scope, limited, with_headers)
+
+    def _refusal(self, request: Request) -> tuple[int, str] | None:
+        """Status and sentence for a question that is refused."""
+        headers = request.headers
+        host = headers.get("host", "")
+        if host not in self._hosts:
+            return 403, "this page is there for this machine only"
+        origin = headers.get("origin")
+        if origin is not None and origin != f"http://{host}":
+            return 403, "another page may not ask here"
+        if headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
+            return 403, "another page may not ask here"
+        if request.url.path.startswith("/static/"):
+            return None  # the page's own code: no one's data
+        given = headers.get("x-token") or request.query_params.get("token", "")
+        if not hmac.compare_digest(given.encode(), self._token.encode()):
+            return 403, "open the address that `jaxbeam app` has printed, with its token"
+        length = headers.get("content-length", "0")
+        if not length.isdigit() or int(length) > self._max_bytes:
+            return 413, f"this is more than the {self._max_bytes >> 20} MB that the page takes"
+        return None
+
+
+def packed(words: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Response:
+    """Words as JSON and arrays as 32-bit floats in one answer.
+
+    First the length of the JSON (32 bits, little-endian), then the JSON, padded to 4 bytes, with
+    the shapes of the arrays, then their numbers one after the other.
+    """
+    content = {name: np.ascontiguousarray(array, "<f4") for name, array in arrays.items()}
+    shapes = {name: list(array.shape) for name, array in content.items()}
+    head = json.dumps(jb.api.plain({**words, "arrays": shapes}), allow_nan=False).encode()
+    head += b" " * (-len(head) % 4)
+    body = struct.pack("<I", len(head)) + head + b"".join(map(bytes, content.values()))
+    return Response(body, media_type="application/octet-stream")
+
+
+def application(workspace: Workspace, opened: str | None, token: str, port: int) -> Any:
+    """The ASGI application of a page for a workspace, with a file of it `opened` first."""
+
+    def asked(work: Callable[[dict[str, Any]], Any], method: str = "POST"):
+        """Handler of a question: its JSON to the work, in a thread; errors as data."""
+
+        async def answer(request: Request) -> Response:
+            try:
+                question = json.loads(await request.body()) if method == "POST" else {}
+                if not isinstance(question, dict):
+                    raise ValueError("a question is a table")
+                found = await run_in_threadpool(work, question)
+            except (ValueError, KeyError, OSError, RuntimeError, ImportError, TypeError) as error:
+                problem = jb.api.problem(error)._asdict()
+                if isinstance(error, KeyError):
+                    problem["message"] = f"the question lacks {error}"
+                return JSONResponse({"problem": problem}, 422)
+            return found if isinstance(found, Response) else JSONResponse(jb.api.plain(found))
+
+        return answer
+
+    def index(_) -> Response:
+        return Response((STATIC / "index.html").read_bytes(), media_type="text/html")
+
+    def hello(_) -> dict[str, Any]:
+        return {
+            "opened": opened,
+            "folder": workspace.folder.name,
+            "files": workspace.files(),
+            "library": workspace.library(),
+            "names": names,
+        }
+
+    names = {"model": vehicle_names(), "train": list(trains())}
+
+    def run(question) -> Response:
+        record = workspace.record(question["text"])
+        words, arrays = views.pictures(record)
+        return packed(words, arrays)
+
+    def preview(question) -> Any:
+        text, values, ranges = question["text"], question["values"], question["ranges"]
+        if question.get("prepare"):
+            workspace.simulator(workspace.case(text), values, ranges)
+            return {}
+        record = workspace.preview(text, values, ranges)
+        words, arrays = views.pictures(record)
+        return packed(words | {"scene": views.scene(record.case)}, arrays)
+
+    def schema(_) -> dict[str, Any]:
+        from jaxbeam.files.json_schema import json_schema
+
+        return json_schema()
+
+    def take(question) -> Response:
+        name, content, kind = take_away.take(workspace, question["text"], question["what"])
+        heads = {"content-disposition": f'attachment; filename="{name}"'}
+        return Response(content, media_type=kind, headers=heads)
+
+    questions = {
+        "hello": hello,
+        "schema": schema,
+        "open": lambda q: workspace.read(q["name"]),
+        "library": lambda q: {"text": workspace.library_text(q["name"])},
+        "save": lambda q: workspace.save(q["name"], q["text"], q.get("mark")),
+        "model": lambda q: workspace.model(q["text"]),
+        "change": lambda q: {"text": workspace.change(q["text"], q["changes"])},
+        "run": run,
+        "preview": preview,
+        "envelopes": lambda q: views.envelopes(workspace.record(q["text"])),
+        "take": take,
+        "words": lambda q: take_away.words(workspace, q["text"], q.get("name")),
+    }
+    routes = [
+        Route("/", index),
+        *(Route(f"/api/{name}", asked(work), methods=["POST"]) for name, work in questions.items()),
+        Mount("/static", StaticFiles(directory=STATIC)),
+    ]
+    return Guard(Starlette(routes=routes), token, port, MAX_BYTES)
+
+
+def serve(folder: Path, opened: str | None, port: int, browser: bool) -> None:
+    """Serve the page of a folder until it is stopped, and print its address on one line."""
+    with socket.socket() as listening:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind((LOOPBACK, port))
+        port = listening.getsockname()[1]
+        token = secrets.token_urlsafe(24)
+        address = f"http://{LOOPBACK}:{port}/?token={token}"
+        workspace = Workspace(folder)
+        app = application(workspace, opened, token, port)
+        server = uvicorn.Server(
+            uvicorn.Config(
+                app,
+                log_level="error",
+                lifespan="off",
+                ws="none",
+                server_header=False,
+                access_log=False,
+                timeout_graceful_shutdown=1,
+            )
+        )
+        listening.listen(64)
+        print(address, flush=True)
+        if browser:
+            webbrowser.open(address)
+        try:
+            server.run(sockets=[listening])
+        finally:
+            workspace.close()

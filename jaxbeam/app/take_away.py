@@ -1,0 +1,140 @@
+"""What a reader takes away from the page: files, pictures, a report, and the same in words."""
+
+import shlex
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jaxbeam as jb
+from jaxbeam.app.workspace import Workspace
+
+KINDS = {
+    "csv": "text/csv",
+    "xlsx": "application/vnd.openxmlformats-officedocument.spreadsheetml.sheet",
+    "nc": "application/x-netcdf",
+    "png": "image/png",
+    "svg": "image/svg+xml",
+    "gif": "image/gif",
+    "toml": "application/toml",
+    "html": "text/html",
+}
+
+
+def take(workspace: Workspace, text: str, what: str) -> tuple[str, bytes, str]:
+    """Name, content and media type of a file of the run of a case; `what` is its ending.
+
+    Raises ValueError for an ending that is none of KINDS.
+    """
+    if what not in KINDS:
+        raise ValueError(f"{what!r} is none of the files to take away: {', '.join(KINDS)}")
+    if what == "toml":
+        return "case.toml", text.encode(), KINDS[what]
+    record = workspace.record(text)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"run.{what}"
+        _write(what, record, path)
+        return path.name, path.read_bytes(), KINDS[what]
+
+
+def _write(what: str, record: "jb.Record", path: Path) -> None:
+    writers: dict[str, Callable[[], Any]] = {
+        "gif": lambda: _animate(record, path),
+        "html": lambda: path.write_text(report(record), encoding="utf-8"),
+        "png": lambda: _draw(record, path),
+        "svg": lambda: _draw(record, path),
+    }
+    writers.get(what, lambda: jb.save(record, path))()
+
+
+def _animate(record: "jb.Record", path: Path) -> None:
+    from jaxbeam.plot import animate
+
+    animate(record, path)
+
+
+def _draw(record: "jb.Record", path: Path) -> None:
+    from jaxbeam.plot import plot_record
+
+    plot_record(record).savefig(path)
+
+
+def report(record: "jb.Record") -> str:
+    """A page to print: what the run is, its peaks and contact forces, the picture, the case."""
+    import base64
+    import html
+    import io
+
+    from jaxbeam.files.case_file import case_to_dict
+    from jaxbeam.files.report import PAGE_STYLE
+    from jaxbeam.plot import plot_record
+
+    content, safe = jb.api.content(record), html.escape
+    picture = io.BytesIO()
+    plot_record(record).savefig(picture, format="png")
+    image = base64.b64encode(picture.getvalue()).decode()
+
+    def table(header, rows):
+        cells = "".join(
+            "<tr>" + "".join(f"<td>{safe(str(cell))}</td>" for cell in row) + "</tr>"
+            for row in rows
+        )
+        heads = "".join(f"<th>{safe(head)}</th>" for head in header)
+        return f"<table><tr>{heads}</tr>{cells}</table>"
+
+    def number(value):
+        return "-" if value is None else f"{value:.5g}"
+
+    sensors = table(
+        ("sensor", "quantity", "unit", "smallest", "at (s)", "largest", "at (s)", "amplification"),
+        [
+            (s["name"], s["quantity"], s["unit"], *(number(s[key]) for key in PEAKS))
+            for s in content["sensors"]
+        ],
+    )
+    forces = zip(content["lowest_contact_force"], content["largest_contact_force"], strict=True)
+    wheels = table(
+        ("wheel", "lowest contact force (N)", "largest (N)"),
+        [(i, number(low), number(high)) for i, (low, high) in enumerate(forces)],
+    )
+    title = safe(record.case.title or "Run")
+    parts = case_to_dict(record.case)
+    entries = [(f"{key}", _short(value)) for key, value in parts.items() if key != "title"]
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        f"<style>{PAGE_STYLE}</style></head><body><h1>{title}</h1>"
+        f"<p>{safe(content['verdict'])}</p><h2>Sensors</h2>{sensors}"
+        f'<img alt="histories of the run" src="data:image/png;base64,{image}">'
+        f"<h2>Wheels</h2>{wheels}<h2>Case (SI units)</h2>{table(('part', 'numbers'), entries)}"
+        f"<p>jaxbeam {safe(_version())}</p></body></html>"
+    )
+
+
+PEAKS = ("smallest", "smallest_time", "largest", "largest_time", "dynamic_amplification")
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("jaxbeam")
+
+
+def _short(value: Any) -> str:
+    text = ", ".join(f"{k} = {v}" for k, v in value.items()) if isinstance(value, dict) else ""
+    text = text or "; ".join(map(_short, value))
+    return text if len(text) < 600 else f"{text[:600]} ..."
+
+
+def words(workspace: Workspace, text: str, name: str | None) -> dict[str, str]:
+    """The same run as Python and as a command line, for a file of some name."""
+    file = name or "case.toml"
+    case = workspace.case(text)
+    python = [
+        "import jaxbeam as jb",
+        "",
+        f"case = jb.load_case({file!r})",
+        "record = jb.simulate(case)",
+        "print(record.verdict)",
+        "print(record.extremes)" if case.sensors else "print(record.contact_force.max(axis=0))",
+    ]
+    return {"python": "\n".join(python), "command": f"jaxbeam simulate {shlex.quote(file)} --plot"}

@@ -1,0 +1,252 @@
+"""A folder of case files, and what is computed for the text of one: no web in it.
+
+Texts come with each question, so that two pages, or one that was loaded again, do not disturb each
+other; what was computed for a text is remembered for a while.
+"""
+
+import collections
+import hashlib
+import itertools
+import os
+import threading
+import warnings
+from collections.abc import Iterable, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import jaxbeam as jb
+from jaxbeam.app import document, views
+from jaxbeam.case.case import Case, addresses, leaves_by_address, unit_at
+from jaxbeam.case.display.addresses import address_words
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.reading.toml_file import parse_toml
+from jaxbeam.rigs import RIG_NAMES
+from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.simulation.simulate import ContactLossWarning
+
+KEPT = 6  # cases, records and prepared simulations that are remembered
+PREVIEW_TOLERANCE, PREVIEW_SAMPLES = 1e-2, 401  # of pictures while a slider moves
+MAX_BYTES = 2 * 2**20  # of the text of a case
+_STARTERS = resources.files("jaxbeam") / "files" / "starters"
+
+
+class Remembered:
+    """What was computed for the last few keys."""
+
+    def __init__(self, size: int = KEPT):
+        self._size, self._found = size, collections.OrderedDict()
+
+    def get(self, key: Any, compute: Any) -> Any:
+        """What is known for a key, computed if it is not."""
+        if key not in self._found:
+            self._found[key] = compute()
+        self._found.move_to_end(key)
+        while len(self._found) > self._size:
+            self._found.popitem(last=False)
+        return self._found[key]
+
+
+class Workspace:
+    """Cases in a folder, and computations for texts of cases; one computation at a time.
+
+    All methods raise ValueError with one sentence for what is wrong in a text, OSError for files.
+    """
+
+    def __init__(self, folder: str | os.PathLike):
+        self.folder = Path(folder).resolve()
+        self._cases, self._records, self._simulators = Remembered(), Remembered(), Remembered()
+        self._jobs: dict[str, Any] = {}
+        self._numbers = itertools.count(1)
+        self._computing = threading.RLock()
+
+    # Files
+
+    def files(self) -> list[str]:
+        """Names of the TOML files of the folder."""
+        return sorted(path.name for path in self.folder.glob("*.toml"))
+
+    def _place(self, name: str) -> Path:
+        """Path of a file of the folder. Raises ValueError for any other place."""
+        path = self.folder / name
+        plain = name == Path(name).name and not name.startswith(".") and name.endswith(".toml")
+        if not plain or path.resolve().parent != self.folder:
+            raise ValueError(
+                f"{name!r} is no place for a case: give a name that ends with .toml, of a file in"
+                f" the folder {self.folder.name}"
+            )
+        return path
+
+    def read(self, name: str) -> dict[str, Any]:
+        """Text of a case file, and a mark by which a later change of the file is seen."""
+        path = self._place(name)
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError(f"{name} has more than the {MAX_BYTES >> 20} MB of a case file")
+        text = path.read_bytes().decode("utf-8-sig")
+        return {"name": name, "text": text, "mark": _mark(text)}
+
+    def save(self, name: str, text: str, mark: str | None = None) -> dict[str, Any]:
+        """Write a text to a file of the folder, whole or not at all.
+
+        `mark` is that of the file as it was read; a file that has changed since, or that was not
+        read, is left alone: FileExistsError.
+        """
+        path = self._place(name)
+        if path.exists() and _mark(path.read_bytes().decode("utf-8-sig", "replace")) != mark:
+            raise FileExistsError(
+                f"{name} has been changed by someone else, or is another file: save under another"
+                " name, or open it again"
+            )
+        with whole_file(path, overwrite=True) as beside:
+            beside.write_bytes(text.encode("utf-8"))
+        return {"name": name, "mark": _mark(text)}
+
+    def library(self) -> list[dict[str, str]]:
+        """Cases to start from: name, title and group."""
+        found = []
+        for group, names in (("Starters", _starters()), ("Published rigs", RIG_NAMES)):
+            for name in names:
+                title = str(parse_toml(self.library_text(name))["title"])
+                found.append({"name": name, "title": title, "group": group})
+        return found
+
+    def library_text(self, name: str) -> str:
+        """Text of a case to start from. Raises ValueError if there is none of the name."""
+        if name in _starters():
+            place = _STARTERS
+        elif name in RIG_NAMES:
+            place = resources.files("jaxbeam.rigs")
+        else:
+            raise ValueError(f"there is no case {name!r} to start from")
+        return (place / f"{name}.toml").read_text(encoding="utf-8")
+
+    # Cases
+
+    def case(self, text: str) -> Case:
+        """The validated case of a text."""
+        return self._cases.get(text, lambda: jb.api.load_case(text, folder=self.folder))
+
+    def model(self, text: str) -> dict[str, Any]:
+        """Tables of a text, and what is to be seen of its case, or what is wrong with it.
+
+        `numbers` are those of the case by address, with units and words.
+        """
+        found: dict[str, Any] = {"tables": {}, "problem": None}
+        try:
+            found["tables"] = parse_toml(text)
+            with self._computing:
+                case = self.case(text)
+                plausibility = jb.check(case)
+        except ValueError as error:
+            problem = jb.api.problem(error)._asdict()
+            return jb.api.plain(found) | {"problem": problem}
+        numbers = {
+            address: {
+                "value": float(concrete(number)),
+                "unit": unit_at(case, address),
+                "words": address_words(case, address),
+            }
+            for address, number in addresses(case).items()
+            if np.ndim(number) == 0
+        }
+        found |= {
+            "scene": views.scene(case),
+            "numbers": numbers,
+            "plausibility": {"line": str(plausibility), "warnings": list(plausibility.warnings)},
+        }
+        return jb.api.plain(found)
+
+    def change(self, text: str, changes: Iterable[Mapping[str, Any]]) -> str:
+        """The text after changes; see `document.changed`."""
+        try:
+            case = self.case(text)
+        except ValueError:  # it is being mended
+            case = None
+        return document.changed(text, changes, case)
+
+    # Runs
+
+    def record(self, text: str) -> "jb.Record":
+        """The run of a case."""
+
+        def compute():
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ContactLossWarning)  # the verdict tells it
+                return jb.simulate(self.case(text))
+
+        with self._computing:
+            return self._records.get(text, compute)
+
+    def simulator(
+        self, case: Case, values: Mapping[str, float], ranges: Mapping[str, Any]
+    ) -> "jb.Simulator | None":
+        """Simulation prepared for numbers within ranges; None where they change its structure.
+
+        That is, where they change the order of parts along the beam, or the duration. It is the
+        same for all cases that differ in these numbers only.
+        """
+        vary = {address: tuple(ranges[address]) for address in values if address in ranges}
+        leaves = leaves_by_address(case)
+        others = {a: np.asarray(leaf).tobytes() for a, leaf in leaves.items() if a not in values}
+        times = np.linspace(0.0, float(concrete(case.run.duration)), PREVIEW_SAMPLES)
+        key = (jax.tree.structure(case), tuple(others.items()), tuple(vary.items()), tuple(values))
+
+        def prepare():
+            try:
+                return jb.Simulator(case, vary or tuple(values), times, PREVIEW_TOLERANCE)
+            except ValueError:
+                return None
+
+        with self._computing:
+            return self._simulators.get(key, prepare)
+
+    def preview(
+        self, text: str, values: Mapping[str, float], ranges: Mapping[str, Any] | None = None
+    ) -> "jb.Record":
+        """A run with other numbers at some addresses, coarser than `record`, for a moving slider.
+
+        Its steps are chosen once for the `ranges` (low, high) of the numbers; beyond them, and
+        where the numbers change the structure of the case, they are chosen anew.
+        """
+        case, values = self.case(text), dict(values)
+        with self._computing, warnings.catch_warnings():
+            warnings.simplefilter("ignore", ContactLossWarning)
+            simulator = self.simulator(case, values, ranges or {})
+            if simulator is not None:
+                try:
+                    return simulator(values)
+                except ValueError:  # beyond its ranges
+                    pass
+            return jb.simulate(jb.replace(case, values), tolerance=PREVIEW_TOLERANCE)
+
+    # Work that takes long
+
+    def start(self, job: Any) -> str:
+        """Keep work that goes on; returns its number for `job`."""
+        number = str(next(self._numbers))
+        self._jobs[number] = job
+        for old in list(self._jobs)[:-KEPT]:
+            self._jobs.pop(old).cancel()
+        return number
+
+    def job(self, number: str) -> Any:
+        """Work that was started. Raises ValueError for a number that is not known."""
+        if number not in self._jobs:
+            raise ValueError("this work is no longer known: start it again")
+        return self._jobs[number]
+
+    def close(self) -> None:
+        """Cancel all work."""
+        for job in self._jobs.values():
+            job.cancel()
+
+
+def _starters() -> list[str]:
+    return sorted(one.name.removesuffix(".toml") for one in _STARTERS.iterdir())
+
+
+def _mark(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
