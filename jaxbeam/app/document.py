@@ -20,9 +20,9 @@ def changed(text: str, changes: Iterable[Mapping[str, Any]], case: Case | None =
     `case` of the text is known. Raises ValueError for text that is not TOML and for addresses that
     it does not have.
 
-    >>> print(changed("[beam]\\nlength = 2.0  # m, all of it\\n", [{"set": "beam.length", "to": 3}]))
+    >>> print(changed("[beam]\\nlength = 2.0  # m, all\\n", [{"set": "beam.length", "to": 3}]))
     [beam]
-    length = 3  # m, all of it
+    length = 3  # m, all
     <BLANKLINE>
     """
     try:
@@ -88,7 +88,7 @@ def _as_before(old: Any, value: Any, address: str, case: Case | None) -> Any:
         factor = number_in_si(f"1 {unit}", unit_at(case, address), address)
     except ValueError:
         return value
-    return f"{float(f'{value / factor:.12g}'):g} {unit}"
+    return f"{value / factor:.12g} {unit}"
 
 
 def _remove(document: Any, path: list[str]) -> None:

@@ -1,4 +1,4 @@
-"""Thin server of the page: loopback only, a token for each question, JSON in, JSON or arrays out."""
+"""Thin server of the page: loopback only, a token for each question, JSON or arrays out."""
 
 import hmac
 import json
@@ -119,26 +119,29 @@ def packed(words: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Respon
     return Response(body, media_type="application/octet-stream")
 
 
+def _asked(work: Callable[[dict[str, Any]], Any]) -> Callable[[Request], Any]:
+    """Handler of a question: its JSON to the work, in a thread; errors as data."""
+
+    async def answer(request: Request) -> Response:
+        try:
+            question = json.loads(await request.body())
+            if not isinstance(question, dict):
+                raise ValueError("a question is a table")
+            if not isinstance(question.get("text", ""), str):
+                raise ValueError("the text of a question is text")
+            found = await run_in_threadpool(work, question)
+        except (ValueError, KeyError, OSError, RuntimeError, ImportError, TypeError) as error:
+            problem = jb.api.problem(error)._asdict()
+            if isinstance(error, KeyError):
+                problem["message"] = f"the question lacks {error}"
+            return JSONResponse({"problem": problem}, 422)
+        return found if isinstance(found, Response) else JSONResponse(jb.api.plain(found))
+
+    return answer
+
+
 def application(workspace: Workspace, opened: str | None, token: str, port: int) -> Any:
     """The ASGI application of a page for a workspace, with a file of it `opened` first."""
-
-    def asked(work: Callable[[dict[str, Any]], Any], method: str = "POST"):
-        """Handler of a question: its JSON to the work, in a thread; errors as data."""
-
-        async def answer(request: Request) -> Response:
-            try:
-                question = json.loads(await request.body()) if method == "POST" else {}
-                if not isinstance(question, dict):
-                    raise ValueError("a question is a table")
-                found = await run_in_threadpool(work, question)
-            except (ValueError, KeyError, OSError, RuntimeError, ImportError, TypeError) as error:
-                problem = jb.api.problem(error)._asdict()
-                if isinstance(error, KeyError):
-                    problem["message"] = f"the question lacks {error}"
-                return JSONResponse({"problem": problem}, 422)
-            return found if isinstance(found, Response) else JSONResponse(jb.api.plain(found))
-
-        return answer
 
     def index(_) -> Response:
         return Response((STATIC / "index.html").read_bytes(), media_type="text/html")
@@ -194,7 +197,10 @@ def application(workspace: Workspace, opened: str | None, token: str, port: int)
     }
     routes = [
         Route("/", index),
-        *(Route(f"/api/{name}", asked(work), methods=["POST"]) for name, work in questions.items()),
+        *(
+            Route(f"/api/{name}", _asked(work), methods=["POST"])
+            for name, work in questions.items()
+        ),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]
     return Guard(Starlette(routes=routes), token, port, MAX_BYTES)

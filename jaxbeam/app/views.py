@@ -62,7 +62,7 @@ def scene(case: Case) -> dict[str, Any]:
 
 
 def _loads(case: Case) -> list[dict[str, Any]]:
-    """Loads: their wheels (indices), whether these roll on the ground, too, and vehicles on them."""
+    """Loads: the indices of their wheels, and the vehicles on them."""
     loads = load_set(case)
     groups = {loads.load_of_wheel[one.first_wheel]: one for one in loads.wheels.vehicles}
     found, first_body = [], 0
@@ -136,10 +136,8 @@ def pictures(record: Record) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         "extremes": {
             name: np.asarray(values).tolist() for name, values in record.extremes._asdict().items()
         },
-        "crossing": [
-            [float(v) for v in passage] for passage in np.asarray(concrete(loads.entry_exit_times()))
-        ],
-    }  # fmt: skip
+        "crossing": np.asarray(concrete(loads.entry_exit_times())).tolist(),
+    }
     arrays = {
         "times": record.times[samples],
         "sensors": record.sensor_values[samples],

@@ -8,6 +8,7 @@ import collections
 import hashlib
 import itertools
 import os
+import re
 import threading
 import warnings
 from collections.abc import Iterable, Mapping
@@ -29,7 +30,7 @@ from jaxbeam.runtime.whole_file import whole_file
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 KEPT = 6  # cases, records and prepared simulations that are remembered
-PREVIEW_TOLERANCE, PREVIEW_SAMPLES = 1e-2, 401  # of pictures while a slider moves
+PREVIEW_TOLERANCE, PREVIEW_SAMPLES = 1e-2, 201  # of pictures while a slider moves
 MAX_BYTES = 2 * 2**20  # of the text of a case
 _STARTERS = resources.files("jaxbeam") / "files" / "starters"
 
@@ -72,7 +73,7 @@ class Workspace:
     def _place(self, name: str) -> Path:
         """Path of a file of the folder. Raises ValueError for any other place."""
         path = self.folder / name
-        plain = name == Path(name).name and not name.startswith(".") and name.endswith(".toml")
+        plain = re.fullmatch(r"[^./\\\0][^/\\\0]*\.toml", name) is not None
         if not plain or path.resolve().parent != self.folder:
             raise ValueError(
                 f"{name!r} is no place for a case: give a name that ends with .toml, of a file in"
@@ -81,7 +82,10 @@ class Workspace:
         return path
 
     def read(self, name: str) -> dict[str, Any]:
-        """Text of a case file, and a mark by which a later change of the file is seen."""
+        """Text of a case file, and a mark by which a later change of the file is seen.
+
+        Raises ValueError for a place outside the folder and for a file that is too large.
+        """
         path = self._place(name)
         if path.stat().st_size > MAX_BYTES:
             raise ValueError(f"{name} has more than the {MAX_BYTES >> 20} MB of a case file")
@@ -92,7 +96,7 @@ class Workspace:
         """Write a text to a file of the folder, whole or not at all.
 
         `mark` is that of the file as it was read; a file that has changed since, or that was not
-        read, is left alone: FileExistsError.
+        read, is left alone. Raises FileExistsError then, ValueError for a place outside the folder.
         """
         path = self._place(name)
         if path.exists() and _mark(path.read_bytes().decode("utf-8-sig", "replace")) != mark:

@@ -281,7 +281,7 @@ class Record(RecordViews):
             if limits is not None:
                 rounding = 1e-9 * (limits[1] - limits[0])
                 columns[i] = (command <= limits[0] + rounding) | (command >= limits[1] - rounding)
-        return xp.array(columns).reshape(len(columns), self.times.shape[0]).T
+        return xp.array(columns, bool).reshape(len(columns), self.times.shape[0]).T
 
     @property
     def peak_command(self) -> Float[Array, " actuator"]:

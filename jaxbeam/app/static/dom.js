@@ -91,13 +91,16 @@ const PREFIXES = [[1e9, "G"], [1e6, "M"], [1e3, "k"], [1, ""], [1e-3, "m"], [1e-
  * @returns {[number, string]}
  */
 export function scaled(largest, unit) {
-  if (!/^(m|N|Pa|V|A|J|W|Nm|N m)$/.test(unit) || !(largest > 0)) return [1, unit === "1" ? "" : unit];
+  if (!/^(m|Pa|V|N|N m|N m\^2|N\/m)$/.test(unit) || !(largest > 0)) return [1, unit === "1" ? "" : raised(unit)];
   for (const [factor, prefix] of /** @type {[number, string][]} */ (PREFIXES)) {
     if (unit === "m" && factor > 1) continue;
-    if (largest >= factor * 0.9999) return [factor, prefix + unit];
+    if (largest >= factor * 0.9999) return [factor, prefix + raised(unit)];
   }
-  return [1e-6, "µ" + unit];
+  return [1e-6, "µ" + raised(unit)];
 }
+
+/** A unit with raised powers. @param {string} unit */
+export const raised = (unit) => unit.replace(/\^(\d)/g, (_, power) => "⁰¹²³⁴⁵⁶⁷⁸⁹"[power]);
 
 /**
  * A number to some digits, without an exponent where it is short.

@@ -1,6 +1,6 @@
 // Fields of all tables of a case, made from the JSON Schema of case files: nothing is typed again.
 
-import { html, number } from "./dom.js";
+import { html, number, raised } from "./dom.js";
 
 /** @typedef {Record<string, any>} Schema */
 
@@ -212,7 +212,7 @@ export function createFields(store, context) {
     const help = `${schema.description ?? ""}${bounds ? `; ${bounds}` : ""}`.replace(` (${unit})`, "");
     return html("div.field", {},
       html("label", { for: id, title: help }, spaced(key)),
-      html("span.entry", {}, input, ...(unit ? [html("span.unit", {}, unit)] : []), ...(pin ? [pin] : [])),
+      html("span.entry", {}, input, ...(unit ? [html("span.unit", { title: unit }, raised(unit))] : []), ...(pin ? [pin] : [])),
       html("small.help", { id: `${id}-help` }, help),
       ...(problem ? [html("p.wrong", {}, problem.message)] : []));
   }

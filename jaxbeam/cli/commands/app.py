@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from jaxbeam.cli.arguments import refuse_option
+from jaxbeam.cli.arguments import check_exists, refuse_option
 from jaxbeam.cli.options import enable_compile_cache, print_message
 
 
@@ -22,8 +22,19 @@ def app(case: Path | None = None, /, *, no_browser: bool = False, port: int = 0)
         Port of the page; any that is free if left out.
     """
     refuse_option(not 0 <= port < 65536, f"--port must be from 0 to 65535; it is {port}")
-    if case is not None and not case.is_file():
-        raise FileNotFoundError(f"cannot read the case file {case}: no such file")
+    if case is not None:
+        check_exists("case file", case)
+    _check_packages()
+    enable_compile_cache()
+    from jaxbeam.app.server import serve
+
+    folder, opened = (Path.cwd(), None) if case is None else (case.parent, case.name)
+    if not no_browser:
+        print_message("the page is open in the browser; Ctrl-C ends it")
+    serve(folder, opened, port, browser=not no_browser)
+
+
+def _check_packages() -> None:
     try:
         import starlette  # noqa: F401
         import tomlkit  # noqa: F401
@@ -32,10 +43,3 @@ def app(case: Path | None = None, /, *, no_browser: bool = False, port: int = 0)
         raise ImportError(
             f"the page needs {error.name}, which is not installed: pip install 'jaxbeam[app]'"
         ) from None
-    enable_compile_cache()
-    from jaxbeam.app.server import serve
-
-    folder, opened = (Path.cwd(), None) if case is None else (case.parent, case.name)
-    if not no_browser:
-        print_message("the page is open in the browser; Ctrl-C ends it")
-    serve(folder, opened, port, browser=not no_browser)

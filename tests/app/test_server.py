@@ -1,0 +1,213 @@
+"""What the server takes, and what it refuses, without a browser."""
+
+import http.client
+import json
+import socket
+import struct
+import threading
+import time
+
+import numpy as np
+import pytest
+import uvicorn
+
+import jaxbeam as jb
+from jaxbeam.app.server import HEADERS, MAX_BYTES, application
+from jaxbeam.app.take_away import KINDS
+from jaxbeam.app.workspace import Workspace
+from tests.app.conftest import RIG
+
+TOKEN = "a-token-of-the-tests"
+
+
+class Answer:
+    """Status, headers and content of an answer."""
+
+    def __init__(self, response):
+        self.status = response.status
+        self.headers = {name.lower(): value for name, value in response.getheaders()}
+        self.content = response.read()
+
+    @property
+    def text(self):
+        return self.content.decode()
+
+    def json(self):
+        return json.loads(self.content)
+
+
+class Client:
+    """Questions to a server of this process, with whatever headers are wanted."""
+
+    def __init__(self, port):
+        self.port = port
+
+    def request(self, method, path, body=None, headers=None):
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        try:
+            connection.request(method, path, body, headers or {})
+            return Answer(connection.getresponse())
+        finally:
+            connection.close()
+
+    def get(self, path, **heads):
+        return self.request("GET", path, headers=heads)
+
+
+@pytest.fixture
+def client(rig):
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        port = listening.getsockname()[1]
+        app = application(Workspace(rig.parent), "rig.toml", TOKEN, port)
+        server = uvicorn.Server(uvicorn.Config(app, log_level="error", lifespan="off", ws="none"))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
+        thread.start()
+        while not server.started:
+            time.sleep(0.01)
+        yield Client(port)
+        server.should_exit = True
+        thread.join()
+
+
+def ask(client, name, question=None, **heads):
+    headers = {"x-token": TOKEN} | {key.replace("_", "-"): value for key, value in heads.items()}
+    return client.request("POST", f"/api/{name}", json.dumps(question or {}), headers)
+
+
+def test_the_page_has_its_policy_and_no_markup_of_others(client):
+    answer = client.get(f"/?token={TOKEN}")
+    assert answer.status == 200 and "jaxbeam" in answer.text
+    assert {name: answer.headers[name] for name in HEADERS} == HEADERS
+    assert "unsafe" not in HEADERS["content-security-policy"]
+
+
+@pytest.mark.parametrize("name", ["index.html", "main.js", "style.css", "icon.svg"])
+def test_the_code_of_the_page_asks_nowhere_else(client, name):
+    text = client.get(f"/static/{name}").text
+    others = [word for word in ("http://", "https://", "//cdn") if word in text]
+    assert [w for w in others if "http://www.w3.org/" not in text] == []
+    assert "innerHTML" not in text and "eval(" not in text
+
+
+@pytest.mark.parametrize(
+    "heads",
+    [
+        {"x_token": ""},
+        {"x_token": TOKEN[:-1]},
+        {"x_token": "é"},
+        {"host": "evil.example:PORT"},
+        {"host": "127.0.0.1:1"},
+        {"origin": "https://evil.example"},
+        {"origin": "null"},
+        {"origin": "http://127.0.0.1:1"},
+        {"origin": "http://localhost:PORT"},
+        {"sec_fetch_site": "cross-site"},
+        {"sec_fetch_site": "same-site"},
+    ],
+)
+def test_questions_from_elsewhere_are_refused(client, heads):
+    heads = {name: value.replace("PORT", str(client.port)) for name, value in heads.items()}
+    answer = ask(client, "hello", **heads)
+    assert answer.status == 403 and answer.json()["problem"]["message"]
+
+
+def test_the_page_itself_needs_the_token(client):
+    assert client.get("/").status == 403
+    assert client.get("/?token=wrong").status == 403
+
+
+def test_the_page_of_this_origin_may_ask(client):
+    origin = f"http://127.0.0.1:{client.port}"
+    answer = ask(client, "hello", origin=origin, sec_fetch_site="same-origin")
+    assert answer.status == 200 and answer.json()["opened"] == "rig.toml"
+
+
+def test_oversized_questions_are_refused(client):
+    heads = {"x-token": TOKEN, "content-length": str(MAX_BYTES + 1)}
+    assert client.request("POST", "/api/model", headers=heads).status == 413
+
+
+def test_oversized_questions_without_a_length_are_not_read_to_their_end(client):
+    sent = []
+
+    def chunks():
+        for _ in range(40):
+            sent.append(1)
+            yield b"#" * (MAX_BYTES // 4)
+
+    with pytest.raises((OSError, http.client.HTTPException)):
+        answer = client.request("POST", "/api/model", chunks(), {"x-token": TOKEN})
+        raise OSError(answer.status)  # a refusal is as good as an end
+    assert len(sent) < 40
+
+
+@pytest.mark.parametrize("name", ["../secret.toml", "/etc/passwd", "rig.toml/../x.toml"])
+def test_paths_outside_of_the_folder_are_refused(client, name):
+    for question in ({"name": name}, {"name": name, "text": RIG}):
+        answer = ask(client, "save" if "text" in question else "open", question)
+        assert answer.status == 422
+        assert "no place for a case" in answer.json()["problem"]["message"]
+    assert client.get(f"/static/{name}").status == 404
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{", "3", '"a"', '{"text": 3}', '{"a": 1}'])
+def test_questions_that_make_no_sense_are_refused_in_a_sentence(client, content):
+    answer = client.request("POST", "/api/model", content, {"x-token": TOKEN})
+    assert answer.status == 422 and answer.json()["problem"]["message"]
+
+
+def test_a_run_is_packed_and_equal_to_that_of_the_library(client, rig):
+    content = ask(client, "run", {"text": RIG}).content
+    (length,) = struct.unpack_from("<I", content)
+    words = json.loads(content[4 : 4 + length])
+    place, arrays = 4 + length, {}
+    for name, shape in words["arrays"].items():
+        size = int(np.prod(shape))
+        arrays[name] = np.frombuffer(content, "<f4", size, place).reshape(shape)
+        place += 4 * size
+    assert place == len(content) and length % 4 == 0
+    record = jb.simulate(jb.load_case(rig))
+    np.testing.assert_allclose(arrays["sensors"], record.sensor_values, rtol=1e-6, atol=1e-12)
+    assert words["verdict"] == record.verdict
+
+
+def test_a_preview_has_its_own_scene(client):
+    question = {"text": RIG, "values": {"sensors.0.position": 0.4}, "ranges": {}}
+    content = ask(client, "preview", question).content
+    (length,) = struct.unpack_from("<I", content)
+    assert json.loads(content[4 : 4 + length])["scene"]["sensors"][0]["position"] == 0.4
+    assert ask(client, "preview", question | {"prepare": True}).json() == {}
+
+
+@pytest.mark.parametrize("what", sorted(KINDS))
+def test_every_file_can_be_taken_away(client, what, few_frames):
+    answer = ask(client, "take", {"text": RIG, "what": what})
+    assert answer.status == 200, answer.text
+    assert answer.headers["content-disposition"].endswith(f'.{what}"')
+    starts = {"png": b"\x89PNG", "gif": b"GIF8", "nc": b"CDF", "xlsx": b"PK", "csv": b"time"}
+    assert answer.content.startswith(starts.get(what, b"")) and answer.content
+
+
+def test_the_report_shows_titles_as_text(client):
+    text = RIG.replace("Rig of two spans", "<script>alert(1)</script>")
+    page = ask(client, "take", {"text": text, "what": "html"}).text
+    assert "<script>" not in page and "&lt;script&gt;" in page
+
+
+@pytest.fixture
+def few_frames(monkeypatch):
+    """An animation of two frames, not of a hundred."""
+    import jaxbeam.plot
+
+    whole = jaxbeam.plot.animate
+    short = lambda record, path: whole(record, path, frames=2)  # noqa: E731
+    monkeypatch.setattr(jaxbeam.plot, "animate", short)
+
+
+def test_the_words_to_copy_are_those_of_the_run(client, rig, monkeypatch, capsys):
+    words = ask(client, "words", {"text": RIG, "name": "rig.toml"}).json()
+    assert words["command"] == "jaxbeam simulate rig.toml --plot"
+    monkeypatch.chdir(rig.parent)
+    exec(words["python"], {})
+    assert jb.simulate(jb.load_case(rig)).verdict in capsys.readouterr().out
