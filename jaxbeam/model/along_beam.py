@@ -26,6 +26,7 @@ LEFT_SHARE = 1e-7  # of the length, from a position to the section left of it: s
 SETTLED = 1e-4  # change of an extreme, relative to it, at which positions are dense enough
 LEAST_SIZE = 1e-3  # of the largest value, below which an extreme need not settle
 MAX_ROUNDS = 8
+SETTLED_ROUNDS = 2  # without a change; where a curve jumps, its fall beside a peak says nothing
 CANDIDATES = 6  # peaks along the beam that are refined at a time
 INNER = np.array([0.2, 0.4, 0.6, 0.8])  # of an interval beside a peak
 
@@ -130,19 +131,23 @@ def refined(
 
     `evaluate` returns a tree of arrays with an axis of positions first, of which `curves` gives the
     values (position, curve) whose maxima are refined, the size of each curve, and known places (m),
-    of loads, near maxima. Traced numbers are not refined.
+    of loads, near maxima. A maximum that SETTLED_ROUNDS leave as it is has settled. Traced numbers
+    are not refined.
     """
     x = positions_along(case) if x is None else x
     found = evaluate(x)
     if any_traced(x, found):
         return xp.asarray(x), found
-    refined_x = np.asarray(x)
+    refined_x, tops, unchanged = np.asarray(x), np.array(np.inf), np.zeros(1, int)
     for _ in range(MAX_ROUNDS):
         values, sizes, near = curves(found)
         values, sizes = np.asarray(values), np.broadcast_to(sizes, values.shape[1:])
         if not np.all(np.isfinite(values)):  # a run that diverges
             break
-        peaks = [_beside_peaks(refined_x, *one) for one in zip(values.T, sizes, near, strict=True)]
+        last, tops = tops, values.max(axis=0)
+        unchanged = np.where(np.abs(tops - last) <= SETTLED * np.abs(tops), unchanged + 1, 0)
+        each = zip(values.T, sizes, near, unchanged, strict=True)
+        peaks = [_beside_peaks(refined_x, *one) for *one, rounds in each if rounds < SETTLED_ROUNDS]
         added = np.unique(np.concatenate([np.zeros(0), *peaks]))
         if not added.size:
             break
