@@ -15,7 +15,7 @@ import jax.extend
 import numpy as np
 
 from jaxbeam.case.reading.units import in_si
-from jaxbeam.runtime.arrays import xp
+from jaxbeam.runtime.arrays import not_differentiated, xp
 
 
 def _as_array(unit: str, meaning: str):
@@ -119,6 +119,18 @@ def is_concrete(value) -> bool:
     except jax.errors.ConcretizationTypeError:
         return False
     return True
+
+
+def deciding(value, what: str):
+    """A number with which something is compared at the samples of a law. Its derivative is refused.
+
+    It would be zero, but for jumps where a sample comes to be decided otherwise.
+    """
+    reason = (
+        f"{what} decides at samples, so that commands jump with it and it has no derivative:"
+        " compare several values"
+    )
+    return not_differentiated(value, reason)
 
 
 class TracedNumberError(jax.errors.ConcretizationTypeError):

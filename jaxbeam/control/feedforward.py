@@ -12,7 +12,15 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep
-from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, POSITIVE, concrete, is_concrete, number
+from jaxbeam.case.fields import (
+    INCREASING,
+    NOT_NEGATIVE,
+    POSITIVE,
+    concrete,
+    deciding,
+    is_concrete,
+    number,
+)
 from jaxbeam.case.loads.base import trajectory
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.runtime.arrays import Array, xp
@@ -99,7 +107,8 @@ class Feedforward(AbstractController):
         if self.confirmation is None:
             return FeedforwardLaw(*settings, gate_times, length)
         sensors = _deflection_sensors(plant.case.sensors)
-        return ConfirmedFeedforwardLaw(*settings, gate_times, length, self.confirmation, sensors)
+        confirmation = deciding(self.confirmation, "controller.confirmation")
+        return ConfirmedFeedforwardLaw(*settings, gate_times, length, confirmation, sensors)
 
 
 class FeedforwardLaw(AbstractSampledLaw):

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.display.parts import ReprWithUnits
-from jaxbeam.case.fields import POSITIVE, concrete, is_concrete, number
+from jaxbeam.case.fields import POSITIVE, concrete, deciding, is_concrete, number
 from jaxbeam.control.load_identifiers import (
     AbstractLoadIdentifier,
     DeflectionIdentifier,
@@ -110,11 +110,12 @@ class LoadIdentification(ReprWithUnits):
             @ (design_plant.coordinate_scale[:, None] * shapes.T),
             "static_lift": response @ system.B,
             "offset": sensor_offsets(design_plant)[sensor_indices],
-            "until": self.until,
+            "until": deciding(self.until, "load_identification.until"),
             "sensor_indices": tuple(int(i) for i in sensor_indices),
         }
         if self.gates is None:
-            return DeflectionIdentifier(threshold=self.threshold, **common)
+            threshold = deciding(self.threshold, "load_identification.threshold")
+            return DeflectionIdentifier(threshold=threshold, **common)
         true_gates = self.gates + self.gate_errors
         gate_times = plant.loads.trajectories[0].passage_times(true_gates)[:2]
         return GateIdentifier(gates=self.gates, gate_times=gate_times, **common)

@@ -12,7 +12,16 @@ from jaxbeam.case.controller import (
     AbstractSampledLaw,
     ControlStep,
 )
-from jaxbeam.case.fields import INCREASING, choice, concrete, count, is_concrete, number, part
+from jaxbeam.case.fields import (
+    INCREASING,
+    choice,
+    concrete,
+    count,
+    deciding,
+    is_concrete,
+    number,
+    part,
+)
 from jaxbeam.control.feedback import pairing_error, power_law
 from jaxbeam.control.load_identification import LoadIdentification, identification_error
 from jaxbeam.control.load_identifiers import AbstractLoadSource, given_load
@@ -77,9 +86,9 @@ class ScheduledFeedback(AbstractController):
             source = given_load(plant.case.loads[0], plant.case.run.gravity)
         else:
             source = self.load_identification.identifier(plant, plant)
-        return ScheduledFeedbackLaw(
-            self.masses, self.gains, source, self.power, self.between == "interpolated"
-        )
+        interpolated = self.between == "interpolated"
+        masses = self.masses if interpolated else deciding(self.masses, "controller.masses")
+        return ScheduledFeedbackLaw(masses, self.gains, source, self.power, interpolated)
 
 
 class ScheduledFeedbackLaw(AbstractSampledLaw, AbstractContinuousLaw):

@@ -19,7 +19,15 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractSampledLaw, ControlStep
-from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, concrete, count, is_concrete, number
+from jaxbeam.case.fields import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    concrete,
+    count,
+    deciding,
+    is_concrete,
+    number,
+)
 from jaxbeam.control.predictive.gpc import (
     GPC,
     PolynomialModel,
@@ -107,7 +115,7 @@ class AdaptiveGPC(GPC):
             self.forgetting,
             self.measurement_noise,
             self.period,
-            xp.asarray(xp.inf) if self.until is None else self.until,
+            xp.asarray(xp.inf) if self.until is None else deciding(self.until, "controller.until"),
             xp.broadcast_to(probe, (actuators,)),
             *weights,
             (self.first, self.horizon, self.moves),
