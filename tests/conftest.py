@@ -14,8 +14,13 @@ import tempfile
 os.environ["MPLBACKEND"] = "Agg"
 # Several test processes share a GPU: none may allocate most of its memory.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-# Test processes share the cores: threads of small matrix products would wait for each other.
+# Test processes share the cores: threads of small matrix products would wait for each other, on a
+# busy machine ten times as long as they compute. A plugin of pytest may have loaded NumPy before.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+if "numpy" in sys.modules:
+    import threadpoolctl
+
+    threadpoolctl.threadpool_limits(1, user_api="blas")
 # Compiling takes most of the time of the tests: the settings of `jaxbeam.runtime.compiling`, and
 # without optimisations, whose time small cases do not regain.
 os.environ["XLA_FLAGS"] = " ".join(

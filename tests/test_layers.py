@@ -2,6 +2,8 @@
 
 import re
 
+import threadpoolctl
+
 from tests.layers.selection import layers, matches
 from tests.layers.touched import nearest_tests
 from tests.modules import ROOT, module_files
@@ -38,3 +40,11 @@ def test_all_modules_have_tests_near():
         near = nearest_tests([file])
         assert near or file in ("jaxbeam/__init__.py", "jaxbeam/__main__.py"), file
         assert all((ROOT / test).exists() for test in near)
+
+
+def test_matrices_are_computed_by_one_thread():
+    """In one process and in many, whatever loaded NumPy first."""
+    import scipy.linalg  # noqa: F401
+
+    libraries = threadpoolctl.threadpool_info()
+    assert {one["num_threads"] for one in libraries if one["user_api"] == "blas"} == {1}
