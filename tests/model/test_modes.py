@@ -73,7 +73,7 @@ def test_rotational_springs_range_from_none_to_a_clamp():
         supports = [Support(0.0, rotational_stiffness=stiffness)]
         return Case(Beam(1.2, **PROPERTIES, modes=12), supports)
 
-    for stiffness in (0.0, 1.0, 1e3, 1e8, 1e16):
+    for stiffness in (0.0, 1e3, 1e16):
         assert_frequencies(with_rotational_spring(stiffness))
         assert_frequencies(supported_beam(None, stiffness))
     clamped = solve(Case(Beam(1.2, **PROPERTIES, ends="clamped-pinned", modes=12))).frequencies

@@ -30,7 +30,7 @@ pytestmark = pytest.mark.filterwarnings(
 # Independent modal equations
 
 
-LOADS = [random_load(np.random.default_rng(seed)) for seed in range(8)] + [
+LOADS = [random_load(np.random.default_rng(seed)) for seed in range(4)] + [
     Load(0.3, 2.0, entry_time=1.2),  # after the run
     Load(0.3, -2.0, entry_time=-0.2),  # at midspan at the start of the run
     Load(0.3, 1.0, entry_time=-0.7),  # before the run
