@@ -21,7 +21,7 @@ from jaxbeam.runtime.arrays import (
 ESTIMATE_ITERATIONS = 2  # of Newton's method in an estimate
 TIE_ROUNDING_UNITS = 8  # by which equal numbers may differ
 START_POINTS = 17  # of the search, closer to each other than extrema of the curve can be
-NEWTON_ITERATIONS = 3  # from each start point, and once more from the best
+NEWTON_ITERATIONS = 6  # from each start point
 
 
 class Curve(NamedTuple):
@@ -106,78 +106,66 @@ def estimate_peak(
     samples: Float[Array, "point *rest"],
     points: tuple[float, ...],
     magnitude: Callable = xp.abs,
-    spelt_out: bool = True,
 ) -> Float[Array, " *rest"]:
     """Estimate of the peak, searched from the largest sample only.
 
-    It tells which of many steps has the peak, which `refine_peak` then finds. Polynomials are
-    `spelt_out` in programs that search often.
+    It tells which of many steps has the peak, which `refine_peak` then finds.
     """
     magnitudes = magnitude(samples)
     largest = xp.max(magnitudes, axis=0)
     start = take(_to_unit_interval(points), xp.argmax(magnitudes, axis=0)).astype(samples.dtype)
-    curve = _interpolate(samples, points)
-    curve = Curve(*map(list, curve)) if spelt_out else curve
+    curve = Curve(*map(list, _interpolate(samples, points)))  # as programs search often
     position = _newton_stationary_point(
         curve, start, newton_step_limit(points), iterations=ESTIMATE_ITERATIONS
     )
     return xp.maximum(magnitude(polynomial(curve.value, position)), largest)
 
 
-def peak_step(
+def steps_beside_peak(
     samples: Float[Array, "step point *rest"], points: tuple[float, ...], magnitude: Callable
-) -> tuple[Int[Array, " *rest"], Float[Array, " *rest"]]:
-    """Step that has the peak of the polynomials through the samples of each, and its estimate.
+) -> Int[Array, "candidate *rest"]:
+    """Three steps, one of which has the peak of the polynomials through the samples of each.
 
-    That with the largest of values at equal distances, or one of those beside it.
+    That with the largest of values at equal distances, and those beside it.
     """
     grid = np.linspace(-1.0, 1.0, START_POINTS)[:, None] ** np.arange(len(points))
     weights = grid @ interpolation_matrix(points)[: len(points)]
-    steps = samples.shape[0]
     largest = xp.max(magnitude(xp.einsum("gp,tp...->tg...", weights, samples)), axis=1)
     beside = np.arange(-1, 2).reshape(-1, *(1,) * (samples.ndim - 2))
-    steps = xp.clip(xp.argmax(largest, axis=0) + beside, 0, steps - 1)
-    candidates = xp.take_along_axis(samples, steps[:, None], axis=0)
-    estimates = estimate_peak(xp.moveaxis(candidates, 1, 0), points, magnitude, spelt_out=False)
-    best = xp.argmax(estimates, axis=0)[None]
-    return xp.take_along_axis(steps, best, axis=0)[0], xp.max(estimates, axis=0)
+    return xp.clip(xp.argmax(largest, axis=0) + beside, 0, samples.shape[0] - 1)
 
 
 @jax.named_scope("peaks")
 def locate_peak(
     samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = xp.abs
-) -> Float[Array, " *rest"]:
-    """Position in [-1, 1] of the largest magnitude of the polynomial through the samples."""
+) -> tuple[Float[Array, " *rest"], Float[Array, " *rest"]]:
+    """Position in [-1, 1] of the largest magnitude of the polynomial through samples, and it."""
     curve = _interpolate(samples, points)
     # The start points are candidates too: Newton's method may leave an end for a lower extremum.
     starts = np.linspace(-1.0, 1.0, START_POINTS).reshape(-1, *(1,) * (samples.ndim - 1))
     starts = xp.broadcast_to(starts.astype(samples.dtype), (START_POINTS, *samples.shape[1:]))
-    positions = xp.concatenate(
-        [starts, _newton_stationary_point(curve, starts, 2 / START_POINTS, NEWTON_ITERATIONS)]
-    )
-    _, ties = max_with_ties(magnitude(polynomial(curve.value, positions)))
-    position = xp.max(xp.where(ties, positions, -1.0), axis=0)
-    # The magnitude is accurate to nearly rounding by now, the position to the square root of that:
-    # further iterations improve it, unless the peak is at an end without stationary point nearby.
-    stationary_point = _newton_stationary_point(
-        curve, position, 2 / START_POINTS, NEWTON_ITERATIONS
-    )
-    _, ties_of_two = max_with_ties(
-        magnitude(polynomial(curve.value, xp.stack([stationary_point, position])))
-    )
-    return xp.where(ties_of_two[0], stationary_point, position)
+    found = _newton_stationary_point(curve, starts, 2 / START_POINTS, NEWTON_ITERATIONS)
+    positions = xp.concatenate([starts, found])
+    largest, ties = max_with_ties(magnitude(polynomial(curve.value, positions)))
+    return xp.max(xp.where(ties, positions, -1.0), axis=0), largest
 
 
 def refine_peak(
-    samples: Float[Array, "point *rest"], points: tuple[float, ...], magnitude: Callable = xp.abs
+    samples: Float[Array, "point *rest"],
+    points: tuple[float, ...],
+    magnitude: Callable = xp.abs,
+    position: Float[Array, " *rest"] | None = None,
 ) -> tuple[Float[Array, " *rest"], ...]:
     """Largest magnitude of the polynomial through the samples, and its position in [0, 1].
+
+    It is that of `locate_peak` unless a `position` is given.
 
     `points` are the positions in [0, 1] of the samples, ascending and with both ends. Inside the
     curve the position has the derivative of a stationary point, so that second derivatives of the
     magnitude are those of the moving peak; at an end it is fixed.
     """
-    position = locate_peak(stop_gradient(samples), points, magnitude)
+    if position is None:
+        position, _ = locate_peak(stop_gradient(samples), points, magnitude)
     position = optimization_barrier(stop_gradient(position))
     curve = _interpolate(samples, points)
     if is_jax(samples):

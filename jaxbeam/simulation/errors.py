@@ -72,18 +72,22 @@ def interpolation_errors(
 
 
 def peak_errors(
-    case: Case, model: ModalModel, running_peaks: RunningPeaks, motion: Motion
+    case: Case,
+    model: ModalModel,
+    running_peaks: RunningPeaks,
+    heights: Float[Array, " output"],
+    motion: Motion,
 ) -> tuple[Float[Array, ""], Float[Array, " sensor"]]:
     """Errors of the interpolated peaks of a run, of `monitored_sensors` up and down.
 
     Of the deflection, relative to its largest value along the beam, and of what each sensor
-    measures, relative to its largest.
+    measures, relative to its largest. `heights` are the refined peaks.
     """
     count, own = len(case.sensors), own_outputs(case.sensors)
     if not count:
         return xp.zeros(()), xp.zeros(0)
     absolute = xp.max(xp.stack(xp.split(interpolation_errors(model, running_peaks)[:, 0], 2)), 0)
-    up, down = xp.split(running_peaks.refined_peak()[0][:, 0], 2)
+    up, down = xp.split(heights, 2)
     largest = stop_gradient(xp.maximum(up, down))
     rows = model.modes.shapes(trial_positions(case))
     along = xp.max(xp.abs(stop_gradient(motion.coordinates) @ rows.T))

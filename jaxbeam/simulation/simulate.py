@@ -267,12 +267,15 @@ def _record(case: Case, integration: "Integration", times) -> Record:
     """Record of a run, whose errors are those of its peaks only."""
     outputs = integration.outputs
     peaks = Peaks(*(part[0] for part in integration.running_peaks.peaks()))
+    heights = peaks.peak_deflection
     extremes, peaks = sensor_extremes(case.sensors, peaks)
     loads, lost_times = load_set(case), peaks.contact_lost_time
     # Each wheel at its own time.
     lost_positions = xp.diagonal(loads.kinematics(lost_times)[0])
     diverged = xp.any(xp.isnan(outputs.motion.coordinates))  # errors are not defined
-    of_peaks = peak_errors(case, integration.model, integration.running_peaks, outputs.motion)
+    of_peaks = peak_errors(
+        case, integration.model, integration.running_peaks, heights, outputs.motion
+    )
     return Record(
         case=case,
         modes=integration.model.modes,

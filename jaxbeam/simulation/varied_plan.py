@@ -17,6 +17,7 @@ from jaxtyping import Bool
 from jaxbeam.case.case import Case, leaves_by_address, own_addresses, replace, value_at
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.simulation.integration_plan import IntegrationPlan, common_plan, integration_plan
 
 Range = tuple[Any, Any]  # lowest and highest value, arrays of the shape of the number
@@ -129,6 +130,7 @@ def _assumed_range(case: Case, address: str) -> Range:
     )
 
 
+@compiled_if_traced
 def within(case: Case, ranges: Mapping[str, Range]) -> Bool[Array, ""]:
     """Whether all numbers of a case are within their ranges."""
     inside: Any = np.ones((), bool)

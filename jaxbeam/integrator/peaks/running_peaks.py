@@ -16,7 +16,13 @@ from jaxbeam.integrator.load_path import LoadPath
 from jaxbeam.integrator.peaks.contact_minimum import contact_minimum
 from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.step_matrices import StepMatrices
-from jaxbeam.numerics.peak_search import estimate_peak, max_with_ties, peak_step, refine_peak
+from jaxbeam.numerics.peak_search import (
+    estimate_peak,
+    locate_peak,
+    max_with_ties,
+    refine_peak,
+    steps_beside_peak,
+)
 from jaxbeam.runtime.arrays import (
     Array,
     cond,
@@ -49,7 +55,8 @@ class RunningPeaks(Module):
     `samples` are the deflections (m) at the peak nodes of the step with the largest `estimate` of
     the `magnitude` of each monitored deflection; that step has `step_start` (s) and `step_length`
     (s). Contact forces (N) are positive where a load presses on the beam; `contact_lost_time` (s)
-    is the first instant of a tensile contact force. A run is `finite` until it diverges.
+    is the first instant of a tensile contact force. A run is `finite` until it diverges. The
+    `position` of the peak in its step, in [-1, 1], is known of a whole run only.
     """
 
     estimate: Float[Array, "sensor batch"]
@@ -60,10 +67,11 @@ class RunningPeaks(Module):
     contact_lost_time: Float[Array, "load batch"]
     finite: Bool[Array, " batch"]
     magnitude: Callable = eqx.field(static=True)
+    position: Float[Array, "sensor batch"] | None = None
 
     def refined_peak(self) -> tuple[Float[Array, "sensor batch"], Float[Array, "sensor batch"]]:
         """Peak magnitude of each monitored deflection (m), and its time (s); NaN if not finite."""
-        value, position = refine_peak(self.samples, PEAK_NODES, self.magnitude)
+        value, position = refine_peak(self.samples, PEAK_NODES, self.magnitude, self.position)
         time = self.step_start + position * self.step_length
         return xp.where(self.finite, value, xp.nan), xp.where(self.finite, time, xp.nan)
 
@@ -113,15 +121,11 @@ def update_peaks(
     whole_run = is_jax(largest) and not is_jax(running_peaks.estimate)
 
     def updated(best):
-        if whole_run:
-            found = peak_step(stop_gradient(samples), PEAK_NODES, best.magnitude)
-            best_step, best_estimate = found
-        else:
-            estimate = optimization_barrier(
-                estimate_peak(xp.moveaxis(samples, 1, 0), PEAK_NODES, best.magnitude)
-            )
-            best_estimate, is_best = max_with_ties(estimate)
-            best_step = xp.max(xp.where(is_best, np.arange(steps)[:, None, None], 0), axis=0)
+        estimate = optimization_barrier(
+            estimate_peak(xp.moveaxis(samples, 1, 0), PEAK_NODES, best.magnitude)
+        )
+        best_estimate, is_best = max_with_ties(estimate)
+        best_step = xp.max(xp.where(is_best, np.arange(steps)[:, None, None], 0), axis=0)
         better = best_estimate > best.estimate
         chosen = xp.take_along_axis(samples, best_step[None, None], axis=0)[0]
         return RunningPeaks(
@@ -135,13 +139,16 @@ def update_peaks(
             best.magnitude,
         )
 
-    # Most chunks stay far below the peak so far and lose no contact: they skip the refinement.
-    running_peaks = cond(
-        whole_run or xp.any(largest * PEAK_MARGIN > running_peaks.estimate),
-        updated,
-        lambda best: best,
-        running_peaks,
-    )
+    if whole_run:
+        running_peaks = _of_whole_run(running_peaks, samples, start, length)
+    else:
+        # Most chunks stay far below the peak so far and lose no contact: they skip the refinement.
+        running_peaks = cond(
+            xp.any(largest * PEAK_MARGIN > running_peaks.estimate),
+            updated,
+            lambda best: best,
+            running_peaks,
+        )
     # Loads off the beam do not count, nor do impulses.
     is_load = (
         path.loads[:, :, None] == np.arange(running_peaks.lowest_contact_force.shape[0])
@@ -159,6 +166,30 @@ def update_peaks(
         lambda b: (b.lowest_contact_force, b.contact_lost_time, b.finite),
         running_peaks,
         (lowest_force, contact_lost_time, finite),
+    )
+
+
+def _of_whole_run(initial: RunningPeaks, samples, start, length) -> RunningPeaks:
+    """Peaks of a traced run whose steps are all known at once: by products, without branches."""
+    fixed, magnitude = stop_gradient(samples), initial.magnitude
+    steps = steps_beside_peak(fixed, PEAK_NODES, magnitude)
+    candidates = xp.moveaxis(xp.take_along_axis(samples, steps[:, None], axis=0), 0, 1)
+    positions, heights = locate_peak(stop_gradient(candidates), PEAK_NODES, magnitude)
+    highest = xp.argmax(heights, axis=0) == np.arange(len(steps))[:, None, None]
+
+    def chosen(parts):
+        return xp.sum(xp.where(highest, parts, 0.0), axis=-3)
+
+    return RunningPeaks(
+        chosen(heights),
+        chosen(candidates),
+        chosen(take(start, steps)),
+        chosen(take(length, steps)),
+        initial.lowest_contact_force,
+        initial.contact_lost_time,
+        initial.finite,
+        magnitude,
+        chosen(positions),
     )
 
 
