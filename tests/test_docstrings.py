@@ -6,6 +6,7 @@ import importlib
 import inspect
 import re
 import shutil
+from collections.abc import Iterator
 
 import pytest
 
@@ -29,25 +30,32 @@ def raised(function: ast.FunctionDef) -> set[str]:
     return {name if name.endswith(("Error", "Exception")) else "" for name in names}
 
 
-@pytest.mark.parametrize("name", FILES)
-def test_what_is_public_is_documented_with_what_it_raises(name):
-    """Modules, functions, classes and methods; a method may inherit its docstring."""
+def undocumented(name: str) -> Iterator[str]:
+    """Sentences on what is public in a module and has no docstring, or one that lacks an exception.
+
+    A method may inherit its docstring.
+    """
     tree, module = parse(FILES[name]), None
-    assert not tree.body or ast.get_docstring(tree), f"{name} has no docstring"
+    if tree.body and not ast.get_docstring(tree):
+        yield f"{name} has no docstring"
     for node in public(tree.body, ast.FunctionDef, ast.ClassDef):
         overloaded = any(ast.unparse(one) == "overload" for one in node.decorator_list)
-        assert overloaded or ast.get_docstring(node), f"{name}.{node.name} has no docstring"
+        if not overloaded and not ast.get_docstring(node):
+            yield f"{name}.{node.name} has no docstring"
     for node in public(tree.body, ast.ClassDef):
         for method in public(node.body, ast.FunctionDef):
             module = module or importlib.import_module(name.removesuffix(".__init__"))
-            attribute = getattr(getattr(module, node.name), method.name)
-            assert inspect.getdoc(attribute), f"{name}.{node.name}.{method.name}: no docstring"
+            if not inspect.getdoc(getattr(getattr(module, node.name), method.name)):
+                yield f"{name}.{node.name}.{method.name} has no docstring"
     for function in public(ast.walk(tree), ast.FunctionDef):
         text = ast.get_docstring(function) or ""
         for error in raised(function):
-            assert "aises" in text and error in text, (
-                f"the docstring of {name}.{function.name} should say: Raises {error or '...'}"
-            )
+            if "aises" not in text or error not in text:
+                yield f"the docstring of {name}.{function.name} should say: Raises {error or '...'}"
+
+
+def test_what_is_public_is_documented_with_what_it_raises():
+    assert [sentence for name in FILES for sentence in undocumented(name)] == []
 
 
 @pytest.mark.parametrize("name", sorted(EXAMPLES))
@@ -84,28 +92,24 @@ def words_of(docstring: str) -> set[str]:
     return words
 
 
-@pytest.mark.parametrize("name", PUBLIC_FUNCTIONS)
-def test_public_functions_document_every_argument(name):
+def test_public_functions_document_every_argument():
     """By its name, also in the plural, in the docstring or one that it refers to."""
-    function = PUBLIC_FUNCTIONS[name]
-    words = words_of(inspect.getdoc(function) or "")
-    arguments = set(inspect.signature(function).parameters) - COMMON_ARGUMENTS
-    missing = {a for a in arguments if not {a, f"{a}s", a.removesuffix("s")} & words}
-    assert missing == set()
+    missing = {}
+    for name, function in PUBLIC_FUNCTIONS.items():
+        words = words_of(inspect.getdoc(function) or "")
+        arguments = set(inspect.signature(function).parameters) - COMMON_ARGUMENTS
+        missing[name] = {a for a in arguments if not {a, f"{a}s", a.removesuffix("s")} & words}
+    assert {name: arguments for name, arguments in missing.items() if arguments} == {}
 
 
-@pytest.mark.parametrize("name", PUBLIC_FUNCTIONS)
-def test_public_functions_have_types_of_arguments_and_results(name):
-    signature = inspect.signature(PUBLIC_FUNCTIONS[name])
-    assert signature.return_annotation is not inspect.Signature.empty
+def test_public_functions_have_types_of_arguments_and_results():
+    signatures = {name: inspect.signature(one) for name, one in PUBLIC_FUNCTIONS.items()}
+    empty = inspect.Signature.empty
+    assert [name for name, one in signatures.items() if one.return_annotation is empty] == []
 
 
-@pytest.mark.parametrize("name", sorted(PUBLIC_FUNCTIONS))
-def test_public_functions_have_an_example(name):
+def test_what_is_public_has_an_example():
     """`test_examples_in_docstrings_print_what_they_show` runs it."""
-    assert ">>> " in (inspect.getdoc(PUBLIC_FUNCTIONS[name]) or "")
-
-
-@pytest.mark.parametrize("name", sorted(PUBLIC_CLASSES))
-def test_public_classes_have_an_example(name):
-    assert ">>> " in (PUBLIC_CLASSES[name].__doc__ or "")
+    docstrings = {name: inspect.getdoc(function) for name, function in PUBLIC_FUNCTIONS.items()}
+    docstrings |= {name: one.__doc__ for name, one in PUBLIC_CLASSES.items()}
+    assert [name for name, text in docstrings.items() if ">>> " not in (text or "")] == []
