@@ -1,4 +1,5 @@
 from . import api as api
+from .analysis.absorber_tuning import tuned_absorber as tuned_absorber
 from .analysis.assessment.assess import assess as assess
 from .analysis.assessment.assessment import Assessment as Assessment, CodeCheck as CodeCheck
 from .analysis.bound.bound import bound as bound
@@ -19,6 +20,7 @@ from .analysis.sections.amplification import (
     envelope as envelope,
 )
 from .analysis.sections.characteristic_points import characteristic_points as characteristic_points
+from .case.absorbers import Absorber as Absorber
 from .case.actuators.creep import Creep as Creep
 from .case.actuators.electrodynamic import Electrodynamic as Electrodynamic
 from .case.actuators.hysteresis import Hysteresis as Hysteresis

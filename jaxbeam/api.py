@@ -158,6 +158,13 @@ def _content_of_record(record: Record) -> dict[str, Any]:
         "error_estimate": record.error_estimate,
         "steps": record.steps,
     }
+    if record.case.absorbers:
+        found["absorbers"] = {
+            "position": [absorber.position for absorber in record.case.absorbers],
+            "largest_stroke": abs(record.stroke).max(axis=0),
+            "largest_force": abs(record.absorber_force).max(axis=0),
+            "energy": record.absorber_energy[-1],
+        }
     ride = ride_of(record)
     if ride is not None:
         found["ride"] = {
@@ -177,7 +184,8 @@ def _content_of_record(record: Record) -> dict[str, Any]:
 
 def ride_of(record: Record) -> "RideMeasures | None":
     """Ride measures of the bodies, None without any or with too few samples a second for them."""
-    if not record.bodies or float(record.case.run.sample_rate) < MIN_RIDE_RATE:
+    vehicles = len(record.bodies) > len(record.case.absorbers)
+    if not vehicles or float(record.case.run.sample_rate) < MIN_RIDE_RATE:
         return None
     from jaxbeam.analysis.ride import ride_measures
 

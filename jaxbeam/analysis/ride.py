@@ -233,7 +233,8 @@ def ride_measures(record: Record) -> RideMeasures:
     loads.0 body 0.07 m/s^2
     """
     names, times = record.bodies, record.times
-    heights = np.flatnonzero([not name.endswith(" pitch") for name in names])
+    of_loads = [name for name in names if not name.startswith("absorbers.")]
+    heights = np.flatnonzero([not name.endswith(" pitch") for name in of_loads])
     acceleration = record.body_acceleration[:, heights]
     return RideMeasures(
         [names[i] for i in heights],

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.controller import AbstractController
@@ -59,7 +60,7 @@ class Run(ReprWithUnits):
 
 
 class Case(Module):
-    """Beam, supports, actuators, sensors, loads, profile, controller and run settings.
+    """Beam, supports, absorbers, actuators, sensors, loads, profile, controller, run settings.
 
     Sensors are on the beam; `vehicle_sensors` are on bodies and axles of the loads.
 
@@ -74,6 +75,7 @@ class Case(Module):
 
     beam: Beam
     supports: tuple[Support, ...] = ()
+    absorbers: tuple[Absorber, ...] = ()
     actuators: tuple[AbstractActuator, ...] = ()
     sensors: tuple[Sensor, ...] = ()
     loads: tuple[AbstractLoad, ...] = ()
@@ -95,9 +97,11 @@ class Case(Module):
         title: str = "",
         profile=None,
         vehicle_sensors=(),
+        absorbers=(),
     ):
         self.beam = beam
         self.supports = tuple(supports)
+        self.absorbers = tuple(absorbers)
         self.actuators = tuple(actuators)
         self.sensors = tuple(sensors)
         self.loads = tuple(loads)
@@ -122,6 +126,11 @@ class Case(Module):
     def driven(self) -> tuple[AbstractActuator, ...]:
         """Actuators that take commands: all but springs and dampers."""
         return tuple(actuator for actuator in self.actuators if actuator.command_unit != "1")
+
+    @property
+    def carried(self) -> tuple[AbstractLoad | Absorber, ...]:
+        """What presses on the beam, in the order of its wheels: loads, then absorbers."""
+        return (*self.loads, *self.absorbers)
 
     @property
     def all_sensors(self) -> tuple[Sensor | VehicleSensor, ...]:
@@ -367,8 +376,8 @@ def concrete_case(case: Case) -> Case:
 
 
 def structure_of(case: Case) -> Case:
-    """Beam, supports, actuators and sensors of a case, as a case without loads."""
-    return Case(case.beam, case.supports, case.actuators, case.sensors)
+    """Beam, supports, absorbers, actuators and sensors of a case, as a case without loads."""
+    return Case(case.beam, case.supports, case.actuators, case.sensors, absorbers=case.absorbers)
 
 
 def stack_cases(cases: Sequence[Case]) -> Case:

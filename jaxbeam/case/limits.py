@@ -9,6 +9,7 @@ from typing import Any
 # By the key of a list of parts, or of a whole number, wherever it stands in a case.
 MAX_COUNTS = {
     "supports": 1000,
+    "absorbers": 200,
     "actuators": 200,
     "sensors": 10_000,
     "vehicle_sensors": 10_000,

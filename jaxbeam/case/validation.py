@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.beam_parts.properties import has
@@ -35,7 +36,7 @@ from jaxbeam.case.sensors import Sensor, sensor_labels
 from jaxbeam.runtime.arrays import Array
 
 # Parts with a method `validate(address)`.
-SELF_VALIDATING = Beam | AbstractActuator | Sensor | AbstractLoad | AbstractProfile
+SELF_VALIDATING = Beam | Absorber | AbstractActuator | Sensor | AbstractLoad | AbstractProfile
 
 
 def check_case(case: Case) -> None:

@@ -1,10 +1,11 @@
-"""Frequency responses of beam, supports and actuators, with stationary masses on the beam.
+"""Frequency responses of beam, absorbers and actuators, with stationary masses on the beam.
 
 With the states z of the modal model and s = 2 pi i f,
 
     (s E - A) z = B u + shapes(y) . force,    y = (C + s C') z + D u.
 
 E is the identity plus the stationary masses, eq. (2.30) of the thesis; C' acts on the rates z'.
+Heights and rates of the absorbers' bodies follow the states of the model.
 """
 
 import os
@@ -167,7 +168,7 @@ def _responses(case: Case, layout: Layout, frequencies, stationary, pairs: tuple
     model = modal_model(case, layout)
     inputs = [input_column(case, model, pair.excitation) for pair in pairs]
     input_matrix = xp.stack([input_vector for input_vector, _ in inputs], axis=-1)
-    states = _state_responses(model, stationary, frequencies, input_matrix)
+    states = _state_responses(case, model, stationary, frequencies, input_matrix)
     s = 2j * xp.pi * frequencies
     responses = []
     for i, (pair, (_, command)) in enumerate(zip(pairs, inputs, strict=True)):
@@ -188,21 +189,46 @@ def _evaluate_output(row, states, s, command):
 
 
 def _state_responses(
-    model: ModalModel, stationary, frequencies, input_matrix
+    case: Case, model: ModalModel, stationary, frequencies, input_matrix
 ) -> Complex[Array, "frequency state input"]:
     """States per unit of each input (column of the input matrix), at every frequency (Hz)."""
-    A, E = descriptor_matrices(model, stationary)
+    A, E = descriptor_matrices(case, model, stationary)
     s = 2j * xp.pi * frequencies[:, None, None]
-    return solve(s * E - A, input_matrix + 0j)
+    added = A.shape[0] - model.state_count
+    states = solve(s * E - A, xp.pad(input_matrix, ((0, added), (0, 0))) + 0j)
+    return states[:, : model.state_count]
 
 
-def descriptor_matrices(model: ModalModel, stationary):
-    """A and E of the model with stationary masses: (positions in m, masses in kg)."""
+def descriptor_matrices(case: Case, model: ModalModel, stationary):
+    """A and E of the model with absorbers and stationary masses: (positions in m, masses in kg).
+
+    Heights and rates of the absorbers' bodies follow the states of the model, as oscillators
+    equivalent to them (see `jaxbeam.case.absorbers`).
+    """
     positions, kilograms = stationary
     shapes = model.shapes(positions, (0,))[0]
     added_mass = (shapes.T * kilograms) @ shapes
-    rates = model.rate_index
-    return model.A, add_at(xp.eye(model.state_count), (rates, rates), added_mass)
+    rates, coordinates = model.rate_index, model.coordinate_index
+    A, E = model.A, add_at(xp.eye(model.state_count), (rates, rates), added_mass)
+    for absorber in case.absorbers:
+        oscillator, body = absorber.vehicle(case.run.gravity), A.shape[0]
+        shape = model.shapes(xp.reshape(absorber.position, 1), (0,))[0]
+        A, E = (xp.pad(matrix, (0, 2)) for matrix in (A, E))
+        A = set_at(A, (body, body + 1), 1.0)
+        identity = np.eye(2)
+        E = set_at(E, np.s_[body:, body:], identity)
+        # The pull of spring and damper over the mass of the body, and on the modes.
+        for columns, own, factor in (
+            (coordinates, body, oscillator.contact_stiffness),
+            (rates, body + 1, oscillator.contact_damping),
+        ):
+            on_body = factor / oscillator.mass[0, 0]
+            A = add_at(A, (rates, columns), -factor * shape.T @ shape)
+            A = add_at(A, (rates, own), factor * shape[0])
+            A = add_at(A, (body + 1, columns), on_body * shape[0])
+            A = add_at(A, (body + 1, own), -on_body[0])
+        E = add_at(E, (rates, rates), oscillator.wheel_masses * shape.T @ shape)
+    return A, E
 
 
 def receptance(
@@ -239,7 +265,7 @@ def _receptance(case: Case, layout: Layout, frequencies, stationary, x, y):
     model = modal_model(case, layout)
     input_matrix = xp.zeros((model.state_count, y.size))
     input_matrix = set_at(input_matrix, model.rate_index, model.shapes(y.reshape(-1), (0,))[0].T)
-    states = _state_responses(model, stationary, frequencies, input_matrix)
+    states = _state_responses(case, model, stationary, frequencies, input_matrix)
     amplitudes = states[:, model.coordinate_index]
     response = model.shapes(x.reshape(-1), (0,))[0] @ amplitudes
     return response.reshape(frequencies.size, *x.shape, *y.shape)

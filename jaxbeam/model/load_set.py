@@ -8,9 +8,10 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
+from jaxbeam.case.loads.base import AbstractLoad, wheel_distances
 from jaxbeam.case.loads.force_history import ForceHistory
 from jaxbeam.case.loads.vehicle_model import VehicleModel
 from jaxbeam.case.trajectory import AbstractTrajectory
@@ -121,13 +122,15 @@ class LoadSet(Module):
     """All loads of a run: trajectories, distances of wheels behind the first (m), wheels.
 
     The runs of a batch share everything but the numbers of the wheels. Loads have one wheel each
-    unless `behind` lists the wheels of each. `profile` is that of the surface, if it has one.
+    unless `behind` lists the wheels of each. `profile` is that of the surface, if it has one. The
+    last wheels are those of `absorbers`, which are fixed to the beam.
     """
 
     trajectories: tuple[AbstractTrajectory, ...]
     wheels: WheelSet
     behind: tuple[Float[Array, " _"], ...] | None = None
     profile: Module | None = None
+    absorbers: int = eqx.field(static=True, default=0)
 
     @property
     def inertia(self) -> Float[Array, "wheel batch"]:
@@ -151,6 +154,11 @@ class LoadSet(Module):
         for group in self.wheels.vehicles:
             on_ground[group.wheels] = True
         return on_ground
+
+    @property
+    def fixed(self) -> Bool[np.ndarray, " wheel"]:
+        """Whether each wheel is an absorber's, which is fixed to the beam and may pull."""
+        return np.arange(self.wheel_count) >= self.wheel_count - self.absorbers
 
     @property
     def prescribed(self) -> Bool[np.ndarray, " wheel"]:
@@ -280,26 +288,27 @@ class LoadSet(Module):
 
 
 def load_set(case: Case, layout: Layout | None = None) -> LoadSet:
-    """Loads of a case, as a batch of one run, on the surface that settled supports give the beam.
+    """Loads and absorbers of a case, as a batch of one run, on the surface of settled supports.
 
     This needs a `layout` (from `mesh_layout`) where the numbers of the case are traced.
     """
-    trajectories = tuple(trajectory(load, case.beam.length) for load in case.loads)
-    vehicles = [load.vehicle(case.run.gravity) for load in case.loads]
+    trajectories = tuple(one.trajectory(case.beam.length) for one in case.carried)
+    vehicles = [load.vehicle(case.run.gravity) for load in case.carried]
     return LoadSet(
         trajectories,
-        _wheels(case.loads, vehicles),
-        tuple(map(wheel_distances, case.loads, vehicles)),
+        _wheels(case.carried, vehicles),
+        tuple(map(wheel_distances, case.carried, vehicles)),
         surface(case, layout),
+        len(case.absorbers),
     )
 
 
 def wheel_set(case: Case) -> WheelSet:
-    """Wheels of the loads of a case, as a batch of one run."""
-    return _wheels(case.loads, [load.vehicle(case.run.gravity) for load in case.loads])
+    """Wheels of the loads and absorbers of a case, as a batch of one run."""
+    return _wheels(case.carried, [load.vehicle(case.run.gravity) for load in case.carried])
 
 
-def _wheels(loads: Sequence[AbstractLoad], vehicles: Sequence[VehicleModel]) -> WheelSet:
+def _wheels(loads: Sequence[AbstractLoad | Absorber], vehicles: Sequence[VehicleModel]) -> WheelSet:
     """The same of loads whose vehicles are known."""
     counts = [load.spacings().shape[0] for load in loads]
 

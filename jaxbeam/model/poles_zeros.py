@@ -1,4 +1,4 @@
-"""Poles and transmission zeros of beam, supports and actuators, with stationary masses."""
+"""Poles and transmission zeros of beam, absorbers and actuators, with stationary masses."""
 
 import numpy as np
 import scipy
@@ -17,12 +17,13 @@ from jaxbeam.runtime.arrays import xp
 
 
 def poles(case: Case, stationary_masses: StationaryMasses = ()) -> Complex[np.ndarray, " state"]:
-    """Poles of beam, supports and actuators in rad/s, in order of magnitude.
+    """Poles of beam, supports, absorbers and actuators in rad/s, in order of magnitude.
 
     Not differentiable. Raises ValueError as `frequency_response` does.
     """
     check_case(case)
-    A, E = descriptor_matrices(compiled_modal_model(case), checked_masses(case, stationary_masses))
+    masses = checked_masses(case, stationary_masses)
+    A, E = descriptor_matrices(case, compiled_modal_model(case), masses)
     return _sort_by_magnitude(scipy.linalg.eigvals(np.asarray(A), np.asarray(E)))
 
 
@@ -37,10 +38,14 @@ def zeros(
     check_case(case)
     (checked_pair,) = check_pairs(case, [pair])
     model = compiled_modal_model(case)
-    A, E = descriptor_matrices(model, checked_masses(case, stationary_masses))
+    A, E = descriptor_matrices(case, model, checked_masses(case, stationary_masses))
     input_vector, command = input_column(case, model, checked_pair.excitation)
     state_row, rate_row, feedthrough_row = output_row(case, model, checked_pair.output)
     feedthrough = xp.atleast_1d(feedthrough_row @ command)
+    added = ((0, A.shape[0] - model.state_count),)  # of absorbers
+    input_vector, state_row, rate_row = (
+        xp.pad(part, added) for part in (input_vector, state_row, rate_row)
+    )
     pencil_A = xp.block([[A, input_vector[:, None]], [state_row, feedthrough]])
     pencil_E = xp.block([[E, xp.zeros_like(input_vector)[:, None]], [-rate_row, xp.zeros(1)]])
     eigenvalues = scipy.linalg.eigvals(np.asarray(pencil_A), np.asarray(pencil_E))

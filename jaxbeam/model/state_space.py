@@ -128,7 +128,10 @@ class Plant(Module):
 
     @property
     def unloaded(self) -> StateSpace:
-        """Time-invariant system without loads; its inputs are the commands."""
+        """Time-invariant system without loads and absorbers; its inputs are the commands.
+
+        Of a beam with absorbers, which are among the wheels of `at`, `jaxbeam.poles` has the poles.
+        """
         return _unloaded_plant(self)
 
     def augmented(self, t: Float[Array, "*time"] | float) -> StateSpace:
@@ -257,7 +260,7 @@ def _command_signals(plant: Plant) -> tuple[Signal, ...]:
 
 
 def state_space(case: Case, coordinates: str = "modal", layout: Layout | None = None) -> Plant:
-    """State space of a case: beam, supports, actuators and loads, without its controller.
+    """State space of a case: beam, supports, absorbers, actuators, loads; not its controller.
 
     The coordinates q are mass-normalised ("modal"), in m kg^0.5, or ("sine") the amplitudes in m
     of sin(n pi x / L) as in the thesis, for a uniform pinned-pinned beam without supports in

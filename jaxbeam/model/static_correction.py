@@ -117,7 +117,7 @@ def corrected_history(
     history = xp.tensordot(motion.coordinates, modes.fields(x, (derivative,))[0], axes=[1, -1])
     if not is_supported(case, layout):
         return history
-    if case.loads:
+    if case.carried:
         history = history + _loads_history(case, motion, x, derivative, layout)
     for support in case.supports:
         if support.damping is not None:

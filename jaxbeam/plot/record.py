@@ -28,7 +28,13 @@ from jaxbeam.plot.style import (
     use_style,
 )
 from jaxbeam.plot.traffic.crossings import label_loads, shade_crossings
-from jaxbeam.plot.traffic.rows import draw_accelerations, draw_forces, forces_vary, has_bodies
+from jaxbeam.plot.traffic.rows import (
+    draw_accelerations,
+    draw_forces,
+    draw_strokes,
+    forces_vary,
+    has_bodies,
+)
 from jaxbeam.simulation.record import Record
 
 
@@ -45,8 +51,8 @@ def plot_record(
 
     Each quantity has axes of its own. Dots mark peaks, shading the times with loads on the beam;
     vehicles have a row for the accelerations of their bodies (see `jaxbeam.plot.traffic.rows`),
-    controllers one for the commands. There is no row for contact forces where all are constant.
-    With a `quantity` of the sensors only its histories are drawn.
+    absorbers one for their strokes, controllers one for the commands. There is no row for contact
+    forces where all are constant. With a `quantity` of the sensors only its histories are drawn.
 
     The whole takes the place of `ax`, histories are drawn on it. The title is that of the case if
     left out; `labels` name the sensors, in their order, in place of their names. Returns the
@@ -71,6 +77,7 @@ def plot_record(
             ),
             (1.7, _with_crossings(draw_forces), case.loads and shows_forces),
             (1.5, _with_crossings(draw_accelerations), has_bodies(record)),
+            (1.5, _with_crossings(draw_strokes), case.absorbers),
             (1.7, _draw_commands, case.controller is not None),
         )
         if shown

@@ -72,7 +72,7 @@ def actuator_positions(actuator: AbstractActuator) -> list[float]:
 def shows_traffic(case: Case) -> bool:
     """Whether the schematic shows loads or a profile: vehicles, and several wheels in a row."""
     loads = load_set(case)
-    return case.profile is not None or loads.wheel_count > len(case.loads) or any(loads.on_ground)
+    return case.profile is not None or loads.wheel_count > len(case.carried) or any(loads.on_ground)
 
 
 def draw_schematic(axes, case: Case) -> None:

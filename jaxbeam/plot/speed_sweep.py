@@ -54,7 +54,7 @@ def is_speed_sweep(peaks: xarray.DataArray, case: Case) -> bool:
     others = [dim for dim in swept if dim not in speeds]
     if len(speeds) != 1 or len(others) > 1 or not all(is_word_axis(peaks, dim) for dim in others):
         return False
-    return bool(others) or load_set(case).wheel_count > len(case.loads)
+    return bool(others) or load_set(case).wheel_count > len(case.carried)
 
 
 def is_speed(address: str) -> bool:

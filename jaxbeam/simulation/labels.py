@@ -14,12 +14,15 @@ ROUNDING = 1e-12  # of a given force
 def wheel_labels(case: Case) -> np.ndarray:
     """Labels of all wheels: the number of the load, "0", or of one of its wheels, "0 wheel 2".
 
-    Wheels of a load of several are counted from 1, front first, through all its vehicles.
+    Wheels of a load of several are counted from 1, front first, through all its vehicles. Absorbers
+    come last, "absorber 0".
     """
     loads, labels = load_set(case).load_of_wheel, []
     for wheel, load in enumerate(loads):
         is_only = loads.count(load) == 1
-        labels.append(f"{load}" if is_only else f"{load} wheel {wheel - loads.index(load) + 1}")
+        label = f"{load}" if is_only else f"{load} wheel {wheel - loads.index(load) + 1}"
+        absorber = load - len(case.loads)
+        labels.append(label if absorber < 0 else f"absorber {absorber}")
     return np.array(labels, dtype=str)
 
 
@@ -71,7 +74,7 @@ def _pressing_sentence(case: Case, loads: LoadSet, lowest_forces) -> str:
         return "the case has no loads"
     labels = wheel_labels(case)
     enter, leave = concrete(loads.entry_exit_times()).T
-    crosses = (enter < concrete(case.run.duration)) & (leave > 0)
+    crosses = (enter < concrete(case.run.duration)) & (leave > 0) & ~loads.fixed
     if not np.any(crosses):
         return "no load is on the beam during the run"
     weightless = crosses & (concrete(loads.weight)[:, 0] == 0) & (lowest_forces == 0)
@@ -80,7 +83,7 @@ def _pressing_sentence(case: Case, loads: LoadSet, lowest_forces) -> str:
     exceptions = [
         (weightless, "{} has no weight", "{} have no weight"),
         (released, "the force of {} falls to 0 N", "the forces of {} fall to 0 N"),
-        (~crosses, "{} is not on the beam", "{} are not on the beam"),
+        (~crosses & ~loads.fixed, "{} is not on the beam", "{} are not on the beam"),
     ]
     parts = []
     for wheels, one, several in exceptions:

@@ -110,10 +110,12 @@ class Record(RecordViews):
 
     @property
     def bodies(self) -> list[str]:
-        """Names of the degrees of freedom of all vehicles, as in "loads.0 vehicle 2 body"."""
+        """Names of the degrees of freedom of vehicles and absorbers: "loads.0 vehicle 2 body"."""
         loads, names = load_set(self.case), []
         for group in loads.wheels.vehicles:
-            load = f"loads.{loads.load_of_wheel[group.first_wheel]}"
+            number = loads.load_of_wheel[group.first_wheel]
+            absorber = number - len(self.case.loads)
+            load = f"loads.{number}" if absorber < 0 else f"absorbers.{absorber}"
             for i in range(group.count):
                 vehicle = load if group.count == 1 else f"{load} vehicle {i}"
                 names += [f"{vehicle} {name}" for name in group.names]
@@ -273,6 +275,37 @@ class Record(RecordViews):
         return vehicle_readings(self.case, VehicleMotion(*motion), self.times, noisy=True)
 
     @property
+    def stroke(self) -> Float[Array, "time absorber"]:
+        """Motion (m) of the bodies of absorbers relative to the beam, positive upwards."""
+        return self._relative_to_beam(self.body_displacement, self.coordinates)
+
+    @property
+    def stroke_rate(self) -> Float[Array, "time absorber"]:
+        """Rate (m/s) of the stroke."""
+        return self._relative_to_beam(self.body_velocity, self.rates)
+
+    def _relative_to_beam(self, of_bodies, of_modes) -> Float[Array, "time absorber"]:
+        absorbers = self.case.absorbers
+        if not absorbers:
+            return xp.zeros((self.times.shape[0], 0))
+        places = xp.stack([one.position for one in absorbers])
+        return of_bodies[:, -len(absorbers) :] - of_modes @ self.modes.shapes(places).T
+
+    @property
+    def absorber_force(self) -> Float[Array, "time absorber"]:
+        """Forces (N) of absorbers on the beam, positive downwards, their weight left out."""
+        return self.contact_force[:, self.contact_force.shape[1] - len(self.case.absorbers) :]
+
+    @property
+    def absorber_energy(self) -> Float[Array, "time absorber"]:
+        """Energy (J) that the damper of each absorber has dissipated, by the trapezoidal rule."""
+        if not self.case.absorbers:
+            return self.stroke
+        power = xp.stack([one.damper for one in self.case.absorbers]) * self.stroke_rate**2
+        steps = xp.diff(self.times)[:, None] * (power[1:] + power[:-1]) / 2
+        return xp.concatenate([xp.zeros((1, power.shape[1])), xp.cumsum(steps, axis=0)])
+
+    @property
     def saturated(self) -> Bool[Array, "time actuator"]:
         """Whether each command is at a limit of its actuator, to 1e-9 of its range."""
         columns = [xp.zeros(self.times.shape, bool) for _ in self.case.actuators]
@@ -299,6 +332,15 @@ class Record(RecordViews):
         diverged = xp.any(xp.isnan(self.coordinates), axis=1)
         return xp.where(xp.any(diverged), self.times[xp.argmax(diverged)], xp.nan)
 
+    def _stroke_sentences(self) -> list[str]:
+        """Which absorbers move further than they may."""
+        strokes, found = np.abs(np.asarray(concrete(self.stroke))).max(axis=0, initial=0.0), []
+        for i, (absorber, stroke) in enumerate(zip(self.case.absorbers, strokes, strict=True)):
+            largest = absorber.max_stroke
+            if largest is not None and stroke > (limit := float(concrete(largest))):
+                found.append(f"the stroke of absorber {i} is {stroke:.4g} m, above {limit:.4g} m")
+        return found
+
     @property
     def verdict(self) -> str:
         """Sentence on divergence, contact, controller steps without a solution, and the error."""
@@ -310,6 +352,7 @@ class Record(RecordViews):
             )
         contact = self.contact_lost_time, self.contact_lost_position, self.lowest_contact_force
         parts = [contact_sentence(self.case, *(np.asarray(concrete(part)) for part in contact))]
+        parts += self._stroke_sentences()
         failures = int(concrete(self.failures)[-1])
         if failures:
             parts.append(f"the controller found no solution in {failures} of its steps")

@@ -31,6 +31,11 @@ VARIABLES = {
     "body_velocity": (("time", "body"), "m/s or rad/s", "velocity of the body"),
     "body_acceleration": (("time", "body"), "m/s^2 or rad/s^2", "acceleration of the body"),
 }
+OF_ABSORBERS = {
+    "stroke": (("time", "absorber"), "m", "motion of the absorber's body relative to the beam"),
+    "absorber_force": (("time", "absorber"), "N", "force on the beam, positive downwards"),
+    "absorber_energy": (("time", "absorber"), "J", "energy dissipated so far"),
+}
 # Where an actuator has a hysteresis or creep.
 ACTING_COMMAND = (("time", "actuator"), "unit of a command", "command that acts on the beam")
 # Variables of a run in a sweep; the dimensions of the sweep come first.

@@ -270,6 +270,10 @@ def _record(case: Case, integration: "Integration", times) -> Record:
     heights = peaks.peak_deflection
     extremes, peaks = sensor_extremes(case.sensors, peaks)
     loads, lost_times = load_set(case), peaks.contact_lost_time
+    if loads.absorbers:  # which hold on to the beam
+        lost_times = xp.where(loads.fixed, xp.nan, lost_times)
+        lowest = xp.where(loads.fixed, xp.nan, peaks.lowest_contact_force)
+        peaks = peaks._replace(lowest_contact_force=lowest, contact_lost_time=lost_times)
     # Each wheel at its own time.
     lost_positions = xp.diagonal(loads.kinematics(lost_times)[0])
     diverged = xp.any(xp.isnan(outputs.motion.coordinates))  # errors are not defined

@@ -152,6 +152,9 @@ def _to_dataset(
         name: collapse(values, 0, 2)[rows]  # padding is at the end, or left out
         for name, values in results.items()
     }
+    if case.absorbers:  # which hold on to the beam
+        of_wheels = [name for name in flat if SWEEP_VARIABLES[name][0] == ("load",)]
+        flat |= {name: flat[name][:, : -len(case.absorbers)] for name in of_wheels}
     failed = ~np.all(np.isfinite(flat["peak_deflection"]), axis=1)
     variables: dict[str, Any] = {
         "failed": (dims, failed.reshape(shape), {"long_name": "whether the run failed"})

@@ -63,7 +63,9 @@ def standing_mass(case: Case, position: float, mass: float) -> LoadSet:
     path = FrozenTrajectory(
         xp.asarray(position), zero, zero, one, xp.ones(1, bool), case.beam.length
     )
-    return dataclasses.replace(load_set(alone), trajectories=(path,), profile=None)
+    loads = load_set(alone)
+    paths = path, *loads.trajectories[1:]  # of absorbers
+    return dataclasses.replace(loads, trajectories=paths, profile=None)
 
 
 def without_constant_states(loop: LinearisedLoop) -> LinearisedLoop:

@@ -10,6 +10,7 @@ from typing import ClassVar
 import equinox as eqx
 from jaxtyping import Float
 
+from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.declared_checks import validate_exactly_one
 from jaxbeam.case.display.parts import ReprWithUnits
 from jaxbeam.case.fields import INCREASING, concrete, is_concrete, number
@@ -147,6 +148,6 @@ def trajectory(load: AbstractLoad, length: Float[Array, ""]) -> AbstractPiecewis
     return load.trajectory(length)
 
 
-def wheel_distances(load: AbstractLoad, vehicle: VehicleModel) -> Float[Array, " wheel"]:
+def wheel_distances(load: AbstractLoad | Absorber, vehicle: VehicleModel) -> Float[Array, " wheel"]:
     """Distances (m) of all wheels of a load, whose vehicles are given, behind its first one."""
     return (load.spacings()[:, None] + vehicle.offsets).reshape(-1)

@@ -98,7 +98,7 @@ def _wheel_lines(record: "jb.Record") -> list[str]:
     largest = np.max(record.contact_force, axis=0, initial=0.0)
     unloading = np.asarray(wheel_unloading(record))
     load_of_wheel, rows = np.array(loads.load_of_wheel), []
-    for load in np.unique(load_of_wheel):
+    for load in range(len(record.case.loads)):
         wheels = np.flatnonzero(load_of_wheel == load)
         names = {int(i): str(labels[i]) for i in wheels}
         if wheels.size > MAX_WHEELS:
@@ -110,6 +110,21 @@ def _wheel_lines(record: "jb.Record") -> list[str]:
     forces = ("static load (N)", "lowest contact force (N)", "largest (N)")
     header = ("load", *forces, "unloading")
     return table(header, rows)
+
+
+def _absorber_lines(record: "jb.Record") -> list[str]:
+    """Table of the absorbers: largest stroke and force, and energy dissipated."""
+    absorbers = record.case.absorbers
+    if not absorbers:
+        return []
+    largest = [abs(part).max(axis=0) for part in (record.stroke, record.absorber_force)]
+    columns = (*largest, record.absorber_energy[-1])
+    rows = [
+        (str(i), f"{absorber.position:.4g}", *(f"{column[i]:.6g}" for column in columns))
+        for i, absorber in enumerate(absorbers)
+    ]
+    names = ("position (m)", "largest stroke (m)", "largest force (N)", "dissipated (J)")
+    return table(("absorber", *names), rows)
 
 
 def _extreme_wheels(labels: dict[int, str], **values) -> dict[int, str]:
@@ -191,6 +206,7 @@ def _lines(record: "jb.Record", sensors: Sequence[dict]) -> list[str]:
         record.verdict,
         *table(header, rows),
         *_wheel_lines(record),
+        *_absorber_lines(record),
         *_body_lines(record),
     ]
     if record.case.controller is not None:

@@ -78,7 +78,8 @@ def plausible_numbers(case: Case, found: Modes) -> Plausibility:
     frequencies = found.frequencies[found.stiffness > 1e-9 * found.stiffness_unit]
     first = float(frequencies[0]) if frequencies.size else None
     span = _longest_span(case)
-    deflection, on_beam, fastest = _under_loads(case, found, load_set(case))
+    loads = load_set(dataclasses.replace(case, absorbers=()))
+    deflection, on_beam, fastest = _under_loads(case, found, loads)
     return Plausibility(
         first_frequency=first,
         span=span,

@@ -23,13 +23,16 @@ def initial_vehicle_states(loads: LoadSet) -> Float[Array, "state batch"] | None
 def vehicle_signals(loads: LoadSet) -> tuple[Signal, ...]:
     """Names and units of the states of all vehicles: heights and pitch angles, then their rates.
 
-    That of a body of the first load is "load_0_body", in a row "load_0_vehicle_1_body".
+    That of a body of the first load is "load_0_body", in a row "load_0_vehicle_1_body", that of
+    the first absorber "absorber_0_body".
     """
-    of_wheel, signals = loads.load_of_wheel, []
+    of_wheel, signals, count = loads.load_of_wheel, [], len(loads.trajectories) - loads.absorbers
     for group in loads.wheels.vehicles:
         for i in range(group.count):
             vehicle = f"_vehicle_{i + 1}" if group.count > 1 else ""
-            prefix = f"load_{of_wheel[group.first_wheel]}{vehicle}"
+            number = of_wheel[group.first_wheel]
+            carried = f"load_{number}" if number < count else f"absorber_{number - count}"
+            prefix = f"{carried}{vehicle}"
             names = [f"{prefix}_{name.replace(' ', '_')}" for name in group.names]
             units = ["rad" if name.endswith("pitch") else "m" for name in group.names]
             signals += [Signal(*pair) for pair in zip(names, units, strict=True)]

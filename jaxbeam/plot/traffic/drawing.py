@@ -6,7 +6,6 @@ from matplotlib.path import Path
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads.base import trajectory
 from jaxbeam.model.load_set import VehicleGroup, load_set
 from jaxbeam.plot.style import GREY, INK, load_colour, tinted
 from jaxbeam.plot.traffic.parts import drawn_vehicle
@@ -29,8 +28,8 @@ class VehicleArt:
     def __init__(
         self, axes, case: Case, group: VehicleGroup, number, wheel_size, wheel_height, least_length
     ):
-        load = case.loads[number]
-        direction = float(concrete(trajectory(load, case.beam.length).direction()))
+        load = case.carried[number]
+        direction = float(concrete(load.trajectory(case.beam.length).direction()))
         self._vehicle = drawn_vehicle(load)
         self.wheels, self.wheels_per_vehicle = group.wheels, group.wheels_per_vehicle
         self.dofs = group.count * len(group.names)

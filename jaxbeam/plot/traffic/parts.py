@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.loads.vehicle import VehicleLoad
@@ -44,7 +45,7 @@ class DrawnVehicle(NamedTuple):
     springs: list[tuple[float, int, int]]
 
 
-def drawn_vehicle(load: AbstractLoad, gravity=9.81) -> DrawnVehicle:
+def drawn_vehicle(load: AbstractLoad | Absorber, gravity=9.81) -> DrawnVehicle:
     """What to draw of one vehicle of a load; parts that carry nothing else are found by springs."""
     model = load.vehicle(np.float64(gravity))
     if isinstance(load, VehicleLoad):

@@ -31,6 +31,7 @@ def forces_vary(record: Record) -> bool:
     """
     on = np.isfinite(np.asarray(record.load_position))
     static = np.asarray(concrete(load_set(record.case).weight))[:, 0]
+    on = on & ~load_set(record.case).fixed
     deviation = np.where(on, np.abs(np.asarray(record.contact_force) - static), 0.0)
     return bool(np.any(deviation > SAME_FORCE * np.abs(static)))
 
@@ -48,7 +49,7 @@ def draw_forces(axes, record: Record) -> None:
     loads, labels = load_set(record.case), wheel_labels(record.case)
     static = np.asarray(concrete(loads.weight))[:, 0] / factor
     load_of_wheel, heights, names, tints = np.array(loads.load_of_wheel), [], [], []
-    for load in np.unique(load_of_wheel):
+    for load in range(len(record.case.loads)):
         wheels, tint = np.flatnonzero(load_of_wheel == load), load_colour(int(load))
         if wheels.size > MAX_CURVES and np.any(on[:, wheels]):
             worst = _draw_envelope(axes, times, force, static, wheels, tint)
@@ -110,7 +111,7 @@ def _mark_losses(axes, record) -> None:
 
 def has_bodies(record: Record) -> bool:
     """Whether a load of the record is a vehicle with bodies."""
-    return record.body_acceleration.shape[1] > 0
+    return record.body_acceleration.shape[1] > len(record.case.absorbers)
 
 
 def draw_accelerations(axes, record: Record) -> None:
@@ -122,6 +123,8 @@ def draw_accelerations(axes, record: Record) -> None:
     loads, first, curves = load_set(record.case), 0, []
     for group in loads.wheels.vehicles:
         load = loads.load_of_wheel[group.first_wheel]
+        if load == len(record.case.loads):
+            break  # absorbers, which have a row of their own
         parts = drawn_vehicle(record.case.loads[load]).parts
         top = max(part.level for part in parts)
         for part in (part for part in parts if part.level == top):
@@ -150,4 +153,26 @@ def draw_accelerations(axes, record: Record) -> None:
         names.append(f"{who} {format_number(peak)} {unit}")
         tints.append(shade)
     label_height(axes, "body", unit)
+    margin_labels(axes, heights, names, tints)
+
+
+def draw_strokes(axes, record: Record) -> None:
+    """Strokes of the absorbers, the largest of each beside it, dashed lines at what they may."""
+    times, strokes, absorbers = record.times, np.asarray(record.stroke), record.case.absorbers
+    factor, unit = unit_scale(strokes, "m")
+    axes.axhline(0, color=GREY, linewidth=0.8)
+    heights, names, tints = [], [], []
+    for i, absorber in enumerate(absorbers):
+        values, tint = strokes[:, i] / factor, load_colour(len(record.case.loads) + i)
+        axes.plot(times, values, color=tint, linewidth=1.1)
+        peak = values[np.argmax(np.abs(values))]
+        who = f"absorber {i} " if len(absorbers) > 1 else ""
+        heights.append(peak)
+        names.append(f"{who}{format_number(peak)} {unit}")
+        tints.append(tint)
+        if absorber.max_stroke is not None:
+            largest = float(concrete(absorber.max_stroke)) / factor
+            for limit in (-largest, largest):
+                axes.axhline(limit, color=tint, linewidth=0.9, linestyle="--")
+    label_height(axes, "stroke", unit)
     margin_labels(axes, heights, names, tints)

@@ -36,7 +36,27 @@ def motion_at(
     position = xp.where(loads.on_beam(times).T, loads.kinematics(times)[0].T, xp.nan)
     actuators = len(case.actuators)
     command = xp.zeros((times.shape[0], actuators)) if commands is None else commands[:, :actuators]
-    return Motion(coordinates, rates, accelerations, position, -force, command), vehicles
+    motion = Motion(coordinates, rates, accelerations, position, -force, command)
+    return motion, _with_absorbers(case, model, motion, vehicles)
+
+
+def _with_absorbers(
+    case: Case, model: ModalModel, motion: Motion, vehicles: VehicleMotion
+) -> VehicleMotion:
+    """The motion of the bodies, those of absorbers in place of their equivalent oscillators.
+
+    u = r z + (1 - r) y; see `jaxbeam.case.absorbers`.
+    """
+    if not case.absorbers:
+        return vehicles
+    shapes = model.modes.shapes(xp.stack([one.position for one in case.absorbers]))
+    fraction = xp.stack([one.body_fraction for one in case.absorbers])
+    count, moved = len(case.absorbers), []
+    of_modes = motion.coordinates, motion.rates, motion.accelerations
+    for equivalent, modal in zip(vehicles, of_modes, strict=True):
+        own = fraction * equivalent[:, -count:] + (1 - fraction) * (modal @ shapes.T)
+        moved.append(xp.concatenate([equivalent[:, :-count], own], axis=1))
+    return VehicleMotion(*moved)
 
 
 def _vehicle_motion(model: ModalModel, loads: LoadSet, states, accelerations) -> VehicleMotion:

@@ -14,6 +14,7 @@ from jaxbeam.simulation.result_variables import (
     ACTING_COMMAND,
     MODE_FIELDS,
     MODE_VARIABLES,
+    OF_ABSORBERS,
     ROTATION_SERIES,
     VARIABLES,
     sensor_coordinates,
@@ -36,6 +37,11 @@ def dataset_parts(
     if supports.size:
         labels = {"units": "N", "long_name": "reaction of the support, positive upwards"}
         variables["reaction"] = (("time", "support"), reactions, labels)
+    if case.absorbers:
+        variables |= {
+            name: (dims, np.asarray(value(name)), {"units": unit, "long_name": words})
+            for name, (dims, unit, words) in OF_ABSORBERS.items()
+        }
     # Modes of repeated frequencies are not unique, so they are stored.
     variables |= {
         f"mode_{name}": (
