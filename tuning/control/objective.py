@@ -148,9 +148,12 @@ def run_metrics(
     """
     size = jnp.abs(found.deflection)
     change = jnp.abs(found.contact_force - weights) * (found.contact_force != 0)
+    change = change * (weights > 0)  # absorbers have none
     nonzero_weights = jnp.where(weights > 0, weights, 1.0)
     peak = smooth_max(size / uncontrolled["peak"], sharpness)
     least = uncontrolled["least"] / uncontrolled["peak"]
+    commands = found.command / command_ranges
+    effort = jnp.sum(commands**2) / max(1, commands.size)
     measured = {
         name: smooth_max(jnp.abs(history) / uncontrolled[name], sharpness)
         for name, history in found.measured.items()
@@ -160,6 +163,6 @@ def run_metrics(
         "shortfall": (peak - least) / (1 - least),
         "rms": jnp.sqrt(jnp.mean(found.deflection**2)) / uncontrolled["rms"],
         "after_exit": smooth_max(size * after_exit[:, None] / uncontrolled["peak"], sharpness),
-        "effort": jnp.sqrt(jnp.mean((found.command / command_ranges) ** 2) + 1e-30),
+        "effort": jnp.sqrt(effort + 1e-30),
         "contact": smooth_max(change / nonzero_weights, sharpness),
     }

@@ -128,10 +128,13 @@ def make_run_set(
     metrics.
 
     Raises ValueError for an unknown address, a faulty run or one that ends too early, and for a
-    case without a controller, without positions, or without a sensor of one of the quantities.
+    case without controller and absorbers, without positions, or without a sensor of one of the
+    quantities.
     """
-    if case.controller is None:
-        raise ValueError("there is no controller to tune: give the case one")
+    if case.controller is None and not case.absorbers:
+        raise ValueError(
+            "there is nothing to tune: the case has neither a controller nor absorbers; add one"
+        )
     if positions is None:
         positions = [float(sensor.position) for sensor in case.sensors]
     positions = jnp.asarray(positions, float).reshape(-1)
@@ -150,7 +153,8 @@ def make_run_set(
         plan_future = pool.submit(_integration_plan, cases)
         wanted = times, positions, tuple(quantities)
         uncontrolled_future = pool.submit(_uncontrolled_histories, cases, *wanted)
-        least_future = pool.submit(_least_peaks, cases, positions) if least_peaks else None
+        bounded = least_peaks and case.controller is not None
+        least_future = pool.submit(_least_peaks, cases, positions) if bounded else None
     plan = plan_future.result()
     uncontrolled = uncontrolled_future.result()
     deflection = uncontrolled.deflection
@@ -180,14 +184,21 @@ def make_run_set(
     )
 
 
+def uncontrolled(case: Case) -> Case:
+    """The case without its controller; without its absorbers, if it has no controller."""
+    if case.controller is None:
+        return dataclasses.replace(case, absorbers=())
+    return dataclasses.replace(case, controller=None)
+
+
 def _integration_plan(cases: list[Case]) -> IntegrationPlan:
     """Integration plan of all cases."""
     return common_plan([integration_plan(case, tolerance=PEAK_TOLERANCE) for case in cases], "runs")
 
 
 def _uncontrolled_histories(cases: list[Case], times, positions, quantities) -> Histories:
-    """Histories of runs without their controllers, along a first axis."""
-    without_controller = [dataclasses.replace(case, controller=None) for case in cases]
+    """Histories of runs without their controllers, or else absorbers, along a first axis."""
+    without_controller = [uncontrolled(case) for case in cases]
     plan = _integration_plan(without_controller).without_statements()
     wanted = times, plan, positions, quantities
     if len(cases) <= MAX_KNOWN_RUNS:

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.case.case import Case, replace
 from jaxbeam.files.case_file import case_to_dict
@@ -54,10 +54,11 @@ def tune(
     resume: bool = False,
     progress: bool = True,
 ) -> TuningResult:
-    """Tune parameters of a controlled case on training runs; report them on held-out runs.
+    """Tune parameters of a controlled or damped case on training runs; report held-out runs.
 
     `free` gives addresses, each with bounds (low, high) or None: gains and weights of the
-    controller, but also cutoffs of filters or positions of actuators and sensors. The runs of
+    controller, numbers of absorbers, cutoffs of filters, positions of actuators and sensors. In a
+    case without a controller "no control" is that without its absorbers. The runs of
     `cases` are simulated in closed loop, limits included, as one batch. An optimiser follows the
     gradient of the `objective`, whose maxima are smooth at first and ever sharper, for a number of
     `steps`, from the case's own values and from `starts` - 1 random ones at once. The result is the
@@ -270,11 +271,16 @@ def _run_set_result(name, run_set: RunSet, objective, before, after) -> RunSetRe
         peaks_before=peaks[0],
         peaks_after=peaks[1],
         least_peaks=run_set.uncontrolled["least"],
-        saturated_share=np.array([float(np.asarray(r.saturated).mean()) for r in pairs[1]]),
+        saturated_share=np.array([_share(np.asarray(record.saturated)) for record in pairs[1]]),
         objective=[float(objective.aggregate(own)) for own in values],
         metrics=metrics_after,
         metrics_before=metrics_before,
     )
+
+
+def _share(saturated: Bool[np.ndarray, "time actuator"]) -> float:
+    """Share of the time at a limit, over all actuators; 0 without any."""
+    return float(saturated.mean()) if saturated.size else 0.0
 
 
 def _histories(records: list[Record], run_set: RunSet) -> Histories:

@@ -267,21 +267,25 @@ def _bound_mark(parameter: FreeParameter, value: float) -> str:
 def _run_table(run_set: RunSetResult) -> list[str]:
     """Lines of a table of the runs of a run set: what varies, peaks (mm), attained shares."""
     varied = value_columns(run_set.runs)
-    header = [*varied, "no control", "before", "after", "least", "share before", "share after"]
-    peaks = (
-        run_set.uncontrolled_peaks,
-        run_set.peaks_before,
-        run_set.peaks_after,
-        run_set.least_peaks,
-    )
-    shares = [run_set.attained_shares(own) for own in (run_set.peaks_before, run_set.peaks_after)]
+    peaks = {
+        "no control": run_set.uncontrolled_peaks,
+        "before": run_set.peaks_before,
+        "after": run_set.peaks_after,
+    }
+    title, shares = f"{run_set.name} runs: peaks in mm", {}
+    if np.isfinite(run_set.least_peaks).any():
+        title += ", shares of the attainable reduction"
+        shares = {
+            f"share {name}": run_set.attained_shares(peaks[name]) for name in ("before", "after")
+        }
+        peaks["least"] = run_set.least_peaks
     rows = [
         [
             *(f"{column[i]:.4g}" for column in varied.values()),
-            *(f"{1e3 * own[i]:.4f}" for own in peaks),
-            *(f"{own[i]:.1%}" for own in shares),
+            *(f"{1e3 * own[i]:.4f}" for own in peaks.values()),
+            *(f"{own[i]:.1%}" for own in shares.values()),
         ]
         for i in range(len(run_set.runs))
     ]
-    title = f"{run_set.name} runs: peaks in mm, shares of the attainable reduction"
+    header = [*varied, *peaks, *shares]
     return [title, *text_table(header, rows, ">" * len(header))]

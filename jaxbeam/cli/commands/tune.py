@@ -1,4 +1,4 @@
-"""Command `tune`: parameters of a controller by gradient descent through the closed loop."""
+"""Command `tune`: parameters of controllers and absorbers by gradient descent over runs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -47,7 +47,7 @@ def tune(
     resume: Resume = False,
     options: CaseOptions = CaseOptions(),
 ) -> None:
-    """Tune controller parameters by gradient descent; report performance on held-out runs.
+    """Tune controllers and absorbers by gradient descent; report performance on held-out runs.
 
     Metrics are peak, shortfall, rms, after_exit, effort and contact.
 
@@ -56,7 +56,7 @@ def tune(
     Parameters
     ----------
     case
-        Case file with a controller, TOML.
+        Case file with a controller or absorbers, TOML.
     cases
         Load cases, TOML: tables [training] and [held_out] with lists of values by address.
     objective
@@ -229,15 +229,14 @@ def _write_and_print(result, tuned, files, picture, pictures, options: CaseOptio
     from jaxbeam.analysis.crossing_margin import stability_margin
     from tuning.control.comparison import beside_hand_drawn
 
-    loops = [stability_margin(one.case) for one in tuned]
-    summaries = [
-        one.to_dict() | {"stability": loop.verdict} for one, loop in zip(tuned, loops, strict=True)
-    ]
-    closed = [
-        f"the tuned loop is {loop}"
-        for one, loop in zip(tuned, loops, strict=True)
-        if not one.case.controller.open_loop
-    ]
+    summaries, closed = [one.to_dict() for one in tuned], []
+    for one, summary in zip(tuned, summaries, strict=True):
+        if one.case.controller is None:  # absorbers alone
+            continue
+        loop = stability_margin(one.case)
+        summary["stability"] = loop.verdict
+        if not one.case.controller.open_loop:
+            closed.append(f"the tuned loop is {loop}")
     by_hand = []
     drawn_by_hand = _hand_drawn(tuned)
     if drawn_by_hand is not None:
