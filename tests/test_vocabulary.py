@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Run
@@ -21,6 +22,7 @@ from tests.modules import ROOT
 PARTS = {
     "beam": Beam,
     "supports": Support,
+    "absorbers": Absorber,
     "actuators": AbstractActuator,
     "sensors": Sensor,
     "vehicle_sensors": VehicleSensor,

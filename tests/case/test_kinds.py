@@ -85,6 +85,7 @@ def test_parts_of_a_case_follow_from_its_fields():
     assert classes == {
         "beam": "Beam",
         "supports": "Support",
+        "absorbers": "Absorber",
         "actuators": "AbstractActuator",
         "sensors": "Sensor",
         "loads": "AbstractLoad",
@@ -95,7 +96,7 @@ def test_parts_of_a_case_follow_from_its_fields():
     }
     assert {*classes, "title"} == set(Case.__dataclass_fields__)
     assert [key for key, found in part_classes().items() if found.listed] == [
-        *("supports", "actuators", "sensors", "loads", "vehicle_sensors")
+        *("supports", "absorbers", "actuators", "sensors", "loads", "vehicle_sensors")
     ]
 
 
