@@ -104,7 +104,7 @@ def chunk_length(
     In NumPy, where each operation takes microseconds to begin, as many as caches hold; of
     `prepared` steps, which a program takes as they are, all if they fit into memory.
     """
-    if any_jax(discrete.grid if prepared else discrete):
+    if any_jax(discrete) and not prepared:
         return CHUNK_STEPS
     rows = max_loads * NODE_COUNT
     states = discrete.model.state_count + loads.vehicle_states
