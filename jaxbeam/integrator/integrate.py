@@ -213,8 +213,8 @@ def integrate_history(
     States (boundary, state, batch) are those before each step and at the end. Commands (step,
     command, batch) at the nodes, observations of each step, and the final memory of the `policy`
     are None without one. Running peaks are those at the monitored positions, None without any.
-    `max_loads` is the largest number of loads on the beam at once. Where the path or the model is
-    traced, the reverse pass saves one state for each chunk.
+    `max_loads` is the largest number of loads on the beam at once. Of a run whose matrices
+    do not fit into memory, the reverse pass saves one state for each chunk.
     """
     chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy, steps)
     load_count, batch_size = loads.inertia.shape
