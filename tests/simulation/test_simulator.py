@@ -110,7 +110,9 @@ def test_wrong_uses_of_a_simulator_are_said():
         jb.Simulator(CASE, ("run.duration",))
 
 
-@pytest.mark.parametrize(("address", "most"), [(MASS, 900), (RIGIDITY, 1400), ("loads.0.speed", 2200)])
+@pytest.mark.parametrize(
+    ("address", "most"), [(MASS, 900), (RIGIDITY, 1400), ("loads.0.speed", 2200)]
+)
 def test_programs_hold_only_what_varies(address, most):
     """Equations of whole records; all stages of a run are 4000."""
     simulator = jb.Simulator(CASE, (address,))
