@@ -132,7 +132,9 @@ def _say(kept, written) -> None:
     """Print what is kept: the innermost of the work in progress, and files that are whole."""
     said = [sentence() for sentence in reversed(list(kept))]
     said = [one for one in said if one][:1]
-    said += [f"written: {', '.join(written)}"] if written else []
+    # A checkpoint is written many times, and named as what is kept.
+    files = [one for one in dict.fromkeys(written) if not any(one in kept for kept in said)]
+    said += [f"written: {', '.join(files)}"] if files else []
     line = f"jaxbeam: interrupted; {'; '.join(said) or 'nothing is kept'}\n"
     with contextlib.suppress(OSError, ValueError):
         sys.stderr.flush()

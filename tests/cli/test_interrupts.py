@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from jaxbeam.cli import main
@@ -11,16 +12,19 @@ from jaxbeam.runtime.interrupts import interruptible, keeping
 from jaxbeam.runtime.whole_file import whole_file
 from tuning.checkpoint import kept_in
 
-# A command that gets SIGINT when it first imports a module, or opens a file, of some name.
+# A command that gets SIGINT when it first, or a given time ("name*2"), imports a module, or opens a
+# file, of some name.
 SCRIPT = """
 import os, signal, sys
 sys.argv[0] = "jaxbeam"
-moment = sys.argv.pop(1)
+moment, _, left = sys.argv.pop(1).partition("*")
+left = int(left or 1)
 def hook(event, arguments):
-    global moment
-    if moment and event in ("import", "open") and moment in str(arguments[0]):
-        moment = ""
-        os.kill(os.getpid(), signal.SIGINT)
+    global left
+    if left and event in ("import", "open") and moment in str(arguments[0]):
+        left -= 1
+        if not left:
+            os.kill(os.getpid(), signal.SIGINT)
 sys.addaudithook(hook)
 from jaxbeam.cli import main
 main()
@@ -63,6 +67,29 @@ def test_a_sweep_goes_on_where_it_was_interrupted(folder, run):
     assert "600 runs, 0 failed" in run(f"{SWEEP} --resume")
     again = interrupted(folder, "/done/c/1", f"{SWEEP} --overwrite")
     assert again == f"interrupted; {KEPT}: the same command goes on"
+
+
+LOADS = '[training]\n"loads.0.mass" = [0.3, 0.5]\n'
+LOG = "[columns]\nw = { unit = 'm', sensor = 0 }\n"
+FREE = "--free controller.gains.0=50:400"
+SEARCHES = {
+    "fit": "identify case.toml log.csv --free beam.flexural_rigidity=5:20 --starts 10 -o fit.toml",
+    "tuned": f"tune controlled.toml --cases loads.toml {FREE} -o tuned.toml",
+}
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_a_search_keeps_what_it_found(folder, name):
+    """Interrupted as it writes its checkpoint the second time: the first is kept."""
+    times = np.arange(0.0, 1.0, 0.005)
+    rows = [f"{t:.6f},{-1e-3 * np.sin(np.pi * t) ** 2:.9e}\n" for t in times]
+    (folder / "log.csv").write_text("time [s],w [m]\n" + "".join(rows))
+    (folder / "log.toml").write_text(LOG)
+    (folder / "loads.toml").write_text(LOADS)
+    said = interrupted(folder, f".{name}.search.*2", SEARCHES[name])
+    kept = f"{name}.search.npz"
+    assert said == f"interrupted; the search is kept in {kept}: resume it, with --resume"
+    assert (folder / kept).exists()
 
 
 def test_status_and_sentence_within_a_process(folder, capfd, monkeypatch):
