@@ -9,6 +9,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES
 from jaxbeam.integrator.step_matrices import CHUNK_STEPS
 from jaxbeam.model.load_set import load_set
@@ -23,7 +24,8 @@ class RunSizes(NamedTuple):
     """Sizes of the runs of a sweep that decide how much memory they take.
 
     A wheel passes `places` on the beam where steps end, besides those of corrected sensors. With
-    histories there are `samples`, and so many `steps` in a run.
+    histories there are `samples`, and so many `steps` in a run; so many `given_steps` where a
+    profile or forces over time are given at the nodes of each, forces of each run.
     """
 
     modes: int
@@ -33,6 +35,8 @@ class RunSizes(NamedTuple):
     places: int
     samples: int
     steps: int
+    given_steps: int
+    has_forces: bool
 
     def batch_bytes(self, sensors: Sequence[Sensor], runs: int) -> float:
         """Memory (bytes) of a batch of so many runs with some sensors, at most.
@@ -52,7 +56,10 @@ class RunSizes(NamedTuple):
 
     def input_bytes(self, sensors: Sequence[Sensor], runs: int) -> float:
         """Memory (bytes) of the time grid and the loads of a batch, and to make them."""
-        return 8.0 * (4 * self.panels(sensors) * (self.wheels + 8) + 20 * self.wheels * runs)
+        of_node = 3 + runs * self.has_forces
+        given = self.given_steps * self.wheels * native_peaks.PATH_NODES * of_node
+        panels = 4 * self.panels(sensors) * (self.wheels + 8)
+        return 8.0 * (panels + 20 * self.wheels * runs + 2 * given)
 
     def panels(self, sensors: Sequence[Sensor]) -> int:
         """Number of panels of the time grid, at most."""
@@ -65,15 +72,26 @@ def run_sizes(case: Case, speeds: Float[np.ndarray, " speed"], histories: bool) 
     case = concrete_case(case)
     loads, layout, modes = load_set(case), mesh_layout(case), case.beam.modes
     pieces = loads.cubics()[0].shape[1] if loads.wheel_count else 0
-    samples = steps = 0
+    duration, length = float(case.run.duration), float(concrete(case.beam.length))
+    crossings = duration * np.abs(speeds).max(initial=0.0) / length
+    samples, of_crossings, steps = 0, int(STEPS_PER_MODE * modes * crossings), 0
     if histories:
-        duration, length = float(case.run.duration), float(concrete(case.beam.length))
         samples = len(sample_times(case))
-        crossings = duration * np.abs(speeds).max(initial=0.0) / length
-        steps = 2 * samples + int(STEPS_PER_MODE * modes * crossings)
+        steps = 2 * samples + of_crossings
+    given_steps = of_crossings if native_peaks.has_courses(case) else 0
     states = 2 * modes + 4 * len(case.actuators)
     places = len(layout.degrees) + pieces
-    return RunSizes(modes, states, has_coupling(case), loads.wheel_count, places, samples, steps)
+    return RunSizes(
+        modes=modes,
+        states=states,
+        coupled=has_coupling(case),
+        wheels=loads.wheel_count,
+        places=places,
+        samples=samples,
+        steps=steps,
+        given_steps=given_steps,
+        has_forces=bool(loads.wheels.histories),
+    )
 
 
 def largest_group(count: int, fits) -> int:
