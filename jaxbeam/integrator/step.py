@@ -9,7 +9,9 @@ from jaxbeam.integrator.step_matrices import StepMatrices, advances_by_forces
 from jaxbeam.integrator.vehicles.steps import StepInput, Vehicles
 from jaxbeam.model.contact import ModalCompliance, solve_contact_forces
 from jaxbeam.numerics.batched_linalg import matvec
-from jaxbeam.runtime.arrays import Array, any_jax, cond, is_jax, scan, vmap, xp
+from jaxbeam.runtime.arrays import Array, any_jax, cond, is_jax, is_known, scan, vmap, xp
+
+MANY_RUNS = 16  # of a batch that NumPy advances by its contact forces, as maps of each take longer
 
 
 @jax.named_scope("collocation")
@@ -64,7 +66,8 @@ def advance_unforced(step: StepInput, state, vehicles: Vehicles | None):
     As one map a step, whose systems are solved at once. Plain wheels of a compiled batch, whose
     runs share the matrices but not the maps, and of many known states by their contact forces.
     """
-    if vehicles is None and is_jax(step.matrices.transition) and state.shape[1] > 1:
+    shared = is_jax(step.matrices.transition) or is_known(state) and state.shape[1] >= MANY_RUNS
+    if vehicles is None and shared and state.shape[1] > 1:
         final_state, (states, forces) = scan(advance, state, step)
         return final_state, states, forces
     if vehicles is None and advances_by_forces(step.matrices.state_count):

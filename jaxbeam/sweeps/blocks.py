@@ -20,9 +20,10 @@ from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.runtime.vectorised import NotVectorisedError
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import sample_times, steps_per_interval
-from jaxbeam.sweeps import programs
+from jaxbeam.sweeps import known_batches, programs
 from jaxbeam.sweeps.batches import Batches, common_layout, swept_masses
 from jaxbeam.sweeps.compiled_batches import CompiledBatches
+from jaxbeam.sweeps.known_batches import KnownBatches
 from jaxbeam.sweeps.known_inputs import KnownInputs, inputs_of_rows, known_model
 from jaxbeam.sweeps.path_times import PathTimes, path_times, step_limits
 from jaxbeam.sweeps.step_size import (
@@ -48,8 +49,9 @@ class Runner:
 
     With `single` precision the integration is in float32, models and propagators are made in
     float64; `native` steps are taken in C. Memory allows blocks of `most_batches`, and inputs of C
-    for `most_inputs` batches at once. Raises ValueError if positions along the beam change their
-    order within the sweep.
+    for `most_inputs` batches at once. If `small`, NumPy takes the steps of a few batches, and
+    nothing is compiled. Raises ValueError if positions along the beam change their order within the
+    sweep.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class Runner:
         native: bool = False,
         most_batches: int = 2**31,
         most_inputs: int = 2**31,
+        small: bool = False,
     ):
         self.case, self.batches, self.tolerance = case, batches, tolerance
         self.histories, self.single = histories, single
@@ -89,8 +92,10 @@ class Runner:
         # More threads than cores where some wait for others.
         waiting = self.known_inputs is None
         self.pool = ThreadPoolExecutor((os.cpu_count() or 1) * (2 if waiting else 1))
+        self.compiled: CompiledBatches | KnownBatches | None = None
         if self.known_inputs is None:
-            self.compiled = self._compile()
+            small = small and known_batches.suits(case, batches, self.schedule)
+            self.compiled = self._known_batches() if small else self._compile()
         longest = None
         if self.schedule is not None and case.controller is not None:  # steps end at events
             longest = self.schedule.lengths.max()
@@ -128,6 +133,14 @@ class Runner:
         for compilation in compilations:
             compilation.result()  # raises its error, if any
         return compiled
+
+    def _known_batches(self) -> KnownBatches:
+        """Batches of a small sweep, without a program."""
+        known, events = self.known_model, None
+        if known is not None and self.schedule is None:
+            events = self._path_times.load_events
+        model = known and known.model
+        return KnownBatches(self.program, self.batches, model, events, self.schedule)
 
     def _stable_steps(self) -> Float[np.ndarray, " path"]:
         """Longest stable steps (s), infinite where there is none: a run fails with any step."""
@@ -184,7 +197,7 @@ class Runner:
         Raises RuntimeError if no time step meets the tolerance.
         """
         count = MIN_TRIAL_BATCHES
-        if self.known_inputs is None:  # calls of a program take equally many
+        if isinstance(self.compiled, CompiledBatches):  # calls of a program take equally many
             count = _round_up(count, self.trial_batches)
 
         def peaks(batch_indices, steps, extra_steps, single=False):

@@ -37,7 +37,7 @@ from jaxbeam.model.sensing.corrected_rows import (
     static_correction,
 )
 from jaxbeam.model.sensing.output_rows import OutputRows, sensor_rows
-from jaxbeam.runtime.arrays import Array, vmap
+from jaxbeam.runtime.arrays import Array, vmap, xp
 from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,
     PARALLEL_COMPILATION,
@@ -106,8 +106,8 @@ class Program(NamedTuple):
         places = corrected_places(varied, model, varied.sensors)
         if self.schedule is None:
             return grid_by_step_length(varied, model, *steps, places)
-        longest = jnp.max(self.schedule.lengths)
-        substeps = jnp.ceil(longest / stepping.max_step).astype(int) + stepping.extra_steps
+        longest = xp.max(self.schedule.lengths)
+        substeps = xp.ceil(longest / stepping.max_step).astype(int) + stepping.extra_steps
         return grid_by_schedule(varied, model, self.schedule, self.substeps or substeps, places)
 
     def discretise(self, model, shared_values, stepping, policy=None):
@@ -218,7 +218,7 @@ def _compiled_results(program: Program, mask, discrete, shared_values, batched_v
         own_discrete, own_model, shared, batched = values
         own_discrete = _with_model(own_discrete, shared_model or own_model)
         case, loads = program.case_with(shared), program.loads(shared, batched)
-        return _results(program, own_discrete, case, loads)
+        return results(program, own_discrete, case, loads)
 
     return _map_masked(
         batch_results, mask, (_without_model(discrete), own_models, shared_values, batched_values)
@@ -229,7 +229,7 @@ def _closed_loop_results(program: Program, shared_values, batched_values, steppi
     """Results of a batch with a controller."""
     varied, loads = program.case_with(shared_values), program.loads(shared_values, batched_values)
     policy = closed_loop(varied, program.shapes.layout, loads, program.schedule)
-    return _results(
+    return results(
         program,
         program.discretise(policy.model, shared_values, stepping, policy),
         varied,
@@ -238,7 +238,7 @@ def _closed_loop_results(program: Program, shared_values, batched_values, steppi
     )
 
 
-def _results(program: Program, discrete, varied: Case, loads: LoadSet, policy=None):
+def results(program: Program, discrete, varied: Case, loads: LoadSet, policy=None):
     """Results of a batch by name: peaks (batch, ...), histories and controller failures."""
     max_loads, substeps, history = program.shapes.max_loads, program.substeps, {}
     if substeps is None:
@@ -252,7 +252,7 @@ def _results(program: Program, discrete, varied: Case, loads: LoadSet, policy=No
         samples = states[substeps * grid.event_panels[program.schedule.sample_events]]
         rows = discrete.model.shapes(varied.sensor_positions, (0,))[0]
         modal = samples[:, 0 : 2 * varied.beam.modes : 2]
-        history["deflection"] = jnp.einsum("sm,tml->lts", rows, modal)
+        history["deflection"] = xp.einsum("sm,tml->lts", rows, modal)
     if policy is not None:
         history["controller_failures"] = policy.failures(memory)
     return running_peaks.peaks()._asdict() | history

@@ -59,7 +59,7 @@ class SweepSpecification:
     The runs are all combinations of the values, or with `paired` the first of each address, the
     second, and so on. `tolerance` is the relative error allowed of peaks, rounding in `single`
     precision excluded. A block of runs takes at most `block_bytes` of memory, if one run takes no
-    more.
+    more. One of `several` sweeps of one structure shares its compiled programs with the others.
     """
 
     case: Case
@@ -69,6 +69,7 @@ class SweepSpecification:
     tolerance: float
     single: bool
     block_bytes: float
+    several: bool = False
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -147,7 +148,8 @@ class SweepSpecification:
         batch_bytes = max(self._sizes.batch_bytes(group, runs) for group in sensors)
         input_bytes = max(self._sizes.input_bytes(group, runs) for group in sensors)
         limits = (max(1, int(self.block_bytes / size)) for size in (batch_bytes, input_bytes))
-        settings = self.batches, self.histories, self.tolerance, self.single, native, *limits
+        small = not (self.single or self.several)
+        settings = self.batches, self.histories, self.tolerance, self.single, native, *limits, small
         if len(groups) == 1:
             return Runner(self.case, *settings)
         cases = [dataclasses.replace(self.case, sensors=tuple(group)) for group in sensors]
@@ -187,6 +189,7 @@ class SweepSpecification:
             "case": self.case_dict,
             "axes": {address: values.tolist() for address, values in self.axes.items()},
             "settings": [self.paired, self.histories, self.tolerance, self.single],
+            "several": self.several,
             "block_bytes": self.block_bytes,
         }
 
@@ -218,7 +221,8 @@ def specification_from_dict(content: dict[str, Any]) -> SweepSpecification:
     """Specification from the dictionary of `SweepSpecification.to_dict`, without checks."""
     axes = {address: np.asarray(values, float) for address, values in content["axes"].items()}
     case, settings = case_from_dict(content["case"]), content["settings"]
-    return SweepSpecification(case, axes, *settings, block_bytes=content["block_bytes"])
+    kept = {name: content[name] for name in ("block_bytes", "several")}
+    return SweepSpecification(case, axes, *settings, **kept)
 
 
 def sweep_specification(

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
 
 
+MOST_KNOWN = 2  # sweeps, each of a few runs, that NumPy computes sooner than a program compiles
 Words = tuple[str, ...] | tuple[int, ...]
 
 
@@ -182,6 +183,8 @@ def word_sweep(
         if [str(s.quantity) for s in changed.sensors] != [str(s.quantity) for s in case.sensors]:
             raise ValueError(f"{named} changes the sensors, which all runs share: make two sweeps")
         cases.append(changed)
+    if len(sweeps) > MOST_KNOWN:
+        sweeps = [dataclasses.replace(part, several=True) for part in sweeps]
     dims = tuple(attribute_address(address) for address in order)
     plan = WordSweep(case, words, dims, cases, sweeps)
     if plan.count > MAX_RUNS:

@@ -1,7 +1,7 @@
 """Every way of computing a run against every other: the same case has one answer.
 
-Single runs of known and of traced numbers, envelopes, sweeps of peaks in XLA and in C, sweeps of
-histories. Runs end at their durations, so peaks do not depend on the sample rate.
+Single runs of known and of traced numbers, envelopes, sweeps of peaks in XLA, in C and in NumPy,
+sweeps of histories. Runs end at their durations, so peaks do not depend on the sample rate.
 """
 
 import contextlib
@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.integrator import native_peaks
 from jaxbeam.simulation.integration_plan import common_plan, integration_plan, sample_times
+from jaxbeam.sweeps import known_batches
 from jaxbeam.sweeps.blocks import Runner
 from tests.strategies import numbers
 
@@ -73,11 +74,15 @@ def same_steps():
         yield
 
 
-def swept(case, runs, native: bool, **options) -> np.ndarray:
-    """Peaks (run, sensor) of a sweep, in C or in XLA."""
+def swept(case, runs, native: bool = False, known: bool = False, **options) -> np.ndarray:
+    """Peaks (run, sensor) of a sweep: in C if `native`, in NumPy if `known`, else in XLA."""
     over = {address: [run[address] for run in runs] for address in runs[0]}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(native_peaks, "available", lambda: native)
+        if known:
+            patch.setattr(Runner, "_compile", None)
+        else:
+            patch.setattr(known_batches, "suits", lambda *_: False)
         assert native_peaks.chosen_for(case, 1) == (native and case.controller is None)
         found = jb.sweep(case, over, paired=True, progress=False, **options)
     return found.peak_deflection.values
@@ -93,8 +98,9 @@ def single(case, run, rate: float = 150.0) -> np.ndarray:
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 def test_single_runs_envelopes_and_sweeps_of_known_numbers(runs, rate):
     with same_steps():
-        expected = swept(CASE, runs, native=False)
+        expected = swept(CASE, runs)
         assert_allclose(swept(CASE, runs, native=True), expected, rtol=1e-10)
+        assert_allclose(swept(CASE, runs, known=True), expected, rtol=1e-10)
     assert_allclose(swept(CASE, runs, native=True), expected, rtol=TOLERANCE)
     for run, peaks in zip(runs, expected, strict=True):
         assert_allclose(single(CASE, run), peaks, rtol=TOLERANCE)
@@ -124,9 +130,11 @@ def test_traced_runs_and_sweeps_of_histories(runs):
             )
         )
     )(values)
-    expected = swept(case, runs, native=False)
+    expected = swept(case, runs)
     assert_allclose(traced, expected, rtol=TOLERANCE)
-    assert_allclose(swept(case, runs, native=False, histories=True), expected, rtol=TOLERANCE)
+    for known in (False, True):
+        of_histories = swept(case, runs, known=known, histories=True)
+        assert_allclose(of_histories, expected, rtol=TOLERANCE)
     for run, peaks in zip(runs, expected, strict=True):
         assert_allclose(single(case, run, 33.0), peaks, rtol=TOLERANCE)
 
@@ -141,7 +149,9 @@ def test_controlled_runs(period):
         controller=jb.Feedback(gains=[300.0], period=period),
     )
     runs = [{"loads.0.mass": mass, "loads.0.speed": v} for mass, v in [(0.4, 2.5), (0.9, 4.0)]]
-    expected = swept(controlled, runs, native=False)
+    expected = swept(controlled, runs)
+    if period is not None:
+        assert_allclose(swept(controlled, runs, known=True), expected, rtol=TOLERANCE)
     for run, peaks in zip(runs, expected, strict=True):
         assert_allclose(single(controlled, run, 33.0), peaks, rtol=TOLERANCE)
         assert_allclose(single(controlled, run, 1000.0), peaks, rtol=TOLERANCE)
