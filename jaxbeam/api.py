@@ -20,7 +20,7 @@ from jaxbeam.case.reading.toml_file import parse_toml
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_from_tables, load_case_with
 from jaxbeam.model.plausibility.check import leave_warnings_to_caller
-from jaxbeam.model.plausibility.numbers import Plausibility
+from jaxbeam.model.plausibility.facts import Plausibility
 from jaxbeam.runtime.progress import listening
 from jaxbeam.simulation.record import Record
 
@@ -130,7 +130,7 @@ def content(result: "Record | Plausibility | xarray.Dataset") -> dict[str, Any]:
 
 def _content_of_record(record: Record) -> dict[str, Any]:
     from jaxbeam.analysis.ride import wheel_unloading
-    from jaxbeam.analysis.sections.record_amplification import record_amplification
+    from jaxbeam.analysis.sections import record_amplification
 
     sensors, controller = record.case.sensors, record.case.controller
     names, columns = zip(*record.extremes._asdict().items(), strict=True)

@@ -3,11 +3,11 @@
 import jax
 import numpy as np
 
-from jaxbeam.case.actuators.shaker import Shaker
+from jaxbeam.case.actuators.point import Shaker
 from jaxbeam.case.case import Case
-from jaxbeam.case.loads.mass import MovingMass
+from jaxbeam.case.loads.point import MovingMass
 from jaxbeam.control.feedback import Feedback
-from jaxbeam.control.state_feedback import StateFeedback
+from jaxbeam.control.state_controller import StateFeedback
 from tests.oracles import closed_loop
 from tests.oracles.loads import Load
 from tests.oracles.modal_equations import Span

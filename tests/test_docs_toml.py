@@ -5,9 +5,9 @@ import tomllib
 
 import pytest
 
-from jaxbeam.case.loads.planar.files import load_vehicle
+from jaxbeam.case.loads.planar.vehicle import load_vehicle
 from jaxbeam.files.case_file import case_from_dict
-from jaxbeam.files.declared_keys import tables
+from jaxbeam.files.json_schema import tables
 from tests.modules import ROOT
 from tuning.control.load_cases import read_load_cases
 

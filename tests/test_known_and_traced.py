@@ -328,7 +328,7 @@ def test_plain_calls_compile_nothing(tmp_path):
     code = (
         "import jax; jax.config.update('jax_log_compiles', True)\n"
         "import dataclasses, sys, numpy as np, jaxbeam as jb\n"
-        "from jaxbeam.analysis.crossing_margin import stability_margin\n"
+        "from jaxbeam.analysis.margins import stability_margin\n"
         "from jaxbeam.analysis.stability import frozen_poles, growth\n"
         "case = jb.load_case('case.toml')\n"
         "beam = dataclasses.replace(case.beam, modes=7, damping_ratio=0.01)\n"

@@ -12,11 +12,10 @@ from plain_docstrings import as_text
 import jaxbeam
 import jaxbeam.plot
 import tuning
-from jaxbeam.case.display.views import TableViews
+from jaxbeam.case.display import TableViews
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE
 from jaxbeam.cli.app import COMMANDS, app as commands
-from jaxbeam.files.declared_keys import Key, table_classes, table_keys, tables
-from jaxbeam.files.json_schema import json_schema
+from jaxbeam.files.json_schema import Key, json_schema, table_classes, table_keys, tables
 
 # Pages of the public names, by the packages in which they are defined; the first that fits.
 GROUPS = {
@@ -43,7 +42,7 @@ GROUPS = {
 }
 INTERFACES = [
     ("jaxbeam.case.loads.base", "AbstractLoad"),
-    ("jaxbeam.case.profiles.base", "AbstractProfile"),
+    ("jaxbeam.case.profiles.shapes", "AbstractProfile"),
     ("jaxbeam.case.actuators.base", "AbstractActuator"),
     ("jaxbeam.case.controller", "AbstractController"),
     ("jaxbeam.case.controller", "AbstractStaticController"),

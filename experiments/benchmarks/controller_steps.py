@@ -21,7 +21,7 @@ from experiments.benchmarks.computing_time import ComputingTimes, computing_time
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.kinds import kinds
 from jaxbeam.control.design_model import DesignModel
-from jaxbeam.control.optimal.sampling_loss import SamplingWarning
+from jaxbeam.control.optimal.sampled_lqr import SamplingWarning
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 PERIOD, MODES = 0.01, 5

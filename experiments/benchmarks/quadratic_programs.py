@@ -36,9 +36,9 @@ from experiments.benchmarks.common import (
     time_call,
 )
 from experiments.benchmarks.controller_steps import PREDICTIVE, patch_case
-from jaxbeam.control.optimal.sampling_loss import SamplingWarning
+from jaxbeam.control.optimal.sampled_lqr import SamplingWarning
 from jaxbeam.model.state_space import state_space
-from jaxbeam.numerics.optimisation.qp import solve_qp
+from jaxbeam.numerics.qp import solve_qp
 from jaxbeam.runtime.compiling import compiled
 from jaxbeam.simulation.simulate import ContactLossWarning
 

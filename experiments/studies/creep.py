@@ -5,8 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.actuators.creep import Creep
-from jaxbeam.case.actuators.hysteresis import Hysteresis
+from jaxbeam.case.actuators.hysteresis import Creep, Hysteresis
 from tuning.fit.hysteresis import (
     channel_pair,
     checked_thresholds,

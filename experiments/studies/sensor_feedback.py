@@ -1,6 +1,6 @@
 """Static output feedback through a table on the patch rigs, from sensors alone; held-out loads.
 
-One table of commands over the deflection under the load (`jaxbeam.control.internal_model.table`)
+One table of commands over the deflection under the load (`jaxbeam.control.internal_model`)
 serves all masses and speeds. It is tuned by `experiments.studies.tune_sensor_feedback` on the
 bench: noise of 4 um, filters of tenth order at 10 Hz (one span) and 20 Hz (two), a command every 10
 ms in steps of 10 mV, 20 ms late. There are no gates, and neither mass nor speed is given. It is

@@ -20,7 +20,7 @@ from jaxbeam import rigs
 from jaxbeam.analysis.bound.bound import Bound
 from jaxbeam.analysis.bound.input_influence import input_influence
 from jaxbeam.case.filters import filter_history, second_order_sections, steady_filter_state
-from jaxbeam.estimation.gains import kalman_gain, sampled_kalman_gain
+from jaxbeam.estimation.observer import kalman_gain, sampled_kalman_gain
 from tests import loop_as_oracle
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, Bound, bound
-from jaxbeam.analysis.crossing_margin import StabilityMargin, stability_margin
 from jaxbeam.analysis.limit_cycles import CommandOscillation, command_oscillations
+from jaxbeam.analysis.margins import StabilityMargin, stability_margin
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.runtime.module import Module

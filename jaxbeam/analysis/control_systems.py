@@ -3,10 +3,10 @@
 import dataclasses
 from typing import Any, NamedTuple
 
-from jaxbeam.analysis.loops.stationary_loop import loop_with_mass_at, standing_mass
+from jaxbeam.analysis.stationary_loop import loop_with_mass_at, standing_mass
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads.mass import MovingMass
+from jaxbeam.case.loads.point import MovingMass
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.state_space import state_space
 

@@ -22,8 +22,8 @@ from starlette.staticfiles import StaticFiles
 import jaxbeam as jb
 from jaxbeam.app import take_away, views
 from jaxbeam.app.workspace import MAX_BYTES, Workspace
-from jaxbeam.case.loads.planar.files import vehicle_names
-from jaxbeam.vehicles.trains import trains
+from jaxbeam.case.loads.planar.vehicle import vehicle_names
+from jaxbeam.vehicles.library import trains
 
 STATIC = Path(__file__).parent / "static"
 LOOPBACK = "127.0.0.1"

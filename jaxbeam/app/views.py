@@ -11,7 +11,7 @@ from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.model.along_beam import positions_along
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.plot.schematic import actuator_positions, surface_height
-from jaxbeam.plot.traffic.parts import drawn_vehicle
+from jaxbeam.plot.traffic.drawing import drawn_vehicle
 from jaxbeam.simulation.labels import wheel_labels
 from jaxbeam.simulation.record import Record
 

@@ -21,8 +21,7 @@ import numpy as np
 
 import jaxbeam as jb
 from jaxbeam.app import document, views
-from jaxbeam.case.case import Case, addresses, leaves_by_address, unit_at
-from jaxbeam.case.display.addresses import address_words
+from jaxbeam.case.case import Case, address_words, addresses, leaves_by_address, unit_at
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.reading.toml_file import parse_toml
 from jaxbeam.rigs import RIG_NAMES

@@ -23,8 +23,7 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.kinds import import_modules, kind_of
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.state_controller import AbstractStateController
-from jaxbeam.control.state_law import SampledStateLaw, TrueState
+from jaxbeam.control.state_controller import AbstractStateController, SampledStateLaw, TrueState
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.sensor_signals import (
     initial_filter_state,

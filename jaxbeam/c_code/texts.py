@@ -1,14 +1,30 @@
-"""Texts of the files of a program in C: header, source, recorded samples, loop that checks."""
+"""Texts of C: numbers, tables and loops."""
 
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 
+import jax
 import numpy as np
 
-from jaxbeam.c_code.recorded_loop import RecordedLoop
+from jaxbeam.c_code.recorded_loop import MIN_COMPILED, RecordedLoop
 from jaxbeam.c_code.source import CSource, array_text
+
+
+def at_samples(function: Callable, code: CSource, varies: bool = True) -> tuple[np.ndarray, ...]:
+    """Arrays that a function gives at each sample time (s), stacked along a first axis.
+
+    A function that does not vary is evaluated once.
+    """
+    times = code.period * np.arange(code.samples if varies else 1)
+    if len(times) > 1 and (code.compiles or len(times) >= MIN_COMPILED):
+        return tuple(np.asarray(part) for part in jax.jit(jax.vmap(function))(times))
+    rows = [function(t) for t in times]
+    return tuple(
+        np.stack([np.asarray(part) for part in column]) for column in zip(*rows, strict=True)
+    )
+
 
 # Of commands, relative to the largest, in double and single precision. Rounding makes 1e-12 and
 # less; filters that invert their sensors and programs with many limits may magnify it.

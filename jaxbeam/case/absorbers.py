@@ -18,10 +18,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.declared_checks import validate_exactly_one
-from jaxbeam.case.display.parts import ReprWithUnits
+from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, concrete, is_concrete, number
-from jaxbeam.case.loads.force_history import ForceHistory
-from jaxbeam.case.loads.vehicle_model import VehicleModel
+from jaxbeam.case.loads.base import ForceHistory, VehicleModel
 from jaxbeam.case.trajectory import StandingTrajectory
 from jaxbeam.runtime.arrays import Array, xp
 

@@ -1,20 +1,16 @@
-"""Beam and supports: section, material, modal damping, end conditions."""
+"""Beam of a case: its ends, sections, damping, segments, hinges and supports.
 
+The `beam` is a `jaxbeam.case.beam.Beam`, which has the parts of this package.
+"""
+
+from typing import NamedTuple
+
+import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.beam_parts.damping import MATERIALS
-from jaxbeam.case.beam_parts.hinge import Hinge
-from jaxbeam.case.beam_parts.properties import (
-    OPTIONAL,
-    mass_per_length,
-    mean,
-    rigidity,
-    validate_segments,
-)
-from jaxbeam.case.beam_parts.segment import Segment
 from jaxbeam.case.declared_checks import check_on_beam, suggestion, validate_direct_or_derived
-from jaxbeam.case.display.parts import ReprWithUnits
+from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import (
     NOT_NEGATIVE,
     ON_BEAM,
@@ -26,7 +22,270 @@ from jaxbeam.case.fields import (
     number,
     parts,
 )
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
+
+LIMIT_SPAN = 20.0  # m: shorter spans have more damping
+
+
+class MaterialDamping(NamedTuple):
+    """Lower bounds of the damping of railway bridges: ratio of long spans, increase per m below."""
+
+    ratio: float
+    increase: float
+
+    def at(self, span: Float[Array, ""]) -> Float[Array, ""]:
+        """Damping ratio of a span (m)."""
+        return self.ratio + self.increase * xp.maximum(LIMIT_SPAN - span, 0.0)
+
+
+# EN 1991-2, table 6.6; numbers as in the function `ec1damping` of a public solver in Julia.
+MATERIALS = {
+    "steel": MaterialDamping(0.005, 0.00125),
+    "composite": MaterialDamping(0.005, 0.00125),
+    "prestressed-concrete": MaterialDamping(0.01, 0.0007),
+    "reinforced-concrete": MaterialDamping(0.015, 0.0007),
+    "filler-beam": MaterialDamping(0.015, 0.0007),
+}
+
+
+def rayleigh_coefficients(frequencies, ratios) -> Float[Array, "2"]:
+    """Coefficients a (1/s) and b (s) of Rayleigh damping D = a M + b K with two given ratios.
+
+    zeta = a / (2 omega) + b omega / 2 holds at both `frequencies` (2,) in Hz for the damping
+    `ratios` (2,): `rayleigh_damping` of a beam. Raises ValueError for equal frequencies.
+
+    >>> import jaxbeam as jb
+    >>> print(jb.rayleigh_coefficients([2.0, 8.0], [0.01, 0.01]).round(6))
+    [0.201062 0.000318]
+    """
+    omega, ratios = 2 * xp.pi * xp.asarray(frequencies, float), xp.asarray(ratios, float)
+    if omega.shape != (2,) or ratios.shape != (2,):
+        raise ValueError("give two frequencies in Hz and two damping ratios")
+    if is_concrete(omega) and concrete(omega)[0] == concrete(omega)[1]:
+        raise ValueError(f"the two frequencies must differ; both are {frequencies[0]:g} Hz")
+    matrix = xp.stack([1 / (2 * omega), omega / 2], axis=-1)
+    return xp.linalg.solve(matrix, ratios)
+
+
+class Hinge(ReprWithUnits):
+    """Hinge between the ends of a beam: no bending moment, or that of a rotational spring.
+
+    The deflection is continuous, the rotation jumps. A moment M = k (phi_right - phi_left) is that
+    of a semi-rigid joint of `rotational_stiffness` k.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(10.0, 2e7, 400.0, ends="clamped-pinned", hinges=[jb.Hinge(6.0)])
+    >>> print(jb.modes(jb.Case(beam)).frequencies.round(2)[:2])
+    [ 2.52 16.91]
+    """
+
+    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
+    rotational_stiffness: Float[Array, ""] = number(
+        "N m/rad", "spring between both sides", NOT_NEGATIVE, default=0.0
+    )
+
+
+class Segment(ReprWithUnits):
+    """Length of a beam over which stiffness and mass are constant or polynomials.
+
+    Each property is one number, or the coefficients c_0, c_1, ... of
+
+        c_0 + c_1 s + c_2 s^2 + ...,    s = 0 at the left end of the segment, 1 at its right end,
+
+    so that [1.0, -0.5] falls from 1.0 to 0.5. A property that is left out is that of the beam.
+    `width` and `height` (in the bending direction) are those of a rectangular section of the
+    beam's `youngs_modulus` and `density`. The last segment may leave out its `length`: it ends
+    where the beam does.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(
+    ...     10.0, segments=[jb.Segment(6.0, 2e7, 400.0), jb.Segment(4.0, 1e7, 300.0)]
+    ... )
+    >>> print(jb.modes(jb.Case(beam)).frequencies.round(2)[:2])
+    [ 3.22 12.83]
+    """
+
+    length: Float[Array, ""] | None = number("m", "length", POSITIVE, default=None)
+    flexural_rigidity: Float[Array, " *power"] | None = number(
+        "N m^2", "bending stiffness E I", default=None
+    )
+    mass_per_length: Float[Array, " *power"] | None = number(
+        "kg/m", "mass per length", default=None
+    )
+    width: Float[Array, " *power"] | None = number("m", "section width", default=None)
+    height: Float[Array, " *power"] | None = number("m", "section height", default=None)
+    shear_stiffness: Float[Array, " *power"] | None = number(
+        "N", "shear stiffness kappa G A", default=None
+    )
+    rotary_inertia: Float[Array, " *power"] | None = number(
+        "kg m", "mass moment of inertia per length, rho I", default=None
+    )
+    foundation_stiffness: Float[Array, " *power"] | None = number(
+        "N/m^2", "elastic foundation, force per length and deflection", default=None
+    )
+    loss_factor: Float[Array, ""] | None = number(
+        "1", "loss factor of its material", NOT_NEGATIVE, default=None
+    )
+
+
+OPTIONAL = ("shear_stiffness", "rotary_inertia", "foundation_stiffness")
+CHECKED_POSITIONS = np.linspace(0, 1, 129)  # in a segment: where its properties are validated
+LENGTH_TOLERANCE = 1e-9  # of the length of the beam
+
+
+def polynomial(coefficients, s) -> Float[Array, "*position"]:
+    """Polynomial c_0 + c_1 s + ... at s, of a list of coefficients or one number."""
+    coefficients = xp.atleast_1d(coefficients)
+    total = xp.zeros(xp.shape(s)) + coefficients[-1]
+    for power in range(coefficients.shape[0] - 2, -1, -1):
+        total = total * s + coefficients[power]
+    return total
+
+
+def degree(coefficients) -> int:
+    """Degree of a polynomial by its list of coefficients."""
+    return 0 if coefficients is None else max(xp.size(coefficients), 1) - 1
+
+
+def polynomial_degree(beam) -> int:
+    """Largest degree of any property of any segment."""
+    return max(
+        max(
+            degree(segment.width) + 3 * degree(segment.height),
+            *(degree(getattr(segment, name)) for name in OPTIONAL),
+            degree(segment.flexural_rigidity),
+            degree(segment.mass_per_length),
+        )
+        for segment in beam.segments or (Segment(),)
+    )
+
+
+def has(beam, name: str) -> bool:
+    """Whether the beam or one of its segments has an optional property."""
+    return any(getattr(part, name) is not None for part in (beam, *beam.segments))
+
+
+def segment_edges(beam) -> list:
+    """Positions (m) of the edges of the segments, from 0 to the length of the beam."""
+    edges = [xp.zeros(())]
+    for segment in beam.segments[:-1]:
+        edges.append(edges[-1] + segment.length)
+    return [*edges, beam.length]
+
+
+def rigidity(beam, segment: Segment, s) -> Float[Array, "*position"]:
+    """Bending stiffness E I (N m^2) at relative positions s, 0 to 1, of a segment."""
+    if segment.flexural_rigidity is not None:
+        return polynomial(segment.flexural_rigidity, s)
+    if segment.width is None and segment.height is None and beam.flexural_rigidity is not None:
+        return xp.zeros(xp.shape(s)) + beam.flexural_rigidity
+    width, height = _rectangle(beam, segment, s)
+    return beam.youngs_modulus * width * height**3 / 12
+
+
+def mass_per_length(beam, segment: Segment, s) -> Float[Array, "*position"]:
+    """Mass per length (kg/m) at relative positions s, 0 to 1, of a segment."""
+    if segment.mass_per_length is not None:
+        return polynomial(segment.mass_per_length, s)
+    if segment.width is None and segment.height is None and beam.mass_per_length is not None:
+        return xp.zeros(xp.shape(s)) + beam.mass_per_length
+    width, height = _rectangle(beam, segment, s)
+    return beam.density * width * height
+
+
+def optional_property(beam, segment: Segment, name: str, s) -> Float[Array, "*position"]:
+    """Shear stiffness, rotary inertia or foundation stiffness at s; zero if there is none."""
+    own = getattr(segment, name)
+    value = getattr(beam, name) if own is None else own
+    return xp.zeros(xp.shape(s)) if value is None else polynomial(value, s)
+
+
+def _rectangle(beam, segment: Segment, s):
+    sizes = (
+        getattr(beam if getattr(segment, name) is None else segment, name)
+        for name in ("width", "height")
+    )
+    return [polynomial(size, s) for size in sizes]
+
+
+def mean(beam, of) -> Float[Array, ""]:
+    """Mean over the length of a property, `rigidity` or `mass_per_length`."""
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    edges, total = segment_edges(beam), xp.zeros(())
+    for i, segment in enumerate(beam.segments):
+        values = of(beam, segment, (nodes + 1) / 2)
+        total = total + (edges[i + 1] - edges[i]) * xp.sum(weights / 2 * values)
+    return total / beam.length
+
+
+def validate_segments(address: str, beam) -> str | None:
+    """First inconsistency of the segments of a beam as an error message, or None."""
+    name = "shear_stiffness"
+    lacking = [i for i, segment in enumerate(beam.segments) if getattr(segment, name) is None]
+    if lacking and has(beam, name) and getattr(beam, name) is None:
+        return (
+            f"{address}.segments.{lacking[0]}.{name} is missing: give it to every segment, or"
+            f" {address}.{name} for those without"
+        )
+    for i, segment in enumerate(beam.segments):
+        error = _validate_segment(f"{address}.segments.{i}", beam, segment, i)
+        if error is not None:
+            return error
+    lengths = [segment.length for segment in beam.segments if segment.length is not None]
+    if lengths and all(map(is_concrete, (*lengths, beam.length))):
+        total, whole = sum(float(concrete(length)) for length in lengths), concrete(beam.length)
+        complete = len(lengths) == len(beam.segments)
+        if complete and abs(total - whole) > LENGTH_TOLERANCE * whole:
+            return (
+                f"the lengths of {address}.segments add up to {total:g} m, but {address}.length is"
+                f" {whole:g} m; leave out the length of the last segment to let it take the rest"
+            )
+        if not complete and total >= (1 - LENGTH_TOLERANCE) * whole:
+            return (
+                f"the lengths of {address}.segments add up to {total:g} m and leave nothing of"
+                f" {address}.length, {whole:g} m, for the last segment"
+            )
+    return None
+
+
+def _validate_segment(address: str, beam, segment: Segment, index: int) -> str | None:
+    if segment.length is None and index < len(beam.segments) - 1:
+        return f"{address}.length is missing; give the length in m"
+    properties = [("flexural_rigidity", "youngs_modulus"), ("mass_per_length", "density")]
+    for name, source in properties:
+        resized = segment.width is not None or segment.height is not None
+        if getattr(segment, name) is not None:
+            continue
+        if resized or getattr(beam, name) is None:
+            sizes = [
+                size
+                for size in ("width", "height")
+                if getattr(segment, size) is None and getattr(beam, size) is None
+            ]
+            absent = [f"beam.{source}"] if getattr(beam, source) is None else []
+            absent += [f"{address}.{size}" for size in sizes]
+            if absent:
+                return (
+                    f"{address}.{name} is missing; give it, or {' and '.join(absent)}, from which"
+                    " it follows"
+                )
+    positive = [("flexural_rigidity", rigidity), ("mass_per_length", mass_per_length)]
+    numbers = [leaf for part in (beam, segment) for leaf in jax.tree.leaves(part)]
+    if not all(map(is_concrete, numbers)):
+        return None
+    for name, of in positive:
+        lowest = np.min(concrete(of(beam, segment, CHECKED_POSITIONS)))
+        if not lowest > 0:
+            return f"{address}.{name} must be positive all along; it falls to {lowest:g}"
+    for name in OPTIONAL:
+        values = concrete(optional_property(beam, segment, name, CHECKED_POSITIONS))
+        if np.min(values) < 0 or (
+            name == "shear_stiffness" and has(beam, name) and not np.all(values > 0)
+        ):
+            least = "positive" if name == "shear_stiffness" else "not negative"
+            return f"{address}.{name} must be {least} all along; it falls to {np.min(values):g}"
+    return None
+
 
 SAME_POSITION = 1e-9  # of the length: closer positions are one
 

@@ -13,8 +13,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbeam.case.display.arguments import ExplainsArguments
-from jaxbeam.case.display.parts import ReprWithUnits
+from jaxbeam.case.display import ExplainsArguments, ReprWithUnits
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, PROBABILITY, number
 from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.module import Module

@@ -11,8 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 from jaxtyping import Float
 
 from jaxbeam.case.controller import Command, Measurement, Time
-from jaxbeam.case.display.arguments import ExplainsArguments
-from jaxbeam.case.display.parts import ReprWithUnits
+from jaxbeam.case.display import ExplainsArguments, ReprWithUnits
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.module import Module
 

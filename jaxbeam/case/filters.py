@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float
 
-from jaxbeam.case.display.parts import ReprWithUnits
+from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import POSITIVE, choice, concrete, count, is_concrete, number
 from jaxbeam.runtime.arrays import Array, scan, xp
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 from jaxtyping import Float
 
-from jaxbeam.case.display.parts import ReprWithUnits
+from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import (
     INCREASING,
     NOT_NEGATIVE,

@@ -14,8 +14,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.actuators.base import AbstractActuator
-from jaxbeam.case.beam import Beam, Support
-from jaxbeam.case.beam_parts.properties import has
+from jaxbeam.case.beam import Beam, Support, has
 from jaxbeam.case.case import Case, list_sizes, parts
 from jaxbeam.case.declared_checks import (
     POSITION_TOLERANCE,
@@ -26,11 +25,15 @@ from jaxbeam.case.declared_checks import (
 from jaxbeam.case.fields import ON_BEAM, concrete, is_concrete
 from jaxbeam.case.filters import nyquist_error
 from jaxbeam.case.limits import MAX_WHEELS, check_length
-from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
-from jaxbeam.case.loads.planar.sensors import VehicleSensor
-from jaxbeam.case.loads.vehicle_checks import known_numbers
-from jaxbeam.case.loads.vehicle_model import VehicleModel
-from jaxbeam.case.profiles.base import AbstractProfile
+from jaxbeam.case.loads.base import (
+    AbstractLoad,
+    VehicleModel,
+    known_numbers,
+    trajectory,
+    wheel_distances,
+)
+from jaxbeam.case.loads.planar.vehicle import VehicleSensor
+from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor, sensor_labels
 from jaxbeam.runtime.arrays import Array

@@ -24,14 +24,12 @@ from jaxbeam.cli.arguments import UsageError
 from jaxbeam.cli.commands.app import app as app_command
 from jaxbeam.cli.commands.compare import compare
 from jaxbeam.cli.commands.describe import describe
-from jaxbeam.cli.commands.engineering.assess import assess
-from jaxbeam.cli.commands.engineering.check import check
-from jaxbeam.cli.commands.engineering.influence import influence
+from jaxbeam.cli.commands.engineering import assess, check, influence
 from jaxbeam.cli.commands.export import export
 from jaxbeam.cli.commands.frequency import frf, modes, state_space
 from jaxbeam.cli.commands.identify import identify
-from jaxbeam.cli.commands.logs.modes_from_log import modes_from_log
 from jaxbeam.cli.commands.models import compare_models, design_experiment
+from jaxbeam.cli.commands.modes_from_log import modes_from_log
 from jaxbeam.cli.commands.new import new, schema
 from jaxbeam.cli.commands.simulate import simulate
 from jaxbeam.cli.commands.stability import stability

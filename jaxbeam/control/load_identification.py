@@ -1,28 +1,246 @@
-"""Load identification: settings of a case file, and its replay on the record of a run.
+"""Identification of mass and speed of a load from the readings, on line.
+
+Identification is by least squares on static influence lines, sample by sample. The position of the
+load follows from two gate times at constant speed, or from the deflections themselves: their ratio
+at two sensors or more depends on the position of a load at rest, not on its mass.
 
 In a simulation the gate times are computed from the trajectory of the load.
 """
 
+import abc
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.controller import Measurement
-from jaxbeam.case.display.parts import ReprWithUnits
+from jaxbeam.case.controller import Measurement, Time
+from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import POSITIVE, concrete, deciding, is_concrete, number
-from jaxbeam.control.load_identifiers import (
-    AbstractLoadIdentifier,
-    DeflectionIdentifier,
-    GateIdentifier,
-)
-from jaxbeam.estimation.constant_gain import sensor_offsets
+from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.estimation.observability import deflection_outputs
+from jaxbeam.estimation.observer import sensor_offsets
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.state_space import Plant, state_space
-from jaxbeam.runtime.arrays import Array, scan, xp
+from jaxbeam.runtime.arrays import Array, scan, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
+from jaxbeam.runtime.module import Module
+
+# A line through identified positions is accepted when these scatter by this share of the distance
+# over which they are identified, and their weights add up to this many of the largest weight: at
+# first the beam lags, and identified positions stand still or jump.
+MIN_TRAVEL_SPREAD, MIN_EFFECTIVE_SAMPLES = 0.1, 8
+INFLUENCE_ROUNDING = 1e-20  # of the largest squared influence; smaller ones are rounding errors
+
+
+class LoadEstimate(NamedTuple):
+    """Mass (kg), speed (m/s, negative to the left) and entry time (s) of a load.
+
+    Entry time and speed are meaningless until `speed_identified`, the mass until `mass_identified`.
+    """
+
+    mass: Float[Array, ""]
+    speed: Float[Array, ""]
+    entry_time: Float[Array, ""]
+    speed_identified: Bool[Array, ""]
+    mass_identified: Bool[Array, ""]
+
+
+class AbstractLoadSource(Module):
+    """Source of mass, speed and entry time of the load for a scheduled law, with its own state."""
+
+    def initial_state(self) -> Any:
+        """State at the start of a run."""
+        return ()
+
+    @abc.abstractmethod
+    def update(self, state: Any, measurement: Measurement, t: Time) -> tuple[LoadEstimate, Any]:
+        """Estimate at a sample at t (s), and the next state."""
+
+
+class GivenLoad(AbstractLoadSource):
+    """Load with mass (kg), speed (m/s) and entry time (s) given beforehand."""
+
+    mass: Float[Array, ""]
+    speed: Float[Array, ""]
+    entry_time: Float[Array, ""]
+
+    def update(self, state, measurement, t):
+        true = xp.ones((), bool)
+        return LoadEstimate(self.mass, self.speed, self.entry_time, true, true), state
+
+
+def given_load(load: AbstractLoad, gravity: Float[Array, ""]) -> GivenLoad:
+    """Load of a case as given; speed and entry time are NaN for a table of positions.
+
+    That of a vehicle is its total mass, entering with its first wheel.
+    """
+    numbers = load.total_mass(gravity), load.speed, load.entry_time
+    return GivenLoad(*(xp.asarray(xp.nan if x is None else x) for x in numbers))
+
+
+class AbstractLoadIdentifier(AbstractLoadSource):
+    """Least-squares identification of a load from deflections; its state are sums over samples.
+
+    `influence_lines` (m/N) are deflections at the sensors `sensor_indices` under a unit force at
+    positions spaced evenly along the beam, by the modes of the design model (exact ones:
+    `jaxbeam.model.statics.influence_line`); `static_lift` is the static deflection there per unit
+    of each command, `offset` the offset of the readings (m). `until` is the share of the crossing
+    up to which samples are used. Samples at which a deflection is missing are left out.
+    """
+
+    length: Float[Array, ""]
+    gravity: Float[Array, ""]
+    influence_lines: Float[Array, "sensor position"]
+    static_lift: Float[Array, "sensor actuator"]
+    offset: Float[Array, " sensor"]
+    until: Float[Array, ""]
+    sensor_indices: tuple[int, ...] = eqx.field(static=True)
+
+    @abc.abstractmethod
+    def estimate(self, sums: Float[Array, " sum"], t: Time) -> LoadEstimate:
+        """Estimate from the sums, at t (s)."""
+
+    @abc.abstractmethod
+    def increments(
+        self, sums: Float[Array, " sum"], deflections: Float[Array, " sensor"], t: Time
+    ) -> Float[Array, " sum"]:
+        """Increments of the sums by the deflections (m) due to the load alone, at t (s)."""
+
+    def update(self, state, measurement, t):
+        readings = measurement.readings[np.array(self.sensor_indices)] - self.offset
+        deflections = readings - self.static_lift @ measurement.command
+        increments = self.increments(state, deflections, t)
+        sums = state + xp.where(measurement.complete(self.sensor_indices), increments, 0.0)
+        return self.estimate(sums, t), sums
+
+    def fitted_mass(self, cross_sum, square_sum) -> Float[Array, ""]:
+        """Mass (kg) by least squares, sum a y / (g sum a^2) with influence a, reading y; or 0."""
+        observable = square_sum > 0
+        weight = xp.where(observable, cross_sum / xp.where(observable, square_sum, 1.0), 0.0)
+        return weight / self.gravity
+
+
+class GateIdentifier(AbstractLoadIdentifier):
+    """Speed and entry time from two gates, mass from deflections after the second gate.
+
+    `gates` (m) are passed at `gate_times` (s). The sums are those of a y and a^2, with the
+    influence a at the position of the load and the deflection y.
+    """
+
+    gates: Float[Array, "2"]
+    gate_times: Float[Array, "2"]
+
+    def initial_state(self):
+        return xp.zeros(2)
+
+    @property
+    def speed(self) -> Float[Array, ""]:
+        """Speed (m/s), negative to the left."""
+        return xp.diff(self.gates)[0] / xp.diff(self.gate_times)[0]
+
+    @property
+    def entry_time(self) -> Float[Array, ""]:
+        """Time (s) at which the load enters the beam at constant speed."""
+        start = xp.where(self.speed < 0, self.length, 0.0)
+        return self.gate_times[1] + (start - self.gates[1]) / self.speed
+
+    def crossing_share(self, t: Time) -> Float[Array, ""]:
+        """Share of the crossing that is completed at t (s)."""
+        return (t - self.entry_time) * xp.abs(self.speed) / self.length
+
+    def estimate(self, sums, t):
+        speed_identified = t >= self.gate_times[1]
+        mass_identified = speed_identified & (self.crossing_share(t) >= self.until)
+        mass = self.fitted_mass(*sums)
+        return LoadEstimate(mass, self.speed, self.entry_time, speed_identified, mass_identified)
+
+    def increments(self, sums, deflections, t):
+        share = self.crossing_share(t)
+        *_, speed_identified, mass_identified = self.estimate(sums, t)
+        relative_position = xp.where(self.speed < 0, 1 - share, share)
+        positions = np.linspace(0, 1, self.influence_lines.shape[1])
+        influence = xp.stack(
+            [xp.interp(relative_position, positions, line) for line in self.influence_lines]
+        )
+        active = speed_identified & ~mass_identified & (share > 0)
+        return xp.where(active, xp.stack([influence @ deflections, influence @ influence]), 0.0)
+
+
+class DeflectionIdentifier(AbstractLoadIdentifier):
+    """Speed, entry time and mass from deflections that exceed a `threshold` (m).
+
+    At each sample the position x is the one whose influence lines fit the deflections best. Speed
+    and entry time follow from a straight line through these positions over time, weighted by the
+    fourth power of the size of the deflections. The sums are those of the weights w, of w t, w t^2,
+    w x and w t x, of a y and a^2 as in `GateIdentifier`, and the largest w.
+    """
+
+    threshold: Float[Array, ""]
+
+    def initial_state(self):
+        return xp.zeros(8)
+
+    def estimate(self, sums, t):
+        speed, entry_time, determined = self._fitted_line(sums)
+        travelled = (t - entry_time) * xp.abs(speed)
+        identified = determined & (travelled >= self.until * self.length)
+        mass = self.fitted_mass(*sums[5:7])
+        return LoadEstimate(mass, speed, entry_time, identified, identified)
+
+    def increments(self, sums, deflections, t):
+        position, cross_product, squared_influence = self._best_position(deflections)
+        weight = xp.sum(deflections**2) ** 2
+        line_sums = weight * xp.stack([xp.ones(()), t, t**2, position, t * position])
+        peak_increment = xp.maximum(weight - sums[7], 0.0)
+        increments = xp.concatenate(
+            [line_sums, xp.stack([cross_product, squared_influence, peak_increment])]
+        )
+        identified = self.estimate(sums, t).mass_identified
+        active = ~identified & (xp.max(xp.abs(deflections)) > self.threshold)
+        return xp.where(active, increments, 0.0)
+
+    def _best_position(self, deflections):
+        """Position (m) whose influence lines a fit the deflections y best, with a y and a^2 there.
+
+        The maximum of (a y)^2 / a^2 over the positions, refined by a parabola.
+        """
+        squares = xp.sum(self.influence_lines**2, axis=0)
+        products = deflections @ self.influence_lines
+        # At a support the lines are zero but for rounding, whose ratio may fit any deflections.
+        observable = squares > INFLUENCE_ROUNDING * xp.max(squares)
+        explained = xp.where(observable, products**2 / xp.where(observable, squares, 1.0), 0.0)
+        best = xp.clip(xp.argmax(explained), 1, squares.shape[0] - 2)
+        left, centre, right = (take(explained, best + k) for k in (-1, 0, 1))
+        curvature = left - 2 * centre + right
+        concave = curvature < 0
+        vertex = xp.where(concave, (left - right) / (2 * xp.where(concave, curvature, -1.0)), 0.0)
+        index = best + xp.clip(vertex, -0.5, 0.5)
+        position = index * self.length / (squares.shape[0] - 1)
+        return position, take(products, best), take(squares, best)
+
+    def _fitted_line(self, sums):
+        """Speed (m/s) and entry time (s) of the fitted line, and whether they are determined.
+
+        Until they are determined: one beam length per second, and zero.
+        """
+        total, t, square, x, product = sums[:5]
+        time_variance = total * square - t**2
+        determined = time_variance > 1e-9 * total * square
+        speed = (total * product - t * x) / xp.where(determined, time_variance, 1.0)
+        min_travel = MIN_TRAVEL_SPREAD * self.until * self.length
+        determined = (
+            determined
+            & (speed**2 * time_variance > (min_travel * total) ** 2)
+            & (total > MIN_EFFECTIVE_SAMPLES * sums[7])
+        )
+        speed = xp.where(determined, speed, self.length)
+        start = xp.where(speed < 0, self.length, 0.0)
+        total = xp.where(determined, total, 1.0)
+        entry_time = xp.where(determined, t / total + (start - x / total) / speed, 0.0)
+        return speed, entry_time, determined
+
 
 INFLUENCE_POSITIONS = 201  # load positions along the beam at which influence lines are tabulated
 

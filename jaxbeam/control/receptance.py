@@ -23,7 +23,7 @@ from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.output_feedback import OutputFeedback
+from jaxbeam.control.feedback import OutputFeedback
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.runtime.arrays import Array, is_jax, solve, xp
 from jaxbeam.runtime.module import Module

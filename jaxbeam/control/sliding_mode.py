@@ -14,8 +14,11 @@ from jaxtyping import Float
 
 from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.fields import ON_BEAM, POSITIVE, choice, concrete, is_concrete, number
-from jaxbeam.control.state_controller import AbstractStateController, deflection_rows
-from jaxbeam.control.state_law import AbstractStateLaw
+from jaxbeam.control.state_controller import (
+    AbstractStateController,
+    AbstractStateLaw,
+    deflection_rows,
+)
 from jaxbeam.runtime.arrays import Array, solve, xp
 
 SMALLEST_EFFECT = 1e-9  # of the commands on the surfaces, of that on all modes

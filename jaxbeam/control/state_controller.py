@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -9,16 +10,22 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, crossing_times
-from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.estimator import AbstractEstimator
-from jaxbeam.case.fields import choice, concrete, is_concrete, part
-from jaxbeam.control.design_model import DesignModel
-from jaxbeam.control.state_law import (
-    AbstractStateLaw,
-    ContinuousStateLaw,
-    SampledStateLaw,
-    TrueState,
+from jaxbeam.case.controller import (
+    AbstractContinuousLaw,
+    AbstractController,
+    AbstractSampledLaw,
+    ControlStep,
+    Measurement,
+    Time,
 )
+from jaxbeam.case.estimator import (
+    AbstractContinuousFilter,
+    AbstractEstimator,
+    AbstractSampledFilter,
+    Estimate,
+)
+from jaxbeam.case.fields import choice, concrete, is_concrete, number, part
+from jaxbeam.control.design_model import DesignModel
 from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.estimation.simulated_vehicles import ContinuousWithVehicles, SampledWithVehicles
 from jaxbeam.model.linear_system import StateSpace
@@ -27,6 +34,101 @@ from jaxbeam.model.sensing.output_rows import modal_row
 from jaxbeam.model.state_space import Plant, build_plant, state_space
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
+from jaxbeam.runtime.module import Module
+
+
+class AbstractStateLaw(Module):
+    """Control law fed by an estimate of the state of its plant; static laws have an empty state.
+
+    Fields of the class hold the design; they are constant during a run.
+    """
+
+    @property
+    def needs_vehicles(self) -> bool:
+        """Whether the estimate must have the states of the vehicles."""
+        return False
+
+    def initial_state(self) -> Any:
+        """State of the law at the start of a run."""
+        return ()
+
+    @abc.abstractmethod
+    def step(
+        self, state: Any, estimate: Estimate, measurement: Measurement, t: Time
+    ) -> ControlStep:
+        """Command for an estimate at t (s), and the next state of the law."""
+
+    def tabulated(self, times: Float[Array, " sample"]) -> "AbstractStateLaw":
+        """As `AbstractSampledLaw.tabulated`."""
+        return self
+
+
+class GainLaw(AbstractStateLaw):
+    """u = -K x with a constant gain K; with `feeds_back_command` x ends with the last command."""
+
+    gain: Float[Array, "actuator column"]
+    feeds_back_command: bool = eqx.field(static=True, default=False)
+
+    def step(self, state, estimate, measurement, t):
+        x = estimate.state
+        if self.feeds_back_command:
+            x = xp.concatenate([x, measurement.command])
+        return ControlStep(-self.gain @ x, state)
+
+
+class TrueState(AbstractSampledFilter, AbstractContinuousFilter):
+    """Full state information: the estimate is the true state of the plant in other coordinates.
+
+    `state_map` maps the states of the plant to those of the design plant.
+    """
+
+    state_map: Float[Array, "design_state state"]
+
+    def update(self, state, measurement, t):
+        return self.estimate(state, measurement, t), state
+
+    def estimate(self, state, measurement, t):
+        return Estimate(self.state_map @ measurement.state)
+
+    def rates(self, state, measurement, command, t):
+        return state
+
+
+class SampledStateLaw(AbstractSampledLaw):
+    """State law behind a filter at samples; the state holds those of the law and of the filter."""
+
+    law: AbstractStateLaw
+    filter: AbstractSampledFilter
+
+    def initial_state(self):
+        return self.law.initial_state(), self.filter.initial_state()
+
+    def tabulated(self, times):
+        return SampledStateLaw(self.law.tabulated(times), self.filter.tabulated(times))
+
+    def step(self, state, measurement, t):
+        law_state, filter_state = state
+        estimate, filter_state = self.filter.update(filter_state, measurement, t)
+        command, law_state, solved = self.law.step(law_state, estimate, measurement, t)
+        return ControlStep(command, (law_state, filter_state), solved)
+
+
+class ContinuousStateLaw(AbstractContinuousLaw):
+    """Static state law behind a filter in continuous time; the states are those of the filter."""
+
+    law: AbstractStateLaw
+    filter: AbstractContinuousFilter
+
+    @property
+    def state_count(self):
+        return self.filter.state_count
+
+    def command(self, state, measurement, t):
+        estimate = self.filter.estimate(state, measurement, t)
+        return self.law.step(self.law.initial_state(), estimate, measurement, t).command
+
+    def rates(self, state, measurement, command, t):
+        return self.filter.rates(state, measurement, command, t)
 
 
 class AbstractStateController(AbstractController):
@@ -170,3 +272,35 @@ def deflection_rows(
     rows = modal_row(plant.modal_model.fields, plant.case, positions, "deflection")
     rows = rows / plant.coordinate_scale
     return xp.pad(rows, ((0, 0), (0, plant.modal_model.state_count - rows.shape[1])))
+
+
+class StateFeedback(AbstractStateController):
+    """u = -K z with the state z, in the order and units of `state_space(case, coordinates)`.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3)],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+    ...     controller=jb.StateFeedback(gain=[[3e3, 30.0]], period=0.005),
+    ...     run=jb.Run(0.15),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    1.149 mm
+    """
+
+    kind: ClassVar[str] = "state"
+
+    gain: Float[Array, "actuator state"] = number(
+        "unit of a command per state", "gain, a row for each actuator"
+    )
+
+    def validate(self, case):
+        shape = (len(case.driven), self.state_count(case))
+        if self.gain.shape != shape:
+            return f"gain must have a row for each actuator, a column for each state: {shape}"
+        return super().validate(case)
+
+    def design_state_law(self, plant, design_plant):
+        return GainLaw(self.gain)

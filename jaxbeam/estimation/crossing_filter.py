@@ -1,20 +1,23 @@
-"""Kalman filter at samples for a plant with its moving loads."""
+"""Filters of plants that vary while loads cross, of known loads and of loads that they follow."""
 
 import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.estimator import AbstractSampledFilter, Estimate
-from jaxbeam.estimation.constant_gain import sensor_offsets
-from jaxbeam.estimation.gains import filter_gain
+from jaxbeam.case.estimator import AbstractSampledFilter, Estimate, EstimatedLoads
+from jaxbeam.estimation.observer import filter_gain, sensor_offsets
 from jaxbeam.estimation.sampled_plant import Transition, in_blocks
 from jaxbeam.estimation.sensor_chain import FilteredPlant, SensorChain
 from jaxbeam.estimation.simulated_vehicles import with_loads
+from jaxbeam.model.linear_system import Signal, StateSpace
+from jaxbeam.model.sensing.output_rows import OutputRows
+from jaxbeam.model.vehicle_contact import mass_contact_rows
 from jaxbeam.numerics.matrices import symmetric_part
-from jaxbeam.runtime.arrays import Array, take, xp
+from jaxbeam.runtime.arrays import Array, add_at, take, xp
 
 Square = Float[Array, "state state"]
 
@@ -130,3 +133,151 @@ def corrected(
     error_matrix = xp.eye(covariance.shape[0]) - gain @ C
     after = error_matrix @ covariance @ error_matrix.T + gain @ noise_covariance @ gain.T
     return gain, symmetric_part(after)
+
+
+NUMBERS = 3  # of each load: position (m), speed (m/s), mass (kg)
+LoadNumbers = Float[Array, "*variant load"]
+
+
+class FollowingState(NamedTuple):
+    """Estimate x after a sample, its covariance, and the command of that sample."""
+
+    x: Float[Array, " state"]
+    covariance: Square
+    command: Float[Array, " actuator"]
+
+
+class LoadFollowingFilter(AbstractSampledFilter):
+    """Kalman filter of a plant linearised about the estimated positions, speeds and masses.
+
+    The first `plant_states` states x are those of the plant; those of analogue filters follow, the
+    positions (m), speeds (m/s) and masses (kg) of the loads, and the states of the sensors. Given
+    the numbers of the loads the plant is linear, and its transition that of `SampleTiming`: loads
+    travel at their speeds through a period. Derivatives by these numbers are central differences
+    over `steps`. `output_rows` are those of the plant; a share `inertia_share` of each mass follows
+    the beam: 1, or 0 for a force. `scale` and `noise_intensity` are those of the states before the
+    sensors.
+    """
+
+    filtered: FilteredPlant
+    output_rows: OutputRows
+    sensor_chain: SensorChain
+    scale: Float[Array, " loaded"]
+    noise_intensity: Float[Array, "loaded loaded"]
+    initial: Float[Array, " state"]
+    initial_covariance: Square
+    steps: Float[Array, " number"]
+    inertia_share: Float[Array, " load"]
+    plant_states: int = eqx.field(static=True)
+
+    def initial_state(self):
+        commands = self.filtered.plant.commands
+        return FollowingState(self.initial, self.initial_covariance, xp.zeros(commands))
+
+    def update(self, state, measurement, t):
+        command = measurement.command
+        x, covariance = self.predict(state, command, t)
+        C, D, slopes = self._readings(x, command)
+        readings = C @ x + D @ command + sensor_offsets(self.filtered.plant)
+        rows = add_at(C, np.s_[:, self._numbers], slopes)
+        if measurement.present is not None:  # a missing reading corrects neither x nor covariance
+            rows = xp.where(measurement.present[:, None], rows, 0.0)
+        gain, covariance = corrected(covariance, rows, self.sensor_chain.noise_covariance)
+        x = x + gain @ measurement.innovation(readings)
+        return self._estimate(x), FollowingState(x, covariance, command)
+
+    def predict(
+        self, state: FollowingState, command: Float[Array, " actuator"], t: Float[Array, ""]
+    ) -> tuple[Float[Array, " state"], Square]:
+        """State at the sample at t (s), before its readings, and its covariance."""
+        variants = self._variants(state.x)
+        start = t - self.sensor_chain.timing.period
+
+        def system_at(times):
+            elapsed = (times - start)[..., None]
+            # Times of a variant may be split into parts along a last axis.
+            position, speed, mass = (
+                part[:, None] if elapsed.ndim > 2 else part for part in variants
+            )
+            return self._system(position + speed * elapsed, speed + 0.0 * elapsed, mass)
+
+        times = xp.full(variants[0].shape[:1], t)
+        transition = self.sensor_chain.transition(
+            system_at, self.noise_intensity, self.scale, times
+        )
+        states = transition.predict(state.x, state.command, command)
+        jacobian = add_at(transition.matrix[0], np.s_[:, self._numbers], self._slopes(states))
+        covariance = jacobian @ state.covariance @ jacobian.T + transition.noise_covariance[0]
+        return states[0], symmetric_part(covariance)
+
+    def _readings(self, x, command):
+        """C and D of the readings, and their derivatives by the numbers of the loads."""
+        position, speed, mass = self._variants(x)
+        system = self._system(position, speed, mass)
+        C, D = self.sensor_chain.output_matrices(system.C, system.D)
+        return C[0], D[0], self._slopes(C @ x + D @ command)
+
+    @property
+    def _numbers(self) -> slice:
+        """Index of the positions, speeds and masses among the states."""
+        end = self.sensor_chain.plant_states
+        return slice(end - self.steps.shape[0], end)
+
+    def _variants(self, x) -> tuple[LoadNumbers, LoadNumbers, LoadNumbers]:
+        """Positions, speeds and masses as estimated, then each larger, then each smaller."""
+        steps = xp.diag(self.steps)
+        changes = xp.concatenate([xp.zeros((1, steps.shape[0])), steps, -steps])
+        parts = (x[self._numbers] + changes).reshape(changes.shape[0], NUMBERS, -1)
+        return parts[:, 0], parts[:, 1], parts[:, 2]
+
+    def _slopes(self, values: Float[Array, "variant row"]) -> Float[Array, "row number"]:
+        """Derivatives of values by the numbers of the loads."""
+        larger, smaller = xp.split(values[1:], 2)
+        return ((larger - smaller) / (2 * self.steps[:, None])).T
+
+    def _system(self, position, speed, mass) -> StateSpace:
+        """Plant under loads of some positions, speeds and masses, which are its last states."""
+        plant = self.filtered.plant
+        speed, mass = (xp.broadcast_to(part, position.shape) for part in (speed, mass))
+        on_beam = (position >= 0) & (position <= plant.case.beam.length)
+        inertia = self.inertia_share * xp.maximum(mass, 0.0)
+        contact = mass_contact_rows(plant.modal_model, position, speed, on_beam, inertia)
+        system, commands = plant.with_contact(contact, self.output_rows), plant.commands
+        times, loads, gravity = position.shape[:-1], position.shape[-1], plant.case.run.gravity
+
+        def of_numbers(inputs):
+            """Columns of positions, speeds and masses."""
+            zeros = xp.zeros((*inputs.shape[:-1], 2 * loads))
+            return xp.concatenate([zeros, inputs[..., commands:] * gravity], axis=-1)
+
+        # The rates of the positions are the speeds; speeds and masses stay.
+        size, states = NUMBERS * loads, system.A.shape[-1]
+        motion = np.eye(loads, states + size, k=states + loads)
+        below = xp.pad(motion, ((0, size - loads), (0, 0)))
+        below = xp.broadcast_to(below, (*times, *below.shape))
+        upper = xp.concatenate([system.A, of_numbers(system.B)], axis=-1)
+        A = xp.concatenate([upper, below], axis=-2)
+        rows = [*[(0, 0)] * len(times), (0, size), (0, 0)]
+        C = xp.concatenate([system.C, of_numbers(system.D)], axis=-1)
+        names = ("position", "m"), ("speed", "m/s"), ("mass", "kg")
+        signals = tuple(
+            Signal(f"load_{i}_{name}", unit) for name, unit in names for i in range(loads)
+        )
+        system = StateSpace(
+            A=A,
+            B=xp.pad(system.B[..., :commands], rows),
+            C=C,
+            D=system.D[..., :commands],
+            states=system.states + signals,
+            inputs=system.inputs[:commands],
+            outputs=system.outputs,
+        )
+        return self.filtered.with_filtered_outputs(system)
+
+    def _estimate(self, x) -> Estimate:
+        plant = self.filtered.plant
+        positions, speeds, masses = x[self._numbers].reshape(NUMBERS, -1)
+        on_beam = (positions >= 0) & (positions <= plant.case.beam.length)
+        weights = xp.where(on_beam, masses * plant.case.run.gravity, 0.0)
+        loads = EstimatedLoads(masses, positions, speeds)
+        return Estimate(x[: self.plant_states], weights, loads=loads)

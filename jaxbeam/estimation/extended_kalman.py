@@ -7,12 +7,12 @@ from jaxtyping import Float
 
 from jaxbeam.case.fields import NOT_NEGATIVE, concrete, is_concrete, number
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.estimation.kalman_noise import (
+from jaxbeam.estimation.crossing_filter import NUMBERS, LoadFollowingFilter
+from jaxbeam.estimation.kalman import (
     AbstractKalmanEstimator,
     modal_noise_intensity,
     reading_variance,
 )
-from jaxbeam.estimation.load_following_filter import NUMBERS, LoadFollowingFilter
 from jaxbeam.estimation.observability import detectability_error, mode_count
 from jaxbeam.estimation.sensor_chain import filtered_plant, sensor_chain
 from jaxbeam.model.state_space import Plant

@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from jaxbeam.case.estimator import AbstractEstimator, AbstractSampledFilter, Estimate
 from jaxbeam.case.fields import POSITIVE, concrete, number
-from jaxbeam.estimation.constant_gain import sensor_offsets
 from jaxbeam.estimation.observability import (
     UNOBSERVABLE,
     ConditioningWarning,
@@ -17,6 +16,7 @@ from jaxbeam.estimation.observability import (
     deflection_mode_shapes,
     deflection_outputs,
 )
+from jaxbeam.estimation.observer import sensor_offsets
 from jaxbeam.estimation.sampled_plant import Transition
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.runtime.arrays import Array, set_at, xp

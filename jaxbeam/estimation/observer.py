@@ -1,20 +1,103 @@
-"""Luenberger observer: the poles of the estimation error are placed."""
+"""Observers of constant gain: by poles, and gains of stationary Kalman filters."""
 
 from typing import ClassVar
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.estimator import AbstractEstimator
+from jaxbeam.case.estimator import AbstractEstimator, AbstractSampledFilter, Estimate
 from jaxbeam.case.fields import POSITIVE, concrete, number
-from jaxbeam.estimation.constant_gain import ConstantGainFilter, sensor_offsets
 from jaxbeam.estimation.continuous import TimeInvariantFilter
-from jaxbeam.estimation.gains import placed_gain
 from jaxbeam.estimation.observability import mode_count, observability_error
-from jaxbeam.estimation.sampled_plant import SampleTiming
+from jaxbeam.estimation.sampled_plant import SampleTiming, Transition
 from jaxbeam.model.linear_system import StateSpace
+from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance, c2d
-from jaxbeam.runtime.arrays import Array, set_at, xp
+from jaxbeam.numerics.riccati import care, dare
+from jaxbeam.runtime.arrays import Array, set_at, solve, xp
+
+
+class ConstantGainFilter(AbstractSampledFilter):
+    """x = prediction + gain (y - C prediction - D u - offset), with the `transition` of a period.
+
+    A missing reading corrects nothing.
+
+    The first `plant_states` states x are those of the plant; states of the sensors may follow. The
+    state of the filter is x and the command of the last sample.
+    """
+
+    transition: Transition
+    C: Float[Array, "sensor state"]
+    D: Float[Array, "sensor actuator"]
+    offset: Float[Array, " sensor"]
+    gain: Float[Array, "state sensor"]
+    plant_states: int = eqx.field(static=True)
+
+    def initial_state(self):
+        return xp.zeros(self.C.shape[1]), xp.zeros(self.D.shape[1])
+
+    def update(self, state, measurement, t):
+        x, command = state[0], measurement.command
+        x = self.transition.predict(x, state[1], command)
+        innovation = measurement.innovation(self.offset + self.C @ x + self.D @ command)
+        x = x + self.gain @ innovation
+        return Estimate(x[: self.plant_states]), (x, command)
+
+
+def sensor_offsets(plant: Plant) -> Float[Array, " sensor"]:
+    """Offsets of the sensors, in the units of their quantities."""
+    return xp.array([sensor.offset for sensor in plant.case.sensors]).reshape(-1)
+
+
+Square = Float[Array, "state state"]
+Rows = Float[Array, "output state"]
+Outputs = Float[Array, "output output"]
+Gain = tuple[Float[Array, "state output"], Square]
+
+
+def kalman_gain(A: Square, C: Rows, Q: Square, R: Outputs) -> Gain:
+    """Gain L of the filter x' = A x + B u + L (y - C x) in continuous time, and its covariance P.
+
+    Q and R are the intensities of the white noise of x' and of y. Eqs (4.5) and (4.6) of the
+    thesis, corrected: L = P C' R^-1, A P + P A' - P C' R^-1 C P + Q = 0. Differentiable. Raises
+    ValueError as `riccati.care` does.
+    """
+    covariance = care(A.T, C.T, Q, R)
+    return solve(R, C @ covariance).T, covariance
+
+
+def sampled_kalman_gain(A: Square, C: Rows, Q: Square, R: Outputs) -> Gain:
+    """Gain K of the sampled filter, which adds K (y - C x) to a prediction x, and its covariance.
+
+    x_(k+1) = A x_k + B u_k + w, y = C x + v with covariances Q of w and R of v. The covariance is
+    that of the prediction. Differentiable. Raises ValueError as `riccati.dare` does.
+    """
+    covariance = dare(A.T, C.T, Q, R)
+    return filter_gain(covariance, C, R), covariance
+
+
+def filter_gain(covariance: Square, C: Rows, R: Outputs) -> Float[Array, "state output"]:
+    """Gain K = P C' (C P C' + R)^-1 for a prediction of covariance P."""
+    return solve(C @ covariance @ C.T + R, C @ covariance).T
+
+
+def placed_gain(A: Square, C: Rows, desired: Square) -> Float[Array, "state output"]:
+    """L with which A - L C has the eigenvalues of the matrix `desired`; differentiable.
+
+    From A'X - X desired = C'C and L' = C X^-1 (Bhattacharyya and de Souza, Systems & Control
+    Letters 1, 1982). A and `desired` must have no common eigenvalue, and both be observable through
+    C; otherwise the result is NaN or meaningless.
+    """
+    scale = balance(A)
+    A, desired = A * scale / scale[:, None], desired * scale / scale[:, None]
+    rows = C * scale
+    row_norms = xp.sqrt(xp.sum(rows**2, axis=1))
+    rows = rows / row_norms[:, None]
+    identity = xp.eye(A.shape[0])
+    sylvester = xp.kron(A.T, identity) - xp.kron(identity, desired.T)
+    X = solve(sylvester, (rows.T @ rows).reshape(-1)).reshape(A.shape)
+    return scale[:, None] * solve(X.T, rows.T) / row_norms
 
 
 class Observer(AbstractEstimator):

@@ -15,8 +15,7 @@ from jaxtyping import Float
 from jaxbeam.case.filters import filter_step
 from jaxbeam.estimation.sampled_plant import SampleTiming, Transition, split_delay
 from jaxbeam.model.linear_system import StateSpace
-from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
-from jaxbeam.model.sensing.sensor_signals import Sections, sensor_sections
+from jaxbeam.model.sensing.sensor_signals import Sections, sensor_sections, with_sensor_filters
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.module import Module

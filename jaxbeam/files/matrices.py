@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxbeam.files.spreadsheet import as_text_cell
+from jaxbeam.files.tables import as_text_cell
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.runtime.whole_file import whole_file
 

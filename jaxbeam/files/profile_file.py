@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from jaxbeam.case.profiles.table import TableProfile
+from jaxbeam.case.profiles.shapes import TableProfile
 from jaxbeam.runtime.input_file import read_text_input
 
 POINTS = ("positions", "heights", "point_heights")  # keys of a profile in the case file itself

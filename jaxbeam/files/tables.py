@@ -1,7 +1,14 @@
-"""Results as files for other programs, by their ending: tables of columns, and whole datasets."""
+"""Tables of records and sweeps: CSV, Excel, MATLAB and Parquet.
+
+A cell that begins with = + - @, a tab or a line break is a formula, or may become one, to Excel,
+LibreOffice and Google Sheets, in .csv files as in .xlsx. An apostrophe before it makes it text
+("CSV Injection", OWASP).
+"""
 
 import itertools
+import json
 import os
+import re
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -9,12 +16,36 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxbeam.case.case import Case, address_words, unit_at
+from jaxbeam.case.sensors import sensor_labels
+from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.files.endings import DATASETS, RESULTS, TABLES, check_ending
-from jaxbeam.files.spreadsheet import as_text_cell
 from jaxbeam.runtime.whole_file import whole_file
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
+
+
+_FORMULA = re.compile(r"'*[=+\-@\t\r\n＝＋－＠]")
+
+
+def as_text_cell(text: str) -> str:
+    """Text of a cell that no spreadsheet runs; `from_text_cell` restores it.
+
+    >>> as_text_cell("=1+1"), as_text_cell("midspan")
+    ("'=1+1", 'midspan')
+    """
+    return f"'{text}" if _FORMULA.match(text) else text
+
+
+def from_text_cell(cell: str) -> str:
+    """The text of which `as_text_cell` made a cell.
+
+    >>> from_text_cell("'=1+1"), from_text_cell("'t Zand")
+    ('=1+1', "'t Zand")
+    """
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
+
 
 Columns = Mapping[str, np.ndarray]  # equally long, of numbers or texts, by their heads
 MAX_EXCEL_ROWS = 1_048_575  # below the heads
@@ -26,7 +57,7 @@ def save(result: Any, path: str | os.PathLike, overwrite: bool = False) -> None:
     The ending decides: .nc and .zarr hold its dataset, with units and coordinates; .csv (UTF-8, all
     digits), .xlsx, .mat and .parquet its `columns`, with units in their heads (`write_table`); a
     text that a spreadsheet would run as a formula has an apostrophe before it in the first two. Of
-    a sweep, a row for each run (`files.sweep_table.sweep_columns`). Raises FileExistsError if the
+    a sweep, a row for each run (`sweep_columns`). Raises FileExistsError if the
     file exists, without `overwrite`; ValueError for another ending; ImportError, with what to
     install, if a package is missing.
 
@@ -40,8 +71,6 @@ def save(result: Any, path: str | os.PathLike, overwrite: bool = False) -> None:
     path = Path(path)
     check_ending(path, "a result", RESULTS)
     if hasattr(result, "data_vars"):  # the dataset of a sweep
-        from jaxbeam.files.sweep_table import sweep_columns
-
         columns = sweep_columns(result) if path.suffix in TABLES else {}
         write_result(path, lambda: columns, lambda: result, overwrite)
     else:
@@ -183,3 +212,69 @@ WRITERS: dict[str, Callable[[Path, Columns], None]] = {
     ".mat": _write_matlab,
     ".parquet": _write_parquet,
 }
+
+
+MAX_LOADS = 8  # wheels with a column each; of more the least contact force of all
+
+
+def sweep_columns(dataset: "xarray.Dataset") -> dict[str, np.ndarray]:
+    """Columns of the dataset of a sweep by head, as "speed of the load (m/s)"; a row for each run.
+
+    Swept values, peaks of all sensors with their times, smallest contact forces in N, and whether
+    the run failed (1) or not (0); histories are left out. `pandas.DataFrame(columns)` works. Raises
+    ValueError for a dataset that is not that of a sweep.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> case = jb.Case(
+    ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingForce(force=5.0, speed=2.0)]
+    ... )
+    >>> runs = jb.sweep(case, {"loads.0.speed": [1.0, 2.0]}, progress=False)
+    >>> print(next(iter(sweep_columns(runs))))
+    speed of the load (m/s)
+    """
+    if "failed" not in dataset or "case" not in dataset.attrs:
+        raise ValueError("not a sweep of jaxbeam: the dataset lacks its runs or its case")
+    case = case_from_dict(json.loads(dataset.attrs["case"]))
+    failed = dataset["failed"]
+
+    def of_runs(values: "xarray.DataArray") -> np.ndarray:
+        return values.broadcast_like(failed).transpose(*failed.dims).values.ravel()
+
+    names = dict.fromkeys([*map(str, failed.dims), *map(str, dataset.coords)])
+    columns = {
+        _head(case, name): of_runs(dataset[name])
+        for name in names
+        if "." in name and name in dataset.coords
+    }
+    labels = [str(label) for label in np.atleast_1d(dataset["sensor"].values)]
+    for i, label in enumerate(labels):
+        sensor = case.sensors[sensor_labels(case.sensors).index(label)]
+        name = sensor.name or f"sensor {label.partition(':')[0]}"
+        peak, time = f"peak_{sensor.quantity}", "peak_time"
+        words = f"{name} peak {sensor.quantity}"
+        columns[words + _in_brackets(sensor.unit)] = of_runs(_entry(dataset[peak], "sensor", i))
+        columns[f"time of {words} (s)"] = of_runs(_entry(dataset[time], "sensor", i))
+    forces = dataset.get("lowest_contact_force", None)
+    if forces is not None and "load" in forces.dims and 0 < forces.sizes["load"] <= MAX_LOADS:
+        for i in range(forces.sizes["load"]):
+            columns[f"load {i} lowest contact force (N)"] = of_runs(forces.isel(load=i))
+    elif forces is not None and forces.size:
+        columns["lowest contact force (N)"] = of_runs(forces.min("load"))
+    return columns | {"failed": of_runs(failed)}
+
+
+def _entry(values: "xarray.DataArray", dim: str, index: int) -> "xarray.DataArray":
+    return values.isel({dim: index}) if dim in values.dims else values
+
+
+def _head(case: Case, address: str) -> str:
+    try:
+        unit = unit_at(case, address)
+    except ValueError:  # a word has no unit
+        unit = ""
+    return address_words(case, address) + _in_brackets(unit)
+
+
+def _in_brackets(unit: str) -> str:
+    return "" if unit in ("", "1") else f" ({unit})"

@@ -16,8 +16,7 @@ from jaxbeam.integrator.peaks.monitored_rows import (
 from jaxbeam.integrator.propagators import PEAK_NODES, Propagators, propagators
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.sensing.corrected_rows import LoadInfluence, StaticCorrection
-from jaxbeam.model.sensing.linear_outputs import linear_outputs
+from jaxbeam.model.sensing.corrected_rows import LoadInfluence, StaticCorrection, linear_outputs
 from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.module import Module

@@ -43,7 +43,7 @@ from jaxbeam.integrator.vehicles.steps import (
 )
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.vehicles.vehicle_states import initial_vehicle_states
+from jaxbeam.model.vehicle_contact import initial_vehicle_states
 from jaxbeam.runtime.arrays import (
     Array,
     any_jax,

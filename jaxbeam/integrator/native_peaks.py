@@ -42,11 +42,10 @@ from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import LoadSet, WheelSet
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.sensing.corrected_rows import StaticCorrection
-from jaxbeam.model.sensing.linear_outputs import linear_outputs
+from jaxbeam.model.sensing.corrected_rows import StaticCorrection, linear_outputs
 from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.model.settlement import has_settlement
-from jaxbeam.model.vehicles.vehicle_states import initial_vehicle_states
+from jaxbeam.model.vehicle_contact import initial_vehicle_states
 from jaxbeam.numerics.gauss import lagrange_coefficients
 from jaxbeam.numerics.peak_search import (
     ESTIMATE_ITERATIONS,

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbeam.case.beam_parts.properties import segment_edges
+from jaxbeam.case.beam import segment_edges
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.quantities import QUANTITIES

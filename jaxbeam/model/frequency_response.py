@@ -18,7 +18,7 @@ from jaxtyping import Complex, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
-from jaxbeam.case.display.views import TableViews
+from jaxbeam.case.display import TableViews
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.channels import ChannelPair, check_pairs, common_pairs, input_column, output_row

@@ -19,7 +19,7 @@ from jaxbeam.model.flexibility import flexibility
 from jaxbeam.model.layout import Layout, is_uniform
 from jaxbeam.model.sensing.output_rows import SIDE_SHARE, beside, quantity_factor
 from jaxbeam.model.static_correction import section_stiffness
-from jaxbeam.model.theory.fields import SLOPE
+from jaxbeam.model.theory.elements import SLOPE
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 

@@ -4,15 +4,15 @@ import dataclasses
 
 import numpy as np
 
-from jaxbeam.case.beam import END_CONDITIONS
-from jaxbeam.case.beam_parts.properties import (
+from jaxbeam.case.beam import (
+    END_CONDITIONS,
+    Segment,
     has,
     mass_per_length,
     optional_property,
     rigidity,
     segment_edges,
 )
-from jaxbeam.case.beam_parts.segment import Segment
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
 from jaxbeam.runtime.arrays import xp

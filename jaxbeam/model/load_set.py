@@ -11,9 +11,12 @@ from jaxtyping import Bool, Float
 from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.case.loads.base import AbstractLoad, wheel_distances
-from jaxbeam.case.loads.force_history import ForceHistory
-from jaxbeam.case.loads.vehicle_model import VehicleModel
+from jaxbeam.case.loads.base import (
+    AbstractLoad,
+    ForceHistory,
+    VehicleModel,
+    wheel_distances,
+)
 from jaxbeam.case.trajectory import AbstractTrajectory
 from jaxbeam.model.layout import Layout
 from jaxbeam.model.settlement import surface

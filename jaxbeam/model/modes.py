@@ -20,11 +20,10 @@ from jaxtyping import Bool, Float
 from numpy.polynomial import legendre
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.display.views import TableViews
+from jaxbeam.case.display import TableViews
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.validation import check_plant
 from jaxbeam.model.layout import Layout, find_layout, is_uniform, longest_span, node_positions
-from jaxbeam.model.theory.buckling import check_buckling
 from jaxbeam.model.theory.damping import (
     damping_of_ratios,
     has_lossy_segments,
@@ -32,9 +31,16 @@ from jaxbeam.model.theory.damping import (
     ratios_of_segments,
     safe_sqrt,
 )
-from jaxbeam.model.theory.elements import assemble_sections, bending_basis
-from jaxbeam.model.theory.fields import SLOPE, FieldParts, section_fields
-from jaxbeam.model.theory.sections import Sections, sections
+from jaxbeam.model.theory.elements import (
+    SLOPE,
+    FieldParts,
+    Sections,
+    assemble_sections,
+    bending_basis,
+    section_fields,
+    sections,
+)
+from jaxbeam.model.theory.statics import check_buckling
 from jaxbeam.numerics.eigen import REPEATED_EIGENVALUE_TOLERANCE, eigen
 from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, add_at, set_at, stop_gradient, xp

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.case.profiles.base import AbstractProfile
+from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.layout import Layout, find_layout, kink_nodes
 from jaxbeam.model.theory.elements import nodal_unknowns

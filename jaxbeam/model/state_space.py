@@ -24,14 +24,15 @@ from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
 from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensing.output_rows import OutputRows, sensor_rows
-from jaxbeam.model.vehicles.contact_rows import (
+from jaxbeam.model.vehicle_contact import (
     ContactRows,
     contact_rows,
     has_known_disturbance,
+    initial_vehicle_states,
     known_disturbance,
+    vehicle_signals,
     vehicle_system,
 )
-from jaxbeam.model.vehicles.vehicle_states import initial_vehicle_states, vehicle_signals
 from jaxbeam.numerics.batched_linalg import solve_small
 from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.compiling import compiled_if_traced

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.beam_parts.properties import has
+from jaxbeam.case.beam import has
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import is_concrete
 from jaxbeam.model.flexibility import check_supported
@@ -22,7 +22,7 @@ from jaxbeam.model.statics import (
     unchecked_influence_line,
     validated_layout,
 )
-from jaxbeam.model.theory.sections import rigidity_at
+from jaxbeam.model.theory.elements import rigidity_at
 from jaxbeam.runtime.arrays import Array, is_known, set_at, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 

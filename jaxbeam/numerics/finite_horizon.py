@@ -29,8 +29,7 @@ from jaxbeam.numerics.coupled_stages import (
     stage_responses,
     stages_of_length,
 )
-from jaxbeam.numerics.gain_polynomials import interpolate_gains
-from jaxbeam.numerics.gain_table import GainTable, PlantMatrices
+from jaxbeam.numerics.gain_table import GainTable, PlantMatrices, interpolate_gains
 from jaxbeam.numerics.matrices import InputWeight, Square
 from jaxbeam.numerics.stages import (
     GAUSS_NODES,

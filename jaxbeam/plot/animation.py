@@ -31,8 +31,7 @@ from jaxbeam.plot.style import (
     use_style,
 )
 from jaxbeam.plot.traffic.crossings import shade_crossings
-from jaxbeam.plot.traffic.film import check_film, write_film
-from jaxbeam.plot.traffic.moving import Traffic
+from jaxbeam.plot.traffic.moving import Traffic, check_film, write_film
 from jaxbeam.simulation.record import Record
 
 

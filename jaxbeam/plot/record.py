@@ -27,13 +27,14 @@ from jaxbeam.plot.style import (
     unit_scale,
     use_style,
 )
-from jaxbeam.plot.traffic.crossings import label_loads, shade_crossings
-from jaxbeam.plot.traffic.rows import (
+from jaxbeam.plot.traffic.crossings import (
     draw_accelerations,
     draw_forces,
     draw_strokes,
     forces_vary,
     has_bodies,
+    label_loads,
+    shade_crossings,
 )
 from jaxbeam.simulation.record import Record
 
@@ -50,9 +51,10 @@ def plot_record(
     """Schematic, quantities of the sensors, contact forces, bodies of vehicles, and commands.
 
     Each quantity has axes of its own. Dots mark peaks, shading the times with loads on the beam;
-    vehicles have a row for the accelerations of their bodies (see `jaxbeam.plot.traffic.rows`),
+    vehicles have a row for the accelerations of their bodies (see `plot_crossings`),
     absorbers one for their strokes, controllers one for the commands. There is no row for contact
-    forces where all are constant. With a `quantity` of the sensors only its histories are drawn.
+    forces where all are constant.
+    With a `quantity` of the sensors only its histories are drawn.
 
     The whole takes the place of `ax`, histories are drawn on it. The title is that of the case if
     left out; `labels` name the sensors, in their order, in place of their names. Returns the

@@ -16,8 +16,7 @@ from jaxbeam.analysis.critical_speeds import (
     regular_spacing,
     resonance_speeds,
 )
-from jaxbeam.case.case import Case
-from jaxbeam.case.display.addresses import address_words
+from jaxbeam.case.case import Case, address_words
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_from_dict

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure, SubFigure
 
-from jaxbeam.case.display.prefixes import UnitScale as UnitScale, unit_scale as unit_scale
+from jaxbeam.case.display import UnitScale as UnitScale, unit_scale as unit_scale
 
 INK, GREY, FAINT, SHADE = "#22282e", "#6b747c", "#dfe3e6", "#eef2f5"
 # Okabe and Ito's colours, distinct with any kind of colour vision.

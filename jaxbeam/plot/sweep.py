@@ -12,8 +12,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
-from jaxbeam.case.case import Case, unit_at
-from jaxbeam.case.display.addresses import address_words
+from jaxbeam.case.case import Case, address_words, unit_at
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.files.case_file import case_from_dict

@@ -22,13 +22,14 @@ from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Layout
 from jaxbeam.model.sensing.output_rows import sensor_rows
-from jaxbeam.model.sensing.sensor_filters import with_sensor_filters
-from jaxbeam.model.sensing.sensor_signals import noise_samples, sensor_sections
-from jaxbeam.model.sensing.transmission import (
+from jaxbeam.model.sensing.sensor_signals import (
     COMMANDS,
     NO_DERIVATIVE,
+    noise_samples,
     refuse_derivatives,
+    sensor_sections,
     sent_readings,
+    with_sensor_filters,
 )
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import Array, any_jax, block_diag, known, not_differentiated, xp

@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 from jaxtyping import Float
 
-from jaxbeam.case.actuators.electrodynamic import Electrodynamic
-from jaxbeam.case.actuators.inner_loops import PortSignal
+from jaxbeam.case.actuators.electrodynamic import Electrodynamic, PortSignal
 from jaxbeam.case.case import Case
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times

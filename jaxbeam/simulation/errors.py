@@ -13,8 +13,7 @@ from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.sensing.mode_band import band_weights
-from jaxbeam.model.sensing.output_rows import beside, modal_row, sensor_history
+from jaxbeam.model.sensing.output_rows import band_weights, beside, modal_row, sensor_history
 from jaxbeam.model.static_correction import Motion, corrected_history, is_supported
 from jaxbeam.runtime.arrays import Array, stop_gradient, xp
 from jaxbeam.simulation.extremes import own_outputs

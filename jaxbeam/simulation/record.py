@@ -11,9 +11,8 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.sensing.output_rows import sensor_history
-from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readings
+from jaxbeam.model.sensing.sensor_signals import VehicleMotion, sensor_readings, vehicle_readings
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation import section_forces

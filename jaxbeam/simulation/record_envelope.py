@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.display.views import TableViews
+from jaxbeam.case.display import TableViews
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.along_beam import refined, sections
 from jaxbeam.model.modes import Modes

@@ -10,12 +10,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.quantities import quantity_of
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.sensing.output_rows import (
-    SIDE_SHARE,
-    beside,
-    quantity_factor,
-    quantity_history,
-)
+from jaxbeam.model.sensing.output_rows import SIDE_SHARE, beside, quantity_factor, quantity_history
 from jaxbeam.model.settlement import has_settlement, settled_beam
 from jaxbeam.model.static_correction import (
     Motion,
@@ -23,7 +18,7 @@ from jaxbeam.model.static_correction import (
     port_forces,
     shear_force as shear_of_third_derivative,
 )
-from jaxbeam.model.theory.fields import SLOPE
+from jaxbeam.model.theory.elements import SLOPE
 from jaxbeam.runtime.arrays import Array, xp
 
 SIDES = ("left", "right")

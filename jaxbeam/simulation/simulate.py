@@ -22,9 +22,8 @@ from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
-from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.sensing.output_rows import sensor_history, sensor_rows
-from jaxbeam.model.sensing.vehicle_readings import VehicleMotion, vehicle_readings
+from jaxbeam.model.sensing.sensor_signals import VehicleMotion, sensor_readings, vehicle_readings
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, any_jax, put, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxbeam.case.beam_parts.properties import has
+from jaxbeam.case.beam import has
 from jaxbeam.case.case import Case
 from jaxbeam.files.case_file import case_from_dict
-from jaxbeam.files.zarr_codecs import check_codecs
+from jaxbeam.files.netcdf import check_codecs
 from jaxbeam.model.layout import Layout, is_uniform
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes, mesh_layout, modes
-from jaxbeam.model.theory.sections import sections
+from jaxbeam.model.theory.elements import sections
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.runtime.input_file import check_input, not_as_named
 from jaxbeam.simulation.record import Record

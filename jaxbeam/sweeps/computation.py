@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.case import Case, unit_at
-from jaxbeam.case.display.addresses import address_words
+from jaxbeam.case.case import Case, address_words, unit_at
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime.arrays import collapse

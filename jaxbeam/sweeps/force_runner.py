@@ -25,8 +25,7 @@ from jaxbeam.integrator.peaks.running_peaks import Peaks
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
-from jaxbeam.model.sensing.linear_outputs import linear_outputs
+from jaxbeam.model.sensing.corrected_rows import corrected_places, linear_outputs, static_correction
 from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.static_correction import is_supported
 from jaxbeam.runtime.remembering import remembered_within

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxbeam.case.case import Case, addresses
-from jaxbeam.case.display.addresses import address_words
+from jaxbeam.case.case import Case, address_words, addresses
 from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.joint_addresses import ALL
 from jaxbeam.files.case_file import case_to_dict, with_settings

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbeam.analysis.loops.affine import NotAffineError, affine_jacobian
+from jaxbeam.analysis.frozen_loop import NotAffineError, affine_jacobian
 from jaxbeam.numerics.discretisation import exponential_times, propagate
 
 MATRIX = np.array([[1.0, -3e4], [1e-3, 0.7], [0.0, 2.0]])

@@ -7,8 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.sections.amplification import amplification, envelope
-from jaxbeam.analysis.sections.record_amplification import record_amplification
+from jaxbeam.analysis.sections import amplification, envelope, record_amplification
 
 LENGTH, RIGIDITY, DENSITY, FORCE = 0.6, 11.68, 0.535, 5.0
 POSITIONS = np.array([0.15, 0.3, 0.4])

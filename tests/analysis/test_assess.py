@@ -8,23 +8,23 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.assessment.formulas import (
+from jaxbeam.analysis.assessment.assessment import (
     frequency_limits,
     irregularity_factor,
     running_factor,
     static_dynamic_factor,
 )
 from jaxbeam.analysis.assessment.high_speed import reaction_peaks, train_response
-from jaxbeam.analysis.assessment.static_loads import (
+from jaxbeam.analysis.assessment.static_checks import (
     CheckedSection,
     largest_under_lm71,
     largest_under_train,
     tabulated_line,
 )
 from jaxbeam.analysis.assessment.train_checks import checked_sections
-from jaxbeam.analysis.sections.characteristic_points import characteristic_points
-from jaxbeam.model.sensing.mode_band import counted_frequency
-from jaxbeam.vehicles.trains import trains
+from jaxbeam.analysis.sections import characteristic_points
+from jaxbeam.model.sensing.output_rows import counted_frequency
+from jaxbeam.vehicles.library import trains
 from tests.modules import ROOT
 
 DATA = json.loads((ROOT / "tests" / "data" / "railway_code.json").read_text())

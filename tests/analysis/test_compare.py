@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.analysis.compare import compare
-from jaxbeam.analysis.crossing_margin import LOAD_POSITIONS, stability_margin
+from jaxbeam.analysis.margins import LOAD_POSITIONS, stability_margin
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import load_controller
 from jaxbeam.plot import plot_comparison

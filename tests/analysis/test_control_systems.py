@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.loops.stationary_loop import loop_with_mass_at
+from jaxbeam.analysis.stationary_loop import loop_with_mass_at
 from tests.analysis.test_stationary_loop import (
     MASS,
     POSITION,

@@ -7,8 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.crossing_margin import stability_margin
 from jaxbeam.analysis.limit_cycles import command_oscillations, count_oscillations, turning_points
+from jaxbeam.analysis.margins import stability_margin
 from jaxbeam.rigs import load
 from jaxbeam.simulation.integration_plan import integration_plan
 

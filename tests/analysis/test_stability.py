@@ -15,8 +15,14 @@ from jaxbeam.analysis import stability
 from jaxbeam.analysis.frozen_loop import loop_dynamics
 from jaxbeam.analysis.linearised_loop import affine_linearisations, linearised_loop, loop_timing
 from jaxbeam.analysis.margins import margins
-from jaxbeam.analysis.stability import _assignment, _tracked_branches, frozen_poles, growth, stream
-from jaxbeam.analysis.stability_limits import stability_limit
+from jaxbeam.analysis.stability import (
+    _assignment,
+    _tracked_branches,
+    frozen_poles,
+    growth,
+    stability_limit,
+    stream,
+)
 from jaxbeam.case.controller import AbstractSampledLaw, ControlStep
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.control.optimal.crossing_gains import GainSchedule

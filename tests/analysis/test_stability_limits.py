@@ -9,10 +9,12 @@ import scipy.linalg
 import scipy.optimize
 
 import jaxbeam as jb
-from jaxbeam.analysis.stability import frozen_poles, growth, stream
-from jaxbeam.analysis.stability_limits import (
+from jaxbeam.analysis.stability import (
     LoadStabilityLimits,
+    frozen_poles,
+    growth,
     load_stability_limits,
+    stream,
     stream_excess,
 )
 from jaxbeam.cli import main

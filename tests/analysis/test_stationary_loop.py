@@ -9,11 +9,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.crossing_margin import stability_margin
 from jaxbeam.analysis.linearised_loop import linearised_loop
-from jaxbeam.analysis.loops.stationary_loop import loop_with_mass_at, stationary_loops
-from jaxbeam.analysis.margins import loop_gain, margins
+from jaxbeam.analysis.margins import loop_gain, margins, stability_margin
 from jaxbeam.analysis.stability import growth
+from jaxbeam.analysis.stationary_loop import loop_with_mass_at, stationary_loops
 from jaxbeam.cli import main
 from tests.loop_as_oracle import span_of
 

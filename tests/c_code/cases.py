@@ -4,12 +4,10 @@ import numpy as np
 
 import jaxbeam as jb
 from jaxbeam.case.case import Run
-from jaxbeam.control.feedback import Feedback
+from jaxbeam.control.feedback import Feedback, OutputFeedback, ScheduledFeedback
+from jaxbeam.control.feedforward import Prescribed
 from jaxbeam.control.load_identification import LoadIdentification
 from jaxbeam.control.optimal.lqr import LQR
-from jaxbeam.control.output_feedback import OutputFeedback
-from jaxbeam.control.prescribed import Prescribed
-from jaxbeam.control.scheduled_feedback import ScheduledFeedback
 from tests.c_code.given_laws import PERIOD, FollowedPositions, GivenTables, VaryingMPC
 
 

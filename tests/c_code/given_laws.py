@@ -11,9 +11,8 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.load_identification import LoadIdentification
 from jaxbeam.control.optimal.crossing_gains import GainSchedule
 from jaxbeam.control.optimal.load_tables import PositionGainLaw, ScheduledGainLaw
-from jaxbeam.control.predictive.prediction import SampledPlant
-from jaxbeam.control.predictive.preview import Preview
-from jaxbeam.control.state_law import SampledStateLaw, TrueState
+from jaxbeam.control.predictive.prediction import Preview, SampledPlant
+from jaxbeam.control.state_controller import SampledStateLaw, TrueState
 from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.numerics.gain_table import GainTable
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from jaxbeam.c_code.source import array_text, helpers_of
-from jaxbeam.numerics.optimisation.qp import MAX_STEPS, MAX_SWEEPS, solve_qp
+from jaxbeam.numerics.qp import MAX_STEPS, MAX_SWEEPS, solve_qp
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 ROWS, VARIABLES = 12, 4

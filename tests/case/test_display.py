@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.case.display.addresses import address_words, value_words
-from jaxbeam.case.display.prefixes import unit_scale, with_prefix
+from jaxbeam.case.case import address_words, value_words
+from jaxbeam.case.display import unit_scale, with_prefix
 
 BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.02)
 

@@ -10,7 +10,7 @@ from jaxbeam.case.case import part_classes
 from jaxbeam.case.limits import MAX_COUNTS, MAX_ENTRIES, MAX_WHEELS
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict
-from jaxbeam.files.declared_keys import table_classes, table_keys, tables
+from jaxbeam.files.json_schema import table_classes, table_keys, tables
 
 BEAM = {"length": 20.0, "flexural_rigidity": 1e10, "mass_per_length": 12e3}
 CONVOY = {"kind": "vehicle", "model": "half-truck", "speed": 1.0, "count": 10**9}

@@ -11,13 +11,10 @@ from hypothesis import given
 
 from jaxbeam.case.actuators.electrodynamic import Electrodynamic
 from jaxbeam.case.actuators.patch import Patch
-from jaxbeam.case.actuators.point import PointForce
-from jaxbeam.case.actuators.shaker import Shaker
-from jaxbeam.case.actuators.spring import SpringDamper
+from jaxbeam.case.actuators.point import PointForce, Shaker, SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, Run, replace
-from jaxbeam.case.loads.force import MovingForce
-from jaxbeam.case.loads.mass import MovingMass
+from jaxbeam.case.loads.point import MovingForce, MovingMass
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedback import Feedback

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.scheduled_feedback import ScheduledFeedback
+from jaxbeam.control.feedback import ScheduledFeedback
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from tests.loop_as_oracle import span_of
 

@@ -9,7 +9,7 @@ import scipy.linalg
 import scipy.signal
 from numpy.testing import assert_allclose
 
-from jaxbeam.estimation.gains import kalman_gain, placed_gain, sampled_kalman_gain
+from jaxbeam.estimation.observer import kalman_gain, placed_gain, sampled_kalman_gain
 from jaxbeam.estimation.sampled_plant import SampleTiming
 from jaxbeam.numerics.discretisation import balance
 from tests.differences import central

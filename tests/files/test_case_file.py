@@ -9,12 +9,10 @@ import pytest
 from hypothesis import given
 
 from jaxbeam.case.actuators.patch import Patch
-from jaxbeam.case.actuators.point import PointForce
-from jaxbeam.case.actuators.shaker import Shaker
+from jaxbeam.case.actuators.point import PointForce, Shaker
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, Run
-from jaxbeam.case.loads.force import MovingForce
-from jaxbeam.case.loads.mass import MovingMass
+from jaxbeam.case.loads.point import MovingForce, MovingMass
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.files.case_file import (
     case_from_dict,

@@ -4,8 +4,7 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.cli import main
-from jaxbeam.files.case_file import with_settings
-from jaxbeam.files.kind_changes import KindChangeWarning
+from jaxbeam.files.case_file import KindChangeWarning, with_settings
 
 CASE = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2),

@@ -12,8 +12,7 @@ from openpyxl.utils.escape import unescape
 
 import jaxbeam as jb
 import tuning
-from jaxbeam.files.spreadsheet import as_text_cell, from_text_cell
-from jaxbeam.files.tables import write_table
+from jaxbeam.files.tables import as_text_cell, from_text_cell, write_table
 
 FORMULAS = ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", "=cmd|' /C calc'!A0", "＝1+1"]
 RUNS = re.compile(r"[=+\-@\t\r\n＝＋－＠]")

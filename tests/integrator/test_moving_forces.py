@@ -14,7 +14,7 @@ from jaxbeam.integrator.forces.system import force_responses, force_system, part
 from jaxbeam.integrator.step_size import without_later_vibration
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.sensing.linear_outputs import linear_outputs
+from jaxbeam.model.sensing.corrected_rows import linear_outputs
 from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.numerics.piecewise import piecewise_chebyshev
 from jaxbeam.sweeps.force_runner import _systems, force_runner

@@ -18,9 +18,9 @@ from jaxbeam.model.frequency_response import (
     receptance,
     resonances_and_antiresonances,
 )
+from jaxbeam.model.linear_system import poles, zeros
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.poles_zeros import poles, zeros
 from jaxbeam.model.static_correction import residual_actuator_gain
 from tests.as_oracle import as_oracle
 from tests.differences import central

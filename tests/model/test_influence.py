@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.sections.influence_table import influence_table
+from jaxbeam.analysis.sections import influence_table
 from jaxbeam.model.modes import mesh_layout
 from tests.differences import central
 

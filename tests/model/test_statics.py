@@ -10,13 +10,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 from jaxbeam.case.actuators.patch import Patch
-from jaxbeam.case.actuators.shaker import Shaker
-from jaxbeam.case.actuators.spring import SpringDamper
+from jaxbeam.case.actuators.point import Shaker, SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.loads.base import trajectory
-from jaxbeam.case.loads.force import MovingForce
-from jaxbeam.case.loads.mass import MovingMass
+from jaxbeam.case.loads.point import MovingForce, MovingMass
 from jaxbeam.model.influence import static_peak
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.statics import influence_line, static_deflection

@@ -12,8 +12,7 @@ from PIL import Image, ImageSequence
 
 import jaxbeam as jb
 from jaxbeam.plot import animate, plot_record, plot_vehicles
-from jaxbeam.plot.traffic.drawing import vehicle_art
-from jaxbeam.plot.traffic.parts import drawn_vehicle
+from jaxbeam.plot.traffic.drawing import drawn_vehicle, vehicle_art
 from tests.plot.figures import CASE as BALL, data, lines_of, words
 from tests.simulation.vehicles.test_vehicle_record import WAGON
 

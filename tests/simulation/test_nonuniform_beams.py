@@ -10,9 +10,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.beam_parts.properties import rigidity
+from jaxbeam.case.beam import rigidity
 from jaxbeam.case.case import replace
-from jaxbeam.case.loads.oscillator import Oscillator
+from jaxbeam.case.loads.cars import Oscillator
 from jaxbeam.integrator import native_peaks
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import Motion, corrected_history

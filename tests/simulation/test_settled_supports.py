@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.case.case import replace
-from jaxbeam.case.loads.oscillator import Oscillator
-from jaxbeam.case.profiles.ramp import RampProfile
+from jaxbeam.case.loads.cars import Oscillator
+from jaxbeam.case.profiles.shapes import RampProfile
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.settlement import surface
 from tests.differences import central

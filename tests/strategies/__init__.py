@@ -4,17 +4,18 @@ import itertools
 
 from hypothesis import strategies as st
 
-from jaxbeam.case.actuators.electrodynamic import Electrodynamic
-from jaxbeam.case.actuators.inner_loops import AbstractInnerLoop, CurrentLoop, ForceLoop
+from jaxbeam.case.actuators.electrodynamic import (
+    AbstractInnerLoop,
+    CurrentLoop,
+    Electrodynamic,
+    ForceLoop,
+)
 from jaxbeam.case.actuators.patch import Patch
-from jaxbeam.case.actuators.point import PointForce
-from jaxbeam.case.actuators.shaker import Shaker
-from jaxbeam.case.actuators.spring import SpringDamper
+from jaxbeam.case.actuators.point import PointForce, Shaker, SpringDamper
 from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.filters import Filter
-from jaxbeam.case.loads.force import MovingForce
-from jaxbeam.case.loads.mass import MovingMass
+from jaxbeam.case.loads.point import MovingForce, MovingMass
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor
 

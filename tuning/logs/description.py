@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from jaxbeam.case.loads.base import AbstractLoad
-from jaxbeam.case.reading.parts import read_parts
 from jaxbeam.case.reading.tables import (
     COUNT,
     NUMBER,
@@ -15,6 +14,7 @@ from jaxbeam.case.reading.tables import (
     WORD,
     check_entry,
     check_table,
+    read_parts,
 )
 from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.files.case_file import find_vehicle_files

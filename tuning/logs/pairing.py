@@ -12,7 +12,7 @@ from jaxbeam.case.kinds import kind_of
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.quantities import unit_of
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.control.prescribed import Prescribed
+from jaxbeam.control.feedforward import Prescribed
 from tuning.logs.log import Log
 
 MAX_START_DURATIONS = 10.0  # first time of a log, in its durations, that is simulated from 0 on

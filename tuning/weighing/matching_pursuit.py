@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads.mass import MovingMass
+from jaxbeam.case.loads.point import MovingMass
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
 from tuning.weighing.unit_force import UnitForce

@@ -10,7 +10,7 @@ import dataclasses
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.base import AbstractLoad
-from jaxbeam.case.loads.mass import MovingMass
+from jaxbeam.case.loads.point import MovingMass
 from tuning.fit.identify import identify
 from tuning.fit.model_validation import ModelCriteria, compare_fits
 from tuning.fit.residuals import WHITENESS_SIGNIFICANCE

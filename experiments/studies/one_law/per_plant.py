@@ -30,7 +30,7 @@ from experiments.studies.one_law.tune import (
     search,
     with_numbers,
 )
-from jaxbeam.control.internal_model.scheduled import REFERENCE, VALUES
+from jaxbeam.control.internal_model import REFERENCE, VALUES
 
 GENERATIONS = 8
 TABLE_FILE = Path(__file__).parents[3] / "docs" / "_static" / "one_law_per_plant.md"

@@ -19,7 +19,7 @@ import numpy as np
 import jaxbeam as jb
 from experiments.studies.loads import training_loads
 from experiments.studies.one_law.plants import ONE_LAW, Shares, plant_case
-from jaxbeam.control.internal_model.scheduled import ORDER, REFERENCE, SHARES, VALUES
+from jaxbeam.control.internal_model import ORDER, REFERENCE, SHARES, VALUES
 
 SPEEDS = {"B": (0.35, 0.6, 1.0), "C": (0.5, 1.0)}  # m/s
 CUTOFF, DELAYS, FACTORS = 10.0, (0.0, 0.04), (0.8, 1.2)  # Hz, s, -

@@ -15,10 +15,9 @@ import jaxbeam as jb
 from experiments.thesis.cases import with_modes
 from experiments.thesis.chapter5 import published
 from experiments.thesis.verdicts import Finding, make_finding
-from jaxbeam.analysis.stability import frozen_poles, growth
-from jaxbeam.analysis.stability_limits import stability_limit
+from jaxbeam.analysis.stability import frozen_poles, growth, stability_limit
 from jaxbeam.numerics.riccati import dlqr
-from jaxbeam.plot.poles import plot_poles
+from jaxbeam.plot.modes import plot_poles
 
 COMMAND_WEIGHT = 9e-8  # R of the example in 5.1
 ACTIVE_STIFFNESS = 3500.0  # N/m

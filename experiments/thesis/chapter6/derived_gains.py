@@ -13,12 +13,11 @@ import scipy
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxbeam.analysis.crossing_margin import stability_margin
+from jaxbeam.analysis.margins import stability_margin
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import concrete
-from jaxbeam.control.feedback import Feedback
+from jaxbeam.control.feedback import Feedback, ScheduledFeedback
 from jaxbeam.control.load_identification import LoadIdentification
-from jaxbeam.control.scheduled_feedback import ScheduledFeedback
 from jaxbeam.model.statics import influence_line, static_deflection_per_command
 from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate

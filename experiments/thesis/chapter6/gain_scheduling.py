@@ -28,8 +28,8 @@ from experiments.thesis.chapter6.patch_rigs import (
     static_extremes,
 )
 from experiments.thesis.verdicts import Finding, make_finding
-from jaxbeam.analysis.crossing_margin import stability_margin
-from jaxbeam.control.scheduled_feedback import ScheduledFeedback
+from jaxbeam.analysis.margins import stability_margin
+from jaxbeam.control.feedback import ScheduledFeedback
 from jaxbeam.plot.style import colour, set_title, use_style
 
 HIGHER_GAINS = (3.0, 4.5)  # V/mm, of the scheduled linear law

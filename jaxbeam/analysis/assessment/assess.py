@@ -5,8 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxbeam.analysis.assessment.assessment import REQUIRED, Assessment
-from jaxbeam.analysis.assessment.formulas import code_numbers
+from jaxbeam.analysis.assessment.assessment import REQUIRED, Assessment, code_numbers
 from jaxbeam.analysis.assessment.static_checks import (
     analysis_check,
     damping_checks,
@@ -14,7 +13,7 @@ from jaxbeam.analysis.assessment.static_checks import (
     frequency_check,
 )
 from jaxbeam.analysis.assessment.train_checks import TrackState, train_checks
-from jaxbeam.analysis.sections.characteristic_points import spans
+from jaxbeam.analysis.sections import spans
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.declared_checks import suggestion
 from jaxbeam.case.fields import concrete
@@ -22,8 +21,8 @@ from jaxbeam.case.reading.units import number_in_si
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import modes
 from jaxbeam.model.plausibility.check import warn_if_implausible
-from jaxbeam.model.sensing.mode_band import counted_frequency
-from jaxbeam.vehicles.trains import trains as library
+from jaxbeam.model.sensing.output_rows import counted_frequency
+from jaxbeam.vehicles.library import trains as library
 
 CODES = ("en1991-2",)
 DECKS = ("ballasted", "slab")

@@ -18,14 +18,13 @@ from jaxbeam.integrator.forces.peaks import peaks_of_forces
 from jaxbeam.integrator.forces.system import force_responses, force_system
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import modes
-from jaxbeam.model.sensing.corrected_rows import static_correction
-from jaxbeam.model.sensing.linear_outputs import LinearOutputs, linear_outputs
+from jaxbeam.model.sensing.corrected_rows import LinearOutputs, linear_outputs, static_correction
 from jaxbeam.model.sensing.output_rows import SIDE_SHARE, sensor_rows
 from jaxbeam.sweeps.computation import peaks_in_memory
 from jaxbeam.sweeps.failures import failure_sentence
 from jaxbeam.sweeps.force_runner import PHASE
 from jaxbeam.sweeps.specification import sweep_specification
-from jaxbeam.vehicles.trains import trains as library
+from jaxbeam.vehicles.library import trains as library
 
 # Ratio of speeds: N axles at a spacing build up resonance of order i over a share 2 / (N i) of the
 # speed, 3 % for the longest trains at third order, with at least one speed within.

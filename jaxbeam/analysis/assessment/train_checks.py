@@ -1,4 +1,4 @@
-"""Checks of a bridge by a dynamic analysis: deck acceleration, and trains against LM71."""
+"""Checks of effects of trains over speed."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,29 +11,28 @@ from jaxbeam.analysis.assessment.assessment import (
     SATISFIED,
     TRAINS_GOVERN,
     CodeCheck,
-)
-from jaxbeam.analysis.assessment.formulas import (
+    TrainCurve,
+    TrainEffects,
     code_numbers,
     static_dynamic_factor,
     track_factor,
 )
 from jaxbeam.analysis.assessment.high_speed import TrainResponse, train_response
-from jaxbeam.analysis.assessment.static_loads import (
+from jaxbeam.analysis.assessment.static_checks import (
     CheckedSection,
     largest_moments,
     largest_under_lm71,
     largest_under_train,
     tabulated_line,
 )
-from jaxbeam.analysis.assessment.train_effects import TrainCurve, TrainEffects
-from jaxbeam.analysis.sections.characteristic_points import characteristic_points
+from jaxbeam.analysis.sections import characteristic_points
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.along_beam import left_of
 from jaxbeam.model.influence import REACTION
-from jaxbeam.vehicles.trains import trains as library
+from jaxbeam.vehicles.library import trains as library
 
 
 class TrackState(NamedTuple):

@@ -28,7 +28,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.controller import commanded
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.prescribed import Prescribed
+from jaxbeam.control.feedforward import Prescribed
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_peaks
 from jaxbeam.integrator.peaks.running_peaks import RunningPeaks

@@ -18,9 +18,9 @@ from jaxbeam.analysis.bound.bound import checked_influence, held_command_limits
 from jaxbeam.analysis.bound.input_influence import InputInfluence
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import commanded
-from jaxbeam.control.prescribed import Prescribed
+from jaxbeam.control.feedforward import Prescribed
 from jaxbeam.model.channels import accepts_commands
-from jaxbeam.numerics.optimisation.qp import STATUS_TEXT, solve_qp
+from jaxbeam.numerics.qp import STATUS_TEXT, solve_qp
 from jaxbeam.runtime.module import Module
 from jaxbeam.simulation.record import Record
 

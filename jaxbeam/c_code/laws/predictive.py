@@ -1,6 +1,6 @@
-"""C code of model predictive control: prediction and quadratic program as data of the law.
+"""C code of predictive control and moving-horizon estimation.
 
-The program of a sample is brought to its least-distance form (`jaxbeam.numerics.optimisation.qp`)
+The program of a sample is brought to its least-distance form (`jaxbeam.numerics.qp`)
 beforehand: minimise |z| subject to G z <= h, all of which but h is constant, or known over time.
 """
 
@@ -9,14 +9,74 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.c_code.quadratic_programs import write_solution
+from jaxbeam.c_code.laws.estimators import FilterModel, transition_matrices, write_filter_step
 from jaxbeam.c_code.source import CSource
-from jaxbeam.c_code.tables import at_samples
-from jaxbeam.c_code.writers import EstimateCode, write_state_law
+from jaxbeam.c_code.texts import at_samples
+from jaxbeam.c_code.writers import EstimateCode, write_filter, write_law, write_state_law
 from jaxbeam.case.estimator import Estimate
+from jaxbeam.control.predictive.gpc import AdaptiveGPCLaw, probe_signs
 from jaxbeam.control.predictive.mpc_law import MPCLaw
 from jaxbeam.control.predictive.scenario_mpc import ScenarioLaw
+from jaxbeam.estimation.crossing_filter import corrected
+from jaxbeam.estimation.moving_horizon import BoundFactor, WindowFilter
+from jaxbeam.estimation.observer import sensor_offsets
+from jaxbeam.numerics.qp import MAX_STEPS, MAX_SWEEPS
 from jaxbeam.runtime.arrays import vmap, xp
+
+
+def write_solution(
+    code: CSource,
+    solver: str,
+    h: str,
+    G: str,
+    minimiser: str,
+    limits: int,
+    variables: int,
+    counter: tuple[str, str],
+) -> None:
+    """Write the point within G z <= h that is nearest to a `minimiser`, which it replaces.
+
+    The rows of G have length one; `h` is work space, of which nothing is left. The C variable
+    `solved` is whether there is such a point. A `counter`, its name and its meaning, counts the
+    samples where there is none.
+    """
+    declared = "real scale", "int solved"
+    code.variables += [each for each in declared if each not in code.variables]
+    z = code.work("solution", variables, "solution of the least-distance form")
+    if solver == "hildreth":
+        work = code.work("qp_work", 2 * limits + variables)
+        operations = MAX_SWEEPS * _sweep_operations(limits, variables)
+        code.notes.append(f"Hildreth's procedure ends after {MAX_SWEEPS} sweeps at the latest.")
+        steps = MAX_SWEEPS
+    else:
+        work = code.work("qp_work", variables * variables + 4 * variables + 10 * limits)
+        operations = MAX_STEPS * _interior_operations(limits, variables)
+        code.notes.append(f"The interior-point method ends after {MAX_STEPS} steps at the latest.")
+        steps = MAX_STEPS
+    failures = code.counter(*counter)
+    method = "hildreth" if solver == "hildreth" else "interior_point"
+    code.add(
+        f"""
+scale = least_distance({h}, {G}, {minimiser}, {limits}, {variables});
+solved = scale <= 0 || {method}({z}, {G}, {h}, {limits}, {variables}, {steps}, {work});
+if (!solved) {failures}++;
+if (scale > 0)
+    for (i = 0; i < {variables}; i++) {minimiser}[i] += scale * {z}[i];""",
+        operations + limits * (2 * variables + 6) + 4 * variables + 4,
+    )
+
+
+def _interior_operations(R: int, V: int) -> int:
+    """Operations of a step of the interior-point method for R limits and V variables, at most."""
+    newton = 4 * R * V + 3 * V * V + 16 * R + 6 * V
+    factor = (3 * R + 2) * V * (V + 1) // 2 + V * V * V + 3 * V * V + 4 * R
+    return factor + 2 * newton + 10 * R * V + 58 * R + 12 * V + 32
+
+
+def _sweep_operations(R: int, V: int) -> int:
+    """Operations of a sweep of Hildreth's procedure, at most."""
+    return 10 * R * V + 14 * R + 8 * V + 12
+
 
 Rows = Float[np.ndarray, "sample row column"]
 
@@ -180,3 +240,193 @@ def _program(scenarios: ScenarioLaw, code: CSource, wheels: int) -> _Program:
     moved = np.shape(law.move_maps)[2]
     move = np.asarray(law.move_maps)[0] @ transposed[:, :moved]
     return _Program(past, -inverse_factor @ f, limit_columns / norms, rows / norms, move)
+
+
+@write_filter.register
+def _(filter: WindowFilter, code: CSource) -> EstimateCode:
+    plant, states = filter.filter.filtered.plant, filter.rows.shape[1]
+
+    def model(t):
+        transition, C, D = filter.filter.model_at(t)
+        _, *inputs = transition_matrices(transition)
+        on_beam = xp.where(plant.loads.on_beam(t), 1.0, 0.0)
+        return *filter.joint(transition, C), *inputs, D, on_beam
+
+    A, noise, C, *inputs, D, on_beam = at_samples(model, code)
+    previous, present = (np.pad(part, ((0, 0), (0, filter.earlier), (0, 0))) for part in inputs)
+    gains, factors = [], []
+    start, of_readings = filter.initial_state(), filter.filter.sensor_chain.noise_covariance
+    covariance = np.asarray(start.covariance)
+    for k in range(len(A)):
+        covariance = A[k] @ covariance @ A[k].T + noise[k]
+        gain, covariance = (np.asarray(part) for part in corrected(covariance, C[k], of_readings))
+        gains.append(gain)
+        factors.append(filter.factor(covariance))
+    x = code.state("estimate", start.mean, "states of beam, loads and sensors; deflections before")
+    model_at_samples = FilterModel(A, previous, present, C, D, np.stack(gains))
+    write_filter_step(code, model_at_samples, sensor_offsets(plant), x)
+    if filter.bounds()[0].shape[0]:
+        x = _write_bounds(filter, factors, code, x)
+    added, vehicles = plant.modal_model.state_count, plant.vehicle_states
+    weights, wheels = None, filter.weight_rows.shape[0]
+    if wheels:
+        weights = code.work("weights", wheels, "estimated weights, zero off the beam (N)")
+        mask = code.per_sample("on_beam", on_beam.reshape(len(A), -1))
+        first = int(np.argmax(np.asarray(filter.weight_rows)[0]))
+        code.add(
+            f"for (i = 0; i < {wheels}; i++) {weights}[i] = {mask}[i] * {x}[{first} + i];", wheels
+        )
+    assert added + vehicles <= states
+    return EstimateCode(
+        x, filter.filter.plant_states, weights, wheels, f"{x} + {added}" if vehicles else None
+    )
+
+
+def _write_bounds(filter: WindowFilter, factors: list[BoundFactor], code: CSource, x: str) -> str:
+    """Most probable states within the bounds; their C expression."""
+    rows, lowest, highest = (np.asarray(part) for part in filter.bounds())
+    states, (count, joint) = filter.rows.shape[1], rows.shape
+    size, root, columns, certain = (
+        np.stack([np.asarray(part) for part in parts]) for parts in zip(*factors, strict=True)
+    )
+    limits = np.concatenate([highest, -lowest])
+    finite = np.isfinite(limits)
+    limits, both = limits[finite], np.concatenate([rows, -rows])[finite]
+
+    def of_both(part):
+        return np.concatenate([part, part], axis=1)[:, finite]
+
+    free, size = of_both(certain)[..., None], of_both(size)[..., None]
+    G = np.where(free, 0.0, np.concatenate([root, -root], axis=1)[:, finite])
+    norms = np.sqrt(np.sum(G**2, axis=2, keepdims=True))
+    norms = np.where(norms > 0, norms, 1.0)
+    sides = np.where(free, 1.0, limits[:, None] / size / norms)
+    sides_by_states = np.where(free, 0.0, both / size / norms)
+    h = code.work("bounds", len(limits), "right-hand sides of the bounds")
+    z = code.work("correction", count, "independent numbers of the correction")
+    within = code.work("within", states, "most probable states within the bounds")
+    code.add("/* Most probable states within the bounds: minimise |z| subject to G z <= h */")
+    code.add(
+        f"copy({h}, {code.per_sample('bound', sides)}, {len(limits)});\n"
+        f"for (i = 0; i < {count}; i++) {z}[i] = 0;"
+    )
+    matrix = code.per_sample("bound_rows", sides_by_states)
+    code.multiply_add(h, matrix, x, len(limits), joint, -1)
+    G = code.per_sample("bound_matrix", G / norms)
+    counter = "bound_failures", "samples at which no states within the bounds were found"
+    write_solution(code, "interior", h, G, z, len(limits), count, counter)
+    columns = code.per_sample("correction_columns", columns[:, :states])
+    code.add(f"copy({within}, {x}, {states});")
+    code.add(
+        f"if (solved) multiply_add({within}, 1, {columns}, {z}, {states}, {count});",
+        2 * states * (count + 1),
+    )
+    return within
+
+
+@write_law.register
+def _(law: AdaptiveGPCLaw, code: CSource) -> None:
+    powers, outputs, actuators = law.powers, law.outputs, code.actuators
+    count, past, (first, horizon, moves) = np.size(law.start), law.powers + 1, law.horizons
+    until, period = float(law.until), float(law.period)
+    coefficients = code.state("coefficients", law.start, "a, then B by powers")
+    root = code.state("root", law.start_root, "square root S of their covariance S S'")
+    readings = code.state("past_readings", np.zeros(past * outputs), "the latest first")
+    commands = code.state("past_commands", np.zeros(past * actuators), "the latest first")
+    complete = code.state("complete", [past + 1.0], "samples with complete readings until now")
+    code.missing.append("Identification pauses while one is missing or among the past readings.")
+    changes = code.work("past_moves", powers * actuators, "changes of commands, the latest first")
+    row = code.work("row", count, "what the coefficients multiply")
+    spread = code.work("spread", 2 * count, "S' row, S S' row")
+    n = moves * actuators
+    size = horizon * outputs * (1 + actuators) + n * (n + 2)
+    work = code.work("prediction", size, "predicted outputs, normal equations")
+    move = code.work("move", actuators, "first move")
+    start_trace = float(np.sum(np.asarray(law.start_root) ** 2))
+    code.add(
+        f"""
+/* Past commands, and their changes */
+for (i = {past * actuators - 1}; i >= {actuators}; i--) {commands}[i] = {commands}[i - {actuators}];
+copy({commands}, {code.command}, {actuators});
+for (i = 0; i < {powers * actuators}; i++)
+    {changes}[i] = {commands}[i] - {commands}[i + {actuators}];
+/* Recursive least squares with forgetting, from changes of readings and commands */
+{complete}[0] = {complete}[0] < {past} ? {complete}[0] + 1 : {past + 1};
+for (i = 0; i < {outputs}; i++)
+    if (!({code.present}[i] > 0)) {complete}[0] = 0;
+if ({"1" if np.isinf(until) else f"t <= (real){until!r}"} && t >= (real){period / 2!r}
+    && {complete}[0] > {past}) {{
+    real trace = 0;
+    int k, o;
+    for (i = 0; i < {count * count}; i++) {root}[i] /= (real){float(law.forgetting) ** 0.5!r};
+    for (o = 0; o < {outputs}; o++) {{
+        for (i = 0; i < {count}; i++) {row}[i] = 0;
+        for (i = 0; i < {powers}; i++) {{
+            {row}[i] = {readings}[(i + 1) * {outputs} + o] - {readings}[i * {outputs} + o];
+            for (k = 0; k < {actuators}; k++)
+                {row}[{powers} + (i * {outputs} + o) * {actuators} + k] =
+                    {changes}[i * {actuators} + k];
+        }}
+        least_squares_step({coefficients}, {root}, {row}, {code.readings}[o] - {readings}[o],
+                           (real){float(law.noise)!r}, {count}, {spread});
+    }}
+    for (i = 0; i < {count * count}; i++) trace += {root}[i] * {root}[i];
+    if (trace > (real){start_trace!r})
+        for (i = 0; i < {count * count}; i++) {root}[i] /= sqrt(trace / (real){start_trace!r});
+}}
+for (i = {past * outputs - 1}; i >= {outputs}; i--) {readings}[i] = {readings}[i - {outputs}];
+copy({readings}, {code.readings}, {outputs});""",
+        powers * actuators
+        + 5
+        + outputs
+        + count * count
+        + outputs * (powers + 6 + 6 * count * count + 7 * count)
+        + 5 * count * count
+        + 1,
+    )
+    weights = code.constant("output_weights", law.output_weights)
+    move_weights = code.constant("move_weights", law.move_weights)
+    reference = code.constant("reference", law.reference)
+    code.add(
+        f"""
+/* First move by the identified model */
+predictive_move({move}, {coefficients}, {coefficients} + {powers}, {readings}, {changes},
+                {powers}, {outputs}, {actuators}, {first}, {horizon}, {moves}, {weights},
+                {move_weights}, {reference}, {work});
+for (i = 0; i < {actuators}; i++) {code.output}[i] = {code.command}[i] + {move}[i];""",
+        _move_operations(law) + actuators,
+    )
+    if law.probes:
+        signs, probe = probe_signs(), code.constant("probe", law.probe)
+        sign, last = code.constant("probe_sign", signs), int(until / period) + 2
+        code.add(
+            f"""
+/* Probe, before the loads come */
+if (t < (real){until!r}) {{
+    const int at = sample_number(t, (real){period!r}, {last}) % {len(signs)};
+    for (i = 0; i < {actuators}; i++) {code.output}[i] = {probe}[i] * {sign}[at];
+}}""",
+            4 + actuators,
+        )
+
+
+def _move_operations(law: AdaptiveGPCLaw) -> int:
+    """Operations of the helper `predictive_move`, at most."""
+    powers, outputs, actuators = law.powers, law.outputs, np.size(law.probe)
+    first, horizon, moves = law.horizons
+    n, size = moves * actuators, outputs * actuators
+    periods = range(1, horizon + 1)
+    terms = [min(powers + 1, j - 1) for j in periods]
+    later = [max(powers - j, 0) for j in periods]
+    predictions = sum(
+        outputs * (3 * (powers + 1) + 2 * actuators * late) + 3 * size * term
+        for late, term in zip(later, terms, strict=True)
+    )
+    normal = sum(
+        outputs * (4 + 2 * (i + 1))
+        for i in range(n)
+        for j in range(first, horizon + 1)
+        if j - 1 >= i // actuators
+    )
+    factor = sum(2 * j + 1 for i in range(n) for j in range(i + 1)) + n * n + n
+    return predictions + normal + factor + n * n + n

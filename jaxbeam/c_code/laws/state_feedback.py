@@ -5,7 +5,7 @@ from textwrap import indent
 import numpy as np
 
 from jaxbeam.c_code.source import CSource, search_operations
-from jaxbeam.c_code.tables import at_samples
+from jaxbeam.c_code.texts import at_samples
 from jaxbeam.c_code.writers import (
     EstimateCode,
     write_filter,
@@ -16,7 +16,7 @@ from jaxbeam.c_code.writers import (
 from jaxbeam.control.optimal.crossing_gains import GainSchedule
 from jaxbeam.control.optimal.load_tables import PositionGainLaw, ScheduledGainLaw
 from jaxbeam.control.sliding_mode import SlidingModeLaw
-from jaxbeam.control.state_law import GainLaw, SampledStateLaw
+from jaxbeam.control.state_controller import GainLaw, SampledStateLaw
 
 
 @write_law.register

@@ -6,9 +6,8 @@ from typing import ClassVar
 import equinox as eqx
 from jaxtyping import Float
 
-from jaxbeam.case.actuators.creep import Creep
-from jaxbeam.case.actuators.hysteresis import Hysteresis
-from jaxbeam.case.display.parts import ReprWithUnits
+from jaxbeam.case.actuators.hysteresis import Creep, Hysteresis
+from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.module import Module
 

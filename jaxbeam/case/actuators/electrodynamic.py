@@ -1,13 +1,250 @@
-"""Electrodynamic shaker with the dynamics of its coil, from voltage through current to force."""
+"""Electrodynamic shakers, and the inner loops of current and force around them.
 
-from typing import ClassVar
+The amplifier sets the voltage u of the coil from the error e of what it measures,
 
+    u = P e + Q integral of e dt,      L I' = u - R I - K_v s',
+    F = K_f I - m s'' - c s' - k s,
+
+with e = command - I, or e = command - F of the force on the beam as a sensor shows it. The loop is
+linear: the voltage that the amplifier can give does not bound it.
+"""
+
+import abc
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
 from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment
-from jaxbeam.case.actuators.inner_loops import AbstractInnerLoop, Coil, LoopPort, coil_alone
+from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, number, part
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, xp
+
+
+class Coil(NamedTuple):
+    """Numbers of the coil (ohm, H, N/A, V s/m) and of its moving mass (kg, N s/m, N/m)."""
+
+    resistance: Float[Array, ""]
+    inductance: Float[Array, ""]
+    force_constant: Float[Array, ""]
+    back_emf: Float[Array, ""]
+    mass: Float[Array, ""]
+    damping: Float[Array, ""]
+    stiffness: Float[Array, ""]
+
+
+class PortSignal(NamedTuple):
+    """Signal of a device: a z + b u + (g_0 s + g_1 s' + g_2 s'') of its port, g in `port`.
+
+    z are the states of its attachment, u its command, s the displacement at its port.
+    """
+
+    states: Float[Array, " state"]
+    command: Float[Array, ""]
+    port: Float[Array, "3"]
+
+
+class LoopPort(NamedTuple):
+    """Attachment of a coil with its inner loop, its current (A) and the voltage across it (V)."""
+
+    attachment: Attachment
+    current: PortSignal
+    voltage: PortSignal
+
+
+class AbstractInnerLoop(ReprWithUnits):
+    """Interface of inner loops: proportional and integral gains, or a bandwidth."""
+
+    kind: ClassVar[str]
+    command_unit: ClassVar[str]
+    bandwidth: eqx.AbstractVar[Float[Array, ""] | None]
+    proportional: eqx.AbstractVar[Float[Array, ""] | None]
+    integral: eqx.AbstractVar[Float[Array, ""] | None]
+    limits: eqx.AbstractVar[Float[Array, "2"] | None]
+
+    @abc.abstractmethod
+    def port(self, coil: Coil) -> LoopPort:
+        """Linear model from the command and the displacement to the force on the beam."""
+
+    def validate(self) -> str | None:
+        """Error of the gains, as "key must ...", or None."""
+        if self.bandwidth is None and self.proportional is None:
+            return "proportional is missing; give it, or a bandwidth from which both gains follow"
+        if self.bandwidth is not None:
+            for name in ("proportional", "integral"):
+                if getattr(self, name) is not None:
+                    return f"{name} contradicts bandwidth, from which it follows; leave one out"
+        return None
+
+
+class CurrentLoop(AbstractInnerLoop):
+    """Current feedback: the command is a current in A, which the amplifier holds in the coil.
+
+    Its gains follow from the `bandwidth` b as P = L b and Q = R b. The integral action then cancels
+    the pole of the coil: I = command b / (p + b) with the coil at rest, while a velocity s' of the
+    beam leaves the current -K_v p s' / ((L p + R)(p + b)), p the variable of Laplace. So the
+    damping by the back-EMF vanishes as the bandwidth grows, and the shaker becomes a point force
+    K_f times the command. Without `integral` a share R / (R + P) of a steady command is missing.
+
+    >>> import jaxbeam as jb
+    >>> shaker = jb.Electrodynamic(
+    ...     0.3, 3.0, 1e-3, 8.0, inner_loop=jb.CurrentLoop(bandwidth=2e3, limits=(-1.0, 1.0))
+    ... )
+    >>> print(shaker.command_unit, f"{shaker.attachment().static_gain:.1f} N/A")
+    A 8.0 N/A
+    """
+
+    kind: ClassVar[str] = "current"
+    command_unit: ClassVar[str] = "A"
+
+    bandwidth: Float[Array, ""] | None = number(
+        "1/s", "bandwidth of the loop, from which its gains follow", POSITIVE, default=None
+    )
+    proportional: Float[Array, ""] | None = number(
+        "V/A", "voltage per error of the current", POSITIVE, default=None
+    )
+    integral: Float[Array, ""] | None = number(
+        "V/(A s)", "rate of the voltage per error of the current", POSITIVE, default=None
+    )
+    limits: Float[Array, "2"] | None = number(
+        "A", "smallest and largest current commanded", INCREASING, default=None
+    )
+
+    def port(self, coil: Coil) -> LoopPort:
+        gains = _gains(self, coil.inductance, coil.resistance)
+        return _closed(coil, gains, -xp.ones(1), xp.zeros(3))
+
+
+class ForceLoop(AbstractInnerLoop):
+    """Force feedback: the command is a force in N, which the amplifier holds between coil and beam.
+
+    The force F is that of a sensor at the tip, so that mass, suspension and back-EMF of the shaker
+    stand within the loop and their effect vanishes as its gains grow; with integral action a steady
+    command acts in full on a beam that gives way. Gains follow from the `bandwidth` b as
+    P = L b / K_f and Q = R b / K_f: F = command b / (p + b) with the coil at rest. The signal of
+    the sensor passes a first-order lag of `sensor_bandwidth`.
+
+    A loop that is stable with the coil at rest need not be so on the beam: see `jb.check`.
+
+    >>> import jaxbeam as jb
+    >>> shaker = jb.Electrodynamic(
+    ...     0.3, 3.0, 1e-3, 8.0, stiffness=2e3, inner_loop=jb.ForceLoop(bandwidth=500.0)
+    ... )
+    >>> attachment = shaker.attachment()
+    >>> print(shaker.command_unit, f"{attachment.static_gain:.1f}, {attachment.stiffness:.1f} N/m")
+    N 1.0, 0.0 N/m
+    """
+
+    kind: ClassVar[str] = "force"
+    command_unit: ClassVar[str] = "N"
+
+    bandwidth: Float[Array, ""] | None = number(
+        "1/s", "bandwidth of the loop, from which its gains follow", POSITIVE, default=None
+    )
+    proportional: Float[Array, ""] | None = number(
+        "V/N", "voltage per error of the force", POSITIVE, default=None
+    )
+    integral: Float[Array, ""] | None = number(
+        "V/(N s)", "rate of the voltage per error of the force", POSITIVE, default=None
+    )
+    sensor_bandwidth: Float[Array, ""] | None = number(
+        "1/s", "bandwidth of the lag of the force sensor; none if left out", POSITIVE, default=None
+    )
+    limits: Float[Array, "2"] | None = number(
+        "N", "smallest and largest force commanded", INCREASING, default=None
+    )
+
+    def port(self, coil: Coil) -> LoopPort:
+        constant = coil.force_constant
+        gains = _gains(self, coil.inductance / constant, coil.resistance / constant)
+        suspension = xp.stack([coil.stiffness, coil.damping, coil.mass])
+        lag = self.sensor_bandwidth
+        if lag is None:
+            return _closed(coil, gains, -constant[None], suspension)
+        # The second state is what the sensor shows of the force.
+        sensor = xp.stack([lag * constant, -lag]), -lag * suspension
+        return _closed(coil, gains, xp.array([0.0, -1.0]), xp.zeros(3), sensor)
+
+
+def coil_alone(coil: Coil) -> LoopPort:
+    """Port of a coil whose command is its voltage; its state is the current."""
+    velocity = xp.stack([xp.zeros(()), -coil.back_emf, xp.zeros(())])
+    matrix, columns = -coil.resistance[None, None], velocity[None]
+    voltage = PortSignal(xp.zeros(1), xp.ones(()), xp.zeros(3))
+    return _port(
+        coil,
+        matrix / coil.inductance,
+        1 / coil.inductance[None],
+        columns / coil.inductance,
+        voltage,
+    )
+
+
+def _gains(loop: AbstractInnerLoop, inductance, resistance) -> tuple[Array, Array | None]:
+    """Gains P and Q, given or from the bandwidth; the numbers of the coil are over its output."""
+    if loop.bandwidth is None:
+        return xp.asarray(loop.proportional), loop.integral
+    return inductance * loop.bandwidth, resistance * loop.bandwidth
+
+
+def _closed(coil: Coil, gains, error_states, error_port, sensor=None) -> LoopPort:
+    """Port of a coil whose voltage follows from an error u + error_states z + error_port (s, ...).
+
+    The states z are the current, the reading of the `sensor`, with its rows on both and on the
+    port, and the integral of the error, if there are such.
+    """
+    proportional, integral = gains
+    zero = xp.zeros(())
+    states, port = proportional * error_states, proportional * error_port
+    rows, columns = [], []
+    if sensor is not None:
+        rows.append(sensor[0])
+        columns.append(sensor[1])
+    commands = [proportional / coil.inductance] + [zero] * len(rows)
+    if integral is not None:
+        states = xp.concatenate([states, integral[None]])
+        rows = [xp.concatenate([row, xp.zeros(1)]) for row in rows]
+        rows.append(xp.concatenate([error_states, xp.zeros(1)]))
+        columns.append(error_port)
+        commands.append(xp.ones(()))
+    emf = xp.stack([zero, coil.back_emf, zero])
+    resistance = coil.resistance * xp.eye(states.shape[0])[0]
+    return _port(
+        coil,
+        xp.stack([(states - resistance) / coil.inductance, *rows]),
+        xp.stack(commands),
+        xp.stack([(port - emf) / coil.inductance, *columns]),
+        PortSignal(states, proportional, port),
+    )
+
+
+def _port(coil: Coil, matrix, commands, columns, voltage: PortSignal) -> LoopPort:
+    """Port of z' = matrix z + commands u + columns (s, s', s''), whose first state is the current.
+
+    An attachment depends on s' alone. With z = y + a s + b s', a = -matrix^-1 columns_s and
+    b = columns_s'', so does y' = matrix y + commands u + (columns_s' + matrix b - a) s'; what is
+    left of s and s' is a share of its stiffness and damping. At y = 0 the loop is at rest with s.
+    """
+    on_s, on_rate, on_acceleration = columns.T
+    shift = -xp.linalg.solve(matrix, on_s)
+    moved = xp.stack([shift, on_acceleration, xp.zeros_like(shift)], axis=1)
+
+    def shown(signal: PortSignal) -> PortSignal:
+        return PortSignal(signal.states, signal.command, signal.port + signal.states @ moved)
+
+    first = xp.eye(matrix.shape[0])[0]
+    current = shown(PortSignal(first, xp.zeros(()), xp.zeros(3)))
+    attachment = Attachment(
+        state_matrix=matrix,
+        input_matrix=commands,
+        velocity_matrix=on_rate + matrix @ on_acceleration - shift,
+        output_matrix=coil.force_constant * first,
+        feedthrough=xp.zeros(()),
+        stiffness=coil.stiffness - coil.force_constant * current.port[0],
+        damping=coil.damping - coil.force_constant * current.port[1],
+        mass=coil.mass,
+    )
+    return LoopPort(attachment, current, shown(voltage))
 
 
 class Electrodynamic(AbstractActuator):

@@ -5,8 +5,7 @@ from typing import ClassVar
 from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment, SectionStiffening
-from jaxbeam.case.actuators.creep import Creep
-from jaxbeam.case.actuators.hysteresis import Hysteresis
+from jaxbeam.case.actuators.hysteresis import Creep, Hysteresis
 from jaxbeam.case.declared_checks import validate_direct_or_derived
 from jaxbeam.case.fields import (
     INCREASING,

@@ -1,4 +1,4 @@
-"""Axles in a row: forces or masses that travel together."""
+"""Rows of forces: axles, trains of the library, line loads."""
 
 import dataclasses
 from typing import ClassVar
@@ -6,20 +6,21 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case import fields
 from jaxbeam.case.declared_checks import suggestion
 from jaxbeam.case.fields import (
     INCREASING,
     NOT_NEGATIVE,
+    POSITIVE,
     choice,
     concrete,
     is_concrete,
     number,
 )
-from jaxbeam.case.loads.row import AbstractRowLoad
-from jaxbeam.case.loads.vehicle_checks import length_error
-from jaxbeam.case.loads.vehicle_model import plain_wheels
+from jaxbeam.case.loads.base import AbstractRowLoad, AbstractVehicleLoad, length_error, plain_wheels
+from jaxbeam.case.trajectory import StandingTrajectory
 from jaxbeam.runtime.arrays import Array, xp
-from jaxbeam.vehicles.trains import LEFT_OUT, Train, trains
+from jaxbeam.vehicles.library import LEFT_OUT, Train, line_loads, trains
 
 
 class Axles(AbstractRowLoad):
@@ -132,3 +133,99 @@ class Axles(AbstractRowLoad):
         masses = 0.0 * each if self.masses is None else self.masses * each
         forces = masses * gravity if self.forces is None else self.forces * each
         return plain_wheels(xp.asarray(forces), xp.asarray(masses), self.offsets)
+
+
+class LineLoad(AbstractVehicleLoad):
+    """Forces per length in one or more parts, one behind the other, as many point forces each.
+
+    A `model` of the library, LM71, SW/0, SW/2 or "unloaded-train", or own lists. Each part is
+    replaced by `points` equal forces in the middles of as many pieces: for statics the error falls
+    as the square of their length h; a travelling load excites the beam at the frequency v / h too.
+    The front is at the position of the load; with a `position` it stands there, and parts beyond
+    the ends of the beam do not count.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[jb.LineLoad(force_per_length=[80e3], lengths=[5.0], points=4, speed=20.0)],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    6.708 mm
+    """
+
+    kind: ClassVar[str] = "line-load"
+
+    model: str = choice("name of a line load of the library", default="")
+    force_per_length: Float[Array, "*part"] | None = number(
+        "N/m", "force per length of each part, positive downwards", NOT_NEGATIVE, default=None
+    )
+    lengths: Float[Array, "*part"] | None = number(
+        "m", "lengths of the parts, front first", POSITIVE, default=None
+    )
+    gaps: Float[Array, "*part"] | None = number(
+        "m", "gaps before the parts; 0 if left out", NOT_NEGATIVE, default=None
+    )
+    tail: Float[Array, ""] = number(
+        "m", "length of parts of the library without an end", POSITIVE, default=50.0
+    )
+    points: int = fields.count("point forces of each part", default=100)
+    position: Float[Array, ""] | None = number(
+        "m", "place of the front of a load that does not travel", default=None
+    )
+
+    def validate(self, address):
+        error = self._model_error(address) if self.model else self._list_error(address)
+        if error is not None or self.position is None:
+            return error or super().validate(address)
+        for name in ("speed", "times", "start_position"):
+            if getattr(self, name) is not None:
+                return f"{address} has both position and {name}; leave one out"
+        return None
+
+    def _model_error(self, address: str) -> str | None:
+        if self.model not in line_loads():
+            hint = suggestion(self.model, line_loads())
+            return f"{address}.model cannot be {self.model!r}; {hint}"
+        for name in ("force_per_length", "lengths", "gaps"):
+            if getattr(self, name) is not None:
+                return f"{address} has both model and {name}; leave one out"
+        return None
+
+    def _list_error(self, address: str) -> str | None:
+        if self.force_per_length is None or self.lengths is None:
+            return (
+                f"{address} has neither model nor force_per_length with lengths; name a line load"
+                " of the library, or give both"
+            )
+        if not np.ndim(self.lengths):
+            for name in ("force_per_length", "gaps"):
+                if np.ndim(getattr(self, name)):
+                    return f"{address}.lengths must be a list as {name} is, one for each part"
+            return None
+        return length_error(address, self, "lengths", ("force_per_length", "gaps"))
+
+    def trajectory(self, length):
+        if self.position is None:
+            return super().trajectory(length)
+        return StandingTrajectory(self.position, self.entry_time, length)
+
+    def vehicle(self, gravity):
+        axle_offsets, axle_forces = np.zeros(0), np.zeros(0)
+        if self.model:
+            code = line_loads()[self.model]
+            intensity, gaps = code.force_per_length, code.gaps
+            lengths = xp.where(code.lengths == 0, self.tail, code.lengths)
+            axle_offsets, axle_forces = lengths[0] + code.axle_offsets, code.axle_forces
+        else:
+            lengths = xp.reshape(self.lengths, -1)
+            gaps = 0.0 * lengths if self.gaps is None else self.gaps * xp.ones_like(lengths)
+            intensity = self.force_per_length * xp.ones_like(lengths)
+        ends = xp.cumsum(gaps + lengths)
+        middles = (np.arange(self.points) + 0.5) / self.points
+        places = (ends - lengths)[:, None] + lengths[:, None] * middles
+        forces = (intensity * lengths / self.points)[:, None] * np.ones(self.points)
+        places = xp.concatenate([places.reshape(-1), axle_offsets])
+        forces = xp.concatenate([forces.reshape(-1), axle_forces])
+        return plain_wheels(forces, xp.zeros_like(forces), places)

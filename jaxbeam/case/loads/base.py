@@ -1,27 +1,126 @@
-"""Interface of loads that travel along the beam.
+"""Loads: the interface, rows of several, and the vehicle that a load is.
+
+The heights u of the degrees of freedom, positive upwards, are measured from static equilibrium on a
+level surface. With the height y of the surface under each wheel (deflection plus profile), the
+force of a wheel on the surface, positive in compression, and the motion of the vehicle are
+
+    F = P + k (y - N u) + c (y' - N u') + m y'',
+    M u'' + C u' + K u = N^T (k (y - N u) + c (y' - N u')),
+
+with static wheel loads P, contact stiffness k and damping c, the unsprung mass m that follows the
+surface, and N u the heights above the wheels. A mass has no degree of freedom, and k = c = 0.
 
 A load is a vehicle, in the simplest case a mass or a force, with a trajectory x(t) (m) of its first
 wheel: constant deceleration, or a table of positions (see `jaxbeam.case.trajectory`).
 """
 
 import abc
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
+import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.absorbers import Absorber
+from jaxbeam.case import fields
 from jaxbeam.case.declared_checks import validate_exactly_one
-from jaxbeam.case.display.parts import ReprWithUnits
-from jaxbeam.case.fields import INCREASING, concrete, is_concrete, number
-from jaxbeam.case.loads.force_history import ForceHistory
-from jaxbeam.case.loads.vehicle_model import VehicleModel
+from jaxbeam.case.display import ReprWithUnits
+from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, concrete, is_concrete, number
 from jaxbeam.case.trajectory import (
     AbstractPiecewiseTrajectory,
     BrakingTrajectory,
     TabulatedTrajectory,
 )
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, cholesky, solve, xp
+from jaxbeam.runtime.module import Module
+
+_LOAD_TOLERANCE = 1e-9  # of the mean wheel load: a smaller one carries nothing
+
+
+class ForceHistory(Module):
+    """Force (N, positive downwards) over time, in addition to a constant one.
+
+    The sum of A sin(2 pi f t + phase) and of a table of forces at times, with straight lines
+    between them, constant before and after; t in s. Runs of a batch differ along a last axis.
+    """
+
+    frequencies: Float[Array, "wave *batch"]
+    amplitudes: Float[Array, "wave *batch"]
+    phases: Float[Array, "wave *batch"]
+    times: Float[Array, "entry *batch"]
+    forces: Float[Array, "entry *batch"]
+
+    def at(self, times: Float[Array, "*time"]) -> Float[Array, "*time_and_batch"]:
+        """Force (N) at times (s), the batch axis last."""
+        batch = (1,) * (self.amplitudes.ndim - 1)
+        t = xp.asarray(times).reshape(*xp.shape(times), 1, *batch)
+        axis = -1 - len(batch)
+        angles = 2 * np.pi * self.frequencies * t + self.phases
+        force = xp.sum(self.amplitudes * xp.sin(angles), axis=axis)
+        if self.times.shape[0] == 0:
+            return force
+        slopes = xp.diff(self.forces, axis=0) / xp.diff(self.times, axis=0)
+        elapsed = xp.clip(t - self.times[:-1], 0.0, xp.diff(self.times, axis=0))
+        return force + self.forces[0] + xp.sum(slopes * elapsed, axis=axis)
+
+
+class VehicleModel(Module):
+    """Matrices of one vehicle: equations of motion, and what its wheels do to the surface.
+
+    `offsets` are the distances (m) of the wheels behind the first one. Wheels have static loads P
+    (N), unsprung masses m (kg), and k (N/m) and c (N s/m) of the springs between surface and
+    vehicle. M, C, K belong to the vehicle without these; `wheel_map` is N. `names` are those of the
+    degrees of freedom: heights in m, and pitch angles in rad where the name ends in "pitch".
+    """
+
+    offsets: Float[Array, " wheel"]
+    static_loads: Float[Array, " wheel"]
+    wheel_masses: Float[Array, " wheel"]
+    contact_stiffness: Float[Array, " wheel"]
+    contact_damping: Float[Array, " wheel"]
+    mass: Float[Array, "dof dof"]
+    damping: Float[Array, "dof dof"]
+    stiffness: Float[Array, "dof dof"]
+    wheel_map: Float[Array, "wheel dof"]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def full_stiffness(self) -> Float[Array, "dof dof"]:
+        """Stiffness (N/m) of the vehicle on a rigid surface."""
+        contact = self.contact_stiffness[:, None] * self.wheel_map
+        return self.stiffness + self.wheel_map.T @ contact
+
+    @property
+    def full_damping(self) -> Float[Array, "dof dof"]:
+        """Damping (N s/m) of the vehicle on a rigid surface."""
+        contact = self.contact_damping[:, None] * self.wheel_map
+        return self.damping + self.wheel_map.T @ contact
+
+    def natural_frequencies(self) -> Float[Array, " dof"]:
+        """Undamped natural frequencies (Hz) on a rigid surface, ascending.
+
+        det(K - (2 pi f)^2 M) = 0 with the springs of the wheels in K.
+        """
+        if not self.names:
+            return xp.zeros(0)
+        half_solved = solve(factor := cholesky(self.mass), self.full_stiffness)
+        scaled = solve(factor, half_solved.T)
+        values = xp.linalg.eigvalsh((scaled + scaled.T) / 2)
+        return xp.sqrt(xp.maximum(values, 0.0)) / (2 * np.pi)
+
+
+def plain_wheels(
+    static_loads: Float[Array, "*wheel"],
+    masses: Float[Array, "*wheel"],
+    offsets: Float[Array, " wheel"] | None = None,
+) -> VehicleModel:
+    """Wheels without a vehicle above them: forces (N) and masses (kg) that follow the surface."""
+    static_loads, masses = xp.reshape(static_loads, -1), xp.reshape(masses, -1)
+    wheels = static_loads.shape[0]
+    none, nothing = xp.zeros(wheels), np.zeros((0, 0))
+    offsets = none if offsets is None else offsets
+    matrices = nothing, nothing, nothing, np.zeros((wheels, 0))
+    return VehicleModel(offsets, static_loads, masses, none, none, *matrices, ())
 
 
 class AbstractLoad(ReprWithUnits):
@@ -148,6 +247,111 @@ def trajectory(load: AbstractLoad, length: Float[Array, ""]) -> AbstractPiecewis
     return load.trajectory(length)
 
 
-def wheel_distances(load: AbstractLoad | Absorber, vehicle: VehicleModel) -> Float[Array, " wheel"]:
-    """Distances (m) of all wheels of a load, whose vehicles are given, behind its first one."""
+def wheel_distances(load: Any, vehicle: VehicleModel) -> Float[Array, " wheel"]:
+    """Distances (m) of all wheels of a load or an absorber behind its first one, given vehicles."""
     return (load.spacings()[:, None] + vehicle.offsets).reshape(-1)
+
+
+class AbstractRowLoad(AbstractVehicleLoad):
+    """`count` vehicles in a row, the first wheels of neighbours `spacing` apart."""
+
+    count: int = fields.count("number of vehicles in a row", default=1, kw_only=True)
+    spacing: Float[Array, ""] | None = number(
+        "m", "distance from vehicle to vehicle", NOT_NEGATIVE, default=None, kw_only=True
+    )
+
+    def row_spacing(self) -> Float[Array, ""] | None:
+        """Distance (m) between the first wheels of neighbours; None if it is not given."""
+        return self.spacing
+
+    def spacings(self) -> Float[Array, " vehicle"]:
+        if self.count == 1:
+            return xp.zeros(1)
+        return xp.arange(self.count) * self.row_spacing()
+
+    def validate(self, address):
+        if self.count > 1 and self.row_spacing() is None:
+            return (
+                f"{address}.spacing is missing; give the distance in m from vehicle to vehicle of"
+                f" the {self.count}"
+            )
+        return super().validate(address)
+
+    def overlap_error(self, address: str, wheelbase: Float[Array, ""], name: str) -> str | None:
+        """Error message if a vehicle of a wheelbase (m) is longer than the spacing, or None."""
+        spacing = self.row_spacing()
+        if self.count == 1 or not (is_concrete(spacing) and is_concrete(wheelbase)):
+            return None
+        if concrete(spacing) > concrete(wheelbase):
+            return None
+        return (
+            f"{address}.spacing must exceed the wheelbase of the {name},"
+            f" {concrete(wheelbase):g} m; it is {concrete(spacing):g} m: give a larger one"
+        )
+
+
+def known_numbers(part: Any) -> bool:
+    """Whether no number of a part is traced by `jit` or `vmap`."""
+    return all(is_concrete(leaf) for leaf in jax.tree.leaves(part))
+
+
+def positive_error(address: str, part: Any, names: tuple[str, ...], reason: str) -> str | None:
+    """Error of the first number among some fields of a part that is not positive."""
+    for name in names:
+        value = getattr(part, name)
+        if value is None or not is_concrete(value):
+            continue
+        numbers = np.atleast_1d(concrete(value))
+        wrong = np.flatnonzero(numbers <= 0)
+        if wrong.size:
+            entry = f".{wrong[0]}" if np.ndim(value) else ""
+            return f"{address}.{name}{entry} must be positive: {reason}"
+    return None
+
+
+def length_error(address: str, part: Any, first: str, names: tuple[str, ...]) -> str | None:
+    """Error of the first list among some fields that is not as long as that of the field first."""
+    expected = np.shape(getattr(part, first))[0]
+    for name in names:
+        value = getattr(part, name)
+        if value is None or not np.ndim(value) or np.shape(value)[0] == expected:
+            continue
+        return (
+            f"{address}.{name} has {np.shape(value)[0]} entries and {first} has {expected};"
+            " give one for each axle, front first"
+        )
+    return None
+
+
+def static_load_error(address: str, vehicle: VehicleModel) -> str | None:
+    """Error of a vehicle without static equilibrium, or with a wheel that presses on nothing.
+
+    `vehicle` is that of any gravity.
+    """
+    if not is_concrete(vehicle.static_loads):
+        return None
+    stiffness = concrete(vehicle.full_stiffness)
+    scale = np.sqrt(np.abs(np.diag(stiffness)))
+    held = np.all(scale > 0) and np.linalg.matrix_rank(stiffness / np.outer(scale, scale)) == len(
+        scale
+    )
+    if not held:
+        return (
+            f"{address} has no static equilibrium: its springs hold {_loose(vehicle)} in no"
+            " place; add a spring or an axle"
+        )
+    loads = concrete(vehicle.static_loads)
+    for i, load in enumerate(loads):
+        if load <= _LOAD_TOLERANCE * np.mean(np.abs(loads)):
+            sign = "a negative static load" if load < 0 else "no static load"
+            return (
+                f"axle {i + 1} of {address} would carry {sign}; move it, or the centres of mass,"
+                " so that every axle is pressed down"
+            )
+    return None
+
+
+def _loose(vehicle: VehicleModel) -> str:
+    """Degrees of freedom that move most where no spring resists."""
+    values, vectors = np.linalg.eigh(concrete(vehicle.full_stiffness))
+    return repr(vehicle.names[int(np.argmax(np.abs(vectors[:, 0])))])

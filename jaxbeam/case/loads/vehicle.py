@@ -1,20 +1,28 @@
-"""Any planar vehicle, from a file or from the library, that travels along the beam."""
+"""Loads that are vehicles: what all of them have, and the checks of their numbers."""
 
 import dataclasses
 from typing import ClassVar
 
 import equinox as eqx
 
-from jaxbeam.case.fields import choice, parts
-from jaxbeam.case.loads.planar.files import is_path, load_vehicle, unknown_vehicle, vehicle_names
+from jaxbeam.case.fields import (
+    choice,
+    parts,
+)
+from jaxbeam.case.loads.base import AbstractRowLoad
 from jaxbeam.case.loads.planar.parts import (
     VehicleAxle,
     VehicleBody,
     VehicleHinge,
     VehicleSpring,
 )
-from jaxbeam.case.loads.planar.vehicle import PlanarVehicle
-from jaxbeam.case.loads.row import AbstractRowLoad
+from jaxbeam.case.loads.planar.vehicle import (
+    PlanarVehicle,
+    is_path,
+    load_vehicle,
+    unknown_vehicle,
+    vehicle_names,
+)
 
 DESCRIPTION = ("bodies", "springs", "hinges", "axles", "spacing")
 IMPLIED = {"model": DESCRIPTION}  # entries of a load that follow from another one

@@ -60,7 +60,7 @@ def compare(
     parsed_case = options.read(case)
 
     from jaxbeam.analysis.compare import compare, metrics_over_cases
-    from jaxbeam.case.display.addresses import value_words
+    from jaxbeam.case.case import value_words
     from jaxbeam.case.validation import check_case
 
     laws = _read_controllers(case, parsed_case, controllers)

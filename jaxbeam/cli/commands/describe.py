@@ -14,8 +14,7 @@ from jaxbeam.cli.options import (
 
 if TYPE_CHECKING:
     from jaxbeam.case.case import Case
-    from jaxbeam.case.loads.base import AbstractLoad
-    from jaxbeam.case.loads.vehicle_model import VehicleModel
+    from jaxbeam.case.loads.base import AbstractLoad, VehicleModel
 
 GRAVITY = 9.81  # m/s^2, of vehicles without a case
 FAST = 5.0  # m/s, from where speeds are in km/h too
@@ -53,7 +52,7 @@ def describe(
     elif "beam" in content or "loads" in content:
         results = _of_case(source)
     else:
-        from jaxbeam.case.loads.planar.files import load_vehicle
+        from jaxbeam.case.loads.planar.vehicle import load_vehicle
 
         vehicle = load_vehicle(Path(source))
         title = vehicle.title or Path(source).stem
@@ -76,7 +75,7 @@ def describe(
 def _about_case(path: str) -> tuple[dict[str, Any], list[str]]:
     """What a case is, in numbers by their names in JSON and in words."""
     import jaxbeam as jb
-    from jaxbeam.case.display.prefixes import with_prefix
+    from jaxbeam.case.display import with_prefix
 
     case = jb.load_case(path)
     found, frequencies = jb.check(case), jb.modes(case).frequencies
@@ -103,7 +102,7 @@ def _about_case(path: str) -> tuple[dict[str, Any], list[str]]:
 
 def _beam_words(case: "Case") -> str:
     """Length, ends, supports, stiffness, mass and damping of the beam of a case."""
-    from jaxbeam.case.display.prefixes import with_prefix
+    from jaxbeam.case.display import with_prefix
 
     beam, count = case.beam, len(case.supports)
     held = f", {count} support{'s' * (count > 1)} between" if count else ""
@@ -118,7 +117,7 @@ def settlement_words(case: "Case") -> list[str]:
     """What settles, and the smallest and largest moment that this locks in."""
     import numpy as np
 
-    from jaxbeam.case.display.prefixes import with_prefix
+    from jaxbeam.case.display import with_prefix
     from jaxbeam.model.along_beam import positions_along, sections
     from jaxbeam.model.settlement import has_settlement, settled_beam
     from jaxbeam.model.static_correction import bending_moment
@@ -177,7 +176,7 @@ def _loads(source: str, content: dict[str, Any]) -> "Sequence[AbstractLoad]":
     from jaxbeam.case.loads.axles import Axles
     from jaxbeam.case.loads.vehicle import VehicleLoad
     from jaxbeam.files.case_file import load_case
-    from jaxbeam.vehicles.trains import trains
+    from jaxbeam.vehicles.library import trains
 
     if "beam" in content or "loads" in content:
         return load_case(source).loads
@@ -189,8 +188,8 @@ def _loads(source: str, content: dict[str, Any]) -> "Sequence[AbstractLoad]":
 def _of_library(name: str) -> dict[str, Any]:
     from jaxbeam.case.declared_checks import suggestion
     from jaxbeam.case.loads.axles import Axles
-    from jaxbeam.case.loads.planar.files import load_vehicle, vehicle_names
-    from jaxbeam.vehicles.trains import trains
+    from jaxbeam.case.loads.planar.vehicle import load_vehicle, vehicle_names
+    from jaxbeam.vehicles.library import trains
 
     if name in trains():
         return _result(name, trains()[name].source, Axles(train=name, speed=1.0).vehicle, GRAVITY)
@@ -269,9 +268,8 @@ def _lines(result: dict[str, Any], is_part: bool) -> list[str]:
 
 
 def _list_library(options: PrintOptions) -> None:
-    from jaxbeam.case.loads.planar.files import load_vehicle, vehicle_names
-    from jaxbeam.vehicles.line_loads import line_loads
-    from jaxbeam.vehicles.trains import trains
+    from jaxbeam.case.loads.planar.vehicle import load_vehicle, vehicle_names
+    from jaxbeam.vehicles.library import line_loads, trains
 
     vehicles = {name: load_vehicle(name).title for name in vehicle_names()}
     rows = [(name, title) for name, title in vehicles.items()]

@@ -45,7 +45,7 @@ def simulate(
     """
     check_suffix(output, ".nc", "a record", RESULTS)
     if animate:
-        from jaxbeam.plot.traffic.film import check_film
+        from jaxbeam.plot.traffic.moving import check_film
 
         check_film(animate)
     picture = pictures.path(output, case)
@@ -77,7 +77,7 @@ def simulate(
         lines.append(f"{words}; sensors read changes from there")
     controller = parsed_case.controller
     if controller is not None and not controller.open_loop:
-        from jaxbeam.analysis.crossing_margin import stability_margin
+        from jaxbeam.analysis.margins import stability_margin
 
         margin = stability_margin(parsed_case, verdict_only=True)
         content["stability"] = margin.verdict

@@ -47,15 +47,17 @@ def stability(
     options.check_outputs(picture, loop_picture)
     parsed_case = options.read(case)
 
-    from jaxbeam.analysis.crossing_margin import stability_margin
     from jaxbeam.analysis.linearised_loop import linearised_loop
-    from jaxbeam.analysis.loops.stationary_loop import loop_with_mass_at
-    from jaxbeam.analysis.stability import frozen_poles, growth, stream
-    from jaxbeam.analysis.stability_limits import (
+    from jaxbeam.analysis.margins import stability_margin
+    from jaxbeam.analysis.stability import (
+        frozen_poles,
+        growth,
         largest_frozen_pole,
         load_stability_limits,
+        stream,
         stream_excess,
     )
+    from jaxbeam.analysis.stationary_loop import loop_with_mass_at
 
     along_crossing = stability_margin(parsed_case)
     # Before the first load: loads off the beam leave the loop as it is.

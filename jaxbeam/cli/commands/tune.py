@@ -226,7 +226,7 @@ def _write_and_print(result, tuned, files, picture, pictures, options: CaseOptio
     if picture:
         drawn = result if hasattr(result, "plot") else tuned[0]
         pictures.save(pictures.titled(drawn.plot()), picture)
-    from jaxbeam.analysis.crossing_margin import stability_margin
+    from jaxbeam.analysis.margins import stability_margin
     from tuning.control.comparison import beside_hand_drawn
 
     summaries, closed = [one.to_dict() for one in tuned], []

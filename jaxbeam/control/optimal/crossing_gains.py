@@ -9,10 +9,10 @@ from jaxtyping import Float
 
 from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.control.state_law import AbstractStateLaw
+from jaxbeam.control.state_controller import AbstractStateLaw
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.state_space import Plant
-from jaxbeam.model.vehicles.contact_rows import (
+from jaxbeam.model.vehicle_contact import (
     contact_rows,
     has_known_disturbance,
     known_disturbance,

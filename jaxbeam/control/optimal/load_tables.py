@@ -20,10 +20,10 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.estimator import EstimatedLoads
-from jaxbeam.case.loads.mass import MovingMass
-from jaxbeam.control.load_identifiers import AbstractLoadSource
+from jaxbeam.case.loads.point import MovingMass
+from jaxbeam.control.load_identification import AbstractLoadSource
 from jaxbeam.control.optimal.crossing_gains import GainSchedule
-from jaxbeam.control.state_law import AbstractStateLaw
+from jaxbeam.control.state_controller import AbstractStateLaw
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, vmap, xp

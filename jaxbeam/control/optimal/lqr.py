@@ -28,10 +28,8 @@ from jaxbeam.case.fields import (
     number,
     part,
 )
-from jaxbeam.case.loads.base import trajectory
-from jaxbeam.case.loads.vehicle_model import VehicleModel
-from jaxbeam.control.load_identification import LoadIdentification, identification_error
-from jaxbeam.control.load_identifiers import given_load
+from jaxbeam.case.loads.base import VehicleModel, trajectory
+from jaxbeam.control.load_identification import LoadIdentification, given_load, identification_error
 from jaxbeam.control.optimal.crossing_gains import (
     GainSchedule,
     crossing_events,
@@ -44,10 +42,8 @@ from jaxbeam.control.optimal.load_tables import (
     designs_of,
     with_single_mass,
 )
-from jaxbeam.control.optimal.sampled_lqr import IntegralLaw, sampled_gain
-from jaxbeam.control.optimal.sampling_loss import warn_slow_sampling
-from jaxbeam.control.state_controller import AbstractStateController, deflection_rows
-from jaxbeam.control.state_law import GainLaw
+from jaxbeam.control.optimal.sampled_lqr import IntegralLaw, sampled_gain, warn_slow_sampling
+from jaxbeam.control.state_controller import AbstractStateController, GainLaw, deflection_rows
 from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.finite_horizon import boundary_layer

@@ -28,10 +28,10 @@ from jaxbeam.control.predictive.prediction import (
     move_basis,
     move_maps,
     predict,
+    preview,
     repeat_plant,
     sampled_plant,
 )
-from jaxbeam.control.predictive.preview import preview
 from jaxbeam.control.predictive.terminal import (
     TerminalRegulator,
     dual_mode_terminal,
@@ -42,7 +42,7 @@ from jaxbeam.control.predictive.terminal import (
 )
 from jaxbeam.control.state_controller import AbstractStateController, deflection_rows
 from jaxbeam.model.state_space import Plant
-from jaxbeam.numerics.optimisation.qp import METHODS
+from jaxbeam.numerics.qp import METHODS
 from jaxbeam.runtime.arrays import Array, xp
 
 MAX_TERMINAL_WEIGHT = 3.0  # beyond it crossings were worse than without a terminal set, in trials

@@ -10,12 +10,11 @@ from jaxtyping import Float
 
 from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.estimator import Estimate
-from jaxbeam.control.predictive.prediction import Prediction, SampledPlant, predict
-from jaxbeam.control.predictive.preview import Preview
+from jaxbeam.control.predictive.prediction import Prediction, Preview, SampledPlant, predict
 from jaxbeam.control.predictive.terminal import Terminal
-from jaxbeam.control.state_law import AbstractStateLaw
+from jaxbeam.control.state_controller import AbstractStateLaw
 from jaxbeam.estimation.sampled_plant import in_blocks
-from jaxbeam.numerics.optimisation.quadratic_program import QuadraticProgram, first_move
+from jaxbeam.numerics.qp import QuadraticProgram, first_move
 from jaxbeam.runtime.arrays import Array, add_at, set_at, take, xp
 
 

@@ -15,10 +15,10 @@ from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, concrete, is_concrete, number
 from jaxbeam.control.predictive.mpc import MPC
 from jaxbeam.control.predictive.mpc_law import MPCLaw, rows_within
-from jaxbeam.control.state_law import AbstractStateLaw
+from jaxbeam.control.state_controller import AbstractStateLaw
 from jaxbeam.model.modal_model import assemble_modal_model
 from jaxbeam.model.state_space import Plant, build_plant
-from jaxbeam.numerics.optimisation.quadratic_program import QuadraticProgram, first_move
+from jaxbeam.numerics.qp import QuadraticProgram, first_move
 from jaxbeam.runtime.arrays import Array, xp
 
 

@@ -15,10 +15,8 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.control.optimal.crossing_gains import GainSchedule
 from jaxbeam.control.optimal.load_tables import ScheduledGainLaw
 from jaxbeam.control.optimal.lqr import LQR
-from jaxbeam.control.state_feedback import StateFeedback
-from jaxbeam.control.state_law import AbstractStateLaw, GainLaw
-from jaxbeam.estimation.constant_gain import ConstantGainFilter
-from jaxbeam.estimation.observer import Observer
+from jaxbeam.control.state_controller import AbstractStateLaw, GainLaw, StateFeedback
+from jaxbeam.estimation.observer import ConstantGainFilter, Observer
 from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.files.export.gains import Gains
 from jaxbeam.model.linear_system import StateSpace
@@ -26,7 +24,7 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.sensor_signals import sensor_sections
 from jaxbeam.model.state_space import state_space
-from jaxbeam.model.vehicles.vehicle_states import vehicle_signals
+from jaxbeam.model.vehicle_contact import vehicle_signals
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 

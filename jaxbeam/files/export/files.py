@@ -18,7 +18,7 @@ import scipy
 
 from jaxbeam.files.export.gains import ARRAYS, Gains
 from jaxbeam.files.export.header import c_header
-from jaxbeam.files.spreadsheet import as_text_cell
+from jaxbeam.files.tables import as_text_cell
 from jaxbeam.runtime.input_file import check_input, describe_content
 from jaxbeam.runtime.whole_file import whole_file
 

@@ -23,7 +23,7 @@ from numpy.polynomial import chebyshev
 
 from jaxbeam.integrator.forces.products import product
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.sensing.linear_outputs import LinearOutputs
+from jaxbeam.model.sensing.corrected_rows import LinearOutputs
 
 MAX_CONDITION = 1e6  # of the eigenvectors; beyond, poles are nearly repeated
 TABLE_POINTS = 600  # of the beam, at least; peaks are searched on lines between them

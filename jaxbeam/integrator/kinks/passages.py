@@ -8,7 +8,7 @@ then changes its velocity by |v| ([w'] + [r']) at once, from left to right: see 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbeam.case.beam_parts.properties import has
+from jaxbeam.case.beam import has
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.loads.base import AbstractLoad

@@ -16,11 +16,10 @@ import numpy as np
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads.vehicle_checks import known_numbers
+from jaxbeam.case.loads.base import known_numbers
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import Modes, modes
-from jaxbeam.model.plausibility.facts import Facts
-from jaxbeam.model.plausibility.numbers import Plausibility, plausible_numbers
+from jaxbeam.model.plausibility.facts import Facts, Plausibility, plausible_numbers
 from jaxbeam.model.plausibility.ranges import ADVICE, RANGES, Range
 
 MOST_MODES = 60

@@ -9,9 +9,8 @@ import numpy as np
 
 from jaxbeam.case.actuators.electrodynamic import Electrodynamic
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.model.plausibility.facts import Facts
-from jaxbeam.model.plausibility.numbers import GRAVITY
-from jaxbeam.model.poles_zeros import poles
+from jaxbeam.model.linear_system import poles
+from jaxbeam.model.plausibility.facts import GRAVITY, Facts
 
 INF = math.inf
 SOUND_SPEED = 5000.0  # m/s, of waves in steel, aluminium, timber along the grain; concrete 3500

@@ -1,4 +1,4 @@
-"""Output rows: measured quantities as linear functions of the modal coordinates q.
+"""Rows of what sensors measure: of the beam, of vehicles, as linear outputs.
 
     y_i = row_i . d^n q / dt^n,    row_i = d^k psi / dx^k at x_i, times -z_i for a fibre,
 
@@ -19,7 +19,6 @@ from jaxbeam.case.quantities import QUANTITIES, Quantity, quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.sensing.mode_band import band_weights, banded_fields
 from jaxbeam.model.static_correction import (
     Motion,
     active_moments,
@@ -28,6 +27,43 @@ from jaxbeam.model.static_correction import (
 )
 from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.module import Module
+
+LEAST_FREQUENCY = 30.0  # Hz
+FIRST_MODE_FACTOR = 1.5
+MODES_AT_LEAST = 3
+ROUNDING = 1e-9  # of a frequency
+
+
+def counted_frequency(frequencies: Float[Array, " mode"]) -> Float[Array, ""]:
+    """Frequency (Hz) up to which modes count: the largest of 30 Hz, 1.5 f_1 and f_3.
+
+    `frequencies` (Hz) ascend.
+    """
+    third = frequencies[min(MODES_AT_LEAST, frequencies.shape[0]) - 1]
+    limit = xp.maximum(LEAST_FREQUENCY, FIRST_MODE_FACTOR * frequencies[0])
+    return xp.maximum(limit, third) * (1 + ROUNDING)
+
+
+def band_weights(modes: Modes, band: str) -> Float[Array, " mode"]:
+    """1 for the modes of a band ("all" or "en1990"), 0 for the others."""
+    frequencies = modes.frequencies
+    if band == "all":
+        return xp.ones(frequencies.shape)
+    return xp.where(frequencies <= counted_frequency(frequencies), 1.0, 0.0)
+
+
+def banded_fields(model: ModalModel, band: str):
+    """Function like `ModalModel.fields` without the modes outside a band."""
+    if band == "all":
+        return model.fields
+    weights = band_weights(model.modes, band)
+
+    def fields(x, orders: tuple[int, ...]):
+        rows = model.modes.fields(x, orders) * weights
+        return rows if model.mode_map is None else rows @ model.mode_map
+
+    return fields
+
 
 # Positions x (m) and orders of fields to their rows (order, *position, mode), as
 # `ModalModel.fields` and `Modes.fields`.

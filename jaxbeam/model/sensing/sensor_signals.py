@@ -1,4 +1,4 @@
-"""Sensor model: from the true value of a quantity to the readings of a sensor.
+"""Signals of sensors: noise, filters, sampling, and what is lost on the way.
 
 In this order: analogue filter; sampling of the signal `delay` and a random delay before; offset and
 noise; range and resolution; loss; digital filter of the samples that are not lost.
@@ -6,11 +6,15 @@ noise; range and resolution; loss; digital filter of the samples that are not lo
 readings of a history, with analogue filter, delay, clock and losses.
 """
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxbeam.case.case import Case
+from jaxbeam.case.controller import ControllerFilter
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.filters import (
     Filter,
@@ -21,11 +25,115 @@ from jaxbeam.case.filters import (
     second_order_sections,
     steady_filter_state,
 )
-from jaxbeam.case.loads.planar.sensors import VehicleSensor
+from jaxbeam.case.loads.planar.vehicle import VehicleSensor
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.model.load_set import LoadSet, load_set
+from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.model.modes import Modes
+from jaxbeam.model.sensing.output_rows import sensor_history, sensor_rows
+from jaxbeam.model.state_space import Plant
+from jaxbeam.model.static_correction import (
+    Motion,
+)
 from jaxbeam.numerics.discretisation import c2d, evaluate_cubics, hermite_cubics
-from jaxbeam.numerics.normal_samples import normal_samples
-from jaxbeam.runtime.arrays import Array, not_differentiated, scan, stop_gradient, take, xp
+from jaxbeam.numerics.normal_samples import normal_samples, uniform_samples
+from jaxbeam.runtime.arrays import (
+    Array,
+    add_at,
+    block_diag,
+    not_differentiated,
+    scan,
+    set_at,
+    stop_gradient,
+    take,
+    xp,
+)
+
+COMMANDS = -1  # the number that stands for the commands, among those of the sensors
+LOSSES, DELAYS = 1, 2  # streams of random numbers within that of a sensor or of the commands
+
+NO_DERIVATIVE = (
+    "what {1} is drawn by a seed and jumps with the {0}, so that there is no derivative by it:"
+    " compare several of its values"
+)
+
+
+def refuse_derivatives(part: Any) -> None:
+    """Raise ValueError if there are derivatives by dropout or jitter of a part of a loop."""
+    for name, what in (("dropout", "is lost"), ("jitter", "is late in a loop")):
+        not_differentiated(getattr(part, name), NO_DERIVATIVE.format(name, what))
+
+
+def sent_readings(
+    seed: int, number: int, part: Any, count: int
+) -> tuple[Bool[Array, " sample"] | None, Float[Array, " sample"] | None]:
+    """Which of the first readings of a sensor are lost, and their random delays (s); None for none.
+
+    `part` has `dropout` and `jitter`: a sensor of this number, or a controller for its COMMANDS.
+    Derivatives by the dropout raise ValueError.
+    """
+    losses = late = None
+    if part.dropout is not None:
+        dropout = not_differentiated(part.dropout, NO_DERIVATIVE.format("dropout", "is lost"))
+        losses = xp.asarray(uniform_samples(seed, (number + 1, LOSSES), count)) < dropout
+    if part.jitter is not None:
+        late = part.jitter * uniform_samples(seed, (number + 1, DELAYS), count)
+    return losses, late
+
+
+def with_sensor_filters(
+    plant: Plant, controller_filters: Sequence[ControllerFilter] = ()
+) -> tuple[ModalModel, Float[Array, "sensor state"]]:
+    """Modal model with states of the analogue filters, and rows from its states to their outputs.
+
+    Rows are those of the sensors, then those of the filters of a control law. Rows of acceleration
+    sensors are zero: accelerations depend on contact forces and commands too.
+    """
+    case, model = plant.case, plant.modal_model
+    state_matrices, filter_inputs, rows = [model.A], [], []
+    on_states, _ = sensor_rows(model, case, case.sensors).on_states(model)
+    for sensor, row in zip(case.sensors, on_states, strict=True):
+        if sensor.filter is None or sensor.filter.realisation != "analogue":
+            rows.append({0: row})
+            continue
+        matrix, column, output, _ = analogue_state_space(sensor.filter)
+        filter_inputs.append((len(state_matrices), column, {0: row}))
+        rows.append({len(state_matrices): output})
+        state_matrices.append(matrix)
+    for controller_filter in controller_filters:
+        filter_input = rows[controller_filter.sensor]
+        filter_inputs.append((len(state_matrices), controller_filter.B, filter_input))
+        rows.append(
+            {part: controller_filter.D * row for part, row in filter_input.items()}
+            | {len(state_matrices): controller_filter.C}
+        )
+        state_matrices.append(controller_filter.A)
+    first_states = np.cumsum([0, *(part.shape[0] for part in state_matrices)])
+    total = int(first_states[-1])
+
+    def expand(row):
+        """A row on the states of some parts as a row on all states."""
+        row_parts = [row.get(i, xp.zeros(part.shape[0])) for i, part in enumerate(state_matrices)]
+        return xp.concatenate(row_parts)
+
+    state_matrix = block_diag(*state_matrices)
+    for i, column, row in filter_inputs:
+        state_matrix = add_at(
+            state_matrix,
+            np.s_[first_states[i] : first_states[i + 1]],
+            xp.outer(column, expand(row)),
+        )
+    filter_input = xp.stack([expand(row) for row in rows]) if rows else xp.zeros((0, total))
+    command_matrix = set_at(
+        xp.zeros((total, model.command_matrix.shape[1])),
+        np.s_[: model.state_count],
+        model.command_matrix,
+    )
+    augmented = eqx.tree_at(
+        lambda r: (r.state_matrix, r.command_matrix), model, (state_matrix[None], command_matrix)
+    )
+    return augmented, filter_input
+
 
 CLOCK_TOLERANCE_PERIODS = 1e-6  # a time this much before a sampling instant counts as at it
 IDENTITY = np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])  # a filter that changes nothing
@@ -205,3 +313,101 @@ def _check_times(sensor: AnySensor, times) -> None:
                 f" samples of the run are {max_spacing:g} s apart: save samples as often"
                 " (run.sample_rate)"
             )
+
+
+def sensor_readings(
+    case: Case,
+    modes: Modes,
+    motion: Motion,
+    times: Float[Array, " time"] | None = None,
+    noisy: bool = False,
+) -> Float[Array, "time sensor"]:
+    """Readings of the sensors of a case (SI units) from the motion of its modes.
+
+    The `times` (s) are needed for sensors whose readings depend on more than the present. `noisy`
+    readings include noise, losses and random delays by the run's seed; predictions to compare with
+    logs do without.
+
+    Raises ValueError, naming the sensor, as `sampled_readings` does and for missing times.
+    """
+    samples = motion.coordinates.shape[0]
+    random, noisy = noisy, noisy and any(sensor.noise is not None for sensor in case.sensors)
+    noise = noise_samples(case.run.seed, len(case.sensors), samples) if noisy else None
+    columns = []
+    for i, sensor in enumerate(case.sensors):
+        values = sensor_history(case, modes, motion, sensor)
+        noise_of_sensor = None if noise is None else noise[:, i]
+        if not needs_times(sensor):
+            columns.append(to_reading(sensor, values, noise_of_sensor))
+            continue
+        if times is None:
+            raise ValueError(
+                f"sensors.{i} has a filter, a delay, a sampling period, dropout or jitter: its"
+                " readings need times"
+            )
+        rates_of_change = None
+        if not (sensor.has_feedthrough or sensor.bends):
+            rates = motion._replace(coordinates=motion.rates, rates=motion.accelerations)
+            rates_of_change = sensor_history(case, modes, rates, sensor)
+        try:
+            way = sent_readings(case.run.seed, i, sensor, samples) if random else (None, None)
+            columns.append(
+                sampled_readings(sensor, times, values, rates_of_change, noise_of_sensor, *way)
+            )
+        except ValueError as error:
+            raise ValueError(f"sensors.{i}: {error}") from None
+    return xp.array(columns).reshape(-1, samples).T
+
+
+class VehicleMotion(NamedTuple):
+    """Heights (m) or pitch angles (rad) of the bodies of vehicles, their rates and accelerations.
+
+    Of all vehicles, one after the other (see `Record.bodies`), measured from static equilibrium.
+    """
+
+    body_displacement: Float[Array, "time body"]
+    body_velocity: Float[Array, "time body"]
+    body_acceleration: Float[Array, "time body"]
+
+
+def vehicle_readings(
+    case: Case, motion: VehicleMotion, times: Float[Array, " time"], noisy: bool = False
+) -> Float[Array, "time sensor"]:
+    """Readings of the vehicle sensors of a case (SI units) at times (s).
+
+    `noisy` readings include noise, losses and random delays by the run's seed.
+
+    Raises ValueError, naming the sensor, as `sampled_readings` does.
+    """
+    loads, columns, samples = load_set(case), [], motion.body_displacement.shape[0]
+    for i, sensor in enumerate(case.vehicle_sensors):
+        values = _history(loads, sensor, motion)
+        has_noise = noisy and sensor.noise is not None
+        number = len(case.sensors) + i  # noise of its own, unlike that of the sensors on the beam
+        noise = xp.asarray(normal_samples(case.run.seed, number, samples)) if has_noise else None
+        if not needs_times(sensor):
+            columns.append(to_reading(sensor, values, noise))
+            continue
+        try:
+            way = sent_readings(case.run.seed, number, sensor, samples) if noisy else (None, None)
+            columns.append(sampled_readings(sensor, times, values, None, noise, *way))
+        except ValueError as error:
+            raise ValueError(f"vehicle_sensors.{i}: {error}") from None
+    return xp.array(columns).reshape(-1, samples).T
+
+
+def _history(loads: LoadSet, sensor: VehicleSensor, motion: VehicleMotion) -> Float[Array, " time"]:
+    """History of the quantity of a sensor: height u + x t of a point, or its rates."""
+    history = getattr(motion, f"body_{sensor.quantity}")
+    first = 0
+    for group in loads.wheels.vehicles:
+        dofs = len(group.names)
+        if loads.load_of_wheel[group.first_wheel] == sensor.load:
+            first += sensor.vehicle * dofs
+            values = history[:, first + group.names.index(sensor.body)]
+            pitch = f"{sensor.body} pitch"
+            if pitch in group.names:
+                values = values + sensor.position * history[:, first + group.names.index(pitch)]
+            return values
+        first += group.count * dofs
+    raise ValueError(f"loads.{sensor.load} has no bodies")  # refused by `check_case`

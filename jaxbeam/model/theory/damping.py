@@ -5,11 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.beam import Beam
-from jaxbeam.case.beam_parts.damping import MATERIALS
+from jaxbeam.case.beam import MATERIALS, Beam
 from jaxbeam.model.layout import Layout
-from jaxbeam.model.theory.fields import SLOPE
-from jaxbeam.model.theory.sections import RIGIDITY, SHEAR, Sections
+from jaxbeam.model.theory.elements import RIGIDITY, SHEAR, SLOPE, Sections
 from jaxbeam.runtime.arrays import Array, xp
 
 FURTHER_POINTS = 8  # of the quadrature, for properties of degree up to 15

@@ -18,8 +18,7 @@ from jaxtyping import Float
 from numpy.polynomial import chebyshev
 
 from jaxbeam.model.layout import Layout
-from jaxbeam.model.theory.fields import SLOPE
-from jaxbeam.model.theory.sections import FOUNDATION, RIGIDITY, SHEAR, Sections
+from jaxbeam.model.theory.elements import FOUNDATION, RIGIDITY, SHEAR, SLOPE, Sections
 from jaxbeam.numerics.piecewise import piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, solve, xp
 from jaxbeam.runtime.module import Module

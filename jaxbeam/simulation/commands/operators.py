@@ -6,8 +6,7 @@ than a rate of the creep times the period from its ends.
 
 from jaxtyping import Float
 
-from jaxbeam.case.actuators.creep import Creep
-from jaxbeam.case.actuators.hysteresis import Hysteresis
+from jaxbeam.case.actuators.hysteresis import Creep, Hysteresis
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.module import Module
 

@@ -6,7 +6,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.model.contact import contact_at, split_states
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.sensing.vehicle_readings import VehicleMotion
+from jaxbeam.model.sensing.sensor_signals import VehicleMotion
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 

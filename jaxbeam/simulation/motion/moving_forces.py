@@ -9,7 +9,7 @@ from jaxbeam.integrator.forces.states import outputs_of_forces
 from jaxbeam.integrator.forces.system import force_system
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.sensing.linear_outputs import LinearOutputs
+from jaxbeam.model.sensing.corrected_rows import LinearOutputs
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.simulation.motion.at_samples import motion_at
 

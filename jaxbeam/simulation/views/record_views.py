@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.display.views import TableViews
+from jaxbeam.case.display import TableViews
 from jaxbeam.case.fields import is_concrete
 from jaxbeam.files.endings import check_ending
 from jaxbeam.files.netcdf import write_netcdf

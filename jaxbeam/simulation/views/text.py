@@ -5,8 +5,7 @@ from html import escape
 import numpy as np
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.display.parts import html_table
-from jaxbeam.case.display.prefixes import with_prefix
+from jaxbeam.case.display import html_table, with_prefix
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.report import text_table
 from jaxbeam.simulation.extremes import Extremes

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxbeam.files.zarr_codecs import check_codecs
+from jaxbeam.files.netcdf import check_codecs
 from jaxbeam.sweeps.stores.block_store import BlockStore
 from jaxbeam.sweeps.stores.zarr_files import (
     BLOCKS_GROUP,

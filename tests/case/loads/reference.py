@@ -4,11 +4,8 @@ import json
 
 import numpy as np
 
-from jaxbeam.case.loads.half_car import HalfCar
-from jaxbeam.case.loads.oscillator import Oscillator
-from jaxbeam.case.loads.quarter_car import QuarterCar
+from jaxbeam.case.loads.cars import HalfCar, Oscillator, QuarterCar, Wagon
 from jaxbeam.case.loads.vehicle import VehicleLoad
-from jaxbeam.case.loads.wagon import Wagon
 from tests.modules import ROOT
 
 REFERENCE = json.loads((ROOT / "tests" / "data" / "vehicles.json").read_text(encoding="utf-8"))

@@ -9,7 +9,7 @@ import jaxbeam as jb
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.model.load_set import load_set
-from jaxbeam.vehicles.line_loads import line_loads
+from jaxbeam.vehicles.library import line_loads
 from tests.differences import central
 
 LENGTH, RIGIDITY = 20.0, 1e10

@@ -6,14 +6,13 @@ import jax
 import numpy as np
 import pytest
 
-from jaxbeam.case.loads.planar.files import check_vehicle, load_vehicle
 from jaxbeam.case.loads.planar.parts import (
     VehicleAxle,
     VehicleBody,
     VehicleHinge,
     VehicleSpring,
 )
-from jaxbeam.case.loads.planar.vehicle import PlanarVehicle
+from jaxbeam.case.loads.planar.vehicle import PlanarVehicle, check_vehicle, load_vehicle
 from tests.case.loads.reference import LOADS
 
 GRAVITY = np.float64(9.81)

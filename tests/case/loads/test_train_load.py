@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.case.loads.planar.files import load_vehicle
+from jaxbeam.case.loads.planar.vehicle import load_vehicle
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 

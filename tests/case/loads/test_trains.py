@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxbeam.case.loads.axles import Axles
-from jaxbeam.vehicles.trains import trains
+from jaxbeam.vehicles.library import trains
 
 GRAVITY = np.float64(9.81)
 

@@ -3,10 +3,10 @@
 import re
 import tomllib
 
-from jaxbeam.case.loads.planar.files import check_vehicle, load_vehicle, vehicle_names
+from jaxbeam.case.loads.planar.vehicle import check_vehicle, load_vehicle, vehicle_names
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict
-from jaxbeam.vehicles.trains import trains
+from jaxbeam.vehicles.library import trains
 from tests.modules import ROOT
 
 TEXT = (ROOT / "docs" / "vehicles.md").read_text(encoding="utf-8")

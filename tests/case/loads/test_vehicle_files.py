@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.case.loads.planar.files import check_vehicle, load_vehicle, vehicle_names
+from jaxbeam.case.loads.planar.vehicle import check_vehicle, load_vehicle, vehicle_names
 from jaxbeam.files.case_file import (
     case_from_dict,
     case_to_dict,

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbeam.case.loads.oscillator import Oscillator
+from jaxbeam.case.loads.cars import Oscillator, QuarterCar
 from jaxbeam.case.loads.planar.parts import VehicleSpring
-from jaxbeam.case.loads.quarter_car import QuarterCar
 from tests.case.loads.reference import COORDINATES, LOADS, REFERENCE, coordinate_map
 from tests.differences import central
 

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import quad, solve_ivp
 
 import jaxbeam as jb
-from jaxbeam.case.loads.walking.footfalls import contact_time, jogging_factors, walking_factors
+from jaxbeam.case.loads.walking import contact_time, jogging_factors, walking_factors
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.model.load_set import load_set

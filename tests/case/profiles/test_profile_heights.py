@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 
 import jaxbeam as jb
 from jaxbeam.case.kinds import kinds
-from jaxbeam.case.profiles.base import AbstractProfile
+from jaxbeam.case.profiles.shapes import AbstractProfile
 from tests.case.profiles.examples import AVERAGED, HEIGHTS, PLAIN, POSITIONS, PROFILES
 from tests.differences import central
 

@@ -11,9 +11,7 @@ from scipy.integrate import quad
 from scipy.signal.windows import hann
 
 import jaxbeam as jb
-from jaxbeam.case.profiles.iso8608 import ROAD_CLASSES
-from jaxbeam.case.profiles.rail_spectra import RAIL_SPECTRA
-from jaxbeam.case.profiles.spectral import DIRECT_SIZE, sum_of_cosines
+from jaxbeam.case.profiles.spectra import DIRECT_SIZE, RAIL_SPECTRA, ROAD_CLASSES, sum_of_cosines
 from tests.modules import DATA
 
 REFERENCE = json.loads((DATA / "profiles.json").read_text())

@@ -16,7 +16,7 @@ from scipy.integrate import simpson, solve_ivp
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.control.optimal.crossing_gains import crossing_events
-from jaxbeam.control.state_law import TrueState
+from jaxbeam.control.state_controller import TrueState
 from jaxbeam.estimation.sampled_plant import SampleTiming
 from jaxbeam.estimation.simulated_vehicles import SampledWithVehicles
 from jaxbeam.model.modes import mesh_layout

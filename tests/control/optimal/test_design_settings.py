@@ -10,8 +10,7 @@ import scipy.optimize
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.stability import frozen_poles
-from jaxbeam.analysis.stability_limits import stability_limit
+from jaxbeam.analysis.stability import frozen_poles, stability_limit
 from jaxbeam.control.design_model import DesignModel
 from tests.analysis import test_stability as oracle
 from tests.analysis.test_stability import LENGTH, MASS, SPEED, shaker_case, state_matrices

@@ -6,7 +6,7 @@ import pytest
 import scipy.linalg
 from numpy.testing import assert_allclose
 
-from jaxbeam.control.optimal.minimax import Game, is_attained, least_level, minimax_law
+from jaxbeam.control.optimal.h_infinity import Game, is_attained, least_level, minimax_law
 from jaxbeam.runtime.arrays import xp
 from tests.differences import central
 

@@ -16,8 +16,11 @@ from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.case.validation import check_case
 from jaxbeam.cli import main
 from jaxbeam.control.optimal.lqr import LQR
-from jaxbeam.control.optimal.sampled_lqr import discrete_lq_problem
-from jaxbeam.control.optimal.sampling_loss import SamplingWarning, sampled_reachability
+from jaxbeam.control.optimal.sampled_lqr import (
+    SamplingWarning,
+    discrete_lq_problem,
+    sampled_reachability,
+)
 from jaxbeam.model.modes import mesh_layout
 
 WEIGHTS = {

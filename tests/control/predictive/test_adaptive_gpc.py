@@ -13,8 +13,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.predictive.adaptive_gpc import lift_and_delay
-from jaxbeam.control.predictive.gpc import PolynomialModel
+from jaxbeam.control.predictive.gpc import PolynomialModel, lift_and_delay
 from tests.differences import central
 
 PERIOD = 0.005

@@ -16,7 +16,7 @@ from jaxbeam.case.estimator import Estimate
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.predictive.mpc import TerminalSetWarning
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.numerics.optimisation.qp import solve_qp
+from jaxbeam.numerics.qp import solve_qp
 from tests.differences import central
 
 PERIOD, POSITIONS, MOVE_WEIGHT = 0.01, [0.2, 0.3, 0.45], 1e-9

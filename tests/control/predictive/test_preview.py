@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.control.predictive.preview import preview
+from jaxbeam.control.predictive.prediction import preview
 from tests.control.optimal import test_crossing_vehicles as crossing
 from tests.control.predictive import test_mpc_exact as exact
 from tests.loop_as_oracle import span_of

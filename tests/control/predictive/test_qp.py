@@ -8,7 +8,7 @@ import pytest
 import scipy.sparse
 from numpy.testing import assert_allclose, assert_array_equal
 
-from jaxbeam.numerics.optimisation.qp import INFEASIBLE, METHODS, SOLVED, UNFINISHED, solve_qp
+from jaxbeam.numerics.qp import INFEASIBLE, METHODS, SOLVED, UNFINISHED, solve_qp
 from tests.differences import central
 
 SIZES = [(3, 8), (6, 12), (8, 32)]

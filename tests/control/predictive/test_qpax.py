@@ -8,7 +8,7 @@ import qpax
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
-from jaxbeam.numerics.optimisation.qp import solve_qp
+from jaxbeam.numerics.qp import solve_qp
 from tests.control.predictive.test_mpc import beam_case, mpc
 from tests.control.predictive.test_mpc_law import commands
 from tests.control.predictive.test_qp import FEASIBLE, problems

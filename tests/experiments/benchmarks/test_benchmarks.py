@@ -57,7 +57,7 @@ def test_packages_that_are_not_installed_are_none():
         (1, "sampled", "histories"),
     ],
 )
-@pytest.mark.filterwarnings("ignore::jaxbeam.control.optimal.sampling_loss.SamplingWarning")
+@pytest.mark.filterwarnings("ignore::jaxbeam.control.optimal.sampled_lqr.SamplingWarning")
 def test_sweeps_of_the_table_are_right_and_fully_measured(kind):
     row = cases.measure(*kind, modes=2, side=2)
     assert row["error"] < 1e-6 and row["scipy_error"] < 1e-6

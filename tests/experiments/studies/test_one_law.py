@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from experiments.studies.one_law import plants, tune
 from experiments.studies.one_law.per_plant import TABLE_FILE
-from jaxbeam.control.internal_model.scheduled import REFERENCE, VALUES
+from jaxbeam.control.internal_model import REFERENCE, VALUES
 from tests.modules import ROOT
 
 

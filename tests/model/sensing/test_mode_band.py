@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.model.sensing.mode_band import band_weights
+from jaxbeam.model.sensing.output_rows import band_weights
 
 # 4, 16, 36, 64 Hz: three of the four count, the third beyond 30 Hz.
 RIGIDITY = (4.0 * 2 * np.pi) ** 2 * 15000.0 * 25.0**4 / np.pi**4

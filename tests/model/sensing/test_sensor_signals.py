@@ -15,12 +15,12 @@ from jaxbeam.case.filters import Filter
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict
-from jaxbeam.model.sensing.measurement import sensor_readings
 from jaxbeam.model.sensing.sensor_signals import (
     filtered_reading,
     initial_filter_state,
     noise_samples,
     sampled_readings,
+    sensor_readings,
     sensor_sections,
     to_reading,
 )

@@ -12,7 +12,7 @@ import jaxbeam as jb
 from jaxbeam.case.case import replace, value_at
 from jaxbeam.model.layout import find_layout
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.theory.buckling import critical_axial_force
+from jaxbeam.model.theory.statics import critical_axial_force
 from tests.differences import central
 from tests.modules import ROOT
 from tests.oracles.shooting import ShootingBeam

@@ -8,7 +8,7 @@ import pytest
 
 import jaxbeam as jb
 import tuning
-from jaxbeam.analysis import crossing_margin
+from jaxbeam.analysis import margins
 from jaxbeam.cli import main
 from tests.tuning.small_rig import GAIN, RIGIDITY, rig
 from tests.tuning.stand_in import dataset, fit, least_squares
@@ -107,8 +107,8 @@ def test_arguments_of_the_other_kinds_of_tuning(call, monkeypatch):
     class Reduced:
         tuned = Result()
 
-    margin = crossing_margin.StabilityMargin(2.0, 0.1)
-    monkeypatch.setattr(crossing_margin, "stability_margin", lambda case: margin)
+    margin = margins.StabilityMargin(2.0, 0.1)
+    monkeypatch.setattr(margins, "stability_margin", lambda case: margin)
     monkeypatch.setattr(tuning, "lexicographic", lexicographic)
     monkeypatch.setattr(tuning, "tune_reduced", tune_reduced)
     monkeypatch.setattr(tuning, "tune_integers", tune_integers)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxbeam.case.loads.mass import MovingMass
+from jaxbeam.case.loads.point import MovingMass
 from tuning import Log, read_log
 
 EXPECTED = [[1.5e-3, -2e-3], [2.5e-3, 0.0], [3.5e-3, 1e-3]]

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from jaxbeam.files.spreadsheet import from_text_cell
+from jaxbeam.files.tables import from_text_cell
 from tuning.logs.readers.stamps import is_stamp
 from tuning.logs.readers.table import is_time_name, parse_heading
 from tuning.logs.units import is_unit

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.loads.vehicle_model import VehicleModel
+from jaxbeam.case.loads.base import VehicleModel
 from jaxbeam.runtime.arrays import Array, solve, xp
 
 Pairs = tuple[tuple[int, int], ...]

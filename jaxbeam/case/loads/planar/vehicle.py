@@ -1,21 +1,135 @@
-"""Planar vehicles of any bodies, springs, dampers, hinges and axles."""
+"""Vehicles and trains of planar vehicles, from files or the library, and their sensors.
+
+A vehicle file is TOML with the keys of `PlanarVehicle`:
+
+    title = "Tractor and trailer"
+    source = "measured"
+    [[bodies]]                       # name, mass, inertia (left out: no pitch), position
+    name = "tractor"
+    mass = 4500.0                    # kg
+    inertia = 4604.0                 # kg m^2
+    position = 0.0                   # m, centre of mass; forward positive, from any origin
+    [[springs]]                      # between bodies: first, second, position, stiffness, damping,
+    ...                              # rotational_stiffness, rotational_damping
+    [[hinges]]                       # first, second, position
+    first = "tractor"
+    second = "trailer"
+    position = -2.15
+    [[axles]]                        # front first
+    body = "tractor"
+    position = 0.5
+    mass = 700.0
+    suspension_stiffness = 4.0e5     # N/m; left out: the axle is part of the body
+    suspension_damping = 1.0e3
+    tyre_stiffness = 1.75e6          # left out: the mass of the axle stays on the surface
+    tyre_damping = 1.0e4
+"""
+
+import functools
+import os
+import tomllib
+from importlib import resources
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.fields import POSITIVE, choice, number, parts
+from jaxbeam.case import fields
+from jaxbeam.case.declared_checks import check_fields, suggestion
+from jaxbeam.case.display import ReprWithUnits
+from jaxbeam.case.fields import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    PROBABILITY,
+    choice,
+    concrete,
+    count,
+    is_concrete,
+    number,
+    part,
+    parts,
+)
+from jaxbeam.case.filters import Filter
+from jaxbeam.case.loads.base import (
+    AbstractVehicleLoad,
+    VehicleModel,
+    known_numbers,
+    static_load_error,
+)
 from jaxbeam.case.loads.planar.assembly import Bodies, Hinges, Links, Wheels, assemble
-from jaxbeam.case.loads.planar.checks import description_errors
 from jaxbeam.case.loads.planar.parts import (
     VehicleAxle,
     VehicleBody,
     VehicleHinge,
     VehicleSpring,
+    description_errors,
 )
-from jaxbeam.case.loads.vehicle_checks import known_numbers, static_load_error
-from jaxbeam.case.loads.vehicle_model import VehicleModel
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.case.quantities import BODY_QUANTITIES, OF_QUANTITY, QUANTITIES
+from jaxbeam.case.reading.tables import read_part
+from jaxbeam.case.reading.toml_file import read_toml
+from jaxbeam.case.reading.units import in_si
+from jaxbeam.runtime.arrays import Array, block_diag, xp
 from jaxbeam.runtime.module import Module
+
+
+class VehicleSensor(ReprWithUnits, Module):
+    """Sensor of the vertical motion of a body or an axle of a vehicle, positive upwards.
+
+    `load` is the number of the load, `vehicle` that of the vehicle in its row, both from 0; `body`
+    a name of `Record.bodies` without the load, as "body" or "axle 1". At `position` (m) forward of
+    the centre of mass it feels the pitch as well. Displacements are from static equilibrium. The
+    other entries are those of `Sensor`.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3),
+    ...     loads=[jb.VehicleLoad(model="half-truck", speed=20.0)],
+    ...     vehicle_sensors=[jb.VehicleSensor(body="axle 1", quantity="acceleration")],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(case.vehicle_sensors[0].unit)
+    m/s^2
+    """
+
+    # What a sensor on the beam may have and this one has not.
+    range: ClassVar[None] = None
+    resolution: ClassVar[None] = None
+    has_feedthrough: ClassVar[bool] = True  # there is no history of the rate of an acceleration
+    bends: ClassVar[bool] = False
+
+    load: int = count("number of the load, from 0", minimum=0, default=0)
+    body: str = choice("name of the body or axle", default="body")
+    quantity: str = choice("measured quantity", *BODY_QUANTITIES, default="acceleration")
+    vehicle: int = count("number of the vehicle in a row, from 0", minimum=0, default=0)
+    position: Float[Array, ""] = number("m", "forward of the centre of mass", default=0.0)
+    offset: Float[Array, ""] = number(OF_QUANTITY, "constant added", default=0.0)
+    noise: Float[Array, ""] | None = number(
+        OF_QUANTITY, "standard deviation of white noise", NOT_NEGATIVE, default=None
+    )
+    filter: Filter | None = part("filter of the signal or of its samples", Filter)
+    sampling_period: Float[Array, ""] | None = number(
+        "s", "time between readings; that of the run if left out", POSITIVE, default=None
+    )
+    delay: Float[Array, ""] | None = number(
+        "s", "from motion to reading", NOT_NEGATIVE, default=None
+    )
+    dropout: Float[Array, ""] | None = number(
+        "1", "probability that a reading is lost", PROBABILITY, default=None, kw_only=True
+    )
+    jitter: Float[Array, ""] | None = number(
+        "s", "largest random delay of a reading", NOT_NEGATIVE, default=None, kw_only=True
+    )
+
+    def __post_init__(self):
+        for name in ("offset", "noise"):
+            value = getattr(self, name)
+            if isinstance(value, str) and self.quantity in BODY_QUANTITIES:
+                setattr(self, name, in_si(value, self.unit, name))
+
+    @property
+    def unit(self) -> str:
+        """SI unit of the readings."""
+        return QUANTITIES[BODY_QUANTITIES[self.quantity]].unit
 
 
 class PlanarVehicle(Module):
@@ -111,3 +225,163 @@ def _contact(axle: VehicleAxle):
     if axle.tyre_stiffness is None:
         return axle.mass, axle.suspension_stiffness, axle.suspension_damping
     return xp.zeros_like(axle.mass), axle.tyre_stiffness, axle.tyre_damping
+
+
+def is_path(model: str) -> bool:
+    """Whether the model of a vehicle is the path of a file, not a name of the library."""
+    return model.endswith(".toml")
+
+
+@functools.cache
+def vehicle_names() -> tuple[str, ...]:
+    """Names of the vehicles of the library."""
+    folder = resources.files("jaxbeam.vehicles") / "models"
+    names = (entry.name for entry in folder.iterdir())
+    return tuple(sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml")))
+
+
+def load_vehicle(model: str | os.PathLike) -> PlanarVehicle:
+    """The validated vehicle of a file, whose name ends in .toml, or of the library.
+
+    Raises ValueError for an unknown name, and with the file and the address for whatever is wrong
+    in a file; OSError if it cannot be read.
+
+    `model` is the name, or the path of the file.
+
+    >>> import jaxbeam as jb
+    >>> print(jb.load_vehicle("truck-5-axle").title)
+    Articulated truck: tractor with two axles, trailer with three
+    """
+    if isinstance(model, str) and not is_path(model):
+        if model not in vehicle_names():
+            raise ValueError(unknown_vehicle(model))
+        return _library_vehicle(model)
+    content = read_toml(model, "vehicle file")
+    try:
+        vehicle = read_part("", content, PlanarVehicle)
+        check_vehicle(vehicle)
+    except ValueError as error:
+        raise ValueError(f"{model}: {str(error).lstrip('. ')}") from None
+    return vehicle
+
+
+def unknown_vehicle(name: str) -> str:
+    """Error message for a name that the library does not have."""
+    return (
+        f"there is no vehicle {name!r} in the library (the name of a file ends in .toml);"
+        f" {suggestion(name, vehicle_names())}"
+    )
+
+
+def check_vehicle(vehicle: PlanarVehicle) -> None:
+    """Validate a vehicle; raises ValueError with the address of the first error."""
+    check_fields("", vehicle)
+    error = vehicle.validate("")
+    if error is not None:
+        raise ValueError(error)
+
+
+@functools.cache
+def _library_vehicle(name: str) -> PlanarVehicle:
+    text = (resources.files("jaxbeam.vehicles") / "models" / f"{name}.toml").read_text("utf-8")
+    return read_part("", tomllib.loads(text), PlanarVehicle)
+
+
+PER_WHEEL = ("static_loads", "wheel_masses", "contact_stiffness", "contact_damping")
+MATRICES = ("mass", "damping", "stiffness")
+
+
+class Coach(Module):
+    """Vehicles of one kind in a train, `count` one behind the other.
+
+    `length` over couplers is that of the vehicle file if it is left out; the wheels are in the
+    middle of it.
+
+    >>> import jaxbeam as jb
+    >>> coach = jb.Coach("manchester-wagon", count=4)
+    >>> print(coach.count, "coaches of", coach.coupler_length(), "m")
+    4 coaches of 25.0 m
+    """
+
+    model: str = choice("name of a vehicle of the library, or path of a vehicle file")
+    count: int = fields.count("number of vehicles in a row", default=1)
+    length: Float[Array, ""] | None = number("m", "length over couplers", POSITIVE, default=None)
+
+    def vehicle(self) -> PlanarVehicle:
+        """The vehicle of its file, or of the library."""
+        return load_vehicle(self.model)
+
+    def coupler_length(self) -> Float[Array, ""] | None:
+        """Length over couplers (m); None if neither it nor the file gives one."""
+        return self.vehicle().spacing if self.length is None else self.length
+
+
+class TrainLoad(AbstractVehicleLoad):
+    """Vehicles of several kinds, `coaches` from the front on, coupled without forces between them.
+
+    They are one load with one trajectory, that of the first wheel of the train.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
+    ...     sensors=[jb.Sensor(10.0)],
+    ...     loads=[jb.TrainLoad(speed=50.0, coaches=[jb.Coach("manchester-wagon", count=2)])],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
+    7.645 mm
+    """
+
+    kind: ClassVar[str] = "train"
+
+    coaches: tuple[Coach, ...] = parts("vehicles, front first", Coach)
+
+    def validate(self, address):
+        if not self.coaches:
+            return f"{address}.coaches has no entry; give at least one vehicle, with its model"
+        for i, coach in enumerate(self.coaches):
+            own = f"{address}.coaches.{i}"
+            if not is_path(coach.model) and coach.model not in vehicle_names():
+                return f"{own}.model: {unknown_vehicle(coach.model)}"
+            length = coach.coupler_length()
+            if length is None:
+                return (
+                    f"{own}.length is missing, and {coach.model} has no spacing in its file; give"
+                    " the length over couplers in m"
+                )
+            axles = coach.vehicle().axles
+            wheelbase = concrete(axles[0].position - axles[-1].position)
+            if is_concrete(length) and concrete(length) <= wheelbase:
+                return (
+                    f"{own}.length must exceed the wheelbase of {coach.model}, {wheelbase:g} m; it"
+                    f" is {concrete(length):g} m"
+                )
+        return super().validate(address)
+
+    def vehicle(self, gravity):
+        models, behind, end = [], [], 0.0
+        for coach in self.coaches:
+            model, length = coach.vehicle().model(gravity), coach.coupler_length()
+            overhang = (length - model.offsets[-1]) / 2
+            for _ in range(coach.count):
+                models.append(model)
+                behind.append(end + overhang + model.offsets)
+                end = end + length
+        behind = [offsets - behind[0][0] for offsets in behind]
+        return _coupled(models, behind)
+
+
+def _coupled(models: list[VehicleModel], behind) -> VehicleModel:
+    """Vehicles one behind the other as one; names begin with the number of each, from 1."""
+    names = tuple(f"coach {i + 1} {name}" for i, one in enumerate(models) for name in one.names)
+    rows, column = [], 0
+    for one in models:
+        size, dofs = one.wheel_map.shape
+        rest = len(names) - column - dofs
+        row = xp.zeros((size, column)), one.wheel_map, xp.zeros((size, rest))
+        rows.append(xp.concatenate(row, axis=1))
+        column += dofs
+    lists = {name: xp.concatenate([getattr(one, name) for one in models]) for name in PER_WHEEL}
+    matrices = {name: block_diag(*(getattr(one, name) for one in models)) for name in MATRICES}
+    offsets, wheel_map = xp.concatenate(behind), xp.concatenate(rows)
+    return VehicleModel(offsets=offsets, wheel_map=wheel_map, names=names, **lists, **matrices)

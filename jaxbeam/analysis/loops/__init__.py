@@ -1,1 +1,0 @@
-"""Loops of known numbers: of affine laws, and with stationary loads."""

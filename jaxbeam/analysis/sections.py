@@ -1,0 +1,347 @@
+"""Dynamic amplification, influence lines and characteristic points of sections."""
+
+import dataclasses
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.case.beam import END_CONDITIONS
+from jaxbeam.case.case import Case
+from jaxbeam.case.declared_checks import check_on_beam, suggestion
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.quantities import QUANTITIES, quantity_of
+from jaxbeam.case.sensors import Sensor
+from jaxbeam.integrator.integrate import integrate_peaks
+from jaxbeam.model.along_beam import LEFT_SHARE, positions_along, refined, sections
+from jaxbeam.model.influence import (
+    REACTION,
+    held_positions,
+    influence_line,
+    static_peak,
+)
+from jaxbeam.model.load_set import load_set
+from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.compiling import compiled, compiled_if_traced
+from jaxbeam.runtime.module import Module
+from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
+from jaxbeam.simulation.record import Record
+from jaxbeam.simulation.simulate import integration_setup
+
+AMPLIFIED = tuple(name for name, entry in QUANTITIES.items() if not entry.time_derivative)
+
+
+class Envelope(Module):
+    """Lowest and highest value of a quantity at `positions` (m): at most zero, and at least zero.
+
+    In m for deflections. It unpacks as lowest and highest.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(jb.Beam(0.6, 12.0, 0.5), loads=[jb.MovingMass(mass=0.1, speed=1.0)])
+    >>> found = jb.envelope(case, x=[0.15, 0.3])
+    >>> print((1e3 * found.lowest).round(3), "mm")
+    [-0.267 -0.38 ] mm
+    """
+
+    lowest: Float[Array, " position"]
+    highest: Float[Array, " position"]
+    positions: Float[Array, " position"]
+
+    def __iter__(self) -> Iterator[Float[Array, " position"]]:
+        return iter((self.lowest, self.highest))
+
+
+def envelope(
+    case: Case,
+    x=None,
+    tolerance: float = TOLERANCE,
+    *,
+    quantity: str = "deflection",
+    fibre_distance=None,
+    section_modulus=None,
+) -> Envelope:
+    """Lowest and highest value of a quantity at positions x (m) during a run, between samples too.
+
+    Without x at the positions of `Record.envelope`: the special ones, a grid, and more around the
+    extremes along the beam until they change by less than 1e-4. What jumps at a position, as shear
+    forces at supports, is taken on both sides. By default the deflection in m; other quantities are
+    those of sensors, in their units, moments and the like statically corrected. Free vibration and
+    control are included; histories are not stored. The beam starts at rest, so zero is always among
+    the values. `tolerance` is relative to the largest deflection. Strain needs `fibre_distance`
+    (m), stress `section_modulus` (m^3).
+
+    Raises ValueError for an invalid case, positions off the beam, an unknown quantity or one whose
+    parameter is missing, RuntimeError if no time step meets the tolerance.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535),
+    ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
+    ... )
+    >>> low, high = jb.envelope(case, x=[0.3])
+    >>> print(f"{1e3 * low[0]:.2f} mm")
+    -2.00 mm
+    """
+    quantity_of(quantity, fibre_distance, section_modulus)
+    plan = dataclasses.replace(integration_plan(case, tolerance=tolerance), error=0.0)
+    calculate = _open_loop_envelope if case.controller is None else _closed_loop_envelope
+
+    parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
+
+    def at(x):
+        points = sections(case, x, quantity)
+        sensors = tuple(Sensor(point, quantity, **parameters) for point in points.points)
+        lowest, highest = calculate(case, plan, sample_times(case), sensors)
+        return Envelope(points.smallest(lowest), points.largest(highest), x)
+
+    def curves(found):
+        values = xp.stack([-found.lowest, found.highest], axis=-1)
+        return values, xp.max(xp.abs(values)), [np.zeros((values.shape[0], 0))] * 2
+
+    if x is None:
+        return refined(case, at, curves)[1]
+    x = xp.asarray(x, float)
+    check_on_beam("x", x, case.beam.length)
+    return at(x)
+
+
+def _envelope(case, plan, times, sensors):
+    discrete, loads, policy, *_ = integration_setup(case, plan, times, sensors)
+    running_peaks, _ = integrate_peaks(
+        discrete, loads, max_loads=plan.shapes.max_loads, policy=policy
+    )
+    highest, lowest = xp.split(running_peaks.refined_peak()[0][:, 0], 2)
+    return -lowest, highest
+
+
+_open_loop_envelope = compiled_if_traced(_envelope)
+_closed_loop_envelope = compiled(_envelope)
+
+
+def amplification(
+    case: Case,
+    x,
+    tolerance: float = TOLERANCE,
+    *,
+    quantity: str = "deflection",
+    fibre_distance=None,
+    section_modulus=None,
+) -> Float[Array, " position"]:
+    """Dynamic amplification at positions x (m): largest dynamic over largest static value.
+
+    By default of the deflection; `quantity` may be rotation, slope, curvature, strain, moment,
+    shear or stress, as in `envelope`. The static value is that of the same loads without inertia of
+    beam and loads, exact (see `static_peak`). The dynamic deflection has the modes of the case
+    only, so with few modes the ratio of a slow crossing is slightly below one; moments and the like
+    are statically corrected. Raises as `envelope`, and ValueError for a beam that can move as a
+    rigid body, or a quantity without a static value.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535),
+    ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
+    ... )
+    >>> print(f"{jb.amplification(case, x=[0.3])[0]:.2f}")
+    1.06
+    >>> print(f"{jb.amplification(case, x=[0.3], quantity='moment')[0]:.2f}")
+    1.03
+    """
+    parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
+    if quantity not in AMPLIFIED:
+        raise ValueError(f"no amplification of {quantity!r}; {suggestion(quantity, AMPLIFIED)}")
+    quantity_of(quantity, **parameters)
+    lowest, highest = envelope(case, x, tolerance, quantity=quantity, **parameters)
+    return xp.maximum(-lowest, highest) / static_amplified(case, x, quantity, **parameters)
+
+
+def static_amplified(case: Case, x, quantity: str, **parameters) -> Float[Array, " position"]:
+    """Largest absolute static value at positions x (m), on both sides: see `amplification`."""
+    points = sections(case, xp.asarray(x, float), quantity)
+    return points.largest(static_peak(case, points.points, quantity=quantity, **parameters))
+
+
+class CharacteristicPoint(NamedTuple):
+    """Point of a beam by name, as "midspan 1", with its distance from the left end (m)."""
+
+    name: str
+    x: float
+
+
+def spans(case: Case) -> list[tuple[float, float]]:
+    """Ends (m) of the spans between held points, overhangs included, from left to right."""
+    length = float(concrete(case.beam.length))
+    marks = sorted({0.0, *held_positions(case).tolist(), length})
+    return [(a, b) for a, b in itertools.pairwise(marks) if b - a > 1e-9 * length]
+
+
+def characteristic_points(case: Case) -> list[CharacteristicPoint]:
+    """Supports, quarter points and midspans of all spans, hinges and free ends, left to right.
+
+    Spans and supports are counted from 1; of an overhang the points are those of a span.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> print([point[0] for point in jb.characteristic_points(jb.Case(beam))][:2])
+    ['support 1', 'quarter 1']
+    """
+    length, held = float(concrete(case.beam.length)), set(held_positions(case).tolist())
+    points = [CharacteristicPoint(f"support {i}", x) for i, x in enumerate(sorted(held), 1)]
+    for i, (a, b) in enumerate(spans(case), 1):
+        for name, share in (("quarter", 0.25), ("midspan", 0.5), ("three quarters", 0.75)):
+            points.append(CharacteristicPoint(f"{name} {i}", a + share * (b - a)))
+    hinges = sorted(float(concrete(hinge.position)) for hinge in case.beam.hinges)
+    points += [CharacteristicPoint(f"hinge {i}", x) for i, x in enumerate(hinges, 1)]
+    for name, x in (("left end", 0.0), ("right end", length)):
+        if x not in held:
+            points.append(CharacteristicPoint(name, x))
+    return sorted(points, key=lambda point: point.x)
+
+
+PER_NEWTON = {"N": "1", "N m": "m"}  # other units are written with /N
+
+
+@dataclasses.dataclass(frozen=True)
+class InfluenceTable:
+    """Influence lines (position, line) per newton downwards at load `positions` (m).
+
+    Each line has a quantity, a unit and the place of its section, as "midspan 1".
+    """
+
+    positions: Float[np.ndarray, " position"]
+    values: Float[np.ndarray, "position line"]
+    quantities: tuple[str, ...]
+    units: tuple[str, ...]
+    places: tuple[str, ...]
+
+    @property
+    def columns(self) -> dict[str, Float[np.ndarray, " position"]]:
+        """Load positions and lines by head, as "moment at midspan 1 (m)"."""
+        heads = {"load position (m)": self.positions}
+        for i, (quantity, unit, place) in enumerate(
+            zip(self.quantities, self.units, self.places, strict=True)
+        ):
+            heads[f"{quantity} at {place} ({unit})"] = self.values[:, i]
+        return heads
+
+
+def influence_table(
+    case: Case,
+    quantities: tuple[str, ...] = (),
+    x: tuple[float, ...] = (),
+    load_positions=None,
+    *,
+    fibre_distance=None,
+    section_modulus=None,
+) -> InfluenceTable:
+    """Influence lines of quantities at positions x (m), by default the characteristic ones.
+
+    By default moments at midspans and over supports that bend, deflections at midspans, and
+    reactions; one quantity alone is at all characteristic points, a reaction at all supports.
+    Shear forces are those right of a section (at the right end, left of it). Positions of the load
+    are by default those of `model.along_beam`, with more around the extremes of each line. Raises
+    ValueError as `influence_line` does.
+    """
+    parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
+    lines = _sections(case, quantities, x)
+
+    def at(positions) -> dict[str, np.ndarray]:
+        columns = [
+            influence_line(case, place, positions, quantity=quantity, **parameters)
+            for quantity, _, place in lines
+        ]
+        return {"values": np.stack(list(map(np.asarray, columns)), axis=-1)}
+
+    def curves(found):
+        values = found["values"]
+        sizes, near = np.abs(values).max(axis=0), np.zeros((values.shape[0], 0))
+        both = np.concatenate([values, -values], axis=-1)
+        return both, np.concatenate([sizes, sizes]), [near] * both.shape[-1]
+
+    if load_positions is None:
+        # A shear force jumps by the load as it passes the section: a position on each side.
+        length = float(concrete(case.beam.length))
+        own = np.array([place for _, _, place in lines])
+        beside = [min(p + LEFT_SHARE * length, length) for q, _, p in lines if q == "shear"]
+        start = positions_along(case, places=np.concatenate([own, beside]))
+        found_at, found = refined(case, at, curves, start)
+        positions = np.asarray(found_at)
+    else:
+        positions = np.asarray(load_positions, float)
+        found = at(positions)
+    units = ["N" if q == REACTION else QUANTITIES[q].unit for q, _, _ in lines]
+    return InfluenceTable(
+        positions,
+        found["values"],
+        tuple(quantity for quantity, _, _ in lines),
+        tuple(PER_NEWTON.get(unit, f"{unit}/N") for unit in units),
+        tuple(name for _, name, _ in lines),
+    )
+
+
+def _sections(case: Case, quantities, x) -> list[tuple[str, str, float]]:
+    """Quantity, name of the place and position (m) of each line."""
+    points, held = characteristic_points(case), held_positions(case).tolist()
+    if x:
+        named = {point.x: point.name for point in points}
+        given = [(named.get(at, f"{at:g} m"), float(at)) for at in x]
+        return [(quantity, *at) for quantity in quantities or ("moment",) for at in given]
+    supports = [(p.name, p.x) for p in points if p.x in held]
+    if quantities:
+        every = [(p.name, p.x) for p in points]
+        return [
+            (quantity, *at)
+            for quantity in quantities
+            for at in (supports if quantity == REACTION else every)
+        ]
+    middles = [(p.name, p.x) for p in points if p.name.startswith("midspan")]
+    length = float(concrete(case.beam.length))
+    turning = {0.0: case.beam.left_end, length: case.beam.right_end}
+    bending = [(n, at) for n, at in supports if at not in turning or END_CONDITIONS[turning[at]][1]]
+    return [
+        *(("moment", *at) for at in (*middles, *bending)),
+        *(("deflection", *at) for at in middles),
+        *((REACTION, *at) for at in supports),
+    ]
+
+
+MAX_WHEELS = 400  # of a record with amplification, as its static peaks take about 2 ms a wheel
+NEGLIGIBLE = 1e-6  # share of the largest static value of a quantity that counts as none
+
+
+@np.errstate(all="ignore")  # of extreme numbers
+def record_amplification(record: Record) -> list[float | None]:
+    """Largest absolute over largest static value of the quantity of each sensor of a record.
+
+    None at sensors of velocities and accelerations, where the static value vanishes, with a
+    controller, for more wheels than MAX_WHEELS, and for beams whose static deflections are
+    not known (see `static_peak`).
+    """
+    case = record.case
+    wheels = load_set(case).wheel_count
+    if case.controller is not None or not 0 < wheels <= MAX_WHEELS:
+        return [None] * len(case.sensors)
+    static = [_static(case, sensor) for sensor in case.sensors]
+    largest: dict[str, float] = {}
+    for sensor, value in zip(case.sensors, static, strict=True):
+        largest[sensor.quantity] = max(largest.get(sensor.quantity, 0.0), value or 0.0)
+    peaks = np.maximum(-np.asarray(record.smallest), np.asarray(record.largest))
+    return [
+        float(peak) / value if value and value > NEGLIGIBLE * largest[sensor.quantity] else None
+        for sensor, peak, value in zip(case.sensors, peaks, static, strict=True)
+    ]
+
+
+def _static(case: Case, sensor: Sensor) -> float | None:
+    """Largest static value at a sensor; None where it is not known."""
+    if sensor.quantity not in AMPLIFIED:
+        return None
+    channel = {
+        name: getattr(sensor, name) for name in ("quantity", "fibre_distance", "section_modulus")
+    }
+    try:
+        value = float(static_peak(case, sensor.position, **channel))
+    except ValueError:
+        return None
+    return value if np.isfinite(value) else None

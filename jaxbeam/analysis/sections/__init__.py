@@ -1,1 +1,0 @@
-"""Characteristic sections of a beam, and their influence lines."""

@@ -1,1 +1,0 @@
-"""Parts of a beam: segments of stepped and tapered beams, hinges."""

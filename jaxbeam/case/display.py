@@ -1,0 +1,230 @@
+"""How parts of a case are shown: numbers with units, addresses in words, arguments explained."""
+
+import abc
+import dataclasses
+import re
+from collections.abc import Iterable, Sequence
+from html import escape
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxbeam.case.declared_checks import in_unit, suggestion
+from jaxbeam.runtime.module import Module
+
+if TYPE_CHECKING:
+    import pandas  # imported where it is used, as it takes half a second
+
+
+# Least largest value, factor and prefix.
+PREFIXES = (
+    (1e9, 1e9, "G"),
+    (1e6, 1e6, "M"),
+    (1e3, 1e3, "k"),
+    (0.1, 1.0, ""),
+    (1e-4, 1e-3, "m"),
+    (1e-7, 1e-6, "µ"),
+)
+# Units that take no prefix: those that have one, and powers, as k(m^2) is not (km)^2.
+UNPREFIXED = re.compile(r"kg\b|\w+\^")
+
+
+class UnitScale(NamedTuple):
+    """Values divided by `factor` are in `unit`."""
+
+    factor: float
+    unit: str
+
+
+def unit_scale(values, unit: str) -> UnitScale:
+    """Prefixed unit for the largest of some values in an SI unit: mm for 0.0014 m.
+
+    Values without unit ("1"), or in 1/m, get a power of ten instead; kg and powers stay.
+    """
+    sizes = np.abs(np.asarray(values, float))
+    largest = np.max(sizes[np.isfinite(sizes)], initial=0.0)
+    fitting = ((factor, prefix) for least, factor, prefix in PREFIXES if largest >= least)
+    factor, prefix = next(fitting, (1e-9, "n")) if largest else (1.0, "")
+    if unit == "" or unit.startswith("1"):
+        power = "" if factor == 1 else f"$10^{{{np.log10(factor):.0f}}}$"
+        return UnitScale(factor, f"{power or '1'}{unit[1:]}" if unit[1:] else power)
+    if UNPREFIXED.match(unit):
+        factor, prefix = 1.0, ""
+    return UnitScale(factor, prefix + unit.replace("^2", "²").replace("^3", "³"))
+
+
+def with_prefix(value: float, unit: str, digits: int = 4) -> str:
+    """A number with its unit, prefixed where it has one: "1.4 mm"; "0.0002" without unit."""
+    scale = UnitScale(1.0, "") if unit in ("", "1") else unit_scale(value, unit)
+    if scale.unit.startswith("$"):
+        scale = UnitScale(1.0, unit)
+    return f"{value / scale.factor:.{digits}g} {scale.unit}".rstrip()
+
+
+if TYPE_CHECKING:  # a type checker takes the fields of a module for its arguments
+    ExplainsArguments = type
+else:
+
+    class ExplainsArguments(type(eqx.Module)):
+        """Metaclass of parts whose errors of arguments say what each number is."""
+
+        def __call__(cls, *args, **arguments):
+            """Raises TypeError for arguments that are missing or unknown."""
+            try:
+                return super().__call__(*args, **arguments)
+            except TypeError:
+                explanation = _explanation(cls, args, arguments)
+                if explanation is None:
+                    raise
+            raise TypeError(explanation)
+
+
+def _explanation(part_class: type, args: tuple, arguments: dict) -> str | None:
+    """Sentence about the first unknown, or all missing arguments; None without any."""
+    fields = {field.name: field for field in dataclasses.fields(part_class) if field.init}
+    for name in arguments:
+        if name not in fields:
+            return f"{part_class.__name__} has no {name}; {suggestion(name, fields)}"
+    positional = [name for name, field in fields.items() if not field.kw_only]
+    given = {*positional[: len(args)], *arguments}
+    missing = [
+        f"{name}, the {field.metadata['meaning']}{in_unit(field)}"
+        for name, field in fields.items()
+        if name not in given and _is_required(field)
+    ]
+    if not missing:
+        return None
+    return f"{part_class.__name__} lacks {'; '.join(missing)}: give {_them(missing)}"
+
+
+def _them(missing: list[str]) -> str:
+    return "it" if len(missing) == 1 else "them"
+
+
+def _is_required(field: dataclasses.Field) -> bool:
+    return field.default is field.default_factory is dataclasses.MISSING
+
+
+MAX_VALUES = 6  # of a list that are written out
+MAX_PARTS = 8  # in a row under one key that are written out
+
+
+class ReprWithUnits(Module, metaclass=ExplainsArguments):
+    """Base of parts of a case whose `repr` shows numbers with units: "Beam(length=0.6 m, ...)".
+
+    Entries that equal their defaults are left out.
+    """
+
+    def __repr__(self) -> str:
+        entries = [f"{name}={value}" for name, value in part_entries(self)]
+        return f"{type(self).__name__}({', '.join(entries)})"
+
+
+def part_entries(part: Any) -> list[tuple[str, str]]:
+    """Names of the entries of a part that are not left out, and their values with units."""
+    return [
+        (field.name, _entry(value, field.metadata.get("unit", "")))
+        for field in dataclasses.fields(part)
+        if not _is_default(value := getattr(part, field.name), field)
+    ]
+
+
+def case_text(case: Any) -> str:
+    """Text of a case: its title, and each part in a line with its address."""
+    head = f"Case {case.title!r}" if case.title else "Case"
+    lines = [address if part is None else f"{address}: {part!r}" for address, part in _parts(case)]
+    return "\n  ".join([head, *lines])
+
+
+def case_html(case: Any) -> str:
+    """A case as a table in HTML: address, class and entries of each part, as in `case_text`."""
+    rows = []
+    for address, part in _parts(case):
+        if part is None:
+            rows.append((address, "", ""))
+        elif isinstance(part, ReprWithUnits):
+            entries = ", ".join(f"{name} = {value}" for name, value in part_entries(part))
+            rows.append((address, type(part).__name__, entries))
+        else:
+            rows.append((address, type(part).__name__, repr(part)))
+    return html_table(case.title or "Case", ("address", "part", "entries"), rows)
+
+
+def html_table(caption: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in HTML, its texts escaped, flush left."""
+
+    def row(tag, cells):
+        texts = (f'<{tag} style="text-align: left">{escape(cell)}</{tag}>' for cell in cells)
+        return f"<tr>{''.join(texts)}</tr>"
+
+    body = "".join(row("td", cells) for cells in rows)
+    head = f'<caption style="text-align: left"><b>{escape(caption)}</b></caption>'
+    return f"<table>{head}<thead>{row('th', header)}</thead><tbody>{body}</tbody></table>"
+
+
+def _parts(case: Any) -> list[tuple[str, Any]]:
+    """Addresses and parts of a case; of a long row of loads, say, the number left out and None."""
+    found = []
+    for field in dataclasses.fields(case):
+        value = getattr(case, field.name)
+        if isinstance(value, tuple):
+            listed = [(f"{field.name}.{i}", part) for i, part in enumerate(value)]
+            if len(listed) > MAX_PARTS:
+                left_out = f"... {len(listed) - 4} more {field.name} ..."
+                listed = [*listed[:3], (left_out, None), listed[-1]]
+            found += listed
+        elif field.name != "title" and value is not None:
+            found.append((field.name, value))
+    return found
+
+
+def _is_default(value: Any, field: dataclasses.Field) -> bool:
+    if field.default is dataclasses.MISSING:
+        return False
+    if isinstance(value, jax.core.Tracer):
+        return False
+    if isinstance(value, np.ndarray | jax.Array):
+        return isinstance(field.default, int | float) and np.all(value == field.default).item()
+    return value is field.default or (
+        isinstance(value, str | int | tuple) and value == field.default
+    )
+
+
+def _entry(value: Any, unit: str) -> str:
+    """A number or list with its unit, another value as its `repr`; shapes of traced numbers."""
+    if isinstance(value, jax.core.Tracer):
+        return f"traced {value.dtype}{list(value.shape)}"
+    if not isinstance(value, np.ndarray | jax.Array):
+        if isinstance(value, tuple) and len(value) > MAX_PARTS:
+            return f"({value[0]!r}, ... {len(value)} in all)"
+        return repr(value)
+    unit = "" if unit == "1" else f" {unit}"
+    return f"{_numbers(np.asarray(value))}{unit}"
+
+
+def _numbers(values) -> str:
+    if np.ndim(values) == 0:
+        return f"{values:.6g}"
+    if values.size > MAX_VALUES:
+        shape = " x ".join(map(str, values.shape))
+        first = ", ".join(f"{one:.6g}" for one in values.ravel()[:3])
+        return f"[{first}, ... {shape} values]"
+    return f"[{', '.join(map(_numbers, values))}]"
+
+
+class TableViews:
+    """Base of results that have columns of equally many numbers by their heads."""
+
+    @property
+    @abc.abstractmethod
+    def columns(self) -> dict[str, np.ndarray]:
+        """Columns by head, with units, as "frequency (Hz)"."""
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """Columns as a table of pandas, the first of them as its index."""
+        import pandas
+
+        first, *_ = columns = self.columns
+        return pandas.DataFrame(dict(columns)).set_index(first)

@@ -1,1 +1,0 @@
-"""Cases and results in words for people: numbers with units, prefixes of units, addresses."""

@@ -1,1 +1,0 @@
-"""People on the beam: the forces of their steps, pedestrians, crowds."""

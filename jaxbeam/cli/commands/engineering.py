@@ -1,0 +1,185 @@
+"""Commands about results that an engineer signs: checks by codes, influence lines."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+import jaxbeam as jb
+from jaxbeam.cli.arguments import check_suffix
+from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, print_warnings, table
+from jaxbeam.files.endings import TABLES
+
+
+def assess(
+    case: Path,
+    /,
+    *,
+    line_speed: Annotated[str, Parameter(required=True)],
+    code: str = "en1991-2",
+    deck: str = "ballasted",
+    track: str = "standard",
+    classification: float = 1.0,
+    determinant_length: str | None = None,
+    added_damping: float = 0.0,
+    lowest_speed: str | None = None,
+    train: tuple[str, ...] = (),
+    dynamic: bool = False,
+    output: Output = None,
+    pictures: PictureOptions = PictureOptions(),
+    options: CaseOptions = CaseOptions(),
+) -> None:
+    """Check a railway bridge by a code: dynamic factors, deck acceleration, trains against LM71.
+
+    Each check cites its clause; what the model cannot show is listed and not certified. `--plot`
+    draws the effects of the trains over speed to CASE_assessment.png in this folder, or beside the
+    report.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML, of which beam and supports count.
+    line_speed
+        Maximum line speed at the site, as "250 km/h", or a number in m/s.
+    code
+        en1991-2: section 6.4 of EN 1991-2, with EN 1990, annex A2.
+    deck
+        ballasted or slab.
+    track
+        State of the track: standard, or maintained with care. Calculated effects of trains are
+        multiplied by 1 + phi'' or 1 + phi''/2.
+    classification
+        Factor alpha of LM71.
+    determinant_length
+        L_phi by table 6.2 of EN 1991-2, as "30 m"; needed for more than one span.
+    added_damping
+        Ratio to add to the damping, by 6.4.6.4.
+    lowest_speed
+        Start of the speeds of the dynamic analysis, as "150 km/h"; 40 m/s if left out.
+    train
+        Train of the library, as HSLM-A1; repeat it for more. All of HSLM-A if left out.
+    dynamic
+        Make the dynamic analysis also where it is not required.
+    output
+        Write the report to this file, OUT.md.
+    """
+    check_suffix(output, ".md", "a report")
+    picture = pictures.path(output, case.with_stem(f"{case.stem}_assessment"))
+    options.check_outputs(output, picture)
+    found = jb.assess(
+        options.read(case, judged="structure"),
+        _number_or_quantity(line_speed),
+        code=code,
+        deck=deck,
+        track=track,
+        classification=classification,
+        determinant_length=_number_or_quantity(determinant_length),
+        added_damping=added_damping,
+        lowest_speed=_number_or_quantity(lowest_speed),
+        dynamic=True if dynamic else None,
+        **({"trains": train} if train else {}),
+    )
+    if output:
+        found.save(output, options.overwrite)
+    if picture:
+        pictures.save(found.plot(ax=pictures.page(), title=pictures.title), picture)
+    options.report(found.to_dict(), found.lines, output, picture)
+
+
+def _number_or_quantity(text: str | None) -> float | str | None:
+    """A number of a text, or the text itself, as "25 m"."""
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return text
+
+
+def influence(
+    case: Path,
+    /,
+    *,
+    quantity: tuple[str, ...] = (),
+    at: tuple[str, ...] = (),
+    fibre_distance: float | None = None,
+    section_modulus: float | None = None,
+    output: Output = None,
+    pictures: PictureOptions = PictureOptions(),
+    options: CaseOptions = CaseOptions(),
+) -> None:
+    """Compute influence lines: values at a section over the position of a load of 1 N.
+
+    `--plot` draws them to CASE_influence.png in this folder, or beside the output.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML, of which beam, supports and actuators at rest count.
+    quantity
+        deflection, rotation, moment, shear, reaction, ...; repeat it for more. By default moments
+        and deflections at midspans, support moments and reactions.
+    at
+        Position of a section, as 12.5 (m) or "12.5 m"; repeat it for more. By default supports,
+        midspans and quarter points.
+    fibre_distance
+        Height of a fibre above the neutral axis in m, for strain.
+    section_modulus
+        Bending moment over stress in m^3, for stress.
+    output
+        Write the lines to a table: OUT.csv, .xlsx, .mat or .parquet.
+    """
+    check_suffix(output, TABLES[0], "a table of influence lines", TABLES[1:])
+    picture = pictures.path(output, case.with_stem(f"{case.stem}_influence"))
+    options.check_outputs(output, picture)
+    parsed_case = options.read(case, judged="structure")
+
+    from jaxbeam.analysis import sections as influence_table
+    from jaxbeam.case.reading.units import number_in_si
+
+    sections = tuple(number_in_si(text, "m", "--at") for text in at)
+    found = influence_table(
+        parsed_case,
+        quantity,
+        sections,
+        fibre_distance=fibre_distance,
+        section_modulus=section_modulus,
+    )
+    if output:
+        from jaxbeam.files.tables import write_table
+
+        write_table(output, found.columns, options.overwrite)
+    if picture:
+        from jaxbeam.plot import plot_influence
+
+        figure = plot_influence(parsed_case, found, ax=pictures.page(), title=pictures.title)
+        pictures.save(figure, picture)
+    rows = []
+    for i, (head, values) in enumerate(list(found.columns.items())[1:]):
+        low, high = values.argmin(), values.argmax()
+        rows.append(
+            (
+                head.removesuffix(f" ({found.units[i]})"),
+                "" if found.units[i] == "1" else found.units[i],
+                *(text for j in (low, high) for text in _value_and_place(found, values, j)),
+            )
+        )
+    header = ("line", "unit", "smallest", "load at (m)", "largest", "load at (m)")
+    options.report(dict(found.columns), table(header, rows), output, picture)
+
+
+def _value_and_place(found, values, index) -> tuple[str, str]:
+    return f"{values[index]:.6g}", f"{found.positions[index]:.6g}"
+
+
+def check(case: Path, /, *, options: CaseOptions = CaseOptions()) -> None:
+    """Check a case without running it: errors, and warnings of what looks wrong, as units.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML.
+    """
+    found = jb.check(options.read(case, judged=""))
+    print_warnings(found)
+    number = len(found.warnings)
+    words = "nothing looks wrong" if not number else f"{number} warning{'s' * (number > 1)}"
+    options.report(jb.api.content(found), [f"plausibility: {found}", words])

@@ -1,1 +1,0 @@
-"""Commands about results that an engineer signs: code checks and influence lines."""

@@ -1,1 +1,0 @@
-"""Commands on logs without a case."""

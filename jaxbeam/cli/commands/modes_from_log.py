@@ -1,0 +1,247 @@
+"""Command `modes-from-log`: modes of a structure from its logs."""
+
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+import jaxbeam as jb
+from jaxbeam.cli.arguments import (
+    UsageError,
+    bounds_in_si,
+    check_exists,
+    figure_path,
+    parse_bounds,
+    parse_range,
+    refuse_option,
+)
+from jaxbeam.cli.options import CaseOptions, Free, Output, print_message
+
+if TYPE_CHECKING:
+    from tuning import Log
+
+
+def modes_from_log(
+    *logs: Path,
+    band: str | None = None,
+    from_: Annotated[float | None, Parameter("--from")] = None,
+    to: float | None = None,
+    channels: str | None = None,
+    columns: str | None = None,
+    rate: float | None = None,
+    order: int | None = None,
+    method: str | None = None,
+    references: str | None = None,
+    force: str | None = None,
+    force_window: float | None = None,
+    responses: str | None = None,
+    exponential: float | None = None,
+    kind: str | None = None,
+    exclude: str | None = None,
+    choose: str | None = None,
+    count: int | None = None,
+    align: bool = False,
+    as_logged: bool = False,
+    plot: bool = False,
+    length: float | None = None,
+    case: Path | None = None,
+    free: Free = (),
+    output: Output = None,
+    options: CaseOptions = CaseOptions(),
+) -> None:
+    """Natural frequencies, damping ratios and mode shapes from logs of unknown excitation.
+
+    Free decays after blows, ambient vibration, and the harmonic lines of machines in it are
+    recognised. Every choice is printed with the option that overrides it. Logs whose sensors are at
+    other places are setups, whose modes are merged. With `--case`, parameters of a case are fitted
+    to the modes that were found, with 95 % intervals.
+
+    Parameters
+    ----------
+    logs
+        LOG...: logs of the same channels are used together; the modes of logs with other channels
+        (setups), of which some are the same (references), are merged.
+    band
+        LOW:HIGH: frequencies (Hz) between which modes are sought.
+    from_
+        Start (s) of the part of the log to use.
+    to
+        End (s) of the part of the log to use.
+    channels
+        NAME,NAME,...: channels to use.
+    columns
+        Headings of the columns, with units, for files without: "time [s], a1 [g]".
+    rate
+        Sampling rate (Hz) of logs without times.
+    order
+        Highest order of the models of the stabilisation diagram.
+    method
+        decay: poles of free decays; for all else covariance or data: stochastic subspace
+        identification, covariance- or data-driven; fdd: enhanced frequency-domain decomposition;
+        plscf: poly-reference least-squares complex frequency (p-LSCF).
+    references
+        NAME,NAME,...: channels that stay at their places in all logs, while sensors of the same
+        names move; by default channels of one name are one place, if positions do not differ.
+    force
+        NAME,NAME,...: channels of measured forces (N), of a hammer or shaker; by default all in N.
+        The responses to them are fitted by p-LSCF.
+    force_window
+        Time (s) after each blow from which on the force is taken for zero.
+    responses
+        H1, H2 or Hv: draw frequency responses to the forces, by this estimate, with their coherence
+        to a PNG named after the first log.
+    exponential
+        Time constant (s) of an exponential window from each blow on, for `--responses`. Modes are
+        found without it.
+    kind
+        ambient or "free decay".
+    exclude
+        FREQUENCY,FREQUENCY,...: frequencies (Hz) of machines or hum, which are no modes.
+    choose
+        FREQUENCY,FREQUENCY,...: keep the modes nearest to these frequencies (Hz), also those that
+        are not well identified, and no others.
+    count
+        Number of modes to keep, those with most energy.
+    align
+        The logs are of one experiment by loggers whose clocks differ: align them by correlation.
+    as_logged
+        Take all samples as they are logged: readings that a logger repeats are not decimated, zeros
+        before a sensor has answered not interpolated.
+    plot
+        Draw the log, its spectrum with the stabilisation diagram, and the shapes to a PNG named
+        after the first log; of setups LOG_setup1.png and so on, and merged LOG_setups.png.
+    length
+        Length (m) of the beam on which the shapes are drawn.
+    case
+        CASE.toml: the case whose parameters (`--free`) are fitted to the modes.
+    output
+        Write the fitted case to this file, FIT.toml.
+    """
+    refuse_option(not logs, "modes-from-log needs a log: jaxbeam modes-from-log LOG...")
+    limits = None if band is None else parse_range("--band", band, "Hz, such as 5:45")
+    refuse_option(
+        from_ is not None and to is not None and from_ >= to, "--from must be less than --to"
+    )
+    refuse_option(
+        (case is None) != (not free), "--case and --free belong together: what is fitted, and where"
+    )
+    refuse_option(output is not None and case is None, "-o writes the fitted case: give --case")
+    bounds = dict(parse_bounds(text) for text in free)
+    refuse_option(
+        responses not in (None, "H1", "H2", "Hv"),
+        f"--responses takes H1, H2 or Hv, not {responses!r}",
+    )
+    refuse_option(
+        exponential is not None and responses is None,
+        "--exponential is for --responses; modes are found without it",
+    )
+    excluded, chosen = _numbers("--exclude", exclude), _numbers("--choose", choose)
+    check_exists("log file", *logs)
+    options.check_outputs(output)
+    if case is not None:
+        options.check_case(case)
+
+    import tuning
+    from tuning.modal.setups.grouping import logs_of_setups
+
+    read = [tuning.read_log(path, columns=columns, rate=rate) for path in logs]
+    if align:
+        read = [tuning.align_logs(read)]
+    setups = logs_of_setups(read, _names(references), _names(channels))
+    several = [f"_setup{k + 1}" for k in range(len(setups))] if len(setups) > 1 else [""]
+    pictures = [_picture(logs[0], word) for word in several if plot]
+    if plot and len(setups) > 1:
+        pictures.append(_picture(logs[0], "_setups"))
+    drawn = [_picture(logs[0], f"{word}_responses") for word in several if responses]
+    options.check_outputs(*pictures, *drawn)
+    fits = []
+    for setup in setups:
+        window = _window(setup[0], from_, to)
+        of_setup = {
+            "channels": _of_setup(_names(channels), setup, read),
+            "force": _of_setup(_names(force), setup, read),
+            "force_window": force_window,
+        }
+        fit = tuning.identify_modes(
+            setup,
+            window=window,
+            band=limits,
+            count=count,
+            kind=kind,
+            order=order,
+            method=method,
+            exclude=excluded,
+            choose=chosen,
+            as_logged=as_logged,
+            progress=None if options.json_ or not sys.stderr.isatty() else print_message,
+            **of_setup,
+        )
+        if responses:
+            tuning.measured_responses(
+                setup, window=window, estimator=responses, exponential=exponential, **of_setup
+            ).plot(drawn[len(fits)])
+        fits.append(fit)
+    found, lines = fits[0], [str(fit) for fit in fits]
+    if len(fits) > 1:
+        found = tuning.merge_setups(fits, references=_names(references))
+        lines += ["", str(found)]
+    for fit, picture in zip(dict.fromkeys([*fits, found]), pictures, strict=False):
+        fit.plot(picture, length=length)
+    answer = found.to_dict()
+    if case is not None:
+        model = options.read(case)
+        updated = tuning.identify_from_modes(model, found, bounds_in_si(model, bounds))
+        answer, lines = {**answer, "fit": updated.to_dict()}, [*lines, "", str(updated)]
+        if output is not None:
+            jb.save_case(updated.case, output, options.overwrite)
+    options.report(answer, lines, output, *pictures, *drawn)
+
+
+def _picture(log: Path, word: str) -> Path:
+    """File of a picture named after a log, in this folder, told from others by a word."""
+    return figure_path(None, log.with_stem(f"{log.stem}{word}"))
+
+
+def _window(log: "Log", from_: float | None, to: float | None):
+    """Part (s) of a log between two times, either of which may be left out; None for all.
+
+    Raises ValueError if the log has no such part.
+    """
+    if from_ is None and to is None:
+        return None
+    first, last = (float(log.times[i]) for i in (0, -1))
+    start, end = first if from_ is None else from_, last if to is None else to
+    if start >= last or end <= first:
+        raise ValueError(
+            f"the log is from {first:g} to {last:g} s, and has no part from {start:g} to {end:g} s:"
+            " change --from or --to"
+        )
+    return max(start, first), min(end, last)
+
+
+def _of_setup(names: list[str] | None, setup: "list[Log]", read: "list[Log]"):
+    """Those of some channels that the logs of a setup have.
+
+    All, for one clear error, if no log has one of them, or this setup has none.
+    """
+    if names is None or any(all(name not in log.names for log in read) for name in names):
+        return names
+    return [name for name in names if any(name in log.names for log in setup)] or names
+
+
+def _names(text: str | None) -> list[str] | None:
+    """Names separated by commas."""
+    return None if text is None else [name.strip() for name in text.split(",")]
+
+
+def _numbers(option: str, text: str | None) -> tuple[float, ...]:
+    """Positive numbers separated by commas. Raises ValueError otherwise."""
+    try:
+        numbers = tuple(float(word) for word in text.split(",")) if text else ()
+    except ValueError:
+        numbers = (math.nan,)
+    if not all(0 < number < math.inf for number in numbers):
+        raise UsageError(f"{option} takes frequencies in Hz, such as 50 or 50,100, not {text!r}")
+    return numbers

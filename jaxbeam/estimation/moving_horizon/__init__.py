@@ -1,1 +1,0 @@
-"""Moving-horizon estimation."""

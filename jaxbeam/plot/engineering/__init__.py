@@ -1,1 +1,0 @@
-"""Figures of results that an engineer signs."""

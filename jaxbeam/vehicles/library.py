@@ -1,0 +1,110 @@
+"""Trains and line loads of the library."""
+
+import functools
+import tomllib
+from importlib import resources
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+# Known trains that the library lacks, and why.
+LEFT_OUT = {
+    "HSLM-B": "its axles and spacings by span are curves of EN 1991-2 without open numbers",
+    "FLM2-lorry-3": "one of its distances could not be confirmed",
+    "FLM3": "its distances were found in pictures alone",
+    "FLM4": "its distances were found in pictures alone",
+}
+
+
+class Train(NamedTuple):
+    """Axles of a train: offsets behind the first axle (m), and forces (N) or masses (kg).
+
+    `spacing` (m) is that from one vehicle to the next of its kind, None for a whole train.
+    """
+
+    offsets: Float[np.ndarray, " axle"]
+    forces: Float[np.ndarray, " axle"] | None
+    masses: Float[np.ndarray, " axle"] | None
+    spacing: float | None
+    source: str
+
+
+@functools.cache
+def trains() -> dict[str, Train]:
+    """All trains of the library by name."""
+    found = {}
+    folder = resources.files(__package__) / "trains"
+    for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
+        if entry.name.endswith(".toml"):
+            content = tomllib.loads(entry.read_text(encoding="utf-8"))
+            layout = LAYOUTS[content["layout"]]
+            for table in content["trains"]:
+                found[table["name"]] = layout(content, table)
+    return found
+
+
+def _high_speed(content: dict[str, Any], table: dict[str, Any]) -> Train:
+    """Power car, end coach, coaches on shared bogies, end coach, power car; symmetrical.
+
+    A coach is coupled to the next above the middle of their bogie, and the end coach to the power
+    car midway between their axles.
+    """
+    power_car = np.array(content["power_car"])
+    coupling, axles = content["coupling"], table["bogie_axle_spacing"]
+    first_coupling = power_car[-1] + coupling / 2
+    coaches = table["coaches"] + 2
+    length = 2 * first_coupling + coaches * table["coach_length"]
+    outer = power_car[-1] + coupling + np.array([0.0, axles])
+    shared = first_coupling + np.arange(1, coaches) * table["coach_length"]
+    bogies = (shared[:, None] + np.array([-axles, axles]) / 2).ravel()
+    front = np.concatenate([power_car, outer])
+    offsets = np.concatenate([front, bogies, (length - front)[::-1]])
+    return Train(offsets, np.full(len(offsets), table["axle_force"]), None, None, content["source"])
+
+
+def _wagon(content: dict[str, Any], table: dict[str, Any]) -> Train:
+    """Wagon with overhangs beyond its outer axles, by which the next one follows."""
+    offsets = np.concatenate([[0.0], np.cumsum(table["axle_spacings"])])
+    spacing = float(offsets[-1] + sum(table["overhangs"]))
+    return Train(
+        offsets, None, np.full(len(offsets), table["axle_mass"]), spacing, content["source"]
+    )
+
+
+def _axles(content: dict[str, Any], table: dict[str, Any]) -> Train:
+    """Axles of a load model, at their distances."""
+    offsets = np.concatenate([[0.0], np.cumsum(table["axle_spacings"])])
+    return Train(offsets, np.array(table["axle_forces"]), None, None, content["source"])
+
+
+LAYOUTS = {"high-speed": _high_speed, "wagon": _wagon, "axles": _axles}
+
+
+class CodeLineLoad(NamedTuple):
+    """Parts of a line load: N/m, lengths (m, 0 for a part without an end), gaps (m) before them.
+
+    Axles are at offsets (m) behind the end of the first part, with forces in N.
+    """
+
+    force_per_length: Float[np.ndarray, " part"]
+    lengths: Float[np.ndarray, " part"]
+    gaps: Float[np.ndarray, " part"]
+    axle_offsets: Float[np.ndarray, " axle"]
+    axle_forces: Float[np.ndarray, " axle"]
+    source: str
+
+
+@functools.cache
+def line_loads() -> dict[str, CodeLineLoad]:
+    """All line loads of the library by name."""
+    text = (resources.files(__package__) / "line_loads.toml").read_text(encoding="utf-8")
+    content = tomllib.loads(text)
+    names = ("force_per_length", "lengths", "gaps", "axle_offsets", "axle_forces")
+    return {
+        table["name"]: CodeLineLoad(
+            source=content["source"],
+            **{name: np.array(table.get(name, []), float) for name in names},
+        )
+        for table in content["loads"]
+    }
