@@ -416,6 +416,23 @@ MISTAKES = [
     ("rig", "controller.period", 0.05, "", "in s, not in ms"),
     ("rig", "controller.delay", 1.5, "", "in s, not in ms"),
     ("rig", "controller.delay", 0.5, "", "in s, not in ms"),
+    (
+        "rig",
+        "controller",
+        {
+            "kind": "lqr",
+            "state_weight": [1e4, 1e4, 1e4, 1.0, 1.0, 1.0, 0.0],
+            "command_weight": [1e-3, 1e-3, 1e-3],
+            "period": 0.002,
+            "estimator": {
+                "kind": "kalman",
+                "process_noise": 0.02,
+                "measurement_noise": [0.01, 1e-6, 1e3],
+            },
+        },
+        ".estimator.measurement_noise.0",
+        "in m, not in mm",
+    ),
 ]
 
 

@@ -538,15 +538,29 @@ def size_of_section_modulus(facts):
 
 
 def error_over_reading(facts):
-    """Noise, resolution and offset of sensors over the size of their readings."""
-    for address, sensor in _parts(facts, "sensors"):
-        size = facts.reading(sensor)
+    """Noise, resolution and offset of sensors over the size of their readings.
+
+    The noise that an estimator expects, too; one number for all sensors is that of the largest.
+    """
+    found = _parts(facts, "sensors")
+    sizes = [facts.reading(sensor) or 0.0 for _, sensor in found]
+    for (address, sensor), size in zip(found, sizes, strict=True):
         for name, given in _numbers(sensor, address, "noise", "resolution", "offset"):
-            if size:
-                small = SMALL_UNITS.get(sensor.unit, f"1e-3 {sensor.unit}")
-                unit = "m/m" if sensor.unit == "1" else sensor.unit
-                words = {"given": abs(given), "unit": unit, "size": size, "small": small}
-                yield Value(name, abs(given) / size, words)
+            yield from _error_of(sensor, size, name, given)
+    estimator = getattr(facts.case.controller, "estimator", None)
+    noises = list(_numbers(estimator, "controller.estimator", "measurement_noise"))
+    for i, (name, given) in enumerate(noises if found else ()):
+        sensor = i if len(noises) == len(found) else int(np.argmax(sizes))
+        yield from _error_of(found[sensor][1], sizes[sensor], name, given)
+
+
+def _error_of(sensor, size: float, name: str, given: float) -> Iterator[Value]:
+    """An error of a sensor over the size of its readings, unless it reads nothing."""
+    if size:
+        small = SMALL_UNITS.get(sensor.unit, f"1e-3 {sensor.unit}")
+        unit = "m/m" if sensor.unit == "1" else sensor.unit
+        words = {"given": abs(given), "unit": unit, "size": size, "small": small}
+        yield Value(name, abs(given) / size, words)
 
 
 def _delays(facts):
