@@ -55,11 +55,13 @@ QUANTITIES = {
     "stress": Quantity("Pa", x_derivative=2, section_force=True, over_modulus=True),
 }
 
-# Quantities of the bodies of vehicles, and those of the beam in the same units.
+# Quantities of the bodies of vehicles and absorbers, and those of the beam in the same units; a
+# stroke, relative to the beam, is that of an absorber.
 BODY_QUANTITIES = {
     "acceleration": "acceleration",
     "velocity": "velocity",
     "displacement": "deflection",
+    "stroke": "deflection",
 }
 
 

@@ -205,7 +205,12 @@ def _check_labels(sensors: tuple[Sensor, ...]) -> None:
 
 
 def _check_vehicle_sensor(address: str, sensor: VehicleSensor, case: Case) -> None:
-    """Validate that the body of a sensor is one of the loads."""
+    """Validate that the body of a sensor is one of the loads or absorbers."""
+    if sensor.absorber is not None:
+        _check_absorber_sensor(address, sensor, case)
+        return
+    if sensor.quantity == "stroke":
+        raise ValueError(f"{address}.quantity is 'stroke', that of an absorber: give its number")
     if sensor.load >= len(case.loads):
         raise ValueError(
             f"{address}.load is {sensor.load}, but the case has {len(case.loads)} loads, counted"
@@ -230,6 +235,22 @@ def _check_vehicle_sensor(address: str, sensor: VehicleSensor, case: Case) -> No
         raise ValueError(
             f"{address}.position would have no effect: the {sensor.body} of loads.{sensor.load}"
             " does not pitch; leave it out"
+        )
+
+
+def _check_absorber_sensor(address: str, sensor: VehicleSensor, case: Case) -> None:
+    """Validate that the absorber of a sensor is there, and that nothing names a vehicle beside."""
+    if sensor.absorber >= len(case.absorbers):
+        raise ValueError(
+            f"{address}.absorber is {sensor.absorber}, but the case has {len(case.absorbers)}"
+            " absorbers, counted from 0"
+        )
+    of_vehicle = sensor.load, sensor.vehicle, sensor.body != "body"
+    shifted = is_concrete(sensor.position) and concrete(sensor.position) != 0
+    if any(of_vehicle) or shifted:
+        raise ValueError(
+            f"{address} has an absorber, whose one body does not pitch: leave out load, vehicle,"
+            " body and position"
         )
 
 

@@ -12,7 +12,12 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.output_rows import sensor_history
-from jaxbeam.model.sensing.sensor_signals import VehicleMotion, sensor_readings, vehicle_readings
+from jaxbeam.model.sensing.sensor_signals import (
+    VehicleMotion,
+    relative_to_beam,
+    sensor_readings,
+    vehicle_readings,
+)
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation import section_forces
@@ -266,29 +271,23 @@ class Record(RecordViews):
 
     @property
     def vehicle_readings(self) -> Float[Array, "time vehicle_sensor"]:
-        """Readings of the sensors on vehicles in SI units, with filters and noise.
+        """Readings of the sensors on vehicles and absorbers in SI units, with filters and noise.
 
         Raises ValueError if the times do not suit a filter.
         """
         motion = self.body_displacement, self.body_velocity, self.body_acceleration
-        return vehicle_readings(self.case, VehicleMotion(*motion), self.times, noisy=True)
+        vehicles = VehicleMotion(*motion)
+        return vehicle_readings(self.case, vehicles, self.stroke, self.times, noisy=True)
 
     @property
     def stroke(self) -> Float[Array, "time absorber"]:
         """Motion (m) of the bodies of absorbers relative to the beam, positive upwards."""
-        return self._relative_to_beam(self.body_displacement, self.coordinates)
+        return relative_to_beam(self.case, self.modes, self.body_displacement, self.coordinates)
 
     @property
     def stroke_rate(self) -> Float[Array, "time absorber"]:
         """Rate (m/s) of the stroke."""
-        return self._relative_to_beam(self.body_velocity, self.rates)
-
-    def _relative_to_beam(self, of_bodies, of_modes) -> Float[Array, "time absorber"]:
-        absorbers = self.case.absorbers
-        if not absorbers:
-            return xp.zeros((self.times.shape[0], 0))
-        places = xp.stack([one.position for one in absorbers])
-        return of_bodies[:, -len(absorbers) :] - of_modes @ self.modes.shapes(places).T
+        return relative_to_beam(self.case, self.modes, self.body_velocity, self.rates)
 
     @property
     def absorber_force(self) -> Float[Array, "time absorber"]:

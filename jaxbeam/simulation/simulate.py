@@ -23,7 +23,12 @@ from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
 from jaxbeam.model.sensing.output_rows import sensor_history, sensor_rows
-from jaxbeam.model.sensing.sensor_signals import VehicleMotion, sensor_readings, vehicle_readings
+from jaxbeam.model.sensing.sensor_signals import (
+    VehicleMotion,
+    relative_to_beam,
+    sensor_readings,
+    vehicle_readings,
+)
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, any_jax, put, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
@@ -325,7 +330,10 @@ def simulate_readings(
         readings = sensor_readings(case, integration.model.modes, outputs.motion, times)
     if not case.vehicle_sensors:
         return readings
-    return xp.concatenate([readings, vehicle_readings(case, outputs.vehicles, times)], axis=1)
+    bodies, motion = outputs.vehicles, outputs.motion
+    heights = bodies.body_displacement, motion.coordinates
+    stroke = relative_to_beam(case, integration.model.modes, *heights)
+    return xp.concatenate([readings, vehicle_readings(case, bodies, stroke, times)], axis=1)
 
 
 class Histories(NamedTuple):

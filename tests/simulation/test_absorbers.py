@@ -373,3 +373,31 @@ def test_tuned_absorber_refusals():
     ):
         with pytest.raises(ValueError, match=words):
             jb.tuned_absorber(case, **arguments)
+
+
+def test_sensors_on_absorbers():
+    sensors = [
+        jb.VehicleSensor(absorber=1, quantity="stroke"),
+        jb.VehicleSensor(absorber=0, quantity="acceleration", offset=0.5),
+    ]
+    absorbers = [
+        jb.Absorber(x, mass=3e3, frequency=3.4, damping_ratio=0.1, inertance=200.0)
+        for x in (9.0, 12.5)
+    ]
+    case = jb.Case(
+        dataclasses.replace(BRIDGE, modes=2),
+        loads=[jb.MovingForce(force=2e5, speed=40.0)],
+        absorbers=absorbers,
+        vehicle_sensors=sensors,
+        run=jb.Run(0.8, sample_rate=50.0),
+    )
+    record = jb.simulate(case)
+    expected = [record.stroke[:, 1], record.body_acceleration[:, 0] + 0.5]
+    assert np.array_equal(record.vehicle_readings, np.transpose(expected))
+    for faulty, words in (
+        (jb.VehicleSensor(absorber=2), "vehicle_sensors.0.absorber is 2, but the case has 2"),
+        (jb.VehicleSensor(absorber=0, body="axle 1"), "leave out load, vehicle, body"),
+        (jb.VehicleSensor(quantity="stroke"), "give its number"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            jb.simulate(dataclasses.replace(case, vehicle_sensors=[faulty]))

@@ -362,7 +362,7 @@ def sensor_readings(
 class VehicleMotion(NamedTuple):
     """Heights (m) or pitch angles (rad) of the bodies of vehicles, their rates and accelerations.
 
-    Of all vehicles, one after the other (see `Record.bodies`), measured from static equilibrium.
+    Of all vehicles, then absorbers (see `Record.bodies`), measured from static equilibrium.
     """
 
     body_displacement: Float[Array, "time body"]
@@ -371,9 +371,13 @@ class VehicleMotion(NamedTuple):
 
 
 def vehicle_readings(
-    case: Case, motion: VehicleMotion, times: Float[Array, " time"], noisy: bool = False
+    case: Case,
+    motion: VehicleMotion,
+    stroke: Float[Array, "time absorber"],
+    times: Float[Array, " time"],
+    noisy: bool = False,
 ) -> Float[Array, "time sensor"]:
-    """Readings of the vehicle sensors of a case (SI units) at times (s).
+    """Readings of the vehicle sensors of a case (SI units) at times (s), strokes in m.
 
     `noisy` readings include noise, losses and random delays by the run's seed.
 
@@ -381,7 +385,7 @@ def vehicle_readings(
     """
     loads, columns, samples = load_set(case), [], motion.body_displacement.shape[0]
     for i, sensor in enumerate(case.vehicle_sensors):
-        values = _history(loads, sensor, motion)
+        values = _history(loads, sensor, motion, stroke)
         has_noise = noisy and sensor.noise is not None
         number = len(case.sensors) + i  # noise of its own, unlike that of the sensors on the beam
         noise = xp.asarray(normal_samples(case.run.seed, number, samples)) if has_noise else None
@@ -396,8 +400,26 @@ def vehicle_readings(
     return xp.array(columns).reshape(-1, samples).T
 
 
-def _history(loads: LoadSet, sensor: VehicleSensor, motion: VehicleMotion) -> Float[Array, " time"]:
-    """History of the quantity of a sensor: height u + x t of a point, or its rates."""
+def relative_to_beam(
+    case: Case, modes: Modes, of_bodies, of_modes
+) -> Float[Array, "time absorber"]:
+    """Motion of the bodies of absorbers less that of the beam there: displacements, or rates."""
+    absorbers = case.absorbers
+    if not absorbers:
+        return xp.zeros((of_bodies.shape[0], 0))
+    shapes = modes.shapes(xp.stack([one.position for one in absorbers]))
+    return of_bodies[:, -len(absorbers) :] - of_modes @ shapes.T
+
+
+def _history(
+    loads: LoadSet, sensor: VehicleSensor, motion: VehicleMotion, stroke
+) -> Float[Array, " time"]:
+    """History of the quantity of a sensor: height u + x t of a point, or its rates; a stroke."""
+    if sensor.absorber is not None:
+        if sensor.quantity == "stroke":
+            return stroke[:, sensor.absorber]
+        own = getattr(motion, f"body_{sensor.quantity}")
+        return own[:, own.shape[1] - loads.absorbers + sensor.absorber]
     history = getattr(motion, f"body_{sensor.quantity}")
     first = 0
     for group in loads.wheels.vehicles:

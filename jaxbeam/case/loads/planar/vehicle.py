@@ -73,12 +73,13 @@ from jaxbeam.runtime.module import Module
 
 
 class VehicleSensor(ReprWithUnits, Module):
-    """Sensor of the vertical motion of a body or an axle of a vehicle, positive upwards.
+    """Sensor of the vertical motion of a body or axle of a vehicle or absorber, positive upwards.
 
-    `load` is the number of the load, `vehicle` that of the vehicle in its row, both from 0; `body`
-    a name of `Record.bodies` without the load, as "body" or "axle 1". At `position` (m) forward of
-    the centre of mass it feels the pitch as well. Displacements are from static equilibrium. The
-    other entries are those of `Sensor`.
+    `absorber` is the number of an absorber, whose motion relative to the beam is its "stroke", in
+    place of a vehicle. `load` is the number of the load, `vehicle` that of the vehicle in its row,
+    both from 0; `body` a name of `Record.bodies` without the load, as "body" or "axle 1". At
+    `position` (m) forward of the centre of mass it feels the pitch as well. Displacements are from
+    static equilibrium. The other entries are those of `Sensor`.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -102,6 +103,9 @@ class VehicleSensor(ReprWithUnits, Module):
     quantity: str = choice("measured quantity", *BODY_QUANTITIES, default="acceleration")
     vehicle: int = count("number of the vehicle in a row, from 0", minimum=0, default=0)
     position: Float[Array, ""] = number("m", "forward of the centre of mass", default=0.0)
+    absorber: int | None = count(
+        "number of an absorber, from 0, in place of a load", minimum=0, default=None, kw_only=True
+    )
     offset: Float[Array, ""] = number(OF_QUANTITY, "constant added", default=0.0)
     noise: Float[Array, ""] | None = number(
         OF_QUANTITY, "standard deviation of white noise", NOT_NEGATIVE, default=None
