@@ -32,8 +32,8 @@ from jaxbeam.model.sensing.sensor_signals import (
     with_sensor_filters,
 )
 from jaxbeam.model.state_space import state_space
-from jaxbeam.runtime.arrays import Array, any_jax, block_diag, known, not_differentiated, xp
-from jaxbeam.runtime.compiling import compiled, compiled_if_traced
+from jaxbeam.runtime.arrays import Array, any_jax, block_diag, not_differentiated, xp
+from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.simulation.commands.path import command_path
 from jaxbeam.simulation.continuous_loop import ContinuousLoop
 from jaxbeam.simulation.sampled_loop import SampledLoop
@@ -200,6 +200,8 @@ def closed_loop(
         return ContinuousLoop(
             plant, law, model, output_rows, least, not controller.open_loop, states
         )
+    if not any_jax(plant, law, schedule):
+        law = law.tabulated(schedule.times[schedule.control_sample >= 0])
     model, output_rows = with_sensor_filters(plant)
     sections = tuple(sensor_sections(sensor, controller.period) for sensor in case.sensors)
     noise = None
@@ -208,43 +210,25 @@ def closed_loop(
     measured_rows = None
     if any(sensor.has_feedthrough for sensor in case.sensors):
         measured_rows = sensor_rows(model, case, case.sensors)
-    return tabulated(
-        SampledLoop(
-            plant=plant,
-            law=law,
-            model=model,
-            output_rows=output_rows,
-            measured_rows=measured_rows,
-            load_amplitude=least,
-            loads=loads,
-            schedule=schedule,
-            filter_sections=sections,
-            path=command_path(case),
-            noise=noise,
-        )
+    return SampledLoop(
+        plant=plant,
+        law=law,
+        model=model,
+        output_rows=output_rows,
+        measured_rows=measured_rows,
+        load_amplitude=least,
+        loads=loads,
+        schedule=schedule,
+        filter_sections=sections,
+        path=command_path(case),
+        noise=noise,
     )
 
 
-def tabulated(policy: SampledLoop | ContinuousLoop) -> SampledLoop | ContinuousLoop:
-    """The policy, with tables of what changes with time alone if its numbers are known."""
-    if isinstance(policy, ContinuousLoop) or any_jax(policy):
-        return policy
-    samples = policy.schedule.times[policy.schedule.control_sample >= 0]
-    return dataclasses.replace(policy, law=policy.law.tabulated(samples))
-
-
+@compiled_if_traced
 def known_loop(case: Case, layout: Layout, schedule: EventSchedule) -> SampledLoop | ContinuousLoop:
-    """`closed_loop` of a case of known numbers; a long design takes a program of its own."""
-    if not case.controller.runs_compiled:
-        return _known_loop(case, layout, schedule)
-    return tabulated(known(_designed_loop(case, layout, schedule)))
-
-
-def _loop(case, layout, schedule):
+    """`closed_loop` of a case of known numbers."""
     return closed_loop(case, layout, load_set(case, layout), schedule)
-
-
-_known_loop, _designed_loop = compiled_if_traced(_loop), compiled(_loop)
 
 
 def _with_controller_states(

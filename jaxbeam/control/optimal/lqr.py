@@ -11,7 +11,6 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -49,7 +48,8 @@ from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.finite_horizon import boundary_layer
 from jaxbeam.numerics.gain_table import GainTable
 from jaxbeam.numerics.riccati import lqr
-from jaxbeam.runtime.arrays import Array, set_at, xp
+from jaxbeam.runtime.arrays import Array, known, set_at, xp
+from jaxbeam.runtime.compiling import compiled
 
 MAX_PHASE_PER_INTERVAL = 3.0  # rad, phase advance of the fastest mode in an interval of a table
 
@@ -301,9 +301,7 @@ class LQR(AbstractStateController):
 
     def gain_table(self, plant: Plant) -> GainTable:
         """Gains over the crossing for a plant: of its states, and of the weights fed forward."""
-        if self.horizon == "frozen":
-            return frozen_gains(plant, self.points, *self.weights(plant))
-        return self.crossing_gains(plant)[0]
+        return known(_gain_table(self, plant))
 
     def gain_schedule(self, plant: Plant, design_plant: Plant) -> GainSchedule:
         """Schedule designed for one plant, for the times of entry and exit of the other."""
@@ -351,20 +349,17 @@ class LQR(AbstractStateController):
 
     def _load_schedule(self, plant: Plant, design_plant: Plant) -> ScheduledGainLaw:
         load = design_plant.case.loads[0]
-        speeds = jnp.abs(load.speed)[None] if self.speeds is None else self.speeds
+        speeds = xp.abs(load.speed)[None] if self.speeds is None else self.speeds
         source = given_load(load, design_plant.case.run.gravity)
         if self.load_identification is not None:
             source = self.load_identification.identifier(plant, design_plant)
 
-        def schedule(design):
-            return self.gain_schedule(plant, design)
-
         return ScheduledGainLaw(
-            designs_of(schedule, design_plant, self.masses, speeds),
+            known(_designs(self, plant, design_plant, speeds)),
             self.masses,
             speeds,
             plant.case.beam.length,
-            jnp.abs(load.speed),
+            xp.abs(load.speed),
             source,
             self.between == "nearest",
             design_plant.weights.shape[0],
@@ -376,12 +371,9 @@ class LQR(AbstractStateController):
         if speeds is None:
             speeds = xp.abs(design_plant.case.loads[0].speed)[None]
 
-        def schedule(design):
-            return self.gain_schedule(alone, design)
-
-        designs = designs_of(schedule, alone, self.masses, speeds)
+        designs = known(_designs(self, alone, alone, speeds))
         gravity = plant.case.run.gravity
-        masses = jnp.stack([jnp.asarray(load.total_mass(gravity)) for load in plant.case.loads])
+        masses = xp.stack([xp.asarray(load.total_mass(gravity)) for load in plant.case.loads])
         return PositionGainLaw(designs, self.masses, speeds, masses, masses * gravity, plant.loads)
 
     def events(self, case: Case) -> Float[np.ndarray, " event"]:
@@ -571,3 +563,21 @@ def _decays(vehicle: VehicleModel) -> bool:
     rates = -np.linalg.solve(mass, np.hstack([stiffness, damping]))
     poles = np.linalg.eigvals(np.vstack([np.eye(count, 2 * count, k=count), rates]))
     return bool(np.all(poles.real < -1e-9 * np.abs(poles)))
+
+
+@compiled
+def _gain_table(law: LQR, plant: Plant) -> GainTable:
+    """Gains over the crossing, by a loop that takes longer in NumPy than its program to compile."""
+    if law.horizon == "frozen":
+        return frozen_gains(plant, law.points, *law.weights(plant))
+    return law.crossing_gains(plant)[0]
+
+
+@compiled
+def _designs(law: LQR, plant: Plant, design_plant: Plant, speeds) -> GainSchedule:
+    """Schedules (mass, speed) of a design plant, for the times of entry and exit of the other."""
+
+    def schedule(design):
+        return law.gain_schedule(plant, design)
+
+    return designs_of(schedule, design_plant, law.masses, speeds)
