@@ -328,7 +328,7 @@ def loop_dynamics(case: Case, layout: Layout) -> LoopDynamics:
     """Loop dynamics of a case that has a controller; may be traced and batched."""
     controller = case.controller
     continuous = controller.period is None and not controller.open_loop
-    build = _compiled_dynamics if controller.runs_compiled or continuous else _known_dynamics
+    build = _compiled_dynamics if continuous else _known_dynamics
     return known(build(case, compiled_modal_model(case, layout)))
 
 

@@ -10,7 +10,6 @@ import numpy as np
 from jaxbeam.c_code.compensation import Compensation
 from jaxbeam.c_code.recorded_loop import (
     RecordedLoop,
-    designs_compiled,
     filters_in_program,
     recorded_loop,
 )
@@ -32,7 +31,7 @@ from jaxbeam.model.sensing.sensor_signals import (
 )
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import known
-from jaxbeam.runtime.compiling import compiled, compiled_if_traced
+from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.whole_file import whole_file
 from jaxbeam.simulation.closed_loop import command_lag
 from jaxbeam.simulation.commands.limits import command_ranges
@@ -73,8 +72,7 @@ def export_c(case: Case, name: str) -> CProgram:
     if controller.period is None:
         raise ValueError("controller.period is missing: a real controller samples; give its period")
     import_modules("jaxbeam.c_code.laws")
-    design = _designed_compiled if designs_compiled(controller) else _designed
-    law = known(design(case, mesh_layout(case)))
+    law = known(_designed(case, mesh_layout(case)))
     code = _source(case)
     try:
         write_law(law, code)
@@ -110,13 +108,10 @@ def write_c(program: CProgram, folder: str | os.PathLike, overwrite: bool = Fals
     return paths
 
 
-def _design(case: Case, layout):
+@compiled_if_traced
+def _designed(case: Case, layout):
     """Law of the controller of a case."""
     return case.controller.law(state_space(case, layout=layout))
-
-
-_designed = compiled_if_traced(_design)
-_designed_compiled = compiled(_design)
 
 
 def _source(case: Case) -> CSource:
@@ -127,7 +122,6 @@ def _source(case: Case) -> CSource:
     period, duration = (float(concrete(x)) for x in (case.controller.period, case.run.duration))
     samples = int(np.floor(duration / period * (1 + 1e-12))) + 1
     code = CSource(len(case.sensors), len(case.actuators), period, samples)
-    code.compiles = designs_compiled(case.controller)
     at_rest = [to_reading(sensor, 0.0) for sensor in case.sensors]
     code.state("reading", at_rest, "last readings, behind the digital filters")
     code.work("present", len(case.sensors), "which of them are new: 1, or 0 for a missing one")

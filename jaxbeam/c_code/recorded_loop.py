@@ -14,7 +14,6 @@ from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, Cont
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.filters import filter_step
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.control.state_controller import AbstractStateController
 from jaxbeam.integrator.integrate import (
     integrate_history,
     longest_force_step,
@@ -30,7 +29,7 @@ from jaxbeam.model.sensing.sensor_signals import (
     to_reading,
 )
 from jaxbeam.runtime.arrays import Array, any_jax, known, take, vmap, xp
-from jaxbeam.runtime.compiling import compiled, compiled_if_traced
+from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import (
     IntegrationPlan,
@@ -39,8 +38,6 @@ from jaxbeam.simulation.integration_plan import (
 )
 from jaxbeam.simulation.sampled_loop import SampledLoop
 from jaxbeam.simulation.simulate import integration_setup
-
-MIN_COMPILED = 300  # samples from which compilation pays
 
 
 class RecordedLoop(NamedTuple):
@@ -111,24 +108,12 @@ class _DesignedController(AbstractController):
     """Controller with a law that is designed already."""
 
     law_to_run: Any = None
-    is_compiled: bool = eqx.field(static=True, default=False)
-
-    @property
-    def runs_compiled(self):
-        return self.is_compiled
 
     def law(self, plant):
         return self.law_to_run
 
     def design_law(self, plant):
         return self.law_to_run
-
-
-def designs_compiled(controller: AbstractController) -> bool:
-    """Whether design and steps of the law take long without compilation, not its filter alone."""
-    if isinstance(controller, AbstractStateController):
-        controller = dataclasses.replace(controller, estimator=None, nominal_plant=None)
-    return controller.runs_compiled
 
 
 def filters_in_program(case: Case) -> tuple[Sections, ...]:
@@ -156,20 +141,16 @@ def recorded_loop(case: Case, law: AbstractSampledLaw, max_samples: int) -> Reco
     period, duration = (float(concrete(x)) for x in (controller.period, case.run.duration))
     count = min(math.floor(duration / period * (1 + 1e-12)) + 1, max_samples)
     times = np.arange(count + 1) * period
-    many = len(times) >= MIN_COMPILED
-    is_compiled = designs_compiled(controller) or (controller.runs_compiled and many)
     settings = "period", "delay", "resolution", "dropout", "jitter"
     recorded = _DesignedController(
         **{name: getattr(controller, name) for name in settings},
         law_to_run=FilteredLaw(law, sections, case.sensors),
-        is_compiled=is_compiled,
     )
     case = eqx.tree_at(
         lambda c: (c.sensors, c.controller), case, (sensors, recorded), is_leaf=lambda x: x is None
     )
     plan = _plan(case, times)
-    run = _run_compiled if is_compiled else _run
-    readings, states, commands = (np.asarray(part) for part in run(case, plan, times))
+    readings, states, commands = (np.asarray(part) for part in _run(case, plan, times))
     if not all(np.isfinite(part).all() for part in (states, commands)):
         raise ValueError("the closed loop diverges, so that there are no commands to check it by")
     return RecordedLoop(times[:-1], readings[:-1], states[:-1], commands[:-1])
@@ -191,7 +172,8 @@ def _longest_step(case: Case, layout: Layout) -> Array:
     return xp.minimum(stable, longest_force_step(case, loads))
 
 
-def _run_loop(case: Case, plan: IntegrationPlan, times) -> tuple[Array, Array, Array]:
+@compiled_if_traced
+def _run(case: Case, plan: IntegrationPlan, times) -> tuple[Array, Array, Array]:
     """Readings, states of the plant and commands sent to the actuators at the samples."""
     discrete, loads, policy, sample_steps, steps = integration_setup(case, plan, times, None)
     policy = _Recorder(**{field.name: getattr(policy, field.name) for field in fields(policy)})
@@ -203,7 +185,3 @@ def _run_loop(case: Case, plan: IntegrationPlan, times) -> tuple[Array, Array, A
     sample_steps = xp.minimum(sample_steps, len(readings) - 1)  # no step starts at the end
     sampled = readings[sample_steps, :, 0], commands[sample_steps, :, 0]
     return sampled[0], vmap(plant.from_modal)(states), sampled[1]
-
-
-_run = compiled_if_traced(_run_loop)
-_run_compiled = compiled(_run_loop)

@@ -43,8 +43,6 @@ class CSource:
     readings, present = "s->reading", "s->present"
     command, time, output = "s->acting", "t", "s->wanted"
 
-    compiles = False  # whether numbers of the law at samples are worth a compilation
-
     def __init__(self, sensors: int, actuators: int, period: float, samples: int):
         self.sensors, self.actuators = sensors, actuators
         self.period, self.samples = period, samples

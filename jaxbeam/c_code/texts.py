@@ -8,8 +8,10 @@ from importlib.metadata import version
 import jax
 import numpy as np
 
-from jaxbeam.c_code.recorded_loop import MIN_COMPILED, RecordedLoop
+from jaxbeam.c_code.recorded_loop import RecordedLoop
 from jaxbeam.c_code.source import CSource, array_text
+
+MIN_COMPILED = 300  # samples from which compilation pays
 
 
 def at_samples(function: Callable, code: CSource, varies: bool = True) -> tuple[np.ndarray, ...]:
@@ -18,7 +20,7 @@ def at_samples(function: Callable, code: CSource, varies: bool = True) -> tuple[
     A function that does not vary is evaluated once.
     """
     times = code.period * np.arange(code.samples if varies else 1)
-    if len(times) > 1 and (code.compiles or len(times) >= MIN_COMPILED):
+    if len(times) >= MIN_COMPILED:
         return tuple(np.asarray(part) for part in jax.jit(jax.vmap(function))(times))
     rows = [function(t) for t in times]
     return tuple(

@@ -211,14 +211,6 @@ class AbstractController(ReprWithUnits, Module, metaclass=ExplainsArguments):
         """Whether the design depends on masses and weights of the loads."""
         return True
 
-    @property
-    def runs_compiled(self) -> bool:
-        """Whether designs are compiled even if all numbers are known.
-
-        True where they take longer in NumPy than their program takes to compile.
-        """
-        return False
-
     @abc.abstractmethod
     def design_law(self, plant: Any) -> Any:
         """Law designed for a plant, a `jaxbeam.model.state_space.Plant`.

@@ -257,10 +257,6 @@ class LQR(AbstractStateController):
         return self.varies or super().design_depends_on_loads
 
     @property
-    def runs_compiled(self) -> bool:
-        return self.varies
-
-    @property
     def feeds_back_command(self) -> bool:
         """Whether the last command is fed back too."""
         held = self.sampling == "exact"
