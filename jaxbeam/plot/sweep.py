@@ -41,6 +41,7 @@ from jaxbeam.plot.style import (
 )
 
 LABEL_MARGIN = 0.06  # share of a map at its edges where contour labels would be cut off
+QUANTILE = "quantile"  # xarray's name of the dimension of fractiles
 MAX_MARKED_RUNS = 40  # largest number of runs of a curve that are marked with dots
 
 
@@ -57,7 +58,8 @@ def plot_sweep(
     Trains over speed are drawn as in `plot_speed_sweep`, other words as bars. Each quantity has a
     scale of its own. A dot marks the largest peak; failed runs are left out; paired runs are drawn
     over their number. A sweep over more addresses is drawn in slices:
-    `plot_sweep(dataset.isel({"loads.0.mass": 0}))`.
+    `plot_sweep(dataset.isel({"loads.0.mass": 0}))`. Fractiles over an address, as
+    `dataset.quantile([0.5, 0.95], "profile.seed", keep_attrs=True)`, are drawn beside each other.
 
     The figure takes the place of `ax`, curves of one quantity are drawn on it. The title is that of
     the case, with what was selected, if left out; `labels` name the sensors of the dataset. Raises
@@ -71,11 +73,16 @@ def plot_sweep(
     # Each sensor has its peaks in the variable of its quantity, and NaN in the others.
     peaks = functools.reduce(lambda one, other: one.fillna(other), (dataset[n] for n in variables))
     peaks = peaks.squeeze([d for d in peaks.dims if d != "sensor" and peaks.sizes[d] == 1])
+    if "sensor" not in peaks.dims:
+        peaks = peaks.expand_dims("sensor")
+    names = _sensor_names(peaks, case, labels)
+    if QUANTILE in peaks.dims:
+        levels = [_fractile_words(level) for level in peaks[QUANTILE].values]
+        names = [f"{name}, {level}" for name in names for level in levels]
+        peaks = _fractiles_as_sensors(peaks)
     swept = [str(dimension) for dimension in peaks.dims if dimension != "sensor"]
     with_values = [address for address in swept if address in peaks.coords]
     peaks = peaks.sortby([a for a in with_values if not is_word_axis(peaks, a)])
-    if "sensor" not in peaks.dims:
-        peaks = peaks.expand_dims("sensor")
     if not swept:
         raise ValueError("the dataset holds a single run; a sweep is drawn over its addresses")
     if len(swept) > 2:
@@ -83,7 +90,6 @@ def plot_sweep(
             f"a sweep is drawn over one or two addresses, not {len(swept)} ({', '.join(swept)}); "
             f"select a value of the others, as in dataset.isel({{{swept[0]!r}: 0}})"
         )
-    names = _sensor_names(peaks, case, labels)
     if is_speed_sweep(peaks, case):
         return plot_speed_sweep(peaks, case, names, ax=ax, title=title)
     words = [address for address in swept if is_word_axis(peaks, address)]
@@ -111,8 +117,24 @@ def plot_sweep(
     return figure
 
 
+def _fractile_words(level: float) -> str:
+    return f"{100 * level:g} % fractile"
+
+
+def _fractiles_as_sensors(peaks: xarray.DataArray) -> xarray.DataArray:
+    """Peaks (sensor, ...) in which each fractile of a sensor is one more sensor."""
+    rest = [dimension for dimension in peaks.dims if dimension not in ("sensor", QUANTILE)]
+    ordered = peaks.transpose("sensor", QUANTILE, *rest)
+    count, levels = ordered.shape[:2]
+    values = ordered.values.reshape(count * levels, *ordered.shape[2:])
+    first = ordered.isel({QUANTILE: 0}, drop=True)
+    return first.isel(sensor=np.repeat(np.arange(count), levels)).copy(data=values)
+
+
 def _fixed_value(case: Case, address: str, value) -> str:
     """What a dimension is that was selected, and its value."""
+    if address == QUANTILE:
+        return _fractile_words(value)
     words = address_words(case, address)
     if isinstance(value, str):
         return f"{words} {value}"

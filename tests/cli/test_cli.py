@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+import xarray
 from PIL import Image
 
 from jaxbeam.cli import main
@@ -82,6 +83,14 @@ REFUSED = [
     (
         "sweep case.toml --over loads.0.speed=1,2 --resume -o out.csv",
         "--resume needs a store of blocks: -o OUT.zarr",
+    ),
+    (
+        "sweep case.toml --over loads.0.speed=1,2 --fractile loads.0.mass=0.5",
+        "loads.0.mass is not swept; it is taken over one of loads.0.speed",
+    ),
+    (
+        "sweep case.toml --over loads.0.speed=1,2 --fractile loads.0.speed=95",
+        "fractiles are numbers from 0 to 1, such as 0.95",
     ),
     ("sweep case.toml --over loads.0.speed=1,2 -o out.txt", "a sweep is written to a .zarr file"),
     ("frf case.toml --from 0", "--from and --to must increase from above 0 Hz; they are 0, 1000"),
@@ -374,6 +383,20 @@ def test_sweep_prints_where_peaks_are_and_writes_rows(run, folder):
     least = min(float(row[heads.index("load 0 lowest contact force (N)")]) for row in rows)
     assert f"smallest contact force {least:.6g} N, at speed of the load " in printed
     assert "no run loses contact" in printed
+
+
+def test_fractiles_of_a_sweep_over_seeds(run, folder):
+    """Of three seeds the median is the middle one; what is written is whole."""
+    profile = "--set profile.kind=iso8608 --set profile.class=A --set profile.scale=0.02"
+    profile += " --set profile.highest_wavenumber=1"
+    line = f"sweep case.toml {profile} --over profile.seed=1,2,3 -o out.nc"
+    said = run(f"{line} --fractile profile.seed=0.5,1 --over loads.0.speed=1,2 --plot")
+    with xarray.open_dataset(folder / "out.nc") as found:
+        peaks = found.peak_deflection.values[..., 0]
+    assert peaks.shape == (3, 2)
+    for name, largest in (("50 %", np.sort(peaks, axis=0)[1].max()), ("100 %", peaks.max())):
+        assert any(name in row and f"{largest:.6g}" in row for row in said.splitlines())
+    assert (folder / "out.png").exists()
 
 
 def test_paired_sweep(run):

@@ -122,3 +122,16 @@ def test_paired_sweep():
 def test_datasets_that_cannot_be_drawn(dataset, message):
     with pytest.raises(ValueError, match=message):
         plot_sweep(dataset)
+
+
+def test_fractiles_over_an_address():
+    """Curves of a sensor beside each other, each under its level; one alone is in the title."""
+    dataset = swept(loads_0_mass=[0.1, 0.2, 0.3], loads_0_speed=[1.0, 2.0])
+    several = dataset.quantile([0.0, 0.5], "loads.0.mass", keep_attrs=True)
+    figure = plot_sweep(several)
+    curves = lines_of(figure.axes[0], 2)
+    expected = [[1.1, 2.1], [1.2, 2.2], [2.2, 4.2], [2.4, 4.4]]
+    assert_allclose([data(curve)[1] for curve in curves], expected)
+    assert "at 0.3 m, 50 % fractile" in words(figure)
+    one = plot_sweep(dataset.quantile(0.95, "loads.0.mass", keep_attrs=True))
+    assert "95 % fractile" in words(one)

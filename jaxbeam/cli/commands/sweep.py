@@ -37,6 +37,7 @@ def sweep(
     over: Annotated[Over, Parameter(required=True)],
     output: Output = None,
     paired: bool = False,
+    fractile: str | None = None,
     resume: bool = False,
     scheduler: str | None = None,
     precision: str = "double",
@@ -58,6 +59,9 @@ def sweep(
         each run, to OUT.csv, .xlsx, .mat or .parquet, or all to OUT.nc.
     paired
         Pair the values of all parameters one by one instead of computing all combinations.
+    fractile
+        ADDRESS=0.5,0.95: print and draw these fractiles of the peaks over the values of a
+        parameter, as of `profile.seed`; the results are written whole.
     resume
         Continue an interrupted sweep in the same store.
     scheduler
@@ -82,9 +86,10 @@ def sweep(
             is_given and store is None,
             f"{option} needs a store of blocks: -o OUT.zarr",
         )
+    fractiles = _fractile_levels(fractile, values)
     picture = pictures.path(output, case.with_stem(f"{case.stem}_sweep"))
     refuse_option(
-        bool(picture) and not 0 < sum(len(given) > 1 for given in values.values()) < 3,
+        bool(picture) and not 0 < len(_several(values) - set(fractiles)) < 3,
         "--plot draws peaks over one or two parameters with several values; leave it out",
     )
     if not resume:
@@ -114,14 +119,65 @@ def sweep(
         from jaxbeam.plot import plot_sweep
 
         look = {"title": pictures.title, "labels": labels}
-        figure = plot_sweep(results, ax=pictures.page(), **look)
+        drawn = _fractiles(results, fractiles) if fractiles else results
+        figure = plot_sweep(drawn, ax=pictures.page(), **look)
         pictures.save(figure, picture)
     options.report(
         jb.api.content(results) | {"plausibility": plausibility},
-        _lines(parsed_case, results, list(values)),
+        _lines(parsed_case, results, list(values))
+        + (_fractile_lines(parsed_case, results, fractiles) if fractiles else []),
         output,
         picture,
     )
+
+
+def _several(values: dict) -> set[str]:
+    """Addresses with more than one value."""
+    return {address for address, given in values.items() if len(given) > 1}
+
+
+def _fractile_levels(given: str | None, values: dict) -> dict[str, list[float]]:
+    """Levels of fractiles by the one address over which they are taken; none if none is given."""
+    if given is None:
+        return {}
+    levels = parse_sweep_values([given])
+    ((address, found),) = levels.items()
+    refuse_option(
+        address not in values,
+        f"--fractile {given}: {address} is not swept; it is taken over one of {', '.join(values)}",
+    )
+    refuse_option(
+        not all(isinstance(level, float) and 0 <= level <= 1 for level in found),
+        f"--fractile {given}: fractiles are numbers from 0 to 1, such as 0.95",
+    )
+    return {address: [float(level) for level in found]}
+
+
+def _fractiles(results: "xarray.Dataset", fractiles: dict[str, list[float]]) -> "xarray.Dataset":
+    """Fractiles of the peaks over one address; of runs that fail none."""
+    import warnings
+
+    ((address, levels),) = fractiles.items()
+    peaks = [name for name in results if str(name).startswith("peak_") and name != "peak_time"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # sensors of other quantities are all NaN
+        return results[peaks].quantile(levels, address, keep_attrs=True)
+
+
+def _fractile_lines(
+    case: "jb.Case", results: "xarray.Dataset", fractiles: dict[str, list[float]]
+) -> list[str]:
+    """Fractiles of the peak of each sensor, the largest over the other values."""
+    found, rows = _fractiles(results, fractiles), []
+    for i, sensor in enumerate(case.sensors):
+        unit = f" ({sensor.unit})" if sensor.unit != "1" else ""
+        for level in found["quantile"].values:
+            peaks = found[f"peak_{sensor.quantity}"].sel(quantile=level)[..., i]
+            row = sensor.name or i, f"{sensor.quantity}{unit}"
+            rows.append((*row, f"{100 * level:g} %", f"{peaks.max().item():.6g}"))
+    ((address, _),) = fractiles.items()
+    head = f"fractiles over {_head(results[address])}, the largest of the other values:"
+    return [head, *table(("sensor", "quantity", "fractile", "peak"), rows)]
 
 
 def _print_plausibility(case: "jb.Case", values, options: CaseOptions) -> dict:
