@@ -42,7 +42,7 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
     os.environ["XDG_CACHE_HOME"] = os.path.abspath(os.environ["JAX_COMPILATION_CACHE_DIR"])
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
-# Tests start a hundred processes, each of which would compile the library's Python anew.
+# Each run, and each of a hundred processes that tests start, would compile all Python anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import hypothesis
@@ -53,6 +53,7 @@ from tests.fuzzing import FACTOR
 from tests.layers.selection import layers, matches
 
 shape_checks.use()
+sys.dont_write_bytecode = False  # set when this process began, by the variable removed above
 
 # Tracing makes millions of small objects that live long: with Python's own thresholds, garbage
 # collection takes up to a tenth of the time and frees next to nothing.
