@@ -23,7 +23,9 @@ from jaxbeam.estimation.sensor_chain import filtered_plant, sensor_chain
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.finite_horizon import finite_horizon
-from jaxbeam.runtime.arrays import Array, set_at, xp
+from jaxbeam.numerics.gain_table import GainTable
+from jaxbeam.runtime.arrays import Array, known, set_at, xp
+from jaxbeam.runtime.compiling import compiled
 
 
 class AbstractKalmanEstimator(AbstractEstimator):
@@ -214,18 +216,9 @@ class Kalman(AbstractKalmanEstimator):
             return TimeInvariantFilter(offset, zero_state, plant_states, system, gain)
         end = plant.case.run.duration
 
-        def dual_system(time_to_end):
-            """Transposed plant at a time (s) before the end: its regulator has the same gain."""
-            plant = filtered.with_filtered_outputs(filtered_model.augmented(end - time_to_end))
-            return plant.A.T, plant.C.T
-
-        crossing_times = filtered_model.loads.entry_exit_times().reshape(-1)
-        events = xp.concatenate([xp.zeros(1), xp.clip(crossing_times, 0.0, end), end[None]])
         initial_covariance = xp.diag(xp.append(zero_state, self.load_variance(plant)))
         Q = xp.pad(intensity, (0, start.shape[0]))
-        table = finite_horizon(
-            dual_system, xp.sort(end - events), self.points, Q, noise, initial_covariance
-        )[0]
+        table = known(_dual_gains(filtered, end, self.points, Q, noise, initial_covariance))
         return ContinuousCrossingFilter(
             offset,
             xp.append(zero_state, start),
@@ -290,3 +283,21 @@ class Kalman(AbstractKalmanEstimator):
         if self.points >= min_points:
             return None
         return f"points must be at least {min_points} for {modes} modes and a run that long"
+
+
+@compiled
+def _dual_gains(filtered, end, points: int, Q, noise, initial_covariance) -> GainTable:
+    """Gains of a filtered plant over the time to the end (s), those of the dual regulator.
+
+    By a loop that takes longer in NumPy than its program takes to compile.
+    """
+
+    def dual_system(time_to_end):
+        """Transposed plant at a time (s) before the end: its regulator has the same gain."""
+        plant = filtered.with_filtered_outputs(filtered.plant.augmented(end - time_to_end))
+        return plant.A.T, plant.C.T
+
+    crossing_times = filtered.plant.loads.entry_exit_times().reshape(-1)
+    events = xp.concatenate([xp.zeros(1), xp.clip(crossing_times, 0.0, end), end[None]])
+    problem = xp.sort(end - events), points, Q, noise, initial_covariance
+    return finite_horizon(dual_system, *problem)[0]
