@@ -75,11 +75,9 @@ def contact_minimum(
 
     def with_first_loss(lost_time):
         """Of each load only the first step with a pull counts."""
-        rows = xp.arange(is_load.shape[0] * is_load.shape[1])
-        pulls = pulls_of_loads().reshape(rows.size, *lost_time.shape)
-        first = xp.min(xp.where(pulls > 0, rows[:, None, None], rows.size), axis=0)
-        found = xp.minimum(first, rows.size - 1)
-        of_rows = by_row.reshape(rows.size, NODE_COUNT, batch_size)
+        pulls = pulls_of_loads().reshape(-1, *lost_time.shape) > 0
+        loses, found = xp.any(pulls, axis=0), xp.argmax(pulls, axis=0)
+        of_rows = by_row.reshape(-1, NODE_COUNT, batch_size)
         nodes = xp.take_along_axis(of_rows, found[:, None], axis=0)[:, None]  # load, 1, node, batch
         pulls = _at_fractions(nodes, whole_run)
         powers = xp.einsum("slnb,nk->kslb", nodes, lagrange_coefficients(NODE_COUNT))
@@ -88,7 +86,7 @@ def contact_minimum(
         fraction = _moving_zero(powers, fraction)[:, 0]
         step = found // is_load.shape[1]
         time = take(start, step) + take(length, step) * fraction
-        return xp.minimum(lost_time, xp.where(first < rows.size, time, NEVER))
+        return xp.minimum(lost_time, xp.where(loses, time, NEVER))
 
     # Most chunks stay above the smallest force so far; NaN is passed on.
     lowest = cond(whole_run or xp.any(~(bound <= -lowest)), with_smaller, lambda same: same, lowest)
@@ -107,17 +105,28 @@ def _at_fractions(by_row: Float[Array, "step row node batch"], by_product: bool)
     return sum(weights[:, node] * by_row[:, :, node] for node in range(NODE_COUNT))
 
 
+def _parabolas() -> tuple[Float[np.ndarray, "inner fraction"], ...]:
+    """Weights of the parabolas through three fractions, from the values at all fractions.
+
+    Slopes before and after the middle one, the slope at it, and half the second derivative.
+    """
+    gaps = np.diff(FORCE_FRACTIONS)[:, None]
+    slopes = np.diff(np.eye(FORCE_FRACTIONS.size), axis=0) / gaps
+    rise, fall = slopes[:-1], slopes[1:]
+    curvature = (fall - rise) / (gaps[:-1] + gaps[1:])
+    return rise, fall, rise + curvature * gaps[:-1], curvature
+
+
+PARABOLAS = _parabolas()
+
+
 def _vertices(pulls: Float[Array, "fraction step row batch"]):
     """Tops of the parabolas through three fractions, -inf without one, and zeros before them."""
-    gaps = np.diff(FORCE_FRACTIONS)[:, None, None, None]
-    slopes = xp.diff(pulls, axis=0) * (1 / gaps)  # XLA does not make products of divisions
-    rise, fall = slopes[:-1], slopes[1:]
+    rise, fall, slope, curvature = (xp.tensordot(weights, pulls, 1) for weights in PARABOLAS)
     inside = (rise > 0) & (fall < 0)
-    curvature = xp.where(inside, (fall - rise) * (1 / (gaps[:-1] + gaps[1:])), -1.0)
-    slope = rise + curvature * gaps[:-1]
-    top = pulls[1:-1] - slope**2 / (4 * curvature)
+    curvature = xp.where(inside, curvature, -1.0)
+    top = xp.where(inside, pulls[1:-1] - slope**2 / (4 * curvature), -xp.inf)
     at = FORCE_FRACTIONS[1:-1, None, None, None] - slope / (2 * curvature)
-    top = xp.where(inside, top, -xp.inf)
     return top, at - xp.sqrt(xp.where(top > 0, top, 1.0) / -curvature)
 
 
