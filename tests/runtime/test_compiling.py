@@ -7,7 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from jaxbeam.runtime import compiling
-from jaxbeam.runtime.compiling import compiled
+from jaxbeam.runtime.arrays import fori_loop, xp
+from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 
 POINTS = np.array([0.1, 0.7, 2.0])
 
@@ -78,3 +79,39 @@ def test_unknown_options_are_left_out(monkeypatch):
         assert_allclose(compiled(jnp.cos)(0.5), np.cos(0.5), rtol=1e-14)
     finally:
         compiling._supported_options.cache_clear()
+
+
+@compiled_if_traced
+def decay(x):
+    return fori_loop(0, 20, lambda _, y: y * xp.cos(x), xp.ones(()))
+
+
+def test_derivatives_are_computed_in_numpy_until_that_has_cost_a_compilation(monkeypatch):
+    programs, program_of = [], compiling._program_of
+
+    def noted(*args):
+        programs.append(program_of(*args))
+        return programs[-1]
+
+    monkeypatch.setattr(compiling, "_program_of", noted)
+    expected = -20 * np.cos(0.4) ** 19 * np.sin(0.4)
+    assert_allclose(jax.grad(decay)(0.4), expected, rtol=1e-12)
+    program = programs[-1]
+    assert program.jitted._cache_size() == 0
+    for _ in range(int(program.price / program.cost)):
+        assert_allclose(jax.grad(decay)(0.4), expected, rtol=1e-12)
+    assert programs[-1] is program
+    assert program.jitted._cache_size() == 1
+
+
+@pytest.mark.parametrize(
+    ("transformed", "x"),
+    [
+        (jax.grad(jax.grad(decay)), 0.4),
+        (jax.vmap(decay), np.array([0.4, 0.7])),
+        (jax.vmap(jax.grad(decay)), np.array([0.4, 0.7])),
+        (jax.hessian(lambda x: decay(x[0]) * decay(x[1])), np.array([0.4, 0.7])),
+    ],
+)
+def test_transformations_in_numpy_are_those_of_xla(transformed, x):
+    assert_allclose(transformed(x), jax.jit(transformed)(x), rtol=1e-12)
