@@ -4,6 +4,7 @@ The public names are listed in `__init__.pyi`. Each is imported when it is first
 `import jaxbeam` and the help of the command line do not import JAX, which takes a second.
 """
 
+import importlib
 import os
 import sys
 
@@ -14,7 +15,17 @@ if is_command_line():
 
 import lazy_loader
 
-from jaxbeam.case.former_words import NAMES
+from jaxbeam.case.former_words import MOVED, NAMES
+
+# Public names that are modules, with the packages in which they are.
+MODULES = {
+    "ride": "jaxbeam.analysis",
+    "receptance_method": "jaxbeam.control",
+    "frequency_responses": "jaxbeam.model",
+    "planar": "jaxbeam.case.loads",
+    "profiles": "jaxbeam.case",
+    "sections": "jaxbeam.analysis",
+}
 
 # Matrices are small and runs share the cores: threads of LAPACK would wait for each other, on a
 # busy machine for minutes. LAPACK reads this when it is loaded; a setting by the user prevails.
@@ -38,4 +49,8 @@ _import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 def __getattr__(name: str):
     if name in NAMES and name not in __all__:
         raise AttributeError(f"jaxbeam.{name} is called jaxbeam.{NAMES[name]} now")
+    if name in MOVED:
+        raise AttributeError(f"jaxbeam.{name} is jaxbeam.{MOVED[name]}.{name} now")
+    if name in MODULES:
+        return importlib.import_module(f"{MODULES[name]}.{name}")
     return _import_name(name)

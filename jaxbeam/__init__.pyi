@@ -1,25 +1,12 @@
 from . import api as api
+from .analysis import ride as ride, sections as sections
 from .analysis.absorber_tuning import tuned_absorber as tuned_absorber
 from .analysis.assessment.assess import assess as assess
-from .analysis.assessment.assessment import Assessment as Assessment, CodeCheck as CodeCheck
 from .analysis.bound.bound import bound as bound
 from .analysis.bound.least_integral import least_integral as least_integral
 from .analysis.control_systems import to_control as to_control
-from .analysis.ride import (
-    RideMeasures as RideMeasures,
-    ride_measures as ride_measures,
-    sperling_index as sperling_index,
-    vibration_dose as vibration_dose,
-    weighted_acceleration as weighted_acceleration,
-    weighted_rms as weighted_rms,
-    wheel_unloading as wheel_unloading,
-)
-from .analysis.sections import (
-    Envelope as Envelope,
-    amplification as amplification,
-    characteristic_points as characteristic_points,
-    envelope as envelope,
-)
+from .analysis.sections import envelope as envelope
+from .case import profiles as profiles
 from .case.absorbers import Absorber as Absorber
 from .case.actuators.electrodynamic import (
     CurrentLoop as CurrentLoop,
@@ -42,6 +29,7 @@ from .case.beam import (
 )
 from .case.case import Case as Case, Run as Run, addresses as addresses, replace as replace
 from .case.filters import Filter as Filter
+from .case.loads import planar as planar
 from .case.loads.axles import Axles as Axles, LineLoad as LineLoad
 from .case.loads.cars import (
     HalfCar as HalfCar,
@@ -49,16 +37,9 @@ from .case.loads.cars import (
     QuarterCar as QuarterCar,
     Wagon as Wagon,
 )
-from .case.loads.planar.parts import (
-    VehicleAxle as VehicleAxle,
-    VehicleBody as VehicleBody,
-    VehicleHinge as VehicleHinge,
-    VehicleSpring as VehicleSpring,
-)
 from .case.loads.planar.vehicle import (
     Coach as Coach,
     TrainLoad as TrainLoad,
-    VehicleSensor as VehicleSensor,
     load_vehicle as load_vehicle,
 )
 from .case.loads.point import (
@@ -68,23 +49,9 @@ from .case.loads.point import (
 )
 from .case.loads.vehicle import VehicleLoad as VehicleLoad
 from .case.loads.walking import Crowd as Crowd, Pedestrian as Pedestrian
-from .case.profiles.shapes import (
-    BumpProfile as BumpProfile,
-    RampProfile as RampProfile,
-    SineProfile as SineProfile,
-    StepProfile as StepProfile,
-    TableProfile as TableProfile,
-)
-from .case.profiles.spectra import (
-    ISO8608Profile as ISO8608Profile,
-    RailProfile as RailProfile,
-    SpectrumProfile as SpectrumProfile,
-)
 from .case.sensors import Sensor as Sensor
-from .control.compensators import (
-    PD as PD,
-    PositivePositionFeedback as PositivePositionFeedback,
-)
+from .control import receptance_method as receptance_method
+from .control.compensators import PD as PD, PositivePositionFeedback as PositivePositionFeedback
 from .control.feedback import (
     Feedback as Feedback,
     OutputFeedback as OutputFeedback,
@@ -105,14 +72,6 @@ from .control.optimal.sampled_lqr import sampling_limit as sampling_limit
 from .control.predictive.gpc import GPC as GPC, AdaptiveGPC as AdaptiveGPC
 from .control.predictive.mpc import MPC as MPC
 from .control.predictive.scenario_mpc import ScenarioMPC as ScenarioMPC
-from .control.receptance import (
-    ReceptanceFeedback as ReceptanceFeedback,
-    closed_loop_poles as closed_loop_poles,
-    fit_receptances as fit_receptances,
-    receptance_feedback as receptance_feedback,
-    receptance_gains as receptance_gains,
-    receptances as receptances,
-)
 from .control.sliding_mode import SlidingMode as SlidingMode
 from .control.state_controller import StateFeedback as StateFeedback
 from .estimation.extended_kalman import ExtendedKalman as ExtendedKalman
@@ -122,15 +81,11 @@ from .estimation.moving_horizon import MovingHorizon as MovingHorizon
 from .estimation.observer import Observer as Observer
 from .files.case_file import load_case as load_case, save_case as save_case
 from .files.profile_file import profile_from_file as profile_from_file
-from .files.tables import save as save, sweep_columns as sweep_columns
-from .model.frequency_response import (
-    accelerance as accelerance,
-    frequency_response as frequency_response,
-    mobility as mobility,
-    receptance as receptance,
-)
+from .files.tables import save as save
+from .model import frequency_responses as frequency_responses
+from .model.frequency_responses import frequency_response as frequency_response
 from .model.influence import influence_line as influence_line, static_peak as static_peak
-from .model.plausibility.check import Plausibility as Plausibility, check as check
+from .model.plausibility.check import check as check
 from .model.plausibility.checked_modes import modes as modes
 from .model.settlement import settlement_response as settlement_response
 from .model.state_space import state_space as state_space

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
     from jaxbeam.analysis.ride import RideMeasures
 
+__all__ = ["load_case", "problem", "plain", "content", "Job"]
+
 MIN_RIDE_RATE = 160.0  # Hz, twice the highest frequency of the weighting of ride measures
 
 
@@ -37,7 +39,7 @@ def load_case(
     settings: Mapping[str, Any] = MappingProxyType({}),
     folder: str | os.PathLike = ".",
 ) -> Case:
-    """The validated case of a file (a path), of the text of one, or of its tables.
+    """The validated case of a source: a file (a path), the text of one, or its tables.
 
     `settings` are other values at some addresses, numbers in SI units, texts with units or words.
     Files that a text or tables name, as those of profiles, must be below the `folder`. Unlike
@@ -71,7 +73,7 @@ class Problem(NamedTuple):
 
 
 def problem(error: Exception) -> Problem:
-    """An error as data.
+    """An `error` as data.
 
     >>> try:
     ...     load_case({"beam": {"length": -1.0, "flexural_rigidity": 1.0, "mass_per_length": 1.0}})
@@ -93,7 +95,7 @@ def problem(error: Exception) -> Problem:
 
 
 def plain(value: Any) -> Any:
-    """Value of JSON types: arrays as lists, keys as strings, None for infinite and NaN.
+    """A value of JSON types: arrays as lists, keys as strings, None for infinite and NaN.
 
     >>> plain({"peaks": np.array([1.0, np.nan])})
     {'peaks': [1.0, None]}
@@ -108,7 +110,7 @@ def plain(value: Any) -> Any:
 
 
 def content(result: "Record | Plausibility | xarray.Dataset") -> dict[str, Any]:
-    """Numbers of a result by their names (SI units), those that the commands print with `--json`.
+    """Numbers of a `result` by their names (SI units), those that the commands print with `--json`.
 
     Results are those of `simulate`, `check` and `sweep`; histories of a record are its `columns`.
 

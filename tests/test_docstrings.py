@@ -69,25 +69,31 @@ def test_examples_in_docstrings_print_what_they_show(name, tmp_path, monkeypatch
 
 # What these arguments are is the same everywhere; the site says it once, above all functions.
 COMMON_ARGUMENTS = {"case", "path", "record", "fit", "progress", "seed", "layout"}
-PUBLIC_FUNCTIONS = {
-    f"{package.__name__}.{name}": inspect.unwrap(getattr(package, name))
-    for package in (jaxbeam, tuning)
-    for name in package.__all__
-    if callable(getattr(package, name)) and not inspect.isclass(getattr(package, name))
-}
-PUBLIC_CLASSES = {
+PUBLIC = {
     f"{package.__name__}.{name}": getattr(package, name)
     for package in (jaxbeam, tuning)
     for name in package.__all__
-    if inspect.isclass(getattr(package, name))
 }
+PUBLIC |= {
+    f"{name}.{inner}": getattr(module, inner)
+    for name, module in PUBLIC.items()
+    if inspect.ismodule(module)
+    for inner in module.__all__
+}
+PUBLIC_FUNCTIONS = {
+    name: inspect.unwrap(one)
+    for name, one in PUBLIC.items()
+    if callable(one) and not inspect.isclass(one)
+}
+PUBLIC_CLASSES = {name: one for name, one in PUBLIC.items() if inspect.isclass(one)}
 
 
 def words_of(docstring: str) -> set[str]:
     """Words of a docstring, and of those of the public functions that it refers to in backticks."""
     words = set(re.findall(r"\w+", docstring))
     for name in re.findall(r"`(?:\w+\.)*(\w+)`", docstring):
-        other = PUBLIC_FUNCTIONS.get(f"jaxbeam.{name}") or PUBLIC_FUNCTIONS.get(f"tuning.{name}")
+        found = (one for key, one in PUBLIC_FUNCTIONS.items() if key.endswith(f".{name}"))
+        other = next(found, None)
         words |= set(re.findall(r"\w+", inspect.getdoc(other) or "")) if other else set()
     return words
 

@@ -84,7 +84,7 @@ CASES = {
             jb.QuarterCar(0.3, 0.02, 60.0, 0.6, 400.0, 0.1, speed=6.0, start_position=-0.2),
             jb.Oscillator(0.1, 40.0, 0.2, 0.01, speed=-5.0, entry_time=0.05, deceleration=8.0),
         ),
-        profile=jb.BumpProfile(-0.15, 0.4, 1e-3),
+        profile=jb.profiles.BumpProfile(-0.15, 0.4, 1e-3),
     ),
     "no loads": dataclasses.replace(MASSES, loads=()),
     "coupled": dataclasses.replace(
@@ -151,7 +151,7 @@ FUNCTIONS = {
         stationary_masses=[(0.3, 0.2)],
         layout=layout,
     ),
-    "receptance": lambda case, layout: jb.receptance(
+    "receptance": lambda case, layout: jb.frequency_responses.receptance(
         case, np.array([5.0, 40.0]), 0.3, 0.7, layout=layout
     ),
     "state space": lambda case, layout: [

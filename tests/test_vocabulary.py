@@ -14,7 +14,7 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.estimator import AbstractEstimator
 from jaxbeam.case.kinds import PACKAGES, import_modules
 from jaxbeam.case.loads.base import AbstractLoad
-from jaxbeam.case.loads.planar.vehicle import VehicleSensor
+from jaxbeam.case.loads.planar.vehicle_parts import VehicleSensor
 from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.sensors import Sensor
 from tests.modules import ROOT

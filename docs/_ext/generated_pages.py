@@ -5,7 +5,6 @@ import importlib
 import inspect
 import json
 from pathlib import Path
-from types import ModuleType
 
 from plain_docstrings import as_text
 
@@ -88,21 +87,12 @@ def public_names() -> dict[str, list[tuple[str, str]]]:
         for name in sorted(package.__all__, key=str.lower):
             one = getattr(package, name)
             if inspect.ismodule(one):
-                found = own_names(one)
-                pages[group_of(one.__name__)] += [(one.__name__, inner) for inner in found]
+                found = [(one.__name__, inner) for inner in one.__all__]
+                pages[group_of(one.__name__)] += found
             else:
                 pages[group_of(one.__module__)].append((package.__name__, name))
     pages["interfaces"] = INTERFACES
     return pages
-
-
-def own_names(module: ModuleType) -> list[str]:
-    """Public functions and classes that a module defines."""
-    return [
-        name
-        for name, one in vars(module).items()
-        if not name.startswith("_") and getattr(one, "__module__", "") == module.__name__
-    ]
 
 
 def api_page(title: str, names: list[tuple[str, str]]) -> str:

@@ -12,7 +12,14 @@ from sphinx import addnodes
 import jaxbeam
 import tuning
 
-PUBLIC = {name: "jaxbeam" for name in jaxbeam.__all__} | {name: "tuning" for name in tuning.__all__}
+PUBLIC: dict[str, str] = {}
+for package in (jaxbeam, tuning):
+    for public_name in package.__all__:
+        one = getattr(package, public_name)
+        if inspect.ismodule(one):
+            PUBLIC |= {f"{public_name}.{inner}": package.__name__ for inner in one.__all__}
+        else:
+            PUBLIC[public_name] = package.__name__
 
 
 def as_text(line: str) -> str:

@@ -17,7 +17,7 @@ def main(out: Path = Path("out/examples")) -> dict[str, tuple[float, float]]:
     for road in ("smooth", "A", "B", "C"):
         one = smooth
         if road != "smooth":
-            one = dataclasses.replace(case, profile=jb.ISO8608Profile(road, seed=3))
+            one = dataclasses.replace(case, profile=jb.profiles.ISO8608Profile(road, seed=3))
         record = jb.simulate(one)
         peaks = [abs(smallest) for smallest in record.extremes.smallest]
         increments[road] = tuple(float(p / s - 1) for p, s in zip(peaks, static, strict=True))

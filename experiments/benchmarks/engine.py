@@ -49,7 +49,7 @@ CONTINUOUS = jb.Case(
             speed=1.5,
         ),
     ],
-    profile=jb.TableProfile([0.0, 0.2, 0.4, 0.6], [0.0, 1e-4, -1e-4, 0.0]),
+    profile=jb.profiles.TableProfile([0.0, 0.2, 0.4, 0.6], [0.0, 1e-4, -1e-4, 0.0]),
     controller=jb.Feedback(gains=[200.0]),
     run=jb.Run(0.5, 200.0),
 )

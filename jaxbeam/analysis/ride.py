@@ -15,6 +15,16 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation.record import Record
 
+__all__ = [
+    "RideMeasures",
+    "ride_measures",
+    "sperling_index",
+    "vibration_dose",
+    "weighted_acceleration",
+    "weighted_rms",
+    "wheel_unloading",
+]
+
 # Weighting W_k: frequencies (Hz) and quality factors of its filters, from table 3.1 of the HVM200
 # manual of Larson Davis (easymanua.ls/larson-davis/hvm200/manual, page 30), which names ISO 8041.
 HIGH_PASS, LOW_PASS, BUTTERWORTH = 0.4, 100.0, 1 / np.sqrt(2)
@@ -81,7 +91,7 @@ def weighted_acceleration(
     >>> import jaxbeam as jb
     >>> times = np.arange(0.0, 20.0, 1 / 400)
     >>> shaking = np.sqrt(2) * np.sin(2 * np.pi * 6.0 * times)  # rms 1 m/s^2, where W_k is about 1
-    >>> print(jb.weighted_acceleration(times, shaking).shape)
+    >>> print(jb.ride.weighted_acceleration(times, shaking).shape)
     (8000,)
     """
     step = _time_step(times, WEIGHTED_BAND)
@@ -108,7 +118,7 @@ def weighted_rms(
     >>> import jaxbeam as jb
     >>> times = np.arange(0.0, 20.0, 1 / 400)
     >>> shaking = np.sqrt(2) * np.sin(2 * np.pi * 6.0 * times)  # rms 1 m/s^2, where W_k is about 1
-    >>> print(f"{jb.weighted_rms(times, shaking):.2f}")
+    >>> print(f"{jb.ride.weighted_rms(times, shaking):.2f}")
     1.05
     """
     weighted = weighted_acceleration(times, acceleration)
@@ -129,7 +139,7 @@ def vibration_dose(
     >>> import jaxbeam as jb
     >>> times = np.arange(0.0, 20.0, 1 / 400)
     >>> shaking = np.sqrt(2) * np.sin(2 * np.pi * 6.0 * times)  # rms 1 m/s^2, where W_k is about 1
-    >>> print(f"{jb.vibration_dose(times, shaking):.2f}")
+    >>> print(f"{jb.ride.vibration_dose(times, shaking):.2f}")
     2.47
     """
     weighted = weighted_acceleration(times, acceleration)
@@ -151,7 +161,7 @@ def sperling_index(
     >>> import jaxbeam as jb
     >>> times = np.arange(0.0, 20.0, 1 / 400)
     >>> shaking = np.sqrt(2) * np.sin(2 * np.pi * 6.0 * times)  # rms 1 m/s^2, where W_k is about 1
-    >>> print(f"{jb.sperling_index(times, shaking):.2f}")
+    >>> print(f"{jb.ride.sperling_index(times, shaking):.2f}")
     4.12
     """
     low, high = SPERLING_BAND
@@ -177,7 +187,7 @@ def wheel_unloading(record: Record) -> Float[Array, " load"]:
     >>> case = jb.Case(
     ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingMass(mass=0.5, speed=2.0)]
     ... )
-    >>> print(jb.wheel_unloading(jb.simulate(case)).shape)
+    >>> print(jb.ride.wheel_unloading(jb.simulate(case)).shape)
     (1,)
     """
     loads = load_set(record.case)
@@ -201,7 +211,7 @@ class RideMeasures(NamedTuple):
     >>> import jaxbeam as jb
     >>> wagon = jb.VehicleLoad(model="manchester-wagon", speed=50.0)
     >>> case = jb.Case(jb.Beam(20.0, 1e10, 12e3), loads=[wagon], run=jb.Run(1.5))
-    >>> ride = jb.ride_measures(jb.simulate(case))
+    >>> ride = jb.ride.ride_measures(jb.simulate(case))
     >>> print(ride.bodies, f"{ride.wheel_unloading.max():.3f}")
     ['loads.0 body', 'loads.0 front bogie', 'loads.0 rear bogie'] 0.032
     """
@@ -225,10 +235,10 @@ def ride_measures(record: Record) -> RideMeasures:
     >>> case = jb.Case(
     ...     jb.Beam(length=20.0, flexural_rigidity=4.8e10, mass_per_length=18358.0),
     ...     loads=[car],
-    ...     profile=jb.SineProfile(amplitude=0.003, wavelength=10.0),
+    ...     profile=jb.profiles.SineProfile(amplitude=0.003, wavelength=10.0),
     ...     run=jb.Run(duration=3.0),
     ... )
-    >>> ride = jb.ride_measures(jb.simulate(case))
+    >>> ride = jb.ride.ride_measures(jb.simulate(case))
     >>> print(ride.bodies[0], f"{ride.weighted_rms[0]:.2f} m/s^2")
     loads.0 body 0.07 m/s^2
     """

@@ -30,6 +30,13 @@ from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sam
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import integration_setup
 
+__all__ = [
+    "Envelope",
+    "amplification",
+    "characteristic_points",
+    "envelope",
+]
+
 AMPLIFIED = tuple(name for name, entry in QUANTITIES.items() if not entry.time_derivative)
 
 
@@ -143,9 +150,9 @@ def amplification(
     ...     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535),
     ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
     ... )
-    >>> print(f"{jb.amplification(case, x=[0.3])[0]:.2f}")
+    >>> print(f"{jb.sections.amplification(case, x=[0.3])[0]:.2f}")
     1.06
-    >>> print(f"{jb.amplification(case, x=[0.3], quantity='moment')[0]:.2f}")
+    >>> print(f"{jb.sections.amplification(case, x=[0.3], quantity='moment')[0]:.2f}")
     1.03
     """
     parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
@@ -183,7 +190,7 @@ def characteristic_points(case: Case) -> list[CharacteristicPoint]:
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
-    >>> print([point[0] for point in jb.characteristic_points(jb.Case(beam))][:2])
+    >>> print([point[0] for point in jb.sections.characteristic_points(jb.Case(beam))][:2])
     ['support 1', 'quarter 1']
     """
     length, held = float(concrete(case.beam.length)), set(held_positions(case).tolist())

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -27,6 +27,9 @@ from jaxbeam.cli.arguments import (
 )
 from jaxbeam.files.report import text_table
 from jaxbeam.runtime.whole_file import whole_file
+
+if TYPE_CHECKING:
+    from jaxbeam.model.plausibility.facts import Plausibility
 
 PICTURES = (".png", ".svg", ".pdf")
 # Half the effort of the default: 10 ms less for a picture, and files a seventh larger.
@@ -256,7 +259,7 @@ def print_plausibility(
     return jb.api.content(found)
 
 
-def print_warnings(found: "jb.Plausibility") -> None:
+def print_warnings(found: "Plausibility") -> None:
     """Print what looks wrong in a case."""
     for warning in found.warnings:
         print_message(f"warning: {warning}")

@@ -11,7 +11,7 @@ from jaxtyping import Complex, Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.channels import check_pairs, input_column, output_row
-from jaxbeam.model.frequency_response import (
+from jaxbeam.model.frequency_responses import (
     StationaryMasses,
     checked_masses,
     descriptor_matrices,

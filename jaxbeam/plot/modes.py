@@ -12,7 +12,7 @@ from jaxbeam.analysis.stability import FrozenPoles, Growth
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.model.along_beam import positions_along
-from jaxbeam.model.frequency_response import FrequencyResponse
+from jaxbeam.model.frequency_responses import FrequencyResponse
 from jaxbeam.model.modes import Modes, modes as find_modes
 from jaxbeam.plot.schematic import draw_supports
 from jaxbeam.plot.style import (

@@ -27,7 +27,7 @@ QUARTER_CAR = jb.QuarterCar(
 CASE = jb.Case(
     jb.Beam(20.0, 4.8e10, 18358.0, 0.02, modes=2),
     loads=[QUARTER_CAR],
-    profile=jb.SineProfile(amplitude=0.003, wavelength=10.0),
+    profile=jb.profiles.SineProfile(amplitude=0.003, wavelength=10.0),
     run=jb.Run(2.5, sample_rate=200.0),
 )
 
@@ -44,7 +44,7 @@ def test_weights_are_those_of_the_table():
 def test_a_steady_sine_is_weighted_as_tabulated(band):
     """The amplitude of the second half, over whole periods, against the table."""
     frequency = CENTRES[band]
-    weighted = jb.weighted_acceleration(TIMES, sine(frequency))[20000:]
+    weighted = jb.ride.weighted_acceleration(TIMES, sine(frequency))[20000:]
     periods = int(20.0 * frequency)
     whole = TIMES[20000:] <= 20.0 + periods / frequency
     basis = np.exp(-2j * np.pi * frequency * TIMES[20000:][whole])
@@ -70,7 +70,7 @@ def test_filters_begin_at_rest_and_are_causal():
     expected = pulse
     for numerator, denominator in sections:
         expected = scipy.signal.lsim((numerator, denominator), expected, times)[1]
-    found = jb.weighted_acceleration(times, pulse)
+    found = jb.ride.weighted_acceleration(times, pulse)
     assert_allclose(found, expected, rtol=0, atol=2e-4 * np.max(np.abs(expected)))
     assert_allclose(found[:500], 0.0, atol=1e-9)
 
@@ -78,16 +78,16 @@ def test_filters_begin_at_rest_and_are_causal():
 def test_rms_and_dose_of_a_sine():
     """a W / sqrt(2), and a W (3 T / 8)^(1/4); the start makes the difference of a thousandth."""
     gain = 3.0 * np.abs(vertical_weighting(8.0))
-    assert jb.weighted_rms(TIMES, sine(8.0, 3.0)) == pytest.approx(gain / np.sqrt(2), rel=2e-3)
+    assert jb.ride.weighted_rms(TIMES, sine(8.0, 3.0)) == pytest.approx(gain / np.sqrt(2), rel=2e-3)
     dose = gain * (3 / 8 * TIMES[-1]) ** 0.25
-    assert jb.vibration_dose(TIMES, sine(8.0, 3.0)) == pytest.approx(dose, rel=2e-3)
+    assert jb.ride.vibration_dose(TIMES, sine(8.0, 3.0)) == pytest.approx(dose, rel=2e-3)
 
 
 @pytest.mark.parametrize("frequency", [0.5, 1.0, 5.4, 12.0, 29.0])
 def test_sperling_index_of_a_sine(frequency):
     """W_z = (B a)^(2 / 6.67) with a in cm/s^2; 4.42 a_rms^0.3 after Forstberg's equation 3.1."""
     B = sperling_weighting(frequency)
-    found = jb.sperling_index(TIMES[:-1], sine(frequency, 0.7)[:-1])
+    found = jb.ride.sperling_index(TIMES[:-1], sine(frequency, 0.7)[:-1])
     assert found == pytest.approx((70.0 * B) ** (2 / 6.67), rel=1e-10)
     assert found == pytest.approx(4.42 * (0.7 * B / np.sqrt(2)) ** 0.3, rel=2e-3)
 
@@ -110,13 +110,13 @@ def test_sperling_weighting():
 
 
 def test_frequencies_outside_of_the_band_do_not_count():
-    assert jb.sperling_index(TIMES[:-1], sine(40.0)[:-1]) < 0.05
-    assert jb.sperling_index(TIMES[:-1], sine(0.25)[:-1]) < 0.05
+    assert jb.ride.sperling_index(TIMES[:-1], sine(40.0)[:-1]) < 0.05
+    assert jb.ride.sperling_index(TIMES[:-1], sine(0.25)[:-1]) < 0.05
 
 
 def test_measures_of_several_histories_at_once():
     histories = np.stack([sine(2.0), sine(7.0), sine(20.0)], axis=1)
-    for measure in (jb.weighted_rms, jb.vibration_dose, jb.sperling_index):
+    for measure in (jb.ride.weighted_rms, jb.ride.vibration_dose, jb.ride.sperling_index):
         single = [measure(TIMES, histories[:, i]) for i in range(3)]
         assert_allclose(measure(TIMES, histories), single, rtol=1e-12)
 
@@ -129,7 +129,7 @@ def test_measures_of_a_quarter_car_on_a_sine_profile():
     car = dataclasses.replace(QUARTER_CAR, start_position=-200.0)
     case = dataclasses.replace(CASE, loads=[car], run=jb.Run(9.5, sample_rate=400.0))
     record = jb.simulate(case)
-    ride = jb.ride_measures(record)
+    ride = jb.ride.ride_measures(record)
     assert ride.bodies == ["loads.0 body", "loads.0 axle"]
     vehicle = car.vehicle(np.float64(9.81))
     w = 2 * np.pi * 20.0 / 10.0
@@ -138,7 +138,7 @@ def test_measures_of_a_quarter_car_on_a_sine_profile():
     u = np.linalg.solve(dynamic, vehicle.wheel_map.T @ drive)
     steady = np.asarray(record.body_acceleration)[3000:3800]
     assert_allclose(np.std(steady, axis=0), w**2 * np.abs(u) / np.sqrt(2), rtol=1e-3)
-    weighted = jb.weighted_acceleration(record.times, record.body_acceleration)[3000:3800]
+    weighted = jb.ride.weighted_acceleration(record.times, record.body_acceleration)[3000:3800]
     expected = np.abs(vertical_weighting(2.0)) * w**2 * np.abs(u) / np.sqrt(2)
     assert_allclose(np.std(weighted, axis=0), expected, rtol=2e-3)
     force = drive - (vehicle.contact_stiffness + 1j * w * vehicle.contact_damping) * (
@@ -152,13 +152,15 @@ def test_measures_of_a_quarter_car_on_a_sine_profile():
 
 def test_unloading_of_plain_wheels():
     force = jb.simulate(dataclasses.replace(CASE, loads=[jb.MovingForce(1e4, speed=20.0)]))
-    assert_allclose(jb.wheel_unloading(force), [0.0], atol=1e-12)
+    assert_allclose(jb.ride.wheel_unloading(force), [0.0], atol=1e-12)
     mass = jb.simulate(dataclasses.replace(CASE, loads=[jb.MovingMass(1e4, speed=20.0)]))
     weight = 1e4 * float(CASE.run.gravity)
     expected = 1 - np.asarray(mass.lowest_contact_force) / weight
-    assert_allclose(jb.wheel_unloading(mass), expected, rtol=0, atol=1e-9)
+    assert_allclose(jb.ride.wheel_unloading(mass), expected, rtol=0, atol=1e-9)
     late = jb.MovingMass(1e4, speed=20.0, entry_time=9.0)
-    assert np.isnan(jb.wheel_unloading(jb.simulate(dataclasses.replace(CASE, loads=[late])))[0])
+    assert np.isnan(
+        jb.ride.wheel_unloading(jb.simulate(dataclasses.replace(CASE, loads=[late])))[0]
+    )
 
 
 def test_gradients_against_differences():
@@ -166,7 +168,7 @@ def test_gradients_against_differences():
 
     def measures(factor):
         car = dataclasses.replace(QUARTER_CAR, suspension_stiffness=8e5 * factor)
-        ride = jb.ride_measures(jb.simulate(dataclasses.replace(CASE, loads=[car])))
+        ride = jb.ride.ride_measures(jb.simulate(dataclasses.replace(CASE, loads=[car])))
         parts = ride.weighted_rms, ride.vibration_dose, ride.sperling_index, ride.wheel_unloading
         return jnp.concatenate([jnp.asarray(part) for part in parts])
 
@@ -177,17 +179,17 @@ def test_gradients_against_differences():
 
 def test_known_and_traced_histories_give_the_same():
     history = sine(3.0)[:4000] + sine(11.0)[:4000]
-    for measure in (jb.weighted_rms, jb.vibration_dose, jb.sperling_index):
+    for measure in (jb.ride.weighted_rms, jb.ride.vibration_dose, jb.ride.sperling_index):
         traced = jax.jit(lambda a, measure=measure: measure(TIMES[:4000], a))(history)
         assert_allclose(traced, measure(TIMES[:4000], history), rtol=1e-11)
 
 
 def test_bad_times_are_refused():
     with pytest.raises(ValueError, match="must be equally spaced"):
-        jb.weighted_rms(np.array([0.0, 0.001, 0.003]), np.zeros(3))
+        jb.ride.weighted_rms(np.array([0.0, 0.001, 0.003]), np.zeros(3))
     with pytest.raises(ValueError, match="at least 160 a second .* there are 100: give a larger"):
-        jb.vibration_dose(np.arange(9) / 100, np.zeros(9))
+        jb.ride.vibration_dose(np.arange(9) / 100, np.zeros(9))
     with pytest.raises(ValueError, match="at least 60 a second"):
-        jb.sperling_index(np.arange(9) / 50, np.zeros(9))
+        jb.ride.sperling_index(np.arange(9) / 50, np.zeros(9))
     with pytest.raises(ValueError, match="must be known numbers"):
-        jax.jit(lambda t: jb.weighted_rms(t, np.zeros(9)))(np.arange(9) / 200)
+        jax.jit(lambda t: jb.ride.weighted_rms(t, np.zeros(9)))(np.arange(9) / 200)

@@ -1,5 +1,6 @@
 """Former words of case files, addresses, arguments and the package name the present ones."""
 
+import importlib
 import re
 import subprocess
 import sys
@@ -49,6 +50,14 @@ def test_former_words_are_refused():
         jb.ScheduledFeedback(masses=[0.2], gains=[[2e3]], period=0.01, recognition=None)
     with pytest.raises(TypeError, match="LQR has no places; it is called 'positions' now"):
         jb.LQR([1.0], [1.0], places=[0.3])
+
+
+@pytest.mark.parametrize(("name", "module"), former_words.MOVED.items())
+def test_names_that_are_in_a_module_now(name, module):
+    with pytest.raises(AttributeError, match=re.escape(f"{name} is jaxbeam.{module}.{name} now")):
+        getattr(jb, name)
+    found = getattr(jb, module, None) or importlib.import_module(f"jaxbeam.{module}")
+    assert hasattr(found, name)
 
 
 @pytest.mark.parametrize(("old", "present"), former_words.KINDS.items())

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.case.validation import check_case
-from jaxbeam.model.frequency_response import frequency_response
+from jaxbeam.model.frequency_responses import frequency_response
 from jaxbeam.model.linear_system import poles
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.integration_plan import integration_plan

@@ -169,7 +169,9 @@ def test_simulate_prints_and_writes_the_same(run, folder, monkeypatch):
         "plausibility",
     }
     factors = [sensor["dynamic_amplification"] for sensor in found["sensors"]]
-    np.testing.assert_allclose(factors, jb.amplification(record.case, [0.3, 0.15]), rtol=1e-6)
+    np.testing.assert_allclose(
+        factors, jb.sections.amplification(record.case, [0.3, 0.15]), rtol=1e-6
+    )
     assert found["largest_contact_force"] == [float(record.contact_force.max())]
     printed = run("simulate case.toml -o out.nc --plot --animate out.gif")
     assert f"{factors[0]:.4g}" in printed and f"{found['steps']} steps" not in printed

@@ -40,45 +40,45 @@ def distance(poles, wanted):
 
 
 def test_gains_and_poles_without_delay():
-    law = jb.receptance_feedback(rig(), POLES)
+    law = jb.receptance_method.receptance_feedback(rig(), POLES)
     np.testing.assert_allclose(law.velocity, [-8.26397382, 2.84712574], rtol=1e-8)
     np.testing.assert_allclose(law.displacement, [-122.11846, 127.651937], rtol=1e-8)
-    poles = jb.closed_loop_poles(rig(), law)
+    poles = jb.receptance_method.closed_loop_poles(rig(), law)
     assert max(distance(poles, pole) for pole in POLES) < 1e-12
     assert distance(poles, -10.0696685 + 1152.89103j) < 1e-8
     for change, largest in {0.0005: -10.2286024, 0.001: -8.99594596, 0.002: -7.48508961}.items():
-        poles = jb.closed_loop_poles(rig(), law, delay=change, count=8)
+        poles = jb.receptance_method.closed_loop_poles(rig(), law, delay=change, count=8)
         assert poles[0].real == pytest.approx(largest, rel=1e-8)
 
 
 def test_gains_and_poles_with_delay():
-    law = jb.receptance_feedback(rig(), POLES, delay=0.002)
+    law = jb.receptance_method.receptance_feedback(rig(), POLES, delay=0.002)
     np.testing.assert_allclose(law.velocity, [-4.5088598, 0.225099223], rtol=1e-8)
     np.testing.assert_allclose(law.displacement, [2442.80154, -2063.53204], rtol=1e-8)
-    poles = jb.closed_loop_poles(rig(), law)
+    poles = jb.receptance_method.closed_loop_poles(rig(), law)
     assert max(distance(poles, pole) for pole in DELAYED) < 1e-8
     assert max(distance(poles, pole) for pole in POLES) < 1e-12
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.002])
 def test_kept_poles_stay(delay):
-    law = jb.receptance_feedback(rig(), POLES[:1], keep=[1], delay=delay)
-    poles = jb.closed_loop_poles(rig(), law)
+    law = jb.receptance_method.receptance_feedback(rig(), POLES[:1], keep=[1], delay=delay)
+    poles = jb.receptance_method.closed_loop_poles(rig(), law)
     assert distance(poles, POLES[0]) < 1e-12
     assert distance(poles, OPEN) < 1e-8
 
 
 def test_gains_from_measured_receptances():
     frequencies = np.linspace(1.0, 900.0, 1500)
-    measured = jb.receptances(rig(), 2j * np.pi * frequencies)
-    fitted = jb.fit_receptances(frequencies, measured)
-    law = jb.receptance_gains(fitted(POLES), POLES)
-    poles = jb.closed_loop_poles(rig(), law)
+    measured = jb.receptance_method.receptances(rig(), 2j * np.pi * frequencies)
+    fitted = jb.receptance_method.fit_receptances(frequencies, measured)
+    law = jb.receptance_method.receptance_gains(fitted(POLES), POLES)
+    poles = jb.receptance_method.closed_loop_poles(rig(), law)
     assert max(distance(poles, pole) for pole in POLES) < 1e-8
     noise = 1 + 1e-4 * np.random.default_rng(1).standard_normal(measured.shape)
-    fitted = jb.fit_receptances(frequencies, measured * noise, tolerance=1e-3)
-    law = jb.receptance_gains(fitted(POLES), POLES)
-    poles = jb.closed_loop_poles(rig(), law)
+    fitted = jb.receptance_method.fit_receptances(frequencies, measured * noise, tolerance=1e-3)
+    law = jb.receptance_method.receptance_gains(fitted(POLES), POLES)
+    poles = jb.receptance_method.closed_loop_poles(rig(), law)
     assert max(distance(poles, pole) for pole in POLES) < 1e-2
 
 
@@ -88,13 +88,18 @@ def test_poles_with_the_dynamics_of_a_shaker():
         damping=1.0, mass=0.02,
     )  # fmt: skip
     case = jb.Case(rig().beam, actuators=[shaker], sensors=rig().sensors)
-    law = jb.receptance_feedback(case, POLES, delay=1e-3)
-    assert max(distance(jb.closed_loop_poles(case, law), pole) for pole in POLES) < 1e-11
+    law = jb.receptance_method.receptance_feedback(case, POLES, delay=1e-3)
+    assert (
+        max(distance(jb.receptance_method.closed_loop_poles(case, law), pole) for pole in POLES)
+        < 1e-11
+    )
 
 
 def test_gradients_of_the_gains():
     def gain(rigidity):
-        return jb.receptance_feedback(rig(flexural_rigidity=rigidity, modes=4), POLES).velocity[0]
+        return jb.receptance_method.receptance_feedback(
+            rig(flexural_rigidity=rigidity, modes=4), POLES
+        ).velocity[0]
 
     step = 1e-4
     difference = (gain(11.68 + step) - gain(11.68 - step)) / (2 * step)
@@ -112,7 +117,7 @@ def test_law_damps_a_run():
         loads=[jb.MovingForce(force=1.0, speed=60.0)],
         run=jb.Run(duration=0.3, sample_rate=2000.0),
     )
-    law = jb.receptance_feedback(free, POLES)
+    law = jb.receptance_method.receptance_feedback(free, POLES)
     controlled = jb.Case(
         case.beam, (), case.actuators, case.sensors, case.loads, law.controller(case), case.run
     )
@@ -141,18 +146,18 @@ def test_output_feedback_is_feedback_of_the_opposite_sign():
 
 def test_refusals():
     with pytest.raises(ValueError, match="8 real conditions for poles exceed the 4 gains"):
-        jb.receptance_feedback(rig(), [*POLES, -40 + 1100j, -50 + 2000j])
+        jb.receptance_method.receptance_feedback(rig(), [*POLES, -40 + 1100j, -50 + 2000j])
     with pytest.raises(ValueError, match="there is no actuator 1; the case has 1"):
-        jb.receptance_feedback(rig(), POLES, actuator=1)
+        jb.receptance_method.receptance_feedback(rig(), POLES, actuator=1)
     with pytest.raises(ValueError, match="keep must list modes from 0 to 11"):
-        jb.receptance_feedback(rig(), POLES[:1], keep=[12])
+        jb.receptance_method.receptance_feedback(rig(), POLES[:1], keep=[12])
     with pytest.raises(ValueError, match="2 sensors of deflection, then 2 of velocity"):
-        jb.receptance_feedback(rig(), POLES).controller(rig())
+        jb.receptance_method.receptance_feedback(rig(), POLES).controller(rig())
     with pytest.raises(ValueError, match="frequencies must be .frequency,. and values"):
-        jb.fit_receptances([1.0, 2.0], np.zeros((3, 1)))
+        jb.receptance_method.fit_receptances([1.0, 2.0], np.zeros((3, 1)))
     with pytest.raises(ValueError, match="conditions contradict each other"):
         twice = jb.Case(rig().beam, actuators=rig().actuators, sensors=[jb.Sensor(0.18)] * 2)
-        jb.receptance_feedback(twice, POLES)
+        jb.receptance_method.receptance_feedback(twice, POLES)
     controller = jb.OutputFeedback(gains=[[1.0]])
     case = jb.Case(rig().beam, (), rig().actuators, rig().sensors, (), controller)
     with pytest.raises(ValueError, match="row for each of 1 actuators, with a gain for each of 2"):

@@ -11,7 +11,7 @@ import xarray
 
 import jaxbeam as jb
 from jaxbeam.files.endings import RESULTS, TABLES, check_ending
-from jaxbeam.files.tables import write_table
+from jaxbeam.files.tables import sweep_columns, write_table
 
 CASE = jb.Case(
     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535),
@@ -114,7 +114,7 @@ def test_every_result_is_written_to_every_ending(name, tmp_path):
     result = RESULTS_BY_NAME[name]()
     is_sweep = name == "sweep"
     dataset = result if is_sweep else result.to_xarray()
-    columns = jb.sweep_columns(result) if is_sweep else result.columns
+    columns = sweep_columns(result) if is_sweep else result.columns
     for ending in RESULTS:
         path = tmp_path / f"out{ending}"
         jb.save(result, path)
@@ -154,7 +154,7 @@ def test_rows_of_a_sweep_of_words_and_numbers(tmp_path):
     case = dataclasses.replace(case, loads=[jb.Axles(train="HL93-tandem", speed=2.0)])
     over = {"loads.0.train": ["HL93-tandem", "LM71-axles"], "loads.0.speed": [2.0, 4.0, 8.0]}
     found = jb.sweep(case, over, progress=False)
-    columns = jb.sweep_columns(found)
+    columns = sweep_columns(found)
     assert list(columns)[:3] == ["train", "speed of the train (m/s)", "midspan peak deflection (m)"]
     assert list(columns["train"]) == 3 * ["HL93-tandem"] + 3 * ["LM71-axles"]
     np.testing.assert_array_equal(columns["speed of the train (m/s)"], 2 * [2.0, 4.0, 8.0])
@@ -168,4 +168,4 @@ def test_rows_of_a_sweep_of_words_and_numbers(tmp_path):
     assert content["text_columns"] == "train" and content["texts"][4] == "LM71-axles"
     assert content["values"].shape == (6, len(columns) - 1)
     with pytest.raises(ValueError, match="not a sweep of jaxbeam"):
-        jb.sweep_columns(found.drop_vars("failed"))
+        sweep_columns(found.drop_vars("failed"))

@@ -41,7 +41,7 @@ CASES = {
     "half a period": rig(dataclasses.replace(FEEDBACK, delay=np.asarray(PERIOD / 2))),
     "two periods": rig(dataclasses.replace(FEEDBACK, delay=np.asarray(2 * PERIOD))),
     "Kalman filter": rig(ESTIMATED),
-    "profile": rig(FEEDBACK, profile=jb.SineProfile(2e-4, 0.2)),
+    "profile": rig(FEEDBACK, profile=jb.profiles.SineProfile(2e-4, 0.2)),
 }
 
 

@@ -34,7 +34,7 @@ CASES = {
         BEAM,
         sensors=SENSORS,
         loads=[jb.MovingMass(mass=0.3, speed=4.0)],
-        profile=jb.SineProfile(amplitude=1e-4, wavelength=0.7),
+        profile=jb.profiles.SineProfile(amplitude=1e-4, wavelength=0.7),
         run=RUN,
     ),
 }

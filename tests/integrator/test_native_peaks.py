@@ -83,7 +83,7 @@ ROUGH = dataclasses.replace(
         jb.MovingMass(mass=0.2, speed=-1.5),
         jb.VaryingForce(force_times=[0.1, 0.3], forces=[1.0, 4.0], speed=0.8),
     ],
-    profile=jb.SineProfile(amplitude=2e-4, wavelength=0.15),
+    profile=jb.profiles.SineProfile(amplitude=2e-4, wavelength=0.15),
 )
 # Other quantities, on a beam whose modes are coupled by a damper.
 QUANTITIES = ("velocity", "acceleration", "strain", "moment", "shear")

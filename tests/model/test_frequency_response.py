@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.case import replace
 from jaxbeam.model.channels import common_pairs, shaker_channels
-from jaxbeam.model.frequency_response import (
+from jaxbeam.model.frequency_responses import (
     accelerance,
     frequency_response,
     mobility,

@@ -12,7 +12,7 @@ from tests.case.loads import reference
 CAR = jb.QuarterCar(14e3, 1100.0, 9e5, 3e4, 3e6, 8e3, speed=-15.0, entry_time=0.1)
 WAGONS = reference.wagon(reference.REFERENCE["wagon"]["input"], 30.0, count=2, spacing=25.0)
 MASS = jb.MovingMass(5e3, speed=10.0, start_position=-4.0)
-PROFILE = jb.SineProfile(5e-3, 7.0, 0.4)
+PROFILE = jb.profiles.SineProfile(5e-3, 7.0, 0.4)
 CASE = jb.Case(
     jb.Beam(20.0, 2e10, 1.2e4, modes=2), loads=[MASS, WAGONS, CAR], profile=PROFILE, run=jb.Run(1.0)
 )

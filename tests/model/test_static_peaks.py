@@ -75,10 +75,10 @@ def test_a_step_load_amplifies_twofold():
     beam = jb.Beam(LENGTH, RIGIDITY, 9e3, modes=1)
     force = jb.VaryingForce(force=1e4, position=LENGTH / 2)
     case = jb.Case(beam, loads=[force], run=jb.Run(2.0))
-    found = jb.amplification(case, [LENGTH / 2])[0]
+    found = jb.sections.amplification(case, [LENGTH / 2])[0]
     assert_allclose(found, 2 * 96 / np.pi**4, rtol=1e-6)
     line = jb.LineLoad(force_per_length=1e3, lengths=LENGTH, position=LENGTH, points=60)
-    found = jb.amplification(dataclasses.replace(case, loads=[line]), [LENGTH / 2])[0]
+    found = jb.sections.amplification(dataclasses.replace(case, loads=[line]), [LENGTH / 2])[0]
     assert_allclose(found, 2 * 384 * 4 / (5 * np.pi**5), rtol=2e-4)
 
 

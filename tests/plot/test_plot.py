@@ -16,7 +16,7 @@ from PIL import Image, ImageSequence
 
 import jaxbeam as jb
 import jaxbeam.plot
-from jaxbeam.model.frequency_response import frequency_response
+from jaxbeam.model.frequency_responses import frequency_response
 from jaxbeam.plot import (
     FitPanel,
     animate,

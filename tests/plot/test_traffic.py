@@ -21,7 +21,7 @@ ROAD = jb.Case(
     jb.Beam(25.0, 4.8e10, 18358.0, 0.02, modes=2),
     sensors=[jb.Sensor(12.5)],
     loads=[CAR],
-    profile=jb.ISO8608Profile("C", seed=3),
+    profile=jb.profiles.ISO8608Profile("C", seed=3),
     run=jb.Run(1.4, sample_rate=200.0),
     title="on a rough road",
 )
@@ -107,7 +107,7 @@ def test_forces_of_many_wheels_are_an_envelope():
     forces, bodies = plot_record(record).axes[2:]
     times, on = np.asarray(record.times), np.isfinite(np.asarray(record.load_position))
     (worst,) = lines_of(forces, times.size)
-    wheel = np.nanargmax(jb.wheel_unloading(record))
+    wheel = np.nanargmax(jb.ride.wheel_unloading(record))
     seen = np.isfinite(data(worst)[1])
     assert_array_equal(seen, on[:, wheel])
     assert_allclose(data(worst)[1][seen], 1e-3 * np.asarray(record.contact_force)[seen, wheel])

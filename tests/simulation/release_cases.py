@@ -58,11 +58,13 @@ CASES = {
     },
     **{f"loop: {name}": LOOPS[name] for name in LOOP_NAMES},
     "a quarter car": _road(_quarter()),
-    "a quarter car on a bump": _road(_quarter(), profile=jb.BumpProfile(8.0, 9.0, 0.01)),
-    "a quarter car on waves": _road(_quarter(), profile=jb.SineProfile(4.0, 2e-3)),
-    "a quarter car on a random road": _road(_quarter(), profile=jb.ISO8608Profile("B", seed=3)),
+    "a quarter car on a bump": _road(_quarter(), profile=jb.profiles.BumpProfile(8.0, 9.0, 0.01)),
+    "a quarter car on waves": _road(_quarter(), profile=jb.profiles.SineProfile(4.0, 2e-3)),
+    "a quarter car on a random road": _road(
+        _quarter(), profile=jb.profiles.ISO8608Profile("B", seed=3)
+    ),
     "a mass on a ramp": _road(
-        jb.MovingMass(mass=500.0, speed=20.0), profile=jb.RampProfile(5.0, 9.0, 0.02)
+        jb.MovingMass(mass=500.0, speed=20.0), profile=jb.profiles.RampProfile(5.0, 9.0, 0.02)
     ),
     "an oscillator that brakes": _road(
         jb.Oscillator(2e3, 2e5, 3e3, 50.0, speed=30.0, deceleration=4.0)

@@ -158,7 +158,7 @@ def test_receptance_with_absorbers():
     stiffness = link * 4250.0 * s**2 / (link + 4250.0 * s**2)
     change = stiffness / (1 + stiffness * own[:, 1, 1])
     expected = own - own[:, :, 1, None] * own[:, 1, None, :] * change[:, None, None]
-    found = jb.receptance(case, f, x, x)
+    found = jb.frequency_responses.receptance(case, f, x, x)
     assert found == pytest.approx(expected, abs=1e-12 * np.abs(expected).max())
     assert absorber.dynamic_stiffness(s) == pytest.approx(stiffness, rel=1e-12)
 
@@ -318,7 +318,9 @@ def test_den_hartog_has_the_least_of_the_two_peaks(mass_ratio):
     frequencies = np.linspace(0.75, 1.25, 4001) * first
 
     def peak(absorber):
-        response = jb.receptance(with_absorbers(case, absorber), frequencies, 12.5, 12.5)
+        response = jb.frequency_responses.receptance(
+            with_absorbers(case, absorber), frequencies, 12.5, 12.5
+        )
         return np.abs(response).max()
 
     numbers = np.array([start.frequency, start.damping_ratio])
@@ -377,8 +379,8 @@ def test_tuned_absorber_refusals():
 
 def test_sensors_on_absorbers():
     sensors = [
-        jb.VehicleSensor(absorber=1, quantity="stroke"),
-        jb.VehicleSensor(absorber=0, quantity="acceleration", offset=0.5),
+        jb.planar.VehicleSensor(absorber=1, quantity="stroke"),
+        jb.planar.VehicleSensor(absorber=0, quantity="acceleration", offset=0.5),
     ]
     absorbers = [
         jb.Absorber(x, mass=3e3, frequency=3.4, damping_ratio=0.1, inertance=200.0)
@@ -395,9 +397,15 @@ def test_sensors_on_absorbers():
     expected = [record.stroke[:, 1], record.body_acceleration[:, 0] + 0.5]
     assert np.array_equal(record.vehicle_readings, np.transpose(expected))
     for faulty, words in (
-        (jb.VehicleSensor(absorber=2), "vehicle_sensors.0.absorber is 2, but the case has 2"),
-        (jb.VehicleSensor(absorber=0, body="axle 1"), "leave out load, vehicle, body"),
-        (jb.VehicleSensor(quantity="stroke"), "give its number"),
+        (
+            jb.planar.VehicleSensor(absorber=2),
+            "vehicle_sensors.0.absorber is 2, but the case has 2",
+        ),
+        (
+            jb.planar.VehicleSensor(absorber=0, body="axle 1"),
+            "leave out load, vehicle, body",
+        ),
+        (jb.planar.VehicleSensor(quantity="stroke"), "give its number"),
     ):
         with pytest.raises(ValueError, match=words):
             jb.simulate(dataclasses.replace(case, vehicle_sensors=[faulty]))

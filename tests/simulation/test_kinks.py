@@ -102,7 +102,7 @@ CASES = {
     "ramp": (
         (
             jb.Beam(**UNIT, modes=3),
-            jb.RampProfile(start=0.2, end=0.5, height=0.03),
+            jb.profiles.RampProfile(start=0.2, end=0.5, height=0.03),
             [mass(0.4, speed=0.7)],
             [],
         ),
@@ -111,7 +111,7 @@ CASES = {
     "ramp over a hinge": (
         (
             HINGED,
-            jb.RampProfile(start=0.2, end=0.5, height=0.03),
+            jb.profiles.RampProfile(start=0.2, end=0.5, height=0.03),
             [Oscillator(**SPRUNG, speed=0.7)],
             [],
         ),
@@ -283,7 +283,7 @@ def test_kink_of_a_settled_beam():
     beam = jb.Beam(**UNIT, modes=3, ends="clamped-free", hinges=[jb.Hinge(0.4)])
     common = {"loads": [mass(0.4, speed=0.7)], "run": jb.Run(1 / 0.7), "sensors": [jb.Sensor(0.47)]}
     settled = jb.Case(beam, supports=[jb.Support(1.0, settlement=0.06)], **common)
-    ramp = jb.RampProfile(start=0.4, end=1.0, height=-0.06)
+    ramp = jb.profiles.RampProfile(start=0.4, end=1.0, height=-0.06)
     expected = jb.simulate(jb.Case(beam, supports=[jb.Support(1.0)], profile=ramp, **common), TIMES)
     found = jb.simulate(settled, TIMES)
     scale = np.abs(expected.deflection).max()

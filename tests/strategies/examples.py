@@ -5,14 +5,14 @@ from jaxbeam.case.kinds import kind_of, kinds
 from tests.c_code import cases as controlled
 
 PROFILES = {
-    "table": jb.TableProfile([-20.0, 0.2, 0.4, 20.0], [0.0, 1e-4, -1e-4, 0.0]),
-    "sine": jb.SineProfile(amplitude=1e-4, wavelength=0.3, phase=0.4),
-    "ramp": jb.RampProfile(start=0.1, end=0.3, height=1e-4),
-    "step": jb.StepProfile(start=0.1, end=0.3, height=-1e-4),
-    "bump": jb.BumpProfile(start=0.1, end=0.3, height=2e-4, contact_length=0.05),
-    "spectrum": jb.SpectrumProfile([0.4, 1.35], [4e-5, 2e-5], [0.3, 2.0]),
-    "iso8608": jb.ISO8608Profile("C", seed=4, waves=12, switch_on=[-2.0, 3.0]),
-    "rail": jb.RailProfile("fra-3", seed=2, waves=12, contact_length=0.05),
+    "table": jb.profiles.TableProfile([-20.0, 0.2, 0.4, 20.0], [0.0, 1e-4, -1e-4, 0.0]),
+    "sine": jb.profiles.SineProfile(amplitude=1e-4, wavelength=0.3, phase=0.4),
+    "ramp": jb.profiles.RampProfile(start=0.1, end=0.3, height=1e-4),
+    "step": jb.profiles.StepProfile(start=0.1, end=0.3, height=-1e-4),
+    "bump": jb.profiles.BumpProfile(start=0.1, end=0.3, height=2e-4, contact_length=0.05),
+    "spectrum": jb.profiles.SpectrumProfile([0.4, 1.35], [4e-5, 2e-5], [0.3, 2.0]),
+    "iso8608": jb.profiles.ISO8608Profile("C", seed=4, waves=12, switch_on=[-2.0, 3.0]),
+    "rail": jb.profiles.RailProfile("fra-3", seed=2, waves=12, contact_length=0.05),
 }
 
 COACH = jb.Coach("quarter-truck", count=2, length=8.0)
@@ -59,9 +59,11 @@ LOADS = {
     ),
     "wagon": jb.Wagon(**WAGON, speed=2.4, start_position=-0.3),
     "vehicle": jb.VehicleLoad(
-        bodies=[jb.VehicleBody("body", mass=0.4, inertia=1e-3, position=0.0)],
+        bodies=[jb.planar.VehicleBody("body", mass=0.4, inertia=1e-3, position=0.0)],
         axles=[
-            jb.VehicleAxle("body", p, mass=0.05, suspension_stiffness=60.0, suspension_damping=0.2)
+            jb.planar.VehicleAxle(
+                "body", p, mass=0.05, suspension_stiffness=60.0, suspension_damping=0.2
+            )
             for p in (0.1, -0.1)
         ],
         speed=2.4,

@@ -174,7 +174,7 @@ def test_seeds_and_counts_are_swept_as_words():
     case = dataclasses.replace(
         CASE,
         loads=[jb.MovingMass(mass=2e4, speed=20.0)],
-        profile=jb.ISO8608Profile("A", seed=0, scale=0.1, highest_wavenumber=1.0),
+        profile=jb.profiles.ISO8608Profile("A", seed=0, scale=0.1, highest_wavenumber=1.0),
     )
     over = {"profile.seed": [3, 5.0], "beam.modes": [1, 2], "profile.scale": [0.1, 0.2]}
     found = sweep(over, case)
@@ -190,10 +190,10 @@ def test_seeds_and_counts_are_swept_as_words():
 
 
 def test_profiles_of_several_seeds_have_one_structure():
-    case = dataclasses.replace(CASE, profile=jb.ISO8608Profile("C", seed=0))
+    case = dataclasses.replace(CASE, profile=jb.profiles.ISO8608Profile("C", seed=0))
     first, second = (
         with_numbers(with_settings(case, {"profile.seed": seed})).profile for seed in (1, 2)
     )
     assert jax.tree.structure(first) == jax.tree.structure(second)
     kept = with_numbers(case, ["profile.scale"]).profile
-    assert isinstance(kept, jb.ISO8608Profile)
+    assert isinstance(kept, jb.profiles.ISO8608Profile)

@@ -16,7 +16,7 @@ import scipy.signal
 from jaxtyping import Complex, Float
 
 from jaxbeam.case.case import Case, replace
-from jaxbeam.model.frequency_response import StationaryMasses, frequency_response
+from jaxbeam.model.frequency_responses import StationaryMasses, frequency_response
 from jaxbeam.model.modes import mesh_layout
 from tuning.fit.least_squares import MAX_STEPS, LeastSquares
 from tuning.fit.summary import parameter_table

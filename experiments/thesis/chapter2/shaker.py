@@ -11,7 +11,7 @@ from experiments.thesis.cases import data_physics_v4
 from experiments.thesis.chapter2 import published
 from experiments.thesis.verdicts import LITERAL, Experiment, ExperimentResult, make_finding
 from jaxbeam.model.channels import shaker_channels
-from jaxbeam.model.frequency_response import (
+from jaxbeam.model.frequency_responses import (
     FrequencyResponse,
     frequency_response,
     resonances_and_antiresonances,

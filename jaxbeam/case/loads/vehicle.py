@@ -10,18 +10,18 @@ from jaxbeam.case.fields import (
     parts,
 )
 from jaxbeam.case.loads.base import AbstractRowLoad
-from jaxbeam.case.loads.planar.parts import (
-    VehicleAxle,
-    VehicleBody,
-    VehicleHinge,
-    VehicleSpring,
-)
 from jaxbeam.case.loads.planar.vehicle import (
     PlanarVehicle,
     is_path,
     load_vehicle,
     unknown_vehicle,
     vehicle_names,
+)
+from jaxbeam.case.loads.planar.vehicle_parts import (
+    VehicleAxle,
+    VehicleBody,
+    VehicleHinge,
+    VehicleSpring,
 )
 
 DESCRIPTION = ("bodies", "springs", "hinges", "axles", "spacing")

@@ -170,7 +170,7 @@ class BumpProfile(AbstractTransition):
     ends, r' does not.
 
     >>> import jaxbeam as jb
-    >>> profile = jb.BumpProfile(start=0.0, end=2.0, height=0.03)
+    >>> profile = jb.profiles.BumpProfile(start=0.0, end=2.0, height=0.03)
     >>> heights, slopes, curvatures = profile.heights([0.5, 1.0])
     >>> print(heights.round(4))
     [0.015 0.03 ]
@@ -195,7 +195,7 @@ class RampProfile(AbstractTransition):
     velocity of a wheel with mass that is rigidly on the surface jumps, by an impulse on the beam.
 
     >>> import jaxbeam as jb
-    >>> profile = jb.RampProfile(start=0.0, end=2.0, height=0.03)
+    >>> profile = jb.profiles.RampProfile(start=0.0, end=2.0, height=0.03)
     >>> heights, slopes, curvatures = profile.heights([0.5, 1.0, 3.0])
     >>> print(heights.round(4))
     [0.0075 0.015  0.03  ]
@@ -222,7 +222,7 @@ class SineProfile(AbstractProfile):
     times the amplitude.
 
     >>> import jaxbeam as jb
-    >>> profile = jb.SineProfile(amplitude=0.002, wavelength=4.0)
+    >>> profile = jb.profiles.SineProfile(amplitude=0.002, wavelength=4.0)
     >>> heights, slopes, curvatures = profile.heights([0.5, 1.0])
     >>> print(heights.round(4))
     [0.0014 0.002 ]
@@ -253,7 +253,7 @@ class StepProfile(AbstractTransition):
     r = height u^3 (10 - 15 u + 6 u^2), u = (x - start) / (end - start). r' and r'' do not jump.
 
     >>> import jaxbeam as jb
-    >>> profile = jb.StepProfile(start=0.0, end=2.0, height=0.03)
+    >>> profile = jb.profiles.StepProfile(start=0.0, end=2.0, height=0.03)
     >>> heights, slopes, curvatures = profile.heights([0.5, 1.0, 3.0])
     >>> print(heights.round(4))
     [0.0031 0.015  0.03  ]
@@ -276,7 +276,8 @@ class TableProfile(AbstractAveragedProfile):
     last. Its points should be close enough to show the shortest wave.
 
     >>> import jaxbeam as jb
-    >>> profile = jb.TableProfile(positions=[0.0, 1.0, 2.0], point_heights=[0.0, 0.01, 0.0])
+    >>> heights = [0.0, 0.01, 0.0]
+    >>> profile = jb.profiles.TableProfile(positions=[0.0, 1.0, 2.0], point_heights=heights)
     >>> heights, slopes, curvatures = profile.heights([0.5, 1.0])
     >>> print(heights.round(4))
     [0.005 0.01 ]

@@ -222,7 +222,7 @@ class SpectrumProfile(AbstractSpectralProfile):
     With `switch_on` it grows from 0 between two positions.
 
     >>> import jaxbeam as jb
-    >>> profile = jb.SpectrumProfile(
+    >>> profile = jb.profiles.SpectrumProfile(
     ...     wavenumbers=[0.1, 0.5], amplitudes=[0.01, 0.002], phases=[0.0, 1.0]
     ... )
     >>> heights, slopes, curvatures = profile.heights([0.0, 5.0])
@@ -329,7 +329,7 @@ class ISO8608Profile(AbstractRandomProfile):
     100 m, is VBI-2D's. `class` is `road_class` in Python, where it is a reserved word.
 
     >>> import jaxbeam as jb
-    >>> profile = jb.ISO8608Profile("A", seed=1)
+    >>> profile = jb.profiles.ISO8608Profile("A", seed=1)
     >>> print(f"{profile.density(0.1):.2g} m^3")
     1.6e-05 m^3
     """
@@ -377,7 +377,7 @@ class RailProfile(AbstractRandomProfile):
     which the spectrum was published, where none are given.
 
     >>> import jaxbeam as jb
-    >>> profile = jb.RailProfile("fra-6", seed=1)
+    >>> profile = jb.profiles.RailProfile("fra-6", seed=1)
     >>> print(f"{profile.density(0.1):.2g} m^3")
     6.5e-07 m^3
     """

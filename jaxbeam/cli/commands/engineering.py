@@ -132,7 +132,7 @@ def influence(
     options.check_outputs(output, picture)
     parsed_case = options.read(case, judged="structure")
 
-    from jaxbeam.analysis import sections as influence_table
+    from jaxbeam.analysis.sections import influence_table
     from jaxbeam.case.reading.units import number_in_si
 
     sections = tuple(number_in_si(text, "m", "--at") for text in at)

@@ -112,7 +112,7 @@ def frf(
     masses = [stationary_mass(text) for text in mass_at]
     parsed_case = options.read(case, judged="structure")
 
-    from jaxbeam.model.frequency_response import frequency_response, resonances_and_antiresonances
+    from jaxbeam.model.frequency_responses import frequency_response, resonances_and_antiresonances
 
     response = frequency_response(parsed_case, frequencies, pairs, masses)
     if output:

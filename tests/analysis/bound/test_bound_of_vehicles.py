@@ -34,7 +34,7 @@ def test_the_uncontrolled_peak_is_that_of_the_simulation(name):
 
 
 def test_its_commands_attain_it_on_a_rough_surface():
-    case = case_of(LOADS["vehicle"], profile=jb.SineProfile(2e-3, 0.5))
+    case = case_of(LOADS["vehicle"], profile=jb.profiles.SineProfile(2e-3, 0.5))
     found = jb.bound(case, period=0.05, spacing=0.005)
     level = jb.bound(dataclasses.replace(case, profile=None), period=0.05, spacing=0.005)
     assert abs(found.peak - level.peak) > 1e-3 * level.peak
@@ -47,7 +47,7 @@ def test_its_commands_attain_it_on_a_rough_surface():
 @pytest.mark.parametrize("settings", [{}, {"prediction": "time-varying"}])
 def test_no_predictive_law_beats_it_on_a_rough_surface(settings):
     law = jb.MPC(horizon=10, moves=5, move_weight=1e-7, loads="known", period=0.05, **settings)
-    case = case_of(LOADS["vehicle"], profile=jb.SineProfile(2e-3, 0.5), controller=law)
+    case = case_of(LOADS["vehicle"], profile=jb.profiles.SineProfile(2e-3, 0.5), controller=law)
     found = jb.bound(case, spacing=0.005)
     record = jb.simulate(case)
     assert found.peak * (1 - 1e-5) < record.peak_deflection[0] < 0.9 * found.uncontrolled

@@ -6,13 +6,13 @@ import jax
 import numpy as np
 import pytest
 
-from jaxbeam.case.loads.planar.parts import (
+from jaxbeam.case.loads.planar.vehicle import PlanarVehicle, check_vehicle, load_vehicle
+from jaxbeam.case.loads.planar.vehicle_parts import (
     VehicleAxle,
     VehicleBody,
     VehicleHinge,
     VehicleSpring,
 )
-from jaxbeam.case.loads.planar.vehicle import PlanarVehicle, check_vehicle, load_vehicle
 from tests.case.loads.reference import LOADS
 
 GRAVITY = np.float64(9.81)

@@ -18,7 +18,7 @@ def case_of(*loads) -> jb.Case:
     beam = jb.Beam(
         length=20.0, flexural_rigidity=1e10, mass_per_length=8000.0, damping_ratio=0.02, modes=2
     )
-    road = jb.SineProfile(amplitude=3e-3, wavelength=4.0)
+    road = jb.profiles.SineProfile(amplitude=3e-3, wavelength=4.0)
     run = jb.Run(duration=2.5, sample_rate=100.0)
     return jb.Case(beam, sensors=[jb.Sensor(10.0)], loads=loads, run=run, profile=road)
 

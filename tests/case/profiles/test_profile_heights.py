@@ -119,7 +119,7 @@ def test_a_contact_patch_feels_the_mean_of_the_surface(kind):
 
 
 def test_sine():
-    profile = jb.SineProfile(amplitude=0.005, wavelength=5.0)
+    profile = jb.profiles.SineProfile(amplitude=0.005, wavelength=5.0)
     height, slope, curvature = profile.heights(np.array([0.0, 1.25, 2.5, -1.25]))
     assert_allclose(height, [0.0, 0.005, 0.0, -0.005], atol=1e-17)
     assert_allclose(slope, 0.002 * np.pi * np.array([1.0, 0.0, -1.0, 0.0]), atol=1e-17)
@@ -127,7 +127,7 @@ def test_sine():
 
 
 def test_ramp():
-    profile = jb.RampProfile(5.0, 7.0, 0.01)
+    profile = jb.profiles.RampProfile(5.0, 7.0, 0.01)
     height, slope, curvature = profile.heights(np.array([4.0, 5.0, 5.5, 7.0, 90.0]))
     assert_allclose(height, [0.0, 0.0, 0.0025, 0.01, 0.01])
     assert_allclose(slope, [0.0, 0.005, 0.005, 0.0, 0.0])
@@ -141,14 +141,14 @@ def test_step_is_the_quintic_with_level_ends():
     rows += [[0, 0, 2, 6 * a, 12 * a**2, 20 * a**3] for a in (2.0, 6.0)]
     quintic = np.polynomial.Polynomial(np.linalg.solve(rows, [0, 0.3, 0, 0, 0, 0]))
     x = np.linspace(2.0, 6.0, 9)
-    profile = jb.StepProfile(2.0, 6.0, 0.3)
+    profile = jb.profiles.StepProfile(2.0, 6.0, 0.3)
     for order, part in enumerate(profile.heights(x)):
         assert_allclose(part, quintic.deriv(order)(x), atol=1e-12)
     assert_allclose(np.stack(profile.heights(np.array([-1.0, 8.0]))), [[0, 0.3], [0, 0], [0, 0]])
 
 
 def test_bump():
-    profile = jb.BumpProfile(-8.0, -6.0, 0.02)
+    profile = jb.profiles.BumpProfile(-8.0, -6.0, 0.02)
     height, slope, curvature = profile.heights(np.array([-9.0, -8.0, -7.5, -7.0, -6.0, 0.0]))
     assert_allclose(height, [0.0, 0.0, 0.01, 0.02, 0.0, 0.0], atol=1e-17)
     assert_allclose(slope, [0.0, 0.0, 0.01 * np.pi, 0.0, 0.0, 0.0], atol=1e-17)
@@ -162,7 +162,7 @@ def test_table_is_the_spline_with_level_ends():
         assert_allclose(part, spline(x, order), rtol=1e-12, atol=1e-16)
     beyond = np.stack(PLAIN["table"].heights(np.array([-40.0, 7.0, 50.0])))
     assert_allclose(beyond, [[0.0, 5e-3, 5e-3], [0, 0, 0], [0, 0, 0]], atol=1e-17)
-    height, slope, curvature = jb.TableProfile([0.0, 2.0], [0.0, 1.0]).heights(1.0)
+    height, slope, curvature = jb.profiles.TableProfile([0.0, 2.0], [0.0, 1.0]).heights(1.0)
     assert_allclose([height, slope, curvature], [0.5, 0.75, 0.0])  # level at both ends
 
 
@@ -171,7 +171,7 @@ def test_a_long_table_converges_to_the_surface():
 
     def error(count):
         points = np.linspace(0.0, 6.0, count)  # level at both ends
-        table = jb.TableProfile(points, np.cos(np.pi * points))
+        table = jb.profiles.TableProfile(points, np.cos(np.pi * points))
         x = np.linspace(0.0, 6.0, 4001)
         return np.abs(table.heights(x)[0] - np.cos(np.pi * x)).max()
 

@@ -65,7 +65,7 @@ def test_words_of_case_files(tmp_path):
 
 
 def test_addresses_are_differentiated():
-    case = jb.Case(BEAM, profile=jb.RampProfile(5.0, 7.0, 0.01))
+    case = jb.Case(BEAM, profile=jb.profiles.RampProfile(5.0, 7.0, 0.01))
 
     def height(value):
         return replace(case, {"profile.height": value}).profile.heights(6.0)[0]
@@ -199,7 +199,7 @@ def test_wrong_input_is_one_sentence(table, message, tmp_path):
 
 
 def test_a_table_may_be_local_where_it_ends_at_height_zero():
-    profile = jb.TableProfile(np.linspace(5.0, 8.0, 7), [0, 0, 1e-3, 2e-3, 1e-3, 0, 0])
+    profile = jb.profiles.TableProfile(np.linspace(5.0, 8.0, 7), [0, 0, 1e-3, 2e-3, 1e-3, 0, 0])
     check_case(jb.Case(BEAM, loads=LOADS, profile=profile))
 
 
@@ -211,7 +211,7 @@ def test_wrong_part_in_python():
 def test_traced_numbers_are_not_validated():
     def valid(height):
         loads = [jb.MovingForce(force=1e4, speed=20.0)]
-        case = jb.Case(BEAM, loads=loads, profile=jb.RampProfile(height, height, height))
+        case = jb.Case(BEAM, loads=loads, profile=jb.profiles.RampProfile(height, height, height))
         check_case(case)
         return case.profile.height
 
@@ -236,8 +236,12 @@ RIGID = {
 @pytest.mark.parametrize("name", RIGID)
 def test_masses_on_the_surface_may_pass_any_profile(name):
     """By an impulse at the ends of a ramp: see `tests/simulation/test_kinks.py`."""
-    ramp = jb.RampProfile(5.0, 7.0, 0.01)
-    for profile in (ramp, jb.RampProfile(5.0, 7.0, 0.01, 0.2), jb.StepProfile(5.0, 7.0, 0.01)):
+    ramp = jb.profiles.RampProfile(5.0, 7.0, 0.01)
+    for profile in (
+        ramp,
+        jb.profiles.RampProfile(5.0, 7.0, 0.01, 0.2),
+        jb.profiles.StepProfile(5.0, 7.0, 0.01),
+    ):
         check_case(jb.Case(BEAM, loads=[RIGID[name]], profile=profile))
 
 
@@ -252,16 +256,16 @@ def test_masses_on_the_surface_may_pass_any_profile(name):
 )
 def test_tables_are_known_where_vehicles_come_from(path, travel):
     load = jb.QuarterCar(**CAR, **path)
-    short = jb.TableProfile([-1.0, 10.0, 26.0], [0.01, 0.0, 0.01])
+    short = jb.profiles.TableProfile([-1.0, 10.0, 26.0], [0.01, 0.0, 0.01])
     run = jb.Run(2.0)
     with pytest.raises(ValueError, match=f"loads travel {travel}"):
         check_case(jb.Case(BEAM, loads=[load], profile=short, run=run))
-    long = jb.TableProfile([-20.0, 10.0, 50.0], [0.01, 0.0, 0.01])
+    long = jb.profiles.TableProfile([-20.0, 10.0, 50.0], [0.01, 0.0, 0.01])
     check_case(jb.Case(BEAM, loads=[load], profile=long, run=run))
 
 
 def test_all_wheels_travel():
     load = jb.VehicleLoad(model="truck-5-axle", speed=20.0)
-    profile = jb.TableProfile([-5.0, 10.0, 50.0], [0.01, 0.0, 0.01])
+    profile = jb.profiles.TableProfile([-5.0, 10.0, 50.0], [0.01, 0.0, 0.01])
     with pytest.raises(ValueError, match=r"loads travel from -12\.8 to 37\.8 m"):
         check_case(jb.Case(BEAM, loads=[load], profile=profile, run=jb.Run(3.0)))

@@ -16,8 +16,8 @@ from tests.modules import DATA
 
 REFERENCE = json.loads((DATA / "profiles.json").read_text())
 EVERYWHERE = [-1e4, -0.9e4]  # switched on long before
-RANDOM = [jb.ISO8608Profile("B", 1, switch_on=EVERYWHERE)] + [
-    jb.RailProfile(name, 1, switch_on=EVERYWHERE) for name in RAIL_SPECTRA
+RANDOM = [jb.profiles.ISO8608Profile("B", 1, switch_on=EVERYWHERE)] + [
+    jb.profiles.RailProfile(name, 1, switch_on=EVERYWHERE) for name in RAIL_SPECTRA
 ]
 REALISATIONS = pytest.mark.parametrize("profile", RANDOM, ids=["B", *RAIL_SPECTRA])
 
@@ -27,7 +27,7 @@ def test_reference_profiles(name):
     """The table of the reference has eight digits."""
     given = REFERENCE[name]
     start, length = given["switch_on"]["x0"], given["switch_on"]["length"]
-    profile = jb.SpectrumProfile(
+    profile = jb.profiles.SpectrumProfile(
         given["n"], given["amp"], given["phase"], switch_on=[start, start + length]
     )
     table = np.array(given["table_r_every_5th"])
@@ -38,7 +38,7 @@ def test_reference_profiles(name):
 
 @pytest.mark.parametrize(
     ("name", "profile"),
-    [("iso8608-A", jb.ISO8608Profile("A")), ("fra-6", jb.RailProfile("fra-6"))],
+    [("iso8608-A", jb.profiles.ISO8608Profile("A")), ("fra-6", jb.profiles.RailProfile("fra-6"))],
 )
 def test_densities_give_the_amplitudes_of_the_reference(name, profile):
     given = REFERENCE[name]
@@ -51,7 +51,7 @@ def test_classes_of_iso_8608():
     means = [16, 64, 256, 1024, 4096, 16384, 65536, 262144]
     for name, mean in zip(ROAD_CLASSES, means, strict=True):
         assert_allclose(
-            jb.ISO8608Profile(name).density(np.array([0.1, 1.0])),
+            jb.profiles.ISO8608Profile(name).density(np.array([0.1, 1.0])),
             [mean * 1e-6] * 2 * np.array([1.0, 0.01]),
         )
 
@@ -90,7 +90,7 @@ def test_variance_is_the_integral_of_the_density(profile):
 def test_variance_of_a_road_is_exact():
     """S ~ n^-2: its integral is S(n0) n0^2 (1 / lowest - 1 / highest), whatever the waves."""
     for waves in (5, 200):
-        profile = jb.ISO8608Profile(
+        profile = jb.profiles.ISO8608Profile(
             "A", 3, lowest_wavenumber=0.02, highest_wavenumber=2.0, waves=waves
         )
         _, amplitudes, _ = profile.lines()
@@ -118,21 +118,21 @@ def test_periodogram_of_a_realisation(profile):
 
 def test_a_seed_is_a_profile():
     x = np.linspace(0.0, 40.0, 60)
-    first, again = (jb.ISO8608Profile("A", seed=7).heights(x) for _ in range(2))
+    first, again = (jb.profiles.ISO8608Profile("A", seed=7).heights(x) for _ in range(2))
     assert_array_equal(first, again)
-    assert_allclose(jb.ISO8608Profile("B", seed=7).heights(x)[0], 2 * first[0], atol=1e-15)
-    scaled = jb.ISO8608Profile("A", seed=7, scale=3.0).heights(x)[0]
+    assert_allclose(jb.profiles.ISO8608Profile("B", seed=7).heights(x)[0], 2 * first[0], atol=1e-15)
+    scaled = jb.profiles.ISO8608Profile("A", seed=7, scale=3.0).heights(x)[0]
     assert_allclose(scaled, 3 * first[0], atol=1e-15)
-    other = jb.ISO8608Profile("A", seed=8).heights(x)[0]
+    other = jb.profiles.ISO8608Profile("A", seed=8).heights(x)[0]
     assert abs(np.corrcoef(other, first[0])[0, 1]) < 0.9
-    phases = jb.RailProfile("fra-2", seed=7).lines()[2]
+    phases = jb.profiles.RailProfile("fra-2", seed=7).lines()[2]
     assert_array_equal(phases, np.random.default_rng(7).uniform(0, 2 * np.pi, 100))
 
 
 def test_heights_are_normally_distributed_over_seeds():
     """Kurtosis 3, no correlation between seeds."""
     x = np.array([12.0])
-    profiles = [jb.ISO8608Profile("A", seed) for seed in range(2000)]
+    profiles = [jb.profiles.ISO8608Profile("A", seed) for seed in range(2000)]
     heights = np.array([profile.heights(x)[0][0] for profile in profiles])
     deviation = np.sqrt(16e-6 * 0.01 * (1 / 0.01 - 1 / 4.0))
     assert_allclose(heights.std(), deviation, rtol=0.05)
@@ -143,8 +143,8 @@ def test_heights_are_normally_distributed_over_seeds():
 @pytest.mark.parametrize("switch_on", [[2.0, 8.0], [8.0, 2.0]])
 def test_switching_on(switch_on):
     """Zero before, all there behind, half in the middle; also for loads that travel left."""
-    profile = jb.RailProfile("fra-6", 3, switch_on=switch_on)
-    full = jb.RailProfile("fra-6", 3, switch_on=EVERYWHERE)
+    profile = jb.profiles.RailProfile("fra-6", 3, switch_on=switch_on)
+    full = jb.profiles.RailProfile("fra-6", 3, switch_on=EVERYWHERE)
     before, behind = np.array([[-30.0, 1.9], [8.1, 40.0]])[:: 1 if switch_on[0] < 5 else -1]
     assert_array_equal(np.stack(profile.heights(before)), 0.0)
     assert_array_equal(np.stack(profile.heights(behind)), np.stack(full.heights(behind)))
@@ -187,7 +187,7 @@ def test_sums_at_close_positions_are_interpolated(shape):
 
 def test_profiles_are_batched():
     """Over the roughness of a road, as a sweep does."""
-    profile, x = jb.ISO8608Profile("A", 5), np.linspace(0.0, 10.0, 7)
+    profile, x = jb.profiles.ISO8608Profile("A", 5), np.linspace(0.0, 10.0, 7)
 
     def heights(scale):
         return eqx.tree_at(lambda p: p.scale, profile, scale).heights(x)[0]

@@ -49,7 +49,7 @@ def profile(x):
 
 def beam_case(load=None, controller=None, **parts) -> jb.Case:
     car = jb.QuarterCar(**dataclasses.asdict(CAR), speed=SPEED)
-    parts = {"profile": jb.SineProfile(AMPLITUDE, WAVELENGTH)} | parts
+    parts = {"profile": jb.profiles.SineProfile(AMPLITUDE, WAVELENGTH)} | parts
     return jb.Case(
         jb.Beam(SPAN.length, SPAN.flexural_rigidity, SPAN.mass_per_length, 0.01, modes=MODES),
         loads=[car if load is None else load],

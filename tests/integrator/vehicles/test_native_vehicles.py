@@ -48,9 +48,9 @@ LONG_CAR = jb.HalfCar(
 SENSORS = [jb.Sensor(7.0), jb.Sensor(10.0, "acceleration")]
 # Body on a wheel with mass: inertia and springs in the same rows; vehicles in a row.
 ROW = jb.VehicleLoad(
-    bodies=[jb.VehicleBody("body", mass=3e4, inertia=4e5, position=0.0)],
+    bodies=[jb.planar.VehicleBody("body", mass=3e4, inertia=4e5, position=0.0)],
     axles=[
-        jb.VehicleAxle("body", p, mass=500.0, suspension_stiffness=k, suspension_damping=2e4)
+        jb.planar.VehicleAxle("body", p, mass=500.0, suspension_stiffness=k, suspension_damping=2e4)
         for p, k in ((2.0, 2e6), (-2.5, 3e6))
     ],
     count=2,
@@ -76,7 +76,7 @@ FACTORS = st.lists(st.floats(0.2, 3.0), min_size=24, max_size=24)
 
 def case_of(name):
     loads, supports = CASES[name]
-    profile = jb.ISO8608Profile("C", seed=2) if name in ("rough", "forced") else None
+    profile = jb.profiles.ISO8608Profile("C", seed=2) if name in ("rough", "forced") else None
     return jb.Case(
         BEAM, supports=supports, sensors=SENSORS, loads=loads, profile=profile, run=jb.Run(2.2)
     )

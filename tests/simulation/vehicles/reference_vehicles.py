@@ -23,14 +23,14 @@ def profile_of(run: dict[str, Any]):
         return None
     kind, *numbers = profile.values()
     if kind == "sine":
-        return jb.SineProfile(*numbers)
+        return jb.profiles.SineProfile(*numbers)
     if kind == "ramp":
-        return jb.RampProfile(*numbers)
+        return jb.profiles.RampProfile(*numbers)
     if kind.startswith("versine"):
-        return jb.BumpProfile(*numbers)
+        return jb.profiles.BumpProfile(*numbers)
     waves = WAVES[kind.removeprefix("profiles.json: ")]
     switch = waves["switch_on"]["x0"] + np.array([0.0, waves["switch_on"]["length"]])
-    return jb.SpectrumProfile(waves["n"], waves["amp"], waves["phase"], switch_on=switch)
+    return jb.profiles.SpectrumProfile(waves["n"], waves["amp"], waves["phase"], switch_on=switch)
 
 
 def load_of(run: dict[str, Any]):

@@ -29,7 +29,7 @@ CASE = jb.Case(
     jb.Beam(20.0, 2e10, 1.2e4, 0.02, modes=2),
     sensors=[jb.Sensor(7.0)],
     loads=[jb.QuarterCar(**CAR, speed=20.0, start_position=-5.0, deceleration=1.0)],
-    profile=jb.BumpProfile(-4.0, 3.0, 0.02),
+    profile=jb.profiles.BumpProfile(-4.0, 3.0, 0.02),
     run=jb.Run(1.4, 40.0),
 )
 NUMBERS = [f"loads.0.{name}" for name in (*CAR, "speed", "deceleration", "start_position")]

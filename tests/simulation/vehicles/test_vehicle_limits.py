@@ -40,9 +40,9 @@ def case_of(*loads, profile=None, beam=BEAM, duration=1.5, sensors=SENSORS, **op
 
 PROFILES = {
     "flat": None,
-    "sine": jb.SineProfile(4e-3, 6.0, 0.7),
-    "ramp": jb.RampProfile(4.0, 6.0, 0.01),
-    "spectrum": jb.SpectrumProfile([0.1, 0.3], [2e-3, 1e-3], [0.4, 2.0]),
+    "sine": jb.profiles.SineProfile(4e-3, 6.0, 0.7),
+    "ramp": jb.profiles.RampProfile(4.0, 6.0, 0.01),
+    "spectrum": jb.profiles.SpectrumProfile([0.1, 0.3], [2e-3, 1e-3], [0.4, 2.0]),
 }
 
 
@@ -138,7 +138,7 @@ def test_work_of_the_contact_forces_is_all_accounted_for():
     (F - P) y' on it, and F takes F w_t from the beam. Kinetic and elastic energy and dissipation
     of both follow.
     """
-    profile = jb.BumpProfile(-3.0, 6.0, 0.02)
+    profile = jb.profiles.BumpProfile(-3.0, 6.0, 0.02)
     span, beam = dataclasses.replace(SPAN, modes=2), dataclasses.replace(BEAM, modes=2)
     load = jb.QuarterCar(**CAR, speed=20.0, start_position=-5.0)
     case = case_of(load, profile=profile, beam=beam)
@@ -208,7 +208,7 @@ def test_travel_to_the_left_mirrors():
         jb.HalfCar(12000.0, 6e4, **numbers, speed=v, start_position=x, deceleration=1.0)
         for v, x in ((20.0, -2.0), (-20.0, 22.0))
     ]
-    profiles = jb.BumpProfile(-3.0, 8.0, 0.02), jb.BumpProfile(12.0, 23.0, 0.02)
+    profiles = jb.profiles.BumpProfile(-3.0, 8.0, 0.02), jb.profiles.BumpProfile(12.0, 23.0, 0.02)
     right, left = (
         jb.simulate(case_of(load, profile=p, sensors=[jb.Sensor(x)]), TIMES)
         for load, p, x in zip(loads, profiles, (7.0, 13.0), strict=True)
@@ -229,7 +229,7 @@ def test_vehicles_that_meet_are_symmetrical():
 
 def test_a_table_of_positions_is_the_braking_that_it_lists():
     """A cubic spline through a parabola is the parabola."""
-    profile = jb.SineProfile(4e-3, 6.0, 0.7)
+    profile = jb.profiles.SineProfile(4e-3, 6.0, 0.7)
     braking = jb.QuarterCar(**CAR, speed=20.0, start_position=-4.0, deceleration=3.0)
     times = np.linspace(0.0, 1.6, 9)
     positions = -4.0 + 20.0 * times - 1.5 * times**2
@@ -242,8 +242,8 @@ def test_a_table_of_positions_is_the_braking_that_it_lists():
 @pytest.mark.parametrize("start", [-8.0, -8.5])
 def test_a_load_begins_in_equilibrium_on_a_raised_surface(start):
     """It stays so on a level part, raised by 0.1 m before the beam, until it meets the slope."""
-    profile = jb.StepProfile(-6.0, -1.0, -0.1)
-    raised = jb.TableProfile([-9.0, -5.0, -1.0], [0.1, 0.1, 0.0])
+    profile = jb.profiles.StepProfile(-6.0, -1.0, -0.1)
+    raised = jb.profiles.TableProfile([-9.0, -5.0, -1.0], [0.1, 0.1, 0.0])
     for surface, height in ((profile, 0.0), (raised, 0.1)):
         load = jb.QuarterCar(**CAR, speed=1.0, start_position=start)
         case = case_of(load, profile=surface, duration=0.2)

@@ -116,8 +116,10 @@ def test_a_body_on_a_slope_is_inclined_as_it_is(speed):
     case = jb.Case(
         jb.Beam(20.0, 1e16, 1e6, damping_ratio=0.5, modes=1),
         loads=[car],
-        profile=jb.TableProfile(positions=x, point_heights=0.01 * x + 0.3),
-        vehicle_sensors=[jb.VehicleSensor(quantity="displacement", position=p) for p in places],
+        profile=jb.profiles.TableProfile(positions=x, point_heights=0.01 * x + 0.3),
+        vehicle_sensors=[
+            jb.planar.VehicleSensor(quantity="displacement", position=p) for p in places
+        ],
         run=jb.Run(3.0, sample_rate=10.0),
     )
     record = jb.simulate(case)

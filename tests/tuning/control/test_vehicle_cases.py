@@ -26,7 +26,7 @@ CAR = {
 def case() -> jb.Case:
     """Small rig under a quarter car on a random road."""
     car = jb.QuarterCar(**CAR, speed=2.0, start_position=-0.1)
-    road = jb.ISO8608Profile(
+    road = jb.profiles.ISO8608Profile(
         road_class="A", scale=0.02, lowest_wavenumber=1.0, highest_wavenumber=8.0, waves=6,
         switch_on=[-0.1, -0.05],
     )  # fmt: skip

@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 
 import jaxbeam as jb
-from jaxbeam.model.frequency_response import frequency_response
+from jaxbeam.model.frequency_responses import frequency_response
 from tests.tuning.fit import test_actuators_from_logs as rigs
 from tuning.fit.frequency_responses import Responses, identify_responses, responses_of
 from tuning.logs.log import Log

@@ -60,8 +60,11 @@ def case() -> jb.Case:
         beam,
         sensors=[jb.Sensor(LENGTH / 2)],
         loads=[jb.QuarterCar(**CAR, speed=SPEED, start_position=START)],
-        vehicle_sensors=[jb.VehicleSensor(body="body"), jb.VehicleSensor(body="axle")],
-        profile=jb.SpectrumProfile(*WAVES.T),
+        vehicle_sensors=[
+            jb.planar.VehicleSensor(body="body"),
+            jb.planar.VehicleSensor(body="axle"),
+        ],
+        profile=jb.profiles.SpectrumProfile(*WAVES.T),
         run=jb.Run(duration=DURATION, sample_rate=RATE),
     )
 
@@ -197,7 +200,7 @@ def test_a_sensor_away_from_the_centre_of_mass_feels_the_pitch(tmp_path):
         body_mass=16000.0, body_inertia=40000.0, axle_positions=np.array([2.0, -2.0]), **axles,
         speed=SPEED, start_position=START,
     )  # fmt: skip
-    point = jb.VehicleSensor(quantity="velocity", position=1.5, offset="2 cm/s")
+    point = jb.planar.VehicleSensor(quantity="velocity", position=1.5, offset="2 cm/s")
     whole = dataclasses.replace(case(), loads=[car], vehicle_sensors=[point])
     jb.save_case(whole, tmp_path / "case.toml")
     record = jb.simulate(jb.load_case(tmp_path / "case.toml"))

@@ -36,20 +36,14 @@ from jaxtyping import Float
 
 from jaxbeam.case import fields
 from jaxbeam.case.declared_checks import check_fields, suggestion
-from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import (
-    NOT_NEGATIVE,
     POSITIVE,
-    PROBABILITY,
     choice,
     concrete,
-    count,
     is_concrete,
     number,
-    part,
     parts,
 )
-from jaxbeam.case.filters import Filter
 from jaxbeam.case.loads.base import (
     AbstractVehicleLoad,
     VehicleModel,
@@ -57,83 +51,17 @@ from jaxbeam.case.loads.base import (
     static_load_error,
 )
 from jaxbeam.case.loads.planar.assembly import Bodies, Hinges, Links, Wheels, assemble
-from jaxbeam.case.loads.planar.parts import (
+from jaxbeam.case.loads.planar.vehicle_parts import (
     VehicleAxle,
     VehicleBody,
     VehicleHinge,
     VehicleSpring,
     description_errors,
 )
-from jaxbeam.case.quantities import BODY_QUANTITIES, OF_QUANTITY, QUANTITIES
 from jaxbeam.case.reading.tables import read_part
 from jaxbeam.case.reading.toml_file import read_toml
-from jaxbeam.case.reading.units import in_si
 from jaxbeam.runtime.arrays import Array, block_diag, xp
 from jaxbeam.runtime.module import Module
-
-
-class VehicleSensor(ReprWithUnits, Module):
-    """Sensor of the vertical motion of a body or axle of a vehicle or absorber, positive upwards.
-
-    `absorber` is the number of an absorber, whose motion relative to the beam is its "stroke", in
-    place of a vehicle. `load` is the number of the load, `vehicle` that of the vehicle in its row,
-    both from 0; `body` a name of `Record.bodies` without the load, as "body" or "axle 1". At
-    `position` (m) forward of the centre of mass it feels the pitch as well. Displacements are from
-    static equilibrium. The other entries are those of `Sensor`.
-
-    >>> import jaxbeam as jb
-    >>> case = jb.Case(
-    ...     jb.Beam(20.0, 1e10, 12e3),
-    ...     loads=[jb.VehicleLoad(model="half-truck", speed=20.0)],
-    ...     vehicle_sensors=[jb.VehicleSensor(body="axle 1", quantity="acceleration")],
-    ...     run=jb.Run(1.0),
-    ... )
-    >>> print(case.vehicle_sensors[0].unit)
-    m/s^2
-    """
-
-    # What a sensor on the beam may have and this one has not.
-    range: ClassVar[None] = None
-    resolution: ClassVar[None] = None
-    has_feedthrough: ClassVar[bool] = True  # there is no history of the rate of an acceleration
-    bends: ClassVar[bool] = False
-
-    load: int = count("number of the load, from 0", minimum=0, default=0)
-    body: str = choice("name of the body or axle", default="body")
-    quantity: str = choice("measured quantity", *BODY_QUANTITIES, default="acceleration")
-    vehicle: int = count("number of the vehicle in a row, from 0", minimum=0, default=0)
-    position: Float[Array, ""] = number("m", "forward of the centre of mass", default=0.0)
-    absorber: int | None = count(
-        "number of an absorber, from 0, in place of a load", minimum=0, default=None, kw_only=True
-    )
-    offset: Float[Array, ""] = number(OF_QUANTITY, "constant added", default=0.0)
-    noise: Float[Array, ""] | None = number(
-        OF_QUANTITY, "standard deviation of white noise", NOT_NEGATIVE, default=None
-    )
-    filter: Filter | None = part("filter of the signal or of its samples", Filter)
-    sampling_period: Float[Array, ""] | None = number(
-        "s", "time between readings; that of the run if left out", POSITIVE, default=None
-    )
-    delay: Float[Array, ""] | None = number(
-        "s", "from motion to reading", NOT_NEGATIVE, default=None
-    )
-    dropout: Float[Array, ""] | None = number(
-        "1", "probability that a reading is lost", PROBABILITY, default=None, kw_only=True
-    )
-    jitter: Float[Array, ""] | None = number(
-        "s", "largest random delay of a reading", NOT_NEGATIVE, default=None, kw_only=True
-    )
-
-    def __post_init__(self):
-        for name in ("offset", "noise"):
-            value = getattr(self, name)
-            if isinstance(value, str) and self.quantity in BODY_QUANTITIES:
-                setattr(self, name, in_si(value, self.unit, name))
-
-    @property
-    def unit(self) -> str:
-        """SI unit of the readings."""
-        return QUANTITIES[BODY_QUANTITIES[self.quantity]].unit
 
 
 class PlanarVehicle(Module):

@@ -28,6 +28,15 @@ from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.runtime.arrays import Array, is_jax, solve, xp
 from jaxbeam.runtime.module import Module
 
+__all__ = [
+    "ReceptanceFeedback",
+    "closed_loop_poles",
+    "fit_receptances",
+    "receptance_feedback",
+    "receptance_gains",
+    "receptances",
+]
+
 COLLOCATION_NODES = 24  # over a delay; the rightmost poles are refined afterwards
 REFINEMENTS = 20  # at most, of each pole
 MAX_TURN = 300.0  # |s| times the delay
@@ -41,7 +50,8 @@ class ReceptanceFeedback(Module):
 
     >>> import numpy as np
     >>> import jaxbeam as jb
-    >>> law = jb.ReceptanceFeedback(np.array([-200.0]), np.array([-5.0]), delay=np.float64(1e-3))
+    >>> gains = np.array([-200.0]), np.array([-5.0])
+    >>> law = jb.receptance_method.ReceptanceFeedback(*gains, delay=np.float64(1e-3))
     >>> print(law.displacement, law.velocity)
     [-200.] [-5.]
     """
@@ -90,7 +100,7 @@ def receptances(case: Case, s, actuator: int = 0) -> Complex[Array, "pole sensor
     ...     sensors=[jb.Sensor(0.3)],
     ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
     ... )
-    >>> print(jb.receptances(case, [10j, 20j]).shape)
+    >>> print(jb.receptance_method.receptances(case, [10j, 20j]).shape)
     (2, 1)
     """
     model = _checked_model(case, actuator)
@@ -213,8 +223,8 @@ def receptance_feedback(
     ...     actuators=[jb.PointForce(position=0.21)],
     ...     sensors=[jb.Sensor(position=0.18), jb.Sensor(position=0.39)],
     ... )
-    >>> law = jb.receptance_feedback(case, [-12.8 + 127.5j, -30.7 + 511.5j])
-    >>> bool(abs(jb.closed_loop_poles(case, law) - (-12.8 + 127.5j)).min() < 1e-8)
+    >>> law = jb.receptance_method.receptance_feedback(case, [-12.8 + 127.5j, -30.7 + 511.5j])
+    >>> bool(abs(jb.receptance_method.closed_loop_poles(case, law) - (-12.8 + 127.5j)).min() < 1e-8)
     True
     """
     model = _checked_model(case, actuator)
@@ -248,8 +258,8 @@ def closed_loop_poles(
     ...     actuators=[jb.PointForce(position=0.21)],
     ...     sensors=[jb.Sensor(position=0.18), jb.Sensor(position=0.39)],
     ... )
-    >>> law = jb.receptance_feedback(case, [-12.8 + 127.5j, -30.7 + 511.5j])
-    >>> bool(abs(jb.closed_loop_poles(case, law) - (-12.8 + 127.5j)).min() < 1e-8)
+    >>> law = jb.receptance_method.receptance_feedback(case, [-12.8 + 127.5j, -30.7 + 511.5j])
+    >>> bool(abs(jb.receptance_method.closed_loop_poles(case, law) - (-12.8 + 127.5j)).min() < 1e-8)
     True
     """
     case = concrete_case(case)

@@ -34,6 +34,13 @@ if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
     from matplotlib.figure import Figure, SubFigure
 
+__all__ = [
+    "accelerance",
+    "frequency_response",
+    "mobility",
+    "receptance",
+]
+
 StationaryMasses = Sequence[tuple[Any, Any]]  # position (m) and mass (kg) of each
 
 
@@ -246,8 +253,8 @@ def receptance(
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
-    >>> static = jb.receptance(jb.Case(beam), [0.0], 0.3, 0.3)  # of three modes; L^3 / (48 E I)
-    >>> print(f"{abs(static[0]) * 48 * 11.68 / 0.6**3:.3f}")
+    >>> static = jb.frequency_responses.receptance(jb.Case(beam), [0.0], 0.3, 0.3)
+    >>> print(f"{abs(static[0]) * 48 * 11.68 / 0.6**3:.3f}")  # of three modes; over L^3 / (48 E I)
     0.998
     """
     check_case(case)
@@ -285,7 +292,7 @@ def mobility(
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
-    >>> print(jb.mobility(jb.Case(beam), [10.0, 20.0], 0.3, 0.3).shape)
+    >>> print(jb.frequency_responses.mobility(jb.Case(beam), [10.0, 20.0], 0.3, 0.3).shape)
     (2,)
     """
     response = receptance(case, frequencies, x, y, stationary_masses, layout)
@@ -306,7 +313,7 @@ def accelerance(
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
-    >>> print(jb.accelerance(jb.Case(beam), [10.0], 0.3, 0.3).shape)
+    >>> print(jb.frequency_responses.accelerance(jb.Case(beam), [10.0], 0.3, 0.3).shape)
     (1,)
     """
     return _differentiated(

@@ -5,14 +5,29 @@ Positions are in m along the vehicle, forward positive, from any common origin.
 
 import collections
 from collections.abc import Iterator
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.declared_checks import suggestion
 from jaxbeam.case.display import ReprWithUnits
-from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, choice, concrete, is_concrete, number
+from jaxbeam.case.fields import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    PROBABILITY,
+    choice,
+    concrete,
+    count,
+    is_concrete,
+    number,
+    part,
+)
+from jaxbeam.case.filters import Filter
+from jaxbeam.case.quantities import BODY_QUANTITIES, OF_QUANTITY, QUANTITIES
+from jaxbeam.case.reading.units import in_si
 from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.module import Module
 
 
 class VehicleBody(ReprWithUnits):
@@ -25,12 +40,12 @@ class VehicleBody(ReprWithUnits):
     ...     loads=[
     ...         jb.VehicleLoad(
     ...             speed=20.0,
-    ...             bodies=[jb.VehicleBody("car", mass=1500.0, inertia=2500.0)],
+    ...             bodies=[jb.planar.VehicleBody("car", mass=1500.0, inertia=2500.0)],
     ...             axles=[
-    ...                 jb.VehicleAxle(
+    ...                 jb.planar.VehicleAxle(
     ...                     "car", 1.2, suspension_stiffness=4e4, suspension_damping=3e3
     ...                 ),
-    ...                 jb.VehicleAxle(
+    ...                 jb.planar.VehicleAxle(
     ...                     "car", -1.5, suspension_stiffness=4e4, suspension_damping=3e3
     ...                 ),
     ...             ],
@@ -63,15 +78,15 @@ class VehicleSpring(ReprWithUnits):
     ...         jb.VehicleLoad(
     ...             speed=20.0,
     ...             bodies=[
-    ...                 jb.VehicleBody("body", mass=8000.0),
-    ...                 jb.VehicleBody("frame", mass=2000.0),
+    ...                 jb.planar.VehicleBody("body", mass=8000.0),
+    ...                 jb.planar.VehicleBody("frame", mass=2000.0),
     ...             ],
     ...             springs=[
-    ...                 jb.VehicleSpring(
+    ...                 jb.planar.VehicleSpring(
     ...                     "body", "frame", position=0.0, stiffness=4e5, damping=1e4
     ...                 )
     ...             ],
-    ...             axles=[jb.VehicleAxle("frame", 0.0, suspension_stiffness=1e6)],
+    ...             axles=[jb.planar.VehicleAxle("frame", 0.0, suspension_stiffness=1e6)],
     ...         )
     ...     ],
     ...     run=jb.Run(1.0),
@@ -104,18 +119,18 @@ class VehicleHinge(ReprWithUnits):
     ...         jb.VehicleLoad(
     ...             speed=20.0,
     ...             bodies=[
-    ...                 jb.VehicleBody("tractor", mass=5000.0, inertia=2e4, position=0.0),
-    ...                 jb.VehicleBody("trailer", mass=15000.0, inertia=8e4, position=-6.0),
+    ...                 jb.planar.VehicleBody("tractor", mass=5000.0, inertia=2e4, position=0.0),
+    ...                 jb.planar.VehicleBody("trailer", mass=15000.0, inertia=8e4, position=-6.0),
     ...             ],
-    ...             hinges=[jb.VehicleHinge("tractor", "trailer", position=-1.5)],
+    ...             hinges=[jb.planar.VehicleHinge("tractor", "trailer", position=-1.5)],
     ...             axles=[
-    ...                 jb.VehicleAxle(
+    ...                 jb.planar.VehicleAxle(
     ...                     "tractor", 2.0, suspension_stiffness=4e5, suspension_damping=1e4
     ...                 ),
-    ...                 jb.VehicleAxle(
+    ...                 jb.planar.VehicleAxle(
     ...                     "tractor", -2.0, suspension_stiffness=4e5, suspension_damping=1e4
     ...                 ),
-    ...                 jb.VehicleAxle(
+    ...                 jb.planar.VehicleAxle(
     ...                     "trailer", -9.0, suspension_stiffness=1e6, suspension_damping=2e4
     ...                 ),
     ...             ],
@@ -145,12 +160,12 @@ class VehicleAxle(ReprWithUnits):
     ...     loads=[
     ...         jb.VehicleLoad(
     ...             speed=20.0,
-    ...             bodies=[jb.VehicleBody("car", mass=1500.0, inertia=2500.0)],
+    ...             bodies=[jb.planar.VehicleBody("car", mass=1500.0, inertia=2500.0)],
     ...             axles=[
-    ...                 jb.VehicleAxle(
+    ...                 jb.planar.VehicleAxle(
     ...                     "car", 1.2, suspension_stiffness=4e4, suspension_damping=3e3
     ...                 ),
-    ...                 jb.VehicleAxle(
+    ...                 jb.planar.VehicleAxle(
     ...                     "car", -1.5, suspension_stiffness=4e4, suspension_damping=3e3
     ...                 ),
     ...             ],
@@ -274,3 +289,67 @@ def _ring_errors(prefix: str, names: list[str], hinges: Hinges) -> Iterator[str]
                 " them one body, or leave the hinge out"
             )
         group = {name: first if one == second else one for name, one in group.items()}
+
+
+class VehicleSensor(ReprWithUnits, Module):
+    """Sensor of the vertical motion of a body or axle of a vehicle or absorber, positive upwards.
+
+    `absorber` is the number of an absorber, whose motion relative to the beam is its "stroke", in
+    place of a vehicle. `load` is the number of the load, `vehicle` that of the vehicle in its row,
+    both from 0; `body` a name of `Record.bodies` without the load, as "body" or "axle 1". At
+    `position` (m) forward of the centre of mass it feels the pitch as well. Displacements are from
+    static equilibrium. The other entries are those of `Sensor`.
+
+    >>> import jaxbeam as jb
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 1e10, 12e3),
+    ...     loads=[jb.VehicleLoad(model="half-truck", speed=20.0)],
+    ...     vehicle_sensors=[jb.planar.VehicleSensor(body="axle 1", quantity="acceleration")],
+    ...     run=jb.Run(1.0),
+    ... )
+    >>> print(case.vehicle_sensors[0].unit)
+    m/s^2
+    """
+
+    # What a sensor on the beam may have and this one has not.
+    range: ClassVar[None] = None
+    resolution: ClassVar[None] = None
+    has_feedthrough: ClassVar[bool] = True  # there is no history of the rate of an acceleration
+    bends: ClassVar[bool] = False
+
+    load: int = count("number of the load, from 0", minimum=0, default=0)
+    body: str = choice("name of the body or axle", default="body")
+    quantity: str = choice("measured quantity", *BODY_QUANTITIES, default="acceleration")
+    vehicle: int = count("number of the vehicle in a row, from 0", minimum=0, default=0)
+    position: Float[Array, ""] = number("m", "forward of the centre of mass", default=0.0)
+    absorber: int | None = count(
+        "number of an absorber, from 0, in place of a load", minimum=0, default=None, kw_only=True
+    )
+    offset: Float[Array, ""] = number(OF_QUANTITY, "constant added", default=0.0)
+    noise: Float[Array, ""] | None = number(
+        OF_QUANTITY, "standard deviation of white noise", NOT_NEGATIVE, default=None
+    )
+    filter: Filter | None = part("filter of the signal or of its samples", Filter)
+    sampling_period: Float[Array, ""] | None = number(
+        "s", "time between readings; that of the run if left out", POSITIVE, default=None
+    )
+    delay: Float[Array, ""] | None = number(
+        "s", "from motion to reading", NOT_NEGATIVE, default=None
+    )
+    dropout: Float[Array, ""] | None = number(
+        "1", "probability that a reading is lost", PROBABILITY, default=None, kw_only=True
+    )
+    jitter: Float[Array, ""] | None = number(
+        "s", "largest random delay of a reading", NOT_NEGATIVE, default=None, kw_only=True
+    )
+
+    def __post_init__(self):
+        for name in ("offset", "noise"):
+            value = getattr(self, name)
+            if isinstance(value, str) and self.quantity in BODY_QUANTITIES:
+                setattr(self, name, in_si(value, self.unit, name))
+
+    @property
+    def unit(self) -> str:
+        """SI unit of the readings."""
+        return QUANTITIES[BODY_QUANTITIES[self.quantity]].unit
