@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxbeam.runtime.arrays import Array, take, xp
+from jaxbeam.runtime.arrays import Array, any_jax, set_at, stop_gradient, take, xp
 from jaxbeam.runtime.module import Module
 
 SAME_TIME_SHARE = 1e-9  # of the duration: closer times are one event
@@ -62,6 +62,16 @@ class EventSchedule(Module):
         return dataclasses.replace(self, times=times, lengths=xp.diff(times))
 
 
+def moving_with_end(times: Float[Array, " time"], end: Float[Array, ""]) -> Float[Array, " time"]:
+    """Times (s), of which those at the `end` (s) of a run, but for rounding, are the end itself.
+
+    What is done at the end of a run changes nothing before: derivatives of a peak at the end are
+    those of the motion at a fixed time, or by the end, not by the times of the actions there.
+    """
+    at_end = stop_gradient(times) >= stop_gradient(end) * (1 - SAME_TIME_SHARE)
+    return xp.where(at_end, end, times)
+
+
 def sample_schedule(
     times: Float[Array, " time"],
     equally_spaced: bool,
@@ -81,7 +91,12 @@ def sample_schedule(
     else:
         lengths, length_index = xp.diff(times), xp.arange(count - 1)
     if end is not None:
-        end = xp.maximum(end, times[-1])
+        if any_jax(times, end):
+            times = moving_with_end(times, end)
+            length_index = set_at(length_index, -1, lengths.shape[0])
+            lengths = xp.append(lengths, times[-1] - times[-2])
+        else:
+            end = xp.maximum(end, times[-1])
         length_index = xp.append(length_index, lengths.shape[0])
         lengths = xp.append(lengths, end - times[-1])
         times = xp.append(times, end)

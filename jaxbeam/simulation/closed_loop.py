@@ -16,7 +16,12 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw
 from jaxbeam.case.fields import concrete
-from jaxbeam.integrator.events import EventSchedule, Transmission, controller_schedule
+from jaxbeam.integrator.events import (
+    EventSchedule,
+    Transmission,
+    controller_schedule,
+    moving_with_end,
+)
 from jaxbeam.integrator.growth import load_amplitude
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
@@ -118,8 +123,10 @@ def moved_schedule(
         times += [sent, sent + delays(COMMANDS, controller, counts[-1])]
     end = samples[-1]
     if to_duration:
-        end = xp.maximum(case.run.duration, end)
-    return schedule.moved(xp.concatenate([*times, samples, end[None]]))
+        end = case.run.duration
+        samples = moving_with_end(samples, end)
+    actions = moving_with_end(xp.concatenate(times), end)
+    return schedule.moved(xp.concatenate([actions, samples, end[None]]))
 
 
 def moves_events(case: Case, times=None) -> bool:

@@ -134,3 +134,36 @@ def test_actions_at_one_time_are_separate_events_in_their_order():
     later = schedule.moved(np.concatenate([times, 1.01 * times, 1.01 * times + 1e-3, times, [0.2]]))
     assert later.times[6] == pytest.approx(0.101) and later.times[7] == pytest.approx(0.102)
     np.testing.assert_allclose(later.lengths, np.diff(later.times))
+
+
+GROWING = jb.Case(
+    LOOP.beam,
+    sensors=[jb.Sensor(0.3)],
+    loads=[jb.MovingMass(mass=0.4, speed=2.4)],
+    run=jb.Run(0.1, sample_rate=200.0),
+)
+GROWING_LOOP = dataclasses.replace(
+    GROWING, actuators=(jb.PointForce(0.3),), controller=jb.Feedback([2e2], period=0.005)
+)
+
+
+@pytest.mark.parametrize(
+    ("case", "address"),
+    [
+        (GROWING, "run.duration"),
+        (GROWING, "run.sample_rate"),
+        (GROWING_LOOP, "run.duration"),
+        (GROWING_LOOP, "controller.period"),
+    ],
+)
+def test_a_peak_at_the_end_moves_with_the_end_alone(case, address):
+    """A sample and an action of the controller are at the end, too, 0.1 s."""
+    value, slope = derivative_of_peak(case, address)
+    point = float(value_at(case, address))
+
+    def peak(share):
+        changed = jb.replace(case, {address: point * (1 + share)})
+        return jb.simulate(changed, tolerance=1e-9).peak_deflection[0]
+
+    expected = (peak(1e-6) - peak(-1e-6)) / (2e-6 * point)
+    assert_allclose(slope, expected, rtol=1e-4, atol=1e-6 * float(value) / point)
