@@ -176,6 +176,7 @@ def _of_whole_run(initial: RunningPeaks, samples, start, length) -> RunningPeaks
     candidates = xp.moveaxis(xp.take_along_axis(samples, steps[:, None], axis=0), 0, 1)
     positions, heights = locate_peak(stop_gradient(candidates), PEAK_NODES, magnitude)
     highest = xp.argmax(heights, axis=0) == np.arange(len(steps))[:, None, None]
+    highest = highest & (heights > initial.estimate)  # without motion, the peak is that at rest
 
     def chosen(parts):
         return xp.sum(xp.where(highest, parts, 0.0), axis=-3)
