@@ -9,6 +9,7 @@ import webbrowser
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import uvicorn
@@ -27,6 +28,7 @@ from jaxbeam.vehicles.library import trains
 
 STATIC = Path(__file__).parent / "static"
 LOOPBACK = "127.0.0.1"
+LOG_PATH, MAX_LOG_BYTES = "/api/log", 64 * 2**20
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self';"
     " img-src 'self' blob: data:; connect-src 'self'; base-uri 'none'; form-action 'none';"
@@ -46,8 +48,8 @@ class Guard:
     other pages in the same browser. Bodies above the limit are refused before they are read.
     """
 
-    def __init__(self, app: Any, token: str, port: int, max_bytes: int):
-        self._app, self._token, self._max_bytes = app, token, max_bytes
+    def __init__(self, app: Any, token: str, port: int):
+        self._app, self._token = app, token
         self._hosts = {f"{name}:{port}" for name in (LOOPBACK, "localhost")}
 
     async def __call__(self, scope, receive, send) -> None:
@@ -61,13 +63,13 @@ class Guard:
                 scope, receive, send
             )
             return
-        received = 0
+        received, most = 0, _most_bytes(request)
 
         async def limited():
             nonlocal received
             message = await receive()
             received += len(message.get("body", b""))
-            if received > self._max_bytes:  # of a body that does not tell its length
+            if received > most:  # of a body that does not tell its length
                 return {"type": "http.disconnect"}
             return message
 
@@ -100,9 +102,15 @@ class Guard:
         if not hmac.compare_digest(given.encode(), self._token.encode()):
             return 403, "open the address that `jaxbeam app` has printed, with its token"
         length = headers.get("content-length", "0")
-        if not length.isdigit() or int(length) > self._max_bytes:
-            return 413, f"this is more than the {self._max_bytes >> 20} MB that the page takes"
+        most = _most_bytes(request)
+        if not length.isdigit() or int(length) > most:
+            return 413, f"this is more than the {most >> 20} MB that the page takes"
         return None
+
+
+def _most_bytes(request: Request) -> int:
+    """Largest size of what may be sent: logs may be longer than cases."""
+    return MAX_LOG_BYTES if request.url.path == LOG_PATH else MAX_BYTES
 
 
 def packed(words: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Response:
@@ -193,17 +201,36 @@ def application(workspace: Workspace, opened: str | None, token: str, port: int)
         "preview": preview,
         "envelopes": lambda q: views.envelopes(workspace.record(q["text"])),
         "take": take,
+        "sweep": lambda q: {"job": workspace.start_sweep(q["text"], q["axes"])},
+        "fit": lambda q: {"job": workspace.start_fit(q["text"], q["logs"], q["free"])},
+        "compare": lambda q: {"job": workspace.start_comparison(q["text"], q["names"])},
+        "tune": lambda q: {
+            "job": workspace.start_tuning(q["text"], q["free"], q["vary"], q["spread"], q["steps"])
+        },
+        "controllers": lambda _: {"names": workspace.controllers()},
+        "job": lambda q: workspace.job(q["job"], q.get("known", 0), q.get("name") or "case.toml"),
+        "cancel": lambda q: workspace.cancel(q["job"]) or {},
         "words": lambda q: take_away.words(workspace, q["text"], q.get("name")),
     }
+
+    async def log(request: Request) -> Response:
+        name, content = unquote(request.headers.get("x-name", "")), await request.body()
+        try:
+            found = await run_in_threadpool(workspace.take_log, name, content)
+        except (ValueError, OSError, ImportError) as error:
+            return JSONResponse({"problem": jb.api.problem(error)._asdict()}, 422)
+        return JSONResponse(jb.api.plain(found))
+
     routes = [
         Route("/", index),
+        Route(LOG_PATH, log, methods=["POST"]),
         *(
             Route(f"/api/{name}", _asked(work), methods=["POST"])
             for name, work in questions.items()
         ),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]
-    return Guard(Starlette(routes=routes), token, port, MAX_BYTES)
+    return Guard(Starlette(routes=routes), token, port)
 
 
 def serve(folder: Path, opened: str | None, port: int, browser: bool) -> None:

@@ -9,6 +9,7 @@ import hashlib
 import itertools
 import os
 import re
+import tempfile
 import threading
 import warnings
 from collections.abc import Iterable, Mapping
@@ -20,10 +21,11 @@ import jax
 import numpy as np
 
 import jaxbeam as jb
-from jaxbeam.app import document, views
+from jaxbeam.app import document, studies, views
 from jaxbeam.case.case import Case, address_words, addresses, leaves_by_address, unit_at
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.reading.toml_file import parse_toml
+from jaxbeam.files.case_file import load_controller
 from jaxbeam.rigs import RIG_NAMES
 from jaxbeam.runtime.whole_file import whole_file
 from jaxbeam.simulation.simulate import ContactLossWarning
@@ -60,6 +62,7 @@ class Workspace:
         self.folder = Path(folder).resolve()
         self._cases, self._records, self._simulators = Remembered(), Remembered(), Remembered()
         self._jobs: dict[str, Any] = {}
+        self._uploads = tempfile.TemporaryDirectory(prefix="jaxbeam-")
         self._numbers = itertools.count(1)
         self._computing = threading.RLock()
 
@@ -227,24 +230,102 @@ class Workspace:
 
     # Work that takes long
 
-    def start(self, job: Any) -> str:
-        """Keep work that goes on; returns its number for `job`."""
+    def start_sweep(self, text: str, axes: Iterable[Mapping[str, Any]]) -> str:
+        """Begin a sweep; returns its number for `job`."""
+        sweep = studies.Sweep(self.case(text), list(axes))
+        return self._start(jb.api.Job(sweep.run), sweep)
+
+    def start_fit(self, text: str, names: Iterable[str], free: Mapping[str, Any]) -> str:
+        """Begin a fit of free numbers to logs that were given; returns its number for `job`."""
+        logs = [log for name in names for log in self.log(name)]
+        if not logs or not free:
+            raise ValueError("a fit needs a log and a free number at least")
+        return self._start(jb.api.Job(studies.fit, self.case(text), logs, dict(free)))
+
+    def start_comparison(self, text: str, names: Iterable[str]) -> str:
+        """Begin a comparison of the controller of a case, if any, with those of other files."""
+        case, found = self.case(text), {}
+        if case.controller is not None:
+            found["this case"] = case.controller
+        for name in names:
+            found[name.removesuffix(".toml")] = load_controller(self._place(name))
+        return self._start(jb.api.Job(studies.compare, case, found))
+
+    def start_tuning(self, text: str, free: Mapping[str, Any], vary: str, spread, steps) -> str:
+        """Begin a tuning of numbers of a controller; returns its number for `job`."""
+        parts = self.case(text), dict(free), vary, float(spread), int(steps)
+        return self._start(jb.api.Job(studies.tune, *parts))
+
+    def controllers(self) -> list[str]:
+        """Names of the files of the folder that have a controller."""
+        found = []
+        for name in self.files():
+            try:
+                if "controller" in parse_toml(self.read(name)["text"]):
+                    found.append(name)
+            except (ValueError, OSError):  # no case, or none that can be read
+                continue
+        return found
+
+    def take_log(self, name: str, content: bytes) -> dict[str, Any]:
+        """Keep a log that was dropped on the page; its columns, units and faults as read.
+
+        The file of a description that belongs to a log, as run.toml to run.csv, is kept for it.
+        Raises ValueError for what is no log.
+        """
+        studies.keep_log(Path(self._uploads.name), name, content)
+        if name.lower().endswith(".toml"):
+            return {"name": name, "logs": []}
+        return {"name": name, "logs": [studies.describe_log(log) for log in self.log(name)]}
+
+    def log(self, name: str) -> list[Any]:
+        """Logs of a file that was dropped on the page. Raises ValueError if there was none."""
+        path = Path(self._uploads.name) / Path(name).name
+        if not path.is_file():
+            raise ValueError(f"there is no log {name!r}: drop it on the page again")
+        return studies.read_logs(path)
+
+    def _start(self, job: "jb.api.Job", sweep: studies.Sweep | None = None) -> str:
+        """Keep work that goes on, of the last few; returns its number."""
         number = str(next(self._numbers))
-        self._jobs[number] = job
+        self._jobs[number] = job, sweep
         for old in list(self._jobs)[:-KEPT]:
-            self._jobs.pop(old).cancel()
+            self._jobs.pop(old)[0].cancel()
         return number
 
-    def job(self, number: str) -> Any:
-        """Work that was started. Raises ValueError for a number that is not known."""
+    def job(self, number: str, known: int = 0, name: str = "case.toml") -> dict[str, Any]:
+        """State of work: its progress, whether it is done, and its result or what was wrong.
+
+        Of a sweep, the rows beyond those that are `known`, and the words to compute it again.
+        Raises ValueError for a number that is not known.
+        """
+        job, sweep = self._known_job(number)
+        state: dict[str, Any] = {"done": job.done, "progress": list(job.progress), "problem": None}
+        if sweep is not None:
+            state |= {"sweep": sweep.state(known), "words": sweep.words(name)}
+        if job.done:
+            try:
+                state["result"] = job.result()
+            except jb.api.Cancelled:
+                state["problem"] = jb.api.Problem("stopped")._asdict()
+            except Exception as error:  # of whatever work, for who looks at it
+                state["problem"] = jb.api.problem(error)._asdict()
+        return state
+
+    def cancel(self, number: str) -> None:
+        """Ask work to end. Raises ValueError for a number that is not known."""
+        self._known_job(number)[0].cancel()
+
+    def _known_job(self, number: str) -> Any:
         if number not in self._jobs:
             raise ValueError("this work is no longer known: start it again")
         return self._jobs[number]
 
     def close(self) -> None:
-        """Cancel all work."""
-        for job in self._jobs.values():
+        """Cancel all work, and forget the logs."""
+        for job, _ in self._jobs.values():
             job.cancel()
+        self._uploads.cleanup()
 
 
 def _starters() -> list[str]:

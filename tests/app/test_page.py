@@ -11,6 +11,7 @@ import tomllib
 import pytest
 
 from tests.app.conftest import RIG, Server, go
+from tests.modules import ROOT
 
 LIMITS = 100, 200  # ms, median and 95 %, from a slider to its picture
 
@@ -249,7 +250,7 @@ def test_the_page_is_for_everyone(page, theme):
 
     page.emulate_media(color_scheme=theme)
     open_all(page)
-    for tab in ("Histories", "Envelopes", "Take away"):
+    for tab in ("Histories", "Envelopes", "Sweep", "Identify", "Control", "Take away"):
         page.get_by_role("tab", name=tab).click()
         found = Axe().run(page, options={"runOnly": ["wcag2a", "wcag2aa", "wcag21aa", "wcag22aa"]})
         assert found.violations_count == 0, found.generate_report()
@@ -267,3 +268,43 @@ def test_nothing_is_wider_than_the_window(page, width):
             .map((one) => one.outerHTML.slice(0, 80))"""
     )
     assert wide == []
+
+
+def test_a_map_fills_and_a_cell_opens_its_run(page):
+    page.get_by_role("tab", name="Sweep").click()
+    page.get_by_label("Over", exact=True).select_option("loads.0.speed")
+    page.get_by_label("and over").select_option("loads.0.mass")
+    page.get_by_label("values").nth(0).fill("4")
+    page.get_by_label("values").nth(1).fill("3")
+    page.get_by_role("button", name="Sweep", exact=True).click()
+    wait_for(lambda: page.locator(".cell:enabled").count() == 12, 120)
+    assert "--over loads.0.speed=0.5:2.0:4" in page.locator(".sweep .code").inner_text()
+    page.locator(".cell").first.focus()
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("Enter")
+    wait_for(lambda: "mass = 0.5" in text_of(page))
+    assert 'speed = "3.6 km/h"' in text_of(page)
+
+
+def test_a_log_is_dropped_and_shown_as_read(page, server):
+    log = server.path.parent / "log.csv"
+    log.write_text("time [s],w1 [mm]\n" + "".join(f"{i / 100},{i % 7}\n" for i in range(50)))
+    page.get_by_role("tab", name="Identify").click()
+    page.locator("#log-files").set_input_files(log)
+    page.wait_for_selector(".log")
+    assert page.locator(".log td").all_inner_texts() == ["w1", "deflection", "mm"]
+    assert page.locator(".chip").all_inner_texts()[0].startswith("beam.flexural_rigidity")
+    page.locator("#log-files").set_input_files(
+        {"name": "log.exe", "mimeType": "text/plain", "buffer": b"no"}
+    )
+    wait_for(lambda: "is no log" in page.locator("#status").inner_text())
+
+
+def test_a_controller_is_compared_with_the_bound(page):
+    write(page, (ROOT / "examples/controlled_rig/case.toml").read_text())
+    page.get_by_role("tab", name="Control").click()
+    page.get_by_role("button", name="Compare", exact=True).click()
+    page.wait_for_selector(".control meter", timeout=120_000)
+    names = page.locator(".control td:first-child").all_inner_texts()
+    assert names == ["without control", "this case", "least of any"]

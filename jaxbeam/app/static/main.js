@@ -1,13 +1,16 @@
 // The page: bar, model, stage and panels, put together.
 
 import { ask } from "./api.js";
+import { createControl } from "./control.js";
 import { html, tabs } from "./dom.js";
 import { createFields } from "./fields.js";
 import { createEnvelopes, createHistories } from "./histories.js";
+import { createIdentify } from "./identify.js";
 import { createLibrary } from "./library.js";
 import { createSliders } from "./sliders.js";
 import { createStage } from "./stage.js";
 import { Store } from "./store.js";
+import { createSweep } from "./sweep.js";
 import { createTake } from "./take.js";
 import { createText } from "./text.js";
 
@@ -38,7 +41,14 @@ place("stage").append(stage.element);
 place("sliders").append(sliders.element);
 
 /** @type {Record<string, {element: HTMLElement, show?: () => void, hide?: () => void}>} */
-const panels = { Histories: createHistories(store), Envelopes: createEnvelopes(store), "Take away": createTake(store) };
+const panels = {
+  Histories: createHistories(store),
+  Envelopes: createEnvelopes(store),
+  Sweep: createSweep(store),
+  Identify: createIdentify(store),
+  Control: createControl(store),
+  "Take away": createTake(store),
+};
 const results = tabs("results", Object.fromEntries(Object.entries(panels).map(([title, panel]) => [title, panel.element])), (title) => {
   for (const [one, panel] of Object.entries(panels)) (one === title ? panel.show : panel.hide)?.();
 });

@@ -21,6 +21,7 @@ import { html, number, scaled } from "./dom.js";
  * @property {{x: number, name: string}[]} [events]
  * @property {{x: number, y: number, tint: number, name: string}[]} [dots]
  * @property {{y: number, name: string, tint: number}[]} [limits]
+ * @property {boolean} [zero] whether zero is in sight; unless false
  */
 
 const MARGIN = { left: 58, right: 14, top: 8, bottom: 22 };
@@ -117,11 +118,11 @@ export class Plot {
     const [from, to] = this.#domain;
     const { x, series, limits = [] } = this.#content;
     const [first, last] = [Math.max(0, indexAt(x, from)), Math.min(x.length - 1, indexAt(x, to) + 1)];
-    let [low, high] = [0, 0];
+    let [low, high] = this.#content.zero === false ? [Infinity, -Infinity] : [0, 0];
     for (const { y } of series) {
       for (let i = first; i <= last; i++) {
         if (y[i] < low) low = y[i];
-        else if (y[i] > high) high = y[i];
+        if (y[i] > high) high = y[i];
       }
     }
     const size = high - low;

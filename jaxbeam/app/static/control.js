@@ -1,0 +1,78 @@
+// Controllers side by side with the least peak of any; and numbers of one, tuned by gradient steps.
+
+import { ask } from "./api.js";
+import { html, number, scaled } from "./dom.js";
+import { addressChoice, createJob, labelled } from "./job.js";
+import { Plot } from "./plot.js";
+
+/** @param {import("./store.js").Store} store */
+export function createControl(store) {
+  const files = html("div.chips");
+  const table = html("div");
+  const deflections = new Plot({ title: "Deflection", unit: "m" });
+  const commands = new Plot({ title: "Command", unit: "" });
+  const pair = html("div.plots", { hidden: true }, deflections.element, commands.element);
+  const compare = createJob(store, "Compare", async () => {
+    const names = [...files.querySelectorAll("input:checked")].map((one) => /** @type {HTMLInputElement} */ (one).value);
+    return { name: "compare", question: { text: store.text, names } };
+  }, (state) => {
+    if (state.result) comparison(state.result);
+    return 0;
+  });
+
+  /** @param {any} found */
+  function comparison(found) {
+    const [factor, unit] = scaled(found.uncontrolled, "m");
+    const share = (/** @type {number} */ value) => `${number(100 * value, 3)} %`;
+    const rows = [
+      ["without control", found.uncontrolled, null], ...found.rows.map((/** @type {any} */ one) => [one.name, one.peak, one]), ["least of any", found.bound, null],
+    ].map(([name, peak, one]) => html("tr", {}, html("td", {}, name), html("td.number", {}, `${number(peak / factor)} ${unit}`),
+      html("td", {}, ...(one ? [html("meter", { min: 0, max: 1, value: Math.max(0, one.share), "aria-label": "share of the attainable" }), ` ${share(one.share)}`] : [])),
+      html("td.number", {}, one ? share(one.saturated) : ""), html("td", {}, one?.remarks ?? "")));
+    table.replaceChildren(html("table.data", {}, html("thead", {}, html("tr", {}, ...["controller", "peak", "of the attainable", "at a limit", "remarks"].map((words) => html("th", {}, words)))), html("tbody", {}, ...rows)));
+    pair.hidden = false;
+    const runs = Object.entries(found.runs);
+    const x = /** @type {any} */ (runs[0][1]).times;
+    deflections.show({ x, series: runs.map(([name, run], i) => ({ name, tint: i, y: /** @type {any} */ (run).deflection })) });
+    commands.options.unit = found.unit;
+    const driven = runs.map(([name, run], i) => ({ name, tint: i, y: /** @type {any} */ (run).command[0], steps: true })).filter((one) => one.name !== "without" && one.y);
+    commands.show({ x, series: driven });
+  }
+
+  const free = addressChoice(store, "Tune");
+  const vary = addressChoice(store, "for runs that differ in");
+  const spread = html("input", { value: 20, size: 3, inputmode: "decimal", autocomplete: "off" });
+  const steps = html("input", { value: 30, size: 3, inputmode: "numeric", autocomplete: "off" });
+  const verdict = html("div");
+  const history = new Plot({ title: "Objective by step", unit: "", axis: "step" });
+  history.element.hidden = true;
+  const tune = createJob(store, "Tune", async () => {
+    if (!free.select.value || !vary.select.value) {
+      store.say("choose a number to tune, and one in which the runs differ", true);
+      return null;
+    }
+    return { name: "tune", question: { text: store.text, free: { [free.select.value]: null }, vary: vary.select.value, spread: Number(spread.value) / 100, steps: Number(steps.value) } };
+  }, (state) => {
+    const { result } = state;
+    if (!result) return 0;
+    const keep = html("button", { type: "button", onclick: () => store.change(...Object.entries(result.settings).map(([address, to]) => ({ set: address, to: Number(/** @type {number} */ (to).toPrecision(6)) }))) }, "Put it into the case");
+    const words = Object.entries(result.settings).map(([address, value]) => `${address} = ${number(/** @type {number} */ (value), 5)}`).join(", ");
+    verdict.replaceChildren(html("h3", {}, words, keep), html("p", {}, result.verdict));
+    history.element.hidden = false;
+    const seen = result.history.map((/** @type {number | null} */ one) => one ?? NaN);
+    history.show({ zero: false, x: seen.map((/** @type {number} */ _, /** @type {number} */ i) => i), series: [{ name: "objective", tint: 0, y: seen }] });
+    return 0;
+  });
+
+  async function show() {
+    await store.attempt(async () => {
+      const { names } = await ask("controllers");
+      files.replaceChildren(...names.filter((/** @type {string} */ name) => name !== store.name).map((/** @type {string} */ name) => html("label.chip", {}, html("input", { type: "checkbox", value: name, checked: true }), name)));
+    });
+  }
+
+  const element = html("div.control", {},
+    html("h3", {}, "Compare this controller with those of the folder"), html("div.form", {}, files, compare.element), table, pair,
+    html("h3", {}, "Tune by gradient steps"), html("div.form", {}, free.element, vary.element, labelled("by ± %", spread), labelled("steps", steps), tune.element), verdict, html("div.plots", {}, history.element));
+  return { element, show };
+}

@@ -1,0 +1,264 @@
+"""Sweeps, fits, comparisons and tunings of the page: work whose results are seen as it goes on."""
+
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import jaxbeam as jb
+from jaxbeam.case.case import Case, own_addresses, unit_at
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.reading.units import number_in_si
+from jaxbeam.files.sweep_table import sweep_columns
+
+MAX_SWEPT = 10_000  # runs of a map on the screen
+MAX_SHOWN = 1500  # samples of a log or a fit on the screen
+LOG_ENDINGS = (".csv", ".txt", ".tsv", ".dat", ".mat", ".npz", ".h5", ".hdf5", ".tdms", ".uff")
+LOG_ENDINGS += (".unv", ".parquet", ".lvm", ".nc", ".xlsx", ".toml")
+
+
+def axis_values(case: Case, axis: Mapping[str, Any]) -> list[Any]:
+    """Values of an axis of a sweep: words, or so many numbers from one to another, also with units.
+
+    Raises ValueError for an axis without two values and for numbers that cannot be read.
+    """
+    address = str(axis["address"])
+    if "words" in axis:
+        words = [word.strip() for word in axis["words"].split(",") if word.strip()]
+        if not words:
+            raise ValueError(f"{address} takes words, separated by commas")
+        return words
+    own_addresses(case, address)  # or else an error with the nearest
+    unit = unit_at(case, address)
+    ends = (number_in_si(axis[end], unit, f"{address}: {end}") for end in ("from", "to"))
+    count = int(axis["count"])
+    if not 2 <= count <= MAX_SWEPT:
+        raise ValueError(f"{address}: a sweep takes from 2 to {MAX_SWEPT} values, not {count}")
+    return np.linspace(*ends, count).tolist()
+
+
+class Sweep:
+    """A sweep over one or two addresses, row by row, each row once it is known.
+
+    The rows are those of the words, or else of the second address; what is `found` of a row are
+    the columns of its table (`files.sweep_table`).
+    """
+
+    def __init__(self, case: Case, axes: Sequence[Mapping[str, Any]]):
+        if not 1 <= len(axes) <= 2:
+            raise ValueError("a map is drawn over one or two addresses")
+        values = {str(axis["address"]): axis_values(case, axis) for axis in axes}
+        if len(values) < len(axes):
+            raise ValueError("the two addresses of a map are the same")
+        if np.prod([len(one) for one in values.values()]) > MAX_SWEPT:
+            raise ValueError(f"a map on the screen has at most {MAX_SWEPT} runs: take fewer values")
+        words = [address for address in values if isinstance(values[address][0], str)]
+        names = list(values)
+        self.rows = words[0] if words else names[-1] if len(names) > 1 else ""
+        self.columns = next((name for name in names if name != self.rows), "")
+        self.values, self.case = values, case
+        self.found: list[dict[str, list[float]]] = []
+
+    def run(self) -> None:
+        """Compute all rows, one after the other. Raises as `jaxbeam.sweep`."""
+        along = {self.columns: self.values[self.columns]} if self.columns else {}
+        for value in self.values[self.rows] if self.rows else [None]:
+            across = {} if value is None else {self.rows: [value]}
+            table = sweep_columns(jb.sweep(self.case, along | across, progress=False))
+            peaks = {
+                head: np.asarray(column, float).tolist()
+                for head, column in table.items()
+                if (" peak " in head and not head.startswith("time of"))
+                or "contact force" in head
+                or head == "failed"
+            }
+            self.found.append(peaks)
+
+    def state(self, known: int) -> dict[str, Any]:
+        """Axes, and rows beyond those that are known."""
+        unit = {
+            a: "" if isinstance(v[0], str) else unit_at(self.case, a)
+            for a, v in self.values.items()
+        }
+        return {
+            "rows": self.rows,
+            "columns": self.columns,
+            "values": self.values,
+            "units": unit,
+            "found": self.found[known:],
+        }
+
+    def words(self, name: str) -> dict[str, str]:
+        """The same sweep in Python and on the command line, for a case in a file of some name."""
+        python, command = [], []
+        for address, values in self.values.items():
+            if isinstance(values[0], str):
+                python.append(f"{address!r}: {values!r}")
+                command.append(f"--over {address}={','.join(values)}")
+            else:
+                low, high, count = values[0], values[-1], len(values)
+                python.append(f"{address!r}: np.linspace({low!r}, {high!r}, {count})")
+                command.append(f"--over {address}={low!r}:{high!r}:{count}")
+        return {
+            "python": "import jaxbeam as jb\nimport numpy as np\n\n"
+            f"runs = jb.sweep(jb.load_case({name!r}), {{{', '.join(python)}}})",
+            "command": f"jaxbeam sweep {name} {' '.join(command)} --plot",
+        }
+
+
+def keep_log(folder: Path, name: str, content: bytes) -> Path:
+    """Keep an uploaded log, or its description, under its own name in a folder of its own.
+
+    Raises ValueError for a name that no log has.
+    """
+    plain = re.fullmatch(r"[^./\\\0][^/\\\0]{0,200}", name) is not None
+    if not plain or not name.lower().endswith(LOG_ENDINGS):
+        raise ValueError(f"{name!r} is no log: it should end with {', '.join(LOG_ENDINGS)}")
+    path = folder / name
+    path.write_bytes(content)
+    return path
+
+
+def read_logs(path: Path) -> list[Any]:
+    """Logs of a file. Raises ValueError as `tuning.read_logs`."""
+    import warnings
+
+    import tuning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the notes and faults of the log tell it
+        logs = tuning.read_logs(path)
+    folder = f"{path.parent}/"  # of the server: no one's who drops a log on the page
+    return [dataclasses.replace(log, source=log.source.removeprefix(folder)) for log in logs]
+
+
+def describe_log(log: Any) -> dict[str, Any]:
+    """Columns of a log with their units as read, its faults in words, and its samples."""
+    import tuning
+
+    chosen = _spread(log.times.size)
+    return {
+        "source": log.source,
+        "duration": log.duration,
+        "rate": log.sample_rate,
+        "channels": [
+            {"name": name, "quantity": quantity, "unit": unit}
+            for name, quantity, unit in zip(log.names, log.quantities, log.units, strict=True)
+        ],
+        "loads": None if log.loads is None else [load.kind for load in log.loads],
+        "faults": [str(fault) for fault in tuning.find_faults(log)],
+        "notes": list(log.notes),
+        "times": log.times[chosen],
+        "values": log.values[chosen].T,
+    }
+
+
+def _spread(count: int) -> np.ndarray:
+    return np.unique(np.linspace(0, count - 1, min(count, MAX_SHOWN)).round().astype(int))
+
+
+def fit(case: Case, logs: Sequence[Any], free: Mapping[str, Any]) -> dict[str, Any]:
+    """Fit free numbers of a case, each with bounds (also with units) or None, to logs.
+
+    Values with intervals, remarks on what the data cannot see, and measured and fitted readings.
+    """
+    import tuning
+    from jaxbeam.case.sensors import sensor_labels
+
+    loaded = case if logs[0].loads is None else dataclasses.replace(case, loads=logs[0].loads)
+    bounds = {}
+    for address, pair in free.items():
+        if pair is not None:
+            unit = unit_at(loaded, re.sub(r"^logs\.[^.]+\.", "", address))
+            pair = tuple(number_in_si(end, unit, address) for end in pair)
+        bounds[address] = pair
+    found = tuning.identify(case, logs, bounds)
+    data, runs = found.dataset, []
+    for i, log in enumerate(data.logs):
+        chosen = _spread(log.times.size)
+        mask = data.mask[i][chosen] > 0
+        runs.append(
+            {
+                "source": log.source,
+                "times": log.times[chosen],
+                "measured": np.where(mask, data.measured[i][chosen], np.nan).T,
+                "fitted": np.where(mask, found.fitted[i][chosen], np.nan).T,
+            }
+        )
+    sensors = case.all_sensors
+    labels = sensor_labels(case.sensors)
+    labels = [*labels, *(f"vehicle {one.quantity}" for one in case.vehicle_sensors)]
+    return found.to_dict() | {
+        "remarks": found.remarks,
+        "noise": np.asarray(found.noise),
+        "runs": runs,
+        "channels": [
+            {"name": label, "quantity": one.quantity, "unit": one.unit}
+            for label, one in zip(labels, sensors, strict=True)
+        ],
+    }
+
+
+def compare(case: Case, controllers: Mapping[str, Any]) -> dict[str, Any]:
+    """Metrics and runs of controllers, without control, and with the least peak of any."""
+    from jaxbeam.analysis.compare import compare as compare_controllers
+
+    found = compare_controllers(case, dict(controllers))
+    records = {"without": found.uncontrolled, **found.records, "bound": found.optimal}
+    rows = []
+    for name, metrics in found.metrics.items():
+        rows.append(
+            {
+                "name": name,
+                "peak": metrics.peak,
+                "share": metrics.share,
+                "rms": metrics.rms,
+                "after_exit": metrics.after_exit,
+                "saturated": float(np.max(metrics.saturated, initial=0.0)),
+                "remarks": found.loop_summary(name),
+            }
+        )
+    runs = {}
+    for name, record in records.items():
+        chosen = _spread(record.times.size)
+        worst = int(np.argmax(record.peak_deflection)) if len(case.sensors) else 0
+        runs[name] = {
+            "times": record.times[chosen],
+            "deflection": record.deflection[chosen, worst],
+            "command": record.command[chosen].T,
+        }
+    uncontrolled = float(np.max(found.uncontrolled.peak_deflection))
+    return {
+        "rows": rows,
+        "uncontrolled": uncontrolled,
+        "bound": float(np.max(found.optimal.peak_deflection)),
+        "runs": runs,
+        "unit": next((one.command_unit for one in case.driven), ""),
+    }
+
+
+def tune(
+    case: Case, free: Mapping[str, Any], vary: str, spread: float, steps: int
+) -> dict[str, Any]:
+    """Tune numbers of a controller on three runs in which one number varies, judged on two.
+
+    The number at `vary` is a share `spread` smaller, as it is, and as much larger in training, half
+    as much in the runs held out.
+    """
+    import tuning
+
+    middle = float(concrete(jb.addresses(case)[vary]))
+    at = [{vary: middle * (1 + share * spread)} for share in (-1.0, 0.0, 1.0, -0.5, 0.5)]
+    runs = tuning.LoadCases(tuple(at[:3]), tuple(at[3:]))
+    bounds = {
+        address: None if pair is None else tuple(map(float, pair)) for address, pair in free.items()
+    }
+    found = tuning.tune(case, bounds, runs, steps=steps, progress=False)
+    return found.to_dict() | {
+        "history": found.history[:, 0],
+        "verdict": found.verdict,
+        "settings": dict(zip(free, map(float, found.values), strict=True)),
+    }
