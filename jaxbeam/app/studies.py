@@ -12,7 +12,7 @@ import jaxbeam as jb
 from jaxbeam.case.case import Case, own_addresses, unit_at
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.reading.units import number_in_si
-from jaxbeam.files.sweep_table import sweep_columns
+from jaxbeam.files.tables import sweep_columns
 
 MAX_SWEPT = 10_000  # runs of a map on the screen
 MAX_SHOWN = 1500  # samples of a log or a fit on the screen
@@ -44,7 +44,7 @@ class Sweep:
     """A sweep over one or two addresses, row by row, each row once it is known.
 
     The rows are those of the words, or else of the second address; what is `found` of a row are
-    the columns of its table (`files.sweep_table`).
+    the columns of its table (`jaxbeam.files.tables`).
     """
 
     def __init__(self, case: Case, axes: Sequence[Mapping[str, Any]]):

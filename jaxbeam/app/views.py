@@ -40,6 +40,7 @@ def scene(case: Case) -> dict[str, Any]:
             for one in case.supports
         ],
         "hinges": [float(concrete(one.position)) for one in case.beam.hinges],
+        "absorbers": [{"position": float(concrete(one.position))} for one in case.absorbers],
         "actuators": [
             {"kind": one.kind, "unit": one.command_unit, "positions": actuator_positions(one)}
             for one in case.actuators
@@ -110,8 +111,9 @@ def pictures(record: Record) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
     `beam` (frame, x) is the deflection (m) at `x` (m) and `frameTimes` (s), `wheelPositions`
     (frame, wheel) and `bodies` (frame, dof) are those of the loads; `sensors` (time, sensor),
-    `contact` (time, wheel) of the first wheels and `commands` (time, actuator) are histories over
-    `times`, in SI units. Only so many samples as a screen can show are among them.
+    `contact` (time, wheel) of the first wheels, `strokes` (time, absorber) and `commands` (time,
+    actuator) are histories over `times`, in SI units. Only so many samples as a screen can show are
+    among them.
     """
     case, loads = record.case, load_set(record.case)
     frames = _spread(record.times.size, MAX_FRAMES)
@@ -120,7 +122,8 @@ def pictures(record: Record) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     limits = [one.command_limits() for one in case.actuators]
     lost = np.asarray(record.contact_lost_time), np.asarray(record.contact_lost_position)
     diverged = float(record.diverged_time)
-    shown = list(range(min(MAX_WHEELS, loads.wheel_count)))
+    wheels = [w for w, load in enumerate(loads.load_of_wheel) if load < len(case.loads)]
+    shown = wheels[:MAX_WHEELS]
     words = {
         "verdict": record.verdict,
         "steps": int(record.steps),
@@ -131,17 +134,19 @@ def pictures(record: Record) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         "lost": [
             {"wheel": int(i), "time": float(lost[0][i]), "position": float(lost[1][i])}
             for i in np.flatnonzero(np.isfinite(lost[0]))
+            if i in wheels
         ],
         "limits": [None if one is None else [float(v) for v in one] for one in limits],
         "extremes": {
             name: np.asarray(values).tolist() for name, values in record.extremes._asdict().items()
         },
-        "crossing": np.asarray(concrete(loads.entry_exit_times())).tolist(),
+        "crossing": np.asarray(concrete(loads.entry_exit_times()))[wheels].tolist(),
     }
     arrays = {
         "times": record.times[samples],
         "sensors": record.sensor_values[samples],
         "contact": record.contact_force[samples][:, shown],
+        "strokes": record.stroke[samples],
         "commands": record.command[samples],
         "saturated": record.saturated[samples],
         "frameTimes": record.times[frames],

@@ -34,6 +34,16 @@ sample_rate = 500.0
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
+@pytest.fixture
+def workspace(rig):
+    """The folder of a rig, opened."""
+    from jaxbeam.app.workspace import Workspace
+
+    opened = Workspace(rig.parent)
+    yield opened
+    opened.close()
+
+
 class Server:
     """The command `jaxbeam app` for a file, in a process of its own."""
 

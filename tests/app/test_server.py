@@ -14,7 +14,6 @@ import uvicorn
 import jaxbeam as jb
 from jaxbeam.app.server import HEADERS, MAX_BYTES, application
 from jaxbeam.app.take_away import KINDS
-from jaxbeam.app.workspace import Workspace
 from tests.app.conftest import RIG
 
 TOKEN = "a-token-of-the-tests"
@@ -55,11 +54,11 @@ class Client:
 
 
 @pytest.fixture
-def client(rig):
+def client(workspace):
     with socket.socket() as listening:
         listening.bind(("127.0.0.1", 0))
         port = listening.getsockname()[1]
-        app = application(Workspace(rig.parent), "rig.toml", TOKEN, port)
+        app = application(workspace, "rig.toml", TOKEN, port)
         server = uvicorn.Server(uvicorn.Config(app, log_level="error", lifespan="off", ws="none"))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
         thread.start()

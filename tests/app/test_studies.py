@@ -7,20 +7,12 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.app.workspace import Workspace
 from tests.app.conftest import RIG
 from tests.modules import ROOT
 
 SPEED = {"address": "loads.0.speed", "from": "1.8 km/h", "to": 1.5, "count": 4}
 MASS = {"address": "loads.0.mass", "from": 0.1, "to": "400 g", "count": 3}
 PEAK = "first span peak deflection (m)"
-
-
-@pytest.fixture
-def workspace(rig):
-    one = Workspace(rig.parent)
-    yield one
-    one.close()
 
 
 def finished(workspace, number, seconds=300):

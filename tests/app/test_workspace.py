@@ -5,13 +5,8 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.app import views
-from jaxbeam.app.workspace import PREVIEW_TOLERANCE, Workspace
+from jaxbeam.app.workspace import PREVIEW_TOLERANCE
 from tests.app.conftest import RIG
-
-
-@pytest.fixture
-def workspace(rig):
-    return Workspace(rig.parent)
 
 
 def test_a_model_has_tables_scene_and_numbers(workspace):
@@ -86,8 +81,8 @@ def test_pictures_are_those_of_the_record(workspace):
     assert words["extremes"]["smallest"][0] == pytest.approx(float(record.smallest[0]))
 
 
-def test_a_vehicle_is_drawn_from_its_parts():
-    text = Workspace(".").library_text("road-bridge")
+def test_a_vehicle_is_drawn_from_its_parts(workspace):
+    text = workspace.library_text("road-bridge")
     scene = views.scene(jb.api.load_case(text))
     vehicle = next(load["vehicle"] for load in scene["loads"] if load["vehicle"])
     assert len(vehicle["parts"]) >= vehicle["wheels"] // 2
@@ -144,3 +139,15 @@ def test_every_case_to_start_from_is_right(workspace):
         assert model["problem"] is None and model["scene"]["length"] > 0
     with pytest.raises(ValueError, match="no case 'X'"):
         workspace.library_text("X")
+
+
+def test_absorbers_are_parts_that_swing_and_no_wheels_of_loads(workspace):
+    text = RIG + "\n[[absorbers]]\nposition = 0.3\nmass = 0.02\nfrequency = 8.0\n"
+    record = workspace.record(text + "damping_ratio = 0.1\n")
+    words, arrays = views.pictures(record)
+    assert workspace.model(text)["scene"]["absorbers"] == [{"position": 0.3}]
+    assert words["shownWheels"] == [0] and len(words["crossing"]) == 1
+    np.testing.assert_array_equal(arrays["strokes"], record.stroke)
+    frames = np.searchsorted(record.times, arrays["frameTimes"])
+    swing = arrays["bodies"][:, -1] - record.at(0.3)[frames]
+    np.testing.assert_allclose(swing, record.stroke[frames, 0], atol=1e-12)

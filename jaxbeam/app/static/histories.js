@@ -22,7 +22,7 @@ export function createHistories(store) {
     const { run, scene } = store;
     verdict.textContent = run.verdict;
     verdict.classList.toggle("alarm", run.lost.length > 0 || run.diverged !== null);
-    const { times, sensors, contact, commands, saturated } = run.arrays;
+    const { times, sensors, contact, strokes, commands, saturated } = run.arrays;
     const x = times.data;
     const spans = onBeam(run.crossing, store.duration);
     const events = run.lost.map((/** @type {any} */ one) => ({ x: one.time, name: `contact of load ${run.wheels[one.wheel]} lost` }));
@@ -37,6 +37,10 @@ export function createHistories(store) {
     if (contact.shape[1]) {
       const series = run.shownWheels.map((/** @type {number} */ wheel, /** @type {number} */ i) => ({ name: `load ${run.wheels[wheel]}`, tint: i, y: column(contact, i) }));
       wanted.push({ title: "Contact force", unit: "N", content: { x, series, spans, events } });
+    }
+    if (strokes.shape[1]) {
+      const series = Array.from({ length: strokes.shape[1] }, (_, i) => ({ name: `absorber ${i}`, tint: i, y: column(strokes, i) }));
+      wanted.push({ title: "Stroke of absorbers", unit: "m", content: { x, series, spans } });
     }
     if (commands.shape[1] && scene.controller !== null) {
       const unit = scene.actuators.find((/** @type {any} */ one) => one.unit !== "1")?.unit ?? "";

@@ -132,7 +132,7 @@ function drawScene(store, scene, size) {
   const rest = svg("path", { class: "rest", d: `M${X(0)},${floor}H${X(length)}` });
   const ground = svg("path", { class: "ground", d: wide ? `M0,${floor}H${X(0)}M${X(length)},${floor}H${size.width}` : "" });
   const profile = svg("path", { class: "surface" });
-  const parts = drawParts(store, scene, { X, back, floor, height, width: size.width });
+  const parts = drawParts(store, scene, { X, back, floor, height, scale, at });
   const loads = drawLoads(store, scene, { X, back, floor, height, surface, scale, share, at });
   const lost = (run?.lost ?? []).map((/** @type {any} */ one) => ({ ...one, mark: svg("text", { class: "lost", "text-anchor": "middle" }, "contact lost") }));
   const saturated = scene.actuators.map((/** @type {any} */ one) => svg("text", { class: "lost", x: X(one.positions[0]), y: floor + 52, "text-anchor": "middle" }, "at its limit"));
@@ -172,7 +172,7 @@ function drawScene(store, scene, size) {
  * @param {import("./store.js").Store} store @param {any} scene @param {any} view
  */
 function drawParts(store, scene, view) {
-  const { X, back, floor, height } = view;
+  const { X, back, floor, height, scale, at } = view;
   /** @type {{element: any, x: () => number, follows: boolean}[]} */
   const moving = [];
 
@@ -242,7 +242,7 @@ function drawParts(store, scene, view) {
   const supports = scene.supports.map((/** @type {any} */ one, /** @type {number} */ i) =>
     part("supports", i, `support ${i}`, [one.position], one.elastic ? [grip(), svg("path", { class: "line", d: "M0,2V6L6,9L-6,13L6,17L-6,21L0,24V28M-11,28H11" })] : [grip(), pin()], false));
   const actuators = scene.actuators.map((/** @type {any} */ one, /** @type {number} */ i) => {
-    const words = one.kind === "spring" ? `absorber ${i}` : `actuator ${i}, ${one.kind}`;
+    const words = `actuator ${i}, ${one.kind}`;
     const shape = one.positions.length > 1
       ? [svg("path", { class: "patch", d: `M0,4H${X(one.positions[1]) - X(one.positions[0])}` })]
       : [svg("path", { class: "device", d: "M0,2V12M-10,12H10V30H-10Z" })];
@@ -250,11 +250,22 @@ function drawParts(store, scene, view) {
   });
   const sensors = scene.sensors.map((/** @type {any} */ one, /** @type {number} */ i) =>
     part("sensors", i, `sensor ${one.label}`, [one.position], [grip(), svg("circle", { class: `dot tint-${i % 6}`, r: 5.5 })], true));
+  const bodies = store.run?.arrays.bodies;
+  const boxes = scene.absorbers.map(() => svg("path", { class: "device", d: "M-11,24H11V40H-11Z" }));
+  const absorbers = scene.absorbers.map((/** @type {any} */ one, /** @type {number} */ i) =>
+    part("absorbers", i, `absorber ${i}`, [one.position], [svg("path", { class: "line", d: "M0,2V6L5,8L-5,12L5,16L-5,20L0,22V24" }), boxes[i]], true));
+  /** Absorbers swing below the beam, as far as there is room. */
+  const swing = () => boxes.forEach((/** @type {any} */ box, /** @type {number} */ i) => {
+    const first = (bodies?.shape[1] ?? 0) - boxes.length;
+    if (first < 0) return;
+    const stroke = scale * at(bodies, first + i) - height(scene.absorbers[i].position);
+    box.setAttribute("transform", `translate(0,${Math.min(Math.max(-stroke || 0, -14), 22)})`);
+  });
   const hinges = scene.hinges.map((/** @type {number} */ x) => svg("circle", { class: "hinge", cx: X(x), cy: floor, r: 4 }));
   return {
-    below: [...ends, ...supports, ...actuators],
+    below: [...ends, ...supports, ...absorbers, ...actuators],
     above: [...hinges, ...sensors],
-    update: () => moving.forEach(({ element, x, follows }) => element.setAttribute("transform", `translate(${X(x())},${floor - (follows ? height(x()) : 0)})`)),
+    update: () => (swing(), moving.forEach(({ element, x, follows }) => element.setAttribute("transform", `translate(${X(x())},${floor - (follows ? height(x()) : 0)})`))),
   };
 }
 
