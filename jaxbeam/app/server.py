@@ -163,6 +163,7 @@ def application(workspace: Workspace, opened: str | None, token: str, port: int)
             "names": names,
         }
 
+    offsets = [{"name": name, "offsets": train.offsets} for name, train in trains().items()]
     names = {"model": vehicle_names(), "train": list(trains())}
 
     def run(question) -> Response:
@@ -210,6 +211,7 @@ def application(workspace: Workspace, opened: str | None, token: str, port: int)
         "controllers": lambda _: {"names": workspace.controllers()},
         "job": lambda q: workspace.job(q["job"], q.get("known", 0), q.get("name") or "case.toml"),
         "cancel": lambda q: workspace.cancel(q["job"]) or {},
+        "vehicles": lambda _: {"vehicles": views.vehicles(), "trains": offsets},
         "words": lambda q: take_away.words(workspace, q["text"], q.get("name")),
     }
 

@@ -4,14 +4,16 @@ from typing import Any
 
 import numpy as np
 
+import jaxbeam as jb
 from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.loads.planar.vehicle import vehicle_names
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.model.along_beam import positions_along
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.plot.schematic import actuator_positions, surface_height
-from jaxbeam.plot.traffic.drawing import drawn_vehicle
+from jaxbeam.plot.traffic.drawing import DrawnVehicle, drawn_vehicle
 from jaxbeam.simulation.labels import wheel_labels
 from jaxbeam.simulation.record import Record
 
@@ -72,26 +74,43 @@ def _loads(case: Case) -> list[dict[str, Any]]:
         entry: dict[str, Any] = {"kind": load.kind, "wheels": wheels, "vehicle": None}
         if i in groups:
             drawn, group = drawn_vehicle(load), groups[i]
-            entry["vehicle"] = {
-                "count": group.count,
-                "wheels": drawn.wheels.size,
-                "dofs": len(group.names),
-                "firstBody": first_body,
-                "parts": [
-                    {
-                        "position": part.position,
-                        "height": part.height.tolist(),
-                        "pitch": part.pitch.tolist(),
-                        "level": part.level,
-                        "ends": list(part.ends),
-                    }
-                    for part in drawn.parts
-                ],
-                "springs": [list(spring) for spring in drawn.springs],
-            }
+            entry["vehicle"] = _vehicle(drawn, len(group.names))
+            entry["vehicle"] |= {"count": group.count, "firstBody": first_body}
             first_body += group.count * len(group.names)
         found.append(entry)
     return found
+
+
+def vehicles() -> list[dict[str, Any]]:
+    """Vehicles of the library: names, masses (kg), and what to draw of them."""
+    found = []
+    for name in vehicle_names():
+        load = jb.VehicleLoad(model=name, speed=1.0)
+        drawn = drawn_vehicle(load)
+        model = load.vehicle(np.float64(9.81))
+        entry = {"name": name, "positions": drawn.wheels.tolist()}
+        mass = float(np.sum(np.asarray(concrete(model.static_loads)))) / 9.81
+        found.append(entry | {"mass": mass, "vehicle": _vehicle(drawn, len(model.names))})
+    return found
+
+
+def _vehicle(drawn: DrawnVehicle, dofs: int) -> dict[str, Any]:
+    """Parts and springs of a vehicle with so many degrees of freedom."""
+    return {
+        "wheels": drawn.wheels.size,
+        "dofs": dofs,
+        "parts": [
+            {
+                "position": part.position,
+                "height": part.height.tolist(),
+                "pitch": part.pitch.tolist(),
+                "level": part.level,
+                "ends": list(part.ends),
+            }
+            for part in drawn.parts
+        ],
+        "springs": [list(spring) for spring in drawn.springs],
+    }
 
 
 def _spread(count: int, most: int) -> np.ndarray:

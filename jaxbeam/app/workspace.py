@@ -61,6 +61,7 @@ class Workspace:
     def __init__(self, folder: str | os.PathLike):
         self.folder = Path(folder).resolve()
         self._cases, self._records, self._simulators = Remembered(), Remembered(), Remembered()
+        self._library = Remembered(100)
         self._jobs: dict[str, Any] = {}
         self._uploads = tempfile.TemporaryDirectory(prefix="jaxbeam-")
         self._numbers = itertools.count(1)
@@ -110,14 +111,18 @@ class Workspace:
             beside.write_bytes(text.encode("utf-8"))
         return {"name": name, "mark": _mark(text)}
 
-    def library(self) -> list[dict[str, str]]:
-        """Cases to start from: name, title and group."""
+    def library(self) -> list[dict[str, Any]]:
+        """Cases to start from: name, title, group, and scene for a picture."""
         found = []
         for group, names in (("Starters", _starters()), ("Published rigs", RIG_NAMES)):
             for name in names:
-                title = str(parse_toml(self.library_text(name))["title"])
-                found.append({"name": name, "title": title, "group": group})
+                case = self._library_case(name)
+                entry = {"name": name, "title": case.title, "group": group}
+                found.append(entry | {"scene": views.scene(case)})
         return found
+
+    def _library_case(self, name: str) -> Case:
+        return self._library.get(name, lambda: jb.api.load_case(self.library_text(name)))
 
     def library_text(self, name: str) -> str:
         """Text of a case to start from. Raises ValueError if there is none of the name."""

@@ -308,3 +308,17 @@ def test_a_controller_is_compared_with_the_bound(page):
     page.wait_for_selector(".control meter", timeout=120_000)
     names = page.locator(".control td:first-child").all_inner_texts()
     assert names == ["without control", "this case", "least of any"]
+
+
+def test_a_vehicle_is_chosen_by_its_picture_and_crosses(page):
+    from axe_playwright_python.sync_playwright import Axe
+
+    page.get_by_role("button", name="Open").click()
+    page.locator("#library svg").first.wait_for()
+    assert Axe().run(page).violations_count == 0
+    page.keyboard.press("Escape")
+    page.get_by_role("button", name="Vehicles").click()
+    page.get_by_role("button", name="quarter-truck").click()
+    wait_for(lambda: 'model = "quarter-truck"' in text_of(page))
+    assert 'speed = "3.6 km/h"' in text_of(page)
+    page.locator(".vehicle .body").first.wait_for(state="attached")

@@ -93,6 +93,13 @@ def test_a_vehicle_is_drawn_from_its_parts(workspace):
     assert arrays["bodies"].shape[1] == len(words["bodies"])
 
 
+def test_vehicles_of_the_library_have_their_masses_and_parts():
+    found = {one["name"]: one for one in views.vehicles()}
+    assert found["truck-5-axle"]["mass"] == pytest.approx(40e3, rel=1e-3)
+    for one in found.values():
+        assert len(one["positions"]) == one["vehicle"]["wheels"]
+
+
 def test_envelopes_are_those_of_the_record(workspace):
     found = views.envelopes(workspace.record(RIG))
     expected = workspace.record(RIG).envelope("moment")
@@ -143,7 +150,8 @@ def test_every_case_to_start_from_is_right(workspace):
 
 def test_absorbers_are_parts_that_swing_and_no_wheels_of_loads(workspace):
     text = RIG + "\n[[absorbers]]\nposition = 0.3\nmass = 0.02\nfrequency = 8.0\n"
-    record = workspace.record(text + "damping_ratio = 0.1\n")
+    text += "damping_ratio = 0.1\n"
+    record = workspace.record(text)
     words, arrays = views.pictures(record)
     assert workspace.model(text)["scene"]["absorbers"] == [{"position": 0.3}]
     assert words["shownWheels"] == [0] and len(words["crossing"]) == 1

@@ -146,7 +146,7 @@ export function createFields(store, context) {
     const entries = Object.entries(own.properties ?? {}).filter(([key]) => key !== "kind");
     const first = entries.filter(([key]) => key in content || own.required?.includes(key));
     const others = entries.filter((entry) => !first.includes(entry));
-    const make = ([key, one]) => part(`${address}.${key}`, one, content[key]);
+    const make = (/** @type {[string, any]} */ [key, one]) => part(`${address}.${key}`, one, content[key]);
     /** @type {Node[]} */
     const found = kinds ? [kindField(address, schema, content)] : [];
     if (own.description) found.unshift(html("p.about", {}, own.description.replaceAll("\n", " ")));

@@ -63,7 +63,7 @@ const redo = button("Redo", () => store.redo(), "Ctrl+Shift+Z");
 const theme = html("button", { type: "button", title: "light or dark", "aria-label": "light or dark" }, "◐");
 place("bar").append(
   html("img", { src: "static/icon.svg", alt: "", width: 26, height: 26 }), title, file,
-  html("nav", { "aria-label": "case" }, button("Open", library.show, "Ctrl+O"), button("Save", save, "Ctrl+S"), undo, redo, theme),
+  html("nav", { "aria-label": "case" }, button("Open", library.show, "Ctrl+O"), button("Vehicles", library.showVehicles, "vehicles and trains of the library"), button("Save", save, "Ctrl+S"), undo, redo, theme),
 );
 
 function save() {

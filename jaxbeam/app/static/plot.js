@@ -33,7 +33,7 @@ export function ticks(low, high, count) {
   const power = 10 ** Math.floor(Math.log10(raw));
   const step = ([1, 2, 5].find((one) => one * power >= raw) ?? 10) * power;
   const found = [];
-  for (let i = Math.ceil(low / step - 1e-9); i * step <= high + 1e-9 * step; i++) found.push(i * step);
+  for (let i = Math.ceil(low / step - 1e-9); i * step <= high + 1e-9 * step; i++) found.push(i * step + 0); // no minus zero
   return found;
 }
 
@@ -268,7 +268,7 @@ export class Plot {
   #listen() {
     const { canvas } = this;
     const at = (/** @type {MouseEvent} */ event) => this.#geometry().back(event.clientX - canvas.getBoundingClientRect().left);
-    canvas.addEventListener("pointermove", (event) => {
+    canvas.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => {
       this.#hover = Math.min(Math.max(at(event), this.#domain[0]), this.#domain[1]);
       this.draw();
     });
@@ -276,11 +276,11 @@ export class Plot {
       this.#hover = null;
       this.draw();
     });
-    canvas.addEventListener("pointerdown", (event) => {
+    canvas.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => {
       this.#drag = at(event);
       canvas.setPointerCapture(event.pointerId);
     });
-    canvas.addEventListener("pointerup", (event) => {
+    canvas.addEventListener("pointerup", (/** @type {PointerEvent} */ event) => {
       const [start, end] = [this.#drag, at(event)];
       this.#drag = NaN;
       const [from, to] = this.#domain;
@@ -289,12 +289,12 @@ export class Plot {
       this.draw();
     });
     canvas.addEventListener("dblclick", () => this.#zoomTo(null));
-    canvas.addEventListener("wheel", (event) => {
+    canvas.addEventListener("wheel", (/** @type {WheelEvent} */ event) => {
       if (!event.ctrlKey && !event.metaKey) return; // or the page would not scroll
       event.preventDefault();
       this.#zoomAround(at(event), Math.exp(event.deltaY / 300));
     }, { passive: false });
-    canvas.addEventListener("keydown", (event) => {
+    canvas.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
       const [from, to] = this.#domain;
       const middle = Number.isFinite(this.#cursor) ? this.#cursor : (from + to) / 2;
       const step = (to - from) / (event.shiftKey ? 10 : 100);

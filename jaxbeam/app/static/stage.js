@@ -305,7 +305,8 @@ function endShape(end, side) {
 function drawLoads(store, scene, view) {
   const { X, back, floor, height, surface, scale, share, at } = view;
   const arrays = store.run?.arrays;
-  const elements = [], updates = [];
+  /** @type {Element[]} */ const elements = [];
+  /** @type {(() => void)[]} */ const updates = [];
   const total = arrays?.wheelPositions.shape[1] ?? 0;
   scene.loads.forEach((/** @type {any} */ load, /** @type {number} */ i) => {
     if (!arrays || load.wheels.some((/** @type {number} */ w) => w >= total)) return;

@@ -167,7 +167,8 @@ export class Store extends EventTarget {
     if (this.#previewing) return;
     this.#previewing = true;
     while (this.#wanted !== null) {
-      const [wanted, text] = [this.#wanted, this.text];
+      const wanted = /** @type {Record<string, any>} */ (this.#wanted);
+      const { text } = this;
       await this.attempt(async () => {
         const run = await askArrays("preview", { text, ...wanted });
         if (text !== this.text) return;

@@ -55,7 +55,7 @@ export function drawVehicle(vehicle, tint) {
         const points = corners.map(([s, up]) => `${X(first + direction * s)},${floor - bottom(part, s) - up}`);
         unit.boxes[i].setAttribute("d", `M${points.join("L")}Z`);
       });
-      const lines = springs.map(([s, upper, lower]) => {
+      const lines = springs.map((/** @type {[number, number, number]} */ [s, upper, lower]) => {
         const high = bottom(parts[upper], s);
         const low = lower >= 0 ? bottom(parts[lower], s) + thickness(parts[lower]) : heights[v * vehicle.wheels - 1 - lower] + wheel;
         const x = X(first + direction * s);
