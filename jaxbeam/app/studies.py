@@ -33,11 +33,11 @@ def axis_values(case: Case, axis: Mapping[str, Any]) -> list[Any]:
         return words
     own_addresses(case, address)  # or else an error with the nearest
     unit = unit_at(case, address)
-    ends = (number_in_si(axis[end], unit, f"{address}: {end}") for end in ("from", "to"))
+    low, high = (number_in_si(axis[end], unit, f"{address}: {end}") for end in ("from", "to"))
     count = int(axis["count"])
     if not 2 <= count <= MAX_SWEPT:
         raise ValueError(f"{address}: a sweep takes from 2 to {MAX_SWEPT} values, not {count}")
-    return np.linspace(*ends, count).tolist()
+    return np.linspace(low, high, count).tolist()
 
 
 class Sweep:

@@ -114,8 +114,10 @@ export function createFields(store, context) {
 
   /** @param {string} address @param {Node} title @param {Node} body */
   function disclosure(address, title, body) {
-    const wrong = store.model.problem?.address?.startsWith(address) ?? false;
-    const details = html("details", { open: open.has(address) || wrong }, html("summary", {}, title), body);
+    const { problem } = store.model;
+    const wrong = problem?.address === address || (problem?.address?.startsWith(`${address}.`) ?? false);
+    const details = html("details", { open: open.has(address) || wrong }, html("summary", {}, title),
+      ...(problem?.address === address ? [html("p.wrong", {}, problem.message)] : []), body);
     details.addEventListener("toggle", () => (details.open ? open.add(address) : open.delete(address)));
     return details;
   }
@@ -152,7 +154,8 @@ export function createFields(store, context) {
     if (own.description) found.unshift(html("p.about", {}, own.description.replaceAll("\n", " ")));
     found.push(...first.map(make));
     if (others.length) {
-      const more = html("details.more", { open: open.has(`${address}/more`) }, html("summary", {}, `${others.length} more`), ...others.map(make));
+      const wrong = others.some(([key]) => store.model.problem?.address === `${address}.${key}`);
+      const more = html("details.more", { open: wrong || open.has(`${address}/more`) }, html("summary", {}, `${others.length} more`), ...others.map(make));
       more.addEventListener("toggle", () => (more.open ? open.add(`${address}/more`) : open.delete(`${address}/more`)));
       found.push(more);
     }
