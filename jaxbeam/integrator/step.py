@@ -89,8 +89,17 @@ def _states_of_maps(of_states: AffineMap, start: Float[Array, "batch state"]):
         return xp.concatenate([states, last[None]])
     states = np.empty((len(of_states.offset) + 1, *of_states.offset.shape[1:]))
     states[0] = start
-    for i in range(len(states) - 1):
-        states[i + 1] = of_states.at(i, states[i])
+    if of_states.linear.shape[1] > 1:
+        for i in range(len(states) - 1):
+            states[i + 1] = of_states.at(i, states[i])
+        return states
+    # Written into place: of small matrices, calls take longer than products.
+    before = states[0]
+    steps = zip(states[1:], of_states.linear[:, 0].mT, of_states.offset, strict=True)
+    for after, linear, offset in steps:
+        np.matmul(before, linear, out=after)
+        after += offset
+        before = after
     return states
 
 

@@ -67,7 +67,12 @@ def step_maps(step: StepInput, vehicles: Vehicles | None) -> StepMaps:
     def through_forces(response, *others):
         """Map by the forces and, with `others` on beam, vehicles and commands, at once."""
         linear, offset = (response[:, None] @ part for part in (of_columns, of_one))
-        return linear + xp.concatenate(others, axis=-1)[:, None], offset
+        direct = [part for part in others if part.shape[-1]]
+        direct = direct[0] if len(direct) == 1 else xp.concatenate(direct, axis=-1)
+        if is_jax(direct):
+            return linear + direct[:, None], offset
+        linear += direct[:, None]  # in place where it is known: the largest matrix of the steps
+        return linear, offset
 
     def no_effect(rows):
         return np.zeros((of_one.shape[0], rows, states))
