@@ -11,9 +11,9 @@ from tuning.control.integer_choices import tune_integers
 from tuning.control.load_cases import LoadCases, full_grid, latin_hypercube, read_load_cases
 from tuning.control.objective import Objective
 from tuning.control.pareto import lexicographic, pareto
-from tuning.control.plants import draw_plants, with_identified_plant
+from tuning.control.penalised_objective import StabilityConstraint
 from tuning.control.reduced_order import tune_reduced
-from tuning.control.stability_constraint import StabilityConstraint
+from tuning.control.run_set import draw_plants, with_identified_plant
 from tuning.control.tune import tune
 from tuning.control.tuning_result import TuningResult
 from tuning.fit.experiment_design import design_experiment

@@ -26,7 +26,7 @@ from jaxbeam.model.modes import mesh_layout
 from jaxbeam.plot.style import colour, set_title, use_style
 from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import ContactLossWarning
-from tuning.control.fixed_design import with_fixed_design
+from tuning.control.objective import with_fixed_design
 
 RIG, MASS, SPEED = "B", 0.42, 0.55  # kg, m/s: a held-out load
 HEADWAY, DECELERATION = 0.4, 0.2  # s; m/s^2: the load leaves with less than half of its speed

@@ -45,8 +45,8 @@ from experiments.thesis.verdicts import Experiment, ExperimentResult
 from jaxbeam.analysis.stability import frozen_poles
 from jaxbeam.case.case import concrete_case
 from jaxbeam.model.modes import mesh_layout
-from tuning.control.fixed_design import with_fixed_design
 from tuning.control.load_cases import run_case
+from tuning.control.objective import with_fixed_design
 from tuning.control.run_set import make_run_set
 
 SENSORS_ONLY = "tuned, sensors only"

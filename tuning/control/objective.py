@@ -1,15 +1,35 @@
-"""Objective of a tuning: metrics of runs, true or with smooth maxima."""
+"""Objective of a tuning: peaks of the runs of a fixed design."""
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from jaxbeam.case.case import Case, replace
 from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.model.modes import Layout
+from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.simulation.simulate import Histories
+
+
+def with_fixed_design(case: Case, nominal: Mapping[str, Any], layout: Layout) -> Case:
+    """Case whose control law is designed for the plant with `nominal` values at some addresses.
+
+    Without that a law is designed for the plant of its case, hence for each uncertain plant anew.
+    `layout` is the order of positions along the beam, the same for both.
+    """
+    if not nominal or case.controller is None:
+        return case
+    plant = state_space(replace(case, dict(nominal)), layout=layout)
+    return eqx.tree_at(
+        lambda c: c.controller.nominal_plant, case, plant, is_leaf=lambda leaf: leaf is None
+    )
+
 
 METRICS = ("peak", "shortfall", "rms", "after_exit", "effort", "contact")
 # Metrics named by what sensors measure; deflections have the metric `peak`.

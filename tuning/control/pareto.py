@@ -9,7 +9,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.files.report import text_table
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import ALL_METRICS, Objective
-from tuning.control.stability_constraint import StabilityConstraint
+from tuning.control.penalised_objective import StabilityConstraint
 from tuning.control.tune import ParameterBounds, TuningProblem, check_arguments
 from tuning.control.tuning_result import TuningResult
 

@@ -20,11 +20,9 @@ from jaxbeam.simulation.simulate import ContactLossWarning, Histories
 from tuning.checkpoint import Checkpoint, checkpoint_path, fingerprint
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
-from tuning.control.optimisation import Optimisation, OptimisationState
-from tuning.control.optimisers import optimiser
-from tuning.control.plants import draw_plants, with_identified_plant
-from tuning.control.run_set import RunSet, make_run_set
-from tuning.control.stability_constraint import STABILITY_PENALTY_SLOPE, StabilityConstraint
+from tuning.control.optimisation import Optimisation, OptimisationState, optimiser
+from tuning.control.penalised_objective import STABILITY_PENALTY_SLOPE, StabilityConstraint
+from tuning.control.run_set import RunSet, draw_plants, make_run_set, with_identified_plant
 from tuning.control.tuning_result import RunSetResult, StartResult, TuningResult
 from tuning.fit.result import Fit
 from tuning.fit.uncertainty.posterior import Posterior

@@ -13,8 +13,7 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.model.plausibility.check import warn_if_implausible
 from tuning.checkpoint import Checkpoint, checkpoint_path, fingerprint
 from tuning.fit.dataset import Dataset, make_dataset
-from tuning.fit.least_squares import LeastSquares
-from tuning.fit.loss import check_loss
+from tuning.fit.least_squares import LeastSquares, check_loss
 from tuning.fit.multi_start import multi_start
 from tuning.fit.result import Fit, fit_result
 from tuning.logs.log import Log

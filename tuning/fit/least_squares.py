@@ -1,17 +1,156 @@
-"""Weighted least squares over the free parameters of a dataset, with noise estimated by channel."""
+"""Nonlinear least squares: residuals, loss, and steps of Levenberg and Marquardt.
+
+Each loss is half the square of `robust_residual(r)`, so that least squares minimises any of them;
+r is a residual over the standard deviation of the noise.
+"""
 
 import dataclasses
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxbeam.runtime.arrays import xp
-from tuning.fit.levenberg_marquardt import levenberg_marquardt
-from tuning.fit.loss import check_loss, robust_residual, robust_slope, variance_factor
+from jaxbeam.runtime.arrays import Array, xp
 from tuning.fit.uncertainty.covariance import Uncertainty, autocorrelation_factor, uncertainty
 from tuning.parameters.free import FreeParameter, to_unbounded
 from tuning.parameters.prediction import SamplePrediction
+
+LOSSES = ("squares", "soft-l1", "huber")
+HUBER_THRESHOLD = 1.345  # 95 % of the efficiency of squares for normal noise
+
+
+def check_loss(loss: str) -> None:
+    """Raises ValueError for an unknown loss."""
+    if loss not in LOSSES:
+        raise ValueError(f"a loss is one of {', '.join(LOSSES)}, not {loss!r}")
+
+
+def robust_residual(loss: str, residual: Float[Array, "*any"]) -> Float[Array, "*any"]:
+    """Residual f whose half square f^2 / 2 is the loss.
+
+    soft-l1: f^2 / 2 = sqrt(1 + r^2) - 1; Huber: f^2 / 2 = k |r| - k^2 / 2 beyond k.
+    """
+    if loss == "soft-l1":
+        return residual * xp.sqrt(2 / (1 + xp.sqrt(1 + residual**2)))
+    if loss == "huber":
+        clipped = xp.maximum(xp.abs(residual), HUBER_THRESHOLD)
+        return xp.where(
+            xp.abs(residual) <= HUBER_THRESHOLD,
+            residual,
+            xp.sign(residual) * xp.sqrt(2 * HUBER_THRESHOLD * clipped - HUBER_THRESHOLD**2),
+        )
+    return residual
+
+
+def robust_slope(loss: str, residual: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
+    """Derivative of `robust_residual` of known residuals.
+
+    That of the loss over f: r / sqrt(1 + r^2) for soft-l1, k sign(r) beyond k for Huber.
+    """
+    size = np.abs(robust_residual(loss, residual))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if loss == "soft-l1":
+            return np.where(size > 0, np.abs(residual) / np.sqrt(1 + residual**2) / size, 1.0)
+        if loss == "huber":
+            return np.where(np.abs(residual) > HUBER_THRESHOLD, HUBER_THRESHOLD / size, 1.0)
+    return np.ones_like(residual)
+
+
+def variance_factor(loss: str, residuals: Float[np.ndarray, " sample"]) -> float:
+    """Factor by which variances of a robust fit exceed those of linearised least squares.
+
+    E[psi^2] / E[psi']^2 with psi the derivative of the loss (Huber, Robust Statistics, section
+    6.3), for residuals over the standard deviation of the noise.
+    """
+    if loss == "soft-l1":
+        root = np.sqrt(1 + residuals**2)
+        influence, stiffness = residuals / root, 1 / root**3
+    elif loss == "huber":
+        influence = np.clip(residuals, -HUBER_THRESHOLD, HUBER_THRESHOLD)
+        stiffness = np.abs(residuals) <= HUBER_THRESHOLD
+    else:
+        return 1.0
+    return float(np.mean(influence**2) / np.mean(stiffness) ** 2)
+
+
+ACCEPTED_SHARE = 0.01  # of the predicted decrease, from which a step is accepted
+GOOD_SHARE = 0.99  # of the predicted decrease, above which the next step is damped less
+# Of the sum of squares, a predicted decrease too small to be told from rounding of the residuals.
+NEGLIGIBLE_SHARE = 1e-11
+LESS_DAMPING, MORE_DAMPING = 1 / 3.5, 4.0  # factors of the damping after good and rejected steps
+
+
+class Minimum(NamedTuple):
+    """Point at which a search ended, and whether it converged there."""
+
+    point: Float[np.ndarray, " variable"]
+    converged: bool
+
+
+def levenberg_marquardt(
+    linearised: Callable,
+    start: Float[np.ndarray, " variable"],
+    rtol: float,
+    atol: float,
+    max_steps: int,
+) -> Minimum:
+    """Minimum of half the sum of squared residuals, from a start.
+
+    `linearised` maps a point to residuals (residual,) and their derivatives (residual, variable).
+    A step d minimises |r + J d|^2 + damping |d|^2, the damping is 1 at first; with a trust region
+    as Gould et al. (4OR 3, 2005) chose it for it. Converged once an accepted step changes no
+    variable and no residual by more than atol + rtol times its size, or the next promises a
+    decrease by less than a share of NEGLIGIBLE_SHARE. Points at which residuals are not finite are
+    rejected.
+    """
+    point, damping = start, 1.0
+    residuals, jacobian = linearised(start)
+    # Of residuals and derivatives only their products matter: those of the triangular factor.
+    factor = _factor(residuals, jacobian)
+    for _ in range(max_steps - 1):
+        if not np.all(np.isfinite(factor)):
+            break
+        change = _damped_step(factor, damping)
+        predicted = (np.sum((factor @ np.append(change, 1.0)) ** 2) - _squares(factor)) / 2
+        if damping <= 1 and -predicted <= NEGLIGIBLE_SHARE * _squares(factor):
+            return Minimum(point, True)
+        trial_residuals, jacobian = linearised(point + change)
+        trial_factor = _factor(trial_residuals, jacobian)
+        decrease = (_squares(trial_factor) - _squares(factor)) / 2
+        if not decrease <= ACCEPTED_SHARE * predicted:
+            damping *= MORE_DAMPING
+            continue
+        if decrease < GOOD_SHARE * predicted and predicted < 0:
+            damping *= LESS_DAMPING
+        point, factor = point + change, trial_factor
+        moved = np.abs(change) / (atol + rtol * np.abs(point))
+        changed = np.abs(trial_residuals - residuals) / (atol + rtol * np.abs(trial_residuals))
+        if max(moved.max(), changed.max()) < 1:
+            return Minimum(point, True)
+        residuals = trial_residuals
+    return Minimum(point, False)
+
+
+def _factor(residuals, jacobian):
+    """Triangular factor of derivatives and residuals side by side; not finite if they are not."""
+    both = np.column_stack([jacobian, residuals])
+    if not np.all(np.isfinite(both)):
+        return np.full((both.shape[1],) * 2, np.nan)
+    return np.linalg.qr(both, mode="r")
+
+
+def _squares(factor) -> float:
+    """Sum of squared residuals."""
+    return float(np.sum(factor[:, -1] ** 2))
+
+
+def _damped_step(factor, damping):
+    """Step that minimises |r + J d|^2 + damping |d|^2."""
+    size = factor.shape[1] - 1
+    matrix = np.vstack([factor[:, :-1], np.sqrt(damping) * np.eye(size)])
+    return np.linalg.lstsq(matrix, np.append(-factor[:, -1], np.zeros(size)), rcond=None)[0]
+
 
 NOISE_ITERATIONS = 2  # fits, each with the noise levels that the one before has estimated
 MAX_STEPS = 60  # steps of one fit
@@ -59,7 +198,7 @@ class LeastSquaresSolution:
 class LeastSquares:
     """Least-squares problem in the free parameters of a dataset, compiled once for any samples.
 
-    Priors of the parameters count as further residuals. `loss` is one of `tuning.fit.loss`.
+    Priors of the parameters count as further residuals. `loss` is one of the losses above.
 
     Raises ValueError if there are more parameters than samples, or for an unknown loss.
     """

@@ -50,7 +50,7 @@ def report_sections(
     models: Sequence[ModelCriteria] = (),
 ) -> list[ReportSection]:
     """Sections of the report on a fit; arguments left out have no section."""
-    from tuning.fit.uncertainty.plots import plot_posterior, plot_profiles
+    from tuning.fit.uncertainty.profile import plot_posterior, plot_profiles
 
     tables = [_parameter_table(fit), *_minima_table(fit)]
     measured = [ReportFigure("fit", fit.plot()), _residual_table(fit)]

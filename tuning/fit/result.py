@@ -9,10 +9,9 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.quantities import unit_of
 from tuning.fit import summary
-from tuning.fit.dataset import Dataset
+from tuning.fit.dataset import ChannelResiduals, Dataset, channel_residuals, residual_remarks
 from tuning.fit.least_squares import MAX_STEPS, LeastSquares, LeastSquaresSolution
 from tuning.fit.multi_start import LocalMinimum
-from tuning.fit.residuals import ChannelResiduals, channel_residuals, residual_remarks
 from tuning.fit.uncertainty.covariance import confidence_intervals
 from tuning.parameters.free import LOG_ADDRESS, FreeParameter, to_unbounded, with_values
 

@@ -12,7 +12,7 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.model.load_set import load_set
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
-from tuning.weighing.unit_force import UnitForce
+from tuning.weighing.dynamic_forces import UnitForce
 
 MODEL_POINTS = 201
 SMOOTHNESS = np.logspace(-8, 4, 49)  # tried weights of second differences

@@ -11,9 +11,9 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.loads.point import MovingMass
+from tuning.fit.dataset import WHITENESS_SIGNIFICANCE
 from tuning.fit.identify import identify
 from tuning.fit.model_validation import ModelCriteria, compare_fits
-from tuning.fit.residuals import WHITENESS_SIGNIFICANCE
 from tuning.fit.result import Fit
 from tuning.logs.log import Log
 from tuning.weighing.matching_pursuit import MatchingPursuit

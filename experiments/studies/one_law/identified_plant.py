@@ -17,7 +17,7 @@ import tuning
 from experiments.studies.loads import PERIOD, held_out_loads
 from experiments.studies.one_law.plants import ONE_LAW, Shares, plant_case
 from jaxbeam.model.modes import mesh_layout
-from tuning.control.fixed_design import with_fixed_design
+from tuning.control.objective import with_fixed_design
 
 CORRECTION, CUTOFF = "actuators.0.correction", "sensors.0.filter.cutoff"
 FREE = {CORRECTION: (0.1, 0.6), CUTOFF: (3.0, 45.0)}

@@ -30,8 +30,8 @@ from experiments.thesis.cases import with_modes
 from jaxbeam import rigs
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.simulation.simulate import ContactLossWarning
-from tuning.control.fixed_design import with_fixed_design
 from tuning.control.load_cases import AddressValues
+from tuning.control.objective import with_fixed_design
 
 TABLE_FILE = Path(__file__).parents[3] / "docs" / "_static" / "one_law.md"
 CUTOFFS, DELAYS, FACTORS = (5.0, 10.0, 20.0, 40.0), (0.0, 0.02, 0.04), (0.8, 1.0, 1.2)  # Hz, s, -

@@ -102,8 +102,8 @@ def compare(
 def _report_runs(case, laws, path: Path, period, options: CaseOptions) -> None:
     """Report the controllers over the runs of a file."""
     from jaxbeam.analysis.compare import metrics_over_cases
-    from tuning.control.comparison import compare_runs
     from tuning.control.load_cases import read_load_cases
+    from tuning.control.tuning_result import compare_runs
 
     load_cases = read_load_cases(path, case)
     runs = load_cases.held_out or load_cases.training

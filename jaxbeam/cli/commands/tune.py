@@ -227,7 +227,7 @@ def _write_and_print(result, tuned, files, picture, pictures, options: CaseOptio
         drawn = result if hasattr(result, "plot") else tuned[0]
         pictures.save(pictures.titled(drawn.plot()), picture)
     from jaxbeam.analysis.margins import stability_margin
-    from tuning.control.comparison import beside_hand_drawn
+    from tuning.control.tuning_result import beside_hand_drawn
 
     summaries, closed = [one.to_dict() for one in tuned], []
     for one, summary in zip(tuned, summaries, strict=True):
@@ -257,7 +257,7 @@ def _hand_drawn(tuned):
     None if the case allows no such law.
     """
     from tuning import TuningResult
-    from tuning.control.comparison import hand_drawn_peaks
+    from tuning.control.tuning_result import hand_drawn_peaks
 
     for index, one in enumerate(tuned):
         if isinstance(one, TuningResult):

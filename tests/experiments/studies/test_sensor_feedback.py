@@ -13,7 +13,7 @@ from jaxbeam import rigs
 from jaxbeam.analysis.stability import frozen_poles
 from jaxbeam.case.case import concrete_case
 from jaxbeam.model.modes import mesh_layout
-from tuning.control.fixed_design import with_fixed_design
+from tuning.control.objective import with_fixed_design
 
 
 @pytest.mark.parametrize("rig", ["B", "C"])

@@ -10,13 +10,13 @@ import jaxbeam as jb
 from jaxbeam.analysis.hand_drawn import hand_drawn_law
 from jaxbeam.case.controller import Measurement
 from jaxbeam.model.statics import influence_line
-from tuning.control.comparison import (
+from tuning.control.tuning_result import (
     HAND_DRAWN,
+    RunSetResult,
     beside_hand_drawn,
     compare_runs,
     hand_drawn_peaks,
 )
-from tuning.control.tuning_result import RunSetResult
 
 CASE = jb.Case(
     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.03, modes=1),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from tuning.control.optimisers import METHODS, optimiser
+from tuning.control.optimisation import METHODS, optimiser
 
 STARTS = jnp.array([[-1.2, 1.0], [0.5, -0.5], [1.3, 1.9]])
 

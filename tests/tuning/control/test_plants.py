@@ -10,7 +10,7 @@ import jaxbeam as jb
 import tuning
 from tests.tuning.small_rig import GAIN, RIGIDITY, rig
 from tests.tuning.stand_in import CASE, fit
-from tuning.control.fixed_design import with_fixed_design
+from tuning.control.objective import with_fixed_design
 from tuning.control.run_set import make_run_set
 from tuning.fit.uncertainty.posterior import Posterior
 

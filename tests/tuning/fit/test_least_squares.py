@@ -20,7 +20,7 @@ from tests.tuning.stand_in import (
 )
 from tuning.checkpoint import Checkpoint
 from tuning.fit.identify import _stage_mask, identify
-from tuning.fit.loss import HUBER_THRESHOLD, check_loss, robust_residual, variance_factor
+from tuning.fit.least_squares import HUBER_THRESHOLD, check_loss, robust_residual, variance_factor
 from tuning.fit.multi_start import draw_start_points, multi_start
 from tuning.parameters.free import FreeParameter, free_parameters
 from tuning.parameters.prior import Prior

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from tuning.fit.levenberg_marquardt import levenberg_marquardt
-from tuning.fit.loss import LOSSES, robust_residual, robust_slope
+from tuning.fit.least_squares import LOSSES, levenberg_marquardt, robust_residual, robust_slope
 from tuning.parameters.free import FreeParameter
 from tuning.parameters.prior import Prior
 

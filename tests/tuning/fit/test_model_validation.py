@@ -25,8 +25,8 @@ from tests.tuning.stand_in import (
 )
 from tuning.checkpoint import Checkpoint, save
 from tuning.fit import model_validation, storage
+from tuning.fit.dataset import residual_remarks, whiteness_p_value
 from tuning.fit.model_validation import compare_fits, cross_validate
-from tuning.fit.residuals import residual_remarks, whiteness_p_value
 from tuning.fit.result import fit_result
 from tuning.fit.uncertainty.covariance import t_quantile
 from tuning.fit.uncertainty.posterior import _log_density, draw_by_nuts, sample, with_diagnostics

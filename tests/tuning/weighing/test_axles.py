@@ -15,8 +15,7 @@ from tuning import Log, calibrate_influence_lines, model_influence_lines, weigh_
 from tuning.fit.dataset import make_dataset
 from tuning.fit.least_squares import LeastSquares
 from tuning.parameters.free import free_parameters, to_unbounded
-from tuning.weighing.axle_count import count_axles
-from tuning.weighing.axles import AxleWeighing, axle_problem, errors_of_fit
+from tuning.weighing.axles import AxleWeighing, axle_problem, count_axles, errors_of_fit
 from tuning.weighing.moses import AxleGeometry, find_geometry, moses
 
 LENGTH, RIGIDITY, DENSITY, DAMPING, FIBRE = 20.0, 1e10, 10000.0, 0.02, -0.5
