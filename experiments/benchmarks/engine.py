@@ -1,4 +1,4 @@
-"""First calls of transformed runs: gradients, batches, second derivatives, closed loops.
+"""First calls of transformed runs and of small sweeps: gradients, batches, closed loops, seeds.
 
     python -m experiments.benchmarks.engine [ROW ...]
 
@@ -7,6 +7,7 @@ the second, and peak memory. A beam of five modes and a moving mass unless said.
 """
 
 import os
+import pathlib
 import resource
 import subprocess
 import sys
@@ -19,7 +20,10 @@ import numpy as np
 
 import jaxbeam as jb
 from experiments.benchmarks.common import parser
+from jaxbeam.integrator import native_peaks
+from jaxbeam.runtime import native_library
 
+ROOT = pathlib.Path(__file__).parents[2]
 MASS, RIGIDITY, SPEED = "loads.0.mass", "beam.flexural_rigidity", "loads.0.speed"
 BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.01, modes=5)
 CASE = jb.Case(
@@ -67,6 +71,17 @@ def _whole_case():
     )
 
 
+def _sweep(over: dict, case: jb.Case = CASE):
+    return jb.sweep(case, over, progress=False).peak_deflection.values
+
+
+def _on_rough_road(over: dict):
+    """Sweep of the truck of five axles over its rough road, in C where there is a compiler."""
+    if native_library.find_compiler() and not native_peaks.available():
+        native_peaks.LIBRARY.build()
+    return _sweep(over, jb.load_case(ROOT / "examples/road_bridge/case.toml"))
+
+
 ROWS: dict[str, Callable] = {
     "grad by mass": lambda: jax.grad(lambda x: peak({MASS: x}))(0.3),
     "grad by E I": lambda: jax.grad(lambda x: peak({RIGIDITY: x}))(11.68),
@@ -79,6 +94,16 @@ ROWS: dict[str, Callable] = {
     "grad through a sampled loop": lambda: jax.grad(
         lambda x: peak({"controller.gains.0": x}, FED_BACK)
     )(200.0),
+    "sweep over 3 masses": lambda: _sweep({MASS: np.linspace(0.1, 0.3, 3)}),
+    "sweep over 64 masses": lambda: _sweep({MASS: np.linspace(0.1, 0.3, 64)}),
+    "sweep over 512 masses": lambda: _sweep({MASS: np.linspace(0.1, 0.3, 512)}),
+    "sweep over 6 gains": lambda: _sweep(
+        {"controller.gains.0": np.linspace(100.0, 300.0, 6)}, FED_BACK
+    ),
+    "truck on a road, 16 speeds": lambda: _on_rough_road({SPEED: np.linspace(20.0, 30.0, 16)}),
+    "truck on a road, 5 seeds, 5 speeds": lambda: _on_rough_road(
+        {"profile.seed": range(5), SPEED: np.linspace(20.0, 30.0, 5)}
+    ),
     "a continuous loop under vehicles": lambda: jb.simulate(CONTINUOUS).peak_deflection,
 }
 
