@@ -92,6 +92,7 @@ def run(folder: str | Path | None = None, json: bool = False) -> None:
         print(json_text.dumps(summary))
     files = ", ".join(sorted(path.name for path in target.iterdir()))
     print_progress(f"\nwritten to {target}: {files}")
+    print_progress(f"see it move in the browser: jaxbeam app {target / 'tuned.toml'}")
 
 
 def with_one_mass(case: jb.Case, slowest: float) -> jb.Case:

@@ -24,6 +24,7 @@ import jaxbeam as jb
 from jaxbeam.app import take_away, views
 from jaxbeam.app.workspace import MAX_BYTES, Workspace
 from jaxbeam.case.loads.planar.vehicle import vehicle_names
+from jaxbeam.model.plausibility.check import leave_warnings_to_caller
 from jaxbeam.vehicles.library import trains
 
 STATIC = Path(__file__).parent / "static"
@@ -243,6 +244,7 @@ def serve(folder: Path, opened: str | None, port: int, browser: bool) -> None:
         port = listening.getsockname()[1]
         token = secrets.token_urlsafe(24)
         address = f"http://{LOOPBACK}:{port}/?token={token}"
+        leave_warnings_to_caller()  # the page shows them
         workspace = Workspace(folder)
         app = application(workspace, opened, token, port)
         server = uvicorn.Server(

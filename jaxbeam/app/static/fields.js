@@ -35,6 +35,8 @@ export function newEntry(root, schema, kind, length, names = {}) {
   const content = kind ? { kind } : {};
   const needed = new Set(table.required ?? []);
   if (table.properties?.speed) needed.add("speed");
+  if (kind === "vehicle") needed.add("model");
+  if (kind === "axles") needed.add("train");
   for (const key of needed) {
     if (key === "kind") continue;
     const own = table.properties[key] ?? {};

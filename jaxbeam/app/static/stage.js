@@ -309,7 +309,9 @@ function drawLoads(store, scene, view) {
   /** @type {(() => void)[]} */ const updates = [];
   const total = arrays?.wheelPositions.shape[1] ?? 0;
   scene.loads.forEach((/** @type {any} */ load, /** @type {number} */ i) => {
-    if (!arrays || load.wheels.some((/** @type {number} */ w) => w >= total)) return;
+    const dofs = load.vehicle ? load.vehicle.firstBody + load.vehicle.count * load.vehicle.dofs : 0;
+    // Of a run before the loads were changed there is nothing to draw.
+    if (!arrays || load.wheels.some((/** @type {number} */ w) => w >= total) || dofs > arrays.bodies.shape[1]) return;
     const { data } = arrays.wheelPositions;
     const path = (/** @type {number} */ w) => Array.from({ length: arrays.wheelPositions.shape[0] }, (_, k) => data[k * total + w]);
     const first = path(load.wheels[0]).filter(Number.isFinite);
