@@ -21,7 +21,7 @@ from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_from_tables, load_case_with
 from jaxbeam.model.plausibility.check import leave_warnings_to_caller
 from jaxbeam.model.plausibility.facts import Plausibility
-from jaxbeam.runtime.progress import listening
+from jaxbeam.runtime.progress import watching
 from jaxbeam.simulation.record import Record
 
 if TYPE_CHECKING:
@@ -271,14 +271,14 @@ class Job:
     def _run(self, work, arguments, options) -> None:
         leave_warnings_to_caller()
         try:
-            with listening(self._listen):
+            with watching(self._on_step):
                 result = work(*arguments, **options)
-            self._listen(*self.progress)
+            self._on_step(*self.progress)
             self._result = result
         except BaseException as error:  # for who asks for the result
             self._error = error
 
-    def _listen(self, done: int, total: int, step: str) -> None:
+    def _on_step(self, done: int, total: int, step: str) -> None:
         self.progress = Progress(done, total, step)
         if self._cancelled.is_set():
             raise Cancelled("cancelled")

@@ -1,4 +1,4 @@
-"""Progress of work that takes long: a bar on standard error, and who else is told of it."""
+"""Progress of work that takes long: a bar on standard error, or a function called at each step."""
 
 import contextlib
 import contextvars
@@ -9,14 +9,12 @@ from typing import Any
 from tqdm import tqdm
 
 # Called with the steps done, those of the whole, and what a step is; what it raises ends the work.
-Listener = Callable[[int, int, str], None]
-_LISTENER: contextvars.ContextVar[Listener | None] = contextvars.ContextVar(
-    "listener", default=None
-)
+OnStep = Callable[[int, int, str], None]
+_ON_STEP: contextvars.ContextVar[OnStep | None] = contextvars.ContextVar("on_step", default=None)
 
 
 class ProgressBar(tqdm):
-    """Bar of `total` steps, shown on request; the listener of the context is told of each."""
+    """Bar of `total` steps, shown on request; the function of `watching` is called at each."""
 
     def __init__(self, total: int, unit: str, *, shown: bool, **options: Any):
         super().__init__(total=total, unit=unit, disable=not shown, file=sys.stderr, **options)
@@ -25,7 +23,7 @@ class ProgressBar(tqdm):
         self._tell()
 
     def update(self, n: float | None = 1) -> bool | None:
-        """Count steps as done. Raises what the listener raises."""
+        """Count steps as done. Raises what the function of `watching` raises."""
         shown = super().update(n)
         self._done += int(n or 0)
         self._tell()
@@ -41,16 +39,16 @@ class ProgressBar(tqdm):
         self._tell()
 
     def _tell(self) -> None:
-        listener = _LISTENER.get()
-        if listener is not None:
-            listener(self._done, int(self.total), self._words)
+        on_step = _ON_STEP.get()
+        if on_step is not None:
+            on_step(self._done, int(self.total), self._words)
 
 
 @contextlib.contextmanager
-def listening(listener: Listener) -> Iterator[None]:
-    """Tell a listener of the progress of work within this context."""
-    token = _LISTENER.set(listener)
+def watching(on_step: OnStep) -> Iterator[None]:
+    """Call a function at each step of work within this context; what it raises ends the work."""
+    token = _ON_STEP.set(on_step)
     try:
         yield
     finally:
-        _LISTENER.reset(token)
+        _ON_STEP.reset(token)
