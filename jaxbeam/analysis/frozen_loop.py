@@ -1,4 +1,4 @@
-"""Dynamics of the loop opened at the commands, as functions of its state; moving or frozen loads.
+"""Dynamics of the loop opened at the commands, as affine functions of its state.
 
 The state holds plant with sensor filters and vehicles, states of law and digital filters, and the
 queues of delayed readings and commands. Limits, ranges and resolution are left out.

@@ -1,4 +1,4 @@
-"""Loads: the interface, rows of several, and the vehicle that a load is.
+"""Loads: the interface, rows of several, the vehicle that a load is, and checks of its numbers.
 
 The heights u of the degrees of freedom, positive upwards, are measured from static equilibrium on a
 level surface. With the height y of the surface under each wheel (deflection plus profile), the

@@ -1,4 +1,4 @@
-"""Loads that are vehicles: what all of them have, and the checks of their numbers."""
+"""Loads that are vehicles in the plane, of the library or of files."""
 
 import dataclasses
 from typing import ClassVar

@@ -1,4 +1,4 @@
-"""Rows of section forces and their static correction, in a band of modes.
+"""Rows of section forces with their static correction, as linear outputs.
 
 For deck accelerations of railway bridges: frequencies up to the largest of 30 Hz, 1.5 f_1 and f_3.
 

@@ -1,4 +1,4 @@
-"""Rows of what sensors measure: of the beam, of vehicles, as linear outputs.
+"""Rows of what sensors measure on the beam, in the band of modes that counts.
 
     y_i = row_i . d^n q / dt^n,    row_i = d^k psi / dx^k at x_i, times -z_i for a fibre,
 

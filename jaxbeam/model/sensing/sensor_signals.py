@@ -1,4 +1,4 @@
-"""Signals of sensors: noise, filters, sampling, and what is lost on the way.
+"""Signals of sensors of beam and vehicles: noise, filters, sampling, and what is lost.
 
 In this order: analogue filter; sampling of the signal `delay` and a random delay before; offset and
 noise; range and resolution; loss; digital filter of the samples that are not lost.

@@ -1,4 +1,4 @@
-"""Beam elements and cross sections: stiffness and mass.
+"""Beam elements and cross sections: stiffness, mass, and fields of deflection.
 
 Bending energy 1/2 int E I phi'^2, shear 1/2 int kGA (w' - phi)^2, axial force 1/2 int T w'^2,
 foundation 1/2 int k w^2; kinetic energy 1/2 int m w_t^2 + 1/2 int r phi_t^2. A beam that is rigid

@@ -1,4 +1,4 @@
-"""Statics of beams: deflection, axial force and buckling, fields of deflection.
+"""Statics of beams: deflection, axial force and buckling.
 
 matrices between them.
 """

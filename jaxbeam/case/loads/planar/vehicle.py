@@ -1,4 +1,4 @@
-"""Vehicles and trains of planar vehicles, from files or the library, and their sensors.
+"""Vehicles and trains of planar vehicles, from files or the library.
 
 A vehicle file is TOML with the keys of `PlanarVehicle`:
 

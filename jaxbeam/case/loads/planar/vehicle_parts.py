@@ -1,4 +1,4 @@
-"""Parts of planar vehicles: bodies, axles, springs, hinges, and their checks.
+"""Parts of planar vehicles: bodies, axles, springs, hinges, sensors, and their checks.
 
 Positions are in m along the vehicle, forward positive, from any common origin.
 """
