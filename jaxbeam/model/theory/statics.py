@@ -1,7 +1,4 @@
-"""Statics of beams: deflection, axial force and buckling.
-
-matrices between them.
-"""
+"""Statics of beams by transfer matrices: deflection, axial force and buckling."""
 
 from typing import NamedTuple
 
