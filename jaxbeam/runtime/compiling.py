@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.runtime import compile_cache
-from jaxbeam.runtime.interpreter import Program, compile_cost, run_cost
+from jaxbeam.runtime.interpreter import InterpretedProgram, compile_cost, run_cost
 from jaxbeam.runtime.program_key import program_name
 
 # XLA's newer code generator for CPUs takes twice as long to compile the programs here, and its
@@ -365,7 +365,7 @@ class _InterpretedFirst:
         self.spent += self.cost
         if self.spent > self.price:
             return self.jitted(*args)
-        self.program = self.program or Program(self.traced.jaxpr)
+        self.program = self.program or InterpretedProgram(self.traced.jaxpr)
         found = self.program(*jax.tree.leaves(args))
         structure = jax.tree.structure(self.traced.out_info)
         return structure.unflatten(map(jnp.asarray, found))

@@ -29,7 +29,7 @@ OPENED = {  # calls of other programs, and the parameters that these are
 LOOPS = {"scan", "while", "cond", "custom_linear_solve"}
 
 
-class Program:
+class InterpretedProgram:
     """Function of arrays by the equations of a jaxpr.
 
     Results are arrays of NumPy, or those of JAX where a primitive is called as it is.
@@ -133,7 +133,7 @@ def _rule(equation) -> Callable:
     if any(jax.dtypes.issubdtype(aval.dtype, jax.dtypes.extended) for aval in avals):
         return _as_it_is(equation)
     if name in OPENED:
-        return Program(params[OPENED[name]])
+        return InterpretedProgram(params[OPENED[name]])
     if name in ELEMENTWISE:
         return ELEMENTWISE[name]
     if name in WITH_PARAMETERS:
@@ -423,7 +423,7 @@ def _eigh(params, *_):
 
 
 def _scan(params, *avals):
-    body, length = Program(params["jaxpr"]), params["length"]
+    body, length = InterpretedProgram(params["jaxpr"]), params["length"]
     constants, carried = params["num_consts"], params["num_carry"]
     order = range(length)[::-1] if params["reverse"] else range(length)
     stacked = params["jaxpr"].out_avals[carried:]
@@ -443,7 +443,10 @@ def _scan(params, *avals):
 
 
 def _while(params, *_):
-    condition, body = Program(params["cond_jaxpr"]), Program(params["body_jaxpr"])
+    condition, body = (
+        InterpretedProgram(params["cond_jaxpr"]),
+        InterpretedProgram(params["body_jaxpr"]),
+    )
     of_condition, of_body = params["cond_nconsts"], params["body_nconsts"]
 
     def loop(*arrays):
@@ -457,7 +460,7 @@ def _while(params, *_):
 
 
 def _cond(params, *_):
-    branches = [Program(branch) for branch in params["branches"]]
+    branches = [InterpretedProgram(branch) for branch in params["branches"]]
     last = len(branches) - 1
     return lambda which, *arrays: branches[min(max(int(which), 0), last)](*arrays)
 
@@ -471,7 +474,7 @@ def _platform_index(params, *_):
 
 
 def _linear_solve(params, *_):
-    lengths, solve = params["const_lengths"], Program(params["jaxprs"].solve)
+    lengths, solve = params["const_lengths"], InterpretedProgram(params["jaxprs"].solve)
     first = lengths.matvec + lengths.vecmat
     last = first + lengths.solve + lengths.transpose_solve
 

@@ -54,7 +54,10 @@ def test_gradient_is_that_of_all_speeds_together():
         ("loads.*.mass", "a number of all loads, and loads.1 has no mass"),
         ("supports.*.position", "the case has no supports"),
         ("loads.*", r"followed by a name, as in loads\.\*\.speed"),
-        ("*.speed", r"lists are supports\.\*, actuators\.\*, sensors\.\*, loads\.\*"),
+        (
+            "*.speed",
+            r"lists are supports\.\*, absorbers\.\*, actuators\.\*, sensors\.\*, loads\.\*",
+        ),
         ("beam.*.length", "stands for all parts of a list"),
     ],
 )

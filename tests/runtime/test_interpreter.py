@@ -8,7 +8,7 @@ from jax import lax
 from numpy.testing import assert_allclose
 
 from jaxbeam.runtime import interpreter
-from jaxbeam.runtime.interpreter import Program, compile_cost, run_cost
+from jaxbeam.runtime.interpreter import InterpretedProgram, compile_cost, run_cost
 from jaxbeam.runtime.lapack import _solve as solve
 
 RANDOM = np.random.default_rng(20)
@@ -224,7 +224,7 @@ FUNCTIONS = {
 def test_each_primitive_is_that_of_xla(name):
     function, *arrays = FUNCTIONS[name]
     expected = jax.tree.leaves(jax.jit(function)(*arrays))
-    found = Program(jax.make_jaxpr(function)(*arrays))(*arrays)
+    found = InterpretedProgram(jax.make_jaxpr(function)(*arrays))(*arrays)
     assert len(found) == len(expected)
     for one, other in zip(found, expected, strict=True):
         assert_allclose(one, other, rtol=1e-12, atol=1e-13)

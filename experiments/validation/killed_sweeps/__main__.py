@@ -57,7 +57,7 @@ def finished(store: Path) -> set[str]:
     return {flag.name for flag in store.glob("blocks/*/done/c/*")}
 
 
-class Sweep:
+class CommandSweep:
     """A sweep by the command line, over masses and speeds."""
 
     def __init__(self, folder: Path, blocks: int):
@@ -82,7 +82,7 @@ class Sweep:
 
 
 def run(
-    seed: int, workers: int, sweep: Sweep, expected: dict[str, bytes], folder: Path
+    seed: int, workers: int, sweep: CommandSweep, expected: dict[str, bytes], folder: Path
 ) -> KilledSweep:
     """Kill processes of a sweep at random until it has survived, then let it end."""
     draws, store = random.Random(seed), folder / "runs.zarr"
@@ -183,7 +183,7 @@ def main() -> int:
     faults = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        sweep, alone = Sweep(folder, arguments.blocks), folder / "alone.zarr"
+        sweep, alone = CommandSweep(folder, arguments.blocks), folder / "alone.zarr"
         said, _ = (client := sweep.begin(alone, None)).communicate()
         if client.returncode:
             raise RuntimeError(said)
