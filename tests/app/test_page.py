@@ -232,7 +232,12 @@ def latencies(page, address, count=40):
     )
 
 
-def test_a_picture_follows_its_slider(page):
+@pytest.mark.parametrize("case", ["a rig", "a road bridge with its truck"])
+def test_a_picture_follows_its_slider(page, case):
+    if case != "a rig":
+        starter = ROOT / "jaxbeam/files/starters/road-bridge.toml"
+        write(page, starter.read_text(encoding="utf-8"))
+        page.locator(".vehicle .body").first.wait_for(state="attached")
     measured = []
     for _ in range(5):  # the machine may be busy with others
         found = latencies(page, "loads.0.speed")
