@@ -142,7 +142,7 @@ def test_the_run_is_played_and_moved_by_keys(page):
     page.keyboard.press("Home")
     page.keyboard.press("Shift+ArrowRight")
     wait_for(lambda: page.locator(".clock").inner_text() == "0.130 s")
-    assert "0.13" in page.locator(".readout").first.inner_text()
+    wait_for(lambda: page.locator(".readout").first.inner_text().startswith("0.13:"))
 
 
 def test_a_file_is_saved_and_loaded_again_and_changes_of_others_are_kept(page, browser, server):
@@ -200,7 +200,8 @@ def test_scripts_in_titles_and_names_are_text(page):
 
 def test_files_are_taken_away(page):
     page.get_by_role("tab", name="Take away").click()
-    assert "jb.load_case('rig.toml')" in page.get_by_label("Python", exact=True).inner_text()
+    python = page.get_by_label("Python", exact=True)
+    wait_for(lambda: "jb.load_case('rig.toml')" in python.inner_text())
     with page.expect_download() as found:
         page.get_by_role("button", name="Table of histories (CSV)").click()
     with open(found.value.path(), encoding="utf-8") as file:
