@@ -89,11 +89,14 @@ export function createFields(store, context) {
     if (schema === null || (Object.keys(model.tables).length === 0 && element.childElementCount)) return;
     const active = /** @type {HTMLInputElement | null} */ (element.contains(document.activeElement) ? document.activeElement : null);
     const place = active?.dataset.address;
+    const typed = active?.matches("input") && active.value !== active.getAttribute("value") ? active.value : null;
     element.replaceChildren(
       titleField(),
       ...Object.entries(schema.properties).filter(([key]) => key !== "title").map(([key, own]) => group(key, /** @type {Schema} */ (own))),
     );
-    if (place) /** @type {HTMLElement | null} */ (element.querySelector(`[data-address="${place}"]`))?.focus();
+    const again = place ? /** @type {HTMLInputElement | null} */ (element.querySelector(`[data-address="${place}"]`)) : null;
+    if (again && typed !== null) again.value = typed; // what is being typed stays
+    again?.focus();
   }
 
   function titleField() {
@@ -205,12 +208,14 @@ export function createFields(store, context) {
     const input = schema.enum
       ? html("select", common, html("option", { value: "" }, places ? `${places} (default)` : "–"), ...schema.enum.map((/** @type {string} */ word) => html("option", { selected: word === value }, word)))
       : html("input", { ...common, value: shown(value), placeholder: places, list: context.names[key] ? `names-${key}` : null, autocomplete: "off", spellcheck: "false" });
-    input.addEventListener("change", () => {
+    const commit = () => {
       const typed = parsed(input.value, schema);
       if (typed === null) {
         if (value !== undefined) store.change({ remove: address });
-      } else if (typed !== value) store.change({ set: address, to: typed });
-    });
+      } else if (JSON.stringify(typed) !== JSON.stringify(value)) store.change({ set: address, to: typed });
+    };
+    input.addEventListener("change", commit);
+    input.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => event.key === "Enter" && commit());
     const slides = store.model.numbers?.[address];
     const pin = slides && html("button.pin", { type: "button", title: "move it by a slider", "aria-label": `slider for ${spaced(key)}`, onclick: () => context.slide(address) }, "⇿");
     const bounds = boundsOf(schema);
