@@ -94,13 +94,15 @@ function bar() {
   file.textContent = `${store.name ?? "not saved"}${store.unsaved && store.name ? " •" : ""}`;
   [undo.disabled, redo.disabled] = [!store.canUndo, !store.canRedo];
 }
+let ofModel = "";
 store.on("text", bar);
 store.on("model", () => {
   bar();
   const { problem, plausibility } = store.model;
-  if (problem) store.say(problem.message, true);
-  else if (plausibility.warnings.length) store.say(plausibility.warnings[0], true);
-  else if (status.className === "wrong") store.say("");
+  const message = problem?.message ?? plausibility.warnings[0] ?? "";
+  if (message) store.say(message, true);
+  else if (status.textContent === ofModel) store.say(""); // what others have said stays
+  ofModel = message;
 });
 
 addEventListener("keydown", (event) => {
