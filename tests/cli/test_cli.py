@@ -113,7 +113,15 @@ REFUSED = [
     ("identify case.toml log.csv --free beam.length -o case.toml", "case.toml exists; choose"),
     (
         "weigh case.toml old.nc --speeds 5:20 --calibration old.nc",
-        "--calibration is for Moses' method: say how many --axles",
+        "--calibration is for axles: say how many --axles, or --axles auto",
+    ),
+    (
+        "weigh case.toml old.nc --speeds 5:20 --axles 2 --lines lines.json",
+        "--lines writes what --calibration LOG finds",
+    ),
+    (
+        "weigh case.toml old.nc --speeds 5:20 --axles 2 --calibration a.json --calibration old.nc",
+        "--calibration takes one file of lines",
     ),
     (
         "weigh case.toml old.nc --speeds 5:20 --axles many",

@@ -1,10 +1,12 @@
 """Influence lines of the sensors of a bridge: of its model, or calibrated by known vehicles."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
@@ -12,14 +14,39 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.model.load_set import load_set
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
-from tuning.weighing.dynamic_forces import UnitForce
+from tuning.weighing.unit_force import UnitForce, driven
 
 MODEL_POINTS = 201
 SMOOTHNESS = np.logspace(-8, 4, 49)  # tried weights of second differences
+FREQUENCY_SHARES = np.geomspace(0.7, 1.8, 40)  # of the model's first frequency, likewise
+DYNAMIC_RATE = 6.0  # Hz, of independent errors: body bounce and vibration have two to four
+FORMAT = "jaxbeam influence lines 1"
+
+
+@dataclasses.dataclass(frozen=True)
+class AxleGeometry:
+    """Speed (m/s), time (s) at which the first axle enters, distances (m) of the axles behind it.
+
+    At a negative speed the axles enter at the right end of the beam of a length (m).
+    """
+
+    speed: float
+    entry_time: float
+    offsets: Float[np.ndarray, " axle"]
+    length: float
+
+    def positions(self, times: Float[np.ndarray, " time"]) -> Float[np.ndarray, "time axle"]:
+        """Positions (m) of the axles at times (s)."""
+        travelled = abs(self.speed) * (times[:, None] - self.entry_time) - self.offsets
+        return travelled if self.speed > 0 else self.length - travelled
 
 
 class InfluenceLines(NamedTuple):
     """Readings of sensors (SI unit per newton downwards) with a force at positions (m).
+
+    `covariance` is that of the ordinates (sensor, point, point) of calibrated lines. `frequency`
+    (Hz) and `damping_ratio` are those of the first mode, in which the bridge vibrates about what
+    the lines tell; without a frequency it does not.
 
     >>> import numpy as np
     >>> import tuning
@@ -32,15 +59,124 @@ class InfluenceLines(NamedTuple):
 
     positions: Float[np.ndarray, " point"]
     values: Float[np.ndarray, "point sensor"]
+    covariance: Float[np.ndarray, "sensor point point"] | None = None
+    frequency: float | None = None
+    damping_ratio: float = 0.0
 
     def at(self, x: Float[np.ndarray, "*force"]) -> Float[np.ndarray, "*force sensor"]:
         """Readings per newton with the force at x (m), zero off the beam."""
         lines = (np.interp(x, self.positions, line, 0.0, 0.0) for line in self.values.T)
         return np.stack(list(lines), axis=-1)
 
+    @property
+    def length(self) -> float:
+        """Length (m) of the beam."""
+        return float(self.positions[-1])
+
+    def crossing(
+        self, geometry: AxleGeometry, times: Float[np.ndarray, " time"]
+    ) -> Float[np.ndarray, "time axle sensor"]:
+        """Readings of a force of one newton at each axle, with the vibration that it leaves."""
+        static = self.at(geometry.positions(times))
+        if self.frequency is None:
+            return static
+        since = times[:, None] - geometry.entry_time - geometry.offsets / abs(geometry.speed)
+        passage = self.length / abs(geometry.speed)
+        swing = vibration(since, passage, self.frequency, self.damping_ratio)
+        parts = first_mode_parts(self.positions) @ self.values
+        return static + swing[:, :, None] * parts
+
+    def modulated(
+        self,
+        geometry: AxleGeometry,
+        times: Float[np.ndarray, " time"],
+        waves: Float[np.ndarray, "time wave"],
+    ) -> Float[np.ndarray, "time axle wave sensor"]:
+        """Readings of forces at the axles that vary in time as `waves` (N), with vibration."""
+        x = geometry.positions(times)
+        found = waves[:, None, :, None] * self.at(x)[:, :, None, :]
+        if self.frequency is None:
+            return found
+        parts = first_mode_parts(self.positions) @ self.values
+        on = (x >= 0) & (x <= self.length)
+        shape = np.where(on, np.sin(np.pi * np.clip(x, 0, self.length) / self.length), 0.0)
+        force = (shape[:, :, None] * waves[:, None, :]).reshape(times.size, -1)
+        grid = np.linspace(times[0], times[-1], times.size)
+        even = np.stack([np.interp(grid, times, one) for one in force.T], axis=1)
+        motion = _first_mode(even, grid[1] - grid[0], self.frequency, self.damping_ratio)
+        swing = np.stack([np.interp(times, grid, one) for one in (motion - even).T], axis=1)
+        return found + swing.reshape(*shape.shape, -1)[..., None] * parts
+
+    def to_dict(self) -> dict:
+        """Plain numbers, from which `lines_from_dict` makes the lines again."""
+        return {
+            "format": FORMAT,
+            "positions_m": self.positions.tolist(),
+            "ordinates": self.values.T.tolist(),
+            "covariances": None if self.covariance is None else self.covariance.tolist(),
+            "frequency_hz": self.frequency,
+            "damping_ratio": self.damping_ratio,
+        }
+
+
+def lines_from_dict(content: dict) -> InfluenceLines:
+    """Influence lines from the numbers of `InfluenceLines.to_dict`.
+
+    Raises ValueError for content of another format.
+    """
+    found = content.get("format") if isinstance(content, dict) else None
+    if found != FORMAT:
+        raise ValueError(
+            f"these are no calibrated influence lines: format {found!r}, not {FORMAT!r}; write them"
+            " by weigh --calibration LOG --lines FILE"
+        )
+    covariance = content["covariances"]
+    return InfluenceLines(
+        np.array(content["positions_m"]),
+        np.array(content["ordinates"]).T,
+        None if covariance is None else np.array(covariance),
+        content["frequency_hz"],
+        content["damping_ratio"],
+    )
+
+
+def first_mode_parts(positions: Float[np.ndarray, " point"]) -> Float[np.ndarray, " point"]:
+    """Weights of ordinates, whose sum is the part of sin(pi x / L) in an influence line.
+
+    That is its share in the first mode of a simply supported beam, (2 / L) int I sin(pi x / L) dx.
+    """
+    length = positions[-1]
+    widths = np.gradient(positions)
+    widths[[0, -1]] /= 2
+    return 2 / length * widths * np.sin(np.pi * positions / length)
+
+
+def vibration(
+    since: Float[np.ndarray, "*time"], passage: float, frequency: float, damping_ratio: float
+) -> Float[np.ndarray, "*time"]:
+    """Response of the first mode to a force that crosses, less the static one, since its entry (s).
+
+    z'' + 2 zeta w z' + w^2 z = w^2 s(t), with s = sin(pi t / T) during the passage T (s), then 0.
+    """
+    last = max(float(since.max()), passage)
+    step = passage / np.ceil(passage / min(passage / 200, 1 / (24 * frequency), last / 8))
+    times = step * np.arange(int(np.ceil(last / step)) + 2)
+    force = np.where(times <= passage, np.sin(np.pi * times / passage), 0.0)
+    motion = _first_mode(force[:, None], step, frequency, damping_ratio)[:, 0]
+    return np.interp(since, times, motion - force, left=0.0)
+
+
+def _first_mode(force, step, frequency, damping_ratio):
+    """Motion z of z'' + 2 zeta w z' + w^2 z = w^2 force (time, number), from rest."""
+    w = 2 * np.pi * frequency
+    pole = complex(-damping_ratio * w, w * np.sqrt(1 - damping_ratio**2))
+    # z is the imaginary part of the response of one pole to w^2 / w_d times the force.
+    inputs = (force * w**2 / pole.imag).astype(complex)
+    return driven(np.full(force.shape[1], pole), inputs, step).imag
+
 
 def model_influence_lines(case: Case) -> InfluenceLines:
-    """Influence lines of a case at 201 points, linear in between.
+    """Influence lines of a case at 201 points, linear in between, and its first mode.
 
     Those of moments and the like are corrected statically; those of deflections are sums of the
     modes of the case.
@@ -59,18 +195,23 @@ def model_influence_lines(case: Case) -> InfluenceLines:
     check_static(case)
     unit_force = UnitForce(case, 1.0)
     shares = np.linspace(0.0, 1.0, MODEL_POINTS)
-    return InfluenceLines(
-        shares * unit_force.length, unit_force.readings(unit_force.length, shares)
-    )
+    values = unit_force.readings(unit_force.length, shares)
+    frequency, damping = unit_force.first_mode
+    return InfluenceLines(shares * unit_force.length, values, None, frequency, damping)
 
 
-def calibrate_influence_lines(case: Case, log: Log, points: int = 41) -> InfluenceLines:
-    """Influence lines from the log of a vehicle of known wheel loads, speed and entry time.
+def calibrate_influence_lines(
+    case: Case, logs: Log | Sequence[Log], points: int = 41
+) -> InfluenceLines:
+    """Influence lines from logs of vehicles of known wheel loads, speeds and entry times.
 
     Ordinates at equally spaced points, linear in between and zero at both ends, are fitted by least
     squares with a weight on their second differences, found by generalised cross-validation (Golub,
-    Heath and Wahba 1979), and an offset of the sensor. The vibration of the crossing stays in them:
-    a slow run is better. Loads are those of the log, or else of the case.
+    Heath and Wahba 1979), and offsets of each sensor in each log. The bridge vibrates meanwhile in
+    its first mode, whose frequency is found with the lines; its damping ratio is that of the case.
+    The covariance of the lines is that of the posterior with the same weight (Wahba 1983), of
+    errors that are independent DYNAMIC_RATE times a second. Loads are those of each log, or else of
+    the case.
 
     Raises ValueError if no load is known, for a sensor of velocity or acceleration, and for less
     than five points.
@@ -90,25 +231,72 @@ def calibrate_influence_lines(case: Case, log: Log, points: int = 41) -> Influen
     check_static(case)
     if points < 5:
         raise ValueError(f"influence lines need at least 5 points, not {points}")
-    loads = case.loads if log.loads is None else tuple(log.loads)
-    if not loads:
-        raise ValueError(
-            f"{log.source}: no load is known; calibration needs a vehicle of known wheel loads, in"
-            " the case or in the TOML file beside the log"
-        )
-    wheels = load_set(dataclasses.replace(case, loads=loads))
-    readings, valid = sensor_readings(case, log)
+    logs = [logs] if isinstance(logs, Log) else list(logs)
     length = float(concrete(case.beam.length))
     positions = np.linspace(0.0, length, points)
-    x = np.asarray(wheels.kinematics(log.times)[0]).T
-    weights = np.asarray(wheels.weight)[:, 0]
-    hats = np.eye(points)[:, 1:-1]
-    matrix = sum(w * _interpolated(positions, hats, x[:, i]) for i, w in enumerate(weights))
-    values = np.zeros((points, len(case.sensors)))
-    for i in range(len(case.sensors)):
-        rows = valid[:, i]
-        values[1:-1, i] = _smooth_ordinates(matrix[rows], readings[rows, i])
-    return InfluenceLines(positions, values)
+    runs = [_Run(case, log, positions) for log in logs]
+    first, damping = UnitForce(case, 1.0).first_mode
+
+    def misfit(share):
+        return sum(one.misfit for one in _lines_of_runs(runs, share * first, damping))
+
+    start = min(FREQUENCY_SHARES.tolist(), key=misfit)
+    share = scipy.optimize.minimize_scalar(
+        misfit, bounds=(0.97 * start, 1.03 * start), method="bounded", options={"xatol": 1e-4}
+    ).x
+    frequency = float(share * first)
+    solved = _lines_of_runs(runs, frequency, damping)
+    values = np.stack([one.ordinates for one in solved], axis=1)
+    covariance = np.stack([one.covariance for one in solved])
+    return InfluenceLines(positions, values, covariance, frequency, damping)
+
+
+class _Run:
+    """A calibration run: readings, and what ordinates at some positions make of them."""
+
+    def __init__(self, case: Case, log: Log, positions):
+        loads = case.loads if log.loads is None else tuple(log.loads)
+        if not loads:
+            raise ValueError(
+                f"{log.source}: no load is known; calibration needs a vehicle of known wheel loads,"
+                " in the case or in the TOML file beside the log"
+            )
+        wheels = load_set(dataclasses.replace(case, loads=loads))
+        self.readings, self.valid = sensor_readings(case, log)
+        x, rates = (np.asarray(part).T for part in wheels.kinematics(log.times)[:2])
+        weights = np.asarray(wheels.weight)[:, 0]
+        hats = np.eye(positions.size)
+        static = [_interpolated(positions, hats, x[:, i]) for i in range(len(weights))]
+        self.static = sum(w * own for w, own in zip(weights, static, strict=True))
+        self.wheels, self.parts = [], first_mode_parts(positions)
+        for i, w in enumerate(weights):
+            speed = float(np.median(np.abs(rates[:, i])))
+            forward = np.median(rates[:, i]) > 0
+            travelled = x[:, i] if forward else positions[-1] - x[:, i]
+            self.wheels.append((w, travelled / speed, positions[-1] / speed))
+        rate = (log.times.size - 1) / log.duration
+        self.counted = min(DYNAMIC_RATE / rate, 1.0)
+
+    def matrix(self, frequency: float, damping_ratio: float):
+        """Readings of unit ordinates (time, point), centred later."""
+        swing = sum(w * vibration(since, passage, frequency, damping_ratio)
+                    for w, since, passage in self.wheels)  # fmt: skip
+        return self.static + np.outer(swing, self.parts)
+
+
+def _lines_of_runs(runs: list[_Run], frequency, damping_ratio) -> "list[_Ordinates]":
+    """Ordinates of each sensor from all runs together."""
+    matrices = [run.matrix(frequency, damping_ratio) for run in runs]
+    found = []
+    for i in range(runs[0].readings.shape[1]):
+        rows, targets = [], []
+        for run, matrix in zip(runs, matrices, strict=True):
+            used = run.valid[:, i]
+            rows.append(matrix[used, 1:-1] - matrix[used, 1:-1].mean(axis=0))
+            targets.append(run.readings[used, i] - run.readings[used, i].mean())
+        counted = float(np.mean([run.counted for run in runs]))
+        found.append(_smooth_ordinates(np.vstack(rows), np.concatenate(targets), counted))
+    return found
 
 
 def check_static(case: Case) -> None:
@@ -127,22 +315,40 @@ def _interpolated(positions, hats, x):
     return np.stack([np.interp(x, positions, hat, 0.0, 0.0) for hat in hats.T], axis=1)
 
 
-def _smooth_ordinates(matrix, reading) -> Float[np.ndarray, " inner"]:
-    """Ordinates that fit a reading, by penalised least squares with the weight of least GCV."""
-    centred, target = matrix - matrix.mean(axis=0), reading - reading.mean()
-    count = matrix.shape[1]
+class _Ordinates(NamedTuple):
+    """Ordinates with zeros at the ends, their covariance, and what they leave of the readings."""
+
+    ordinates: Float[np.ndarray, " point"]
+    covariance: Float[np.ndarray, "point point"]
+    misfit: float
+
+
+def _smooth_ordinates(centred, target, counted) -> _Ordinates:
+    """Ordinates that fit a reading, by penalised least squares with the weight of least GCV.
+
+    `counted` is the share of samples whose errors are independent.
+    """
+    count = centred.shape[1]
     second = np.diff(np.eye(count + 2), 2, axis=0)[:, 1:-1]
     penalty = second.T @ second
     normal, right = centred.T @ centred, centred.T @ target
     penalty = penalty * np.trace(normal) / np.trace(penalty)
     values, vectors = scipy.linalg.eigh(normal, penalty)
     values, projected = np.maximum(values, 0.0), vectors.T @ right
+    whole = float(target @ target)
+
+    def squares(weight):
+        shrunk = projected / (values + weight)
+        return max(whole - 2 * shrunk @ projected + shrunk @ (values * shrunk), 1e-12 * whole)
 
     def criterion(weight):
-        shrunk = values / (values + weight)
-        ordinates = vectors @ (projected / (values + weight))
-        misfit = np.sum((target - centred @ ordinates) ** 2)
-        return misfit / (len(target) - 1 - shrunk.sum()) ** 2
+        freedom = np.sum(values / (values + weight))
+        return squares(weight) / (len(target) - 1 - freedom) ** 2
 
     best = min(SMOOTHNESS, key=criterion)
-    return vectors @ (projected / (values + best))
+    freedom = np.sum(values / (values + best))
+    variance = squares(best) / (len(target) - 1 - freedom) / counted
+    ordinates, covariance = np.zeros(count + 2), np.zeros((count + 2, count + 2))
+    ordinates[1:-1] = vectors @ (projected / (values + best))
+    covariance[1:-1, 1:-1] = variance * (vectors / (values + best)) @ vectors.T
+    return _Ordinates(ordinates, covariance, squares(best) / whole)

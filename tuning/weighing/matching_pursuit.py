@@ -16,7 +16,7 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.point import MovingMass
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
-from tuning.weighing.dynamic_forces import UnitForce
+from tuning.weighing.unit_force import UnitForce
 
 SPEED_COUNT = 16  # candidates in each direction,
 VIBRATING_SPEED_COUNT = 64  # or so many, if a sensor feels the vibration: its phase tells the speed

@@ -36,6 +36,11 @@ class Weighing:
     load_counts: list[ModelCriteria]
 
     @property
+    def case(self) -> Case:
+        """The case with the loads found."""
+        return self.fit.case
+
+    @property
     def loads(self) -> tuple[AbstractLoad, ...]:
         """The fitted loads, in the order in which they were found."""
         return self.fit.cases[0].loads

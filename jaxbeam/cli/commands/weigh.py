@@ -1,5 +1,6 @@
 """Commands `weigh` (weigh-in-motion) and `identify-responses` (fit in the frequency domain)."""
 
+import json
 from pathlib import Path
 
 from jaxbeam.cli.arguments import (
@@ -22,7 +23,8 @@ def weigh(
     max_loads: int = 3,
     one_way: bool = False,
     axles: str | None = None,
-    calibration: Path | None = None,
+    calibration: tuple[Path, ...] = (),
+    lines: Path | None = None,
     output: Output = None,
     options: CaseOptions = CaseOptions(),
 ) -> None:
@@ -44,20 +46,29 @@ def weigh(
         Weigh one vehicle or train of so many axles, or of as many as are found with `auto`: their
         forces and spacings.
     calibration
-        Log of a vehicle of known axle loads (in the TOML file beside it), for the influence lines.
+        Log of a vehicle of known axle loads (in the TOML file beside it), from which influence
+        lines are found; repeat it for more runs. Or one JSON file of lines that `--lines` wrote.
+    lines
+        Write the influence lines found to this file, JSON, for other logs of the bridge.
     output
         Write the case with the identified loads to this file, TOML.
     """
-    options.check_outputs(output)
+    options.check_outputs(output, lines)
+    saved = [path for path in calibration if path.suffix == ".json"]
+    refuse_option(bool(saved) and len(calibration) > 1, "--calibration takes one file of lines")
+    refuse_option(
+        lines is not None and (not calibration or bool(saved)),
+        "--lines writes what --calibration LOG finds",
+    )
     speed_range = parse_range("--speeds", speeds, "m/s, such as 0.5:3")
     number = None if axles in (None, "auto") else _axle_count(axles)
     check_exists("log file", log)
-    if calibration is not None:
-        check_exists("log file", calibration)
-        refuse_option(
-            axles is None,
-            "--calibration is for Moses' method: say how many --axles, or --axles auto",
-        )
+    for path in calibration:
+        check_exists("log file", path)
+    refuse_option(
+        bool(calibration) and axles is None,
+        "--calibration is for axles: say how many --axles, or --axles auto",
+    )
     options.check_case(case)
 
     import tuning  # sets XLA's threads, therefore before the case is read
@@ -67,15 +78,30 @@ def weigh(
     if axles is None:
         weighing = tuning.weigh(parsed_case, read, speed_range, max_loads, both_ways=not one_way)
     else:
-        lines = None
-        if calibration is not None:
-            lines = tuning.calibrate_influence_lines(parsed_case, tuning.read_log(calibration))
+        calibrated = _lines_of(parsed_case, calibration) if calibration else None
         weighing = tuning.weigh_axles(
-            parsed_case, read, speed_range, number, both_ways=not one_way, influence_lines=lines
-        )
+            parsed_case, read, speed_range, number, both_ways=not one_way,
+            influence_lines=calibrated,
+        )  # fmt: skip
+        if lines is not None and calibrated is not None:
+            lines.write_text(json.dumps(calibrated.to_dict()))
     if output:
-        save_case(weighing.fit.case, output, overwrite=True)  # checked before the work
-    options.report(weighing.to_dict(), [str(weighing)], output)
+        save_case(weighing.case, output, overwrite=True)  # checked before the work
+    options.report(weighing.to_dict(), [str(weighing)], output, lines)
+
+
+def _lines_of(case, calibration: tuple[Path, ...]):
+    """Influence lines from logs of known vehicles, or from a file of lines."""
+    import tuning
+    from tuning.weighing.influence_lines import lines_from_dict
+
+    if calibration[0].suffix == ".json":
+        try:
+            content = json.loads(calibration[0].read_text())
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{calibration[0]} is not JSON: {error}") from error
+        return lines_from_dict(content)
+    return tuning.calibrate_influence_lines(case, [tuning.read_log(path) for path in calibration])
 
 
 def _axle_count(text: str) -> int:

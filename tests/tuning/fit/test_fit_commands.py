@@ -22,7 +22,7 @@ def test_weighing(call, tmp_path, monkeypatch):
     class Weighed:
         def __init__(self, *given, **settings):
             arguments.update(given=given, settings=settings)
-            self.fit = fit
+            self.case = fit.case
 
         def to_dict(self):
             return {"loads": np.ones(2)}
@@ -40,6 +40,45 @@ def test_weighing(call, tmp_path, monkeypatch):
     assert json.loads(out) == {"loads": [1.0, 1.0]}
     code, _, err = call("weigh case.toml log.csv --speeds fast")
     assert code == 2 and "--speeds takes LOW:HIGH in m/s, such as 0.5:3, not 'fast'" in err
+
+
+def test_influence_lines_of_several_logs_are_kept(call, tmp_path, monkeypatch):
+    """Those found from two logs weigh a third at once, and a fourth from the file."""
+    found = tuning.InfluenceLines(
+        np.array([0.0, 0.3, 0.6]), np.array([[0.0], [-2e-6], [0.0]]), np.eye(3)[None], 20.0, 0.02
+    )
+    calibrated, used = [], []
+
+    class Weighed:
+        def __init__(self, *given, **settings):
+            used.append(settings["influence_lines"])
+
+        def to_dict(self):
+            return {"axles": []}
+
+        def __str__(self):
+            return "2 axles found"
+
+    def calibrate(case, logs):
+        calibrated.extend(log.source for log in logs)
+        return found
+
+    monkeypatch.setattr(tuning, "weigh_axles", Weighed)
+    monkeypatch.setattr(tuning, "calibrate_influence_lines", calibrate)
+    for name in ("log", "first", "second"):
+        (tmp_path / f"{name}.csv").write_text("t [s],a [mm]\n0,1\n1,2\n2,1\n")
+    weigh = "weigh case.toml log.csv --speeds 0.5:3 --axles auto"
+    runs = "--calibration first.csv --calibration second.csv --lines lines.json"
+    code, out, err = call(f"{weigh} {runs}")
+    assert (code, out) == (0, "2 axles found\nwritten: lines.json\n"), err
+    assert len(calibrated) == 2
+    code, out, err = call(f"{weigh} --calibration lines.json")
+    assert code == 0 and len(calibrated) == 2, err
+    for one, again in zip(used[0], used[1], strict=True):
+        np.testing.assert_array_equal(one, again)
+    (tmp_path / "other.json").write_text("[1, 2")
+    code, _, err = call(f"{weigh} --calibration other.json")
+    assert code == 1 and "other.json is not JSON" in err
 
 
 def test_models_compared_and_held_out_logs(call, tmp_path, monkeypatch):

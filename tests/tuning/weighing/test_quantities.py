@@ -13,8 +13,8 @@ import jaxbeam as jb
 from tests.oracles import finite_elements, vehicle_elements
 from tests.oracles.loads import GRAVITY
 from tuning import Log, identify, weigh
-from tuning.weighing.dynamic_forces import UnitForce
 from tuning.weighing.matching_pursuit import MatchingPursuit
+from tuning.weighing.unit_force import UnitForce
 
 LENGTH, RIGIDITY, DENSITY, DAMPING = 20.0, 1e10, 8000.0, 0.02
 MASS, SPEED, LEAD, FIBRE = 8000.0, 12.0, 3.6, -0.5  # kg, m/s, m, m
