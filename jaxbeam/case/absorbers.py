@@ -11,7 +11,7 @@ r = m_t / (m_t + b) and the height z of u = r z + (1 - r) y, this is an oscillat
 
     r m_t z'' = r^2 s_z,   s_z = k (y - z) + c (y' - z'),   F = r^2 s_z + b r y'',
 
-so that absorbers run as the vehicles of `jaxbeam.case.loads.vehicle_model` do, standing.
+so that absorbers run as the vehicles of `jaxbeam.case.loads.base` do, standing.
 """
 
 import numpy as np
@@ -128,7 +128,7 @@ class Absorber(ReprWithUnits):
 
     def spacings(self) -> Float[Array, " vehicle"]:
         """Zero: one absorber."""
-        return np.zeros(1)
+        return xp.zeros(1)
 
     def force_histories(self) -> dict[int, ForceHistory]:
         """None."""

@@ -249,7 +249,8 @@ def inputs_over_time(
     groups = [range(len(batches))] if one_profile else [[row] for row in range(len(batches))]
     for group in groups:
         flat = [np.concatenate([paths[row][i].ravel() for row in group]) for i in range(3)]
-        motion: Any = np.stack(batches[group[0]].surface_motion(*flat))
+        heights: Any = batches[group[0]].surface_motion(*flat)
+        motion = np.stack(heights)
         for row, part in zip(
             group,
             np.split(motion, np.cumsum([paths[row][0].size for row in group])[:-1], axis=1),
@@ -259,7 +260,8 @@ def inputs_over_time(
             surface[row, : len(all_times[row])] = np.moveaxis(by_wheel, 2, 0).swapaxes(1, 2)
     inputs["surface"] = surface.reshape(len(batches), steps, -1)
     if first.wheels.vehicles:
-        inputs["initial_vehicles"] = np.stack([initial_vehicle_states(loads) for loads in batches])
+        at_rest: list[Any] = [initial_vehicle_states(loads) for loads in batches]
+        inputs["initial_vehicles"] = np.stack(at_rest)
     return inputs
 
 

@@ -131,7 +131,7 @@ class Plant(Module):
     def unloaded(self) -> StateSpace:
         """Time-invariant system without loads and absorbers; its inputs are the commands.
 
-        Of a beam with absorbers, which are among the wheels of `at`, `jaxbeam.poles` has the poles.
+        Absorbers are among the wheels of `at`; `jaxbeam.model.poles_zeros` has their poles.
         """
         return _unloaded_plant(self)
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.runtime.indexed_windows import gather, scatter
@@ -130,7 +131,7 @@ def _rule(equation) -> Callable:
     """Function of the arrays that an equation takes."""
     name, params = equation.primitive.name, equation.params
     avals = [atom.aval for atom in (*equation.invars, *equation.outvars)]
-    if any(jax.dtypes.issubdtype(aval.dtype, jax.dtypes.extended) for aval in avals):
+    if any(jnp.issubdtype(aval.dtype, jax.dtypes.extended) for aval in avals):
         return _as_it_is(equation)
     if name in OPENED:
         return InterpretedProgram(params[OPENED[name]])
@@ -153,7 +154,7 @@ def _as_it_is(equation) -> Callable:
 
 def _known(value):
     """An array of NumPy, of numbers that it has."""
-    return value if jax.dtypes.issubdtype(value.dtype, jax.dtypes.extended) else np.asarray(value)
+    return value if jnp.issubdtype(value.dtype, jax.dtypes.extended) else np.asarray(value)
 
 
 def _divide(a, b):

@@ -149,7 +149,15 @@ class SweepSpecification:
         input_bytes = max(self._sizes.input_bytes(group, runs) for group in sensors)
         limits = (max(1, int(self.block_bytes / size)) for size in (batch_bytes, input_bytes))
         small = not (self.single or self.several)
-        settings = self.batches, self.histories, self.tolerance, self.single, native, *limits, small
+        settings: tuple = (
+            self.batches,
+            self.histories,
+            self.tolerance,
+            self.single,
+            native,
+            *limits,
+            small,
+        )
         if len(groups) == 1:
             return Runner(self.case, *settings)
         cases = [dataclasses.replace(self.case, sensors=tuple(group)) for group in sensors]

@@ -434,7 +434,7 @@ JUMPING = {
     f"{part} jump": (JUMPS_OF_ALL, f"{part}.")
     for part in ("sensors", "vehicle_sensors", "controller")
 }
-CASES: dict[str, tuple[jb.Case, str]] = {
+CASES: dict[str, tuple[jb.Case, str | tuple[str, ...]]] = {
     **{name: (case, "beam.") for name, case in OF_BEAM.items()},
     "supports": (SUPPORTS, "supports."),
     "absorbers": (ABSORBERS, "absorbers."),

@@ -147,7 +147,7 @@ def test_moments_of_a_moving_mass_against_an_independent_program():
     assert_allclose(single, found, rtol=1e-4)
 
 
-@pytest.mark.filterwarnings("ignore::jaxbeam.model.plausibility.facts.PlausibilityWarning")
+@pytest.mark.filterwarnings("ignore::jaxbeam.model.plausibility.check.PlausibilityWarning")
 def test_beams_that_can_move_as_a_rigid_body_are_not_corrected():
     free = dataclasses.replace(BEAM, ends="free-free")
     sensors = (jb.Sensor(0.6, "moment"), jb.Sensor(0.6, "shear"))

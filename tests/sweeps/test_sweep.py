@@ -46,7 +46,7 @@ def single_run_peaks(values) -> np.ndarray:
     return np.asarray(jb.simulate(jb.replace(CASE, values)).peak_deflection)
 
 
-OF_PLAUSIBILITY = "jaxbeam.model.plausibility.facts.PlausibilityWarning"
+OF_PLAUSIBILITY = "jaxbeam.model.plausibility.check.PlausibilityWarning"
 IMPLAUSIBLE = pytest.mark.filterwarnings(f"ignore::{OF_PLAUSIBILITY}")
 
 
