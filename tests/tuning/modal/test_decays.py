@@ -363,3 +363,43 @@ def test_all_strong_modes_of_decays_that_fall_little_or_have_weak_partners(kind,
     one = compare(fit, planted)
     assert fit.kind == "free decay" and not one.missed and not one.false_modes, str(fit)
     assert one.covered.sum() >= one.covered.size - 2
+
+
+def rattling_blow(seed, rattle, noise):
+    """Accelerations of three neighbouring sensors after a blow at 1 s, and the modes' ranges.
+
+    Amplitudes follow da/dt = -(l + m a) a from 1 on, damping ratios falling from twice the last
+    ones, frequencies rising by 1 %. Parts rattle sixty times a second, by up to the amplitude.
+    """
+    random, rate = np.random.default_rng(seed), 800.0
+    times = np.arange(int(10 * rate)) / rate
+    since = np.maximum(times - 1.0, 0.0)
+    values = np.zeros((times.size, 3))
+    shapes = [1.0, 1.1, 1.2], [1.5, 1.35, 1.1], [2.0, 2.3, 1.8]
+    parts = tuple(zip((11.9, 17.4, 26.1), (0.01, 0.008, 0.004), shapes, strict=True))
+    for f, z, shape in parts:
+        decay = 2 * np.pi * f * z
+        amplitude = 1 / (2 * np.exp(decay * since) - 1)
+        phase = 2 * np.pi * f * since - 0.01 / z * np.log(2 - np.exp(-decay * since))
+        values += np.outer((since > 0) * amplitude * np.sin(phase), shape)
+    values += np.outer(np.abs(times - 1.0) < 1.5 / rate, [10.0, 6.0, 3.0])
+    knocks = random.normal(size=values.shape) * (random.random(values.shape) < 60 / rate)
+    values += rattle * knocks * ((since > 0) * amplitude)[:, None]
+    ranges = [((0.99 * f, f), (z, 2 * z)) for f, z, _ in parts]
+    return values + noise * random.normal(size=values.shape), rate, ranges
+
+
+@pytest.mark.parametrize(("rattle", "noise"), [(1.0, 0.003), (2.0, 0.01)])
+@pytest.mark.parametrize("seed", [10, 11, 12])
+def test_the_own_decay_of_a_blow_is_used_though_parts_rattle_in_it(seed, rattle, noise):
+    values, rate, ranges = rattling_blow(seed, rattle, noise)
+    names, quantities, units = ("a1", "a2", "a3"), ("acceleration",) * 3, ("m/s2",) * 3
+    fit = identify_modes(Log(np.arange(len(values)) / rate, values, names, quantities, units))
+    assert fit.kind == "free decay" and 1.0 <= fit.windows[0][0] < 1.1
+    for frequencies, dampings in ranges:
+        mode = min(fit.modes, key=lambda one: abs(one.frequency - np.mean(frequencies)))
+        for value, sd, (low, high) in (
+            (mode.frequency, mode.frequency_sd, frequencies),
+            (mode.damping_ratio, mode.damping_sd, dampings),
+        ):
+            assert low - mode.quantile * sd < value < high + mode.quantile * sd

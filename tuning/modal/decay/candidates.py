@@ -5,12 +5,18 @@ import numpy as np
 from tuning.modal.ambient import Candidate, without_duplicates
 from tuning.modal.decay.fit import DecayFit
 from tuning.modal.decay.leaving import PARTS
-from tuning.modal.result import MAX_DAMPING_RATIO, IdentifiedMode, rejection_reason
+from tuning.modal.result import (
+    MAX_DAMPING_RATIO,
+    MIN_COLLINEARITY,
+    IdentifiedMode,
+    rejection_reason,
+)
 from tuning.modal.shapes import mac_matrix
 
 NOT_REPRODUCED = "not the same in parts of the window"
 NONLINEARITY = "what nonlinearity adds to the mode of"
 NONLINEAR_DECAY = 2.5, 4.5  # decay rates over that of a mode, of what its nonlinearity adds to it
+SKIRT_BANDWIDTHS = 4.0  # half widths of a peak, to where its amplitude has fallen to a quarter
 NONLINEAR_MAC = 0.95
 # Over that of the mode. Its phase moves by k in all, so that k^2 / 3 of its energy is that of the
 # first such term; fits of more than two terms that Duffing's equation asks for give up to four.
@@ -21,13 +27,21 @@ BandFits = list[tuple[tuple[float, float], DecayFit]]  # of parts of a band (Hz)
 
 
 def decay_candidates(
-    fits: BandFits, decays: int, channels: int, duration: float, band: tuple[float, float]
+    fits: BandFits,
+    decays: int,
+    channels: int,
+    duration: float,
+    band: tuple[float, float],
+    is_free: bool = False,
 ) -> tuple[Candidate, ...]:
     """Modes of each part of the band, with their shares in its energy of the channels.
 
+    In decays that are free for sure (`is_free`) a shape may be complex, and frequency and damping
+    depend on amplitude, which widens their intervals: no force makes it so.
     Columns of the fits are the `channels` of each of several `decays`, or of combinations of these.
     """
     found, by_decay = [], []
+    collinear = 0.0 if is_free else MIN_COLLINEARITY
     for part, fit in fits:
         total = np.sum(fit.measured**2, axis=0).reshape(-1, channels).sum(axis=0)
         parts = fit.energies.shape[1] // channels
@@ -36,15 +50,33 @@ def decay_candidates(
         energies = columns.sum(axis=2)
         if parts != decays:  # combinations of decays
             energies = energies.sum(axis=1, keepdims=True)
+        changing = fit.gone
+        if is_free:
+            changing = tuple(
+                gone and _is_beside_stronger(k, fit.modes, shares)
+                for k, gone in enumerate(fit.gone)
+            )
         for mode, share, gone, energy in zip(
-            fit.modes, shares.tolist(), fit.gone, energies, strict=True
+            fit.modes, shares.tolist(), changing, energies, strict=True
         ):
             if part[0] <= mode.frequency < part[1] or len(fits) == 1:
                 mode = mode._replace(energy_share=share)
-                reason = rejection_reason(mode, duration, band) or (NOT_REPRODUCED if gone else "")
+                reason = rejection_reason(mode, duration, band, collinear) or (
+                    NOT_REPRODUCED if gone else ""
+                )
                 found.append(Candidate(mode, reason, 1))
                 by_decay.append(energy)
     return without_duplicates(_without_nonlinearity(found, by_decay))
+
+
+def _is_beside_stronger(k, modes, shares) -> bool:
+    """Whether a mode may stand for what nonlinearity makes of a stronger one about its peak."""
+    return any(
+        shares[j] > shares[k]
+        and abs(one.frequency - modes[k].frequency)
+        < SKIRT_BANDWIDTHS * max(one.damping_ratio, 0.0) * one.frequency
+        for j, one in enumerate(modes)
+    )
 
 
 def share_of_modes(found: tuple[Candidate, ...], fits: BandFits, duration: float) -> float:
@@ -102,3 +134,14 @@ def _grows_as_cube(energies, others) -> bool:
     """Whether energies of a mode in several decays are in proportion to the cubes of another's."""
     ratios = energies / np.maximum(others, 1e-300) ** 3
     return bool(ratios.max() < MAX_CUBE_SPREAD * ratios.min())
+
+
+def information_of_modes(found: tuple[Candidate, ...]) -> float:
+    """Logarithm of the determinant of the information on damping ratios of modes (D-optimality).
+
+    Each counts by how much narrower than itself its 95 % interval is, and rejected ones not at all.
+    """
+    modes = [one.mode for one in found if not one.reason]
+    return float(
+        sum(2 * np.log(one.damping_ratio / (one.quantile * one.damping_sd)) for one in modes)
+    )

@@ -12,7 +12,11 @@ from tuning.modal.ambient import (
     overlapping,
     subspace_modes,
 )
-from tuning.modal.decay.candidates import decay_candidates, share_of_modes
+from tuning.modal.decay.candidates import (
+    decay_candidates,
+    information_of_modes,
+    share_of_modes,
+)
 from tuning.modal.decay.dominant import after_blow, after_soft_blows, dominate, follows
 from tuning.modal.decay.earlier_start import earlier_start
 from tuning.modal.decay.fit import DecayFit, fit_decay
@@ -38,6 +42,7 @@ MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay
 MIN_SHARE_OF_MODES = 0.5  # of the energy at the beginning of decays
 SAFE_SHARE_OF_MODES = 0.9  # the same of a decay that is to begin earlier
 MIN_LEVEL_AT_START = 3.0  # energy of the first part of such a decay over the mean
+SHORTER_PARTS = 0.6, 0.35  # of an impact's decay, that may tell more than all of it
 MAX_CUTS = 3  # of a decay in which the structure is found to be excited
 MAX_RESIDUAL_OF_WINDOW = 0.05  # the same for a window that the user gives and that falls little
 # The same after blows that only the energy tells of: those of three planted logs left 0.003 at
@@ -110,6 +115,24 @@ def _with_excitation(marks, record, size) -> Bool[np.ndarray, " time"]:
     return marks | (np.arange(marks.size) < ends * ratio)
 
 
+def follow_impacts(
+    samples: Samples,
+    struck: tuple[Bool[np.ndarray, " time"], ...],
+    derivatives: tuple[int, ...],
+    band: tuple[float, float],
+) -> bool:
+    """Whether the free decays in a band are impacts' own."""
+    decays = _decays_in_band(samples, struck, derivatives, band)[2]
+    return bool(decays) and all(one.impact for one in decays)
+
+
+def _decays_in_band(samples: Samples, struck, derivatives, band):
+    """The records prepared for a band, the strongest frequency (Hz), and the free decays."""
+    prepared = prepare(samples.records, samples.starts, samples.rate, band)
+    frequency = strongest_frequency(prepared.records, prepared.rate, derivatives, band)
+    return prepared, frequency, free_decays(struck, prepared.records, prepared.rate, frequency)
+
+
 def free_decay_modes(
     samples: Samples,
     struck: tuple[Bool[np.ndarray, " time"], ...],
@@ -126,9 +149,7 @@ def free_decay_modes(
     found, all is one decay if it is said to be (`kind`) or may be (`whole`, of a window that the
     user gives).
     """
-    prepared = prepare(samples.records, samples.starts, samples.rate, band)
-    frequency = strongest_frequency(prepared.records, prepared.rate, derivatives, band)
-    decays = free_decays(struck, prepared.records, prepared.rate, frequency)
+    prepared, frequency, decays = _decays_in_band(samples, struck, derivatives, band)
     given = not decays and (kind == "free decay" or whole)
     if given:
         decays = tuple(Stretch(i, 0, len(r), 0.0) for i, r in enumerate(samples.records))
@@ -143,6 +164,8 @@ def free_decay_modes(
     one = _fitted(decays, samples, band, order)
     if one is None:
         return None
+    if all(one.impact for one in decays):
+        return _told(_of_best_length(one, samples, band, order), samples)
     found = one.used
     for _ in range(MAX_CUTS):
         rest = one.used if given else _rest(one, samples, struck, band, cycle)
@@ -167,9 +190,7 @@ def free_decay_modes(
     damped = one.share_of_modes > MIN_SHARE_OF_MODES
     if kind is None and not (damped and explained):
         return None
-    channels = samples.records[0].shape[1]
-    first = Decays(one.used, one.measured[:, :channels], one.fitted[:, :channels])
-    return one.candidates, one.diagrams, first
+    return _told(one, samples)
 
 
 class _Fitted(NamedTuple):
@@ -187,6 +208,26 @@ class _Fitted(NamedTuple):
     def share_of_modes(self) -> float:
         """Share of the modes in the energy at the beginning."""
         return share_of_modes(self.candidates, self.fits, self.duration)
+
+
+def _told(one: _Fitted, samples: Samples):
+    """Candidates, diagrams and decays of a fit."""
+    channels = samples.records[0].shape[1]
+    first = Decays(one.used, one.measured[:, :channels], one.fitted[:, :channels])
+    return one.candidates, one.diagrams, first
+
+
+def _of_best_length(whole: _Fitted, samples: Samples, band, order) -> _Fitted:
+    """The fit of an impact's decay, or of its first part if that tells more of its modes.
+
+    Noise that is not steady and frequencies that depend on amplitude make the latter parts of a
+    decay tell less than the beginning.
+    """
+    length, fits = len(whole.measured), [whole]
+    for share in SHORTER_PARTS:
+        part = tuple(one._replace(stop=one.start + int(share * length)) for one in whole.used)
+        fits.append(_fitted(part, samples, band, order) or whole)
+    return max(fits, key=lambda one: information_of_modes(one.candidates))
 
 
 def _fitted(decays, samples: Samples, band, order) -> _Fitted | None:
@@ -213,7 +254,8 @@ def _fitted(decays, samples: Samples, band, order) -> _Fitted | None:
         for name in ("measured", "fitted")
     )
     duration = len(windows) / samples.rate
-    found = decay_candidates(fits, len(used), channels, duration, band)
+    is_free = all(one.impact for one in used)
+    found = decay_candidates(fits, len(used), channels, duration, band, is_free)
     return _Fitted(used, duration, found, fits, diagrams, measured, fitted)
 
 

@@ -33,7 +33,7 @@ def until_soft_blow(record: Float[np.ndarray, "sample channel"], width: int) -> 
 
     `width` are two cycles of the strongest vibration in samples.
     """
-    return _until_blow(vibration_energy(record, width), width)
+    return until_blow(vibration_energy(record, width), width)
 
 
 def after_first_blow(energy: Float[np.ndarray, " sample"], width: int) -> int | None:
@@ -50,7 +50,7 @@ def between_soft_blows(
 ) -> Iterator[tuple[int, int]]:
     """First and last samples of the parts of a stretch before and after soft blows."""
     while True:
-        rise = first + _until_blow(energy[first:last], width)
+        rise = first + until_blow(energy[first:last], width)
         yield first, rise
         if rise == last:
             return
@@ -62,7 +62,7 @@ def _highest_after(energy, rise, width) -> int:
     return rise + int(np.argmax(energy[rise : rise + 4 * width]))
 
 
-def _until_blow(energy, width) -> int:
+def until_blow(energy: Float[np.ndarray, " sample"], width: int) -> int:
     """Samples before a blow too soft to be found by its errors.
 
     Close modes make the energy rise, too, but not above what it was as long before its least.

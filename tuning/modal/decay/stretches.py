@@ -18,9 +18,11 @@ from tuning.modal.decay.soft_blows import (
     MAX_HARDER,
     MIN_ENERGY_RISE,
     MIN_START_RATIO,
+    RISE_WIDTHS,
     after_first_blow,
     between_soft_blows,
     moving_mean,
+    until_blow,
     vibration_energy,
 )
 
@@ -45,13 +47,28 @@ CORES_BEFORE_NOISE = 8  # times that of 95 % of the energy above noise: 12 decay
 CORE, WHOLE = 0.95, 0.999  # shares of the energy of a decay: for its fall, and for its end
 
 
+# Of the information of an impact's own decay, that other decays must have to be taken instead:
+# with less than a tenth, their intervals are more than three times as wide.
+LITTLE_INFORMATION = 0.1
+CONTACT_CYCLES = 0.5  # of the strongest vibration, in which marks are those of the blow itself
+# Nepers after which the instants of the fall of the energy are compared. One exponential needs half
+# of the time to the second for the first, several need less. What a load shakes that crosses stays
+# up until it has left: the first neper takes most of the time to the second.
+FALLS = 1.0, 2.0
+MAX_FIRST_SHARE = 0.6
+
+
 class Stretch(NamedTuple):
-    """Samples (start, stop) of a record between excitations, and the fall of energy in nepers."""
+    """Samples (start, stop) of a record between excitations, and the fall of energy in nepers.
+
+    `impact` says that it is the own decay of a blow on a structure at rest.
+    """
 
     record: int
     start: int
     stop: int
     fall: float
+    impact: bool = False
 
 
 def excited_samples(
@@ -147,13 +164,71 @@ def free_decays(
     way. What is at rest before a first blow that was not found does not count. In a record without
     a lasting excitation the energy also tells of blows too soft, or in too much noise, to be found
     by their errors, down to a tenth of the highest energy.
+
+    The own decay of a blow on a structure at rest takes their place in its record where they tell
+    far less than it.
     """
     shortest = int(np.ceil(MIN_DECAY_CYCLES * rate / frequency))
     width = max(int(2 * rate / frequency), 4)
     found = []
     for number, (marks, record) in enumerate(zip(struck, records, strict=True)):
-        found += _decays_of_record(number, marks, vibration_energy(record, width), shortest, width)
+        energy = vibration_energy(record, width)
+        decays = _decays_of_record(number, marks, energy, shortest, width)
+        own = _decay_of_impact(number, marks, energy, shortest, width)
+        found += decays if own is None or _tell_enough(decays, own, marks, energy) else [own]
     return tuple(found)
+
+
+def _decay_of_impact(number, marks, energy, shortest, width) -> Stretch | None:
+    """The decay right after the strongest blow, if that strikes a structure at rest.
+
+    A hammer leaves the structure after milliseconds. Friction, rattling parts and frequencies that
+    depend on amplitude make samples stand out in the decay that nothing has struck, and no linear
+    model explains it: it is known by the energy, which rises at once and falls from then on.
+    """
+    ratio = marks.size / len(energy)
+    highest = int(np.argmax(energy))
+    # The moving mean is highest where it begins with the blow.
+    blow = max(highest - width // 2, 0)
+    past = energy[max(blow - RISE_WIDTHS * width, 0) : max(blow - width // 2, 0)]
+    if past.size < width or MIN_START_RATIO * past.max() > energy[highest]:
+        return None
+    struck = marks[int((blow - width) * ratio) : int((blow + width) * ratio)]
+    if not struck.any() or not _falls_at_once(energy[highest:]):
+        return None
+    exact, contact = int(blow * ratio), int(CONTACT_CYCLES * width / 2 * ratio)
+    start = exact + int(np.flatnonzero(marks[exact : exact + contact])[-1:].sum()) + 2
+    first = int(np.ceil(start / ratio))
+    last = highest + until_blow(energy[highest:], width)
+    part = energy[first:last]
+    if part.size < shortest:
+        return None
+    fall = _fall_of_decay(part, True)
+    if fall < MIN_FALL_NEPERS:
+        return None
+    stop = start + int(max(_until_noise(part), shortest) * ratio)
+    return Stretch(number, start, min(stop, int(last * ratio)), fall, True)
+
+
+def _falls_at_once(energy) -> bool:
+    """Whether energy falls from its beginning, as in a free decay."""
+    level = np.log(np.maximum(energy, 1e-300))
+    first, second = (np.flatnonzero(level < level[0] - fall) for fall in FALLS)
+    return bool(second.size and first[0] <= MAX_FIRST_SHARE * second[0])
+
+
+def _tell_enough(decays, own: Stretch, marks, energy) -> bool:
+    """Whether decays have not far less information than an impact's own: energy times nepers.
+
+    The energy is that above the noise, which is the usual one of the record.
+    """
+    ratio, noise = marks.size / len(energy), np.median(energy)
+
+    def information(one):
+        part = energy[int(one.start / ratio) : int(one.stop / ratio)] - noise
+        return one.fall * np.maximum(part, 0.0).sum()
+
+    return bool(sum(map(information, decays)) > LITTLE_INFORMATION * information(own))
 
 
 def _decays_of_record(number, marks, energy, shortest, width) -> list[Stretch]:

@@ -7,7 +7,13 @@ from jaxtyping import Bool
 
 from tuning.modal.ambient import Candidate, without_duplicates
 from tuning.modal.decay.candidates import NONLINEARITY
-from tuning.modal.decay.modes import Decays, band_of_ends, excited, free_decay_modes
+from tuning.modal.decay.modes import (
+    Decays,
+    band_of_ends,
+    excited,
+    follow_impacts,
+    free_decay_modes,
+)
 from tuning.modal.preprocessing import HALF_POWER, kinetic_band
 from tuning.modal.result import is_at_edge
 from tuning.modal.samples import Samples
@@ -56,6 +62,8 @@ def modes_of_decays(
     found = _in_band(samples, struck, derivatives, band, may_narrow, how)
     if found is None:
         return None
+    if found.decays.stretches[0].impact:
+        return found
     if wide != band:
         more = free_decay_modes(samples, struck, derivatives, wide, **how)
         found = _with_others(found, more, wide)
@@ -63,6 +71,14 @@ def modes_of_decays(
 
 
 def _in_band(samples, struck, derivatives, band, may_narrow, how) -> FromDecays | None:
+    if may_narrow and follow_impacts(samples, struck, derivatives, band):
+        # Contacts and rattling parts have most of the velocities above what the structure moves.
+        displacements = tuple(order + 1 for order in derivatives)
+        narrower = kinetic_band(samples.records, samples.rate, displacements)
+        marks = excited(samples, derivatives, narrower)
+        told = free_decay_modes(samples, marks, derivatives, narrower, **how)
+        if told is not None:
+            return FromDecays(*told, narrower)
     found = free_decay_modes(samples, struck, derivatives, band, **how)
     if found is None and may_narrow:
         lower = kinetic_band(samples.records, samples.rate, derivatives, HALF_POWER)
