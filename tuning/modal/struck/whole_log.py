@@ -62,7 +62,7 @@ def modes_of_decays(
     found = _in_band(samples, struck, derivatives, band, may_narrow, how)
     if found is None:
         return None
-    if found.decays.stretches[0].impact:
+    if all(one.impact for one in found.decays.stretches):
         return found
     if wide != band:
         more = free_decay_modes(samples, struck, derivatives, wide, **how)
