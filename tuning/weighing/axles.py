@@ -1,6 +1,6 @@
 """Axle loads and spacings of a vehicle or train from readings of a bridge.
 
-Influence lines and first mode, of the model or calibrated by known vehicles, serve all steps: the
+Influence lines and first modes, of the model or calibrated by known vehicles, serve all steps: the
 search of speed, entry time and distances (`search`), Moses' method, and the fit, in which dynamic
 wheel forces on an unknown road and errors of calibrated lines are noise (`axle_fit`).
 

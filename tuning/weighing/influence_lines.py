@@ -17,6 +17,9 @@ from tuning.logs.pairing import sensor_readings
 from tuning.weighing.unit_force import UnitForce, driven
 
 MODEL_POINTS = 201
+# The bridge vibrates in as many modes as hold this share of the squares of its influence lines, in
+# so many at most: vehicles change the frequencies of higher ones by more than their part is known.
+MODE_SHARE, MODES = 0.8, 4
 SMOOTHNESS = np.logspace(-8, 4, 49)  # tried weights of second differences
 FREQUENCY_SHARES = np.geomspace(0.7, 1.8, 40)  # of the model's first frequency, likewise
 DYNAMIC_RATE = 6.0  # Hz, of independent errors: body bounce and vibration have two to four
@@ -44,9 +47,9 @@ class AxleGeometry:
 class InfluenceLines(NamedTuple):
     """Readings of sensors (SI unit per newton downwards) with a force at positions (m).
 
-    `covariance` is that of the ordinates (sensor, point, point) of calibrated lines. `frequency`
-    (Hz) and `damping_ratio` are those of the first mode, in which the bridge vibrates about what
-    the lines tell; without a frequency it does not.
+    `covariance` is that of the ordinates (sensor, point, point) of calibrated lines. The bridge
+    vibrates about what the lines tell in modes of these `shapes`, of `ratios` times the first
+    `frequency` (Hz), and `damping_ratios`; without a frequency it does not.
 
     >>> import numpy as np
     >>> import tuning
@@ -61,7 +64,9 @@ class InfluenceLines(NamedTuple):
     values: Float[np.ndarray, "point sensor"]
     covariance: Float[np.ndarray, "sensor point point"] | None = None
     frequency: float | None = None
-    damping_ratio: float = 0.0
+    shapes: Float[np.ndarray, "point mode"] | None = None
+    ratios: Float[np.ndarray, " mode"] | None = None
+    damping_ratios: Float[np.ndarray, " mode"] | None = None
 
     def at(self, x: Float[np.ndarray, "*force"]) -> Float[np.ndarray, "*force sensor"]:
         """Readings per newton with the force at x (m), zero off the beam."""
@@ -77,14 +82,13 @@ class InfluenceLines(NamedTuple):
         self, geometry: AxleGeometry, times: Float[np.ndarray, " time"]
     ) -> Float[np.ndarray, "time axle sensor"]:
         """Readings of a force of one newton at each axle, with the vibration that it leaves."""
-        static = self.at(geometry.positions(times))
-        if self.frequency is None:
-            return static
+        found = self.at(geometry.positions(times))
         since = times[:, None] - geometry.entry_time - geometry.offsets / abs(geometry.speed)
-        passage = self.length / abs(geometry.speed)
-        swing = vibration(since, passage, self.frequency, self.damping_ratio)
-        parts = first_mode_parts(self.positions) @ self.values
-        return static + swing[:, :, None] * parts
+        for mode in self.modes:
+            found = found + mode.swing(since, geometry.speed)[:, :, None] * (
+                mode.parts @ self.values
+            )
+        return found
 
     def modulated(
         self,
@@ -95,17 +99,30 @@ class InfluenceLines(NamedTuple):
         """Readings of forces at the axles that vary in time as `waves` (N), with vibration."""
         x = geometry.positions(times)
         found = waves[:, None, :, None] * self.at(x)[:, :, None, :]
-        if self.frequency is None:
-            return found
-        parts = first_mode_parts(self.positions) @ self.values
-        on = (x >= 0) & (x <= self.length)
-        shape = np.where(on, np.sin(np.pi * np.clip(x, 0, self.length) / self.length), 0.0)
-        force = (shape[:, :, None] * waves[:, None, :]).reshape(times.size, -1)
         grid = np.linspace(times[0], times[-1], times.size)
-        even = np.stack([np.interp(grid, times, one) for one in force.T], axis=1)
-        motion = _first_mode(even, grid[1] - grid[0], self.frequency, self.damping_ratio)
-        swing = np.stack([np.interp(times, grid, one) for one in (motion - even).T], axis=1)
-        return found + swing.reshape(*shape.shape, -1)[..., None] * parts
+        for mode in self.modes:
+            shape = np.interp(x, self.positions, mode.shape, 0.0, 0.0)
+            force = (shape[:, :, None] * waves[:, None, :]).reshape(times.size, -1)
+            even = np.stack([np.interp(grid, times, one) for one in force.T], axis=1)
+            motion = mode.motion(even, grid[1] - grid[0])
+            swing = np.stack([np.interp(times, grid, one) for one in (motion - even).T], axis=1)
+            swing = swing.reshape(*shape.shape, -1)
+            found = found + swing[..., None] * (mode.parts @ self.values)
+        return found
+
+    @property
+    def modes(self) -> "list[_Mode]":
+        """Modes in which the bridge vibrates."""
+        if self.frequency is None:
+            return []
+        assert self.shapes is not None
+        # An influence line is the sum of the shapes times what these rows make of it.
+        parts = np.linalg.pinv(self.shapes)
+        rows = zip(self.shapes.T, self.ratios, self.damping_ratios, parts, strict=True)
+        return [
+            _Mode(self.positions, shape, float(self.frequency * ratio), float(damping), part)
+            for shape, ratio, damping, part in rows
+        ]
 
     def to_dict(self) -> dict:
         """Plain numbers, from which `lines_from_dict` makes the lines again."""
@@ -113,10 +130,16 @@ class InfluenceLines(NamedTuple):
             "format": FORMAT,
             "positions_m": self.positions.tolist(),
             "ordinates": self.values.T.tolist(),
-            "covariances": None if self.covariance is None else self.covariance.tolist(),
+            "covariances": _listed(self.covariance),
             "frequency_hz": self.frequency,
-            "damping_ratio": self.damping_ratio,
+            "shapes": _listed(self.shapes),
+            "frequency_ratios": _listed(self.ratios),
+            "damping_ratios": _listed(self.damping_ratios),
         }
+
+
+def _listed(table: np.ndarray | None) -> list | None:
+    return None if table is None else table.tolist()
 
 
 def lines_from_dict(content: dict) -> InfluenceLines:
@@ -130,53 +153,50 @@ def lines_from_dict(content: dict) -> InfluenceLines:
             f"these are no calibrated influence lines: format {found!r}, not {FORMAT!r}; write them"
             " by weigh --calibration LOG --lines FILE"
         )
-    covariance = content["covariances"]
+    names = "covariances", "shapes", "frequency_ratios", "damping_ratios"
+    tables = [None if content[name] is None else np.array(content[name]) for name in names]
     return InfluenceLines(
-        np.array(content["positions_m"]),
-        np.array(content["ordinates"]).T,
-        None if covariance is None else np.array(covariance),
-        content["frequency_hz"],
-        content["damping_ratio"],
-    )
+        np.array(content["positions_m"]), np.array(content["ordinates"]).T, tables[0],
+        content["frequency_hz"], *tables[1:],
+    )  # fmt: skip
 
 
-def first_mode_parts(positions: Float[np.ndarray, " point"]) -> Float[np.ndarray, " point"]:
-    """Weights of ordinates, whose sum is the part of sin(pi x / L) in an influence line.
+class _Mode(NamedTuple):
+    """z'' + 2 zeta w z' + w^2 z = w^2 s for a mode of a shape, of which `parts` is in a line."""
 
-    That is its share in the first mode of a simply supported beam, (2 / L) int I sin(pi x / L) dx.
-    """
-    length = positions[-1]
-    widths = np.gradient(positions)
-    widths[[0, -1]] /= 2
-    return 2 / length * widths * np.sin(np.pi * positions / length)
+    positions: Float[np.ndarray, " point"]
+    shape: Float[np.ndarray, " point"]
+    frequency: float
+    damping_ratio: float
+    parts: Float[np.ndarray, " point"]
 
+    def swing(self, since: Float[np.ndarray, "*time"], speed: float) -> Float[np.ndarray, "*time"]:
+        """Response z less the static one s to a force that crosses, since its entry (s)."""
+        passage = float(self.positions[-1]) / abs(speed)
+        last = max(float(since.max()), passage)
+        fine = min(passage / 200, 1 / (24 * self.frequency), last / 8)
+        step = passage / np.ceil(passage / fine)
+        times = step * np.arange(int(np.ceil(last / step)) + 2)
+        place = times * abs(speed)
+        if speed < 0:
+            place = self.positions[-1] - place
+        force = np.interp(place, self.positions, self.shape, 0.0, 0.0)
+        motion = self.motion(force[:, None], step)[:, 0]
+        return np.interp(since, times, motion - force, left=0.0)
 
-def vibration(
-    since: Float[np.ndarray, "*time"], passage: float, frequency: float, damping_ratio: float
-) -> Float[np.ndarray, "*time"]:
-    """Response of the first mode to a force that crosses, less the static one, since its entry (s).
-
-    z'' + 2 zeta w z' + w^2 z = w^2 s(t), with s = sin(pi t / T) during the passage T (s), then 0.
-    """
-    last = max(float(since.max()), passage)
-    step = passage / np.ceil(passage / min(passage / 200, 1 / (24 * frequency), last / 8))
-    times = step * np.arange(int(np.ceil(last / step)) + 2)
-    force = np.where(times <= passage, np.sin(np.pi * times / passage), 0.0)
-    motion = _first_mode(force[:, None], step, frequency, damping_ratio)[:, 0]
-    return np.interp(since, times, motion - force, left=0.0)
-
-
-def _first_mode(force, step, frequency, damping_ratio):
-    """Motion z of z'' + 2 zeta w z' + w^2 z = w^2 force (time, number), from rest."""
-    w = 2 * np.pi * frequency
-    pole = complex(-damping_ratio * w, w * np.sqrt(1 - damping_ratio**2))
-    # z is the imaginary part of the response of one pole to w^2 / w_d times the force.
-    inputs = (force * w**2 / pole.imag).astype(complex)
-    return driven(np.full(force.shape[1], pole), inputs, step).imag
+    def motion(
+        self, force: Float[np.ndarray, "time number"], step: float
+    ) -> Float[np.ndarray, "time number"]:
+        """Motion z by forces s at equal steps (s), from rest."""
+        w, damping = 2 * np.pi * self.frequency, self.damping_ratio
+        pole = complex(-damping * w, w * np.sqrt(1 - damping**2))
+        # z is the imaginary part of the response of one pole to w^2 / w_d times the force.
+        inputs = (force * w**2 / pole.imag).astype(complex)
+        return driven(np.full(force.shape[1], pole), inputs, step).imag
 
 
 def model_influence_lines(case: Case) -> InfluenceLines:
-    """Influence lines of a case at 201 points, linear in between, and its first mode.
+    """Influence lines of a case at 201 points, linear in between, and its first modes.
 
     Those of moments and the like are corrected statically; those of deflections are sums of the
     modes of the case.
@@ -196,8 +216,21 @@ def model_influence_lines(case: Case) -> InfluenceLines:
     unit_force = UnitForce(case, 1.0)
     shares = np.linspace(0.0, 1.0, MODEL_POINTS)
     values = unit_force.readings(unit_force.length, shares)
-    frequency, damping = unit_force.first_mode
-    return InfluenceLines(shares * unit_force.length, values, None, frequency, damping)
+    positions = shares * unit_force.length
+    return InfluenceLines(positions, values, None, *_first_modes(case, positions))
+
+
+def _first_modes(case: Case, positions: Float[np.ndarray, " point"]) -> tuple:
+    """First modes that hold MODE_SHARE of the squares of the influence lines of a case."""
+    unit_force = UnitForce(case, 1.0)
+    values = unit_force.readings(unit_force.length, positions / unit_force.length)
+    count, left = 0, np.inf
+    while count < MODES and left > 1 - MODE_SHARE:
+        count += 1
+        modes = unit_force.modes(positions, count)
+        rest = values - modes[1] @ np.linalg.lstsq(modes[1], values, rcond=None)[0]
+        left = float(np.mean(np.sum(rest**2, axis=0) / np.sum(values**2, axis=0)))
+    return modes
 
 
 def calibrate_influence_lines(
@@ -208,7 +241,8 @@ def calibrate_influence_lines(
     Ordinates at equally spaced points, linear in between and zero at both ends, are fitted by least
     squares with a weight on their second differences, found by generalised cross-validation (Golub,
     Heath and Wahba 1979), and offsets of each sensor in each log. The bridge vibrates meanwhile in
-    its first mode, whose frequency is found with the lines; its damping ratio is that of the case.
+    its first modes, whose frequencies are found with the lines: shapes, damping and ratios of
+    frequencies are those of the case.
     The covariance of the lines is that of the posterior with the same weight (Wahba 1983), of
     errors that are independent DYNAMIC_RATE times a second. Loads are those of each log, or else of
     the case.
@@ -235,20 +269,24 @@ def calibrate_influence_lines(
     length = float(concrete(case.beam.length))
     positions = np.linspace(0.0, length, points)
     runs = [_Run(case, log, positions) for log in logs]
-    first, damping = UnitForce(case, 1.0).first_mode
+    first, *others = _first_modes(case, positions)
+    zero = np.zeros((points, len(case.sensors)))
+    vibrating = InfluenceLines(positions, zero, None, first, *others)
+
+    def solved(share):
+        return _lines_of_runs(runs, vibrating._replace(frequency=float(share * first)).modes)
 
     def misfit(share):
-        return sum(one.misfit for one in _lines_of_runs(runs, share * first, damping))
+        return sum(one.misfit for one in solved(share))
 
     start = min(FREQUENCY_SHARES.tolist(), key=misfit)
     share = scipy.optimize.minimize_scalar(
         misfit, bounds=(0.97 * start, 1.03 * start), method="bounded", options={"xatol": 1e-4}
     ).x
-    frequency = float(share * first)
-    solved = _lines_of_runs(runs, frequency, damping)
-    values = np.stack([one.ordinates for one in solved], axis=1)
-    covariance = np.stack([one.covariance for one in solved])
-    return InfluenceLines(positions, values, covariance, frequency, damping)
+    best = solved(share)
+    values = np.stack([one.ordinates for one in best], axis=1)
+    covariance = np.stack([one.covariance for one in best])
+    return InfluenceLines(positions, values, covariance, float(share * first), *others)
 
 
 class _Run:
@@ -268,25 +306,26 @@ class _Run:
         hats = np.eye(positions.size)
         static = [_interpolated(positions, hats, x[:, i]) for i in range(len(weights))]
         self.static = sum(w * own for w, own in zip(weights, static, strict=True))
-        self.wheels, self.parts = [], first_mode_parts(positions)
+        self.wheels = []
         for i, w in enumerate(weights):
-            speed = float(np.median(np.abs(rates[:, i])))
-            forward = np.median(rates[:, i]) > 0
-            travelled = x[:, i] if forward else positions[-1] - x[:, i]
-            self.wheels.append((w, travelled / speed, positions[-1] / speed))
+            speed = float(np.median(rates[:, i]))
+            travelled = x[:, i] if speed > 0 else positions[-1] - x[:, i]
+            self.wheels.append((w, travelled / abs(speed), speed))
         rate = (log.times.size - 1) / log.duration
         self.counted = min(DYNAMIC_RATE / rate, 1.0)
 
-    def matrix(self, frequency: float, damping_ratio: float):
+    def matrix(self, modes: list[_Mode]):
         """Readings of unit ordinates (time, point), centred later."""
-        swing = sum(w * vibration(since, passage, frequency, damping_ratio)
-                    for w, since, passage in self.wheels)  # fmt: skip
-        return self.static + np.outer(swing, self.parts)
+        found = self.static
+        for mode in modes:
+            swing = sum(w * mode.swing(since, speed) for w, since, speed in self.wheels)
+            found = found + np.outer(swing, mode.parts)
+        return found
 
 
-def _lines_of_runs(runs: list[_Run], frequency, damping_ratio) -> "list[_Ordinates]":
+def _lines_of_runs(runs: list[_Run], modes: list[_Mode]) -> "list[_Ordinates]":
     """Ordinates of each sensor from all runs together."""
-    matrices = [run.matrix(frequency, damping_ratio) for run in runs]
+    matrices = [run.matrix(modes) for run in runs]
     found = []
     for i in range(runs[0].readings.shape[1]):
         rows, targets = [], []

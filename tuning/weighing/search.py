@@ -193,9 +193,12 @@ def free_frequency(
         return first
     since = times[begin:] - times[begin]
 
+    assert lines.damping_ratios is not None
+    damping = float(lines.damping_ratios[0])
+
     def explained(frequency):
         w = 2 * np.pi * frequency
-        wave = np.exp((1j * np.sqrt(1 - lines.damping_ratio**2) - lines.damping_ratio) * w * since)
+        wave = np.exp((1j * np.sqrt(1 - damping**2) - damping) * w * since)
         basis = np.linalg.qr(np.stack([wave.real, wave.imag, np.ones(since.size)], axis=1))[0]
         return float(np.sum((basis.T @ rest) ** 2) / max(np.sum(rest**2), 1e-300))
 

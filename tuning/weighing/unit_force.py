@@ -54,17 +54,21 @@ class UnitForce:
         self.correction = static_correction(model, bare, bare.sensors, outputs)
         self.frequencies = np.asarray(model.modes.frequencies)
         # In coordinates in which each state is on its own.
-        self.poles, vectors = np.linalg.eig(model.A)
-        self.inputs = np.linalg.solve(vectors, inputs[:, commands:])
-        self.outputs, self.feedthrough = C @ vectors, D[:, commands:]
+        self.poles, self.vectors = np.linalg.eig(model.A)
+        self.inputs = np.linalg.solve(self.vectors, inputs[:, commands:])
+        self.outputs, self.feedthrough = C @ self.vectors, D[:, commands:]
         self.vibrates = np.array([vibrating or order > 0 for order in outputs.time_derivatives])
 
-    @property
-    def first_mode(self) -> tuple[float, float]:
-        """Frequency (Hz) and damping ratio of the first mode."""
-        size = np.abs(self.poles)
-        first = int(np.argmin(np.where(np.abs(self.poles.imag) > 0, size, np.inf)))
-        return float(size[first] / (2 * np.pi)), float(-self.poles[first].real / size[first])
+    def modes(self, positions: Float[np.ndarray, " point"], count: int) -> tuple:
+        """First frequency (Hz), shapes, ratios of frequencies, and damping ratios of modes."""
+        own = np.flatnonzero(self.poles.imag > 1e-6 * np.abs(self.poles))
+        own = own[np.argsort(np.abs(self.poles[own]))][:count]
+        size = np.abs(self.poles[own])
+        motion = self.vectors[self.model.coordinate_index][:, own]
+        shapes = np.asarray(self.model.shapes(positions, (0,))[0]) @ motion
+        largest = shapes[np.argmax(np.abs(shapes), axis=0), np.arange(own.size)]
+        ratios, damping = size / size[0], -self.poles[own].real / size
+        return float(size[0] / (2 * np.pi)), (shapes / largest).real, ratios, damping
 
     def readings(
         self, speed: float, since_entry: Float[np.ndarray, " time"]

@@ -48,9 +48,12 @@ def road(seed: int):
     return surface
 
 
-def log_of(vehicle, profile=None, speed=SPEED, duration=DURATION, seed=0, step=1e-3, **about):
+def log_of(
+    vehicle, profile=None, speed=SPEED, duration=DURATION, seed=0, step=1e-3, beam=BEAM,
+    places=PLACES, **about,
+):  # fmt: skip
     run = vehicle_elements.cross(
-        BEAM, vehicle, speed, -LEAD, PLACES, duration, profile, step=step, every=5
+        beam, vehicle, speed, -LEAD, places, duration, profile, step=step, every=5
     )
     strain = -FIBRE * run.moment / RIGIDITY
     values = strain + NOISE * np.random.default_rng(seed).normal(size=strain.shape)
@@ -187,6 +190,36 @@ def test_calibrated_lines_serve_every_step_and_are_kept():
     np.testing.assert_allclose(found.fit.geometry.offsets, other.offsets, atol=0.3)
     with pytest.raises(ValueError, match="these are no calibrated influence lines"):
         lines_from_dict({"format": "other"})
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_axles_cross_two_spans(calibrated):
+    """The first mode has a node at the pier, and the second is as strong."""
+    length, places = 2 * LENGTH, [LENGTH / 2, 1.5 * LENGTH]
+    pier = finite_elements.Support(LENGTH, 1e12)
+    beam = finite_elements.Beam(
+        length, RIGIDITY, DENSITY, damping_ratio=DAMPING, elements=40, supports=[pier]
+    )
+    model = dataclasses.replace(
+        case(),
+        beam=dataclasses.replace(case().beam, length=length, modes=6),
+        sensors=[jb.Sensor(x, "strain", fibre_distance=FIBRE) for x in places],
+        supports=[jb.Support(LENGTH, 1e12)],
+    )
+    lines = None
+    if calibrated:
+        known = jb.Axles(offsets=[0.0, 4.0], forces=[50e3, 70e3], speed=5.0, entry_time=LEAD / 5.0)
+        slow = vehicle_elements.forces([0.0, 4.0], [50e3, 70e3])
+        run = log_of(
+            slow, speed=5.0, duration=12.0, step=2e-3, beam=beam, places=places, loads=(known,)
+        )
+        lines = calibrate_influence_lines(model, run)
+    other = vehicle_elements.forces([0.0, 4.0, 9.0], [60e3, 90e3, 70e3])
+    log = log_of(other, speed=20.0, duration=4.0, beam=beam, places=places)
+    fit = weigh_axles(model, log, (10.0, 30.0), 3, influence_lines=lines).fit
+    assert fit.geometry.speed == pytest.approx(20.0, rel=2e-3)
+    np.testing.assert_allclose(fit.forces, other.static_loads, rtol=0.02)
+    assert fit.gross_weight[0] == pytest.approx(220e3, rel=3e-3)
 
 
 def test_what_cannot_be_weighed(crossings):
