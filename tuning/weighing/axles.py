@@ -22,7 +22,7 @@ from jaxbeam.case.loads.axles import Axles
 from jaxbeam.files.report import text_table
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
-from tuning.weighing.axle_fit import AxleFit, fit_axles
+from tuning.weighing.axle_fit import SHARES, AxleFit, fit_axles
 from tuning.weighing.dynamic_forces import degrees_of_freedom, dynamic_readings
 from tuning.weighing.influence_lines import InfluenceLines, check_static, model_influence_lines
 from tuning.weighing.moses import MosesFit, moses
@@ -130,6 +130,11 @@ class AxleWeighing:
             f"intervals allow for dynamic wheel forces of {fit.dynamic_share:.2g} of the static"
             " ones (standard deviation)",
         ]
+        if fit.dynamic_share > 0.95 * SHARES[1]:
+            lines.append(
+                "no road gives so large dynamic wheel forces: number of axles, range of speeds or"
+                " influence lines are wrong, and intervals too narrow; calibrate by more runs"
+            )
         if self.bic:
             lines.append(
                 f"BIC by number of axles, of which the smallest within {EVIDENCE:g} of the lowest"

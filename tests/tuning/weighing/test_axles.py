@@ -163,6 +163,12 @@ def test_axles_of_a_log_are_weighed_and_reported(crossings):
     assert content["offsets"][0]["value"] == pytest.approx(SPACING, abs=0.6)
 
 
+def test_a_wrong_number_of_axles_is_told(crossings):
+    said = "no road gives so large dynamic wheel forces"
+    assert said in str(weigh_axles(case(), crossings[0], SPEEDS, 1))
+    assert said not in str(weigh_axles(case(), crossings[0], SPEEDS, 2))
+
+
 def test_axles_are_counted():
     forces = vehicle_elements.forces([0.0, 3.2, 5.6], [60e3, 95e3, 80e3])
     log = log_of(forces, speed=10.0, duration=4.0, step=2.5e-3)
