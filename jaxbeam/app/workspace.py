@@ -241,7 +241,10 @@ class Workspace:
         return self._start(jb.api.Job(sweep.run), sweep)
 
     def start_fit(self, text: str, names: Iterable[str], free: Mapping[str, Any]) -> str:
-        """Begin a fit of free numbers to logs that were given; returns its number for `job`."""
+        """Begin a fit of free numbers to logs that were given; returns its number for `job`.
+
+        Raises ValueError without a log or without a free number.
+        """
         logs = [log for name in names for log in self.log(name)]
         if not logs or not free:
             raise ValueError("a fit needs a log and a free number at least")

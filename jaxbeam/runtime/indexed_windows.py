@@ -71,6 +71,7 @@ class _Windows:
 
 
 def gather(params, operand, indices, out):
+    """Function of operand and indices that returns what `lax.gather` with these params does."""
     numbers, mode = params["dimension_numbers"], params["mode"]
     windows = _Windows(params, operand, indices, params["slice_sizes"], numbers.offset_dims, mode)
     back = np.argsort(windows.order)
@@ -99,6 +100,8 @@ _LIMIT = {"i": "min", "u": "max"}
 
 
 def scatter(combine):
+    """Rule of a `lax.scatter` that combines entries and updates in place by `combine.at`."""
+
     def rule(params, operand, indices, updates, out):
         numbers = params["dimension_numbers"]
         axes = numbers.update_window_dims

@@ -116,7 +116,7 @@ def test_only_diverging_runs_of_a_sweep_fail(sweep_and_compilations):
     assert dataset.attrs["failed_runs"] == 2
     assert_array_equal(dataset.failed, [[False, False], [True, True], [False, False]])
     assert np.isnan(dataset.peak_deflection[1]).all()
-    assert len(compilations) == 1
+    assert not compilations  # a small sweep takes its steps in NumPy
     plan = plan_for(UNBOUNDED)
     for i in (0, 2):
         for j in range(2):

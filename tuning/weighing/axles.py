@@ -159,8 +159,8 @@ def weigh_axles(
     """Forces and distances of the axles of one vehicle or train that crossed a known beam in a log.
 
     `speeds` (m/s) are the lowest and highest possible ones, from the left or, with `both_ways`, in
-    both directions; `axles` is their number, by default that of least BIC, at most 8. The influence
-    lines are those of the case, or those given (see `calibrate_influence_lines`), in every step.
+    both directions; `axles` is their number, by default that of least BIC, at most 8. All steps use
+    the `influence_lines`, by default those of the case (see `calibrate_influence_lines`).
     Loads and profile of case and log are not used. An axle has at least a twenty-fifth of the gross
     weight, unless no others explain the readings.
 

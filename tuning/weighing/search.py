@@ -114,6 +114,7 @@ class Search:
 
     @property
     def length(self) -> float:
+        """Length (m) of the beam."""
         return self.lines.length
 
     def _columns(self, geometry: AxleGeometry, lines: InfluenceLines | None = None):
