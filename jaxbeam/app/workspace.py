@@ -27,6 +27,7 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.reading.toml_file import parse_toml
 from jaxbeam.files.case_file import load_controller
 from jaxbeam.rigs import RIG_NAMES
+from jaxbeam.runtime.input_file import read_input, read_text_input
 from jaxbeam.runtime.whole_file import whole_file
 from jaxbeam.simulation.simulate import ContactLossWarning
 
@@ -92,7 +93,7 @@ class Workspace:
         path = self._place(name)
         if path.stat().st_size > MAX_BYTES:
             raise ValueError(f"{name} has more than the {MAX_BYTES >> 20} MB of a case file")
-        text = path.read_bytes().decode("utf-8-sig")
+        text = read_text_input(path, "case file")
         return {"name": name, "text": text, "mark": _mark(text)}
 
     def save(self, name: str, text: str, mark: str | None = None) -> dict[str, Any]:
@@ -102,7 +103,7 @@ class Workspace:
         read, is left alone. Raises FileExistsError then, ValueError for a place outside the folder.
         """
         path = self._place(name)
-        if path.exists() and _mark(path.read_bytes().decode("utf-8-sig", "replace")) != mark:
+        if path.exists() and _mark(_text_of(path)) != mark:
             raise FileExistsError(
                 f"{name} has been changed by someone else, or is another file: save under another"
                 " name, or open it again"
@@ -132,7 +133,7 @@ class Workspace:
             place = resources.files("jaxbeam.rigs")
         else:
             raise ValueError(f"there is no case {name!r} to start from")
-        return (place / f"{name}.toml").read_text(encoding="utf-8")
+        return read_text_input(str(place / f"{name}.toml"), "case file")
 
     # Cases
 
@@ -342,3 +343,8 @@ def _starters() -> list[str]:
 
 def _mark(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _text_of(path: Path) -> str:
+    """Text of a file, with a mark in place of what is none."""
+    return read_input(path, "case file").decode("utf-8-sig", "replace")

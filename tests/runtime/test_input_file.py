@@ -239,6 +239,8 @@ BY_THEMSELVES = (
     "jaxbeam.vehicles.",
     "jaxbeam.c_code.source",
     "jaxbeam.analysis.assessment.assessment",
+    "jaxbeam.app.server",  # of the package
+    "jaxbeam.app.take_away",  # what it wrote into a temporary folder
     "jaxbeam.case.loads.planar.vehicle",
     "jaxbeam.cli.",
     "jaxbeam.files.export.files",

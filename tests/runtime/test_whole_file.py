@@ -114,9 +114,11 @@ def test_every_writer_names_its_file_on_a_full_disk(tmp_path, monkeypatch, name)
 def test_nothing_is_written_at_its_place():
     """Every call that writes a file by name is given the path `beside` its place.
 
-    Except caches, and stores of sweeps, which are written in blocks under a lock.
+    Except caches, stores of sweeps, which are written in blocks under a lock, and what the page in
+    the browser writes into a temporary folder of its own.
     """
     by_themselves = "jaxbeam.runtime.", "jaxbeam.sweeps.stores.zarr_files"
+    by_themselves += "jaxbeam.app.studies", "jaxbeam.app.take_away"
     writing = {"write_text", "write_bytes", "savefig", "savez", "to_netcdf", "to_zarr", "savemat"}
     wrong = []
     for module, path in module_files().items():

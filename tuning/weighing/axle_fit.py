@@ -242,7 +242,7 @@ class _Chained(NamedTuple):
 
 
 def _inverse_root(columns, size) -> _Weights:
-    """Weights for the covariance 1 + size^2 columns columns'."""
+    """Weights for the covariance 1 + size^2 C C' of columns C."""
     vectors, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     variance = 1 + (size * sizes) ** 2
     return _Weights(vectors, 1 - variance**-0.5, float(np.sum(np.log(variance))))

@@ -26,7 +26,7 @@ from tuning.weighing.axle_fit import SHARES, AxleFit, fit_axles
 from tuning.weighing.dynamic_forces import degrees_of_freedom, dynamic_readings
 from tuning.weighing.influence_lines import InfluenceLines, check_static, model_influence_lines
 from tuning.weighing.moses import MosesFit, moses
-from tuning.weighing.search import Search
+from tuning.weighing.search import AxleSearch
 
 EVIDENCE = 6.0  # difference of BIC that is strong
 MOST_AXLES = 8
@@ -196,7 +196,7 @@ def weigh_axles(
             f"{len(case.sensors)}: calibrate with this case"
         )
     readings, valid = sensor_readings(case, log)
-    search = Search(lines, log.times, readings, speeds, both_ways)
+    search = AxleSearch(lines, log.times, readings, speeds, both_ways)
     if not search.combs[0][2]:
         raise ValueError(
             f"{log.source}: no load is found in it at {low:g} to {high:g} m/s: other speeds?"

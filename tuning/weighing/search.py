@@ -51,8 +51,8 @@ class Found(NamedTuple):
         return bool(self.forces.min() > MIN_AXLE_SHARE * self.forces.sum())
 
 
-class Search:
-    """Search for axles in the readings (SI units) of one crossing, by influence lines.
+class AxleSearch:
+    """AxleSearch for axles in the readings (SI units) of one crossing, by influence lines.
 
     `speeds` (m/s) are the lowest and highest possible ones, from the left or, with `both_ways`, in
     both directions.

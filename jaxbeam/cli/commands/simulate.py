@@ -17,6 +17,7 @@ from jaxbeam.cli.options import (
 )
 from jaxbeam.files.endings import RESULTS
 
+EXTREMES = "smallest", "smallest_time", "largest", "largest_time"
 MAX_WHEELS = 8  # of a load, or bodies, with a row each
 
 
@@ -186,8 +187,7 @@ def _lines(record: "jb.Record", sensors: Sequence[dict]) -> list[str]:
             record.case.sensors[i].name or str(i),
             f"{sensor['position']:.4g}",
             sensor["quantity"] + (f" ({sensor['unit']})" if sensor["unit"] != "1" else ""),
-            *(f"{sensor[name]:.6g}" for name in ("smallest", "smallest_time")),
-            *(f"{sensor[name]:.6g}" for name in ("largest", "largest_time")),
+            *("nan" if sensor[name] is None else f"{sensor[name]:.6g}" for name in EXTREMES),
         )
         for i, sensor in enumerate(sensors)
     ]

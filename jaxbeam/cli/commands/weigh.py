@@ -73,6 +73,7 @@ def weigh(
 
     import tuning  # sets XLA's threads, therefore before the case is read
     from jaxbeam.files.case_file import save_case
+    from jaxbeam.runtime.whole_file import whole_file
 
     parsed_case, read = options.read(case), tuning.read_log(log)
     if axles is None:
@@ -84,7 +85,8 @@ def weigh(
             influence_lines=calibrated,
         )  # fmt: skip
         if lines is not None and calibrated is not None:
-            lines.write_text(json.dumps(calibrated.to_dict()))
+            with whole_file(lines, options.overwrite) as beside:
+                beside.write_text(json.dumps(calibrated.to_dict()))
     if output:
         save_case(weighing.case, output, overwrite=True)  # checked before the work
     options.report(weighing.to_dict(), [str(weighing)], output, lines)
@@ -93,11 +95,12 @@ def weigh(
 def _lines_of(case, calibration: tuple[Path, ...]):
     """Influence lines from logs of known vehicles, or from a file of lines."""
     import tuning
+    from jaxbeam.runtime.input_file import read_text_input
     from tuning.weighing.influence_lines import lines_from_dict
 
     if calibration[0].suffix == ".json":
         try:
-            content = json.loads(calibration[0].read_text())
+            content = json.loads(read_text_input(calibration[0], "file of lines"))
         except json.JSONDecodeError as error:
             raise ValueError(f"{calibration[0]} is not JSON: {error}") from error
         return lines_from_dict(content)
@@ -142,6 +145,7 @@ def identify_responses(
 
     import tuning  # sets XLA's threads, therefore before the case is read
     from jaxbeam.files.case_file import save_case
+    from jaxbeam.runtime.whole_file import whole_file
 
     parsed_case = options.read(case)
     measured = tuning.responses_of(tuning.read_log(log), segment)

@@ -15,7 +15,7 @@ from tuning.weighing.axle_fit import fit_axles
 from tuning.weighing.axles import AxleWeighing
 from tuning.weighing.influence_lines import AxleGeometry, lines_from_dict
 from tuning.weighing.moses import moses
-from tuning.weighing.search import Search
+from tuning.weighing.search import AxleSearch
 
 LENGTH, RIGIDITY, DENSITY, DAMPING, FIBRE = 20.0, 1e10, 10000.0, 0.02, -0.5
 PLACES, DURATION, SPEED, LEAD = [LENGTH / 2, LENGTH / 4], 2.4, 18.0, 9.0
@@ -67,7 +67,7 @@ def crossings():
 
 def search(log, count, speeds=SPEEDS, lines=None, both_ways=False):
     lines = model_influence_lines(case()) if lines is None else lines
-    return Search(lines, log.times, log.values, speeds, both_ways).axles(count)[0]
+    return AxleSearch(lines, log.times, log.values, speeds, both_ways).axles(count)[0]
 
 
 @pytest.fixture(scope="module")
