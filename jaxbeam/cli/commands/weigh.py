@@ -145,7 +145,6 @@ def identify_responses(
 
     import tuning  # sets XLA's threads, therefore before the case is read
     from jaxbeam.files.case_file import save_case
-    from jaxbeam.runtime.whole_file import whole_file
 
     parsed_case = options.read(case)
     measured = tuning.responses_of(tuning.read_log(log), segment)
