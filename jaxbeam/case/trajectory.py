@@ -282,5 +282,7 @@ class TabulatedTrajectory(AbstractPiecewiseTrajectory):
 
     def passage_times(self, positions, behind=0.0):
         targets = positions + self.direction() * xp.expand_dims(xp.asarray(behind), -1)
-        times = vmap(self._passage_time)(targets.reshape(-1))
+        targets = targets.reshape(-1)
+        # `vmap` would trace the search to find the shape of nothing.
+        times = vmap(self._passage_time)(targets) if targets.size else xp.zeros(0)
         return xp.append(times, self.times[-1])
