@@ -134,6 +134,8 @@ class ExtendedKalman(AbstractKalmanEstimator):
             return "kind needs loads to follow; add one, or take kind 'kalman'"
         if case.profile is not None:
             return "kind is for beams without a profile; take kind 'kalman'"
+        if case.absorbers:
+            return "kind is for beams without absorbers; take kind 'kalman'"
         for i, load in enumerate(case.loads):
             vehicle = load.vehicle(case.run.gravity)
             if vehicle.names or vehicle.offsets.shape[0] * load.spacings().shape[0] != 1:

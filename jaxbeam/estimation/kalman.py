@@ -232,17 +232,18 @@ class Kalman(AbstractKalmanEstimator):
     def load_variance(self, plant: Plant) -> Float[Array, " added"]:
         """Variance of the states that `Plant.augmented` adds, at the start: that of the weights.
 
-        In N^2; zero where they are known, and for states of vehicles. The deviation of a load is
-        that of each of its wheels.
+        In N^2; zero where they are known, as of absorbers, and for states of vehicles. The
+        deviation of a load is that of each of its wheels.
         """
         variance, count = xp.zeros_like(plant.augmented_start), plant.weights.shape[0]
         if self.weight_deviation is None:
             return variance
         deviation = self.weight_deviation
+        rolling = count - plant.loads.absorbers
         if deviation.ndim:
-            deviation = deviation[np.array(plant.loads.load_of_wheel)]
-        weights = np.s_[plant.vehicle_states : plant.vehicle_states + count]
-        return set_at(variance, weights, xp.broadcast_to(deviation**2, (count,)))
+            deviation = deviation[np.array(plant.loads.load_of_wheel[:rolling], int)]
+        weights = np.s_[plant.vehicle_states : plant.vehicle_states + rolling]
+        return set_at(variance, weights, xp.broadcast_to(deviation**2, (rolling,)))
 
     def validate(self, case, system):
         if not case.sensors:

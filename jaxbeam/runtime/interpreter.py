@@ -5,6 +5,7 @@ program that runs a few times only is done sooner so. Primitives without a rule 
 they are, which compiles each of them alone.
 """
 
+import contextlib
 import math
 from collections.abc import Callable
 from typing import Any
@@ -138,7 +139,8 @@ def _rule(equation) -> Callable:
     if name in ELEMENTWISE:
         return ELEMENTWISE[name]
     if name in WITH_PARAMETERS:
-        return WITH_PARAMETERS[name](params, *avals)
+        with contextlib.suppress(NotImplementedError):  # of rare parameters
+            return WITH_PARAMETERS[name](params, *avals)
     return _as_it_is(equation)
 
 

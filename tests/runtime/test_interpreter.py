@@ -26,6 +26,10 @@ def optimized(x):
 optimized.defvjp(lambda x: (x**2, x), lambda x, slope: 2 * x * slope)
 
 FUNCTIONS = {
+    "eigenvalues in any order": (
+        lambda m: lax.linalg.eigh(m + m.mT, sort_eigenvalues=False)[1],
+        SQUARE,
+    ),
     "arithmetic": (lambda a, b: jnp.sign(a) * abs(b) - a / b + jnp.maximum(a, b) % 0.3, A, B),
     "whole numbers": (lambda a: [lax.div(a, 2), lax.rem(a, 2), a**3, -a, jnp.sum(a)], WHOLE),
     "bits": (lambda a, b: [a & b, a | b, a ^ b, ~a, jnp.sum(a)], BITS, BITS[::-1]),

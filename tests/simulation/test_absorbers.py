@@ -409,3 +409,27 @@ def test_sensors_on_absorbers():
     ):
         with pytest.raises(ValueError, match=words):
             jb.simulate(dataclasses.replace(case, vehicle_sensors=[faulty]))
+
+
+def test_filters_know_that_absorbers_have_no_weight():
+    """One deviation for each load: absorbers are states of the filter, but no unknown loads."""
+    case = jb.Case(
+        jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+        actuators=[jb.PointForce(0.35, limits=(-2.0, 2.0))],
+        sensors=[jb.Sensor(0.2)],
+        loads=[jb.MovingMass(mass=0.3, speed=2.0)],
+        absorbers=[jb.Absorber(0.25, mass=0.02, frequency=20.0, damping_ratio=0.1)],
+        run=jb.Run(0.1),
+    )
+    weights = {"state_weight": [1e6, 1.0], "command_weight": [1e-2], "period": 0.002}
+
+    def peak(deviation):
+        estimator = jb.Kalman(0.02, 1e-5, loads="estimated", weight_deviation=deviation)
+        law = jb.LQR(**weights, estimator=estimator)
+        return jb.simulate(dataclasses.replace(case, controller=law)).peak_deflection[0]
+
+    assert peak([1.0]) == pytest.approx(peak(1.0), rel=1e-12)
+    following = jb.ExtendedKalman(0.02, 1e-5, mass_deviation=0.1, speed_deviation=0.2)
+    law = jb.LQR(**weights, estimator=following)
+    with pytest.raises(ValueError, match="kind is for beams without absorbers"):
+        jb.simulate(dataclasses.replace(case, controller=law))
