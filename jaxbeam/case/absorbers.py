@@ -22,7 +22,7 @@ from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import NOT_NEGATIVE, ON_BEAM, POSITIVE, concrete, is_concrete, number
 from jaxbeam.case.loads.base import ForceHistory, VehicleModel
 from jaxbeam.case.trajectory import StandingTrajectory
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, Number, xp
 
 
 class Absorber(ReprWithUnits):
@@ -48,23 +48,23 @@ class Absorber(ReprWithUnits):
     13.9 mm 8.8 mm
     """
 
-    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
-    mass: Float[Array, ""] = number("kg", "mass of the body", NOT_NEGATIVE, default=0.0)
-    stiffness: Float[Array, ""] | None = number("N/m", "spring", POSITIVE, default=None)
-    damping: Float[Array, ""] | None = number("N s/m", "damper", NOT_NEGATIVE, default=None)
-    frequency: Float[Array, ""] | None = number(
+    position: Float[Number, ""] = number("m", "distance from the left end", ON_BEAM)
+    mass: Float[Number, ""] = number("kg", "mass of the body", NOT_NEGATIVE, default=0.0)
+    stiffness: Float[Number, ""] | None = number("N/m", "spring", POSITIVE, default=None)
+    damping: Float[Number, ""] | None = number("N s/m", "damper", NOT_NEGATIVE, default=None)
+    frequency: Float[Number, ""] | None = number(
         "Hz", "natural frequency on a beam at rest", POSITIVE, default=None
     )
-    damping_ratio: Float[Array, ""] | None = number(
+    damping_ratio: Float[Number, ""] | None = number(
         "1", "damping ratio on a beam at rest", NOT_NEGATIVE, default=None
     )
-    inertance: Float[Array, ""] = number(
+    inertance: Float[Number, ""] = number(
         "kg", "inerter between body and beam", NOT_NEGATIVE, default=0.0
     )
-    ground_inertance: Float[Array, ""] = number(
+    ground_inertance: Float[Number, ""] = number(
         "kg", "inerter between body and ground", NOT_NEGATIVE, default=0.0
     )
-    max_stroke: Float[Array, ""] | None = number(
+    max_stroke: Float[Number, ""] | None = number(
         "m", "largest allowed motion of the body relative to the beam", POSITIVE, default=None
     )
 

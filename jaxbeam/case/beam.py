@@ -3,6 +3,7 @@
 The `beam` is a `jaxbeam.case.beam.Beam`, which has the parts of this package.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -22,7 +23,7 @@ from jaxbeam.case.fields import (
     number,
     parts,
 )
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, Number, xp
 
 LIMIT_SPAN = 20.0  # m: shorter spans have more damping
 
@@ -79,8 +80,8 @@ class Hinge(ReprWithUnits):
     [ 2.52 16.91]
     """
 
-    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
-    rotational_stiffness: Float[Array, ""] = number(
+    position: Float[Number, ""] = number("m", "distance from the left end", ON_BEAM)
+    rotational_stiffness: Float[Number, ""] = number(
         "N m/rad", "spring between both sides", NOT_NEGATIVE, default=0.0
     )
 
@@ -105,25 +106,25 @@ class Segment(ReprWithUnits):
     [ 3.22 12.83]
     """
 
-    length: Float[Array, ""] | None = number("m", "length", POSITIVE, default=None)
-    flexural_rigidity: Float[Array, " *power"] | None = number(
+    length: Float[Number, ""] | None = number("m", "length", POSITIVE, default=None)
+    flexural_rigidity: Float[Number, " *power"] | None = number(
         "N m^2", "bending stiffness E I", default=None
     )
-    mass_per_length: Float[Array, " *power"] | None = number(
+    mass_per_length: Float[Number, " *power"] | None = number(
         "kg/m", "mass per length", default=None
     )
-    width: Float[Array, " *power"] | None = number("m", "section width", default=None)
-    height: Float[Array, " *power"] | None = number("m", "section height", default=None)
-    shear_stiffness: Float[Array, " *power"] | None = number(
+    width: Float[Number, " *power"] | None = number("m", "section width", default=None)
+    height: Float[Number, " *power"] | None = number("m", "section height", default=None)
+    shear_stiffness: Float[Number, " *power"] | None = number(
         "N", "shear stiffness kappa G A", default=None
     )
-    rotary_inertia: Float[Array, " *power"] | None = number(
+    rotary_inertia: Float[Number, " *power"] | None = number(
         "kg m", "mass moment of inertia per length, rho I", default=None
     )
-    foundation_stiffness: Float[Array, " *power"] | None = number(
+    foundation_stiffness: Float[Number, " *power"] | None = number(
         "N/m^2", "elastic foundation, force per length and deflection", default=None
     )
-    loss_factor: Float[Array, ""] | None = number(
+    loss_factor: Float[Number, ""] | None = number(
         "1", "loss factor of its material", NOT_NEGATIVE, default=None
     )
 
@@ -312,20 +313,20 @@ class Support(ReprWithUnits):
     [21.38 33.39]
     """
 
-    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
-    stiffness: Float[Array, ""] | None = number(
+    position: Float[Number, ""] = number("m", "distance from the left end", ON_BEAM)
+    stiffness: Float[Number, ""] | None = number(
         "N/m", "vertical spring; rigid if left out", NOT_NEGATIVE, default=None
     )
-    damping: Float[Array, ""] | None = number(
+    damping: Float[Number, ""] | None = number(
         "N s/m", "vertical damper of an elastic support", NOT_NEGATIVE, default=None
     )
-    rotational_stiffness: Float[Array, ""] = number(
+    rotational_stiffness: Float[Number, ""] = number(
         "N m/rad", "spring against rotation", NOT_NEGATIVE, default=0.0
     )
-    mass: Float[Array, ""] | None = number(
+    mass: Float[Number, ""] | None = number(
         "kg", "mass of an elastic bearing that moves with the beam", NOT_NEGATIVE, default=None
     )
-    settlement: Float[Array, ""] | None = number(
+    settlement: Float[Number, ""] | None = number(
         "m", "lowering of its foot before the run, positive downwards", default=None
     )
 
@@ -353,45 +354,45 @@ class Beam(ReprWithUnits):
     EI = 21.56 N m^2, m = 0.405 kg/m
     """
 
-    length: Float[Array, ""] = number("m", "total length", POSITIVE)
-    flexural_rigidity: Float[Array, ""] | None = number(
+    length: Float[Number, ""] = number("m", "total length", POSITIVE)
+    flexural_rigidity: Float[Number, ""] | None = number(
         "N m^2", "bending stiffness E I", POSITIVE, default=None
     )
-    mass_per_length: Float[Array, ""] | None = number(
+    mass_per_length: Float[Number, ""] | None = number(
         "kg/m", "mass per length", POSITIVE, default=None
     )
-    damping_ratio: Float[Array, " *modes"] = number(
+    damping_ratio: Float[Number, " *modes"] = number(
         "1", "modal damping ratio, one for all modes or a list", NOT_NEGATIVE, default=0.0
     )
     ends: str = choice("end conditions, left-right", default="pinned-pinned")
     modes: int = count("number of modes of the supported beam", default=3)
-    width: Float[Array, ""] | None = number("m", "section width", POSITIVE, default=None)
-    height: Float[Array, ""] | None = number("m", "section height", POSITIVE, default=None)
-    youngs_modulus: Float[Array, ""] | None = number(
+    width: Float[Number, ""] | None = number("m", "section width", POSITIVE, default=None)
+    height: Float[Number, ""] | None = number("m", "section height", POSITIVE, default=None)
+    youngs_modulus: Float[Number, ""] | None = number(
         "Pa", "Young's modulus", POSITIVE, default=None
     )
-    density: Float[Array, ""] | None = number("kg/m^3", "density", POSITIVE, default=None)
-    rayleigh_damping: Float[Array, "2"] | None = number(
+    density: Float[Number, ""] | None = number("kg/m^3", "density", POSITIVE, default=None)
+    rayleigh_damping: Float[Number, "2"] | None = number(
         "1/s, s", "coefficients a (of mass) and b (of stiffness)", NOT_NEGATIVE, default=None
     )
-    shear_stiffness: Float[Array, ""] | None = number(
+    shear_stiffness: Float[Number, ""] | None = number(
         "N", "shear stiffness kappa G A; rigid in shear if left out", POSITIVE, default=None
     )
-    rotary_inertia: Float[Array, ""] | None = number(
+    rotary_inertia: Float[Number, ""] | None = number(
         "kg m", "mass moment of inertia per length, rho I", NOT_NEGATIVE, default=None
     )
-    foundation_stiffness: Float[Array, ""] | None = number(
+    foundation_stiffness: Float[Number, ""] | None = number(
         "N/m^2", "elastic foundation, force per length and deflection", NOT_NEGATIVE, default=None
     )
-    loss_factor: Float[Array, ""] | None = number(
+    loss_factor: Float[Number, ""] | None = number(
         "1", "loss factor of hysteretic damping", NOT_NEGATIVE, default=None
     )
     material: str = choice("material of a bridge, for its damping", "", *MATERIALS, default="")
-    axial_force: Float[Array, ""] | None = number(
+    axial_force: Float[Number, ""] | None = number(
         "N", "axial force, tension positive", default=None
     )
-    segments: tuple[Segment, ...] = parts("segments, from left to right", Segment)
-    hinges: tuple[Hinge, ...] = parts("hinges between the ends", Hinge)
+    segments: Sequence[Segment] = parts("segments, from left to right", Segment)
+    hinges: Sequence[Hinge] = parts("hinges between the ends", Hinge)
 
     @property
     def bending_stiffness(self) -> Float[Array, ""]:

@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import functools
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -33,7 +33,7 @@ from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.quantities import OF_QUANTITY
 from jaxbeam.case.reading.units import in_si
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.runtime.arrays import Array, set_at, xp
+from jaxbeam.runtime.arrays import Array, Number, set_at, xp
 from jaxbeam.runtime.module import Module
 
 
@@ -49,11 +49,11 @@ class Run(ReprWithUnits):
     301
     """
 
-    duration: Float[Array, ""] = number("s", "simulated time, from 0", POSITIVE)
-    sample_rate: Float[Array, ""] = number(
+    duration: Float[Number, ""] = number("s", "simulated time, from 0", POSITIVE)
+    sample_rate: Float[Number, ""] = number(
         "Hz", "saved samples per second", POSITIVE, default=1000.0
     )
-    gravity: Float[Array, ""] = number(
+    gravity: Float[Number, ""] = number(
         "m/s^2", "acceleration of gravity", NOT_NEGATIVE, default=9.81
     )
     seed: int = count("seed of noise, dropout and jitter", minimum=0, default=0)
@@ -88,16 +88,16 @@ class Case(Module):
     def __init__(
         self,
         beam: Beam,
-        supports=(),
-        actuators=(),
-        sensors=(),
-        loads=(),
+        supports: Iterable = (),
+        actuators: Iterable = (),
+        sensors: Iterable = (),
+        loads: Iterable = (),
         controller=None,
         run: Run | None = None,
         title: str = "",
         profile=None,
-        vehicle_sensors=(),
-        absorbers=(),
+        vehicle_sensors: Iterable = (),
+        absorbers: Iterable = (),
     ):
         self.beam = beam
         self.supports = tuple(supports)

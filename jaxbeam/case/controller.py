@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.case.display import ExplainsArguments, ReprWithUnits
 from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, PROBABILITY, number
-from jaxbeam.runtime.arrays import Array, set_at, xp
+from jaxbeam.runtime.arrays import Array, Number, set_at, xp
 from jaxbeam.runtime.module import Module
 
 Command = Float[Array, " actuator"]
@@ -189,19 +189,19 @@ class AbstractController(ReprWithUnits, Module, metaclass=ExplainsArguments):
     kind: ClassVar[str]
     open_loop: ClassVar[bool] = False  # whether the command depends on time alone
 
-    period: Float[Array, ""] | None = number(
+    period: Float[Number, ""] | None = number(
         "s", "sampling period; continuous time if left out", POSITIVE, default=None, kw_only=True
     )
-    delay: Float[Array, ""] | None = number(
+    delay: Float[Number, ""] | None = number(
         "s", "from measurement to command", NOT_NEGATIVE, default=None, kw_only=True
     )
-    resolution: Float[Array, ""] | None = number(
+    resolution: Float[Number, ""] | None = number(
         "unit of a command", "step between commands", POSITIVE, default=None, kw_only=True
     )
-    dropout: Float[Array, ""] | None = number(
+    dropout: Float[Number, ""] | None = number(
         "1", "probability that a command is lost", PROBABILITY, default=None, kw_only=True
     )
-    jitter: Float[Array, ""] | None = number(
+    jitter: Float[Number, ""] | None = number(
         "s", "largest random delay of a command", NOT_NEGATIVE, default=None, kw_only=True
     )
     nominal_plant: Any = eqx.field(default=None, kw_only=True)

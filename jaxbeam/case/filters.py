@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import POSITIVE, choice, concrete, count, is_concrete, number
-from jaxbeam.runtime.arrays import Array, scan, xp
+from jaxbeam.runtime.arrays import Array, Number, scan, xp
 
 
 class Filter(ReprWithUnits):
@@ -27,7 +27,7 @@ class Filter(ReprWithUnits):
     40.0 butterworth
     """
 
-    cutoff: Float[Array, ""] = number("Hz", "frequency at which the gain is 1 / sqrt(2)", POSITIVE)
+    cutoff: Float[Number, ""] = number("Hz", "frequency at which the gain is 1 / sqrt(2)", POSITIVE)
     order: int = count("order of the filter", default=2)
     kind: str = choice("characteristic", "butterworth", default="butterworth")
     realisation: str = choice("realisation", "digital", "analogue", default="digital")

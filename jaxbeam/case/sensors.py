@@ -20,7 +20,7 @@ from jaxbeam.case.fields import (
 from jaxbeam.case.filters import Filter
 from jaxbeam.case.quantities import OF_QUANTITY, QUANTITIES
 from jaxbeam.case.reading.units import in_si
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, Number, xp
 from jaxbeam.runtime.module import Module
 
 
@@ -42,29 +42,29 @@ class Sensor(ReprWithUnits, Module):
     midspan 1
     """
 
-    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
+    position: Float[Number, ""] = number("m", "distance from the left end", ON_BEAM)
     quantity: str = choice("measured quantity", *QUANTITIES, default="deflection")
-    offset: Float[Array, ""] = number(OF_QUANTITY, "constant added", default=0.0)
-    fibre_distance: Float[Array, ""] | None = number(
+    offset: Float[Number, ""] = number(OF_QUANTITY, "constant added", default=0.0)
+    fibre_distance: Float[Number, ""] | None = number(
         "m", "height of the strain gauge above the neutral axis", default=None
     )
-    noise: Float[Array, ""] | None = number(
+    noise: Float[Number, ""] | None = number(
         OF_QUANTITY, "standard deviation of white noise", NOT_NEGATIVE, default=None
     )
-    range: Float[Array, "2"] | None = number(
+    range: Float[Number, "2"] | None = number(
         OF_QUANTITY, "smallest and largest reading", INCREASING, default=None
     )
-    resolution: Float[Array, ""] | None = number(
+    resolution: Float[Number, ""] | None = number(
         OF_QUANTITY, "step between readings", POSITIVE, default=None
     )
     filter: Filter | None = part("filter of the signal or of its samples", Filter)
-    sampling_period: Float[Array, ""] | None = number(
+    sampling_period: Float[Number, ""] | None = number(
         "s", "time between readings; that of controller or run if left out", POSITIVE, default=None
     )
-    delay: Float[Array, ""] | None = number(
+    delay: Float[Number, ""] | None = number(
         "s", "from deflection to reading", NOT_NEGATIVE, default=None
     )
-    section_modulus: Float[Array, ""] | None = number(
+    section_modulus: Float[Number, ""] | None = number(
         "m^3", "bending moment over stress; negative for a fibre above the axis", default=None
     )
     mode_band: str = choice(
@@ -75,10 +75,10 @@ class Sensor(ReprWithUnits, Module):
         default="all",
     )
     name: str = choice("label in results; its number and quantity if left out", default="")
-    dropout: Float[Array, ""] | None = number(
+    dropout: Float[Number, ""] | None = number(
         "1", "probability that a reading is lost", PROBABILITY, default=None, kw_only=True
     )
-    jitter: Float[Array, ""] | None = number(
+    jitter: Float[Number, ""] | None = number(
         "s", "largest random delay of a reading", NOT_NEGATIVE, default=None, kw_only=True
     )
 

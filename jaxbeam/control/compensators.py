@@ -23,7 +23,7 @@ from jaxbeam.case.controller import (
 from jaxbeam.case.fields import POSITIVE, axis_names, concrete, is_concrete, number
 from jaxbeam.case.filters import filter_step
 from jaxbeam.control.feedback import pairing_error
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, Number, xp
 
 Polynomials = Float[Array, "power actuator"]  # in s (rad/s), the coefficients ascending
 
@@ -35,7 +35,7 @@ class AbstractCompensator(AbstractController):
     start from zero.
     """
 
-    gains: Float[Array, " actuator"] = number("command per reading", "one gain for each actuator")
+    gains: Float[Number, " actuator"] = number("command per reading", "one gain for each actuator")
 
     @property
     def design_depends_on_loads(self) -> bool:
@@ -135,10 +135,10 @@ class PD(AbstractCompensator):
 
     kind: ClassVar[str] = "pd"
 
-    rate_gains: Float[Array, " *actuator"] = number(
+    rate_gains: Float[Number, " *actuator"] = number(
         "command per reading per s", "gain of the rate of the reading"
     )
-    lag: Float[Array, " *actuator"] = number(
+    lag: Float[Number, " *actuator"] = number(
         "s", "time constant of the lag that smooths the rate", POSITIVE
     )
 
@@ -173,8 +173,8 @@ class PositivePositionFeedback(AbstractCompensator):
 
     kind: ClassVar[str] = "ppf"
 
-    frequency: Float[Array, " *actuator"] = number("Hz", "frequency of the oscillator", POSITIVE)
-    damping_ratio: Float[Array, " *actuator"] = number(
+    frequency: Float[Number, " *actuator"] = number("Hz", "frequency of the oscillator", POSITIVE)
+    damping_ratio: Float[Number, " *actuator"] = number(
         "1", "damping ratio of the oscillator", POSITIVE
     )
 

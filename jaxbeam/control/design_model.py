@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jaxbeam.case.fields import NOT_NEGATIVE, count, number
 from jaxbeam.model.modal_model import assemble_modal_model
 from jaxbeam.model.state_space import Plant, build_plant
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Number, xp
 from jaxbeam.runtime.module import Module
 
 ACTUATOR_FIELDS = ("force_per_volt", "stiffness", "damping", "correction")
@@ -24,23 +24,23 @@ class DesignModel(Module):
     out of the design; `modes` keeps only the lowest modes of the beam in it.
     """
 
-    force_per_volt: Float[Array, " *actuator"] | None = number(
+    force_per_volt: Float[Number, " *actuator"] | None = number(
         "N/V", "steady force of shakers per volt", default=None
     )
-    stiffness: Float[Array, " *actuator"] | None = number(
+    stiffness: Float[Number, " *actuator"] | None = number(
         "N/m", "suspension of shakers and springs", NOT_NEGATIVE, default=None
     )
-    damping: Float[Array, " *actuator"] | None = number(
+    damping: Float[Number, " *actuator"] | None = number(
         "N s/m", "damping of suspensions", NOT_NEGATIVE, default=None
     )
-    correction: Float[Array, " *actuator"] | None = number(
+    correction: Float[Number, " *actuator"] | None = number(
         "1", "share of the moment of patches that reaches the beam", default=None
     )
-    mass: Float[Array, " *load"] | None = number(
+    mass: Float[Number, " *load"] | None = number(
         "kg", "masses of loads", NOT_NEGATIVE, default=None
     )
-    speed: Float[Array, " *load"] | None = number("m/s", "speeds of loads", default=None)
-    entry_time: Float[Array, " *load"] | None = number(
+    speed: Float[Number, " *load"] | None = number("m/s", "speeds of loads", default=None)
+    entry_time: Float[Number, " *load"] | None = number(
         "s", "predicted entry times of loads", default=None
     )
     modes: int | None = count("lowest modes of the beam in the design", default=None)

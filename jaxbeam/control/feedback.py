@@ -29,7 +29,7 @@ from jaxbeam.control.load_identification import (
     given_load,
     identification_error,
 )
-from jaxbeam.runtime.arrays import Array, take, xp
+from jaxbeam.runtime.arrays import Array, Number, take, xp
 
 
 def pairing_error(gains: Float[Array, " actuator"], case) -> str | None:
@@ -73,11 +73,11 @@ class Feedback(AbstractStaticController):
 
     kind: ClassVar[str] = "feedback"
 
-    gains: Float[Array, " actuator"] = number(
+    gains: Float[Number, " actuator"] = number(
         "command per reading^power", "one gain for each actuator"
     )
     power: int = count("power of the reading", default=1)
-    higher_gains: Float[Array, "term actuator"] | None = number(
+    higher_gains: Float[Number, "term actuator"] | None = number(
         "command per reading^(power + 2, power + 4, ...)",
         "row of gains for each further odd power",
         default=None,
@@ -125,7 +125,7 @@ class OutputFeedback(AbstractStaticController):
 
     kind: ClassVar[str] = "output-feedback"
 
-    gains: Float[Array, "actuator sensor"] = number(
+    gains: Float[Number, "actuator sensor"] = number(
         "command per reading", "row of gains of the sensors for each actuator"
     )
 
@@ -169,8 +169,8 @@ class ScheduledFeedback(AbstractController):
 
     kind: ClassVar[str] = "feedback-scheduled"
 
-    masses: Float[Array, " mass"] = number("kg", "masses for which there are gains", INCREASING)
-    gains: Float[Array, "actuator mass"] = number(
+    masses: Float[Number, " mass"] = number("kg", "masses for which there are gains", INCREASING)
+    gains: Float[Number, "actuator mass"] = number(
         "command per reading^power", "gains, a row for each actuator, a column for each mass"
     )
     power: int = count("power of the reading", default=1)

@@ -28,7 +28,7 @@ from jaxbeam.case.fields import (
 )
 from jaxbeam.case.loads.base import trajectory
 from jaxbeam.case.trajectory import NEVER
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, Number, xp
 
 
 class Prescribed(AbstractStaticController):
@@ -56,22 +56,22 @@ class Prescribed(AbstractStaticController):
     kind: ClassVar[str] = "prescribed"
     open_loop: ClassVar[bool] = True
 
-    offsets: Float[Array, " actuator"] = number(
+    offsets: Float[Number, " actuator"] = number(
         "unit of a command", "constant command of each actuator"
     )
-    amplitudes: Float[Array, "actuator sine"] | None = number(
+    amplitudes: Float[Number, "actuator sine"] | None = number(
         "unit of a command", "amplitudes of the sines, a row for each actuator", default=None
     )
-    frequencies: Float[Array, " sine"] | None = number(
+    frequencies: Float[Number, " sine"] | None = number(
         "Hz", "frequencies of the sines", NOT_NEGATIVE, default=None
     )
-    phases: Float[Array, "actuator sine"] | None = number(
+    phases: Float[Number, "actuator sine"] | None = number(
         "rad", "phases of the sines at t = 0", default=None
     )
-    times: Float[Array, " point"] | None = number(
+    times: Float[Number, " point"] | None = number(
         "s", "times of the table", INCREASING, default=None
     )
-    values: Float[Array, "actuator point"] | None = number(
+    values: Float[Number, "actuator point"] | None = number(
         "unit of a command", "commands of the table, a row for each actuator", default=None
     )
 
@@ -149,18 +149,18 @@ class Feedforward(AbstractController):
     kind: ClassVar[str] = "feedforward"
     open_loop: ClassVar[bool] = True
 
-    gates: Float[Array, "2"] = number("m", "positions of the gates, in the order of passage")
-    shares: Float[Array, " breakpoint"] = number("1", "shares of the crossing", INCREASING)
-    values: Float[Array, "actuator breakpoint"] = number(
+    gates: Float[Number, "2"] = number("m", "positions of the gates, in the order of passage")
+    shares: Float[Number, " breakpoint"] = number("1", "shares of the crossing", INCREASING)
+    values: Float[Number, "actuator breakpoint"] = number(
         "unit of a command", "commands of the table, a row for each actuator"
     )
-    lead: Float[Array, ""] = number(
+    lead: Float[Number, ""] = number(
         "s", "time by which the table is read ahead of the load", NOT_NEGATIVE, default=0.0
     )
-    confirmation: Float[Array, ""] | None = number(
+    confirmation: Float[Number, ""] | None = number(
         "m", "downward reading of a deflection sensor that shows a load", POSITIVE, default=None
     )
-    gate_errors: Float[Array, "2"] = number(
+    gate_errors: Float[Number, "2"] = number(
         "m", "distance by which each gate is farther along than the law has it", default=(0.0, 0.0)
     )
 

@@ -24,7 +24,7 @@ from jaxtyping import Float
 from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep
 from jaxbeam.case.fields import INCREASING, POSITIVE, concrete, count, is_concrete, number
 from jaxbeam.case.filters import Filter, filter_step, second_order_sections, steady_filter_state
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, Number, xp
 from jaxbeam.runtime.module import Module
 
 
@@ -56,17 +56,17 @@ class InternalModel(AbstractController):
 
     kind: ClassVar[str] = "internal-model"
 
-    readings: Float[Array, " breakpoint"] = number("m", "deflections due to the load", INCREASING)
-    values: Float[Array, "actuator breakpoint"] = number(
+    readings: Float[Number, " breakpoint"] = number("m", "deflections due to the load", INCREASING)
+    values: Float[Number, "actuator breakpoint"] = number(
         "unit of a command", "commands of the table, a row for each actuator"
     )
-    compensation: Float[Array, ""] = number(
+    compensation: Float[Number, ""] = number(
         "1", "share of the lift of the commands that is subtracted from the readings", default=1.0
     )
-    notches: Float[Array, " notch"] | None = number(
+    notches: Float[Number, " notch"] | None = number(
         "Hz", "frequencies of the notches", POSITIVE, default=None
     )
-    notch_damping: Float[Array, ""] = number(
+    notch_damping: Float[Number, ""] = number(
         "1", "damping ratio of the notches: half their relative width", POSITIVE, default=0.5
     )
 
@@ -209,16 +209,16 @@ class ScheduledInternalModel(AbstractController):
 
     kind: ClassVar[str] = "internal-model-scheduled"
 
-    shares: Float[Array, " breakpoint"] = number(
+    shares: Float[Number, " breakpoint"] = number(
         "1",
         "deflections due to the load over the lift of the full command",
         INCREASING,
         default=SHARES,
     )
-    values: Float[Array, " breakpoint"] = number(
+    values: Float[Number, " breakpoint"] = number(
         "1", "commands over the full one, negative ones over the opposite limit", default=VALUES
     )
-    reference: Float[Array, ""] = number(
+    reference: Float[Number, ""] = number(
         "1",
         "cutoff of the reference filter over the lowest natural frequency",
         POSITIVE,

@@ -23,7 +23,7 @@ from jaxbeam.estimation.observability import deflection_outputs
 from jaxbeam.estimation.observer import sensor_offsets
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.state_space import Plant, state_space
-from jaxbeam.runtime.arrays import Array, scan, take, xp
+from jaxbeam.runtime.arrays import Array, Number, scan, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.module import Module
 
@@ -273,16 +273,16 @@ class LoadIdentification(ReprWithUnits):
     1.019 mm
     """
 
-    gates: Float[Array, "2"] | None = number(
+    gates: Float[Number, "2"] | None = number(
         "m", "positions of the gates, in the order of passage", default=None
     )
-    until: Float[Array, ""] = number(
+    until: Float[Number, ""] = number(
         "1", "share of the crossing after which the mass is identified", POSITIVE, default=0.3
     )
-    threshold: Float[Array, ""] | None = number(
+    threshold: Float[Number, ""] | None = number(
         "m", "deflection above which a load is on the beam, without gates", POSITIVE, default=None
     )
-    gate_errors: Float[Array, "2"] = number(
+    gate_errors: Float[Number, "2"] = number(
         "m", "distance by which each gate is farther along than the law has it", default=(0.0, 0.0)
     )
 

@@ -19,7 +19,7 @@ from jaxbeam.control.state_controller import (
     AbstractStateLaw,
     deflection_rows,
 )
-from jaxbeam.runtime.arrays import Array, solve, xp
+from jaxbeam.runtime.arrays import Array, Number, solve, xp
 
 SMALLEST_EFFECT = 1e-9  # of the commands on the surfaces, of that on all modes
 
@@ -53,16 +53,16 @@ class SlidingMode(AbstractStateController):
 
     kind: ClassVar[str] = "sliding-mode"
 
-    rate: Float[Array, " *output"] = number(
+    rate: Float[Number, " *output"] = number(
         "1/s", "rate at which deflections decay on the surface", POSITIVE
     )
-    reaching_rate: Float[Array, " *output"] = number(
+    reaching_rate: Float[Number, " *output"] = number(
         "m/s^2", "rate of s outside the layer: acceleration of disturbances rejected", POSITIVE
     )
-    layer: Float[Array, " *output"] = number(
+    layer: Float[Number, " *output"] = number(
         "m/s", "half the thickness of the boundary layer of s", POSITIVE
     )
-    positions: Float[Array, " output"] | None = number(
+    positions: Float[Number, " output"] | None = number(
         "m", "positions of the deflections; those of the first sensors", ON_BEAM, default=None
     )
     equivalent: str = choice(

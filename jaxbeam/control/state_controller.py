@@ -32,7 +32,7 @@ from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.output_rows import modal_row
 from jaxbeam.model.state_space import Plant, build_plant, state_space
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, Number, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.module import Module
 
@@ -292,7 +292,7 @@ class StateFeedback(AbstractStateController):
 
     kind: ClassVar[str] = "state"
 
-    gain: Float[Array, "actuator state"] = number(
+    gain: Float[Number, "actuator state"] = number(
         "unit of a command per state", "gain, a row for each actuator"
     )
 

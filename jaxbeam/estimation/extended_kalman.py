@@ -17,7 +17,7 @@ from jaxbeam.estimation.observability import detectability_error, mode_count
 from jaxbeam.estimation.sensor_chain import filtered_plant, sensor_chain
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance
-from jaxbeam.runtime.arrays import Array, set_at, xp
+from jaxbeam.runtime.arrays import Array, Number, set_at, xp
 
 STEP = 1e-4  # of length, speed and mass of the design; over these derivatives are differences
 
@@ -66,16 +66,16 @@ class ExtendedKalman(AbstractKalmanEstimator):
 
     kind: ClassVar[str] = "kalman-extended"
 
-    mass_deviation: Float[Array, " *load"] = number(
+    mass_deviation: Float[Number, " *load"] = number(
         "kg", "standard deviation of the masses of the design", NOT_NEGATIVE, kw_only=True
     )
-    speed_deviation: Float[Array, " *load"] = number(
+    speed_deviation: Float[Number, " *load"] = number(
         "m/s", "standard deviation of the speeds of the design", NOT_NEGATIVE, kw_only=True
     )
-    position_deviation: Float[Array, " *load"] = number(
+    position_deviation: Float[Number, " *load"] = number(
         "m", "standard deviation of the position of a load as it enters", NOT_NEGATIVE, default=0.0
     )
-    acceleration_noise: Float[Array, " *load"] = number(
+    acceleration_noise: Float[Number, " *load"] = number(
         "m^2/s^3", "intensity of the white acceleration of the loads", NOT_NEGATIVE, default=0.0
     )
 

@@ -19,7 +19,7 @@ from jaxbeam.estimation.observability import (
 from jaxbeam.estimation.observer import sensor_offsets
 from jaxbeam.estimation.sampled_plant import Transition
 from jaxbeam.numerics.discretisation import balance
-from jaxbeam.runtime.arrays import Array, set_at, xp
+from jaxbeam.runtime.arrays import Array, Number, set_at, xp
 
 MAX_CONDITION_NUMBER = 100.0  # of the mode shapes at the sensors; beyond, there is a warning
 
@@ -53,7 +53,7 @@ class Inversion(AbstractEstimator):
 
     kind: ClassVar[str] = "inversion"
 
-    time_constant: Float[Array, ""] | None = number(
+    time_constant: Float[Number, ""] | None = number(
         "s", "time constant of the lag that smooths the rates", POSITIVE, default=None
     )
 

@@ -24,17 +24,17 @@ from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.numerics.finite_horizon import finite_horizon
 from jaxbeam.numerics.gain_table import GainTable
-from jaxbeam.runtime.arrays import Array, known, set_at, xp
+from jaxbeam.runtime.arrays import Array, Number, known, set_at, xp
 from jaxbeam.runtime.compiling import compiled
 
 
 class AbstractKalmanEstimator(AbstractEstimator):
     """Settings that Kalman filters share: noise of plant and readings, and delays of sensors."""
 
-    process_noise: Float[Array, " *mode"] = number(
+    process_noise: Float[Number, " *mode"] = number(
         "N^2 s/kg", "intensity of the white force on each mode", POSITIVE
     )
-    measurement_noise: Float[Array, " *sensor"] | None = number(
+    measurement_noise: Float[Number, " *sensor"] | None = number(
         "unit of quantity",
         "standard deviation of readings; that of the sensors if left out",
         POSITIVE,
@@ -155,10 +155,10 @@ class Kalman(AbstractKalmanEstimator):
     loads: str = choice(
         "loads in the model of the filter", "ignored", "known", "estimated", default="ignored"
     )
-    weight_deviation: Float[Array, " *load"] | None = number(
+    weight_deviation: Float[Number, " *load"] | None = number(
         "N", "standard deviation of the weights of the design", POSITIVE, default=None
     )
-    measurement_intensity: Float[Array, " *sensor"] | None = number(
+    measurement_intensity: Float[Number, " *sensor"] | None = number(
         "unit of quantity^2 s", "intensity of the noise of readings", POSITIVE, default=None
     )
     points: int = count("intervals of the gain from event to event", default=400)

@@ -26,7 +26,7 @@ from jaxbeam.estimation.sampled_plant import Transition
 from jaxbeam.model.sensing.output_rows import modal_row
 from jaxbeam.numerics.matrices import symmetric_part
 from jaxbeam.numerics.qp import solve_qp
-from jaxbeam.runtime.arrays import Array, cholesky, solve_triangular, xp
+from jaxbeam.runtime.arrays import Array, Number, cholesky, solve_triangular, xp
 
 RIDGE = 1e-10  # added to correlations, which the deflections of a window make singular
 
@@ -198,13 +198,13 @@ class MovingHorizon(AbstractKalmanEstimator):
     kind: ClassVar[str] = "moving-horizon"
 
     loads: str = choice("loads in the model", "known", "estimated", default="estimated")
-    weight_deviation: Float[Array, " *load"] | None = number(
+    weight_deviation: Float[Number, " *load"] | None = number(
         "N", "standard deviation of the weights of the design", POSITIVE, default=None
     )
     window: int = count("samples, with the present one, over which bounds hold", default=5)
-    min_weight: Float[Array, ""] = number("N", "least weight of a wheel", default=0.0)
-    max_weight: Float[Array, ""] | None = number("N", "largest weight of a wheel", default=None)
-    deflection_limit: Float[Array, ""] | None = number(
+    min_weight: Float[Number, ""] = number("N", "least weight of a wheel", default=0.0)
+    max_weight: Float[Number, ""] | None = number("N", "largest weight of a wheel", default=None)
+    deflection_limit: Float[Number, ""] | None = number(
         "m", "largest deflection at the sensors, up or down", POSITIVE, default=None
     )
 

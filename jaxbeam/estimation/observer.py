@@ -15,7 +15,7 @@ from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance, c2d
 from jaxbeam.numerics.riccati import care, dare
-from jaxbeam.runtime.arrays import Array, set_at, solve, xp
+from jaxbeam.runtime.arrays import Array, Number, set_at, solve, xp
 
 
 class ConstantGainFilter(AbstractSampledFilter):
@@ -129,10 +129,10 @@ class Observer(AbstractEstimator):
     kind: ClassVar[str] = "observer"
     continuous_time: ClassVar[bool] = True
 
-    poles: Float[Array, "mode 2"] | None = number(
+    poles: Float[Number, "mode 2"] | None = number(
         "1/s", "real and imaginary part of a pair of poles for each mode", default=None
     )
-    speed: Float[Array, ""] | None = number(
+    speed: Float[Number, ""] | None = number(
         "1", "ratio of the poles to those of the beam", POSITIVE, default=None
     )
 

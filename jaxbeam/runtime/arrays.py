@@ -121,6 +121,9 @@ class _Namespace:
 if TYPE_CHECKING:
     xp = jnp
     Array = jax.Array
+    # A number of a case: an array when read, and given as whatever its converter takes, which a
+    # checker of types cannot see (mypy knows no converters).
+    Number = jax.Array | Any
 else:
     xp = _Namespace(np, jnp)
 
@@ -130,6 +133,8 @@ else:
 
     class Array(metaclass=_OfEitherLibrary):
         """An array of JAX or NumPy. One class, as a union of three takes jaxtyping longer."""
+
+    Number = Array
 
 
 def array_namespace(*values: Any) -> Any:

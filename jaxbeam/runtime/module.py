@@ -1,5 +1,7 @@
 """Base class of immutable objects, which are trees of arrays."""
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 
 
@@ -10,4 +12,5 @@ class Module(eqx.Module):
     a run of two loads takes 5 % longer.
     """
 
-    __getattribute__ = object.__getattribute__
+    if not TYPE_CHECKING:  # a checker of types takes it for attributes of any name
+        __getattribute__ = object.__getattribute__

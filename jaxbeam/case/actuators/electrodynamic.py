@@ -18,7 +18,7 @@ from jaxtyping import Float
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment
 from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, number, part
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, Number, xp
 
 
 class Coil(NamedTuple):
@@ -97,16 +97,16 @@ class CurrentLoop(AbstractInnerLoop):
     kind: ClassVar[str] = "current"
     command_unit: ClassVar[str] = "A"
 
-    bandwidth: Float[Array, ""] | None = number(
+    bandwidth: Float[Number, ""] | None = number(
         "1/s", "bandwidth of the loop, from which its gains follow", POSITIVE, default=None
     )
-    proportional: Float[Array, ""] | None = number(
+    proportional: Float[Number, ""] | None = number(
         "V/A", "voltage per error of the current", POSITIVE, default=None
     )
-    integral: Float[Array, ""] | None = number(
+    integral: Float[Number, ""] | None = number(
         "V/(A s)", "rate of the voltage per error of the current", POSITIVE, default=None
     )
-    limits: Float[Array, "2"] | None = number(
+    limits: Float[Number, "2"] | None = number(
         "A", "smallest and largest current commanded", INCREASING, default=None
     )
 
@@ -138,19 +138,19 @@ class ForceLoop(AbstractInnerLoop):
     kind: ClassVar[str] = "force"
     command_unit: ClassVar[str] = "N"
 
-    bandwidth: Float[Array, ""] | None = number(
+    bandwidth: Float[Number, ""] | None = number(
         "1/s", "bandwidth of the loop, from which its gains follow", POSITIVE, default=None
     )
-    proportional: Float[Array, ""] | None = number(
+    proportional: Float[Number, ""] | None = number(
         "V/N", "voltage per error of the force", POSITIVE, default=None
     )
-    integral: Float[Array, ""] | None = number(
+    integral: Float[Number, ""] | None = number(
         "V/(N s)", "rate of the voltage per error of the force", POSITIVE, default=None
     )
-    sensor_bandwidth: Float[Array, ""] | None = number(
+    sensor_bandwidth: Float[Number, ""] | None = number(
         "1/s", "bandwidth of the lag of the force sensor; none if left out", POSITIVE, default=None
     )
-    limits: Float[Array, "2"] | None = number(
+    limits: Float[Number, "2"] | None = number(
         "N", "smallest and largest force commanded", INCREASING, default=None
     )
 
@@ -276,17 +276,17 @@ class Electrodynamic(AbstractActuator):
 
     kind: ClassVar[str] = "electrodynamic"
 
-    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
-    resistance: Float[Array, ""] = number("ohm", "coil resistance R", POSITIVE)
-    inductance: Float[Array, ""] = number("H", "coil inductance L", POSITIVE)
-    force_constant: Float[Array, ""] = number("N/A", "coil force per current K_f")
-    back_emf: Float[Array, ""] | None = number(
+    position: Float[Number, ""] = number("m", "distance from the left end", ON_BEAM)
+    resistance: Float[Number, ""] = number("ohm", "coil resistance R", POSITIVE)
+    inductance: Float[Number, ""] = number("H", "coil inductance L", POSITIVE)
+    force_constant: Float[Number, ""] = number("N/A", "coil force per current K_f")
+    back_emf: Float[Number, ""] | None = number(
         "V s/m", "back-EMF constant K_v; K_f if left out", default=None
     )
-    mass: Float[Array, ""] = number("kg", "moving mass", NOT_NEGATIVE, default=0.0)
-    stiffness: Float[Array, ""] = number("N/m", "suspension stiffness", NOT_NEGATIVE, default=0.0)
-    damping: Float[Array, ""] = number("N s/m", "suspension damping", NOT_NEGATIVE, default=0.0)
-    limits: Float[Array, "2"] | None = number(
+    mass: Float[Number, ""] = number("kg", "moving mass", NOT_NEGATIVE, default=0.0)
+    stiffness: Float[Number, ""] = number("N/m", "suspension stiffness", NOT_NEGATIVE, default=0.0)
+    damping: Float[Number, ""] = number("N s/m", "suspension damping", NOT_NEGATIVE, default=0.0)
+    limits: Float[Number, "2"] | None = number(
         "V", "smallest and largest voltage", INCREASING, default=None
     )
     inner_loop: AbstractInnerLoop | None = part(

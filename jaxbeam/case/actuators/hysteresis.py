@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, POSITIVE, concrete, is_concrete, number
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, Number, xp
 
 Plays = Float[Array, "play *batch"]
 
@@ -42,10 +42,10 @@ class Hysteresis(ReprWithUnits):
     [0.  5.6 4.  0.4]
     """
 
-    thresholds: Float[Array, " play"] = number(
+    thresholds: Float[Number, " play"] = number(
         "unit of a command", "thresholds of the plays; the first is zero", INCREASING
     )
-    weights: Float[Array, " play"] = number("1", "weights of the plays")
+    weights: Float[Number, " play"] = number("1", "weights of the plays")
 
     def follow(self, plays: Plays, command: Float[Array, "*batch"]) -> Plays:
         """Plays after a command."""
@@ -110,8 +110,8 @@ class Creep(ReprWithUnits):
     [1.     1.0526 1.0573 1.059 ]
     """
 
-    rates: Float[Array, " lag"] = number("1/s", "rates of the lags", POSITIVE)
-    weights: Float[Array, " lag"] = number("1", "weights of the lags", NOT_NEGATIVE)
+    rates: Float[Number, " lag"] = number("1/s", "rates of the lags", POSITIVE)
+    weights: Float[Number, " lag"] = number("1", "weights of the lags", NOT_NEGATIVE)
 
     @property
     def final_gain(self) -> Float[Array, ""]:

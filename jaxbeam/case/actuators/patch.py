@@ -17,7 +17,7 @@ from jaxbeam.case.fields import (
     number,
     part,
 )
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, Number, xp
 
 # Fields from which the moment per volt is derived where it is not given.
 MOMENT_SOURCES = (
@@ -63,44 +63,46 @@ class Patch(AbstractActuator):
 
     kind: ClassVar[str] = "patch"
 
-    start: Float[Array, ""] = number("m", "left edge", ON_BEAM)
-    end: Float[Array, ""] = number("m", "right edge", ON_BEAM)
-    moment_per_volt: Float[Array, ""] | None = number(
+    start: Float[Number, ""] = number("m", "left edge", ON_BEAM)
+    end: Float[Number, ""] = number("m", "right edge", ON_BEAM)
+    moment_per_volt: Float[Number, ""] | None = number(
         "N m/V", "moment per volt at the patch", default=None
     )
-    correction: Float[Array, ""] = number(
+    correction: Float[Number, ""] = number(
         "1", "share of the moment that reaches the beam", default=1.0
     )
-    amplifier_gain: Float[Array, ""] = number(
+    amplifier_gain: Float[Number, ""] = number(
         "1", "patch volts per volt of command", POSITIVE, default=1.0
     )
-    limits: Float[Array, "2"] | None = number(
+    limits: Float[Number, "2"] | None = number(
         "V", "smallest and largest command, at the input of the amplifier", INCREASING, default=None
     )
-    added_mass: Float[Array, ""] | None = number(
+    added_mass: Float[Number, ""] | None = number(
         "kg/m", "mass per length added", NOT_NEGATIVE, default=None
     )
-    added_rigidity: Float[Array, ""] | None = number(
+    added_rigidity: Float[Number, ""] | None = number(
         "N m^2", "bending stiffness added", NOT_NEGATIVE, default=None
     )
-    d33: Float[Array, ""] | None = number("m/V", "piezoelectric constant", default=None)
-    modulus: Float[Array, ""] | None = number(
+    d33: Float[Number, ""] | None = number("m/V", "piezoelectric constant", default=None)
+    modulus: Float[Number, ""] | None = number(
         "Pa", "Young's modulus of the patch", POSITIVE, default=None
     )
-    electrode_spacing: Float[Array, ""] | None = number(
+    electrode_spacing: Float[Number, ""] | None = number(
         "m", "distance between electrodes", POSITIVE, default=None
     )
-    beam_height: Float[Array, ""] | None = number(
+    beam_height: Float[Number, ""] | None = number(
         "m", "height of the beam under the patch", POSITIVE, default=None
     )
-    patch_height: Float[Array, ""] | None = number(
+    patch_height: Float[Number, ""] | None = number(
         "m", "height of the patch", POSITIVE, default=None
     )
-    patch_width: Float[Array, ""] | None = number("m", "width of the patch", POSITIVE, default=None)
-    depolarisation: Float[Array, "2"] = number(
+    patch_width: Float[Number, ""] | None = number(
+        "m", "width of the patch", POSITIVE, default=None
+    )
+    depolarisation: Float[Number, "2"] = number(
         "V", "smallest and largest voltage at the patch", INCREASING, default=(-500.0, 1500.0)
     )
-    rate_limit: Float[Array, ""] | None = number(
+    rate_limit: Float[Number, ""] | None = number(
         "V/s", "largest rate of change of the command", POSITIVE, default=None
     )
     hysteresis: Hysteresis | None = part("hysteresis of the patch", Hysteresis)

@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.actuators.base import AbstractActuator, Attachment
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE, number
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Number, xp
 
 
 class PointForce(AbstractActuator):
@@ -27,8 +27,8 @@ class PointForce(AbstractActuator):
 
     kind: ClassVar[str] = "point"
 
-    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
-    limits: Float[Array, "2"] | None = number(
+    position: Float[Number, ""] = number("m", "distance from the left end", ON_BEAM)
+    limits: Float[Number, "2"] | None = number(
         "N", "smallest and largest command", INCREASING, default=None
     )
 
@@ -64,14 +64,14 @@ class Shaker(AbstractActuator):
 
     kind: ClassVar[str] = "shaker"
 
-    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
-    stiffness: Float[Array, ""] = number("N/m", "suspension stiffness", NOT_NEGATIVE, default=0.0)
-    damping: Float[Array, ""] = number("N s/m", "suspension damping", NOT_NEGATIVE, default=0.0)
-    force_per_volt: Float[Array, ""] = number("N/V", "steady force per volt", default=4.6)
-    bandwidth: Float[Array, ""] = number(
+    position: Float[Number, ""] = number("m", "distance from the left end", ON_BEAM)
+    stiffness: Float[Number, ""] = number("N/m", "suspension stiffness", NOT_NEGATIVE, default=0.0)
+    damping: Float[Number, ""] = number("N s/m", "suspension damping", NOT_NEGATIVE, default=0.0)
+    force_per_volt: Float[Number, ""] = number("N/V", "steady force per volt", default=4.6)
+    bandwidth: Float[Number, ""] = number(
         "1/s", "bandwidth of the first-order lag", POSITIVE, default=1e4
     )
-    limits: Float[Array, "2"] | None = number(
+    limits: Float[Number, "2"] | None = number(
         "V", "smallest and largest voltage", INCREASING, default=None
     )
 
@@ -110,10 +110,10 @@ class SpringDamper(AbstractActuator):
 
     kind: ClassVar[str] = "spring"
 
-    position: Float[Array, ""] = number("m", "distance from the left end", ON_BEAM)
-    stiffness: Float[Array, ""] = number("N/m", "spring", NOT_NEGATIVE, default=0.0)
-    damping: Float[Array, ""] = number("N s/m", "damper", NOT_NEGATIVE, default=0.0)
-    limits: Float[Array, "2"] | None = number(
+    position: Float[Number, ""] = number("m", "distance from the left end", ON_BEAM)
+    stiffness: Float[Number, ""] = number("N/m", "spring", NOT_NEGATIVE, default=0.0)
+    damping: Float[Number, ""] = number("N s/m", "damper", NOT_NEGATIVE, default=0.0)
+    limits: Float[Number, "2"] | None = number(
         "1", "without effect: it takes no command", INCREASING, default=None
     )
 

@@ -19,7 +19,7 @@ from jaxbeam.case.fields import (
 )
 from jaxbeam.case.loads.base import AbstractRowLoad, AbstractVehicleLoad, length_error, plain_wheels
 from jaxbeam.case.trajectory import StandingTrajectory
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Number, xp
 from jaxbeam.vehicles.library import LEFT_OUT, Train, line_loads, trains
 
 
@@ -45,13 +45,13 @@ class Axles(AbstractRowLoad):
     kind: ClassVar[str] = "axles"
 
     train: str = choice("name of a train of the library", default="")
-    offsets: Float[Array, " axle"] | None = number(
+    offsets: Float[Number, " axle"] | None = number(
         "m", "distances of the axles behind the first one", INCREASING, default=None
     )
-    forces: Float[Array, "*axle"] | None = number(
+    forces: Float[Number, "*axle"] | None = number(
         "N", "forces of the axles, positive downwards", NOT_NEGATIVE, default=None
     )
-    masses: Float[Array, "*axle"] | None = number(
+    masses: Float[Number, "*axle"] | None = number(
         "kg", "masses of the axles", NOT_NEGATIVE, default=None
     )
 
@@ -158,20 +158,20 @@ class LineLoad(AbstractVehicleLoad):
     kind: ClassVar[str] = "line-load"
 
     model: str = choice("name of a line load of the library", default="")
-    force_per_length: Float[Array, "*part"] | None = number(
+    force_per_length: Float[Number, "*part"] | None = number(
         "N/m", "force per length of each part, positive downwards", NOT_NEGATIVE, default=None
     )
-    lengths: Float[Array, "*part"] | None = number(
+    lengths: Float[Number, "*part"] | None = number(
         "m", "lengths of the parts, front first", POSITIVE, default=None
     )
-    gaps: Float[Array, "*part"] | None = number(
+    gaps: Float[Number, "*part"] | None = number(
         "m", "gaps before the parts; 0 if left out", NOT_NEGATIVE, default=None
     )
-    tail: Float[Array, ""] = number(
+    tail: Float[Number, ""] = number(
         "m", "length of parts of the library without an end", POSITIVE, default=50.0
     )
     points: int = fields.count("point forces of each part", default=100)
-    position: Float[Array, ""] | None = number(
+    position: Float[Number, ""] | None = number(
         "m", "place of the front of a load that does not travel", default=None
     )
 

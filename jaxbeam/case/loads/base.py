@@ -31,7 +31,7 @@ from jaxbeam.case.trajectory import (
     BrakingTrajectory,
     TabulatedTrajectory,
 )
-from jaxbeam.runtime.arrays import Array, cholesky, solve, xp
+from jaxbeam.runtime.arrays import Array, Number, cholesky, solve, xp
 from jaxbeam.runtime.module import Module
 
 _LOAD_TOLERANCE = 1e-9  # of the mean wheel load: a smaller one carries nothing
@@ -219,22 +219,22 @@ class AbstractVehicleLoad(AbstractLoad):
     wheels, on its way with `speed`, which is constant until `entry_time`.
     """
 
-    speed: Float[Array, ""] | None = number(
+    speed: Float[Number, ""] | None = number(
         "m/s", "speed at entry; negative: to the left", default=None, kw_only=True
     )
-    entry_time: Float[Array, ""] = number(
+    entry_time: Float[Number, ""] = number(
         "s", "time at which the first wheel is at start_position", default=0.0, kw_only=True
     )
-    deceleration: Float[Array, ""] = number(
+    deceleration: Float[Number, ""] = number(
         "m/s^2", "constant deceleration from entry_time", default=0.0, kw_only=True
     )
-    times: Float[Array, " point"] | None = number(
+    times: Float[Number, " point"] | None = number(
         "s", "table: times", INCREASING, default=None, kw_only=True
     )
-    positions: Float[Array, " point"] | None = number(
+    positions: Float[Number, " point"] | None = number(
         "m", "table: positions of the first wheel", default=None, kw_only=True
     )
-    start_position: Float[Array, ""] | None = number(
+    start_position: Float[Number, ""] | None = number(
         "m",
         "position of the first wheel at entry_time, before the beam",
         default=None,
@@ -256,7 +256,7 @@ class AbstractRowLoad(AbstractVehicleLoad):
     """`count` vehicles in a row, the first wheels of neighbours `spacing` apart."""
 
     count: int = fields.count("number of vehicles in a row", default=1, kw_only=True)
-    spacing: Float[Array, ""] | None = number(
+    spacing: Float[Number, ""] | None = number(
         "m", "distance from vehicle to vehicle", NOT_NEGATIVE, default=None, kw_only=True
     )
 

@@ -15,7 +15,7 @@ from jaxbeam.case.loads.base import (
     static_load_error,
 )
 from jaxbeam.case.loads.planar.assembly import Bodies, Links, Wheels, assemble
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Number, xp
 
 NO_LINKS = Links((), np.zeros(0), np.zeros(0), np.zeros(0))
 
@@ -39,10 +39,10 @@ class Oscillator(AbstractVehicleLoad):
 
     kind: ClassVar[str] = "oscillator"
 
-    mass: Float[Array, ""] = number("kg", "sprung mass", POSITIVE)
-    stiffness: Float[Array, ""] = number("N/m", "spring", NOT_NEGATIVE)
-    damping: Float[Array, ""] = number("N s/m", "damper", NOT_NEGATIVE, default=0.0)
-    wheel_mass: Float[Array, ""] = number(
+    mass: Float[Number, ""] = number("kg", "sprung mass", POSITIVE)
+    stiffness: Float[Number, ""] = number("N/m", "spring", NOT_NEGATIVE)
+    damping: Float[Number, ""] = number("N s/m", "damper", NOT_NEGATIVE, default=0.0)
+    wheel_mass: Float[Number, ""] = number(
         "kg", "unsprung mass, on the surface", NOT_NEGATIVE, default=0.0
     )
 
@@ -84,12 +84,12 @@ class QuarterCar(AbstractVehicleLoad):
 
     kind: ClassVar[str] = "quarter-car"
 
-    body_mass: Float[Array, ""] = number("kg", "mass of the body", POSITIVE)
-    axle_mass: Float[Array, ""] = number("kg", "mass of the axle", POSITIVE)
-    suspension_stiffness: Float[Array, ""] = number("N/m", "spring of the body", NOT_NEGATIVE)
-    suspension_damping: Float[Array, ""] = number("N s/m", "damper of the body", NOT_NEGATIVE)
-    tyre_stiffness: Float[Array, ""] = number("N/m", "spring of the tyre", NOT_NEGATIVE)
-    tyre_damping: Float[Array, ""] = number(
+    body_mass: Float[Number, ""] = number("kg", "mass of the body", POSITIVE)
+    axle_mass: Float[Number, ""] = number("kg", "mass of the axle", POSITIVE)
+    suspension_stiffness: Float[Number, ""] = number("N/m", "spring of the body", NOT_NEGATIVE)
+    suspension_damping: Float[Number, ""] = number("N s/m", "damper of the body", NOT_NEGATIVE)
+    tyre_stiffness: Float[Number, ""] = number("N/m", "spring of the tyre", NOT_NEGATIVE)
+    tyre_damping: Float[Number, ""] = number(
         "N s/m", "damper of the tyre", NOT_NEGATIVE, default=0.0
     )
 
@@ -148,18 +148,22 @@ class HalfCar(AbstractVehicleLoad):
 
     kind: ClassVar[str] = "half-car"
 
-    body_mass: Float[Array, ""] = number("kg", "mass of the body", POSITIVE)
-    body_inertia: Float[Array, ""] = number(
+    body_mass: Float[Number, ""] = number("kg", "mass of the body", POSITIVE)
+    body_inertia: Float[Number, ""] = number(
         "kg m^2", "moment of inertia of the body in pitch", POSITIVE
     )
-    axle_positions: Float[Array, " axle"] = number(
+    axle_positions: Float[Number, " axle"] = number(
         "m", "axles forward of the body's centre of mass, front first"
     )
-    axle_masses: Float[Array, " axle"] = number("kg", "masses of the axles", POSITIVE)
-    suspension_stiffness: Float[Array, " axle"] = number("N/m", "springs of the body", NOT_NEGATIVE)
-    suspension_damping: Float[Array, " axle"] = number("N s/m", "dampers of the body", NOT_NEGATIVE)
-    tyre_stiffness: Float[Array, " axle"] = number("N/m", "springs of the tyres", NOT_NEGATIVE)
-    tyre_damping: Float[Array, " axle"] = number("N s/m", "dampers of the tyres", NOT_NEGATIVE)
+    axle_masses: Float[Number, " axle"] = number("kg", "masses of the axles", POSITIVE)
+    suspension_stiffness: Float[Number, " axle"] = number(
+        "N/m", "springs of the body", NOT_NEGATIVE
+    )
+    suspension_damping: Float[Number, " axle"] = number(
+        "N s/m", "dampers of the body", NOT_NEGATIVE
+    )
+    tyre_stiffness: Float[Number, " axle"] = number("N/m", "springs of the tyres", NOT_NEGATIVE)
+    tyre_damping: Float[Number, " axle"] = number("N s/m", "dampers of the tyres", NOT_NEGATIVE)
 
     def validate(self, address):
         if len(self.axle_positions) < 2:
@@ -242,21 +246,21 @@ class Wagon(AbstractRowLoad):
 
     kind: ClassVar[str] = "wagon"
 
-    body_mass: Float[Array, ""] = number("kg", "mass of the body", POSITIVE)
-    body_inertia: Float[Array, ""] = number("kg m^2", "pitch inertia of the body", POSITIVE)
-    bogie_mass: Float[Array, ""] = number("kg", "mass of a bogie without wheelsets", POSITIVE)
-    bogie_inertia: Float[Array, ""] = number("kg m^2", "pitch inertia of a bogie", POSITIVE)
-    wheelset_mass: Float[Array, ""] = number("kg", "mass of a wheelset", NOT_NEGATIVE)
-    primary_stiffness: Float[Array, ""] = number("N/m", "springs of a wheelset", NOT_NEGATIVE)
-    primary_damping: Float[Array, ""] = number("N s/m", "dampers of a wheelset", NOT_NEGATIVE)
-    secondary_stiffness: Float[Array, ""] = number(
+    body_mass: Float[Number, ""] = number("kg", "mass of the body", POSITIVE)
+    body_inertia: Float[Number, ""] = number("kg m^2", "pitch inertia of the body", POSITIVE)
+    bogie_mass: Float[Number, ""] = number("kg", "mass of a bogie without wheelsets", POSITIVE)
+    bogie_inertia: Float[Number, ""] = number("kg m^2", "pitch inertia of a bogie", POSITIVE)
+    wheelset_mass: Float[Number, ""] = number("kg", "mass of a wheelset", NOT_NEGATIVE)
+    primary_stiffness: Float[Number, ""] = number("N/m", "springs of a wheelset", NOT_NEGATIVE)
+    primary_damping: Float[Number, ""] = number("N s/m", "dampers of a wheelset", NOT_NEGATIVE)
+    secondary_stiffness: Float[Number, ""] = number(
         "N/m", "springs between body and bogie", NOT_NEGATIVE
     )
-    secondary_damping: Float[Array, ""] = number(
+    secondary_damping: Float[Number, ""] = number(
         "N s/m", "dampers between body and bogie", NOT_NEGATIVE
     )
-    bogie_distance: Float[Array, ""] = number("m", "distance between bogie centres", POSITIVE)
-    wheelset_distance: Float[Array, ""] = number("m", "distance of wheelsets of a bogie", POSITIVE)
+    bogie_distance: Float[Number, ""] = number("m", "distance between bogie centres", POSITIVE)
+    wheelset_distance: Float[Number, ""] = number("m", "distance of wheelsets of a bogie", POSITIVE)
 
     def validate(self, address):
         springs = ("primary_stiffness", "secondary_stiffness")

@@ -15,7 +15,7 @@ from jaxbeam.case.loads.base import (
     plain_wheels,
 )
 from jaxbeam.case.trajectory import StandingTrajectory
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Number, xp
 
 
 class MovingForce(AbstractLoad):
@@ -37,16 +37,16 @@ class MovingForce(AbstractLoad):
 
     kind: ClassVar[str] = "force"
 
-    mass: Float[Array, ""] | None = number(
+    mass: Float[Number, ""] | None = number(
         "kg", "mass whose weight it is", NOT_NEGATIVE, default=None
     )
-    force: Float[Array, ""] | None = number("N", "force, positive downwards", default=None)
-    speed: Float[Array, ""] | None = number("m/s", "speed at entry", default=None)
-    entry_time: Float[Array, ""] = number("s", "time of entry", default=0.0)
-    deceleration: Float[Array, ""] = number("m/s^2", "constant deceleration", default=0.0)
-    times: Float[Array, " point"] | None = number("s", "table: times", INCREASING, default=None)
-    positions: Float[Array, " point"] | None = number("m", "table: positions", default=None)
-    start_position: Float[Array, ""] | None = number(
+    force: Float[Number, ""] | None = number("N", "force, positive downwards", default=None)
+    speed: Float[Number, ""] | None = number("m/s", "speed at entry", default=None)
+    entry_time: Float[Number, ""] = number("s", "time of entry", default=0.0)
+    deceleration: Float[Number, ""] = number("m/s^2", "constant deceleration", default=0.0)
+    times: Float[Number, " point"] | None = number("s", "table: times", INCREASING, default=None)
+    positions: Float[Number, " point"] | None = number("m", "table: positions", default=None)
+    start_position: Float[Number, ""] | None = number(
         "m", "position at entry_time, before the beam", default=None
     )
 
@@ -83,19 +83,19 @@ class VaryingForce(AbstractVehicleLoad):
 
     kind: ClassVar[str] = "varying-force"
 
-    force: Float[Array, ""] = number("N", "constant part", default=0.0)
-    frequencies: Float[Array, " wave"] = number(
+    force: Float[Number, ""] = number("N", "constant part", default=0.0)
+    frequencies: Float[Number, " wave"] = number(
         "Hz", "frequencies of the waves", NOT_NEGATIVE, default=()
     )
-    amplitudes: Float[Array, " wave"] = number("N", "amplitudes of the waves", default=())
-    phases: Float[Array, " wave"] | None = number(
+    amplitudes: Float[Number, " wave"] = number("N", "amplitudes of the waves", default=())
+    phases: Float[Number, " wave"] | None = number(
         "rad", "phases of the waves at the start of the run; 0 if left out", default=None
     )
-    force_times: Float[Array, " entry"] | None = number(
+    force_times: Float[Number, " entry"] | None = number(
         "s", "times of the table of forces", INCREASING, default=None
     )
-    forces: Float[Array, " entry"] | None = number("N", "forces of the table", default=None)
-    position: Float[Array, ""] | None = number(
+    forces: Float[Number, " entry"] | None = number("N", "forces of the table", default=None)
+    position: Float[Number, ""] | None = number(
         "m", "place of a force that does not travel", ON_BEAM, default=None
     )
 
@@ -150,13 +150,13 @@ class MovingMass(AbstractLoad):
 
     kind: ClassVar[str] = "mass"
 
-    mass: Float[Array, ""] = number("kg", "mass", NOT_NEGATIVE)
-    speed: Float[Array, ""] | None = number("m/s", "speed at entry", default=None)
-    entry_time: Float[Array, ""] = number("s", "time of entry", default=0.0)
-    deceleration: Float[Array, ""] = number("m/s^2", "constant deceleration", default=0.0)
-    times: Float[Array, " point"] | None = number("s", "table: times", INCREASING, default=None)
-    positions: Float[Array, " point"] | None = number("m", "table: positions", default=None)
-    start_position: Float[Array, ""] | None = number(
+    mass: Float[Number, ""] = number("kg", "mass", NOT_NEGATIVE)
+    speed: Float[Number, ""] | None = number("m/s", "speed at entry", default=None)
+    entry_time: Float[Number, ""] = number("s", "time of entry", default=0.0)
+    deceleration: Float[Number, ""] = number("m/s^2", "constant deceleration", default=0.0)
+    times: Float[Number, " point"] | None = number("s", "table: times", INCREASING, default=None)
+    positions: Float[Number, " point"] | None = number("m", "table: positions", default=None)
+    start_position: Float[Number, ""] | None = number(
         "m", "position at entry_time, before the beam", default=None
     )
 

@@ -1,6 +1,7 @@
 """Loads that are vehicles in the plane, of the library or of files."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -49,10 +50,10 @@ class VehicleLoad(AbstractRowLoad):
     kind: ClassVar[str] = "vehicle"
 
     model: str = choice("name of a vehicle of the library, or path of a vehicle file", default="")
-    bodies: tuple[VehicleBody, ...] = parts("rigid bodies", VehicleBody)
-    springs: tuple[VehicleSpring, ...] = parts("springs between bodies", VehicleSpring)
-    hinges: tuple[VehicleHinge, ...] = parts("hinges between bodies", VehicleHinge)
-    axles: tuple[VehicleAxle, ...] = parts("axles, front first", VehicleAxle)
+    bodies: Sequence[VehicleBody] = parts("rigid bodies", VehicleBody)
+    springs: Sequence[VehicleSpring] = parts("springs between bodies", VehicleSpring)
+    hinges: Sequence[VehicleHinge] = parts("hinges between bodies", VehicleHinge)
+    axles: Sequence[VehicleAxle] = parts("axles, front first", VehicleAxle)
 
     def __post_init__(self):
         if not isinstance(self.model, str) or not (

@@ -38,7 +38,7 @@ from jaxbeam.case.fields import (
 )
 from jaxbeam.case.loads.base import AbstractVehicleLoad, ForceHistory, length_error, plain_wheels
 from jaxbeam.case.trajectory import StandingTrajectory
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, Number, xp
 
 WEIGHT = 700.0  # N, of the reference pedestrian of prEN 1991-2, annex X, as coded in xcfem/xc
 LEAST_WALKING_PACE = 0.95  # Hz, at which the first factor of walking is zero
@@ -78,22 +78,22 @@ class AbstractWalkingLoad(AbstractVehicleLoad):
     the ground, the sum of a few harmonics may be slightly negative, and counts as lost contact.
     """
 
-    pace: Float[Array, ""] = number("Hz", "steps a second", POSITIVE, kw_only=True)
-    weight: Float[Array, ""] = number(
+    pace: Float[Number, ""] = number("Hz", "steps a second", POSITIVE, kw_only=True)
+    weight: Float[Number, ""] = number(
         "N", "weight of a person", POSITIVE, default=WEIGHT, kw_only=True
     )
     activity: str = choice("how people move", "walking", "jogging", default="walking", kw_only=True)
-    factors: Float[Array, " harmonic"] | None = number(
+    factors: Float[Number, " harmonic"] | None = number(
         "1",
         "amplitudes of the harmonics of the pace, as shares of the weight",
         NOT_NEGATIVE,
         default=None,
         kw_only=True,
     )
-    phases: Float[Array, " harmonic"] | None = number(
+    phases: Float[Number, " harmonic"] | None = number(
         "rad", "phases of these harmonics at a step", default=None, kw_only=True
     )
-    contact_time: Float[Array, ""] | None = number(
+    contact_time: Float[Number, ""] | None = number(
         "s", "time of a foot of a jogger on the ground", POSITIVE, default=None, kw_only=True
     )
     harmonics: int = fields.count("harmonics of jogging", default=4, kw_only=True)
@@ -158,8 +158,8 @@ class Pedestrian(AbstractWalkingLoad):
 
     kind: ClassVar[str] = "pedestrian"
 
-    step_time: Float[Array, ""] | None = number("s", "time of a step", default=None, kw_only=True)
-    position: Float[Array, ""] | None = number(
+    step_time: Float[Number, ""] | None = number("s", "time of a step", default=None, kw_only=True)
+    position: Float[Number, ""] | None = number(
         "m", "place of a person who stays there", ON_BEAM, default=None, kw_only=True
     )
 
@@ -202,8 +202,8 @@ class Crowd(AbstractWalkingLoad):
     kind: ClassVar[str] = "crowd"
 
     people: int = fields.count("number of people", kw_only=True)
-    length: Float[Array, ""] = number("m", "length of the stream", POSITIVE, kw_only=True)
-    pace_deviation: Float[Array, ""] = number(
+    length: Float[Number, ""] = number("m", "length of the stream", POSITIVE, kw_only=True)
+    pace_deviation: Float[Number, ""] = number(
         "Hz", "standard deviation of the paces", NOT_NEGATIVE, default=0.0, kw_only=True
     )
     seed: int = fields.count("seed of places, paces and steps", minimum=0, default=0, kw_only=True)

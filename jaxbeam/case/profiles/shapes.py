@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import INCREASING, POSITIVE, concrete, is_concrete, number
-from jaxbeam.runtime.arrays import Array, set_at, solve_tridiagonal, take, xp
+from jaxbeam.runtime.arrays import Array, Number, set_at, solve_tridiagonal, take, xp
 from jaxbeam.runtime.module import Module
 
 Heights = tuple[Float[Array, "*x"], Float[Array, "*x"], Float[Array, "*x"]]
@@ -116,10 +116,10 @@ class AbstractTransition(AbstractAveragedProfile):
 
     shape_at_end: ClassVar[float]
 
-    start: Float[Array, ""] = number("m", "position at which it begins")
-    end: Float[Array, ""] = number("m", "position at which it ends")
-    height: Float[Array, ""] = number("m", "height")
-    contact_length: Float[Array, ""] | None = number(
+    start: Float[Number, ""] = number("m", "position at which it begins")
+    end: Float[Number, ""] = number("m", "position at which it ends")
+    height: Float[Number, ""] = number("m", "height")
+    contact_length: Float[Number, ""] | None = number(
         "m", "length of the contact patch over which a wheel averages", POSITIVE, default=None
     )
 
@@ -230,10 +230,10 @@ class SineProfile(AbstractProfile):
 
     kind: ClassVar[str] = "sine"
 
-    amplitude: Float[Array, ""] = number("m", "amplitude, half of the height from trough to crest")
-    wavelength: Float[Array, ""] = number("m", "distance between crests", POSITIVE)
-    phase: Float[Array, ""] = number("rad", "phase at x = 0", default=0.0)
-    contact_length: Float[Array, ""] | None = number(
+    amplitude: Float[Number, ""] = number("m", "amplitude, half of the height from trough to crest")
+    wavelength: Float[Number, ""] = number("m", "distance between crests", POSITIVE)
+    phase: Float[Number, ""] = number("rad", "phase at x = 0", default=0.0)
+    contact_length: Float[Number, ""] | None = number(
         "m", "length of the contact patch over which a wheel averages", POSITIVE, default=None
     )
 
@@ -285,9 +285,9 @@ class TableProfile(AbstractAveragedProfile):
 
     kind: ClassVar[str] = "table"
 
-    positions: Float[Array, " point"] = number("m", "positions along the beam", INCREASING)
-    point_heights: Float[Array, " point"] = number("m", "heights at the positions")
-    contact_length: Float[Array, ""] | None = number(
+    positions: Float[Number, " point"] = number("m", "positions along the beam", INCREASING)
+    point_heights: Float[Number, " point"] = number("m", "heights at the positions")
+    contact_length: Float[Number, ""] | None = number(
         "m", "length of the contact patch over which a wheel averages", POSITIVE, default=None
     )
 

@@ -24,7 +24,7 @@ from jaxbeam.case.profiles.shapes import (
     Heights,
     smooth_step,
 )
-from jaxbeam.runtime.arrays import Array, checkpoint, is_known, scan, xp, zeros
+from jaxbeam.runtime.arrays import Array, Number, checkpoint, is_known, scan, xp, zeros
 
 DIRECT_SIZE = 100_000  # cosines that are computed at once; more than these wave by wave
 BLOCK = 16  # waves at once then: memory does not grow with their number
@@ -232,13 +232,13 @@ class SpectrumProfile(AbstractSpectralProfile):
 
     kind: ClassVar[str] = "spectrum"
 
-    wavenumbers: Float[Array, " line"] = number("1/m", "wavenumbers, cycles per metre", POSITIVE)
-    amplitudes: Float[Array, " line"] = number("m", "amplitudes")
-    phases: Float[Array, " line"] = number("rad", "phases at x = 0")
-    switch_on: Float[Array, "2"] | None = number(
+    wavenumbers: Float[Number, " line"] = number("1/m", "wavenumbers, cycles per metre", POSITIVE)
+    amplitudes: Float[Number, " line"] = number("m", "amplitudes")
+    phases: Float[Number, " line"] = number("rad", "phases at x = 0")
+    switch_on: Float[Number, "2"] | None = number(
         "m", "positions where the profile begins and where it is all there", default=None
     )
-    contact_length: Float[Array, ""] | None = number(
+    contact_length: Float[Number, ""] | None = number(
         "m", "length of the contact patch over which a wheel averages", POSITIVE, default=None
     )
 
@@ -338,20 +338,20 @@ class ISO8608Profile(AbstractRandomProfile):
 
     road_class: str = choice("roughness class", *ROAD_CLASSES)
     seed: int = count("seed of the phases", minimum=0, default=0)
-    scale: Float[Array, ""] = number("1", "factor of the heights", NOT_NEGATIVE, default=1.0)
-    lowest_wavenumber: Float[Array, ""] = number(
+    scale: Float[Number, ""] = number("1", "factor of the heights", NOT_NEGATIVE, default=1.0)
+    lowest_wavenumber: Float[Number, ""] = number(
         "1/m", "lowest wavenumber, cycles per metre", POSITIVE, default=0.01
     )
-    highest_wavenumber: Float[Array, ""] = number(
+    highest_wavenumber: Float[Number, ""] = number(
         "1/m", "highest wavenumber, cycles per metre", POSITIVE, default=4.0
     )
     waves: int = count("number of waves of the sum", default=100)
-    switch_on: Float[Array, "2"] = number(
+    switch_on: Float[Number, "2"] = number(
         "m",
         "positions where the profile begins and where it is all there",
         default=(-40.0, -30.0),
     )
-    contact_length: Float[Array, ""] | None = number(
+    contact_length: Float[Number, ""] | None = number(
         "m", "length of the contact patch over which a wheel averages", POSITIVE, default=None
     )
 
@@ -386,20 +386,20 @@ class RailProfile(AbstractRandomProfile):
 
     spectrum: str = choice("spectrum of the track", *RAIL_SPECTRA)
     seed: int = count("seed of the phases", minimum=0, default=0)
-    scale: Float[Array, ""] = number("1", "factor of the heights", NOT_NEGATIVE, default=1.0)
-    shortest_wavelength: Float[Array, ""] | None = number(
+    scale: Float[Number, ""] = number("1", "factor of the heights", NOT_NEGATIVE, default=1.0)
+    shortest_wavelength: Float[Number, ""] | None = number(
         "m", "shortest wavelength", POSITIVE, default=None
     )
-    longest_wavelength: Float[Array, ""] | None = number(
+    longest_wavelength: Float[Number, ""] | None = number(
         "m", "longest wavelength", POSITIVE, default=None
     )
     waves: int = count("number of waves of the sum", default=100)
-    switch_on: Float[Array, "2"] = number(
+    switch_on: Float[Number, "2"] = number(
         "m",
         "positions where the profile begins and where it is all there",
         default=(-40.0, -30.0),
     )
-    contact_length: Float[Array, ""] | None = number(
+    contact_length: Float[Number, ""] | None = number(
         "m", "length of the contact patch over which a wheel averages", POSITIVE, default=None
     )
 

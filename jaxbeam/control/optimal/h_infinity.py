@@ -26,7 +26,7 @@ from jaxbeam.model.sensing.output_rows import row_on_states
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square, symmetric_part
 from jaxbeam.numerics.riccati import indefinite_dare
-from jaxbeam.runtime.arrays import Array, any_jax, fori_loop, solve, stop_gradient, xp
+from jaxbeam.runtime.arrays import Array, Number, any_jax, fori_loop, solve, stop_gradient, xp
 
 HIGHEST_LEVEL, BISECTIONS = 1e9, 36  # from 1e9 to 1e-9, in logarithms
 ROUNDING = 1e-9  # of an eigenvalue that may be zero, relative to the largest
@@ -199,31 +199,31 @@ class HInfinity(AbstractController):
 
     kind: ClassVar[str] = "h-infinity"
 
-    output_size: Float[Array, " *output"] = number(
+    output_size: Float[Number, " *output"] = number(
         "unit of a reading", "size of each reading that counts as 1", POSITIVE
     )
-    command_size: Float[Array, " *actuator"] = number(
+    command_size: Float[Number, " *actuator"] = number(
         "unit of a command", "size of each command that counts as 1", POSITIVE
     )
-    force_size: Float[Array, " *force"] = number(
+    force_size: Float[Number, " *force"] = number(
         "N", "size of each disturbing force that counts as 1", POSITIVE
     )
-    noise_size: Float[Array, " *output"] = number(
+    noise_size: Float[Number, " *output"] = number(
         "unit of a reading", "size of the noise of each reading that counts as 1", POSITIVE
     )
-    positions: Float[Array, " force"] | None = number(
+    positions: Float[Number, " force"] | None = number(
         "m",
         "places of the disturbing forces; those of the sensors if left out",
         ON_BEAM,
         default=None,
     )
-    corner: Float[Array, ""] | None = number(
+    corner: Float[Number, ""] | None = number(
         "Hz",
         "corner frequency of the low-pass through which readings count",
         POSITIVE,
         default=None,
     )
-    attenuation: Float[Array, ""] | None = number(
+    attenuation: Float[Number, ""] | None = number(
         "1", "worst gain, 1.05 times the least one if left out", POSITIVE, default=None
     )
     design: DesignModel | None = part("design model of the plant", DesignModel)

@@ -48,7 +48,7 @@ from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.finite_horizon import boundary_layer
 from jaxbeam.numerics.gain_table import GainTable
 from jaxbeam.numerics.riccati import lqr
-from jaxbeam.runtime.arrays import Array, known, set_at, xp
+from jaxbeam.runtime.arrays import Array, Number, known, set_at, xp
 from jaxbeam.runtime.compiling import compiled
 
 MAX_PHASE_PER_INTERVAL = 3.0  # rad, phase advance of the fastest mode in an interval of a table
@@ -153,19 +153,19 @@ class LQR(AbstractStateController):
 
     kind: ClassVar[str] = "lqr"
 
-    state_weight: Float[Array, " state"] = number(
+    state_weight: Float[Number, " state"] = number(
         "1/unit of the state^2", "weight of each state", NOT_NEGATIVE
     )
-    command_weight: Float[Array, " actuator"] = number(
+    command_weight: Float[Number, " actuator"] = number(
         "1/unit of a command^2", "weight of each command", POSITIVE
     )
-    positions: Float[Array, " position"] | None = number(
+    positions: Float[Number, " position"] | None = number(
         "m", "positions of weighted deflections", ON_BEAM, default=None
     )
-    position_weight: Float[Array, " position"] | None = number(
+    position_weight: Float[Number, " position"] | None = number(
         "1/m^2", "weight of the deflection at each position", NOT_NEGATIVE, default=None
     )
-    feedback: Float[Array, " state"] | None = number(
+    feedback: Float[Number, " state"] | None = number(
         "1", "share of each state that is fed back", default=None
     )
     horizon: str = choice(
@@ -179,21 +179,21 @@ class LQR(AbstractStateController):
     sampling: str = choice(
         "design for samples", "emulated", "exact", default="emulated", kw_only=True
     )
-    input_rate_weight: Float[Array, " actuator"] | None = number(
+    input_rate_weight: Float[Number, " actuator"] | None = number(
         "s^2/unit of a command^2",
         "weight of the rate of change of each command",
         NOT_NEGATIVE,
         default=None,
         kw_only=True,
     )
-    integral_weight: Float[Array, " output"] | None = number(
+    integral_weight: Float[Number, " output"] | None = number(
         "1/(m^2 s^2)",
         "weight of the integral of each error",
         POSITIVE,
         default=None,
         kw_only=True,
     )
-    reference: Float[Array, " output"] | None = number(
+    reference: Float[Number, " output"] | None = number(
         "m", "reference of each of the first sensors", default=None, kw_only=True
     )
     entries: str = choice(
@@ -208,11 +208,11 @@ class LQR(AbstractStateController):
         default="none",
         kw_only=True,
     )
-    fade_time: Float[Array, ""] | None = number(
+    fade_time: Float[Number, ""] | None = number(
         "s", "time constant with which the last gain decays", POSITIVE, default=None, kw_only=True
     )
     points: int = count("intervals of the table from event to event", default=1600, kw_only=True)
-    terminal_weight: Float[Array, " state"] | None = number(
+    terminal_weight: Float[Number, " state"] | None = number(
         "s/unit of the state^2",
         "weight of each state at the end",
         NOT_NEGATIVE,
@@ -230,10 +230,10 @@ class LQR(AbstractStateController):
         default="time",
         kw_only=True,
     )
-    masses: Float[Array, " mass"] | None = number(
+    masses: Float[Number, " mass"] | None = number(
         "kg", "masses of the designs", INCREASING, default=None, kw_only=True
     )
-    speeds: Float[Array, " speed"] | None = number(
+    speeds: Float[Number, " speed"] | None = number(
         "m/s", "speeds of the designs", INCREASING, default=None, kw_only=True
     )
     between: str = choice(

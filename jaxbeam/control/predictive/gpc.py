@@ -41,7 +41,7 @@ from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.control.predictive.prediction import sampled_plant
 from jaxbeam.model.state_space import Plant
-from jaxbeam.runtime.arrays import Array, add_at, solve, take, xp
+from jaxbeam.runtime.arrays import Array, Number, add_at, solve, take, xp
 
 
 class PolynomialModel(NamedTuple):
@@ -183,14 +183,14 @@ class GPC(AbstractController):
 
     horizon: int = count("last period of the prediction, N2")
     moves: int = count("moves of each actuator, Nu")
-    move_weight: Float[Array, " *actuator"] = number(
+    move_weight: Float[Number, " *actuator"] = number(
         "unit of a reading^2/unit of a command^2", "weight of the square of each move", POSITIVE
     )
     first: int = count("first period of the prediction, N1", default=1)
-    output_weight: Float[Array, " *output"] | None = number(
+    output_weight: Float[Number, " *output"] | None = number(
         "1", "weight of the square of each reading; 1 if left out", NOT_NEGATIVE, default=None
     )
-    reference: Float[Array, " output"] | None = number(
+    reference: Float[Number, " output"] | None = number(
         "unit of a reading", "reference of each reading; 0 if left out", default=None
     )
     design: DesignModel | None = part("design model of the plant", DesignModel)
@@ -308,18 +308,20 @@ class AdaptiveGPC(GPC):
 
     kind: ClassVar[str] = "gpc-adaptive"
 
-    forgetting: Float[Array, ""] = number("1", "weight of the last sample", POSITIVE, default=0.995)
-    deviation: Float[Array, ""] = number(
+    forgetting: Float[Number, ""] = number(
+        "1", "weight of the last sample", POSITIVE, default=0.995
+    )
+    deviation: Float[Number, ""] = number(
         "1", "relative standard deviation of the design model", POSITIVE, default=0.5
     )
-    measurement_noise: Float[Array, ""] = number(
+    measurement_noise: Float[Number, ""] = number(
         "unit of a reading", "standard deviation of increments of readings", POSITIVE, default=1e-6
     )
     more_delay: int = count("periods of delay beyond those of the design", default=2)
-    until: Float[Array, ""] | None = number(
+    until: Float[Number, ""] | None = number(
         "s", "time up to which the plant is identified", POSITIVE, default=None
     )
-    probe: Float[Array, " *actuator"] | None = number(
+    probe: Float[Number, " *actuator"] | None = number(
         "unit of a command", "amplitude of the probing commands", NOT_NEGATIVE, default=None
     )
 

@@ -43,7 +43,7 @@ from jaxbeam.control.predictive.terminal import (
 from jaxbeam.control.state_controller import AbstractStateController, deflection_rows
 from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.qp import METHODS
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, Number, xp
 
 MAX_TERMINAL_WEIGHT = 3.0  # beyond it crossings were worse than without a terminal set, in trials
 
@@ -101,25 +101,25 @@ class MPC(AbstractStateController):
 
     horizon: int = count("periods of the prediction")
     moves: int = count("moves, or Laguerre functions, for each actuator")
-    move_weight: Float[Array, " *actuator"] = number(
+    move_weight: Float[Number, " *actuator"] = number(
         "m^2/unit of a command^2", "weight of the square of each move, r_w", POSITIVE
     )
-    output_weight: Float[Array, " *output"] | None = number(
+    output_weight: Float[Number, " *output"] | None = number(
         "1", "weight of the square of each deflection; 1 if left out", NOT_NEGATIVE, default=None
     )
-    horizon_weight: Float[Array, " period"] | None = number(
+    horizon_weight: Float[Number, " period"] | None = number(
         "1", "weight of each period of the prediction; 1 if left out", NOT_NEGATIVE, default=None
     )
-    positions: Float[Array, " position"] | None = number(
+    positions: Float[Number, " position"] | None = number(
         "m", "positions of the controlled deflections", ON_BEAM, default=None
     )
-    soft_limit: Float[Array, " *output"] | None = number(
+    soft_limit: Float[Number, " *output"] | None = number(
         "m", "soft limit of each deflection", POSITIVE, default=None
     )
-    soft_weight: Float[Array, ""] = number(
+    soft_weight: Float[Number, ""] = number(
         "1", "weight of the square of the excess over a soft limit", POSITIVE, default=1e4
     )
-    hard_limit: Float[Array, " *output"] | None = number(
+    hard_limit: Float[Number, " *output"] | None = number(
         "m", "limit of each deflection that predictions must keep", POSITIVE, default=None
     )
     loads: str = choice(
@@ -128,14 +128,14 @@ class MPC(AbstractStateController):
     prediction: str = choice(
         "plant in the prediction", "time-invariant", "time-varying", default="time-invariant"
     )
-    laguerre_pole: Float[Array, ""] | None = number(
+    laguerre_pole: Float[Number, ""] | None = number(
         "1", "pole of Laguerre functions, 0 to 1", NOT_NEGATIVE, default=None
     )
     terminal: str = choice(
         "cost, and set, after the horizon", "none", "riccati", "dual-mode", default="none"
     )
     terminal_periods: int = count("periods whose limits make up the terminal set", default=20)
-    terminal_weight: Float[Array, ""] | None = number(
+    terminal_weight: Float[Number, ""] | None = number(
         "1", "weight of excesses over limits after the horizon, 1 say", POSITIVE, default=None
     )
     solver: str = choice(

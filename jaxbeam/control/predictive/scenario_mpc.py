@@ -19,7 +19,7 @@ from jaxbeam.control.state_controller import AbstractStateLaw
 from jaxbeam.model.modal_model import assemble_modal_model
 from jaxbeam.model.state_space import Plant, build_plant
 from jaxbeam.numerics.qp import QuadraticProgram, first_move
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, Number, xp
 
 
 class ScenarioMPC(MPC):
@@ -55,13 +55,13 @@ class ScenarioMPC(MPC):
 
     kind: ClassVar[str] = "mpc-scenario"
 
-    stiffness_factors: Float[Array, " *scenario"] = number(
+    stiffness_factors: Float[Number, " *scenario"] = number(
         "1", "stiffness of the beam over that of the design", POSITIVE, default=1.0
     )
-    mass_factors: Float[Array, " *scenario"] = number(
+    mass_factors: Float[Number, " *scenario"] = number(
         "1", "masses of the loads over those of the design", POSITIVE, default=1.0
     )
-    delays: Float[Array, " *scenario"] | None = number(
+    delays: Float[Number, " *scenario"] | None = number(
         "s", "from measurement to command", NOT_NEGATIVE, default=None
     )
     merit: str = choice("merit over the scenarios", "mean", "worst", default="mean")

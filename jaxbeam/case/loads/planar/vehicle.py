@@ -28,6 +28,7 @@ A vehicle file is TOML with the keys of `PlanarVehicle`:
 import functools
 import os
 import tomllib
+from collections.abc import Sequence
 from importlib import resources
 from typing import ClassVar
 
@@ -60,7 +61,7 @@ from jaxbeam.case.loads.planar.vehicle_parts import (
 )
 from jaxbeam.case.reading.tables import read_part
 from jaxbeam.case.reading.toml_file import read_toml
-from jaxbeam.runtime.arrays import Array, block_diag, xp
+from jaxbeam.runtime.arrays import Array, Number, block_diag, xp
 from jaxbeam.runtime.module import Module
 
 
@@ -73,11 +74,11 @@ class PlanarVehicle(Module):
 
     title: str = choice("what the vehicle is", default="")
     source: str = choice("where the numbers are from", default="")
-    bodies: tuple[VehicleBody, ...] = parts("rigid bodies", VehicleBody)
-    springs: tuple[VehicleSpring, ...] = parts("springs between bodies", VehicleSpring)
-    hinges: tuple[VehicleHinge, ...] = parts("hinges between bodies", VehicleHinge)
-    axles: tuple[VehicleAxle, ...] = parts("axles, front first", VehicleAxle)
-    spacing: Float[Array, ""] | None = number(
+    bodies: Sequence[VehicleBody] = parts("rigid bodies", VehicleBody)
+    springs: Sequence[VehicleSpring] = parts("springs between bodies", VehicleSpring)
+    hinges: Sequence[VehicleHinge] = parts("hinges between bodies", VehicleHinge)
+    axles: Sequence[VehicleAxle] = parts("axles, front first", VehicleAxle)
+    spacing: Float[Number, ""] | None = number(
         "m", "distance from vehicle to vehicle in a row", POSITIVE, default=None
     )
 
@@ -237,7 +238,7 @@ class Coach(Module):
 
     model: str = choice("name of a vehicle of the library, or path of a vehicle file")
     count: int = fields.count("number of vehicles in a row", default=1)
-    length: Float[Array, ""] | None = number("m", "length over couplers", POSITIVE, default=None)
+    length: Float[Number, ""] | None = number("m", "length over couplers", POSITIVE, default=None)
 
     def vehicle(self) -> PlanarVehicle:
         """The vehicle of its file, or of the library."""
@@ -266,7 +267,7 @@ class TrainLoad(AbstractVehicleLoad):
 
     kind: ClassVar[str] = "train"
 
-    coaches: tuple[Coach, ...] = parts("vehicles, front first", Coach)
+    coaches: Sequence[Coach] = parts("vehicles, front first", Coach)
 
     def validate(self, address):
         if not self.coaches:

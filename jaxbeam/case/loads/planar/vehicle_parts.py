@@ -26,7 +26,7 @@ from jaxbeam.case.fields import (
 from jaxbeam.case.filters import Filter
 from jaxbeam.case.quantities import BODY_QUANTITIES, OF_QUANTITY, QUANTITIES
 from jaxbeam.case.reading.units import in_si
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Number
 from jaxbeam.runtime.module import Module
 
 
@@ -58,11 +58,11 @@ class VehicleBody(ReprWithUnits):
     """
 
     name: str = choice("name of the body")
-    mass: Float[Array, ""] = number("kg", "mass", POSITIVE)
-    inertia: Float[Array, ""] | None = number(
+    mass: Float[Number, ""] = number("kg", "mass", POSITIVE)
+    inertia: Float[Number, ""] | None = number(
         "kg m^2", "moment of inertia in pitch", POSITIVE, default=None
     )
-    position: Float[Array, ""] = number("m", "centre of mass, forward positive", default=0.0)
+    position: Float[Number, ""] = number("m", "centre of mass, forward positive", default=0.0)
 
 
 class VehicleSpring(ReprWithUnits):
@@ -97,13 +97,13 @@ class VehicleSpring(ReprWithUnits):
 
     first: str = choice("name of a body")
     second: str = choice("name of another body")
-    position: Float[Array, ""] = number("m", "position, forward positive")
-    stiffness: Float[Array, ""] = number("N/m", "spring", NOT_NEGATIVE, default=0.0)
-    damping: Float[Array, ""] = number("N s/m", "damper", NOT_NEGATIVE, default=0.0)
-    rotational_stiffness: Float[Array, ""] = number(
+    position: Float[Number, ""] = number("m", "position, forward positive")
+    stiffness: Float[Number, ""] = number("N/m", "spring", NOT_NEGATIVE, default=0.0)
+    damping: Float[Number, ""] = number("N s/m", "damper", NOT_NEGATIVE, default=0.0)
+    rotational_stiffness: Float[Number, ""] = number(
         "N m/rad", "spring between the pitches", NOT_NEGATIVE, default=0.0
     )
-    rotational_damping: Float[Array, ""] = number(
+    rotational_damping: Float[Number, ""] = number(
         "N m s/rad", "damper between the pitches", NOT_NEGATIVE, default=0.0
     )
 
@@ -144,7 +144,7 @@ class VehicleHinge(ReprWithUnits):
 
     first: str = choice("name of a body")
     second: str = choice("name of another body")
-    position: Float[Array, ""] = number("m", "position, forward positive")
+    position: Float[Number, ""] = number("m", "position, forward positive")
 
 
 class VehicleAxle(ReprWithUnits):
@@ -178,18 +178,18 @@ class VehicleAxle(ReprWithUnits):
     """
 
     body: str = choice("name of the body that it carries")
-    position: Float[Array, ""] = number("m", "position, forward positive")
-    mass: Float[Array, ""] = number("kg", "mass", NOT_NEGATIVE, default=0.0)
-    suspension_stiffness: Float[Array, ""] | None = number(
+    position: Float[Number, ""] = number("m", "position, forward positive")
+    mass: Float[Number, ""] = number("kg", "mass", NOT_NEGATIVE, default=0.0)
+    suspension_stiffness: Float[Number, ""] | None = number(
         "N/m", "spring between body and axle", POSITIVE, default=None
     )
-    suspension_damping: Float[Array, ""] = number(
+    suspension_damping: Float[Number, ""] = number(
         "N s/m", "damper between body and axle", NOT_NEGATIVE, default=0.0
     )
-    tyre_stiffness: Float[Array, ""] | None = number(
+    tyre_stiffness: Float[Number, ""] | None = number(
         "N/m", "spring between axle and surface", POSITIVE, default=None
     )
-    tyre_damping: Float[Array, ""] = number(
+    tyre_damping: Float[Number, ""] = number(
         "N s/m", "damper between axle and surface", NOT_NEGATIVE, default=0.0
     )
 
@@ -321,25 +321,25 @@ class VehicleSensor(ReprWithUnits, Module):
     body: str = choice("name of the body or axle", default="body")
     quantity: str = choice("measured quantity", *BODY_QUANTITIES, default="acceleration")
     vehicle: int = count("number of the vehicle in a row, from 0", minimum=0, default=0)
-    position: Float[Array, ""] = number("m", "forward of the centre of mass", default=0.0)
+    position: Float[Number, ""] = number("m", "forward of the centre of mass", default=0.0)
     absorber: int | None = count(
         "number of an absorber, from 0, in place of a load", minimum=0, default=None, kw_only=True
     )
-    offset: Float[Array, ""] = number(OF_QUANTITY, "constant added", default=0.0)
-    noise: Float[Array, ""] | None = number(
+    offset: Float[Number, ""] = number(OF_QUANTITY, "constant added", default=0.0)
+    noise: Float[Number, ""] | None = number(
         OF_QUANTITY, "standard deviation of white noise", NOT_NEGATIVE, default=None
     )
     filter: Filter | None = part("filter of the signal or of its samples", Filter)
-    sampling_period: Float[Array, ""] | None = number(
+    sampling_period: Float[Number, ""] | None = number(
         "s", "time between readings; that of the run if left out", POSITIVE, default=None
     )
-    delay: Float[Array, ""] | None = number(
+    delay: Float[Number, ""] | None = number(
         "s", "from motion to reading", NOT_NEGATIVE, default=None
     )
-    dropout: Float[Array, ""] | None = number(
+    dropout: Float[Number, ""] | None = number(
         "1", "probability that a reading is lost", PROBABILITY, default=None, kw_only=True
     )
-    jitter: Float[Array, ""] | None = number(
+    jitter: Float[Number, ""] | None = number(
         "s", "largest random delay of a reading", NOT_NEGATIVE, default=None, kw_only=True
     )
 
