@@ -29,11 +29,11 @@ from tuning.logs.alignment import align_logs
 from tuning.logs.log import Log
 from tuning.logs.quality import find_faults, mask
 from tuning.logs.reading import read_log, read_logs
+from tuning.modal.arguments import ModalSettings
 from tuning.modal.fit import ModalFit
-from tuning.modal.forced.estimates.measured_responses import MeasuredResponses, measured_responses
+from tuning.modal.forced.measured_responses import MeasuredResponses, measured_responses
 from tuning.modal.identify_modes import identify_modes
-from tuning.modal.setups.fit import MultiSetupFit
-from tuning.modal.setups.merge import merge_setups
+from tuning.modal.setups.merge import MultiSetupFit, merge_setups
 from tuning.parameters.prior import Prior
 from tuning.weighing.axles import AxleWeighing, weigh_axles
 from tuning.weighing.influence_lines import (
@@ -52,6 +52,7 @@ __all__ = [
     "MeasuredResponses",
     "ModalFit",
     "ModalParameterFit",
+    "ModalSettings",
     "MultiSetupFit",
     "Objective",
     "Prior",

@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.validation.least_errors import RandomResponse, information, random_response
 from tests.oracles.planted_structures import Planted
-from tuning.modal.likelihood.scoring import damped_scoring
+from tuning.modal.likelihood.model import damped_scoring
 
 TOLERANCE = 1e-2  # of the expected log likelihood, at which the search ends
 MAX_DAMPING_RATIO = 0.5

@@ -108,7 +108,7 @@ def test_a_case_is_fitted_to_the_modes(run, decay_log):
         (f"node.csv {COLUMNS} --to -1", "has no part from 0 to -1 s"),
         (f"node.csv {COLUMNS} --channels c", "the log has no channel 'c'; it has a, b"),
         (f"node.csv {COLUMNS} --method x", "method must be"),
-        (f"node.csv {COLUMNS} --method fdd --order 10", "method 'fdd' has no models and no order"),
+        (f"node.csv {COLUMNS} --method fdd", "method 'fdd' is gone: other methods find more modes"),
         (f"node.csv {COLUMNS} --force b", "channel 'b' is in g, which is no force"),
         (f"node.csv {COLUMNS} --force a --method data", "used by method 'plscf', not by 'data'"),
         (f"node.csv {COLUMNS} --order 2", "the highest order must be at least 4, not 2"),

@@ -22,8 +22,7 @@ from jaxbeam.model.modes import mesh_layout, modes
 from tuning.fit.least_squares import WEAK_PRIOR_WIDTH
 from tuning.fit.summary import parameter_table
 from tuning.fit.uncertainty.covariance import t_quantile, uncertainty
-from tuning.modal.result import ModalEstimates
-from tuning.modal.shapes import mac_matrix
+from tuning.modal.result import ModalEstimates, mac_matrix
 from tuning.parameters.free import FreeParameter, free_parameters, to_unbounded
 from tuning.parameters.prior import Prior
 

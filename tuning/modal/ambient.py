@@ -18,9 +18,9 @@ from tuning.modal.result import (
     MIN_ENERGY_SHARE,
     IdentifiedMode,
     frequency_and_damping,
+    mac_matrix,
     rejection_reason,
 )
-from tuning.modal.shapes import mac_matrix
 from tuning.modal.stabilisation import Chain, Diagram, stabilise
 from tuning.modal.subspace import (
     MIN_BLOCK_ROWS,

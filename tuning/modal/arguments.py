@@ -1,13 +1,55 @@
-"""Arguments of `identify_modes`, checked before any work."""
+"""Settings and arguments of `identify_modes`, checked before any work, and the choice of modes."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from tuning.logs.log import Log
-from tuning.modal.forced.blows import Windows, check_windows
+from tuning.modal.forced.forces import Windows, check_windows
+from tuning.modal.result import IdentifiedMode
 
 KINDS = ("free decay", "ambient")
 DECAY = "decay"  # the method for free decays; the others are for responses to broadband forces
-METHODS = (DECAY, "covariance", "data", "fdd", "plscf")
+METHODS = (DECAY, "covariance", "data", "plscf")
+
+
+@dataclass(frozen=True)
+class ModalSettings:
+    """What `identify_modes` is told beside the log, its part, and the method.
+
+    `count` modes are kept, those with most energy. `exclude` are frequencies (Hz) that are no
+    modes. The modes nearest to the frequencies `choose` (Hz) are kept, also those that are not well
+    identified, and no others. `order` is the highest order of the stabilisation diagram. `force`
+    are the names of the channels of forces that were measured, of a hammer or shaker, by default
+    all in N; a force that one of several logs lacks, as of a hammer that strikes another place in
+    each, is zero there. `force_window` (s) is the time after each blow of a hammer from which on
+    the force is taken for zero. Readings that a logger repeats are decimated, and zeros before a
+    sensor has answered interpolated, but with samples `as_logged`.
+
+    Raises ValueError for a count below one, an order below four, frequencies to choose that are not
+    positive, and a choice beside a count or excluded frequencies, as all modes are chosen then.
+    """
+
+    count: int | None = None
+    exclude: Sequence[float] = ()
+    choose: Sequence[float] = ()
+    order: int | None = None
+    force: Sequence[str] | None = None
+    force_window: float | None = None
+    as_logged: bool = False
+
+    def __post_init__(self):
+        if self.count is not None and self.count < 1:
+            raise ValueError(f"count must be at least 1, not {self.count}")
+        if self.order is not None and self.order < 4:
+            raise ValueError(f"the highest order must be at least 4, not {self.order}")
+        wrong = [frequency for frequency in self.choose if not 0 < frequency < float("inf")]
+        if wrong:
+            raise ValueError(f"modes are chosen by frequencies above 0 Hz, not {wrong[0]:g} Hz")
+        if len(self.choose) and (self.count is not None or len(self.exclude)):
+            other = "exclude" if self.count is None else "count"
+            raise ValueError(f"chosen modes are all that are kept; leave out {other}")
+        check_windows(Windows(force=self.force_window))
 
 
 def check_band(log: Log, rate: float, band: tuple[float, float] | None) -> None:
@@ -28,16 +70,12 @@ def check_band(log: Log, rate: float, band: tuple[float, float] | None) -> None:
         )
 
 
-def check_force(
-    force: Sequence[str] | None, force_window: float | None, kind: str | None, method: str | None
-) -> None:
-    """Check a measured force, and its window, beside the kind of excitation and the method.
+def check_force(settings: ModalSettings, kind: str | None, method: str | None) -> None:
+    """Check that a measured force, or its window, is used.
 
-    Raises ValueError for either beside a kind, or with a method that does not use it, and for a
-    window that does not last.
+    Raises ValueError for either beside a kind, or with a method that does not use it.
     """
-    check_windows(Windows(force=force_window))
-    if force is None and force_window is None:
+    if settings.force is None and settings.force_window is None:
         return
     if method not in (None, "plscf"):
         raise ValueError(f"a measured force is used by method 'plscf', not by {method!r}")
@@ -45,20 +83,18 @@ def check_force(
         raise ValueError(f"with a measured force the excitation is known; leave out kind {kind!r}")
 
 
-def check_arguments(
-    count: int | None, kind: str | None, order: int | None, method: str | None
-) -> None:
-    """Check arguments that need no log.
+def check_method(kind: str | None, method: str | None) -> None:
+    """Check the kind of excitation and the method.
 
-    Raises ValueError for a count or order that is too small, an unknown kind or method, and a kind
-    or an order that the method cannot use.
+    Raises ValueError for an unknown kind or method, and a kind that the method cannot use.
     """
-    if count is not None and count < 1:
-        raise ValueError(f"count must be at least 1, not {count}")
-    if order is not None and order < 4:
-        raise ValueError(f"the highest order must be at least 4, not {order}")
     if kind not in (None, *KINDS):
         raise ValueError(f"kind must be {' or '.join(map(repr, KINDS))}, not {kind!r}")
+    if method == "fdd":
+        raise ValueError(
+            "method 'fdd' is gone: other methods find more modes and smaller errors of damping; "
+            "use 'covariance' or 'plscf'"
+        )
     if method not in (None, *METHODS):
         raise ValueError(f"method must be {' or '.join(map(repr, METHODS))}, not {method!r}")
     if kind == "free decay" and method not in (None, DECAY):
@@ -68,19 +104,41 @@ def check_arguments(
         )
     if kind == "ambient" and method == DECAY:
         raise ValueError("method 'decay' fits free decays; for kind 'ambient' leave the method out")
-    if order is not None and method == "fdd":
-        raise ValueError("method 'fdd' has no models and no order; leave the order out")
 
 
-def check_choice(count: int | None, exclude: Sequence[float], choose: Sequence[float]) -> None:
-    """Check frequencies (Hz) of modes that are chosen.
+MAX_DISTANCE = 0.02  # of a frequency, of the mode that is chosen by it
 
-    Raises ValueError for frequencies that are not positive, and beside a number of modes or
-    excluded frequencies, as all modes are chosen then.
+Judged = tuple[IdentifiedMode, str]  # a mode and the reason for rejecting it, or none
+
+
+def chosen_modes(
+    judged: Sequence[Judged], frequencies: Sequence[float], source: str
+) -> tuple[list[Judged], list[Judged], list[str]]:
+    """The modes nearest to frequencies (Hz), the others, and what speaks against chosen ones.
+
+    Raises ValueError for a frequency without a mode within 2 %, and for two that choose one mode.
     """
-    wrong = [frequency for frequency in choose if not 0 < frequency < float("inf")]
-    if wrong:
-        raise ValueError(f"modes are chosen by frequencies above 0 Hz, not {wrong[0]:g} Hz")
-    if len(choose) and (count is not None or len(exclude)):
-        other = "exclude" if count is None else "count"
-        raise ValueError(f"chosen modes are all that are kept; leave out {other}")
+    chosen: dict[int, float] = {}
+    notes = []
+    for frequency in frequencies:
+        places = sorted(range(len(judged)), key=lambda k: abs(judged[k][0].frequency - frequency))
+        found = judged[places[0]][0].frequency if places else math.inf
+        if abs(found - frequency) > MAX_DISTANCE * frequency:
+            near = f"the nearest is {found:.4g} Hz" if places else "there are none"
+            raise ValueError(
+                f"{source}: no pole within {100 * MAX_DISTANCE:g} % of the chosen {frequency:g} Hz;"
+                f" {near}. Choose frequencies that are printed without a choice"
+            )
+        nearest = places[0]
+        if nearest in chosen:
+            raise ValueError(
+                f"{source}: {chosen[nearest]:g} Hz and {frequency:g} Hz choose one mode, that of"
+                f" {found:.4g} Hz; give one of them, or frequencies nearer to two modes"
+            )
+        chosen[nearest] = frequency
+        if reason := judged[nearest][1]:
+            notes.append(f"{found:.4g} Hz is chosen, though {reason}")
+    others = [
+        (mode, reason or "not chosen") for k, (mode, reason) in enumerate(judged) if k not in chosen
+    ]
+    return [(judged[k][0], "") for k in chosen], others, notes

@@ -10,7 +10,6 @@ from tuning.logs.log import Log
 from tuning.modal.ambient import MAX_BAND_RATIO
 from tuning.modal.harmonics import Line
 from tuning.modal.result import Channels, IdentifiedMode, ModalEstimates, channels_of
-from tuning.modal.spectral.efdd_modes import SingularValues
 from tuning.modal.stabilisation import Diagram
 
 
@@ -30,8 +29,7 @@ class ModalFit(ModalEstimates):
     that of the search; `lines` are harmonic lines that were subtracted. `choices` are the automatic
     choices, `notes` sentences on the log. `diagrams` are stabilisation diagrams, one for each part
     of the band. `times` and `measured` are the log in the first window and the band, `fitted` is
-    the response of the modes to it for a free decay, else None. `singular_values` are those of
-    frequency-domain decomposition, for each part of the band, else none.
+    the response of the modes to it for a free decay, else None.
 
     >>> import numpy as np
     >>> import tuning
@@ -58,7 +56,6 @@ class ModalFit(ModalEstimates):
     times: Float[np.ndarray, " sample"]
     measured: Float[np.ndarray, "sample channel"]
     fitted: Float[np.ndarray, "sample channel"] | None
-    singular_values: tuple[SingularValues, ...] = ()
 
     @property
     def window(self) -> tuple[float, float]:

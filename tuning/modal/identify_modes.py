@@ -23,16 +23,15 @@ from tuning.modal.ambient import Candidate, subspace_modes
 from tuning.modal.arguments import (
     DECAY,
     METHODS,
-    check_arguments,
+    ModalSettings,
     check_band,
-    check_choice,
     check_force,
+    check_method,
+    chosen_modes,
 )
-from tuning.modal.chosen import chosen_modes
 from tuning.modal.decay.modes import Decays, excited, free_decay_modes
 from tuning.modal.fit import Choice, ModalFit
-from tuning.modal.forced.blows import force_at_blows
-from tuning.modal.forced.forces import force_names, force_records, without_forces
+from tuning.modal.forced.forces import force_at_blows, force_names, force_records, without_forces
 from tuning.modal.forced.modes import forced_modes
 from tuning.modal.harmonics import (
     band_of,
@@ -42,10 +41,9 @@ from tuning.modal.harmonics import (
     lines_besides,
     steady_candidates,
 )
+from tuning.modal.plscf import plscf_modes
 from tuning.modal.preprocessing import energy_band, kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels, without_constant
-from tuning.modal.spectral.efdd_modes import SingularValues, efdd_modes
-from tuning.modal.spectral.plscf_modes import plscf_modes
 from tuning.modal.stabilisation import Diagram
 from tuning.modal.struck.whole_log import FromDecays, modes_after_unseen_blows, modes_of_decays
 
@@ -59,42 +57,28 @@ def identify_modes(
     *,
     window: tuple[float, float] | None = None,
     band: tuple[float, float] | None = None,
-    count: int | None = None,
     kind: str | None = None,
-    channels: Sequence[str] | None = None,
-    order: int | None = None,
     method: str | None = None,
-    force: Sequence[str] | None = None,
-    force_window: float | None = None,
-    exclude: Sequence[float] = (),
-    choose: Sequence[float] = (),
-    as_logged: bool = False,
+    channels: Sequence[str] | None = None,
+    settings: ModalSettings | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ModalFit:
     """Modes from a log, or from several of the same channels, of unknown excitation.
 
     `window` (s) is the part of the log to use; `band` (Hz) the range of frequencies, by default
-    that of the resonances with most kinetic energy; `count` modes are kept, those with most energy;
-    `kind` is "free decay" or "ambient", by default decided from the log; `channels` are the names
-    of those to use; `order` is the highest order of the stabilisation diagram; `method` is "decay"
-    (poles of free decays), "covariance" or "data" (subspace identification), "fdd" (enhanced
-    frequency-domain decomposition) or "plscf" (poly-reference least-squares complex frequency), of
-    which all but the first take a log for the response to broadband excitation; `force` are the
-    names of the channels of forces that were measured, of a hammer or shaker, by default all in N:
-    method "plscf", then the default, fits the responses to them; a force that one of several logs
-    lacks, as of a hammer that strikes another place in each, is zero there. `force_window` (s) is
-    the time after each blow of a hammer from which on the force is taken for zero. `exclude` are
-    frequencies (Hz) that are no modes. The modes nearest to the frequencies `choose` (Hz) are kept,
-    also those that are not well identified, and no others. Readings that a logger repeats are
-    decimated, and zeros before a sensor has answered interpolated, but with samples `as_logged`.
-    `progress` is called with a few words on
+    that of the resonances with most kinetic energy; `kind` is "free decay" or "ambient", by default
+    decided from the log; `method` is "decay" (poles of free decays), "covariance" or "data"
+    (subspace identification) or "plscf" (poly-reference least-squares complex frequency), of which
+    all but the first take a log for the response to broadband excitation; where forces were
+    measured, "plscf" fits the responses to them, and is the default. `channels` are the names of
+    those to use. `settings` tell what else may be chosen. `progress` is called with a few words on
     what is being done.
 
     Raises ValueError for a log without evenly sampled records, or too short, a window outside the
-    log, a band above half the sampling rate, an impossible count or order, unknown channels, kinds
-    and methods, a kind or forces that the method cannot use, channels that are no forces, a force
-    window without blows, frequencies to choose that have no pole within 2 %, and logs that differ
-    in channels or sampling rate.
+    log, a band above half the sampling rate, unknown channels, kinds and methods, a kind or forces
+    that the method cannot use, channels that are no forces, a force window without blows,
+    frequencies to choose that have no pole within 2 %, and logs that differ in channels or sampling
+    rate.
 
     >>> import numpy as np
     >>> import tuning
@@ -107,13 +91,13 @@ def identify_modes(
     ['3.20 Hz']
     """
     logs = [log] if isinstance(log, Log) else list(log)
-    logs = logs if as_logged else [sensor_readings(one) for one in logs]
-    check_arguments(count, kind, order, method)
-    check_choice(count, exclude, choose)
-    keep = _Keep(count, exclude, choose)
-    check_force(force, force_window, kind, method)
+    settings = settings or ModalSettings()
+    logs = logs if settings.as_logged else [sensor_readings(one) for one in logs]
+    check_method(kind, method)
+    check_force(settings, kind, method)
+    order, force_window = settings.order, settings.force_window
     measured = logs
-    forces = () if kind or method not in (None, "plscf") else force_names(logs, force)
+    forces = () if kind or method not in (None, "plscf") else force_names(logs, settings.force)
     logs, dead = without_constant([without_forces(with_channels(one, channels)) for one in logs])
     if not forces and force_window is not None:
         raise ValueError(f"{logs[0].source}: a force window is for measured forces; none is in N")
@@ -138,10 +122,10 @@ def identify_modes(
         )
         _add_order(choices, order, found)
         choices = [*_band_choice(band, used_band), *choices]
-        return _result(logs, samples, found, used_band, (), choices, "plscf", keep)
+        return _result(logs, samples, found, used_band, (), choices, "plscf", settings)
     if progress:
         progress("harmonic lines and excitation")
-    wide, lines, cleaned = band_without_lines(samples, derivatives, exclude, band)
+    wide, lines, cleaned = band_without_lines(samples, derivatives, settings.exclude, band)
     readings_differ = band is None and set(derivatives) != {1}  # from velocities
     used_band = wide
     if readings_differ:
@@ -189,7 +173,7 @@ def identify_modes(
         choices.append(Choice(f"method {used_method}", f"--method {', '.join(METHODS)}"))
     _add_order(choices, order, found)
     choices = [*_band_choice(band, used_band), *choices]
-    return _result(logs, samples, found, used_band, lines, choices, used_method, keep)
+    return _result(logs, samples, found, used_band, lines, choices, used_method, settings)
 
 
 def _together(logs: Sequence[Log]) -> list[Choice]:
@@ -208,12 +192,11 @@ def _band_choice(band, used: tuple[float, float]) -> list[Choice]:
 
 
 class _Found(NamedTuple):
-    """Candidates, diagrams, decays that were fitted if any, singular values if any, kind, blows."""
+    """Candidates, diagrams, decays that were fitted if any, kind, blows."""
 
     candidates: tuple[Candidate, ...]
     diagrams: tuple[Diagram, ...]
     decays: Decays | None
-    singular_values: tuple[SingularValues, ...] = ()
     kind: str = "ambient"
     blows: int = 0
 
@@ -243,9 +226,6 @@ def _forced(samples: Samples, driving, band, order, progress) -> tuple[_Found, f
 def _ambient_modes(cleaned, samples: Samples, band, method, order, progress) -> _Found:
     """What a method for ambient excitation finds in records without harmonic lines."""
     arguments = (cleaned, samples.starts, samples.rate, band)
-    if method == "fdd":
-        candidates, values = efdd_modes(*arguments, progress=progress)
-        return _Found(candidates, (), None, values)
     if method == "plscf":
         return _Found(*plscf_modes(*arguments, order=order, progress=progress), None)
     data_driven = method == "data"
@@ -277,15 +257,7 @@ def _kind_words(found: _Found, struck, lines) -> str:
     return "excitation: ambient"
 
 
-class _Keep(NamedTuple):
-    """What the user says on which modes to keep."""
-
-    count: int | None
-    exclude: Sequence[float]
-    choose: Sequence[float]
-
-
-def _result(logs, samples, found: _Found, band, lines, choices, method, keep: _Keep):
+def _result(logs, samples, found: _Found, band, lines, choices, method, keep: ModalSettings):
     """The fit: candidates divided into modes and rejected ones."""
     longest = max(len(record) for record in samples.records)
     resolution = samples.rate / longest
@@ -343,7 +315,6 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, keep: _K
         choices=tuple(choices),
         notes=tuple(notes),
         diagrams=found.diagrams,
-        singular_values=found.singular_values,
         log=logs[0],
         times=times,
         measured=measured,

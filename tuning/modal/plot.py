@@ -1,4 +1,4 @@
-"""Figure of identified modes: log and windows, spectrum with stabilisation diagram, fit, shapes."""
+"""Figures of identified modes, of measured frequency responses, and of modes of several setups."""
 
 from pathlib import Path
 
@@ -6,9 +6,61 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxbeam.case.quantities import QUANTITIES
-from jaxbeam.plot.style import COLOURS, GREY, INK, use_style
+from jaxbeam.plot.style import COLOURS, GREY, INK, colour, use_style
 from jaxbeam.runtime.whole_file import whole_file
-from tuning.modal.shape_plot import draw_shapes
+from tuning.modal.result import ModalEstimates
+
+LONG = 60  # letters of all names of channels, above which they stand upright
+LINES = ("-", "--", ":")  # of modes whose colours are the same
+
+
+def draw_shapes(axes, fit: ModalEstimates, length: float | None = None) -> None:
+    """Draw mode shapes over the positions of the sensors (m), and their MAC matrix.
+
+    Without positions they are drawn over the channels. Bars are 95 % intervals of real parts;
+    hollow markers are imaginary parts, which vanish for a shape without complexity. `length` is
+    that of the beam (m).
+    """
+    axes.set_axis_off()
+    left, right = axes.inset_axes([0.0, 0.1, 0.66, 0.78]), axes.inset_axes([0.76, 0.1, 0.24, 0.78])
+    known = all(position is not None for position in fit.channels.positions)
+    count = len(fit.channels.names)
+    places = np.array(fit.channels.positions, float) if known else np.arange(count, dtype=float)
+    along = np.argsort(places)
+    for k, mode in enumerate(fit.modes):
+        order = along[np.isfinite(mode.shape[along])]
+        tint, line = colour(k), LINES[k // len(COLOURS) % len(LINES)]
+        deviation = np.sqrt(np.maximum(np.diag(mode.shape_covariance)[:count], 0.0))
+        left.errorbar(
+            places[order], mode.shape.real[order], mode.quantile * deviation[order], color=tint,
+            marker="o", markersize=4, linewidth=1.0, linestyle=line, capsize=2,
+            label=f"{mode.frequency:.2f} Hz",
+        )  # fmt: skip
+        left.plot(
+            places[order], mode.shape.imag[order], "o", color=tint, markersize=4, fillstyle="none"
+        )
+    left.axhline(0.0, color=GREY, linewidth=0.8)
+    left.set_ylabel("mode shape")
+    if known:
+        left.set_xlabel("position (m)")
+        if length is not None:
+            left.set_xlim(0.0, length)
+            left.plot([0.0, length], [0.0, 0.0], color=INK, linewidth=2.5)
+    else:
+        names = fit.channels.names
+        left.set_xticks(places, names, rotation=90 if sum(map(len, names)) > LONG else 0)
+    left.legend(
+        frameon=False, fontsize=7, ncols=6, loc="lower left", bbox_to_anchor=(-0.02, 1.0),
+        handletextpad=0.4, columnspacing=1.2,
+    )  # fmt: skip
+    right.imshow(fit.mac, cmap="Blues", vmin=0.0, vmax=1.0)
+    right.grid(False)
+    ticks = np.arange(len(fit.modes))
+    labels = [f"{mode.frequency:.1f}" for mode in fit.modes]
+    right.set_xticks(ticks, labels, rotation=90, fontsize=7)
+    right.set_yticks(ticks, labels, fontsize=7)
+    right.set_title("MAC", fontsize=9)
+
 
 FIT, MODE = COLOURS[:2]
 NAME_WIDTH = 0.08  # of a mode in the spectrum, over that of the axes
@@ -88,9 +140,6 @@ def _draw_spectrum(axes, fit, channel, unit):
     if fit.diagrams:
         above = axes.twinx()
         _draw_diagram(above, fit)
-    if fit.singular_values:
-        above = axes.twinx()
-        _draw_singular_values(above, fit)
     _name_modes(above, fit)
 
 
@@ -128,17 +177,6 @@ def _draw_diagram(axes, fit):
     axes.grid(False)
 
 
-def _draw_singular_values(axes, fit):
-    """Singular values of the cross-spectral matrix, the largest in colour, over the largest."""
-    highest = max(part.values[:, 0].max() for part in fit.singular_values)
-    for part in fit.singular_values:
-        levels = 10 * np.log10(np.maximum(part.values / highest, 1e-12))
-        axes.plot(part.frequencies, levels[:, 1:], color=GREY, linewidth=0.6)
-        axes.plot(part.frequencies, levels[:, 0], color=FIT, linewidth=1.2)
-    axes.set(ylabel="singular values (dB)", xlim=fit.band)
-    axes.grid(False)
-
-
 def _draw_fit(axes, residual_axes, fit, channel, unit):
     """Measured and fitted decay in the band, and the residual on the same scale."""
     measured, fitted = fit.measured[:, channel], fit.fitted[:, channel]
@@ -154,3 +192,105 @@ def _draw_fit(axes, residual_axes, fit, channel, unit):
     residual_axes.set_ylim(np.array(axes.get_ylim()) / 2)
     axes.set(ylabel=f"{fit.log.names[channel]} ({unit})", xlim=fit.windows[0])
     residual_axes.set(xlabel="time (s)", ylabel="residual", xlim=fit.windows[0])
+
+
+@use_style
+def plot_responses(responses, path: str | Path | None = None) -> Figure:
+    """Magnitude, phase and coherence of `MeasuredResponses` over frequency (Hz).
+
+    A colour stands for each output, with a line for each force. Saved if a path is given.
+    """
+    figure = Figure(figsize=(9, 7))
+    size, phase, coherence = figure.subplots(3, 1, sharex=True, height_ratios=(2, 1, 1))
+    frequencies = responses.frequencies
+    for i, (name, unit) in enumerate(zip(responses.outputs, responses.units, strict=True)):
+        for j, force in enumerate(responses.forces):
+            values = responses.values[:, i, j]
+            size.semilogy(
+                frequencies, np.abs(values), color=f"C{i % 10}", linewidth=0.9,
+                linestyle=("-", "--", ":", "-.")[j % 4], label=f"{name} ({unit}) / {force} (N)",
+            )  # fmt: skip
+            phase.plot(
+                frequencies, np.degrees(np.angle(values)), ".", color=f"C{i % 10}", markersize=1.5
+            )
+        coherence.plot(frequencies, responses.coherence[:, i], color=f"C{i % 10}", linewidth=0.9)
+    size.set(ylabel="magnitude")
+    if len(responses.outputs) * len(responses.forces) <= 10:
+        size.legend(frameon=False, fontsize=8, ncols=2)
+    phase.set(ylabel="phase (deg)", ylim=(-190, 190), yticks=(-180, 0, 180))
+    coherence.set(ylabel="coherence", ylim=(0, 1.05), xlabel="frequency (Hz)")
+    if np.all(np.isnan(responses.coherence)):
+        coherence.text(
+            0.5, 0.5, "one average: no coherence", transform=coherence.transAxes, ha="center"
+        )
+    coherence.set_xlim(frequencies[0], frequencies[-1])
+    figure.suptitle(
+        f"{Path(responses.source).name}: {responses.estimator} of {responses.averages} averages"
+    )
+    if path is not None:
+        with whole_file(path, overwrite=True) as beside:
+            figure.savefig(beside)
+    return figure
+
+
+WIDTH = 0.7  # of the space of a mode in which the setups stand beside each other
+
+
+@use_style
+def plot_setups(fit, path: str | Path | None = None, length: float | None = None) -> Figure:
+    """Figure of a `MultiSetupFit`: frequencies and damping ratios of each setup, merged shapes.
+
+    Bars are 95 % intervals, grey boxes those of the merged modes. It is saved if a path is given;
+    `length` (m) is that of the beam.
+    """
+    figure = Figure(figsize=(9, 7.5))
+    axes = figure.subplot_mosaic([["left", "right"], ["shapes"] * 2], height_ratios=(1, 1.3))
+    left, right = axes["left"], axes["right"]
+    _draw(left, fit, _deviation_of_frequency)
+    _draw(right, fit, _damping_in_percent)
+    left.set_ylabel("frequency over the mean - 1 (%)")
+    right.set_ylabel("damping ratio (%)")
+    right.set_ylim(bottom=0.0)
+    left.legend(frameon=False, fontsize=7, title="setup", title_fontsize=7, ncols=2)
+    draw_shapes(axes["shapes"], fit, length)
+    figure.suptitle(f"modes of {len(fit.setups)} setups")
+    if path is not None:
+        with whole_file(path, overwrite=True) as beside:
+            figure.savefig(beside)
+    return figure
+
+
+def _deviation_of_frequency(mode, mean: float):
+    """Frequency of a mode beside the mean, and half of its interval, in %."""
+    return 100 * (mode.frequency / mean - 1), 100 * mode.quantile * mode.frequency_sd / mean
+
+
+def _damping_in_percent(mode, _: float):
+    """Damping ratio of a mode and half of its interval, in %."""
+    return 100 * mode.damping_ratio, 100 * mode.quantile * mode.damping_sd
+
+
+def _draw(axes, fit, value_of) -> None:
+    """Values of each setup, mode by mode, over those merged with their intervals."""
+    count, means = len(fit.setups), fit.frequencies
+    step = WIDTH / max(count, 1)
+    for place, (merged, mean) in enumerate(zip(fit.modes, means, strict=True)):
+        middle, half = value_of(merged, mean)
+        axes.fill_between(
+            [place - WIDTH / 2, place + WIDTH / 2], middle - half, middle + half, color=GREY,
+            alpha=0.3, linewidth=0,
+        )  # fmt: skip
+    for k, setup in enumerate(fit.setups):
+        rows = [
+            (place + (k - (count - 1) / 2) * step, *value_of(setup.modes[pairs[k]], mean))
+            for place, (pairs, mean) in enumerate(zip(fit.pairs, means, strict=True))
+            if k in pairs
+        ]
+        x, y, half = np.array(rows, float).reshape(-1, 3).T
+        axes.errorbar(
+            x, y, half, color=colour(k), fmt="o", markersize=3, linewidth=1.0, capsize=2,
+            label=f"{k + 1}",
+        )  # fmt: skip
+    labels = [f"{frequency:.1f}" for frequency in fit.frequencies]
+    axes.set_xticks(range(len(labels)), labels, rotation=90 if len(labels) > 6 else 0, fontsize=7)
+    axes.set_xlabel("mode (Hz)")

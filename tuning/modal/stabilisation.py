@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tuning.modal.result import MAX_DAMPING_RATIO
-from tuning.modal.shapes import mac_matrix
+from tuning.modal.result import MAX_DAMPING_RATIO, mac_matrix
 from tuning.modal.subspace import Poles
 
 MAX_FREQUENCY_CHANGE = 0.01  # relative, between neighbouring orders

@@ -79,8 +79,8 @@ def modes_from_log(
         Highest order of the models of the stabilisation diagram.
     method
         decay: poles of free decays; for all else covariance or data: stochastic subspace
-        identification, covariance- or data-driven; fdd: enhanced frequency-domain decomposition;
-        plscf: poly-reference least-squares complex frequency (p-LSCF).
+        identification, covariance- or data-driven; plscf: poly-reference least-squares complex
+        frequency (p-LSCF).
     references
         NAME,NAME,...: channels that stay at their places in all logs, while sensors of the same
         names move; by default channels of one name are one place, if positions do not differ.
@@ -144,7 +144,7 @@ def modes_from_log(
         options.check_case(case)
 
     import tuning
-    from tuning.modal.setups.grouping import logs_of_setups
+    from tuning.modal.setups.channels import logs_of_setups
 
     read = [tuning.read_log(path, columns=columns, rate=rate) for path in logs]
     if align:
@@ -159,28 +159,35 @@ def modes_from_log(
     fits = []
     for setup in setups:
         window = _window(setup[0], from_, to)
-        of_setup = {
-            "channels": _of_setup(_names(channels), setup, read),
-            "force": _of_setup(_names(force), setup, read),
-            "force_window": force_window,
-        }
+        own = _of_setup(_names(channels), setup, read)
+        forces = _of_setup(_names(force), setup, read)
         fit = tuning.identify_modes(
             setup,
             window=window,
             band=limits,
-            count=count,
             kind=kind,
-            order=order,
             method=method,
-            exclude=excluded,
-            choose=chosen,
-            as_logged=as_logged,
+            channels=own,
+            settings=tuning.ModalSettings(
+                count=count,
+                exclude=excluded,
+                choose=chosen,
+                order=order,
+                force=forces,
+                force_window=force_window,
+                as_logged=as_logged,
+            ),
             progress=None if options.json_ or not sys.stderr.isatty() else print_message,
-            **of_setup,
         )
         if responses:
             tuning.measured_responses(
-                setup, window=window, estimator=responses, exponential=exponential, **of_setup
+                setup,
+                forces,
+                window=window,
+                channels=own,
+                estimator=responses,
+                exponential=exponential,
+                force_window=force_window,
             ).plot(drawn[len(fits)])
         fits.append(fit)
     found, lines = fits[0], [str(fit) for fit in fits]

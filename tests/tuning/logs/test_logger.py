@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from tests.oracles.planted_structures import Structure, random_structure, response
-from tuning import Log, find_faults, identify_modes, mask
+from tuning import Log, ModalSettings, find_faults, identify_modes, mask
 from tuning.logs.logger import samples_held, sensor_readings, unread
 from tuning.modal.decay.stretches import excited_samples
 
@@ -123,5 +123,5 @@ def test_modes_of_a_hammer_test_from_a_node_that_repeats_readings():
     for one in (fit, direct):
         np.testing.assert_allclose(one.frequencies, frequencies, rtol=2e-3)
         np.testing.assert_allclose(one.damping_ratios, damping, rtol=0.1)
-    raw = str(identify_modes(log, as_logged=True))
+    raw = str(identify_modes(log, settings=ModalSettings(as_logged=True)))
     assert "holds each reading" in raw and "reads 0" in raw and "decimated" not in raw

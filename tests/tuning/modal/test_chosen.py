@@ -5,8 +5,8 @@ import pytest
 
 from tests.tuning.modal.test_leaving import mode
 from tests.tuning.modal.test_modal import ambient
-from tuning import identify_modes
-from tuning.modal.chosen import chosen_modes
+from tuning import ModalSettings, identify_modes
+from tuning.modal.arguments import chosen_modes
 
 JUDGED = (
     (mode(2.0, (1.0, 0.5)), ""),
@@ -40,10 +40,9 @@ def test_poles_that_the_criteria_reject_are_modes_if_they_are_chosen():
     free = identify_modes(ambient(0))
     assert free.rejected
     rejected, reason = free.rejected[0]
-    fit = identify_modes(ambient(0), choose=[free.frequencies[1], rejected.frequency])
-    np.testing.assert_array_equal(
-        np.sort(fit.frequencies), np.sort([free.frequencies[1], rejected.frequency])
-    )
+    chosen = [free.frequencies[1], rejected.frequency]
+    fit = identify_modes(ambient(0), settings=ModalSettings(choose=chosen))
+    np.testing.assert_array_equal(np.sort(fit.frequencies), np.sort(chosen))
     assert f"{rejected.frequency:.4g} Hz is chosen, though {reason}" in str(fit)
     assert f"{free.frequencies[0]:14.4f}  not chosen" in str(fit)
 
@@ -51,6 +50,9 @@ def test_poles_that_the_criteria_reject_are_modes_if_they_are_chosen():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"count": 0}, "count must be at least 1"),
+        ({"order": 3}, "the highest order must be at least 4, not 3"),
+        ({"force_window": -1.0}, "the force window must last longer than 0 s, not -1 s"),
         ({"choose": [0.0]}, "by frequencies above 0 Hz, not 0 Hz"),
         ({"choose": [3.0], "count": 1}, "leave out count"),
         ({"choose": [3.0], "exclude": [50.0]}, "leave out exclude"),
@@ -58,4 +60,4 @@ def test_poles_that_the_criteria_reject_are_modes_if_they_are_chosen():
 )
 def test_choices_that_contradict_each_other(options, message):
     with pytest.raises(ValueError, match=message):
-        identify_modes(ambient(0), **options)
+        ModalSettings(**options)

@@ -9,12 +9,12 @@ from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import Structure, random_structure, response, sampled
 from tuning import Log, identify_modes
 from tuning.modal.decay import modes as decay_modes
-from tuning.modal.decay.soft_blows import until_soft_blow
 from tuning.modal.decay.stretches import (
     Stretch,
     excited_samples,
     free_decays,
     stacked,
+    until_soft_blow,
 )
 from tuning.modal.harmonics import harmonic_lines
 from tuning.modal.preprocessing import kinetic_band, prepare, strongest_frequency

@@ -8,7 +8,6 @@ from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import random_structure, sampled
 from tuning import identify_modes
 from tuning.modal.ambient import Candidate
-from tuning.modal.decay.dominant import after_blow
 from tuning.modal.decay.earlier_start import earlier_start
 from tuning.modal.decay.leaving import (
     PARTS,
@@ -19,7 +18,7 @@ from tuning.modal.decay.leaving import (
     undisturbed,
     without_excitation,
 )
-from tuning.modal.decay.stretches import Stretch
+from tuning.modal.decay.stretches import Stretch, after_blow
 from tuning.modal.result import IdentifiedMode
 
 RATE, SIZE = 40.0, 10

@@ -5,8 +5,14 @@ import pytest
 from scipy.signal import lfilter
 
 from tests.tuning.modal.test_modal import ambient
-from tuning.modal.likelihood.fit import _moved, information
-from tuning.modal.likelihood.model import SpectralModel, Window, expectation, with_cost
+from tuning.modal.likelihood.model import (
+    SpectralModel,
+    Window,
+    _moved,
+    expectation,
+    information,
+    with_cost,
+)
 from tuning.modal.likelihood.refine import Start, _places, refine_modes
 
 

@@ -89,7 +89,9 @@ def test_two_forces_are_told_apart():
 def test_windows_of_blows(tmp_path):
     structure, log = hammer_log()
     plain = tuning.identify_modes(log, band=(2.0, 11.0))
-    windowed = tuning.identify_modes(log, band=(2.0, 11.0), force_window=0.5)
+    windowed = tuning.identify_modes(
+        log, band=(2.0, 11.0), settings=tuning.ModalSettings(force_window=0.5)
+    )
     for fit in (plain, windowed):
         np.testing.assert_allclose(fit.frequencies, structure.frequencies, rtol=2e-3)
         np.testing.assert_allclose(fit.damping_ratios, structure.damping_ratios, rtol=0.1)

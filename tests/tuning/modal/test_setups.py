@@ -12,10 +12,9 @@ from tests.oracles.planted_structures import Structure, beam_matrices, coloured_
 from tuning import Log, identify_modes, merge_setups
 from tuning.modal.fit import ModalFit
 from tuning.modal.harmonics import Line
-from tuning.modal.result import IdentifiedMode
-from tuning.modal.setups.grouping import logs_of_setups
+from tuning.modal.result import IdentifiedMode, mac_matrix
+from tuning.modal.setups.channels import logs_of_setups
 from tuning.modal.setups.shape import Part, whole_shape
-from tuning.modal.shapes import mac_matrix
 
 SHAPES = np.array([[0.6, 1.0, 0.7, 0.2, -0.3], [1.0, 0.1, -0.8, -0.6, 0.4]])
 

@@ -1,24 +1,23 @@
-"""Frequency-domain decomposition and p-LSCF: exact data, differences, planted structures."""
+"""p-LSCF: exact data, differences, planted structures."""
 
 import numpy as np
 import pytest
-import scipy.signal
 import scipy.stats
 
 from experiments.validation.modal_identification import compare, log_of
-from tests.oracles.planted_structures import Structure, sampled
+from tests.oracles.planted_structures import sampled
 from tests.tuning.modal.test_subspace import small_structure
 from tuning import identify_modes
-from tuning.modal.shapes import mac_matrix
-from tuning.modal.spectral.cross_spectra import cross_spectra
-from tuning.modal.spectral.decomposition import decrement, singular_values
-from tuning.modal.spectral.impulse_responses import (
+from tuning.modal.plscf import (
     ImpulseResponses,
+    equations,
+    fit_fraction,
     frequency_responses,
     output_correlations,
+    pole_changes,
+    residue_shapes,
 )
-from tuning.modal.spectral.matrix_fraction import equations, fit_fraction, pole_changes
-from tuning.modal.spectral.residues import residue_shapes
+from tuning.modal.result import mac_matrix
 
 RATE = 100.0
 POLES = 2 * np.pi * np.array([3.0, 3.03, 11.0, 25.0]) * (-np.array([0.01, 0.02, 0.005, 0.03]) + 1j)
@@ -75,46 +74,25 @@ def test_changes_of_poles_agree_with_differences():
         np.testing.assert_allclose(changes[block], expected, rtol=2e-3)
 
 
-def test_correlations_and_spectra_are_those_of_scipy():
+def test_correlations_are_means_of_products():
     random = np.random.default_rng(3)
     values = random.normal(size=(2000, 2))
     found = output_correlations((values,), RATE, 10)
     for lag in (0, 7):
         expected = values[lag : lag + 1984].T @ values[:1984] / 1984
         np.testing.assert_allclose(found.values[lag], expected, atol=5e-3)
-    spectra = cross_spectra((values,), RATE)
-    frequencies, expected = scipy.signal.csd(
-        values[:, 1], values[:, 0], RATE, "hann", spectra.size, nfft=2 * spectra.size
-    )
-    np.testing.assert_allclose(spectra.bins, frequencies)
-    np.testing.assert_allclose(spectra.mean[1:-1, 0, 1], expected[1:-1], rtol=1e-9)
-    largest = np.linalg.svd(spectra.mean[5])
-    np.testing.assert_allclose(singular_values(spectra.mean)[0][5], largest[1], rtol=1e-9)
 
 
-@pytest.mark.parametrize("damping", [0.003, 0.03])
-def test_decrement_of_a_single_mode_is_exact(damping):
-    """exp(-z w t) cos(w_d t + a) has extremes that fall by exp(-pi z / sqrt(1 - z^2)) each."""
-    pole = 2 * np.pi * 3 * (-damping + 1j * np.sqrt(1 - damping**2))
-    correlation = np.real(np.exp(pole * np.arange(6000) / RATE + 0.1j))
-    found = decrement(correlation / correlation[0], RATE)
-    assert found is not None
-    np.testing.assert_allclose(found, (3.0, damping), rtol=2e-4)
-    assert decrement(np.ones(100), RATE) is None
-
-
-@pytest.mark.parametrize("method", ["fdd", "plscf"])
-def test_modes_of_planted_logs_are_found(method):
+def test_modes_of_planted_logs_are_found():
     found = []
     for seed in range(3):
         planted = sampled(small_structure(seed), "ambient", seed, 200.0)
-        fit = identify_modes(log_of(planted), band=(2.0, 11.0), method=method)
+        fit = identify_modes(log_of(planted), band=(2.0, 11.0), method="plscf")
         found.append(compare(fit, planted))
         nearest = mac_matrix(fit.shapes, planted.structure.shapes + 0j).max(axis=1)
         assert np.all(nearest > 0.98)
-        assert fit.method == method and bool(fit.singular_values) == (method == "fdd")
-    # The decrement leaves one damping ratio of nine too uncertain.
-    assert sum(not seen for one in found for seen in one.found) <= (method == "fdd")
+        assert fit.method == "plscf"
+    assert all(seen for one in found for seen in one.found)
     assert not any(one.false_modes for one in found)
     covered = np.concatenate([one.covered for one in found])
     assert np.sum(covered == 0) <= scipy.stats.binom.isf(0.02, covered.size, 0.05), covered
@@ -138,24 +116,10 @@ def test_close_modes_are_told_apart():
 
 def test_a_method_refuses_what_it_cannot_use():
     log = log_of(sampled(small_structure(0), "ambient", 0, 10.0))
-    for method in ("fdd", "covariance"):
+    for method in ("plscf", "covariance"):
         with pytest.raises(ValueError, match="for kind 'free decay' leave the method out"):
             identify_modes(log, method=method, kind="free decay")
     with pytest.raises(ValueError, match="for kind 'ambient' leave the method out"):
         identify_modes(log, method="decay", kind="ambient")
-    with pytest.raises(ValueError, match="no models and no order"):
-        identify_modes(log, method="fdd", order=10)
-
-
-def test_efdd_parts_a_pair_with_one_peak():
-    """Two per cent apart, closer than the segments resolve; shapes are unlike."""
-    random = np.random.default_rng(9001)
-    frequencies, ratios = np.array([4.0, 4.08, 9.0]), random.uniform(0.002, 0.01, 3)
-    structure = Structure(
-        frequencies, ratios, random.normal(size=(3, 5)), random.normal(size=(3, 4))
-    )
-    planted = sampled(structure, "ambient", 9001, 600.0)
-    fit = identify_modes(log_of(planted), band=(2.8, 11.0), method="fdd")
-    np.testing.assert_allclose(fit.frequencies, frequencies, rtol=4e-3)
-    np.testing.assert_allclose(fit.damping_ratios, ratios, rtol=0.5)
-    assert np.all(np.diag(mac_matrix(fit.shapes, structure.shapes + 0j)) > 0.9)
+    with pytest.raises(ValueError, match="method 'fdd' is gone"):
+        identify_modes(log, method="fdd")

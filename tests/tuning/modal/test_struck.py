@@ -10,15 +10,19 @@ from tuning import Log, identify_modes
 from tuning.modal.forced.likelihood import linear_fit, refined_poles, whitened
 from tuning.modal.forced.significance import criterion, criterion_with
 from tuning.modal.result import IdentifiedMode
-from tuning.modal.struck.beginnings import StruckRecords, from_early_blows, from_rests
-from tuning.modal.struck.instants import (
+from tuning.modal.struck.blows import (
+    FROM_AMBIENT,
     Blow,
+    StruckRecords,
     after_blows,
+    alike,
+    from_early_blows,
+    from_rests,
     marked_blows,
     response_in_band,
+    struck_modes,
     with_missed_blows,
 )
-from tuning.modal.struck.struck_modes import FROM_AMBIENT, alike, struck_modes
 
 RATE, BAND, FINER = 40.0, (0.5, 8.0), 8
 FREQUENCIES, DAMPING = np.array([0.83, 1.46, 3.7, 6.3]), np.array([0.006, 0.0054, 0.003, 0.012])

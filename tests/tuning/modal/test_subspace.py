@@ -18,8 +18,7 @@ from tuning.modal.harmonics import (
     steadiness,
     without_lines,
 )
-from tuning.modal.result import IdentifiedMode
-from tuning.modal.shapes import mac_matrix, normalised, phase_collinearity
+from tuning.modal.result import IdentifiedMode, mac_matrix, normalised, phase_collinearity
 from tuning.modal.stabilisation import MIN_CHAIN_ORDERS, Chain
 from tuning.modal.subspace import Poles, Spread, block_rows, decompose, poles_of_order, spreads
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from tuning.modal.decay.soft_blows import MIN_ENERGY_RISE
+from tuning.modal.decay.stretches import MIN_ENERGY_RISE
 
 ORDERS = (2, 4, 6, 8, 12, 16)  # eigenvalues of the models, two for each vibration
 HANKEL_CYCLES = 3.0  # of the strongest vibration in the columns of the matrices

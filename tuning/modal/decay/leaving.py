@@ -21,7 +21,7 @@ from scipy.optimize import nnls
 
 from tuning.modal.ambient import Candidate
 from tuning.modal.decay.stretches import Stretch
-from tuning.modal.shapes import mac_matrix
+from tuning.modal.result import mac_matrix
 
 MIN_GAIN = 12.0  # of the logarithm of the likelihood: of all instants tried, one in ten thousand
 LATEST_LOSS = 2.0  # of the same, within which the latest instant is taken

@@ -12,27 +12,31 @@ from tuning.modal.ambient import (
     overlapping,
     subspace_modes,
 )
-from tuning.modal.decay.candidates import (
+from tuning.modal.decay.earlier_start import earlier_start
+from tuning.modal.decay.fit import (
+    DecayFit,
     decay_candidates,
+    fit_decay,
     information_of_modes,
     share_of_modes,
 )
-from tuning.modal.decay.dominant import after_blow, after_soft_blows, dominate, follows
-from tuning.modal.decay.earlier_start import earlier_start
-from tuning.modal.decay.fit import DecayFit, fit_decay
 from tuning.modal.decay.free_end import free_end
 from tuning.modal.decay.leaving import (
     PARTS,
     end_of_excitation,
     without_excitation,
 )
-from tuning.modal.decay.soft_blows import until_soft_blow
 from tuning.modal.decay.stretches import (
     Stretch,
+    after_blow,
+    after_soft_blows,
+    dominate,
     excited_samples,
+    follows,
     free_decays,
     prediction_errors,
     stacked,
+    until_soft_blow,
 )
 from tuning.modal.preprocessing import HALF_POWER, kinetic_band, prepare, strongest_frequency
 from tuning.modal.samples import MIN_SAMPLES, Samples

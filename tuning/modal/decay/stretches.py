@@ -4,9 +4,11 @@ Between blows the samples are predicted by the past ones, but for noise. An auto
 each channel tells excitation by its prediction errors: a blow is an error far beyond those of the
 quietest parts of the log, and beyond those before it or not small beside the signal itself. The
 model is that of the log at its own rate, whose highest frequencies show a contact best, whatever
-the band in which modes are sought.
+the band in which modes are sought. Blows too soft, or in too much noise, for that are told by the
+energy, which rises at once. The last functions say whether decays stand for a log.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -14,17 +16,78 @@ from jaxtyping import Bool, Float
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.signal import lfilter
 
-from tuning.modal.decay.soft_blows import (
-    MAX_HARDER,
-    MIN_ENERGY_RISE,
-    MIN_START_RATIO,
-    RISE_WIDTHS,
-    after_first_blow,
-    between_soft_blows,
-    moving_mean,
-    until_blow,
-    vibration_energy,
-)
+MIN_ENERGY_RISE = 2.0  # energy in two cycles after a blow over that before it
+RISE_WIDTHS = 5  # of two cycles each, before such a rise
+MIN_START_RATIO = 10.0  # energy right after a blow over that of a structure at rest
+MAX_HARDER = 10.0  # energy right after the hardest blow over that after the softest; less is noise
+
+
+def vibration_energy(
+    record: Float[np.ndarray, "sample channel"], width: int
+) -> Float[np.ndarray, " sample"]:
+    """Energy of a record around each sample, each channel relative to its own."""
+    scaled = record / np.maximum(record.std(axis=0), 1e-300)
+    return moving_mean(np.sum(scaled**2, axis=1), width)
+
+
+def moving_mean(values: Float[np.ndarray, " sample"], width: int) -> Float[np.ndarray, " sample"]:
+    """Means of the values around each sample; fewer at the ends."""
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    index = np.arange(values.size)
+    low, high = np.maximum(index - width // 2, 0), np.minimum(index + width // 2 + 1, values.size)
+    return (total[high] - total[low]) / (high - low)
+
+
+def until_soft_blow(record: Float[np.ndarray, "sample channel"], width: int) -> int:
+    """Samples of a record before a blow too soft to be found by its errors; all if there is none.
+
+    `width` are two cycles of the strongest vibration in samples.
+    """
+    return until_blow(vibration_energy(record, width), width)
+
+
+def after_first_blow(energy: Float[np.ndarray, " sample"], width: int) -> int | None:
+    """Sample of most energy after a blow that strikes a structure at rest; None without one."""
+    rise = _until_rise(energy, width, width, MIN_START_RATIO)
+    if rise == energy.size:
+        return None
+    highest = _highest_after(energy, rise, width)
+    return highest if MAX_HARDER * energy[highest] > energy.max() else None
+
+
+def between_soft_blows(
+    energy: Float[np.ndarray, " sample"], first: int, last: int, width: int
+) -> Iterator[tuple[int, int]]:
+    """First and last samples of the parts of a stretch before and after soft blows."""
+    while True:
+        rise = first + until_blow(energy[first:last], width)
+        yield first, rise
+        if rise == last:
+            return
+        first = _highest_after(energy[:last], rise, width)
+
+
+def _highest_after(energy, rise, width) -> int:
+    """Sample of most energy after a blow, where nothing acts any longer."""
+    return rise + int(np.argmax(energy[rise : rise + 4 * width]))
+
+
+def until_blow(energy: Float[np.ndarray, " sample"], width: int) -> int:
+    """Samples before a blow too soft to be found by its errors.
+
+    Close modes make the energy rise, too, but not above what it was as long before its least.
+    """
+    return _until_rise(energy, width, RISE_WIDTHS * width, MIN_ENERGY_RISE)
+
+
+def _until_rise(energy, width, past, ratio) -> int:
+    """Samples before the energy rises within `width` above a multiple of all in the `past`."""
+    if energy.size < past + 2 * width:
+        return energy.size
+    before = sliding_window_view(energy, past).max(axis=-1)[: -2 * width]
+    risen = energy[past + 2 * width - 1 :][: before.size] > ratio * before
+    return past + int(np.argmax(risen)) if risen.any() else energy.size
+
 
 AR_ORDER = 24
 AR_ITERATIONS = 6
@@ -393,3 +456,62 @@ def stacked(
         weights = weights * np.where(weights.sum(axis=1) < 0, -1.0, 1.0)[:, None]
         parts = (weights @ flat).reshape(-1, *parts.shape[1:])
     return np.hstack(list(parts)), used
+
+
+MIN_DECAY_ENERGY = 0.3  # share of the energy of a log in its decays, if they are to stand for it
+LONG_FALL_NEPERS = 1.5  # or fall of the energy; 95 % of that of an exponential falls by 3
+MIN_START_LEVEL = 0.2  # energy at the start of such a decay over the mean energy of the log
+
+
+def dominate(
+    decays: tuple[Stretch, ...],
+    struck: tuple[Bool[np.ndarray, " time"], ...],
+    records: tuple[Float[np.ndarray, "sample channel"], ...],
+    ratio: float,
+    cycle: float,
+) -> bool:
+    """Whether decays hold much of the energy of a log, or one falls far, or follows a load.
+
+    `struck` are samples of the log, `ratio` those of `records` over these; `cycle` is that of the
+    strongest vibration in samples of `records`. A decay that begins far below the level of the log,
+    long after blows, lacks the modes that were gone by then; one that begins where a lasting
+    excitation ends has them all, however much stronger the excitation was, and how far it falls is
+    of no matter.
+    """
+    inside = sum(
+        np.sum(records[d.record][int(d.start * ratio) : int(d.stop * ratio)] ** 2) for d in decays
+    )
+    whole = sum(np.sum(record**2) for record in records)
+    level = whole / sum(map(len, records))
+    longest = max(decays, key=lambda d: d.fall)
+    start = int(np.ceil(longest.start * ratio))
+    first = records[longest.record][start : start + int(2 * cycle) + 1]
+    begins = np.sum(first**2) / len(first) > MIN_START_LEVEL * level
+    falls = begins and longest.fall > LONG_FALL_NEPERS
+    has_followed = follows(longest, struck[longest.record], cycle / ratio)
+    return bool(inside > MIN_DECAY_ENERGY * whole or falls or has_followed)
+
+
+def after_soft_blows(
+    decays: tuple[Stretch, ...], struck: tuple[Bool[np.ndarray, " time"], ...]
+) -> bool:
+    """Whether there are several decays in records in which no excitation was found."""
+    return len(decays) > len(struck) and not any(marks.any() for marks in struck)
+
+
+def follows(decay: Stretch, struck: Bool[np.ndarray, " time"], cycle: float) -> bool:
+    """Whether a decay begins where the structure was excited for five cycles or more.
+
+    `cycle` is that of the strongest vibration in samples of the log, as are `struck` ones.
+    """
+    before = struck[: max(decay.start - 2, 0)][-int(MIN_DECAY_CYCLES * cycle) :]
+    return bool(before.size and before.all())
+
+
+def after_blow(decay: Stretch, struck: Bool[np.ndarray, " time"], cycle: float) -> bool:
+    """Whether a decay begins right after a blow, not after a lasting excitation.
+
+    `cycle` is that of the strongest vibration in samples of the log, as are `struck` ones.
+    """
+    before = struck[max(decay.start - CONTACT_SAMPLES, 0) : decay.start]
+    return bool(before.any()) and not follows(decay, struck, cycle)

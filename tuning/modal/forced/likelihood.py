@@ -5,26 +5,215 @@ residues R_r and the transients x_r of the samples, z_r = exp(p_r T). Their erro
 over the poles p_r by Gauss-Newton steps with the residues eliminated: the likelihood of output
 errors of one variance for each output (El-Kafafy, De Troyer, Peeters and Guillaume 2013). Shapes
 are the residues by least squares (LSFD), of rank one: shape times participation.
+
+Errors of different lines of a spectrum are independent, and their variance changes little from line
+to line. A lightly damped mode has few lines, which its residues follow, so that the errors left at
+these tell little: at each line the variance is the mean over its neighbours, of errors divided by
+what the model leaves free of them (leverage; MacKinnon and White 1985 for single errors).
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float, Int, Shaped
+from scipy.ndimage import uniform_filter1d
 
 from tuning.modal.forced.common_denominator import Lines
-from tuning.modal.forced.terms import (
-    both_parts,
-    columns_of_model,
-    columns_of_poles,
-    pole_directions,
-)
-from tuning.modal.forced.uncertainty import (
-    FreeErrors,
-    degrees_of_freedom,
-    error_spread,
-    free_errors,
-)
+
+NEIGHBOURS = 5  # lines on either side whose errors tell the variance of a line
+BLOCKS = 48  # of lines, every 48th in one
+
+
+class FreeErrors(NamedTuple):
+    """Errors of rows (real parts of all lines, then imaginary), and shares that were free."""
+
+    errors: Float[np.ndarray, "row output"]
+    free: Float[np.ndarray, "row output"]
+
+
+def line_means(
+    rows: Float[np.ndarray, "row output"], reach: int
+) -> Float[np.ndarray, "line output"]:
+    """Mean over real and imaginary parts and `reach` lines on either side."""
+    count = len(rows) // 2
+    return uniform_filter1d(
+        0.5 * (rows[:count] + rows[count:]), 2 * reach + 1, axis=0, mode="mirror"
+    )
+
+
+def error_spread(
+    errors: Float[np.ndarray, "row output"], reach: int
+) -> Float[np.ndarray, "line output"]:
+    """Root mean square of errors over `reach` lines on either side of each."""
+    return np.sqrt(line_means(errors**2, reach))
+
+
+def free_errors(
+    errors: Float[np.ndarray, "row output"],
+    columns: Float[np.ndarray, "row column"],
+    inverse: Float[np.ndarray, "column row"],
+    slopes: Float[np.ndarray, "row part output"],
+    normal: Float[np.ndarray, "part part"],
+    weight: Float[np.ndarray, " output"],
+) -> FreeErrors:
+    """Errors with one minus their leverage.
+
+    The leverage is that of the columns, linear for each output, and of the slopes by poles.
+    """
+    linear = np.einsum("rc,cr->r", columns, inverse)
+    by_poles = np.einsum(
+        "rko,kl,rlo,o->ro", slopes, np.linalg.pinv(normal, hermitian=True), slopes, weight,
+        optimize=True,
+    )  # fmt: skip
+    return FreeErrors(errors, 1 - linear[:, None] - by_poles)
+
+
+def replicates(found: FreeErrors) -> Iterator[tuple[Float[np.ndarray, "row output"], float]]:
+    """Errors that could have been, with their weights in a covariance.
+
+    Those of each neighbour in the place of a line, also turned by a quarter of a period.
+    """
+    count = len(found.errors) // 2
+    complex_errors = found.errors[:count] + 1j * found.errors[count:]
+    free = np.sqrt(np.maximum(line_means(found.free, NEIGHBOURS), 1e-3))
+    places = np.arange(count)
+    for shift in range(-NEIGHBOURS, NEIGHBOURS + 1):
+        moved = complex_errors[_reflected(places + shift, count)] / free
+        for turned in (moved, 1j * moved):
+            yield np.concatenate([turned.real, turned.imag]), 0.5 / (2 * NEIGHBOURS + 1)
+
+
+def degrees_of_freedom(found: FreeErrors, peak: int, width: float) -> float:
+    """Free errors of one output about a peak `width` lines wide, of the output with fewest."""
+    count = len(found.errors) // 2
+    reach = NEIGHBOURS + int(width / 2)
+    lines = slice(max(peak - reach, 0), peak + reach + 1)
+    both = found.free[:count][lines] + found.free[count:][lines]
+    return float(max(np.min(np.sum(both, axis=0)), 1.0))
+
+
+def _reflected(places, count):
+    places = np.abs(places)
+    return np.where(places >= count, 2 * (count - 1) - places, places)
+
+
+def columns_of_model(
+    lines: Lines, poles: Complex[np.ndarray, " mode"], powers: tuple[int, ...]
+) -> Complex[np.ndarray, "line column"]:
+    """Columns of residues, transients and rest, for poles (1/s) and `powers` of z."""
+    columns = _by_coefficients(lines, resonances_of(lines, poles), transients_of(lines, poles))
+    signals = np.concatenate([lines.inputs, lines.unforced], axis=1)
+    return np.concatenate([*columns, times_signals(_rest(lines, powers), signals)], axis=1)
+
+
+def _by_coefficients(lines: Lines, resonances, transients):
+    """Columns by real, then imaginary parts of residues, and likewise of transients."""
+    columns = []
+    for signals, first, second in ((lines.inputs, *resonances), (lines.unforced, *transients)):
+        columns += [
+            times_signals(first + second, signals),
+            times_signals(1j * (first - second), signals),
+        ]
+    return columns
+
+
+def _rest(lines: Lines, powers):
+    """Terms (line, term) for modes outside of the band: above it powers of z, below it of 1 / w."""
+    angles = np.angle(lines.z)
+    below = 1j * angles / np.exp(np.mean(np.log(angles)))
+    return np.concatenate([lines.z[:, None] ** np.array(powers), 1 / below[:, None] ** [1, 2]], 1)
+
+
+def both_parts(values: Complex[np.ndarray, "line column"]) -> Float[np.ndarray, "row column"]:
+    """Real parts above imaginary parts."""
+    return np.concatenate([values.real, values.imag])
+
+
+def resonances_of(
+    lines: Lines, poles: Complex[np.ndarray, " mode"]
+) -> tuple[Complex[np.ndarray, "line mode"], Complex[np.ndarray, "line mode"]]:
+    """1 / (i w - p) and the same of the conjugate poles (line, mode)."""
+    s = 1j * np.angle(lines.z) / lines.step
+    return (1 / (s - poles[:, None])).T, (1 / (s - poles.conj()[:, None])).T
+
+
+def transients_of(
+    lines: Lines, poles: Complex[np.ndarray, " mode"]
+) -> tuple[Complex[np.ndarray, "line mode"], Complex[np.ndarray, "line mode"]]:
+    """1 / (z - exp(p T)) and the same of the conjugate poles (line, mode)."""
+    roots = np.exp(poles * lines.step)
+    return (1 / (lines.z - roots[:, None])).T, (1 / (lines.z - roots.conj()[:, None])).T
+
+
+def times_signals(
+    terms: Complex[np.ndarray, "line term"], signals: Shaped[np.ndarray, "line signal"]
+) -> Complex[np.ndarray, "line column"]:
+    """Products of all terms and signals, the signals of a term side by side."""
+    return (terms.T[:, None, :] * signals.T[None, :, :]).reshape(-1, len(terms)).T
+
+
+def coefficient_places(lines: Lines, modes: int, k: int) -> Int[np.ndarray, " place"]:
+    """Rows of the coefficients that are those of the k-th of some modes, forced and free."""
+    places, first = [], 0
+    for signals in (lines.inputs.shape[1], lines.unforced.shape[1]):
+        for _ in range(2):  # real parts, imaginary parts
+            places.append(first + k * signals + np.arange(signals))
+            first += modes * signals
+    return np.concatenate(places)
+
+
+def split_coefficients(
+    found: Float[np.ndarray, "column output"], lines: Lines, modes: int
+) -> list[Complex[np.ndarray, "mode signal output"]]:
+    """Complex residues (mode, input, output) and transients (mode, record, output)."""
+    parts, first = [], 0
+    for signals in (lines.inputs.shape[1], lines.unforced.shape[1]):
+        half = modes * signals
+        both = found[first : first + half] + 1j * found[first + half : first + 2 * half]
+        parts.append(both.reshape(modes, signals, both.shape[1]))
+        first += 2 * half
+    return parts
+
+
+def columns_of_poles(
+    lines: Lines, poles: Complex[np.ndarray, " mode"]
+) -> Complex[np.ndarray, "line column"]:
+    """Columns whose combinations are the derivatives of the responses by the poles.
+
+    They are 1 / (i w - p)^2, and the same of the transients, times the signals.
+    """
+    step = lines.step
+    factor = step * np.exp(poles * step)
+    (own, other), (free, mirrored) = resonances_of(lines, poles), transients_of(lines, poles)
+    transients = factor * free**2, factor.conj() * mirrored**2
+    return np.concatenate(_by_coefficients(lines, (own**2, other**2), transients), axis=1)
+
+
+def pole_directions(
+    lines: Lines,
+    found: Float[np.ndarray, "column output"],
+    modes: int,
+    moving: Int[np.ndarray, " moving"],
+) -> Float[np.ndarray, "place part output"]:
+    """Combinations (column, part, output) of the columns of the poles.
+
+    They are derivatives of the responses by real, then imaginary parts of moving poles: with the
+    real part a and the imaginary part b of a coefficient, and its two columns c and d, these are
+    a c + b d, and a d - b c.
+    """
+    size, parts = moving.size, []
+    for coefficients in split_coefficients(found, lines, modes):
+        own = coefficients[moving]  # mode, signal, output
+        spread = np.zeros((size, own.shape[1], size, own.shape[2]), complex)
+        spread[np.arange(size), :, np.arange(size)] = own
+        flat = spread.reshape(size * own.shape[1], size, own.shape[2])
+        parts += [
+            np.concatenate([flat.real, -flat.imag], axis=1),
+            np.concatenate([flat.imag, flat.real], axis=1),
+        ]
+    return np.concatenate(parts)
+
 
 REST_POWERS = (-2, -1, 0, 1, 2)  # of z, for modes above the band and those not found
 REST_TERMS = len(REST_POWERS) + 2  # with those of modes below the band

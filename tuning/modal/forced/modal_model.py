@@ -5,9 +5,14 @@ from jaxtyping import Float
 from scipy.stats import t as student
 
 from tuning.modal.forced.common_denominator import Lines
-from tuning.modal.forced.likelihood import FittedModel
-from tuning.modal.forced.terms import resonances_of, split_coefficients, transients_of
-from tuning.modal.forced.uncertainty import BLOCKS, replicates
+from tuning.modal.forced.likelihood import (
+    BLOCKS,
+    FittedModel,
+    replicates,
+    resonances_of,
+    split_coefficients,
+    transients_of,
+)
 from tuning.modal.result import IdentifiedMode, frequency_and_damping
 
 

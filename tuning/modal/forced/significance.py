@@ -12,15 +12,19 @@ from jaxtyping import Complex, Float
 from scipy.stats import f as fisher
 
 from tuning.modal.forced.common_denominator import Lines
-from tuning.modal.forced.likelihood import FittedModel, LinearFit, linear_fit, refined_poles
-from tuning.modal.forced.terms import (
+from tuning.modal.forced.likelihood import (
+    NEIGHBOURS,
+    FittedModel,
+    LinearFit,
     both_parts,
     coefficient_places,
+    line_means,
+    linear_fit,
+    refined_poles,
     resonances_of,
     times_signals,
     transients_of,
 )
-from tuning.modal.forced.uncertainty import NEIGHBOURS, line_means
 
 DAMPING_RATIOS = (0.004, 0.016, 0.064)  # of poles that are tried
 NEAR_LINES, NEAR_WIDTHS = 32, 16.0  # about a pole that is tried: lines, and decay rates

@@ -14,8 +14,7 @@ from jaxtyping import Bool, Complex, Float
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
-from tuning.modal.likelihood.fit import covariance, maximise
-from tuning.modal.likelihood.model import SpectralModel, Window
+from tuning.modal.likelihood.model import SpectralModel, Window, covariance, maximise
 
 WINDOW_WIDTHS = 8.0  # half width of the window around a pole over its half-power width
 WINDOW_SHARES = 0.1, 0.3  # of the frequency, at least and at most

@@ -6,9 +6,8 @@ import numpy as np
 import scipy.optimize
 
 from tuning.modal.fit import ModalFit
-from tuning.modal.result import MIN_ENERGY_SHARE, IdentifiedMode
+from tuning.modal.result import MIN_ENERGY_SHARE, IdentifiedMode, mac_matrix
 from tuning.modal.setups.shape import Part
-from tuning.modal.shapes import mac_matrix
 
 MAX_FREQUENCY_CHANGE = 0.03  # between setups: temperature, traffic, the mass of moved sensors
 MAX_SDS = 3.0  # standard deviations of the difference of two frequencies that may be more

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from tuning.modal.ambient import Candidate, without_duplicates
-from tuning.modal.decay.candidates import NONLINEARITY
+from tuning.modal.decay.fit import NONLINEARITY
 from tuning.modal.decay.modes import (
     Decays,
     band_of_ends,
@@ -18,8 +18,7 @@ from tuning.modal.preprocessing import HALF_POWER, kinetic_band
 from tuning.modal.result import is_at_edge
 from tuning.modal.samples import Samples
 from tuning.modal.stabilisation import Diagram
-from tuning.modal.struck.instants import marked_blows
-from tuning.modal.struck.struck_modes import (
+from tuning.modal.struck.blows import (
     AFTER_BLOWS,
     AFTER_UNSEEN_BLOWS,
     FROM_AMBIENT,
@@ -27,6 +26,7 @@ from tuning.modal.struck.struck_modes import (
     WEAK,
     Search,
     alike,
+    marked_blows,
     struck_modes,
 )
 

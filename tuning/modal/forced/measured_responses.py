@@ -9,8 +9,15 @@ from jaxtyping import Complex, Float
 from matplotlib.figure import Figure
 
 from tuning.logs.log import Log
-from tuning.modal.forced.blows import Windows, check_windows, find_blows, pieces_of_blows
-from tuning.modal.forced.forces import force_names, force_records, without_forces
+from tuning.modal.forced.forces import (
+    Windows,
+    check_windows,
+    find_blows,
+    force_names,
+    force_records,
+    pieces_of_blows,
+    without_forces,
+)
 from tuning.modal.samples import samples_of, with_channels
 
 ESTIMATORS = ("H1", "H2", "Hv")
@@ -67,7 +74,7 @@ class MeasuredResponses:
 
     def plot(self, path: str | Path | None = None) -> Figure:
         """Draw magnitude, phase and coherence of all outputs; saved if a path is given."""
-        from tuning.modal.forced.estimates.responses_plot import plot_responses
+        from tuning.modal.plot import plot_responses
 
         return plot_responses(self, path)
 

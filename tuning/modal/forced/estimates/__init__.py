@@ -1,1 +1,0 @@
-"""Estimates of frequency responses to measured forces."""

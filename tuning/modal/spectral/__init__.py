@@ -1,1 +1,0 @@
-"""Modal identification from spectra: decomposition of spectra and fits of matrix fractions."""
