@@ -16,6 +16,7 @@ from tuning.modal.likelihood.refine import Start, refine_modes
 from tuning.modal.preprocessing import Prepared, check_length, prepare
 from tuning.modal.result import (
     MIN_ENERGY_SHARE,
+    SAME_MAC,
     IdentifiedMode,
     frequency_and_damping,
     mac_matrix,
@@ -32,13 +33,12 @@ from tuning.modal.subspace import (
     spreads,
 )
 
-MAX_ORDER = 60
+MAX_ORDER = 60  # of models in a stabilisation diagram, by default
 MAX_BAND_RATIO = 8.0  # upper over lower end of the bands that are identified one by one
 BAND_OVERLAP = 1.1  # by which such bands exceed their part
 RECORD_OVER_ROWS = 4  # samples of a record over block rows, for covariances of all lags
 MIN_LENGTH = RECORD_OVER_ROWS * MIN_BLOCK_ROWS
 DUPLICATE_SDS = 2.0  # standard deviations within which two poles are one
-DUPLICATE_MAC = 0.9
 
 
 class Candidate(NamedTuple):
@@ -299,7 +299,7 @@ def _is_same(a: IdentifiedMode, b: IdentifiedMode) -> bool:
     95 % intervals of frequency overlap and the frequencies differ by less than half of the smaller
     half-power bandwidth, z f, however the damping ratios differ: no spectrum shows two peaks then.
     """
-    if mac_matrix(a.shape[None], b.shape[None])[0, 0] < DUPLICATE_MAC:
+    if mac_matrix(a.shape[None], b.shape[None])[0, 0] < SAME_MAC:
         return False
     shift = abs(a.frequency - b.frequency)
     alike = shift < DUPLICATE_SDS * np.hypot(a.frequency_sd, b.frequency_sd) and abs(

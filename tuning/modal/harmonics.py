@@ -19,7 +19,7 @@ from tuning.modal.preprocessing import energy_band, prepare
 from tuning.modal.result import IdentifiedMode
 from tuning.modal.samples import Samples
 
-TAPERS, TIME_BANDWIDTH = 7, 4.0
+TAPERS, TIME_BANDWIDTH = 7, 4.0  # of the F-test (Thomson 1982), of 2 * 4 - 1 good tapers
 FALSE_ALARM_PROBABILITY = 1e-3  # of a line in noise, in a whole spectrum
 PARTS = 8  # parts of a record in which a line is followed
 MIN_COHERENCE = 0.9  # length of the mean of its complex amplitudes over their rms
@@ -31,7 +31,7 @@ RAYLEIGH_RATIO = 0.5227  # deviation over mean of the envelope of a random vibra
 RATIO_SD, DOUBTFUL_SDS, STEADY_SDS = 0.43, 2.3, 3.3
 STEADY_RATIO = 0.35  # of the envelope of a line in noise of a tenth of its power
 HALF_POWER_WIDTHS = 4.0  # half width of the filter around a pole
-MAX_LINES = 100
+MAX_LINES = 100  # the strongest
 MIN_SERIES = 3  # lines that are multiples of one frequency
 
 

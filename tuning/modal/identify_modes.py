@@ -45,7 +45,12 @@ from tuning.modal.plscf import plscf_modes
 from tuning.modal.preprocessing import energy_band, kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels, without_constant
 from tuning.modal.stabilisation import Diagram
-from tuning.modal.struck.whole_log import FromDecays, modes_after_unseen_blows, modes_of_decays
+from tuning.modal.struck.whole_log import (
+    FromDecays,
+    blows_left_out,
+    modes_after_unseen_blows,
+    modes_of_decays,
+)
 
 FORCED = "measured force"
 NARROW = 0.005  # damping ratio of a mode below which it may be a harmonic
@@ -165,6 +170,11 @@ def identify_modes(
         ]
     else:
         used_method = DECAY
+        if found.decays is not None and not found.blows:
+            choices += [
+                Choice(text, "--from and --to")
+                for text in blows_left_out(samples, struck, found.decays.stretches, used_band)
+            ]
         lines = lines_besides(lines, [one.mode for one in found.candidates if not one.reason])
     if kind is None:
         says = _kind_words(found, struck, lines)
@@ -265,6 +275,7 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, keep: Mo
     modes, rejected = [], []
     for candidate in found.candidates:
         mode, reason = candidate.mode, candidate.reason
+        mode = mode._replace(energy_share=float(np.clip(mode.energy_share, 0.0, 1.0)))
         near = [f for f in keep.exclude if abs(mode.frequency - f) < max(0.01 * f, 3 * resolution)]
         hit = [one for one in lines if abs(mode.frequency - one.frequency) < 2 * resolution]
         if near:

@@ -28,6 +28,7 @@ import scipy.linalg
 from jaxtyping import Complex, Float
 
 from tuning.modal.ambient import (
+    MAX_ORDER,
     Candidate,
     divided_band,
     mean_square,
@@ -325,9 +326,8 @@ def spread_of_changes(
 
 
 LAG_CYCLES = 15.0  # cycles of the lowest frequency in the lags of correlations
-MIN_LAGS, MAX_LAGS = 32, 1000
+MIN_LAGS, MAX_LAGS = 32, 1000  # of correlations
 RECORD_OVER_LAGS, MIN_RECORD_OVER_LAGS = 8, 3  # of the longest record; at least
-MAX_ORDER = 60
 MIN_DEGREES = 12  # degrees of the polynomials, however many channels there are
 
 

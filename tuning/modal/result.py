@@ -46,8 +46,10 @@ def normalised(shapes: Complex[np.ndarray, "mode channel"]) -> Complex[np.ndarra
     return turned / np.where(largest == 0, 1.0, largest)
 
 
-MAX_RELATIVE_FREQUENCY_SD = 0.02
-MAX_DAMPING_RATIO = 0.2
+MAX_RELATIVE_FREQUENCY_SD = 0.02  # of a mode; a frequency less certain names none
+MIN_STRUCTURAL_DAMPING = 1e-4  # of steel alone, without joints (Lazan 1968)
+MAX_DAMPING_RATIO = 0.2  # of a mode of a structure
+SAME_MAC = 0.9  # of shapes that may be one (Allemang 2003 has the criterion)
 MIN_CYCLES = 4.0  # cycles of a mode in the window
 MIN_ENERGY_SHARE = 0.002  # of the energy of the log in the mode's part of the band
 MIN_COLLINEARITY = 0.5  # modal phase collinearity, of three channels or more
@@ -58,7 +60,8 @@ class IdentifiedMode(NamedTuple):
     """A mode: undamped natural frequency (Hz) and damping ratio, with standard deviations.
 
     `energy_share` is its share of the energy of a channel in its part of the band, three octaves at
-    most, on average over channels: how strong another part is does not matter.
+    most, on average over channels: how strong another part is does not matter. Close modes cancel
+    in part, so that estimates may be less than 0 or more than 1; results have the nearer end.
     `shape` has a largest component of one; `shape_covariance` is that of its real parts, then its
     imaginary parts.
     """
@@ -204,8 +207,12 @@ def rejection_reason(
     """Reason why a mode found in `duration` seconds is not well identified; empty if it is."""
     if is_at_edge(mode, band):
         return "at the edge of the band"
-    if not mode.quantile * mode.damping_sd < mode.damping_ratio:
-        return "damping not distinguishable from none: hum, or a mode too weak or too short"
+    half = mode.quantile * mode.damping_sd
+    if not half < mode.damping_ratio:
+        if mode.damping_ratio < MIN_STRUCTURAL_DAMPING:
+            return "hum: damped less than any structure, and no more than by chance"
+        found = f"{100 * mode.damping_ratio:.2g} % +- {100 * half:.2g} %"
+        return f"damping uncertain, {found}: too weak, or too short a log"
     if mode.damping_ratio > MAX_DAMPING_RATIO:
         return "damped so strongly that it may be no mode"
     if mode.frequency * duration < MIN_CYCLES:

@@ -45,7 +45,7 @@ def _settled(column) -> int:
     return int(left_out[np.argmin(error)])
 
 
-MIN_SAMPLES = 64
+MIN_SAMPLES = 64  # of a log
 MAX_RATE_CHANGE = 1e-3  # of the sampling rate, between logs that are used together
 
 

@@ -12,16 +12,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from tuning.modal.result import MAX_DAMPING_RATIO, mac_matrix
+from tuning.modal.result import MAX_DAMPING_RATIO, SAME_MAC, mac_matrix
 from tuning.modal.subspace import Poles
 
 MAX_FREQUENCY_CHANGE = 0.01  # relative, between neighbouring orders
 MAX_DAMPING_CHANGE = 0.5  # relative to the larger damping ratio
 DAMPING_FLOOR = 0.002  # damping ratio added to it
-MIN_MAC = 0.9
 MAX_SKIPPED_ORDERS = 3  # orders in which a chain may lack a pole
 MIN_CHAIN_SHARE = 0.4  # of the orders from its first on
-MIN_CHAIN_ORDERS = 6
+MIN_CHAIN_ORDERS = 6  # likewise
 
 
 class Chain(NamedTuple):
@@ -109,7 +108,7 @@ def _distances(poles: Poles, ends, index) -> Float[np.ndarray, "chain pole"]:
     mac = mac_matrix(poles.shapes[ends], poles.shapes[index])
     relative = np.abs(poles.poles[ends][:, None] - poles.poles[index]) / np.abs(poles.poles[index])
     agree = (
-        (shift < MAX_FREQUENCY_CHANGE) & (change < MAX_DAMPING_CHANGE * larger) & (mac > MIN_MAC)
+        (shift < MAX_FREQUENCY_CHANGE) & (change < MAX_DAMPING_CHANGE * larger) & (mac > SAME_MAC)
     )
     return np.where(agree, relative + 1 - mac, np.inf)
 

@@ -22,7 +22,7 @@ from scipy.fft import next_fast_len
 LOWEST_CYCLES = 8.0  # cycles of the lowest frequency of the band in the lags of half a matrix
 MAX_ROWS = 240  # rows of half a Hankel matrix: block rows times channels
 MIN_ROWS = 24  # likewise; two thirds of them are the highest order, of which half are even
-MIN_BLOCK_ROWS = 8
+MIN_BLOCK_ROWS = 8  # of half a Hankel matrix
 MAX_BLOCKS = 24  # blocks of the records for the covariance of the covariances
 MIN_BLOCK_LAGS = 2  # length of a block over the largest lag
 

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 
 from tuning import Log, ModalSettings, identify_modes
 from tuning.modal.preprocessing import energy_band, kinetic_band
-from tuning.modal.result import IdentifiedMode, is_at_edge
+from tuning.modal.result import IdentifiedMode, is_at_edge, rejection_reason
 from tuning.modal.samples import samples_of
 
 FREQUENCIES = np.array([5.0, 12.0, 13.0])
@@ -246,6 +246,22 @@ def test_a_mode_at_the_edge_of_a_band():
     for low, high, at_edge in ((1, 10, False), (1, 9.17, True), (8.9, 20, True)):
         assert is_at_edge(mode, (float(low), float(high))) is at_edge
     assert not is_at_edge(mode._replace(damping_ratio=0.001), (8.9, 20.0))
+
+
+@pytest.mark.parametrize(
+    ("damping", "sd", "says"),
+    [(0.044, 0.004, ""), (0.044, 0.03, "damping uncertain, 4.4 % +- 5.9 %"), (5e-5, 1e-3, "hum:")],
+)
+def test_a_mode_is_called_hum_only_if_no_structure_is_damped_as_little(damping, sd, says):
+    mode = IdentifiedMode(5.0, 0.001, damping, sd, 0.5, np.ones(1, complex), np.zeros((2, 2)))
+    assert rejection_reason(mode, 60.0, (1.0, 20.0)).startswith(says)
+    assert bool(rejection_reason(mode, 60.0, (1.0, 20.0))) == bool(says)
+
+
+def test_energies_are_fractions(ambient_fits):
+    """Shares of close modes cancel in part: those beyond 0 and 1 have the nearer of the two."""
+    every = [m for fit in ambient_fits for m in (*fit.modes, *(one for one, _ in fit.rejected))]
+    assert len(every) > 80 and all(0.0 <= mode.energy_share <= 1.0 for mode in every)
 
 
 def test_samples_are_left_out_while_a_sensor_settles():

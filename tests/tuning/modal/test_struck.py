@@ -7,9 +7,11 @@ from scipy.signal import decimate, lfilter, resample_poly
 from experiments.validation.modal_identification import log_of
 from tests.oracles.planted_structures import random_structure, sampled
 from tuning import Log, identify_modes
+from tuning.modal.decay.stretches import Stretch
 from tuning.modal.forced.likelihood import linear_fit, refined_poles, whitened
 from tuning.modal.forced.significance import criterion, criterion_with
 from tuning.modal.result import IdentifiedMode
+from tuning.modal.samples import Samples
 from tuning.modal.struck.blows import (
     FROM_AMBIENT,
     Blow,
@@ -23,6 +25,7 @@ from tuning.modal.struck.blows import (
     struck_modes,
     with_missed_blows,
 )
+from tuning.modal.struck.whole_log import blows_left_out
 
 RATE, BAND, FINER = 40.0, (0.5, 8.0), 8
 FREQUENCIES, DAMPING = np.array([0.83, 1.46, 3.7, 6.3]), np.array([0.006, 0.0054, 0.003, 0.012])
@@ -198,6 +201,32 @@ def test_a_first_choice_has_the_criterion_of_a_fit_with_the_pole():
     fit = linear_fit(lines, POLES[:3])
     with_it = criterion(linear_fit(lines, POLES), 4)
     assert criterion_with(lines, fit, 3, complex(POLES[3])) == pytest.approx(with_it, rel=1e-9)
+
+
+def two_blows(first=3.0, second=6.0):
+    """Samples of a mode of 4 Hz, struck hard at 3 s and softly at another time, and the marks."""
+    rate = 100.0
+    times = np.arange(1200) / rate
+    since = np.maximum(times - np.array([[first], [second]]), 0.0)
+    parts = np.exp(-0.8 * since) * np.sin(2 * np.pi * 4.0 * since)
+    marks = np.isin(np.arange(times.size), [int(first * rate), int(second * rate)])
+    return Samples(((parts[0] + 0.1 * parts[1])[:, None],), (10.0,), rate, ()), (marks,)
+
+
+@pytest.mark.parametrize(
+    ("second", "starts", "said"),
+    [
+        (6.0, (302, 602), ""),
+        (6.0, (602,), "is left out: what follows it is not the free decay that tells most"),
+        (4.5, (452,), "is left out: the next blow comes 1.5 s later"),
+    ],
+)
+def test_a_hard_blow_whose_decay_is_not_used_is_named(second, starts, said):
+    samples, marks = two_blows(second=second)
+    decays = [Stretch(0, start, start + 250, 2.0) for start in starts]
+    found = blows_left_out(samples, marks, decays, (2.0, 10.0))
+    assert found == ([f"the hardest blow, at 13 s, {said}"] if said else [])
+    assert blows_left_out(samples, (np.zeros(1200, bool),), decays, (2.0, 10.0)) == []
 
 
 def test_marks_of_a_blow_and_its_rebounds_are_one():

@@ -198,7 +198,7 @@ NOT_REPRODUCED = "not the same in parts of the window"
 NONLINEARITY = "what nonlinearity adds to the mode of"
 NONLINEAR_DECAY = 2.5, 4.5  # decay rates over that of a mode, of what its nonlinearity adds to it
 SKIRT_BANDWIDTHS = 4.0  # half widths of a peak, to where its amplitude has fallen to a quarter
-NONLINEAR_MAC = 0.95
+NONLINEAR_MAC = 0.95  # of a mode and what its nonlinearity adds to it
 # Over that of the mode. Its phase moves by k in all, so that k^2 / 3 of its energy is that of the
 # first such term; fits of more than two terms that Duffing's equation asks for give up to four.
 MAX_CUBE_ENERGY = 4.0

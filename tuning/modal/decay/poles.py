@@ -22,7 +22,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 NOISE_SMOOTHING_BINS = 12  # bins on either side over which the noise level is averaged
-MAX_MODES = 24
+MAX_MODES = 24  # of a decay, in three octaves
 CLEAR_GAIN = 20.0  # least gains in likelihood of a mode that is not tried to be left out
 MAX_ADDED_MODES = 6  # to those that a subspace method has found
 FALSE_ALARM_PROBABILITY = 1e-4  # of a mode found in noise, over all bins

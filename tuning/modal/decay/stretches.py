@@ -89,8 +89,8 @@ def _until_rise(energy, width, past, ratio) -> int:
     return past + int(np.argmax(risen)) if risen.any() else energy.size
 
 
-AR_ORDER = 24
-AR_ITERATIONS = 6
+AR_ORDER = 24  # of the model by which samples are predicted
+AR_ITERATIONS = 6  # of reweighting
 AR_ROWS = 20_000  # equations from which its coefficients are found
 QUIET_QUANTILE = 0.2  # of the blocks, by their prediction errors
 BLOW_SD = 10.0  # prediction errors of quiet blocks, beyond which the structure is struck
@@ -118,7 +118,7 @@ CONTACT_CYCLES = 0.5  # of the strongest vibration, in which marks are those of 
 # of the time to the second for the first, several need less. What a load shakes that crosses stays
 # up until it has left: the first neper takes most of the time to the second.
 FALLS = 1.0, 2.0
-MAX_FIRST_SHARE = 0.6
+MAX_FIRST_SHARE = 0.6  # of the time to the second, for the first
 
 
 class Stretch(NamedTuple):

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+HIGHEST_LINE = 1.15  # of transforms, over the upper end of a band
 MAX_ANGLE = 2.8  # of z on the circle, of a band from 0
 PART_LINES = 4096  # lines whose products are formed at once
 # Products of driving signals over the largest, below which they are none: a thousandth of the

@@ -218,12 +218,11 @@ def pole_directions(
 REST_POWERS = (-2, -1, 0, 1, 2)  # of z, for modes above the band and those not found
 REST_TERMS = len(REST_POWERS) + 2  # with those of modes below the band
 FEWER_REST_POWERS = (0, 1)  # with which poles are compared
-STEPS = 12
+STEPS = 12  # of Gauss and Newton, at most
 WIDE = 16  # lines on either side whose errors tell the level of a line
 MIN_SPREAD = 1e-3  # of errors, over that of all lines
-MIN_PIVOT = (
-    1e-4  # of Cholesky's factor, whose relative errors are those of rounding over its square
-)
+# of Cholesky's factor, whose relative errors are those of rounding over its square
+MIN_PIVOT = 1e-4
 MAX_STEP = 0.5  # of a pole, over its width
 CONVERGED = 1e-4  # step over the decay rate; what is left after it is of the order of its square
 MAX_SHIFT = 3.0  # from the start, over the width; beyond, a pole is none of the data

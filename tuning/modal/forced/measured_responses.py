@@ -22,7 +22,7 @@ from tuning.modal.samples import samples_of, with_channels
 
 ESTIMATORS = ("H1", "H2", "Hv")
 SEGMENTS = 8  # into which records of a random force are divided if nothing is said
-MIN_SEGMENT = 16
+MIN_SEGMENT = 16  # samples
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,12 +13,14 @@ from jaxtyping import Complex, Float
 from scipy.signal import detrend
 
 from tuning.modal.ambient import (
+    MAX_ORDER,
     Candidate,
     divided_band,
     overlapping,
     without_duplicates,
 )
 from tuning.modal.forced.common_denominator import (
+    HIGHEST_LINE,
     Lines,
     fit_common_denominator,
     products,
@@ -37,17 +39,14 @@ from tuning.modal.result import MIN_COLLINEARITY, IdentifiedMode, rejection_reas
 from tuning.modal.stabilisation import Diagram, stabilise
 from tuning.modal.subspace import Poles
 
-MAX_ORDER = 60
 MAX_ADDED = 12  # poles, one at a time
-HIGHEST_LINE = 1.15  # over the upper end of a band
 PASSES = 2  # of the search for modes
 WEIGHT_DEGREE_SHARE = 0.5  # degree of the denominator that weights lines, over the highest
 MIN_WEIGHT = 1e-3  # size of the denominator, over its median, below which weights are equal
 CHANCE = 1e-3  # probability below which noise is no explanation
 SAME_POLE = 0.5  # distance of two poles over the smaller decay rate, below which they are one
-MAX_SHAPE_ERRORS = (
-    0.1  # variance of a shape, over its squares, beyond which it may be complex by chance
-)
+# variance of a shape, over its squares, beyond which it may be complex by chance
+MAX_SHAPE_ERRORS = 0.1
 
 
 class ForcedModes(NamedTuple):

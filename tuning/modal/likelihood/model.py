@@ -28,7 +28,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Complex, Float
 
-MAX_ITERATIONS = 40
+MAX_ITERATIONS = 40  # of scoring
 MAX_TRIES, MIN_DAMPING = 10, 1e-6  # of a step, whose damping grows by eight each time
 
 Point = TypeVar("Point")

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-STEPS = 12
+STEPS = 12  # of Gauss and Newton, at most
 MIN_VARIANCE = 1e-8  # of a component over the largest, for weights
 OTHER_ERROR = 0.02  # of a component over the largest: calibration, beside its stated error
 MIN_SIGNAL = 3.0  # size of a shape at the references over its error

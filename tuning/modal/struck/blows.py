@@ -29,7 +29,7 @@ from scipy.signal import detrend
 
 from tuning.modal.ambient import divided_band
 from tuning.modal.decay.poles import NEARBY_BINS, NONLINEARITY_SHARE
-from tuning.modal.forced.common_denominator import Lines, transforms
+from tuning.modal.forced.common_denominator import HIGHEST_LINE, Lines, transforms
 from tuning.modal.forced.likelihood import (
     FEWER_REST_POWERS,
     REST_POWERS,
@@ -44,7 +44,7 @@ from tuning.modal.forced.likelihood import (
 from tuning.modal.forced.modal_model import modes_of_model, unexplained
 from tuning.modal.forced.modes import mode_reason, refined_model
 from tuning.modal.forced.significance import criterion, criterion_with, promising_poles
-from tuning.modal.result import IdentifiedMode, mac_matrix
+from tuning.modal.result import SAME_MAC, IdentifiedMode, mac_matrix
 
 MAX_CONTACT = 40  # samples that a blow marks; more are a lasting excitation
 APART_CYCLES = 2.0  # of the lowest frequency, by which a missed blow is away from all others
@@ -52,7 +52,6 @@ MAX_BLOWS = 16  # whose residues are worth their time; of more, decays tell enou
 ROWS_OVER_COLUMNS = 2  # of the least squares
 WORK = 5e7  # rows times squared columns of them, which takes seconds in all
 PLACES_OVER_BINS = 8  # of instants that are tried
-HIGHEST_LINE = 1.15  # over the upper end of a band
 
 
 class Blow(NamedTuple):
@@ -330,7 +329,7 @@ def energy_along(
     return np.sum(np.fft.irfft(spectrum, length, axis=0) ** 2, axis=1)
 
 
-MIN_BLOWS = 2
+MIN_BLOWS = 2  # of a record that is fitted as a whole
 MAX_ADDED = 16  # poles, one at a time
 TRIED = 6  # for each of them
 TRIAL_STEPS = 6  # in which it is refined, before it is compared
@@ -338,7 +337,6 @@ MIN_DECAY = 0.2  # nepers, over the whole record, of a mode
 SAME_POLE = 0.1  # distance of two poles over the smaller decay rate, below which they are one
 MEDIAN_LINES = 30  # on either side of a line, whose errors tell its level
 SWING_PARTS = 20  # of a record, whose errors are compared
-SAME_MAC = 0.9
 WEAK = 0.05  # share of a mode in the energy
 MAX_ENERGY = 3.0  # of a mode, over that of the log; poles that cancel each other have more
 

@@ -1,5 +1,6 @@
 """What the decays of a log tell: in a band, in a narrower one, above it, and of whole records."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,8 @@ from tuning.modal.decay.modes import (
     follow_impacts,
     free_decay_modes,
 )
-from tuning.modal.preprocessing import HALF_POWER, kinetic_band
+from tuning.modal.decay.stretches import MIN_DECAY_CYCLES, Stretch
+from tuning.modal.preprocessing import HALF_POWER, kinetic_band, prepare
 from tuning.modal.result import is_at_edge
 from tuning.modal.samples import Samples
 from tuning.modal.stabilisation import Diagram
@@ -24,11 +26,14 @@ from tuning.modal.struck.blows import (
     FROM_AMBIENT,
     MIN_BLOWS,
     WEAK,
+    Blow,
     Search,
     alike,
     marked_blows,
     struck_modes,
 )
+
+AFTER_CYCLES = 2.0  # of the lowest frequency, in which a blow's energy is compared
 
 Band = tuple[float, float]
 Struck = tuple[Bool[np.ndarray, " time"], ...]
@@ -162,3 +167,38 @@ def _of_whole_records(candidates, samples: Samples, band, seen, poles, search: S
     ]
     every = [*(Candidate(mode, "", 1) for mode in modes), *others]
     return tuple(sorted(every, key=lambda one: one.mode.frequency)), len(whole.blows)
+
+
+def blows_left_out(
+    samples: Samples, struck: Struck, decays: Sequence[Stretch], band: Band
+) -> list[str]:
+    """A sentence if no decay that is used follows the blow that leaves most energy in a band (Hz).
+
+    `struck` are the samples at which the structure is excited.
+    """
+    blows = marked_blows(struck, samples.rate, band)
+    if not blows:
+        return []
+    prepared = prepare(samples.records, samples.starts, samples.rate, band)
+    ratio = prepared.rate / samples.rate
+    cycles = int(AFTER_CYCLES * samples.rate / band[0])
+
+    def energy(blow: Blow) -> float:
+        first = int(blow.sample * ratio)
+        part = prepared.records[blow.record][first : first + max(int(cycles * ratio), 1)]
+        return float(np.sum(part**2))
+
+    hardest = max(blows, key=energy)
+    later = [b.sample for b in blows if b.record == hardest.record and b.sample > hardest.sample]
+    last = min([hardest.sample + cycles, *later])
+    if any(
+        one.record == hardest.record and one.start <= last and hardest.sample < one.stop
+        for one in decays
+    ):
+        return []
+    start = samples.starts[hardest.record] + hardest.sample / samples.rate
+    wait = (min(later) - hardest.sample) / samples.rate if later else np.inf
+    why = "what follows it is not the free decay that tells most"
+    if wait * band[0] < MIN_DECAY_CYCLES:
+        why = f"the next blow comes {wait:.3g} s later"
+    return [f"the hardest blow, at {start:.4g} s, is left out: {why}"]
