@@ -14,7 +14,7 @@ WRITTEN = {
     "docs/explanation/thesis_changes.md": "a history: verdicts before and after new rules",
 }
 GENERATED = ("docs/_static/", "docs/reference/api/", "docs/reference/case_file/")
-GENERATED = (*GENERATED, "docs/reference/commands.md")
+GENERATED = (*GENERATED, "docs/reference/commands.md", "docs/reference/modal_constants.md")
 CODE = re.compile(r"^(```+|:::+).*?^\1", re.M | re.S)
 MARKED = re.compile(r"<!-- ([\w ]+) -->.*?<!-- end of [\w ]+ -->", re.S)  # written by code
 # A cell that is a number, with a unit perhaps; the unit 1 is none.

@@ -6,6 +6,7 @@ import inspect
 import json
 from pathlib import Path
 
+from modal_constants import EXPLAINED, table
 from plain_docstrings import as_text
 
 import jaxbeam
@@ -267,6 +268,11 @@ def parameter_help(text: str) -> dict[str, str]:
     return found
 
 
+def constants_page() -> str:
+    """Numbers of modal identification."""
+    return f"# Constants of modal identification\n\n{EXPLAINED}\n\n{table()}\n"
+
+
 def write(path: Path, text: str) -> None:
     """Write a page unless it has this text already, so that Sphinx reads only what changed."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -285,6 +291,7 @@ def _generate(app):
     for name, (part_class, listed) in tables().items():
         write(reference / "case_file" / f"{name}.md", case_page(name, part_class, listed))
     write(reference / "commands.md", command_page())
+    write(reference / "modal_constants.md", constants_page())
     schema = json.dumps(json_schema(), indent=1) + "\n"
     write(reference / "case_file" / "case.schema.json", schema)
 

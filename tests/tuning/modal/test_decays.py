@@ -307,21 +307,6 @@ def one_channel(times, values):
     return Log(times, values[:, None], ("a",), ("acceleration",), ("m/s^2",))
 
 
-def test_a_decay_that_is_cut_may_begin_before_the_cut():
-    """A load's forces were taken for part of it, and more was left out than they last."""
-    planted = sampled(random_structure(2819), "crossing", 2819, 60.0)
-    fit = identify_modes(log_of(planted))
-    assert np.abs(fit.frequencies / 3.690 - 1).min() < 0.01  # gone soon after the load has left
-    assert not compare(fit, planted).false_modes
-
-
-def test_a_decay_does_not_begin_earlier_among_poles_that_are_no_modes():
-    """Ten poles would explain the last forces of the load as well, with shares of 0.7 in all."""
-    planted = sampled(random_structure(2304), "crossing", 2304, 60.0)
-    one = compare(identify_modes(log_of(planted)), planted)
-    assert not one.missed and not one.false_modes
-
-
 def test_a_mode_of_blows_at_equal_intervals_is_no_harmonic_line():
     """Four blows, two too soft to be found: in phase, the decays of one mode look like a line."""
     planted = sampled(random_structure(930), "blows", 930, 60.0)

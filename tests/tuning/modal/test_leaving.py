@@ -1,17 +1,14 @@
-"""When the excitation of a log ends: random forces on planted modes, then none."""
+"""Decays in which something still excites the structure: what their fit leaves tells it."""
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import random_structure, sampled
 from tuning import identify_modes
 from tuning.modal.ambient import Candidate
-from tuning.modal.decay.earlier_start import earlier_start
 from tuning.modal.decay.leaving import (
     PARTS,
-    end_of_excitation,
     growing_share,
     has_split,
     shaken_until,
@@ -20,43 +17,6 @@ from tuning.modal.decay.leaving import (
 )
 from tuning.modal.decay.stretches import Stretch, after_blow
 from tuning.modal.result import IdentifiedMode
-
-RATE, SIZE = 40.0, 10
-
-
-def shaken(until, count=2400, noise=0.1, seed=0):
-    """Two channels of a mode of 4 Hz, 1 %, under white forces to a sample, with white noise."""
-    random = np.random.default_rng(seed)
-    pole = np.exp(2 * np.pi * 4 * (-0.01 + 1j) / RATE)
-    forces = random.normal(size=count) * (np.arange(count) < until)
-    forces[0] = 5.0
-    clean = np.real(lfilter([1.0], [1.0, -pole], forces))[:, None] * [1.0, 0.6]
-    values = clean + noise * clean.std() * random.normal(size=clean.shape)
-    # The best predictor of a mode, which the noise makes worse.
-    recursion = [1.0, -2 * pole.real, abs(pole) ** 2]
-    return lfilter(recursion, [1.0], values, axis=0), values, clean
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_end_of_random_forces_is_found(seed):
-    errors, values, _ = shaken(1200, seed=seed)
-    found = end_of_excitation(errors, values, np.zeros(2400, bool), SIZE)
-    assert 1200 - SIZE <= found <= 1200 + 8 * SIZE
-
-
-@pytest.mark.parametrize(("until", "seed"), [(1, 0), (1, 1), (2400, 0), (2400, 1)])
-def test_a_decay_and_lasting_forces_have_no_end(until, seed):
-    errors, values, _ = shaken(until, seed=seed)
-    assert end_of_excitation(errors, values, np.zeros(2400, bool), SIZE) == 0
-
-
-def test_fast_modes_that_are_not_predicted_are_no_forces():
-    """Errors that decay with a mode, whose energy is little of the whole."""
-    random = np.random.default_rng(2)
-    slow, fast = (np.exp(-np.arange(2400) / length) for length in (900.0, 150.0))
-    values = (10 * slow + fast)[:, None] * random.normal(size=(2400, 2))
-    errors = (1 + 3 * fast[:, None]) * random.normal(size=(2400, 2))
-    assert end_of_excitation(errors, values, np.zeros(2400, bool), SIZE) == 0
 
 
 def test_a_part_with_more_than_noise_ends_the_excitation():
@@ -201,21 +161,3 @@ def test_loads_whose_vibration_falls_before_they_leave(seed):
     one = compare(fit, planted)
     assert not one.missed and not one.false_modes
     assert [start > 29.5 for start, _ in fit.windows] == [True]
-
-
-def test_a_decay_begins_earlier_than_its_fast_mode_tells():
-    """Two modes under random forces until 20 s; at 22 s only the slow one is left."""
-    rate, count, until, cycle = 40.0, 2000, 800, 10.0
-    poles = np.array([-0.15 + 25j, -3.0 + 40j])
-    found = []
-    for seed in range(8):
-        random = np.random.default_rng(seed)
-        forces = random.normal(size=count) * (np.arange(count) < until)
-        clean = sum(
-            np.real(lfilter([1.0], [1.0, -np.exp(pole / rate)], forces))[:, None] * [1.0, share]
-            for pole, share in zip(poles, (0.7, -0.8), strict=True)
-        )
-        values = clean + 0.02 * np.std(clean) * random.normal(size=(count, 2))
-        found.append(earlier_start(values, until + 80, rate, (2.0, 12.0), poles[:1], cycle))
-    assert min(found) >= until
-    assert np.median(found) <= until + 40

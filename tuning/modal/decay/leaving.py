@@ -1,14 +1,4 @@
-"""When the excitation of a log ends: a load that shook the structure has left it.
-
-While a rough load crosses, no sample stands out as that of a blow does, but past samples predict
-the coming ones worse than they do afterwards. The variance of prediction errors is that of the
-noise, and a share of the energy E of the vibration, which a model that is not quite right leaves;
-until an instant that of the forces may be added,
-
-    v(t) = a + b E(t) + c 1(t < t_0),   a, b, c >= 0,
-
-if the likelihood of the errors' mean squares, block by block, gains by it more than by chance, and
-more than by a decay c exp(-t / T) in its place, which modes have that decay faster than most.
+"""Decays in which something still excites the structure, told by what their fit leaves.
 
 A load that excites little while it leaves shows in the fit: decaying modes leave the noise alone,
 which is the same throughout, but more where forces act; or the fit explains these, too, by several
@@ -16,21 +6,12 @@ modes where there is one, or by vibrations that grow.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.optimize import nnls
+from jaxtyping import Float
 
 from tuning.modal.ambient import Candidate
 from tuning.modal.decay.stretches import Stretch
 from tuning.modal.result import mac_matrix
 
-MIN_GAIN = 12.0  # of the logarithm of the likelihood: of all instants tried, one in ten thousand
-LATEST_LOSS = 2.0  # of the same, within which the latest instant is taken
-MIN_BLOCKS = 10  # before an instant and after it
-MIN_RAISED = 2 / 3  # of the blocks before it, in which errors are more than after it
-MAX_TRIED = 60  # instants
-ITERATIONS = 8  # of the least squares of variances
-DECAY_TIMES = 2.0 ** -np.arange(7)  # T, over the duration
-MAX_PARTS = 4  # that are searched one after another, as a load may shake less towards its end
 PARTS = 10  # of a decay, whose errors are compared
 MIN_RATIO, RATIO_SDS = 2.5, 5.0  # of errors of a part to the median; or deviations of the ratio
 SPLIT_RATIO, SPLIT_MAC = 1.1, 0.9  # of three frequencies, and of the shapes of modes of one
@@ -168,73 +149,3 @@ def undisturbed(
     )
     more = (errors > MIN_RATIO * errors.min()) & (errors > least * energy)
     return tuple(one for one, has in zip(decays, more, strict=True) if not has)
-
-
-def end_of_excitation(
-    errors: Float[np.ndarray, "sample channel"],
-    record: Float[np.ndarray, "sample channel"],
-    struck: Bool[np.ndarray, " sample"],
-    size: int,
-) -> int:
-    """Sample from which on errors of prediction are those of a free structure; 0 if none is.
-
-    Blocks have `size` samples; those with `struck` samples, of blows, do not count.
-    """
-    scale = np.maximum(np.mean(errors**2, axis=0), 1e-300)
-    level = np.maximum(np.mean(record**2, axis=0), 1e-300)
-    squares, energy = _blocks(errors**2 / scale, size), _blocks(record**2 / level, size)
-    marks = struck[: size * len(squares)].reshape(-1, size).any(axis=1)
-    kept = np.flatnonzero(~(marks | np.roll(marks, 1)))
-    freedom, first = size * errors.shape[1], 0
-    for _ in range(MAX_PARTS):
-        found = _step(squares[kept[first:]], energy[kept[first:]], freedom)
-        if not found:
-            break
-        first += found
-    return size * (int(kept[min(first, kept.size - 1)]) + 1) if first else 0
-
-
-def _blocks(values, size):
-    """Means over channels and blocks of samples."""
-    count = len(values) // size
-    return values[: count * size].mean(axis=1).reshape(count, size).mean(axis=1)
-
-
-def _step(squares, energy, freedom) -> int:
-    """Blocks before the latest instant at which the errors may have fallen; 0 if they did not."""
-    count = len(squares)
-    tried = np.arange(MIN_BLOCKS, count - MIN_BLOCKS, max(count // MAX_TRIED, 1))
-    if not tried.size or not energy.any():
-        return 0
-    steady, places = np.stack([np.ones(count), energy], axis=1), np.arange(count)
-    least = min(
-        _fit(squares, np.column_stack([steady, np.exp(-places / (share * count))]))[0]
-        for share in DECAY_TIMES
-    )
-
-    def gains_at(instants):
-        gains = []
-        for instant in instants.tolist():
-            cost, variance = _fit(squares, np.column_stack([steady, places < instant]))
-            raised = np.mean(squares[:instant] > variance[:instant]) > MIN_RAISED
-            gains.append((least - cost) * freedom / 2 if raised else 0.0)
-        return np.array(gains)
-
-    gains = gains_at(tried)
-    if gains.max() < MIN_GAIN:
-        return 0
-    reach = max(count // MAX_TRIED, 1)
-    best = int(tried[np.argmax(gains)])
-    tried = np.arange(max(best - reach, MIN_BLOCKS), min(best + reach, count - MIN_BLOCKS) + 1)
-    gains = gains_at(tried)
-    return int(tried[np.flatnonzero(gains > gains.max() - LATEST_LOSS)[-1]])
-
-
-def _fit(squares, columns):
-    """Least cost of mean squares, and their variances but for the last of three columns."""
-    variance = np.full(len(squares), squares.mean())
-    found = np.zeros(columns.shape[1])
-    for _ in range(ITERATIONS):
-        found = nnls(columns / variance[:, None], squares / variance)[0]
-        variance = np.maximum(columns @ found, 1e-3 * squares.mean())
-    return float(np.sum(np.log(variance) + squares / variance)), columns[:, :2] @ found[:2]

@@ -12,7 +12,6 @@ from tuning.modal.ambient import (
     overlapping,
     subspace_modes,
 )
-from tuning.modal.decay.earlier_start import earlier_start
 from tuning.modal.decay.fit import (
     DecayFit,
     decay_candidates,
@@ -23,7 +22,6 @@ from tuning.modal.decay.fit import (
 from tuning.modal.decay.free_end import free_end
 from tuning.modal.decay.leaving import (
     PARTS,
-    end_of_excitation,
     without_excitation,
 )
 from tuning.modal.decay.stretches import (
@@ -32,9 +30,7 @@ from tuning.modal.decay.stretches import (
     after_soft_blows,
     dominate,
     excited_samples,
-    follows,
     free_decays,
-    prediction_errors,
     stacked,
     until_soft_blow,
 )
@@ -44,7 +40,6 @@ from tuning.modal.stabilisation import Diagram
 
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
 MIN_SHARE_OF_MODES = 0.5  # of the energy at the beginning of decays
-SAFE_SHARE_OF_MODES = 0.9  # the same of a decay that is to begin earlier
 MIN_LEVEL_AT_START = 3.0  # energy of the first part of such a decay over the mean
 SHORTER_PARTS = 0.6, 0.35  # of an impact's decay, that may tell more than all of it
 MAX_CUTS = 3  # of a decay in which the structure is found to be excited
@@ -67,7 +62,7 @@ def excited(
 ) -> tuple[Bool[np.ndarray, " time"], ...]:
     """Samples of each record at which the structure is excited, at the rate of the log.
 
-    They are those struck by blows, and all until a crossing load has left (`leaving`, `free_end`).
+    They are those struck by blows, and all until a crossing load has left (`free_end`).
 
     Below half the band (Hz) drift is removed; above it all frequencies count.
     """
@@ -79,14 +74,12 @@ def excited(
     cycle = ends.rate / strongest_frequency(ends.records, ends.rate, derivatives, narrow)
     independent = min(2 * (narrow[1] - narrow[0]) / ends.rate, 1.0)
     found = []
-    for record, own, end in zip(samples.records, prepared.records, ends.records, strict=True):
+    for record, end in zip(samples.records, ends.records, strict=True):
         values = sosfiltfilt(sos, detrend(record, axis=0), axis=0)
         marks = excited_samples(values, samples.rate, 1 / frequency)
         last = int(np.flatnonzero(marks)[-1] * len(end) / marks.size) + 1 if marks.any() else 0
         start = free_end(end, cycle, independent, last)
-        if start is None:
-            marks = _with_excitation(marks, own, max(int(prepared.rate / frequency), 4))
-        else:
+        if start is not None:
             # Decays before it, between blows, are told from others by their errors.
             decayed = until_soft_blow(end[last:start], max(int(2 * cycle), 4)) if last else 0
             first = last + (decayed if decayed < start - last else 0)
@@ -107,16 +100,6 @@ def band_of_ends(
     low, high = kinetic_band(halves, samples.rate, derivatives, HALF_POWER)
     low, high = max(low, band[0]), min(high, band[1])
     return (low, high) if low < high else band
-
-
-def _with_excitation(marks, record, size) -> Bool[np.ndarray, " time"]:
-    """Struck samples, with all before the end of a lasting excitation of the record in the band."""
-    ratio = marks.size / len(record)
-    coarse = np.zeros(len(record), bool)
-    coarse[np.minimum((np.flatnonzero(marks) / ratio).astype(int), len(record) - 1)] = True
-    errors = np.stack([prediction_errors(v, np.ones(v.size)) for v in record.T], axis=1)
-    ends = end_of_excitation(errors, record, coarse, size)
-    return marks | (np.arange(marks.size) < ends * ratio)
 
 
 def follow_impacts(
@@ -170,7 +153,6 @@ def free_decay_modes(
         return None
     if all(one.impact for one in decays):
         return _told(_of_best_length(one, samples, band, order), samples)
-    found = one.used
     for _ in range(MAX_CUTS):
         rest = one.used if given else _rest(one, samples, struck, band, cycle)
         if rest == one.used:
@@ -181,9 +163,6 @@ def free_decay_modes(
     else:
         if kind is None and _rest(one, samples, struck, band, cycle) != one.used:
             return None
-    if not given:
-        cut = one.used[0].start not in {stretch.start for stretch in found}
-        one = _from_earlier(one, samples, struck, band, cycle, order, cut)
     if given or after_soft_blows(decays, struck):
         most = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_AFTER_SOFT_BLOWS
         explained = _unexplained(one.measured, one.fitted) < most
@@ -281,31 +260,6 @@ def _rest(one: _Fitted, samples: Samples, struck, band, cycle) -> tuple[Stretch,
         independent=2 * (band[1] - band[0]) / samples.rate,
         after_blow=after_blow(one.used[0], struck[one.used[0].record], cycle),
     )
-
-
-def _from_earlier(one: _Fitted, samples: Samples, struck, band, cycle, order, cut) -> _Fitted:
-    """The fit of a decay from where it begins, if an excitation has lasted for cycles before it.
-
-    What was `cut` from a decay was such an excitation, too.
-    """
-    decay, *others = one.used
-    if others or not (cut or follows(decay, struck[decay.record], cycle)):
-        return one
-    poles = [
-        mode.pole
-        for part, fit in one.fits
-        for mode in fit.modes
-        if len(one.fits) == 1 or part[0] <= mode.frequency < part[1]
-    ]
-    values = samples.records[decay.record][: decay.start + len(one.measured)]
-    start = earlier_start(values, decay.start, samples.rate, band, np.array(poles, complex), cycle)
-    if start == decay.start:
-        return one
-    again = _fitted((decay._replace(start=start),), samples, band, order)
-    if again is None or _rest(again, samples, struck, band, cycle) != again.used:
-        return one
-    # Forces are explained by poles that are no modes.
-    return again if again.share_of_modes > min(one.share_of_modes, SAFE_SHARE_OF_MODES) else one
 
 
 def _unexplained(measured, fitted) -> float:

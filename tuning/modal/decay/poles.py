@@ -306,12 +306,6 @@ def refine(
     return _fit_amplitudes(poles, spectrum, level, nuisance)
 
 
-def same_poles(poles: Complex[np.ndarray, " mode"], spectrum: Spectrum) -> PoleFit:
-    """Fit of a spectrum by given poles (1/s) as they are, weighted by its own noise level."""
-    level = _robust_level(spectrum.values)
-    return _fit_amplitudes(poles, spectrum, level, _nuisance_columns(spectrum))
-
-
 def with_one_more(fit: PoleFit, spectrum: Spectrum) -> PoleFit:
     """Poles of a fit of a spectrum, refined beside one that explains most of its residual."""
     level = _robust_level(fit.residual) + _misfit_level(spectrum)

@@ -1,7 +1,5 @@
 """Table of the numbers that modal identification chooses: value, meaning, and where each is from.
 
-python -m docs.modal_constants
-
 They stand in the code beside what they decide, with a comment; the table is printed from there for
 the page on methods (`docs/explanation/modal.md`).
 """
@@ -12,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-ROOM = Path(__file__).parents[1] / "tuning" / "modal"
+ROOM = Path(__file__).parents[2] / "tuning" / "modal"
 # The first that a name and its comment match.
 SOURCES = {
     r"\b(1[89]|20)\d\d\b": "literature",
@@ -22,6 +20,10 @@ SOURCES = {
     r"ORDER|ROWS|BLOCKS|LAGS|SAMPLES|SEGMENTS|BINS|LINES|MAX_ADDED|MAX_TRIED|TAPERS": "resolution",
 }
 OTHERWISE = "judgement"
+EXPLAINED = """Each number stands in the code beside what it decides. Where it is from:
+*literature*; *statistics*, as probabilities of false alarms; *planted logs*, which show it;
+*resolution* and *numerics*, of which other values cost time and change little; *judgement*, chosen
+by hand on planted structures, without a derivation."""
 
 
 class Constant(NamedTuple):
@@ -36,7 +38,7 @@ class Constant(NamedTuple):
 
 def constants() -> Iterator[Constant]:
     """Constants of modules of `tuning.modal` that are numbers, file by file."""
-    for path in sorted(ROOM.rglob("*.py")):
+    for path in sorted(set(ROOM.rglob("*.py")) - {ROOM / "plot.py"}):
         text = path.read_text(encoding="utf-8")
         lines = text.splitlines()
         for node in ast.parse(text).body:
@@ -60,11 +62,11 @@ def _has_number(node: ast.expr) -> bool:
 
 def _meaning(lines: list[str], first: int, last: int) -> str:
     """The comment beside a constant, and those in the lines above it."""
-    above = []
+    above, inside = [], first
     while first and lines[first - 1].startswith("#"):
         first -= 1
         above.insert(0, lines[first].lstrip("# "))
-    beside = [re.sub(r"^.*?#\s*", "", line) for line in lines[:last][-1:] if "#" in line]
+    beside = [line.split("#")[1].strip() for line in lines[inside:last] if "#" in line]
     return " ".join([*above, *beside])
 
 
@@ -75,14 +77,8 @@ def _source(text: str) -> str:
 def table() -> str:
     """The table in Markdown."""
     rows = [
-        f"| `{one.name}` | {one.value} | {one.meaning} | {one.source} | `{one.file}` |".replace(
-            "||", "|"
-        )
+        f"| `{one.name}` | {one.value} | {one.meaning} | {one.source} | `{one.file}` |"
         for one in constants()
     ]
     head = ["| name | value | meaning | from | file |", "| --- | --- | --- | --- | --- |"]
     return "\n".join([*head, *rows])
-
-
-if __name__ == "__main__":
-    print(table())
