@@ -31,6 +31,7 @@ tuning.parameters  tuning.modal
 tuning.fit
 tuning.weighing  tuning.control
 tuning
+jaxbeam.tuning
 experiments.thesis  experiments.demo
 experiments.studies
 experiments.benchmarks
