@@ -445,6 +445,11 @@ def _scan(params, *avals):
     return loop
 
 
+def _along_first(mask, array):
+    """A mask over the first axes of an array, to be broadcast along the others."""
+    return np.reshape(mask, (*np.shape(mask), *[1] * (np.ndim(array) - np.ndim(mask))))
+
+
 def _while(params, *_):
     condition, body = (
         InterpretedProgram(params["cond_jaxpr"]),
@@ -455,8 +460,12 @@ def _while(params, *_):
     def loop(*arrays):
         first, rest = arrays[:of_condition], arrays[of_condition:]
         second, carry = rest[:of_body], rest[of_body:]
-        while condition(*first, *carry)[0]:
-            carry = body(*second, *carry)
+        while np.any(go_on := condition(*first, *carry)[0]):
+            found = body(*second, *carry)
+            if np.ndim(go_on):  # a batch of loops, each of which ends by itself
+                pairs = zip(found, carry, strict=True)
+                found = [np.where(_along_first(go_on, new), new, old) for new, old in pairs]
+            carry = found
         return list(carry)
 
     return loop

@@ -190,6 +190,12 @@ FUNCTIONS = {
             lax.scan(lambda sum_, x: (sum_ - x, None), 1.0, a, reverse=True),
             lax.fori_loop(0, 5, lambda i, x: x * 0.5 + i, a),
             lax.while_loop(lambda x: x.sum() < 10, lambda x: x + 1, a),
+            # Each ends by itself.
+            jax.vmap(
+                lambda x: lax.while_loop(
+                    lambda x: x[0] < 9, lambda x: 2 * x + 3, jnp.stack([x, 1 - x])
+                )
+            )(a),
         ],
         FLAT,
     ),
