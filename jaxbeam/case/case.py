@@ -222,6 +222,11 @@ def unknown_address_error(case: Case, address: str) -> ValueError:
             f"the case has no number at address {address!r}, as it is left out there: give it a"
             " value first"
         )
+    key = address.partition(".")[0]
+    if getattr(case, key, case) in (None, ()):
+        return ValueError(
+            f"the case has no number at address {address!r}, as it has no {key}: add one first"
+        )
     names = list(addresses(case))
     nearest = difflib.get_close_matches(present_address(address), names, n=1, cutoff=0.5)
     hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; it has {', '.join(names)}"

@@ -274,6 +274,7 @@ def test_settings_change_numbers_words_and_counts(full):
         ("beam.length", "long", "beam.length must be one number, not 'long'"),
         ("beam.length", -1.0, "beam.length must be positive; it is -1 m"),
         ("bean.length", 1.0, "no number at address 'bean.length'; did you mean 'beam.length'?"),
+        ("profile.scale", 1.0, "'profile.scale', as it has no profile: add one first"),
     ],
 )
 def test_invalid_settings_are_refused(full, address, value, message):
