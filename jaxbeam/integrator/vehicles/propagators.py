@@ -9,6 +9,8 @@ vehicle follow exactly (`propagators`), and the springs press on the surface at 
 where z are its states at the start of the step.
 """
 
+import math
+
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -73,19 +75,28 @@ def vehicle_propagators(
 
 
 def _at_once(group: VehicleGroup, lengths: Float[Array, " length"]) -> VehiclePropagators:
-    """Propagators over steps of no length."""
-    states, wheels, batch_size = group.B.shape
+    """Propagators over steps of no length (s), to first order: events at one time may part."""
+    A, B, H = (xp.asarray(part, lengths.dtype) for part in (group.A, group.B, group.H))
+    states, wheels, batch_size = B.shape
     rows = wheels * NODE_COUNT
+    fractions = np.append(GAUSS_NODES, 1.0)
+    # Integrals of the polynomials of the nodes, up to each fraction of a step.
+    divisors = [math.factorial(power) for power in range(1, NODE_COUNT + 1)]
+    integrals = fractions[:, None] * (force_weights() / divisors).sum(axis=-1)
+    to_end = xp.einsum("f,swb->swfb", integrals[-1], B)
+    speeds = xp.einsum("c,wsb,stb->wctb", GAUSS_NODES, H, A)
+    response = xp.einsum("cf,wsb,svb->wcvfb", integrals[:NODE_COUNT], H, B)
 
-    def of_all(matrix):
-        shape = *lengths.shape, *matrix.shape[:2], batch_size
-        return xp.broadcast_to(xp.asarray(matrix, lengths.dtype), shape)
+    def first_order(start, slope, columns):
+        shape = -1, columns, batch_size
+        start, slope = xp.asarray(start, lengths.dtype), slope.reshape(shape)
+        return xp.broadcast_to(start, slope.shape) + lengths[:, None, None, None] * slope
 
     return VehiclePropagators(
-        of_all(np.eye(states)[..., None]),
-        of_all(np.zeros((states, rows, 1))),
-        of_all(xp.repeat(group.H, NODE_COUNT, axis=0)),
-        of_all(np.eye(rows)[..., None]),
+        first_order(np.eye(states)[..., None], A, states),
+        first_order(xp.zeros((states, rows, 1)), to_end, rows),
+        first_order(xp.repeat(H, NODE_COUNT, axis=0), speeds, states),
+        first_order(np.eye(rows)[..., None], -response, rows),
     )
 
 

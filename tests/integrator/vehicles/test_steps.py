@@ -24,6 +24,26 @@ LENGTHS = np.array([0.02, 3e-3])
 
 
 @pytest.mark.parametrize("name", VEHICLES)
+def test_steps_of_no_length_have_the_derivative_of_short_ones(name):
+    """Wheels that enter at one time may part."""
+    group = load_set(jb.Case(BEAM, loads=[VEHICLES[name]])).wheels.vehicles[0]
+
+    def at(length):
+        return vehicle_propagators(group, length)
+
+    step, none = 1e-8, np.zeros(1)
+    value, found = jax.jvp(at, (none,), (np.ones(1),))
+    after, before = at(step + none), at(none)
+    for part, slope, later, start in zip(
+        *map(jax.tree.leaves, (value, found, after, before)), strict=True
+    ):
+        assert_allclose(part, start, atol=1e-15)
+        expected = (later - start) / step
+        size = np.abs(expected).max()
+        assert_allclose(slope, expected, rtol=1e-5, atol=2e-5 * size)
+
+
+@pytest.mark.parametrize("name", VEHICLES)
 def test_a_step_is_that_of_scipy(name):
     """Heights of the surface and their rates are polynomials, which the nodes determine."""
     loads = load_set(jb.Case(BEAM, loads=[VEHICLES[name]]))
