@@ -136,6 +136,24 @@ def test_actions_at_one_time_are_separate_events_in_their_order():
     np.testing.assert_allclose(later.lengths, np.diff(later.times))
 
 
+def test_rounding_keeps_the_order_of_actions_at_one_time():
+    """A command after one period and the next control: products and sums that are equal."""
+    period, count = 0.0052, 40
+    numbers = np.arange(count)
+    sent = Transmission(numbers * period, (numbers + 1) * period)
+    schedule = controller_schedule(np.array([0.2]), sent, [], np.zeros(0), moving=True)
+
+    def times(period, share=0.0):
+        """Times of commands are too early by a share of themselves."""
+        late = (numbers * period + period) * (1 - share)
+        return schedule.moved(jnp.concatenate([numbers * period, late, jnp.full(2, 0.2)])).times
+
+    for share in (0.0, 1e-15):
+        moved, derivative = jax.jvp(jax.jit(lambda p, s=share: times(p, s)), (period,), (1.0,))
+        assert np.diff(moved).min() >= 0
+        assert_allclose(derivative[1:-2], moved[1:-2] / period, rtol=1e-12, atol=1e-12)
+
+
 GROWING = jb.Case(
     LOOP.beam,
     sensors=[jb.Sensor(0.3)],
