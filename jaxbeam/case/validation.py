@@ -84,6 +84,7 @@ def check_plant(case: Case) -> None:
     _check_labels(case.sensors)
     for i, sensor in enumerate(case.vehicle_sensors):
         _check_vehicle_sensor(f"vehicle_sensors.{i}", sensor, case)
+        _check_sampling(f"vehicle_sensors.{i}", sensor, case)
 
 
 def _check_positions(address: str, part: Any, length: Float[Array, ""]) -> None:
@@ -254,9 +255,13 @@ def _check_absorber_sensor(address: str, sensor: VehicleSensor, case: Case) -> N
         )
 
 
-def _check_sampling(address: str, sensor: Sensor, case: Case) -> None:
-    """Validate the sampling period of a sensor: within the run, and short enough for its filter."""
+def _check_sampling(address: str, sensor: Sensor | VehicleSensor, case: Case) -> None:
+    """Validate the sampling period of a sensor: within the run, and short enough for its filter.
+
+    Controllers sample the sensors of the beam only.
+    """
     period, run = sensor.sampling_period, case.run
+    controller = case.controller if isinstance(sensor, Sensor) else None
     if period is not None:
         if (
             is_concrete(period)
@@ -267,12 +272,13 @@ def _check_sampling(address: str, sensor: Sensor, case: Case) -> None:
                 f"{address}.sampling_period must not exceed the run's duration,"
                 f" {concrete(run.duration):g} s; it is {concrete(period):g} s"
             )
-    elif case.controller is not None and case.controller.period is not None:
-        period = case.controller.period
-    elif case.controller is None or case.controller.open_loop:
+    elif controller is not None and controller.period is not None:
+        period = controller.period
+    elif controller is None or controller.open_loop:
         period = 1 / concrete(run.sample_rate) if is_concrete(run.sample_rate) else None
-    if sensor.has_digital_filter and period is not None:
-        error = nyquist_error(f"{address}.filter.cutoff", sensor.filter.cutoff, period)
+    filter = sensor.filter
+    if filter is not None and filter.realisation == "digital" and period is not None:
+        error = nyquist_error(f"{address}.filter.cutoff", filter.cutoff, period)
         if error is not None:
             raise ValueError(error)
 

@@ -261,6 +261,24 @@ def test_invalid_sensors_are_refused(changes, message):
 
 
 @pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"filter": Filter(1000.0)}, "filter.cutoff must be below half the sampling frequency"),
+        (
+            {"filter": Filter(60.0), "sampling_period": 0.01},
+            "frequency, 50 Hz; it is 60 Hz: lower it",
+        ),
+        ({"sampling_period": 0.5}, "must not exceed the run's duration, 0.4 s; it is 0.5 s"),
+    ],
+)
+def test_vehicle_sensors_are_refused_before_work_too(changes, message):
+    load = jb.VehicleLoad(model="half-truck", speed=2.0)
+    sensors = (jb.planar.VehicleSensor(body="axle 1", **changes),)
+    with pytest.raises(ValueError, match="vehicle_sensors.0.*" + message):
+        check_case(dataclasses.replace(CASE, loads=(load,), vehicle_sensors=sensors))
+
+
+@pytest.mark.parametrize(
     ("filter", "message"),
     [
         (10.0, "sensors.0.filter holds 10.0; it takes a table of its own"),
