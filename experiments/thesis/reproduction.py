@@ -1,5 +1,6 @@
 """Runs experiments by name, and writes their numbers, verdicts and figures to one report."""
 
+import contextlib
 import dataclasses
 import importlib
 import json
@@ -7,7 +8,7 @@ import multiprocessing
 import signal
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -25,6 +26,8 @@ from experiments.thesis.verdicts import (
 )
 from jaxbeam import rigs
 from jaxbeam.files.report import check_report_folder, write_report
+from jaxbeam.runtime.interrupts import keeping
+from jaxbeam.runtime.whole_file import whole_file
 
 MODULES = (
     "thesis.chapter2.frequencies",
@@ -42,6 +45,7 @@ MODULES = (
     "studies.fragility",
 )
 OUTPUT_FOLDER = "out/reproduce"
+REPORT_FILES = "report.md", "report.html", "report.json"
 LONGEST = ("optimal-control", "sensed")  # started first, so that no core waits for them at the end
 
 
@@ -82,6 +86,7 @@ def reproduce(
 ) -> list[ExperimentRun]:
     """Run experiments in `processes` and write report.md, .html, .json and figures to a folder.
 
+    The report has the experiments that are done, so that an interrupt loses none of them.
     `report_progress` receives the text of each experiment, in order. Raises ValueError for an
     unknown name, FileExistsError if the folder is not empty and `overwrite` is not set.
     """
@@ -89,17 +94,35 @@ def reproduce(
     folder = Path(folder)
     check_report_folder(folder, overwrite)
     folder.mkdir(parents=True, exist_ok=True)
-    runs = []
-    for run in _run_all(names, folder, processes):
-        report_progress(report.as_text(run))
-        runs.append(run)
-    sections = report.sections(runs)
-    write_report(folder, report.TITLE, sections, style=report.VERDICT_STYLE, overwrite=True)
-    (folder / "report.json").write_text(json.dumps(as_dict(runs), indent=2), encoding="utf-8")
+    runs, kept = [], []  # those in the report
+
+    def sentence() -> str:
+        left = " ".join(name for name in names if name not in kept)
+        files = ", ".join(str(folder / name) for name in REPORT_FILES)
+        words = f"{len(kept)} of {len(names)} experiments are kept in {files}"
+        return f"{words}: go on with reproduce {left} and another folder" if kept else ""
+
+    with keeping(sentence), contextlib.closing(_run_all(names, folder, processes)) as done:
+        for run in done:
+            report_progress(report.as_text(run))
+            runs.append(run)
+            _write(folder, runs)
+            kept.append(run.experiment.name)
     return runs
 
 
-def _run_all(names: Sequence[str], folder: Path, processes: int) -> Iterator[ExperimentRun]:
+def _write(folder: Path, runs: Sequence[ExperimentRun]) -> None:
+    """Write the report of the experiments that are done, in place of that of fewer."""
+    write_report(
+        folder, report.TITLE, report.sections(runs), style=report.VERDICT_STYLE, overwrite=True
+    )
+    with whole_file(folder / REPORT_FILES[-1], overwrite=True) as beside:
+        beside.write_text(json.dumps(as_dict(runs), indent=2), encoding="utf-8")
+
+
+def _run_all(
+    names: Sequence[str], folder: Path, processes: int
+) -> Generator[ExperimentRun, None, None]:
     """Run experiments in order and save their figures to the folder."""
     selected = select_experiments(names)
     if processes == 1:
@@ -114,7 +137,7 @@ def _run_all(names: Sequence[str], folder: Path, processes: int) -> Iterator[Exp
         try:
             for experiment in selected:
                 yield ExperimentRun(experiment, *results[experiment.name].result())
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, GeneratorExit):
             for process in multiprocessing.active_children():
                 process.terminate()
             raise

@@ -1,5 +1,6 @@
 """Ctrl-C at any moment ends a command in one line, which says what is kept, with status 130."""
 
+import json
 import subprocess
 import sys
 
@@ -90,6 +91,16 @@ def test_a_search_keeps_what_it_found(folder, name):
     kept = f"{name}.search.npz"
     assert said == f"interrupted; the search is kept in {kept}: resume it, with --resume"
     assert (folder / kept).exists()
+
+
+def test_experiments_that_are_done_are_kept(folder):
+    """Interrupted as the report of the second is written: that of the first stays whole."""
+    said = interrupted(folder, "r/.report.*4", "reproduce patches frequencies -o r")
+    files = "r/report.md, r/report.html, r/report.json"
+    kept = f"1 of 2 experiments are kept in {files}"
+    assert said == f"interrupted; {kept}: go on with reproduce frequencies and another folder"
+    assert list(json.loads((folder / "r/report.json").read_text())["experiments"]) == ["patches"]
+    assert "patches" in (folder / "r/report.md").read_text()
 
 
 def test_status_and_sentence_within_a_process(folder, capfd, monkeypatch):
