@@ -1,8 +1,8 @@
 """Peaks of many runs by the C integrator (`integrate_peaks.c`), where there is a C compiler.
 
 XLA splits a step into some forty loops over the runs of a batch; in C it is one, and so are all
-steps of all tasks. It serves sweeps of peaks of all quantities (not of histories) without a
-controller, in double precision, on CPUs. The first large sweep compiles it, once for a machine, in
+steps of all tasks. It serves sweeps of peaks of all quantities (not of histories), without a
+controller or with one that acts at samples, in double precision, on CPUs. The first large sweep compiles it, once for a machine, in
 1.2 s of processor time. Each new structure regains 3 s, as XLA has less to compile, or nothing
 (two spans, benchmark `first_answer`), and 4096 crossings 0.05 (3 modes) to 0.26 s (12 modes,
 benchmark `sweep`). XLA's own calls of C would take headers, an aligned workspace as one of the
@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
+from jaxbeam.integrator.growth import MARK_COUNT
 from jaxbeam.integrator.kinks.passages import may_have_kinks
 from jaxbeam.integrator.peaks.contact_minimum import (
     FORCE_FRACTIONS,
@@ -28,7 +29,7 @@ from jaxbeam.integrator.peaks.contact_minimum import (
     spread_factor,
 )
 from jaxbeam.integrator.peaks.end_forces import END_FRACTIONS
-from jaxbeam.integrator.peaks.monitored_rows import bounds_by_energy
+from jaxbeam.integrator.peaks.monitored_rows import bounds_by_energy, commands_at_once
 from jaxbeam.integrator.peaks.running_peaks import PEAK_MARGIN, Peaks
 from jaxbeam.integrator.propagators import (
     DOUBLINGS,
@@ -60,6 +61,8 @@ from jaxbeam.runtime.native_library import Library
 
 PATH_NODES = NODE_COUNT + len(END_FRACTIONS)
 MIN_RUNS_TO_COMPILE = 1000  # smaller sweeps do not wait for a compiler
+# The same of a law, each of which is compiled by itself: in half a second, predictive ones in ten.
+MIN_RUNS_OF_LOOPS = 32
 PADDING = 8  # doubles in the widest vector register
 C_MACROS = {
     "PADDING": PADDING,
@@ -97,7 +100,7 @@ def chosen_for(case: Case, runs: int) -> bool:
 
     Sweeps of many runs do so where it is missing, and there is a compiler.
     """
-    if not supports(case):
+    if not supports(case) or (case.controller is not None and runs < MIN_RUNS_OF_LOOPS):
         return False
     missing = runs >= MIN_RUNS_TO_COMPILE and on_cpu() and LIBRARY.can_be_built()
     return missing or available()
@@ -105,7 +108,10 @@ def chosen_for(case: Case, runs: int) -> bool:
 
 def supports(case: Case) -> bool:
     """Whether the C integrator can compute the peaks of a case."""
-    plain = case.controller is None and not has_settlement(case) and not may_have_kinks(case)
+    plain = not has_settlement(case) and not may_have_kinks(case)
+    if case.controller is not None:  # accelerations would follow from the contact forces
+        sampled = case.controller.period is not None
+        plain &= sampled and not any(sensor.has_feedthrough for sensor in case.sensors)
     # The static influence is then a polynomial in each step.
     return plain and (
         not any(sensor.bends for sensor in case.sensors)
@@ -161,6 +167,34 @@ class NativeInputs(NamedTuple):
     surface: Float[Array, "task step motion_node"] | None = None
     load_forces: Float[Array, "task step wheel_node run"] | None = None
     initial_vehicles: Float[Array, "task state run"] | None = None
+    lengths_of_panels: Int[Array, "task panel"] | None = None
+    events: Int[Array, "task panel"] | None = None
+    memory: Float[Array, "task memory"] | None = None
+    loop_numbers: Int[Array, "task address"] | None = None
+
+
+class NativeLoop(NamedTuple):
+    """A sampled loop in C: its function, numbers of commands, and place of the failures.
+
+    The last four of the `NativeInputs` are those of a loop: the index of the length of the steps
+    of each panel, and of the event at its start, -1 for none; the memory of the loop at the start,
+    and the addresses of its numbers. Commands are states that do not change between events.
+    """
+
+    process: Any
+    commands: int
+    failures: int
+
+
+class _Loop(ctypes.Structure):
+    """A loop as C takes it."""
+
+    _fields_ = (
+        ("process", ctypes.c_void_p),
+        ("commands", ctypes.c_int64),
+        ("marks", ctypes.c_int64),
+        ("failures", ctypes.c_int64),
+    )
 
 
 class _Argument(ctypes.Structure):
@@ -187,6 +221,33 @@ def model_inputs(
         "influence_breaks": None if influence is None else influence.breaks,
         "influence_series": None if influence is None else influence.series,
     }
+
+
+def loop_model_inputs(
+    model: ModalModel, outputs: OutputRows, correction: StaticCorrection | None
+) -> dict[str, Any]:
+    """`model_inputs` of a model of one block with held commands, as states of each of its blocks.
+
+    Modes that nothing couples are blocks of their own then.
+    """
+    found = model_inputs(model, outputs, correction)
+    corrected = None if correction is None else correction.rows
+    direct = commands_at_once(outputs, model.command_matrix[model.rate_index], corrected)
+    matrix, side = model.state_matrix[0], 2
+    alone = np.kron(np.eye(len(matrix) // 2), np.ones((2, 2))).astype(bool)
+    if len(matrix) > 2 * model.mode_count or model.mode_map is not None or matrix[~alone].any():
+        side = len(matrix)
+    blocks, commands = len(matrix) // side, model.command_matrix.shape[1]
+    of_blocks = np.zeros((blocks, side + commands, side + commands))
+    rows = np.zeros((len(outputs.time_derivatives), blocks, side + commands))
+    for b in range(blocks):
+        own = np.s_[b * side : (b + 1) * side]
+        of_blocks[b, :side, :side] = matrix[own, own]
+        of_blocks[b, :side, side:] = model.command_matrix[own]
+        rows[:, b, :side] = found["output_rows"][:, own]
+    rows[:, 0, side:] = direct
+    found |= {"state_matrix": of_blocks, "output_rows": rows.reshape(len(rows), -1)}
+    return found | {"output_bounds": np.zeros((len(rows), blocks))}
 
 
 def batch_inputs(
@@ -274,7 +335,16 @@ def _path_nodes(starts, counts, lengths) -> Float[np.ndarray, "step node"]:
 
 
 def integrate_peaks(max_loads: int, mask: Bool[np.ndarray, " task"], inputs: NativeInputs) -> Peaks:
-    """Peaks of tasks; only where C is `available`. Other threads of Python run meanwhile.
+    """Peaks of tasks without a controller; see `integrate_loops`."""
+    return integrate_loops(max_loads, mask, inputs, None)[0]
+
+
+def integrate_loops(
+    max_loads: int, mask: Bool[np.ndarray, " task"], inputs: NativeInputs, loop: NativeLoop | None
+) -> tuple[Peaks, Float[np.ndarray, "task run"], Float[np.ndarray, "task run mark"]]:
+    """Peaks of tasks, failures of the law, and largest amplitudes up to each of `growth_marks`.
+
+    Only where C is `available`. Other threads of Python run meanwhile.
 
     `max_loads` is the largest number of loads on the beam at once. Tasks not in the mask stay at
     rest. Raises MemoryError without memory for the matrices of the steps.
@@ -287,10 +357,17 @@ def integrate_peaks(max_loads: int, mask: Bool[np.ndarray, " task"], inputs: Nat
     arguments = (_Argument * len(arrays))(
         *((array.ctypes.data, (*array.shape, 1, 1, 1)[:4]) for array in arrays)
     )
-    found = (ctypes.c_void_p * len(peaks))(*(part.ctypes.data for part in peaks))
-    if LIBRARY.load().integrate_peaks(ctypes.c_int64(max_loads), arguments, found):
+    failures, amplitudes = np.zeros((tasks, runs)), np.zeros((tasks, runs, MARK_COUNT))
+    outcomes = (*peaks, failures, amplitudes)
+    found = (ctypes.c_void_p * len(outcomes))(*(part.ctypes.data for part in outcomes))
+    given_loop = None
+    if loop is not None:
+        address = ctypes.cast(loop.process, ctypes.c_void_p)
+        given_loop = ctypes.byref(_Loop(address, loop.commands, MARK_COUNT, loop.failures))
+    if LIBRARY.load().integrate_peaks(ctypes.c_int64(max_loads), arguments, found, given_loop):
         raise MemoryError("there is no memory for the matrices of all steps of a sweep")
-    return peaks
+    amplitudes = np.sqrt(np.maximum.accumulate(amplitudes[..., ::-1], axis=-1)[..., ::-1])
+    return peaks, failures, amplitudes
 
 
 def _constants() -> tuple[np.ndarray, ...]:

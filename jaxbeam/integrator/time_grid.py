@@ -205,14 +205,17 @@ def grid_by_schedule(
     schedule: EventSchedule,
     substeps: int | Int[Array, ""],
     places: Float[Array, " place"] | None = None,
+    known_events: LoadEvents | None = None,
 ) -> TimeGrid:
     """Panels between the events of a schedule and the load events, of `substeps` steps each.
 
     Nearly all panels share a few step lengths, hence their propagators. Steps also end where a
-    wheel passes one of the `places` (m).
+    wheel passes one of the `places` (m). The events of the loads at all `event_places` can be
+    given, if they are known.
     """
     times = schedule.times
-    windows, events, twice, kinks, index = _events_between(case, model, places, times[0], times[-1])
+    between = times[0], times[-1], known_events
+    windows, events, twice, kinks, index = _events_between(case, model, places, *between)
     if schedule.control_sample is not None:
         # A step of zero length after the end: the controller acts at the last event too.
         events = xp.append(events, times[-1])

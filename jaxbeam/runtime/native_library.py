@@ -38,16 +38,18 @@ COMPILER_FLAGS = (
 
 
 class Library(NamedTuple):
-    """A C library: file names in C_FOLDER, and macros."""
+    """A C library: file names in C_FOLDER, and macros; or the text of its only file."""
 
     sources: tuple[str, ...]
     headers: tuple[str, ...]
     macros: tuple[tuple[str, float], ...]
+    text: str | None = None
 
     @property
     def compiler_flags(self) -> tuple[str, ...]:
         """Arguments of the compiler, without the sources."""
-        return (*COMPILER_FLAGS, *(f"-D{name}={value}" for name, value in self.macros))
+        own = () if self.text is None else ("-I", str(C_FOLDER), "-O1")
+        return (*COMPILER_FLAGS, *own, *(f"-D{name}={value}" for name, value in self.macros))
 
     @property
     def file_name(self) -> str:
@@ -140,6 +142,11 @@ def _compile(library: Library, target: pathlib.Path) -> None:
         _run_compiler(command, ["-c", source, *library.compiler_flags, "-o", compiled], source)
         return compiled
 
+    if library.text is not None:
+        written = target.with_name("program.c")
+        written.write_text(library.text)
+        arguments = [str(written), "-shared", *library.compiler_flags, "-lm", "-o", str(target)]
+        return _run_compiler(command, arguments, str(written))
     with ThreadPoolExecutor() as pool:
         parts = list(pool.map(compile_file, library.sources))
     _run_compiler(command, ["-shared", *parts, "-o", str(target)], " ".join(parts))
@@ -176,5 +183,6 @@ def _load(library: Library) -> NativeCode:
 def _fingerprint(library: Library) -> str:
     """Hash of source, compiler flags and machine."""
     texts = [(C_FOLDER / name).read_text() for name in library.sources + library.headers]
+    texts.append(library.text or "")
     parts = [*texts, *library.compiler_flags, machine_description()]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

@@ -87,7 +87,8 @@ class Runner:
         self.known_model = known_model(case) if same_model and self.devices == 1 else None
         self.program = self._make_program(native)
         self.known_inputs = self._known_inputs() if native else None
-        if native and self.known_inputs is None and native_peaks.has_courses(case):
+        needs_inputs = native_peaks.has_courses(case) or case.controller is not None
+        if native and self.known_inputs is None and needs_inputs:
             self.program = self._make_program(native=False)
         # More threads than cores where some wait for others.
         waiting = self.known_inputs is None
@@ -262,10 +263,11 @@ class Runner:
     def _block_integrator(self, steps) -> Callable:
         """Function of a block's number and a mask of its batches: results of those in the mask."""
         if self.known_inputs is not None:
-            integrate, max_loads = native_peaks.integrate_peaks, self.program.shapes.max_loads
-            limits = self.batches_per_block, self.most_inputs
-            inputs_of_block = self.known_inputs.of_blocks(steps, *limits)
-            return lambda block, mask: integrate(max_loads, mask, inputs_of_block(block))._asdict()
+            known, limits = self.known_inputs, (self.batches_per_block, self.most_inputs)
+            inputs_of_block = known.of_blocks(steps, *limits)
+            return lambda block, mask: known.integrate(
+                self._batches_of(block), mask, inputs_of_block(block)
+            )
         substeps = None
         if self.histories:
             substeps = steps_per_interval(float(self.schedule.lengths.max()), steps.min())
@@ -298,8 +300,9 @@ class Runner:
             if inputs is None:
                 few = batch_indices[rows], steps[rows], extra_steps[rows]
                 return self.compiled.integrate_few(*few, single)
-            settings = self.program.shapes.max_loads, np.ones(rows.size, bool)
-            return native_peaks.integrate_peaks(*settings, inputs_of_rows(inputs, rows))._asdict()
+            everyone = np.ones(rows.size, bool)
+            own = batch_indices[rows], everyone, inputs_of_rows(inputs, rows)
+            return self.known_inputs.integrate(*own)
 
         parts = np.array_split(np.arange(count), min(calls, count))
         results = list(self.pool.map(integrate, parts))

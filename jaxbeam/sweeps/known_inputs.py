@@ -20,6 +20,7 @@ from jaxbeam.model.sensing.corrected_rows import corrected_places
 from jaxbeam.runtime.remembering import remembered
 from jaxbeam.runtime.vectorised import vectorised
 from jaxbeam.sweeps.batches import Batches, values_at
+from jaxbeam.sweeps.native_loops import NativeLoops
 from jaxbeam.sweeps.path_times import PathEvents
 from jaxbeam.sweeps.programs import Outputs, Program, outputs_of
 
@@ -65,9 +66,14 @@ class KnownInputs:
         batches: Batches,
     ):
         self.program, self.batches = program, batches
+        self.known, self.loops = known, None
         self.events = events, values_at(program.case, batches, "run.duration")
         with np.errstate(all="ignore"):  # as in compiled code
-            of_model = native_peaks.model_inputs(known.model, *known.outputs)
+            if program.schedule is None:
+                of_model = native_peaks.model_inputs(known.model, *known.outputs)
+            else:
+                self.loops = NativeLoops(program, batches)
+                of_model = self.loops.model_inputs()
         self.of_model = {
             name: None if part is None else part[None] for name, part in of_model.items()
         }
@@ -92,7 +98,11 @@ class KnownInputs:
         events = jax.tree.map(lambda part: part[batch_indices], self.events)
         with np.errstate(all="ignore"):
             loads = self._loads(batch_indices)
-            found = vectorised(of_batch)(*events, max_steps, extra_steps, *loads)
+            if self.loops is None:
+                found = vectorised(of_batch)(*events, max_steps, extra_steps, *loads)
+            else:
+                stepping = max_steps, extra_steps, events[0]
+                found = self.loops.of_batches(batch_indices, *stepping, loads)
         if native_peaks.has_courses(self.program.case):
             found |= self._over_time(batch_indices, loads[1], found)
         return native_peaks.NativeInputs(**self.of_model, **found)
@@ -105,7 +115,11 @@ class KnownInputs:
             own = jax.tree.map(lambda part, row=row: part[row], wheels)
             loads = load_set(case, self.program.shapes.layout)
             batches.append(dataclasses.replace(loads, wheels=own))
-        panels = (found[name] for name in ("panel_starts", "step_counts", "step_lengths"))
+        names = "panel_starts", "step_counts", "step_lengths"
+        starts, counts, lengths = (found[name] for name in names)
+        if self.loops is not None:
+            lengths = np.take_along_axis(lengths, found["lengths_of_panels"], axis=1)
+        panels = starts, counts, lengths
         swept = any(name.startswith("profile.") for name in self.batches.shared_addresses)
         return native_peaks.inputs_over_time(batches, *panels, one_profile=not swept)
 
@@ -138,6 +152,13 @@ class KnownInputs:
             return inputs_of_rows(inputs, rows)
 
         return of_block
+
+    def integrate(self, batch_indices, mask, inputs: native_peaks.NativeInputs):
+        """Results (path, batch, ...) by name of batches with these inputs."""
+        max_loads = self.program.shapes.max_loads
+        if self.loops is None:
+            return native_peaks.integrate_peaks(max_loads, mask, inputs)._asdict()
+        return self.loops.integrate(batch_indices, max_loads, mask, inputs)
 
     def _loads(self, batch_indices):
         """Cubics and wheels of the loads of some batches."""

@@ -377,3 +377,60 @@ def test_stated_errors_hold_for_random_masses():
     )
     for name in ("deflection", "acceleration", "moment"):
         assert_allclose(found[f"peak_{name}"], exact[f"peak_{name}"], rtol=found.error_estimate)
+
+
+# Sampled loops. Modes that nothing couples, readings with noise that are late, limits of commands;
+# and a vehicle on a profile, a coil with a state of its own, an analogue filter, another law.
+PATCHED = dataclasses.replace(
+    PLAIN,
+    actuators=[jb.Patch(0.2575, 0.3425, moment_per_volt=1e-3, limits=(-5.0, 5.0))],
+    sensors=[
+        jb.Sensor(0.3, delay=0.002, noise=1e-6),
+        jb.Sensor(0.15, "velocity", filter=jb.Filter(40.0), sampling_period=0.004),
+    ],
+    controller=jb.Feedback(gains=[2e4], period=0.01, delay=0.003, resolution=0.01),
+)
+COILED = dataclasses.replace(
+    PLAIN,
+    actuators=[
+        jb.Electrodynamic(0.1, resistance=4.0, inductance=1e-3, force_constant=5.0, mass=0.02)
+    ],
+    sensors=[jb.Sensor(0.3), jb.Sensor(0.2, filter=jb.Filter(60.0, realisation="analogue"))],
+    loads=[jb.QuarterCar(0.3, 0.1, 400.0, 4.0, 4e3, speed=1.0), jb.MovingForce(3.0, speed=2.0)],
+    profile=jb.profiles.SineProfile(amplitude=2e-4, wavelength=0.15),
+    controller=jb.LQR([1.0] * 7, [1.0], period=0.0025, estimator=jb.Kalman([0.02] * 3, [1e-5] * 2)),
+)
+UNSTABLE = dataclasses.replace(
+    PATCHED,
+    actuators=[jb.PointForce(0.3)],
+    controller=jb.Feedback(gains=[-1e5], period=0.01),
+)
+
+
+@pytest.mark.parametrize(
+    ("case", "over"),
+    [
+        pytest.param(PATCHED, {"loads.0.mass": [0.1, 0.5, 0.3], "loads.0.speed": [1.0, 2.0]}),
+        pytest.param(COILED, {"loads.0.speed": [0.8, 1.2]}),
+        pytest.param(PATCHED, {"controller.gains.0": [1e4, 2e4]}),
+        pytest.param(UNSTABLE, {"loads.0.mass": [0.1, 0.5]}),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:all 2 runs failed")
+def test_sampled_loops_equal_those_of_numpy(case, over, monkeypatch):
+    """To rounding, which a loop multiplies at each of its samples."""
+    monkeypatch.setattr(native_peaks, "MIN_RUNS_OF_LOOPS", 1)
+    native = jb.sweep(case, over, progress=False)
+    calls = []
+    monkeypatch.setattr(native_peaks, "available", lambda: bool(calls.append(1)))
+    plain = jb.sweep(case, over, progress=False)
+    assert calls
+    assert (native.failed == plain.failed).all()
+    assert native.failed.all() == (case is UNSTABLE)
+    if case is UNSTABLE:
+        return
+    assert (native.controller_failures == plain.controller_failures).all()
+    for name in ("peak_deflection", "lowest_contact_force"):
+        scale = float(abs(plain[name]).max())
+        assert_allclose(native[name], plain[name], rtol=0, atol=1e-11 * scale)
+    assert np.any(native.peak_deflection != plain.peak_deflection)  # it did use C

@@ -1,5 +1,5 @@
 /* Peaks of outputs and contact forces of several tasks, each a batch of runs that differ in their
- * loads: integrator/integrate.py, `integrate_peaks`, without commands. Steps are advanced in
+ * loads: integrator/integrate.py, `integrate_peaks`, with commands of a sampled loop or without. Steps are advanced in
  * chunks. First the matrices of its steps are computed, which all runs of a task share; then groups
  * of runs, as many as fill a vector register, are advanced through all steps of the chunk, so that
  * their states stay in the first-level cache. native_peaks.py compiles this file and calls it. */
@@ -16,7 +16,7 @@ static void reset(Workspace *w) {
     if (w->has_initial) memcpy(w->vehicle_state, w->inputs[INITIAL_VEHICLES], vehicle_bytes);
     else memset(w->vehicle_state, 0, vehicle_bytes);
     for (size_t i = 0; i < batch_size; i += REGISTER_WIDTH)
-        w->vehicle_panel[i / REGISTER_WIDTH] = -1;
+        w->vehicle_kind[i / REGISTER_WIDTH] = -1;
     memset(w->peak_samples, 0, 8 * PEAK_POINTS * sampled);
     memset(w->peak, 0, 8 * sampled);
     memset(w->peak_step_start, 0, 8 * sampled);
@@ -24,6 +24,10 @@ static void reset(Workspace *w) {
     for (size_t i = 0; i < (size_t)w->loads * batch_size; i++)
         w->lowest_force[i] = w->contact_loss_time[i] = INFINITY;
     for (size_t i = 0; i < batch_size; i++) w->finite[i] = 1;
+    for (size_t i = 0; i < (size_t)w->memory_size; i++)
+        for (size_t l = 0; l < batch_size; l++)
+            w->memory[i * batch_size + l] = w->inputs[MEMORY][i];
+    memset(w->amplitudes, 0, 8 * (size_t)w->marks * batch_size);
 }
 
 /* Steps of the next chunk, with their matrices; returns their number. `done` steps of the panel
@@ -37,9 +41,14 @@ static int next_chunk(Workspace *w, int *panel, int64_t *done, int64_t before) {
         }
         Step *step = w->steps + count;
         step->number = before + count++;
-        step->panel = *panel, step->length = w->inputs[STEP_LENGTHS][*panel];
+        step->panel = *panel, step->kind = length_of_panel(w, *panel);
+        step->length = w->inputs[STEP_LENGTHS][step->kind];
+        step->event = -1, step->mark = 0;
+        if (w->loop && *done == 0) step->event = ((const int64_t *)w->inputs[EVENTS])[*panel];
         step->start = w->inputs[PANEL_STARTS][*panel] + (double)(*done)++ * step->length;
-        step->transition = w->transition + (size_t)*panel * transition_size(w);
+        double mark = w->inputs[PANEL_STARTS][w->panels] / 2; /* the end, half of it, and so on */
+        while (step->mark + 1 < w->marks && step->start <= mark) step->mark++, mark /= 2;
+        step->transition = w->transition + (size_t)step->kind * transition_size(w);
         step->loads = 0;
         const uint8_t *active = (const uint8_t *)w->inputs[LOADS_ON_BEAM] + *panel * w->loads;
         for (int l = 0; l < w->loads && step->loads < w->max_loads; l++)
@@ -75,8 +84,10 @@ static void integrate_task(Workspace *w) {
             advance_chunk(w, steps, w->groups, groups);
         }
         const Step *last = w->steps + steps - 1;
+        if (w->loop) continue; /* commands may raise a peak later */
         if (last->start + last->length >= exit_time && peaks_final(w)) break;
     }
+    if (w->loop) end_amplitudes(w);
 }
 
 /* Outputs of a task, (run, position) and (run, load). */
@@ -100,6 +111,12 @@ static void write_results(const Workspace *w, int64_t task) {
                 w->outputs[PEAK_TIME][to] = w->finite[first + l] ? time[l] : NAN;
             }
         }
+    for (ptrdiff_t l = 0; w->loop && l < batch_size; l++) {
+        const ptrdiff_t run = task * batch_size + l;
+        w->outputs[FAILURES][run] = w->memory[w->loop->failures * batch_size + l];
+        for (int mark = 0; mark < w->marks; mark++)
+            w->outputs[AMPLITUDES][run * w->marks + mark] = w->amplitudes[mark * batch_size + l];
+    }
     for (int load = 0; load < w->loads; load++)
         for (ptrdiff_t l = 0; l < batch_size; l++) {
             const double loss_time = w->contact_loss_time[load * batch_size + l];
@@ -123,10 +140,12 @@ static void end_slopes(Workspace *w) {
 
 /* Integrate the tasks, and write their outputs, (task, run, position) or (task, run, load); 1 if
  * there is no memory for it. */
-int integrate_peaks(int64_t max_loads, const Array *arguments, double *const *outputs) {
+int integrate_peaks(int64_t max_loads, const Array *arguments, double *const *outputs,
+                    const Loop *loop) {
     const int64_t *sizes[ARGUMENT_COUNT];
     for (int i = 0; i < ARGUMENT_COUNT; i++) sizes[i] = arguments[i].sizes;
     Workspace workspace = {.panels = (int)sizes[STEP_COUNTS][1],
+                           .lengths = (int)sizes[STEP_LENGTHS][1],
                            .blocks = (int)sizes[STATE_MATRIX][1],
                            .block_size = (int)sizes[STATE_MATRIX][2],
                            .modes = (int)(sizes[SHAPE_SERIES][3] / sizes[STATE_MATRIX][1]),
@@ -145,6 +164,8 @@ int integrate_peaks(int64_t max_loads, const Array *arguments, double *const *ou
                            .has_forces = sizes[LOAD_FORCES][1] > 0,
                            .has_initial = sizes[INITIAL_VEHICLES][1] > 0,
                            .forced_runs = sizes[LOAD_FORCES][3],
+                           .loop = loop,
+                           .memory_size = (int)sizes[MEMORY][1],
                            .outputs = outputs};
     Workspace *w = &workspace;
     derive_sizes(w);

@@ -12,7 +12,7 @@ void prepare_task(Workspace *w);
 /* Matrices of a step, which all runs of a task share. */
 void prepare_step(const Workspace *w, const Step *step);
 
-/* Propagators of the vehicles of a group of runs for the steps of a panel. */
+/* Propagators of the vehicles of a group of runs for the steps of a length. */
 void prepare_vehicles(Workspace *w, const Step *step, const Group *g);
 
 #pragma GCC visibility pop

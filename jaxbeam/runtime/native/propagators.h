@@ -1,4 +1,4 @@
-/* Propagators of all panels: integrator/propagators.py, `propagators`. TAYLOR_TERMS and DOUBLINGS
+/* Propagators of all step lengths: integrator/propagators.py, `propagators`. TAYLOR_TERMS and DOUBLINGS
  * are macros. */
 
 #pragma once
@@ -6,23 +6,23 @@
 #include "matrices.h"
 #include "workspace.h"
 
-/* Fractions of the steps of panels, as many as a register holds, and their lengths (s). */
+/* Fractions of the steps of all lengths, as many as a register holds, and how long they are (s). */
 typedef struct {
-    int count, panel[REGISTER_WIDTH], fraction[REGISTER_WIDTH];
+    int count, kind[REGISTER_WIDTH], fraction[REGISTER_WIDTH];
     Register length;
 } Fractions;
 
-/* Next fractions; panels without steps are skipped. */
-static Fractions next_fractions(const Workspace *w, int *panel, int *fraction) {
+/* Next fractions; lengths that no step has are skipped. */
+static Fractions next_fractions(const Workspace *w, int *kind, int *fraction) {
     Fractions f = {0};
-    while (f.count < REGISTER_WIDTH && *panel < w->panels) {
-        if (*fraction == STEP_FRACTIONS || panel_steps(w, *panel) <= 0) {
-            ++*panel, *fraction = 0;
+    while (f.count < REGISTER_WIDTH && *kind < w->lengths) {
+        if (*fraction == STEP_FRACTIONS || !w->length_used[*kind]) {
+            ++*kind, *fraction = 0;
             continue;
         }
         const double fraction_of_step = *fraction < NODES ? w->inputs[GAUSS_NODES][*fraction] : 1;
-        f.length[f.count] = w->inputs[STEP_LENGTHS][*panel] * fraction_of_step;
-        f.panel[f.count] = *panel, f.fraction[f.count++] = (*fraction)++;
+        f.length[f.count] = w->inputs[STEP_LENGTHS][*kind] * fraction_of_step;
+        f.kind[f.count] = *kind, f.fraction[f.count++] = (*fraction)++;
     }
     return f;
 }
@@ -127,8 +127,8 @@ static void store_propagators(Workspace *w, int block, const Fractions *f) {
             const Register transition =
                 w->exponential[i * block_size + j] * (w->scale[j] / w->scale[i]);
             for (int l = 0; l < f->count; l++) {
-                double *end = w->transition + (size_t)f->panel[l] * transition_size(w);
-                double *nodes = w->node_transition + (size_t)f->panel[l] * node_transition_size(w);
+                double *end = w->transition + (size_t)f->kind[l] * transition_size(w);
+                double *nodes = w->node_transition + (size_t)f->kind[l] * node_transition_size(w);
                 if (f->fraction[l] == NODES)
                     end[(block * block_size + j) * block_size + i] = transition[l];
                 else
@@ -147,9 +147,9 @@ static void store_propagators(Workspace *w, int block, const Fractions *f) {
                 const ptrdiff_t at =
                     (ptrdiff_t)((block * block_size + i) * modes + m) * PADDED_NODES + force;
                 for (int l = 0; l < f->count; l++) {
-                    double *end = w->force_response + (size_t)f->panel[l] * force_response_size(w);
+                    double *end = w->force_response + (size_t)f->kind[l] * force_response_size(w);
                     double *nodes =
-                        w->node_force_response + (size_t)f->panel[l] * node_force_response_size(w);
+                        w->node_force_response + (size_t)f->kind[l] * node_force_response_size(w);
                     if (f->fraction[l] == NODES) end[at] = force_response[l];
                     else
                         nodes[(size_t)f->fraction[l] * force_response_size(w) + (size_t)at] =
@@ -174,17 +174,17 @@ static void set_force_weights(const Workspace *w, const Fractions *f) {
 }
 
 /* Outputs at the peak nodes of a step, by its initial state and by forces on the modes. */
-static void observe_propagators(const Workspace *w, int panel) {
+static void observe_propagators(const Workspace *w, int kind) {
     const int block_size = w->block_size, modes = w->modes, all_modes = w->all_modes;
     const int sample_count = w->sample_count, padded = padded_size(sample_count);
     const double *output_rows = w->inputs[OUTPUT_ROWS];
-    const double *transition = w->transition + (size_t)panel * transition_size(w);
-    const double *force_response = w->force_response + (size_t)panel * force_response_size(w);
-    const double *node_transition = w->node_transition + (size_t)panel * node_transition_size(w);
+    const double *transition = w->transition + (size_t)kind * transition_size(w);
+    const double *force_response = w->force_response + (size_t)kind * force_response_size(w);
+    const double *node_transition = w->node_transition + (size_t)kind * node_transition_size(w);
     const double *node_force_response =
-        w->node_force_response + (size_t)panel * node_force_response_size(w);
-    double *sample_rows = w->sample_rows + (size_t)panel * sample_rows_size(w);
-    double *sample_response = w->sample_response + (size_t)panel * sample_response_size(w);
+        w->node_force_response + (size_t)kind * node_force_response_size(w);
+    double *sample_rows = w->sample_rows + (size_t)kind * sample_rows_size(w);
+    double *sample_response = w->sample_response + (size_t)kind * sample_response_size(w);
     memset(sample_response, 0, 8 * sample_response_size(w));
     for (int point = 0; point < PEAK_POINTS; point++)
         for (int position = 0; position < w->positions; position++) {
@@ -223,13 +223,16 @@ static void observe_propagators(const Workspace *w, int panel) {
         }
 }
 
-/* Propagators of all panels that have steps. */
+/* Propagators of all lengths that steps have. */
 static void compute_propagators(Workspace *w) {
-    memset(w->node_transition, 0, 8 * (size_t)w->panels * node_transition_size(w));
-    memset(w->node_force_response, 0, 8 * (size_t)w->panels * node_force_response_size(w));
-    memset(w->force_response, 0, 8 * (size_t)w->panels * force_response_size(w));
-    int panel = 0, fraction = 0;
-    for (Fractions f; (f = next_fractions(w, &panel, &fraction)).count;) {
+    memset(w->node_transition, 0, 8 * (size_t)w->lengths * node_transition_size(w));
+    memset(w->node_force_response, 0, 8 * (size_t)w->lengths * node_force_response_size(w));
+    memset(w->force_response, 0, 8 * (size_t)w->lengths * force_response_size(w));
+    memset(w->length_used, 0, 8 * (size_t)w->lengths);
+    for (int p = 0; p < w->panels; p++)
+        if (panel_steps(w, p) > 0) w->length_used[length_of_panel(w, p)] = 1;
+    int kind = 0, fraction = 0;
+    for (Fractions f; (f = next_fractions(w, &kind, &fraction)).count;) {
         set_force_weights(w, &f);
         for (int b = 0; b < w->blocks; b++) {
             const double *matrix =
@@ -239,6 +242,6 @@ static void compute_propagators(Workspace *w) {
             store_propagators(w, b, &f);
         }
     }
-    for (int p = 0; p < w->panels; p++)
-        if (panel_steps(w, p) > 0) observe_propagators(w, p);
+    for (int k = 0; k < w->lengths; k++)
+        if (w->length_used[k]) observe_propagators(w, k);
 }

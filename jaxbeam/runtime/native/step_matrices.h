@@ -11,9 +11,9 @@ static void contact_at_nodes(const Workspace *w, const Step *step, int s, int fi
     const int rows = step->rows, states = w->states, last = NODES - first;
     const int count = last < REGISTER_WIDTH ? last : REGISTER_WIDTH;
     const double *node_transition =
-        w->node_transition + (size_t)step->panel * node_transition_size(w) + first;
+        w->node_transition + (size_t)step->kind * node_transition_size(w) + first;
     const double *node_force_response =
-        w->node_force_response + (size_t)step->panel * node_force_response_size(w) + first;
+        w->node_force_response + (size_t)step->kind * node_force_response_size(w) + first;
     const double *shape = w->shape + (ptrdiff_t)s * all_modes * PADDED_NODES + first;
     const double *contact_rows =
         motion_rows(w, motion) + (ptrdiff_t)s * states * PADDED_NODES + first;
@@ -61,7 +61,7 @@ static void force_response_at_nodes(const Workspace *w, const Step *step, int s,
     const int count = last < REGISTER_WIDTH ? last : REGISTER_WIDTH;
     const double *shape = w->shape + (ptrdiff_t)s * w->all_modes * PADDED_NODES + first;
     const double *end_response =
-        w->force_response + (size_t)step->panel * force_response_size(w) + first;
+        w->force_response + (size_t)step->kind * force_response_size(w) + first;
     double *force_response = step->force_response + (ptrdiff_t)(s * NODES + first) * states;
     for (int i = 0; i < states; i++) {
         Register response = {0};
@@ -97,12 +97,12 @@ static void contact_at_ends(const Workspace *w, const Step *step) {
 static void step_matrices(const Workspace *w, const Step *step) {
     const int all_modes = w->all_modes, states = w->states;
     const int sample_count = w->sample_count, padded = padded_size(sample_count);
-    memcpy(step->sample_rows, w->sample_rows + (size_t)step->panel * sample_rows_size(w),
+    memcpy(step->sample_rows, w->sample_rows + (size_t)step->kind * sample_rows_size(w),
            8 * sample_rows_size(w));
     if (!step->loads) return;
     load_path(w, step);
     const double *sample_response =
-        w->sample_response + (size_t)step->panel * sample_response_size(w);
+        w->sample_response + (size_t)step->kind * sample_response_size(w);
     for (int s = 0; s < step->loads; s++) {
         const double *shape = w->shape + (ptrdiff_t)s * all_modes * PADDED_NODES;
         for (int first = 0; first < NODES; first += REGISTER_WIDTH) {

@@ -1,5 +1,5 @@
 /* A chunk of steps for a group of runs: integrator/step.py, `advance`, and
- * integrator/peaks/running_peaks.py, `update_peaks`, without commands. */
+ * integrator/peaks/running_peaks.py, `update_peaks`, with commands as states. */
 
 #pragma once
 
@@ -7,6 +7,35 @@
 #include "matrices.h"
 #include "peak_search.h"
 #include "preparation.h"
+
+/* Stiffness of a mode of a block. */
+static double stiffness_of_mode(const Workspace *w, int block, int mode) {
+    const double *matrix = w->inputs[STATE_MATRIX] + block * w->block_size * w->block_size;
+    return fabs(matrix[(2 * mode + 1) * w->block_size + 2 * mode]);
+}
+
+/* Amplitude of a state, squared: integrator/growth.py, `amplitudes`. */
+static Register squared_amplitude(const Workspace *w, const Register *state) {
+    Register square = {0};
+    for (int b = 0; b < w->blocks; b++, state += w->block_size)
+        for (int m = 0; m < w->modes; m++)
+            square += state[2 * m + 1] * state[2 * m + 1] +
+                      stiffness_of_mode(w, b, m) * (state[2 * m] * state[2 * m]);
+    return square;
+}
+
+/* What happens at an event of a loop: samples and commands, which are the last states of blocks. */
+static void process_event(const Workspace *w, const Step *step, const Group *g) {
+    const int own = w->block_size - w->commands;
+    for (int b = 0; b < w->blocks; b++)
+        memcpy(g->plant_state + b * own, g->state + b * w->block_size,
+               (size_t)own * sizeof(Register));
+    w->loop->process((const void *const *)w->inputs[LOOP_NUMBERS], step->event, step->start,
+                     g->memory, g->plant_state, g->commands);
+    for (int b = 0; b < w->blocks; b++)
+        memcpy(g->state + b * w->block_size + own, g->commands,
+               (size_t)w->commands * sizeof(Register));
+}
 
 /* Deflections at the peak nodes of a step, the largest of them, and a bound of those between; from
  * the state before the step. */
@@ -92,6 +121,10 @@ static void load_states(const Workspace *w, const Group *g) {
         g->state[i] = load(w->state + i * w->batch_size + g->first, g->count);
     for (int i = 0; i < w->vehicle_states; i++)
         g->vehicle_state[i] = load(w->vehicle_state + i * w->batch_size + g->first, g->count);
+    for (int i = 0; i < w->memory_size; i++)
+        g->memory[i] = load(w->memory + i * w->batch_size + g->first, g->count);
+    for (int i = 0; i < w->marks; i++)
+        g->amplitudes[i] = load(w->amplitudes + i * w->batch_size + g->first, g->count);
 }
 
 /* All steps of the chunk for a few groups, interleaved: while the divisions of one wait, another
@@ -103,6 +136,12 @@ static void advance_chunk(Workspace *w, int steps, Group *groups, int group_coun
     for (int t = 0; t < steps; t++) {
         const Step *step = w->steps + t;
         const int vehicles = vehicles_move(w, step);
+        if (w->loop)
+            for (const Group *g = groups; g < end; g++) {
+                g->amplitudes[step->mark] =
+                    maximum(squared_amplitude(w, g->state), g->amplitudes[step->mark]);
+                if (step->event >= 0) process_event(w, step, g);
+            }
         if (vehicles)
             for (const Group *g = groups; g < end; g++) prepare_vehicles(w, step, g);
         if (step->loads) {
@@ -122,6 +161,10 @@ static void advance_chunk(Workspace *w, int steps, Group *groups, int group_coun
             update_peaks(w, steps, g, position);
         for (int i = 0; i < w->vehicle_states; i++)
             store(w->vehicle_state + i * w->batch_size + g->first, g->vehicle_state[i], g->count);
+        for (int i = 0; i < w->memory_size; i++)
+            store(w->memory + i * w->batch_size + g->first, g->memory[i], g->count);
+        for (int i = 0; i < w->marks; i++)
+            store(w->amplitudes + i * w->batch_size + g->first, g->amplitudes[i], g->count);
         Register zero = {0}; /* NaN if a state is infinite or NaN, which it then stays */
         for (int i = 0; i < w->states; i++) {
             store(w->state + i * w->batch_size + g->first, g->state[i], g->count);
@@ -129,6 +172,17 @@ static void advance_chunk(Workspace *w, int steps, Group *groups, int group_coun
         }
         double *finite = w->finite + g->first;
         store(finite, choose(zero == 0, load(finite, g->count), broadcast(0)), g->count);
+    }
+}
+
+/* Amplitudes at the end of a run. */
+static void end_amplitudes(Workspace *w) {
+    Group *g = w->groups;
+    for (g->first = 0; g->first < w->batch_size; g->first += REGISTER_WIDTH) {
+        g->count = runs_from(w, g->first);
+        load_states(w, g);
+        const Register largest = maximum(squared_amplitude(w, g->state), g->amplitudes[0]);
+        store(w->amplitudes + g->first, largest, g->count);
     }
 }
 

@@ -74,11 +74,11 @@ static void balance_vehicle(const Workspace *w, const double *matrix, const Grou
             w->vehicle_scale[i][l] = i < dofs && l < g->count ? sqrt(largest[l]) : 1;
 }
 
-/* Propagators of the vehicles of a group of runs for the steps of a panel. */
+/* Propagators of the vehicles of a group of runs for the steps of a length. */
 static void vehicle_propagators(Workspace *w, const Step *step, const Group *g) {
-    int64_t *panel = w->vehicle_panel + g->first / REGISTER_WIDTH;
-    if (*panel == step->panel) return;
-    *panel = step->panel;
+    int64_t *kind = w->vehicle_kind + g->first / REGISTER_WIDTH;
+    if (*kind == step->kind) return;
+    *kind = step->kind;
     VehicleMatrices m = {w->inputs[VEHICLE_STATE_MATRIX] + g->first,
                          w->inputs[VEHICLE_INPUT_MATRIX] + g->first,
                          w->inputs[VEHICLE_OUTPUT_MATRIX] + g->first};

@@ -50,6 +50,10 @@ enum {
     SURFACE,
     LOAD_FORCES,
     INITIAL_VEHICLES,
+    LENGTHS_OF_PANELS,
+    EVENTS,
+    MEMORY,
+    LOOP_NUMBERS,
     GAUSS_NODES,
     LAGRANGE_COEFFICIENTS,
     INTERPOLATION,
@@ -58,7 +62,17 @@ enum {
     FORCE_WEIGHTS,
     ARGUMENT_COUNT
 };
-enum { PEAK, PEAK_TIME, LOWEST_FORCE, CONTACT_LOSS_TIME, RESULT_COUNT };
+enum { PEAK, PEAK_TIME, LOWEST_FORCE, CONTACT_LOSS_TIME, FAILURES, AMPLITUDES, RESULT_COUNT };
+
+/* A sampled loop: what happens at an event, to the memory of the runs of a group and their commands
+ * (simulation/translated_loop.py); numbers of commands and of marks in time up to which amplitudes
+ * are compared (integrator/growth.py), and the place of the failures in the memory. Commands are
+ * states that do not change between events, in each block. NULL without a loop. */
+typedef struct {
+    void (*process)(const void *const *numbers, int64_t event, double time, Register *memory,
+                    const Register *state, Register *commands);
+    int64_t commands, marks, failures;
+} Loop;
 
 /* Numbers of the vehicles of a load, all alike: first wheel, and wheels and states of each. */
 enum { FIRST_WHEEL, WHEELS, STATES, COUNT, VEHICLE_NUMBERS };
@@ -76,7 +90,8 @@ enum { HEIGHT, HEIGHT_RATE, HEIGHT_SECOND_RATE, SURFACE_MOTIONS };
  * compliance (end, load, load). */
 typedef struct {
     int64_t number; /* among all steps of the task */
-    int panel, loads, rows, ends;
+    int64_t event;  /* at its start, -1 for none */
+    int panel, kind, mark, loads, rows, ends;
     double start, length;
     const double *transition;
     int64_t *load_numbers;
@@ -95,17 +110,21 @@ typedef struct {
     Register *samples; /* (step, sample, position) */
     /* (step, position): largest of the samples, and bound of the curve between them */
     Register *sample_peak, *peak_bound;
+    /* Of a loop: memory, states without the commands, these, amplitudes squared by marks. */
+    Register *memory, *plant_state, *commands, *amplitudes;
 } Group;
 
 typedef struct {
     /* Numbers of each; modes are those of a block. */
-    int panels, blocks, block_size, modes, segments, terms, pieces, max_loads, loads, positions;
+    int panels, lengths, blocks, block_size, modes, segments, terms, pieces, max_loads, loads, positions;
     int influence_pieces, influence_terms;
     int states, all_modes, sample_count, columns;
     /* Loads with vehicles and their VEHICLE_NUMBERS; motions that are needed, states of all
      * vehicles, the largest numbers of one, registers of the propagators of all loads. */
     int groups_of_vehicles, motions, vehicle_states, most_states, most_wheels, vehicle_registers;
     const int64_t *vehicles;
+    const Loop *loop;
+    int commands, marks, memory_size;
     int has_surface, has_forces, has_initial;
     int64_t forced_runs; /* runs with forces over time of their own: all, or one for all */
     ptrdiff_t batch_size;
@@ -113,9 +132,10 @@ typedef struct {
     double *const *outputs;
     /* Of the task: series of mode shapes and their derivatives. */
     double *series;
-    /* Of each panel: propagators, with nodes, forces or samples as the last axis. */
+    /* Of each step length: propagators, with nodes, forces or samples as the last axis. */
     double *node_transition, *node_force_response, *transition, *force_response, *sample_rows,
         *sample_response;
+    int64_t *length_used;
     /* Exponential of a block, for several fractions of steps at once. */
     double *scale;
     Register *block_matrix, *input_matrix, *series_sums, *product, *exponential,
@@ -127,10 +147,10 @@ typedef struct {
     Register *root_energy;
     /* Of each run: state, running peaks, smallest contact forces; whether it is finite. */
     double *state, *peak, *peak_samples, *peak_step_start, *peak_step_length, *lowest_force,
-        *contact_loss_time, *finite, *vehicle_state;
-    /* Of each group of runs: propagators of vehicles, and the panel whose steps they are for. */
+        *contact_loss_time, *finite, *vehicle_state, *memory, *amplitudes;
+    /* Of each group of runs: propagators of vehicles, and the length of steps they are for. */
     Register *vehicle_propagators;
-    int64_t *vehicle_panel;
+    int64_t *vehicle_kind;
     double first_vehicle_entry, last_vehicle_exit; /* s */
     Group groups[INTERLEAVED_GROUPS];
     Step steps[CHUNK_STEPS];
@@ -139,7 +159,7 @@ typedef struct {
 
 static int padded_size(int count) { return (count + PADDING - 1) / PADDING * PADDING; }
 
-/* Sizes of the matrices of a panel, in doubles. */
+/* Sizes of the matrices of a step length, in doubles. */
 static size_t node_transition_size(const Workspace *w) {
     return (size_t)w->states * w->block_size * PADDED_NODES;
 }
@@ -164,19 +184,20 @@ static void *allocate(uintptr_t start, size_t *used, size_t numbers) {
 
 /* Set the pointers into the workspace; its size in bytes. */
 static size_t partition_workspace(Workspace *w, uintptr_t start) {
-    size_t used = 0, batch_size = (size_t)w->batch_size, panels = (size_t)w->panels,
+    size_t used = 0, batch_size = (size_t)w->batch_size, lengths = (size_t)w->lengths,
            block_size = (size_t)w->block_size;
     size_t loads = (size_t)w->max_loads, rows = loads * NODES, ends = 2 * loads;
     size_t states = (size_t)w->states, sample_count = (size_t)w->sample_count;
     size_t positions = (size_t)w->positions, all_modes = (size_t)w->all_modes,
            modes = (size_t)w->modes;
     w->series = allocate(start, &used, (size_t)w->segments * w->terms * w->columns);
-    w->node_transition = allocate(start, &used, panels * node_transition_size(w));
-    w->node_force_response = allocate(start, &used, panels * node_force_response_size(w));
-    w->transition = allocate(start, &used, panels * transition_size(w));
-    w->force_response = allocate(start, &used, panels * force_response_size(w));
-    w->sample_rows = allocate(start, &used, panels * sample_rows_size(w));
-    w->sample_response = allocate(start, &used, panels * sample_response_size(w));
+    w->node_transition = allocate(start, &used, lengths * node_transition_size(w));
+    w->node_force_response = allocate(start, &used, lengths * node_force_response_size(w));
+    w->transition = allocate(start, &used, lengths * transition_size(w));
+    w->force_response = allocate(start, &used, lengths * force_response_size(w));
+    w->sample_rows = allocate(start, &used, lengths * sample_rows_size(w));
+    w->sample_response = allocate(start, &used, lengths * sample_response_size(w));
+    w->length_used = allocate(start, &used, lengths);
     w->scale = allocate(start, &used, block_size);
     const size_t side = block_size > (size_t)w->most_states ? block_size : (size_t)w->most_states,
                  forces = modes > (size_t)w->most_wheels ? modes : (size_t)w->most_wheels;
@@ -205,11 +226,13 @@ static size_t partition_workspace(Workspace *w, uintptr_t start) {
     w->lowest_force = allocate(start, &used, (size_t)w->loads * batch_size);
     w->contact_loss_time = allocate(start, &used, (size_t)w->loads * batch_size);
     w->finite = allocate(start, &used, batch_size);
+    w->memory = allocate(start, &used, (size_t)w->memory_size * batch_size);
+    w->amplitudes = allocate(start, &used, (size_t)w->marks * batch_size);
     const size_t register_count = (batch_size + REGISTER_WIDTH - 1) / REGISTER_WIDTH;
     w->vehicle_state = allocate(start, &used, (size_t)w->vehicle_states * batch_size);
     w->vehicle_propagators =
         allocate(start, &used, register_count * (size_t)w->vehicle_registers * REGISTER_WIDTH);
-    w->vehicle_panel = allocate(start, &used, register_count);
+    w->vehicle_kind = allocate(start, &used, register_count);
     for (int k = 0; k < INTERLEAVED_GROUPS; k++) {
         Group *g = w->groups + k;
         g->state = allocate(start, &used, (states + rows + ends) * REGISTER_WIDTH);
@@ -219,6 +242,10 @@ static size_t partition_workspace(Workspace *w, uintptr_t start) {
         g->samples = allocate(start, &used, CHUNK_STEPS * sample_count * REGISTER_WIDTH);
         g->sample_peak = allocate(start, &used, CHUNK_STEPS * positions * REGISTER_WIDTH);
         g->peak_bound = allocate(start, &used, CHUNK_STEPS * positions * REGISTER_WIDTH);
+        g->memory = allocate(start, &used, (size_t)w->memory_size * REGISTER_WIDTH);
+        g->plant_state = allocate(start, &used, states * REGISTER_WIDTH);
+        g->commands = allocate(start, &used, (size_t)w->commands * REGISTER_WIDTH);
+        g->amplitudes = allocate(start, &used, (size_t)w->marks * REGISTER_WIDTH);
         if (!w->groups_of_vehicles) continue;
         g->vehicle_state = allocate(start, &used, (size_t)w->vehicle_states * REGISTER_WIDTH);
         g->next_vehicle_state = allocate(start, &used, (size_t)w->vehicle_states * REGISTER_WIDTH);
@@ -252,6 +279,7 @@ static void derive_sizes(Workspace *w) {
     w->states = w->blocks * w->block_size, w->all_modes = w->blocks * w->modes;
     w->sample_count = PEAK_POINTS * w->positions, w->columns = 3 * w->all_modes;
     w->motions = w->groups_of_vehicles ? MOTIONS : 1;
+    if (w->loop) w->commands = (int)w->loop->commands, w->marks = (int)w->loop->marks;
     for (int group = 0; group < w->groups_of_vehicles; group++) {
         const int64_t *numbers = w->vehicles + group * VEHICLE_NUMBERS;
         const int states = (int)numbers[STATES], wheels = (int)numbers[WHEELS];
@@ -275,6 +303,11 @@ static void set_inputs(Workspace *w, const Array *arguments, int64_t task) {
 
 static int64_t panel_steps(const Workspace *w, int panel) {
     return ((const int64_t *)w->inputs[STEP_COUNTS])[panel];
+}
+
+/* Index of the length of the steps of a panel: each has its own, or they share some. */
+static int length_of_panel(const Workspace *w, int panel) {
+    return w->loop ? (int)((const int64_t *)w->inputs[LENGTHS_OF_PANELS])[panel] : panel;
 }
 
 /* Motion of the profile at the path nodes under a wheel, NULL without a profile. */
