@@ -250,7 +250,12 @@ def test_a_mode_at_the_edge_of_a_band():
 
 @pytest.mark.parametrize(
     ("damping", "sd", "says"),
-    [(0.044, 0.004, ""), (0.044, 0.03, "damping uncertain, 4.4 % +- 5.9 %"), (5e-5, 1e-3, "hum:")],
+    [
+        (0.044, 0.004, ""),
+        (0.044, 0.03, "damping uncertain, 4.4 % +- 5.9 %"),
+        (5e-5, 2e-4, "hum:"),
+        (-5e-5, 1e-3, "damping uncertain"),
+    ],
 )
 def test_a_mode_is_called_hum_only_if_no_structure_is_damped_as_little(damping, sd, says):
     mode = IdentifiedMode(5.0, 0.001, damping, sd, 0.5, np.ones(1, complex), np.zeros((2, 2)))
