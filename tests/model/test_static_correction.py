@@ -13,7 +13,7 @@ import jaxbeam as jb
 from jaxbeam.case.case import replace
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensing.corrected_rows import static_correction
+from jaxbeam.model.sensing.corrected_rows import LoadInfluence, static_correction
 from jaxbeam.model.sensing.output_rows import sensor_rows
 from jaxbeam.model.static_correction import (
     bending_moment,
@@ -281,3 +281,11 @@ def test_dampers_in_corrected_rows_by_a_long_series(part, quantity):
     assert_allclose(influence, residual * signs[0], rtol=1e-4)
     # The third derivative converges with the square of the number of modes.
     assert_allclose(found, expected * signs[0], rtol=0, atol=1e-4 * scale)
+
+
+@pytest.mark.parametrize(("near", "expected"), [(0.0, 1.0), (0.5 - 1e-9, 1.0), (1.0, 2.0)])
+def test_the_side_of_a_break_beside_another(near, expected):
+    """Constants 1, 2 and 3 between breaks 5e-9 of the length apart: the piece next to the first."""
+    breaks, values = np.array([0.0, 0.5, 0.5 + 5e-9, 1.0]), np.array([1.0, 2.0, 3.0])
+    influence = LoadInfluence(breaks, values[:, None, None])
+    assert_allclose(influence.of_forces_at(np.array(0.5), np.array(near)), [expected])
