@@ -54,16 +54,6 @@ class VehicleGroup(Module):
         """Number of states of all its vehicles."""
         return self.count * self.A.shape[0]
 
-    @property
-    def highest_square(self) -> Float[Array, ""]:
-        """Square of the highest angular frequency (rad^2/s^2) on a rigid surface, or a little more.
-
-        Root of the trace of the square of M^-1 K, whose eigenvalues are not negative.
-        """
-        dofs = self.A.shape[0] // 2
-        ratio = self.A[dofs:, :dofs]
-        return xp.max(xp.sqrt(xp.abs(xp.sum(ratio * xp.swapaxes(ratio, 0, 1), axis=(0, 1)))))
-
     def initial_state(
         self, surface: Float[Array, "wheel batch"]
     ) -> Float[Array, "vehicle state batch"]:

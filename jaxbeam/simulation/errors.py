@@ -10,7 +10,7 @@ from jaxbeam.integrator.peaks.running_peaks import RunningPeaks
 from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.step_size import UNSAMPLED, StepTrial, trial_positions
 from jaxbeam.model.layout import is_uniform
-from jaxbeam.model.load_set import LoadSet, load_set
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.output_rows import band_weights, beside, modal_row, sensor_history
@@ -50,36 +50,29 @@ def step_errors(case: Case, model: ModalModel, trial: StepTrial) -> Float[Array,
 
 
 def interpolation_errors(
-    model: ModalModel, loads: LoadSet, running_peaks: RunningPeaks
+    model: ModalModel, running_peaks: RunningPeaks
 ) -> Float[Array, "output batch"]:
     """Errors of the peaks of each output, in its unit: those of polynomials through samples.
 
     Of cos(z s + c) on [-1, 1], the Chebyshev coefficients are Bessel functions of their order at z:
     the first two that the polynomial leaves out follow from its last two, with the largest z, that
-    of the highest mode of the beam or of a vehicle, which may be far above few modes. A mass that
-    is fast or near an end makes them fall more slowly than any mode, and the more slowly the later:
-    the ratio is at least twice that of the last two to the two before. Twice the sum of all that
-    are left out is 0.7 to 1.4 times the largest error of an interpolant; it is taken four times, as
-    modes, and what loads do to them, may cancel in one of the last two.
+    of the highest mode. Twice the sum of all that are left out is 0.7 to 1.4 times the largest
+    error of an interpolant; it is doubled, as modes may cancel in the last two.
     """
     points = 2 * np.array(PEAK_NODES) - 1
     count = len(points)
-    last = np.linalg.inv(np.polynomial.chebyshev.chebvander(points, count - 1))[-4:]
-    last = xp.abs(xp.tensordot(last, running_peaks.samples, axes=1))
-    before, size = last[0] + last[1], last[2] + last[3]
+    last = np.linalg.inv(np.polynomial.chebyshev.chebvander(points, count - 1))[-2:]
+    size = xp.sum(xp.abs(xp.tensordot(last, running_peaks.samples, axes=1)), axis=0)
     highest = xp.max(xp.abs(xp.diagonal(model.stiffness())))
-    for vehicle in loads.wheels.vehicles:
-        highest = xp.maximum(highest, vehicle.highest_square)
     z_square = highest * (running_peaks.step_length / 2) ** 2
     ratio = z_square / (4 * (count - 1) * count) / xp.maximum(1 - z_square / 80, 0.25)
-    ratio = xp.minimum(xp.maximum(ratio, 2 * size / xp.maximum(before, 1e-300)), 0.5)
-    return stop_gradient(8 * size * ratio / (1 - ratio))
+    ratio = xp.minimum(ratio, 0.5)
+    return stop_gradient(4 * size * ratio / (1 - ratio))
 
 
 def peak_errors(
     case: Case,
     model: ModalModel,
-    loads: LoadSet,
     running_peaks: RunningPeaks,
     heights: Float[Array, " output"],
     motion: Motion,
@@ -92,8 +85,7 @@ def peak_errors(
     count, own = len(case.sensors), own_outputs(case.sensors)
     if not count:
         return xp.zeros(()), xp.zeros(0)
-    absolute = interpolation_errors(model, loads, running_peaks)[:, 0]
-    absolute = xp.max(xp.stack(xp.split(absolute, 2)), 0)
+    absolute = xp.max(xp.stack(xp.split(interpolation_errors(model, running_peaks)[:, 0], 2)), 0)
     up, down = xp.split(heights, 2)
     largest = stop_gradient(xp.maximum(up, down))
     rows = model.modes.shapes(trial_positions(case))

@@ -282,7 +282,7 @@ def _record(case: Case, integration: "Integration", times) -> Record:
     lost_positions = xp.diagonal(loads.kinematics(lost_times)[0])
     diverged = xp.any(xp.isnan(outputs.motion.coordinates))  # errors are not defined
     of_peaks = peak_errors(
-        case, integration.model, loads, integration.running_peaks, heights, outputs.motion
+        case, integration.model, integration.running_peaks, heights, outputs.motion
     )
     return Record(
         case=case,
