@@ -271,7 +271,8 @@ OF_LOADS = {
             )
         ],
     ),
-    "planar vehicles": rig([ARTICULATED, changed("wagon", count=2, spacing=0.35, entry_time=0.02)]),
+    "articulated vehicles": rig([ARTICULATED]),
+    "wagons": rig([changed("wagon", count=2, spacing=0.35, entry_time=0.02)]),
     "train": rig(
         [
             changed("train", speed=40.0, **START),
