@@ -2,11 +2,12 @@
 
 XLA splits a step into some forty loops over the runs of a batch; in C it is one, and so are all
 steps of all tasks. It serves sweeps of peaks of all quantities (not of histories), without a
-controller or with one that acts at samples, in double precision, on CPUs. The first large sweep compiles it, once for a machine, in
-1.2 s of processor time. Each new structure regains 3 s, as XLA has less to compile, or nothing
-(two spans, benchmark `first_answer`), and 4096 crossings 0.05 (3 modes) to 0.26 s (12 modes,
-benchmark `sweep`). XLA's own calls of C would take headers, an aligned workspace as one of the
-results, and rules of derivatives that no sweep needs; and compile after the C.
+controller or with one that acts at samples, in double precision, on CPUs. The first large sweep
+compiles it, once for a machine, in 1.2 s of processor time. Each new structure regains 3 s, as XLA
+has less to compile, or nothing (two spans, benchmark `first_answer`), and 4096 crossings 0.05 (3
+modes) to 0.26 s (12 modes, benchmark `sweep`). XLA's own calls of C would take headers, an aligned
+workspace as one of the results, and rules of derivatives that no sweep needs; and compile after the
+C.
 """
 
 import ctypes
