@@ -138,7 +138,7 @@ class Writer:
         return value
 
     def equation(self, equation, values: list[CArray]) -> list[CArray]:
-        """Write an equation; its results."""
+        """Write an equation; its results. Raises UntranslatedError for one without a rule."""
         name, params = equation.primitive.name, equation.params
         if name in OPENED:
             return self.run(params[OPENED[name]], values)
