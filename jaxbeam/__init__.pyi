@@ -40,6 +40,7 @@ from .case.loads.cars import (
 from .case.loads.planar.vehicle import (
     Coach as Coach,
     TrainLoad as TrainLoad,
+    VehicleLoad as VehicleLoad,
     load_vehicle as load_vehicle,
 )
 from .case.loads.point import (
@@ -47,7 +48,6 @@ from .case.loads.point import (
     MovingMass as MovingMass,
     VaryingForce as VaryingForce,
 )
-from .case.loads.vehicle import VehicleLoad as VehicleLoad
 from .case.loads.walking import Crowd as Crowd, Pedestrian as Pedestrian
 from .case.sensors import Sensor as Sensor
 from .control import receptance_method as receptance_method

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from jaxbeam.case.case import Case, concrete_case
-from jaxbeam.integrator.kinks.passages import kink_passages
+from jaxbeam.integrator.kinks import kink_passages
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 

@@ -12,7 +12,7 @@ from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Run
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.estimator import AbstractEstimator
-from jaxbeam.case.kinds import PACKAGES, import_modules
+from jaxbeam.case.fields import PACKAGES, import_modules
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.loads.planar.vehicle_parts import VehicleSensor
 from jaxbeam.case.profiles.shapes import AbstractProfile

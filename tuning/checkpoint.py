@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxbeam.runtime.input_file import check_input, max_bytes, not_as_named
 from jaxbeam.runtime.interrupts import keeping
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,7 +19,7 @@ import jaxbeam as jb
 from experiments.benchmarks.common import parser, print_row, print_table
 from experiments.benchmarks.computing_time import ComputingTimes, computing_times
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.kinds import kinds
+from jaxbeam.case.fields import kinds
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.control.optimal.sampled_lqr import SamplingWarning
 from jaxbeam.simulation.simulate import ContactLossWarning

@@ -16,7 +16,7 @@ import tuning
 from experiments.studies.creep import CreepFit, fitted_creep
 from jaxbeam import rigs
 from jaxbeam.model.statics import static_deflection_per_command
-from jaxbeam.simulation.commands.operators import command_operator
+from jaxbeam.simulation.commands import command_operator
 
 HYSTERESIS = jb.Hysteresis([0.0, 0.5, 1.5, 3.0], [0.75, 0.12, 0.08, 0.08])
 CREEP = jb.Creep([10.0, 1.0, 0.1], [0.02, 0.02, 0.02])

@@ -27,7 +27,7 @@ from experiments.thesis.verdicts import (
 from jaxbeam import rigs
 from jaxbeam.files.report import check_report_folder, write_report
 from jaxbeam.runtime.interrupts import keeping
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 
 MODULES = (
     "thesis.chapter2.frequencies",

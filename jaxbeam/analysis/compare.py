@@ -18,7 +18,7 @@ from jaxbeam.analysis.margins import StabilityMargin, stability_margin
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.runtime.module import Module
-from jaxbeam.simulation.commands.path import with_exact_compensation
+from jaxbeam.simulation.commands import with_exact_compensation
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 

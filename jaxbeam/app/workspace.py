@@ -28,7 +28,7 @@ from jaxbeam.case.reading.toml_file import parse_toml
 from jaxbeam.files.case_file import load_controller
 from jaxbeam.rigs import RIG_NAMES
 from jaxbeam.runtime.input_file import read_input, read_text_input
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 KEPT = 6  # cases, records and prepared simulations that are remembered

@@ -1,6 +1,6 @@
 """C code of the compensation of hysteresis and creep: inverse before the limits, model after them.
 
-As `jaxbeam.simulation.commands.path` has them: the inverse gives the command for a wanted one; what
+As `jaxbeam.simulation.commands` has them: the inverse gives the command for a wanted one; what
 acts of the limited command, according to the same operators, is what the law knows of it.
 """
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxbeam.c_code.source import CSource
 from jaxbeam.case.case import Case
-from jaxbeam.simulation.commands.path import command_path
+from jaxbeam.simulation.commands import command_path
 
 
 class Compensation:

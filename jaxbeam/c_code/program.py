@@ -18,8 +18,7 @@ from jaxbeam.c_code.texts import check_text, header_text, samples_text, source_t
 from jaxbeam.c_code.writers import NoCCodeError, write_law
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController, LawOfCommanded
-from jaxbeam.case.fields import concrete
-from jaxbeam.case.kinds import import_modules, kind_of
+from jaxbeam.case.fields import concrete, import_modules, kind_of
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.state_controller import AbstractStateController, SampledStateLaw, TrueState
@@ -32,9 +31,9 @@ from jaxbeam.model.sensing.sensor_signals import (
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import known
 from jaxbeam.runtime.compiling import compiled_if_traced
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 from jaxbeam.simulation.closed_loop import command_lag
-from jaxbeam.simulation.commands.limits import command_ranges
+from jaxbeam.simulation.commands import command_ranges
 
 MAX_SAMPLES = 2000  # recorded ones, of the start of the run
 

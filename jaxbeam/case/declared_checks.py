@@ -25,9 +25,9 @@ from jaxbeam.case.fields import (
     describe_shape,
     fits_shape,
     is_concrete,
+    kinds,
 )
 from jaxbeam.case.former_words import KINDS, WORDS
-from jaxbeam.case.kinds import kinds
 from jaxbeam.case.limits import check_count, check_entries, check_length
 from jaxbeam.case.quantities import OF_QUANTITY
 from jaxbeam.runtime.arrays import Array

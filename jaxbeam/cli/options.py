@@ -26,7 +26,7 @@ from jaxbeam.cli.arguments import (
     parse_value,
 )
 from jaxbeam.files.report import text_table
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 
 if TYPE_CHECKING:
     from jaxbeam.model.plausibility.facts import Plausibility

@@ -13,9 +13,9 @@ from jaxbeam.estimation.observer import filter_gain, sensor_offsets
 from jaxbeam.estimation.sampled_plant import Transition, in_blocks
 from jaxbeam.estimation.sensor_chain import FilteredPlant, SensorChain
 from jaxbeam.estimation.simulated_vehicles import with_loads
+from jaxbeam.model.contact import mass_contact_rows
 from jaxbeam.model.linear_system import Signal, StateSpace
 from jaxbeam.model.sensing.output_rows import OutputRows
-from jaxbeam.model.vehicle_contact import mass_contact_rows
 from jaxbeam.numerics.matrices import symmetric_part
 from jaxbeam.runtime.arrays import Array, add_at, take, xp
 

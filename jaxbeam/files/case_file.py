@@ -16,21 +16,18 @@ from typing import Any
 
 import tomli_w
 
-from jaxbeam.case.case import Case, list_sizes, part_classes, unknown_address_error
+from jaxbeam.case.case import Case, each_address, list_sizes, part_classes, unknown_address_error
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.declared_checks import describe_value, suggestion
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, kind_of, kinds
 from jaxbeam.case.former_words import attribute_address
-from jaxbeam.case.joint_addresses import each_address
-from jaxbeam.case.kinds import kind_of, kinds
-from jaxbeam.case.loads.planar.vehicle import is_path
-from jaxbeam.case.loads.vehicle import IMPLIED
+from jaxbeam.case.loads.planar.vehicle import IMPLIED, is_path
 from jaxbeam.case.reading.tables import read_part, read_parts
 from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.profile_file import with_profile_file
 from jaxbeam.model.plausibility.check import warn_if_implausible
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 
 
 class KindChangeWarning(UserWarning):

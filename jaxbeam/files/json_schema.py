@@ -5,9 +5,15 @@ import inspect
 from typing import Any, NamedTuple
 
 from jaxbeam.case.case import part_classes
-from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, PROBABILITY, axis_names, describe_shape
+from jaxbeam.case.fields import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    PROBABILITY,
+    axis_names,
+    describe_shape,
+    kinds,
+)
 from jaxbeam.case.former_words import FILE_KEYS
-from jaxbeam.case.kinds import kinds
 from jaxbeam.case.limits import MAX_COUNTS
 from jaxbeam.case.profiles.shapes import TableProfile
 from jaxbeam.case.quantities import OF_QUANTITY

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxbeam.files.tables import as_text_cell
 from jaxbeam.model.linear_system import StateSpace
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 
 MATRIX_SUFFIXES = (".mat", ".npz", ".json", ".csv")
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxbeam.runtime.whole_file import naming_file, whole_file
+from jaxbeam.runtime.output_file import naming_file, whole_file
 
 Row = Sequence[str]
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.validation import check_case
 from jaxbeam.estimation.sampled_plant import SampleTiming
-from jaxbeam.integrator.kinks.passages import may_have_kinks
+from jaxbeam.integrator.kinks import may_have_kinks
 from jaxbeam.model.state_space import state_space
 from jaxbeam.numerics.discretisation import balance
 

@@ -18,7 +18,7 @@ from jaxbeam.model.sensing.sensor_signals import (
 )
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import known
-from jaxbeam.simulation.commands.path import command_path
+from jaxbeam.simulation.commands import command_path
 
 CLOCK_TOLERANCE = 1e-6  # of a period, by which a time may miss a sample
 

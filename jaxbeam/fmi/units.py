@@ -12,7 +12,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.files.case_file import save_case
 from jaxbeam.fmi.beam_steps import BeamSteps
 from jaxbeam.fmi.controller_steps import ControllerSteps
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 
 PARTS = {"beam": BeamSteps, "controller": ControllerSteps}
 

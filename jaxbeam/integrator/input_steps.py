@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.integrator.growth import OVERFLOW
-from jaxbeam.integrator.input_policy import StepInfo
+from jaxbeam.integrator.inputs import StepInfo
 from jaxbeam.integrator.propagators import GAUSS_NODES
-from jaxbeam.integrator.step_maps import step_maps
-from jaxbeam.integrator.vehicles.steps import StepInput, Vehicles
+from jaxbeam.integrator.step import step_maps
+from jaxbeam.integrator.vehicles import StepInput, Vehicles
 from jaxbeam.runtime.arrays import any_jax, any_traced, collapse, xp
 from jaxbeam.runtime.compiling import compiled
 

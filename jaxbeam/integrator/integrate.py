@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.integrator.discrete_model import DiscreteModel
+from jaxbeam.integrator.contact_forces import END_FRACTIONS, end_forces
+from jaxbeam.integrator.discrete_model import DiscreteModel, energies
 from jaxbeam.integrator.growth import (
     amplitudes,
     diverged,
@@ -25,25 +26,27 @@ from jaxbeam.integrator.growth import (
     has_feedback,
     largest_by_marks,
 )
-from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.input_steps import advance_with_inputs
-from jaxbeam.integrator.kinks.steps import weights_with_impulses, with_impulses
+from jaxbeam.integrator.inputs import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.load_path import LoadPath, load_path
-from jaxbeam.integrator.peaks.end_forces import END_FRACTIONS, end_forces
-from jaxbeam.integrator.peaks.monitored_rows import energies
-from jaxbeam.integrator.peaks.running_peaks import RunningPeaks, initial_peaks, update_peaks
+from jaxbeam.integrator.peaks import RunningPeaks, initial_peaks, update_peaks
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
 from jaxbeam.integrator.step import advance_free, advance_unforced
-from jaxbeam.integrator.step_matrices import chunk_length, step_matrices
-from jaxbeam.integrator.vehicles.propagators import vehicle_state_norm
-from jaxbeam.integrator.vehicles.steps import (
+from jaxbeam.integrator.step_matrices import (
+    chunk_length,
+    step_matrices,
+    weights_with_impulses,
+    with_impulses,
+)
+from jaxbeam.integrator.vehicles import (
     StepInput,
     VehicleStep,
+    vehicle_state_norm,
     vehicles_of,
 )
+from jaxbeam.model.contact import initial_vehicle_states
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.vehicle_contact import initial_vehicle_states
 from jaxbeam.runtime.arrays import (
     Array,
     any_jax,

@@ -3,9 +3,9 @@
 import jax
 from jaxtyping import Bool, Float, Int
 
+from jaxbeam.integrator.contact_forces import EndRows, end_rows
 from jaxbeam.integrator.discrete_model import DiscreteModel
-from jaxbeam.integrator.kinks.passages import KinkSteps
-from jaxbeam.integrator.peaks.end_forces import EndRows, end_rows
+from jaxbeam.integrator.kinks import KinkSteps
 from jaxbeam.integrator.propagators import GAUSS_NODES, PEAK_NODES
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.contact import SurfaceRows, surface_rows

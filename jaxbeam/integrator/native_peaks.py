@@ -20,18 +20,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.integrator.growth import MARK_COUNT
-from jaxbeam.integrator.kinks.passages import may_have_kinks
-from jaxbeam.integrator.peaks.contact_minimum import (
+from jaxbeam.integrator.contact_forces import (
+    END_FRACTIONS,
     FORCE_FRACTIONS,
     FORCE_GAP,
     ZERO_ITERATIONS,
     force_weights_at_fractions,
     spread_factor,
 )
-from jaxbeam.integrator.peaks.end_forces import END_FRACTIONS
-from jaxbeam.integrator.peaks.monitored_rows import bounds_by_energy, commands_at_once
-from jaxbeam.integrator.peaks.running_peaks import PEAK_MARGIN, Peaks
+from jaxbeam.integrator.discrete_model import bounds_by_energy, commands_at_once
+from jaxbeam.integrator.growth import MARK_COUNT
+from jaxbeam.integrator.kinks import may_have_kinks
+from jaxbeam.integrator.peaks import PEAK_MARGIN, Peaks
 from jaxbeam.integrator.propagators import (
     DOUBLINGS,
     GAUSS_NODES,
@@ -41,14 +41,12 @@ from jaxbeam.integrator.propagators import (
 )
 from jaxbeam.integrator.step_matrices import CHUNK_STEPS
 from jaxbeam.integrator.time_grid import TimeGrid
+from jaxbeam.model.contact import initial_vehicle_states
 from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import LoadSet, WheelSet
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.sensing.corrected_rows import StaticCorrection, linear_outputs
-from jaxbeam.model.sensing.output_rows import OutputRows
+from jaxbeam.model.sensing.output_rows import OutputRows, StaticCorrection, linear_outputs
 from jaxbeam.model.settlement import has_settlement
-from jaxbeam.model.vehicle_contact import initial_vehicle_states
-from jaxbeam.numerics.gauss import lagrange_coefficients
 from jaxbeam.numerics.peak_search import (
     ESTIMATE_ITERATIONS,
     NEWTON_ITERATIONS,
@@ -57,6 +55,7 @@ from jaxbeam.numerics.peak_search import (
     interpolation_matrix,
     newton_step_limit,
 )
+from jaxbeam.numerics.polynomials import lagrange_coefficients
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.native_library import Library
 

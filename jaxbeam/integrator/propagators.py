@@ -21,7 +21,7 @@ from jaxtyping import Float
 
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.numerics.batched_linalg import MAX_UNROLLED_TERMS
-from jaxbeam.numerics.gauss import gauss_nodes, lagrange_coefficients
+from jaxbeam.numerics.polynomials import gauss_nodes, lagrange_coefficients
 from jaxbeam.runtime.arrays import Array, cond, scan, set_at, stop_gradient, vmap, xp
 from jaxbeam.runtime.module import Module
 

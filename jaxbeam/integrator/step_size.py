@@ -19,10 +19,10 @@ from jaxbeam.case.case import Case, concrete_case, replace
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.limits import MAX_SAMPLES
 from jaxbeam.integrator.discrete_model import discrete_model
-from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.static_shapes import StaticShapes, model_limits
 from jaxbeam.integrator.time_grid import (
+    EventSchedule,
     LoadEvents,
     TimeGrid,
     event_places,

@@ -1,20 +1,339 @@
 """Time grid: panels of equal steps between events and samples.
 
-A load event is a time at which the motion is not smooth: a load enters, leaves, stops, or passes
-a support or the end of a patch. No step contains one inside. The structure of the case fixes the
-number of panels, so the grid can be compiled; a panel of zero length has no effect.
+Events known before a run (samples, control samples, breakpoints of commands) are merged into one
+schedule, so that steps end there, with the actions at each event. A load event is a time at which
+the motion is not smooth: a load enters, leaves, stops, or passes a support or the end of a patch;
+its time may be traced. No step contains one inside. The structure of the case fixes the number of
+panels, so the grid can be compiled; a panel of zero length has no effect.
 """
 
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.integrator.events import EventSchedule
-from jaxbeam.integrator.kinks.passages import KinkPassages, kink_passages
+from jaxbeam.integrator.kinks import KinkPassages, kink_passages
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.runtime.arrays import Array, put, searchsorted, stop_gradient, take, xp
+from jaxbeam.runtime.arrays import (
+    Array,
+    any_jax,
+    custom_jvp,
+    is_jax,
+    put,
+    searchsorted,
+    set_at,
+    stop_gradient,
+    take,
+    xp,
+)
 from jaxbeam.runtime.module import Module
+
+SAME_TIME_SHARE = 1e-9  # of the duration: closer times are one event
+MAX_DISTINCT_GAPS = 64  # with more different intervals, each has a length of its own
+
+
+class EventSchedule(Module):
+    """Times of events (s), lengths of the intervals between them, and the actions at each event.
+
+    `length_index` is the index of each interval among the `lengths` (s); `sample_events` are the
+    events at which the run is sampled. With a controller: `control_sample` is the number of the
+    control sample at an event and `reading` that of the reading of each sensor, -1 for none.
+    `reading_age` is the number of readings made since the one that is available at an event,
+    `command_age` the number of commands made since the one that takes effect, -1 for none;
+    `max_age` and `max_waiting` are their maxima. A sensor makes at most `max_readings`. Lost
+    readings and commands are left out; `missing` says that the reading due last has been lost, and
+    `assumed_age` is the number of commands made since the one that acts at a sample according to a
+    law that does not know of losses and random delays. Both are None without these.
+
+    In a schedule that moves with the numbers of the case, no two actions share an event, and
+    `source` is the index of each event's time among those that `moved` is given, -1 for a time
+    that stays. `merging` (s) is added to it, by less than SAME_TIME_SHARE, so that times that were
+    equal but for rounding are; `source_counts` are the numbers of times of each kind of action.
+    """
+
+    times: Float[Array, " event"]
+    length_index: Int[Array, " interval"]
+    lengths: Float[Array, " length"]
+    sample_events: Int[Array, " time"]
+    control_sample: Int[Array, " event"] | None = None
+    command_age: Int[Array, " event"] | None = None
+    reading: Int[Array, "event sensor"] | None = None
+    reading_age: Int[Array, "event sensor"] | None = None
+    missing: Bool[Array, "event sensor"] | None = None
+    assumed_age: Int[Array, ""] | None = None
+    source: Int[Array, " event"] | None = None
+    merging: Float[Array, " event"] | None = None
+    max_age: int = eqx.field(static=True, default=0)
+    max_waiting: int = eqx.field(static=True, default=0)
+    max_readings: int = eqx.field(static=True, default=0)
+    source_counts: tuple[int, ...] = eqx.field(static=True, default=())
+
+    def moved(self, times: Float[Array, " time"]) -> "EventSchedule":
+        """The schedule with these times (s) of its actions, in the order of `source`."""
+        own = take(times, xp.maximum(self.source, 0)) + self.merging
+        times = in_order(xp.where(self.source < 0, self.times, own))
+        return dataclasses.replace(self, times=times, lengths=xp.diff(times))
+
+
+@custom_jvp
+def in_order(times: Float[Array, " event"]) -> Float[Array, " event"]:
+    """Times (s) of events in their order, which rounding must not change where two are equal.
+
+    A compiler that multiplies and adds at once rounds `k * period` otherwise in each expression.
+    Derivatives are those of the times.
+    """
+    return jax.lax.cummax(times) if is_jax(times) else np.maximum.accumulate(times)
+
+
+@in_order.defjvp
+def _(primals, tangents):
+    return in_order(*primals), *tangents
+
+
+def moving_with_end(times: Float[Array, " time"], end: Float[Array, ""]) -> Float[Array, " time"]:
+    """Times (s), of which those at the `end` (s) of a run, but for rounding, are the end itself.
+
+    What is done at the end of a run changes nothing before: derivatives of a peak at the end are
+    those of the motion at a fixed time, or by the end, not by the times of the actions there.
+    """
+    at_end = stop_gradient(times) >= stop_gradient(end) * (1 - SAME_TIME_SHARE)
+    return xp.where(at_end, end, times)
+
+
+def sample_schedule(
+    times: Float[Array, " time"],
+    equally_spaced: bool,
+    lead_samples: int = 0,
+    end: Float[Array, ""] | None = None,
+) -> EventSchedule:
+    """Schedule of a run without controller: samples at ascending times (s), which may be traced.
+
+    The first `lead_samples` times are events without a sample, and so is the `end` (s) of the run,
+    if it is not the last sample.
+    """
+    count = times.shape[0]
+    sample_events = xp.arange(lead_samples, count)
+    if equally_spaced:
+        lengths = ((times[-1] - times[0]) / (count - 1))[None]
+        length_index = xp.zeros(count - 1, int)
+    else:
+        lengths, length_index = xp.diff(times), xp.arange(count - 1)
+    if end is not None:
+        if any_jax(times, end):
+            times = moving_with_end(times, end)
+            length_index = set_at(length_index, -1, lengths.shape[0])
+            lengths = xp.append(lengths, times[-1] - times[-2])
+        else:
+            end = xp.maximum(end, times[-1])
+        length_index = xp.append(length_index, lengths.shape[0])
+        lengths = xp.append(lengths, end - times[-1])
+        times = xp.append(times, end)
+    return EventSchedule(times, length_index, lengths, sample_events)
+
+
+class Transmission(NamedTuple):
+    """Times (s) at which readings of a sensor, or commands, begin their way and arrive.
+
+    `lost` are those that do not arrive, None for none.
+    """
+
+    sent: Float[np.ndarray, " number"]
+    arrival: Float[np.ndarray, " number"]
+    lost: Bool[np.ndarray, " number"] | None = None
+
+    @property
+    def is_lost(self) -> Bool[np.ndarray, " number"]:
+        """Whether each does not arrive."""
+        return np.zeros(self.sent.size, bool) if self.lost is None else self.lost
+
+    @property
+    def received(self) -> Int[np.ndarray, " received"]:
+        """Numbers of those that arrive."""
+        return np.flatnonzero(~self.is_lost)
+
+
+def controller_schedule(
+    sample_times: Float[np.ndarray, " time"],
+    commands: Transmission,
+    readings: list[Transmission],
+    breakpoints: Float[np.ndarray, " breakpoint"],
+    end: float | None = None,
+    assumed_age: int | None = None,
+    moving: bool = False,
+) -> EventSchedule:
+    """Schedule of a run with a controller, from rest at zero to the `end` (s).
+
+    By default it ends with the last sample, before which it never does.
+
+    The controller acts when its `commands` are sent, which take effect as they arrive, but not
+    after a newer one. The `readings` of each sensor are those of the signal when they are sent;
+    they are available as they arrive, in their order. `breakpoints` (s) are those of prescribed
+    commands.
+
+    A `moving` schedule has its actions at separate events, those at one time in the order in which
+    they take place: breakpoints, readings of each sensor, control, commands, samples, end. In this
+    order `EventSchedule.moved` takes their times.
+    """
+    end = float(sample_times[-1] if end is None else max(end, sample_times[-1]))
+    control_times, begun = commands.sent, commands.received
+    earliest_later = np.minimum.accumulate(np.append(commands.arrival[begun], np.inf)[::-1])[::-1]
+    begun = begun[commands.arrival[begun] < earliest_later[1:]]
+    all_times = np.sort(
+        np.concatenate(
+            [
+                np.array([0.0, end]),
+                sample_times,
+                control_times,
+                commands.arrival[begun],
+                commands.arrival[commands.is_lost],
+                breakpoints,
+                *[each.sent[each.received] for each in readings],
+            ]
+        )
+    )
+    all_times = all_times[(all_times >= 0) & (all_times <= end * (1 + SAME_TIME_SHARE))]
+    times = all_times[np.diff(all_times, prepend=-np.inf) > SAME_TIME_SHARE * end]
+    # Events merged with a sample take its exact time.
+    nearest_sample = np.clip(
+        np.searchsorted(sample_times, times - SAME_TIME_SHARE * end), 0, sample_times.size - 1
+    )
+    times = np.where(
+        np.abs(sample_times[nearest_sample] - times) <= SAME_TIME_SHARE * end,
+        sample_times[nearest_sample],
+        times,
+    )
+
+    def in_run(kind, numbers):
+        wanted = kinds[kind][numbers]
+        tolerance = SAME_TIME_SHARE * end
+        return numbers[(wanted >= -tolerance) & (wanted <= end + tolerance)]
+
+    merged_times, sensors = times, len(readings)
+    kinds = [breakpoints, *(each.sent for each in readings), control_times, commands.arrival]
+    kinds += [sample_times, np.array([end])]
+    control, command, sample = 1 + sensors, 2 + sensors, 3 + sensors
+    used = [np.arange(times.size) for times in kinds]
+    used[1:control] = [each.received for each in readings]
+    used[command] = np.sort(np.append(begun, np.flatnonzero(commands.is_lost)))
+    source = merging = None
+
+    def instants(wanted_times):
+        found = np.searchsorted(merged_times, wanted_times - SAME_TIME_SHARE * end)
+        return np.clip(found, 0, merged_times.size - 1)
+
+    if moving:
+        # A row of instant and kind for each event; the first event is the start of the run.
+        rows = [
+            np.stack([at := instants(kinds[i][in_run(i, used[i])]), np.full(at.size, i)], axis=1)
+            for i in range(len(kinds))
+        ]
+        rows = np.unique(np.concatenate([[[0, -1]], *rows]), axis=0)
+        times = times[rows[:, 0]]
+        source, merging = np.full(len(rows), -1), np.zeros(len(rows))
+
+    def event_indices(kind, numbers):
+        found = instants(kinds[kind][numbers])
+        if not moving:
+            return found
+        own = np.flatnonzero(rows[:, 1] == kind)
+        return own[np.searchsorted(rows[own, 0], found)]
+
+    def number_at_events(kind, numbers):
+        at_events, numbers = np.full(times.size, -1), in_run(kind, numbers)
+        at_events[event_indices(kind, numbers)] = numbers
+        return at_events
+
+    if moving:
+        firsts = np.cumsum([0, *(each.size for each in kinds)])
+        for i, numbers in enumerate(used):
+            at_events = number_at_events(i, numbers)
+            has = np.flatnonzero(at_events >= 0)
+            source[has] = firsts[i] + at_events[has]
+            merging[has] = times[has] - kinds[i][at_events[has]]
+
+    def newest_at_events(arrivals, numbers):
+        arrived = np.searchsorted(arrivals[numbers], times + SAME_TIME_SHARE * end, side="right")
+        return np.append(numbers, -1)[arrived - 1]
+
+    control_sample = number_at_events(control, used[control])
+    command_start = number_at_events(command, begun)
+    # In place of a lost command the last one begins again.
+    is_lost = number_at_events(command, np.flatnonzero(commands.is_lost)) >= 0
+    again = newest_at_events(commands.arrival, begun)
+    command_start = np.where(is_lost & (command_start < 0), again, command_start)
+    newest_sample = np.maximum.accumulate(control_sample)
+    command_lag = np.where(command_start >= 0, newest_sample - command_start, -1)
+    reading_index, reading_lag = [], []
+    for i, each in enumerate(readings, 1):
+        number = number_at_events(i, each.received)
+        # Readings of signals before the run are those at rest, which fill the buffer at the start.
+        made, order = np.cumsum(number >= 0), np.full(each.sent.size + 1, -1)
+        made_in_run = in_run(i, each.received)
+        order[made_in_run] = made[event_indices(i, made_in_run)] - 1
+        newest = newest_at_events(each.arrival, each.received)
+        reading_index.append(number)
+        reading_lag.append(np.maximum(made - 1 - order[newest], 0))
+    missing = None
+    if any(each.lost is not None for each in readings):
+        missing = [
+            np.append(each.is_lost, False)[
+                newest_at_events(each.arrival, np.arange(each.sent.size))
+            ]
+            for each in readings
+        ]
+    gaps = np.diff(times)
+    lengths, length_index = np.unique(
+        np.round(gaps / (1e-2 * SAME_TIME_SHARE * end)), return_inverse=True
+    )
+    if moving or lengths.size > MAX_DISTINCT_GAPS:
+        length_index = np.arange(gaps.size)
+    mean_lengths = np.bincount(length_index, gaps) / np.bincount(length_index)
+
+    def stack_columns(parts, kind=int):
+        return xp.asarray(np.array(parts).reshape(len(parts), times.size).T, kind)
+
+    return EventSchedule(
+        xp.asarray(times),
+        xp.asarray(length_index),
+        xp.asarray(mean_lengths),
+        xp.asarray(event_indices(sample, used[sample])),
+        control_sample=xp.asarray(control_sample),
+        command_age=xp.asarray(command_lag),
+        reading=stack_columns(reading_index),
+        reading_age=stack_columns(reading_lag),
+        missing=None if missing is None else stack_columns(missing, bool),
+        assumed_age=None if assumed_age is None else xp.asarray(assumed_age),
+        source=None if source is None else xp.asarray(source),
+        merging=None if merging is None else xp.asarray(merging),
+        max_age=int(max((part.max() for part in reading_lag), default=0)),
+        max_waiting=int(command_lag.max(initial=assumed_age or 0)),
+        max_readings=max((each.sent.size for each in readings), default=0),
+        source_counts=tuple(each.size for each in kinds) if moving else (),
+    )
+
+
+def stack_schedules(schedules: list[EventSchedule]) -> EventSchedule:
+    """Schedules with the same numbers of events and samples, stacked along a new first axis.
+
+    Raises ValueError if the numbers differ.
+    """
+    if len({(s.times.shape, s.sample_events.shape) for s in schedules}) > 1:
+        raise ValueError("the schedules differ in the number of events or samples")
+    max_lengths = max(s.lengths.shape[0] for s in schedules)
+    maxima = ("max_age", "max_waiting", "max_readings")
+    largest = {name: max(getattr(s, name) for s in schedules) for name in maxima}
+
+    def pad(schedule):
+        lengths = xp.append(schedule.lengths, xp.zeros(max_lengths - schedule.lengths.shape[0]))
+        return dataclasses.replace(schedule, lengths=lengths, **largest)
+
+    return jax.tree.map(lambda *leaves: xp.stack(leaves), *map(pad, schedules))
+
 
 # Entry and exit of each wheel (s), and times of all load events (s).
 LoadEvents = tuple[Float[Array, "wheel 2"], Float[Array, " event"]]

@@ -17,7 +17,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.model.layout import Layout, is_uniform
 from jaxbeam.model.modes import assemble_matrices, section_properties, supported_matrices
 from jaxbeam.model.theory.statics import SectionFlexibility, is_held, section_flexibility
-from jaxbeam.numerics.piecewise import piecewise_chebyshev
+from jaxbeam.numerics.polynomials import piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, set_at, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.module import Module

@@ -28,7 +28,7 @@ from jaxbeam.runtime.arrays import Array, add_at, set_at, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.module import Module
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX

@@ -20,7 +20,7 @@ from jaxbeam.model.modal_model import compiled_modal_model
 from jaxbeam.numerics.discretisation import c2d
 from jaxbeam.runtime.arrays import Array, solve, xp
 from jaxbeam.runtime.module import Module
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 
 
 class Signal(NamedTuple):

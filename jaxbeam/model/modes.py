@@ -41,8 +41,8 @@ from jaxbeam.model.theory.elements import (
     sections,
 )
 from jaxbeam.model.theory.statics import check_buckling
-from jaxbeam.numerics.eigen import REPEATED_EIGENVALUE_TOLERANCE, eigen
-from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshev
+from jaxbeam.numerics.matrices import REPEATED_EIGENVALUE_TOLERANCE, eigen
+from jaxbeam.numerics.polynomials import legendre_to_chebyshev, piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, add_at, set_at, stop_gradient, xp
 from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.module import Module

@@ -17,9 +17,8 @@ from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.layout import Layout, find_layout, kink_nodes
 from jaxbeam.model.theory.elements import nodal_unknowns
-from jaxbeam.model.theory.statics import LEAST_STIFFNESS, nodal_system
-from jaxbeam.model.theory.transfer import Transfer
-from jaxbeam.numerics.piecewise import piecewise_chebyshev, slope_jumps
+from jaxbeam.model.theory.statics import LEAST_STIFFNESS, Transfer, nodal_system
+from jaxbeam.numerics.polynomials import piecewise_chebyshev, slope_jumps
 from jaxbeam.runtime.arrays import Array, set_at, solve, xp
 from jaxbeam.runtime.module import Module
 

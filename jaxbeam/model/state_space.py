@@ -19,12 +19,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.validation import check_plant
-from jaxbeam.model.linear_system import Signal, StateSpace
-from jaxbeam.model.load_set import LoadSet, load_set
-from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
-from jaxbeam.model.modes import Layout
-from jaxbeam.model.sensing.output_rows import OutputRows, sensor_rows
-from jaxbeam.model.vehicle_contact import (
+from jaxbeam.model.contact import (
     ContactRows,
     contact_rows,
     has_known_disturbance,
@@ -33,6 +28,11 @@ from jaxbeam.model.vehicle_contact import (
     vehicle_signals,
     vehicle_system,
 )
+from jaxbeam.model.linear_system import Signal, StateSpace
+from jaxbeam.model.load_set import LoadSet, load_set
+from jaxbeam.model.modal_model import ModalModel, compiled_modal_model
+from jaxbeam.model.modes import Layout
+from jaxbeam.model.sensing.output_rows import OutputRows, sensor_rows
 from jaxbeam.numerics.batched_linalg import solve_small
 from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.compiling import compiled_if_traced

@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbeam.numerics.batched_linalg import solve_each, solve_unpivoted
-from jaxbeam.numerics.gauss import gauss_weights, lagrange_coefficients
 from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square
+from jaxbeam.numerics.polynomials import gauss_weights, lagrange_coefficients
 from jaxbeam.numerics.stages import GAUSS_NODES, NODE_COUNT, Stage, command_cost_matrix
 from jaxbeam.runtime.arrays import Array, add_at, any_jax, index_in_dim, scan, xp
 from jaxbeam.runtime.module import Module

@@ -15,8 +15,8 @@ from jaxtyping import Float
 
 from jaxbeam.numerics.batched_linalg import batch_size_of, matmul, solve_batch, transpose
 from jaxbeam.numerics.discretisation import balance
-from jaxbeam.numerics.gauss import gauss_nodes, gauss_weights, integration_matrix
 from jaxbeam.numerics.matrices import InputWeight, Square, symmetric_part
+from jaxbeam.numerics.polynomials import gauss_nodes, gauss_weights, integration_matrix
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.module import Module
 

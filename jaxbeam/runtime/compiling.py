@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbeam.runtime import compile_cache
+from jaxbeam.runtime.compile_cache import program_name
 from jaxbeam.runtime.interpreter import InterpretedProgram, compile_cost, run_cost
-from jaxbeam.runtime.program_key import program_name
 
 # XLA's newer code generator for CPUs takes twice as long to compile the programs here, and its
 # last level of optimisation a third longer; they run no faster for the one, 3 % for the other.

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator
 
 from jaxbeam.runtime.early_interrupt import STATUS
-from jaxbeam.runtime.whole_file import WRITTEN
+from jaxbeam.runtime.output_file import WRITTEN
 
 GRACE = 5.0  # s for the work to end; compilers in C do not hear of a signal before they have ended
 

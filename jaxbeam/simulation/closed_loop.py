@@ -16,13 +16,13 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractContinuousLaw, AbstractSampledLaw
 from jaxbeam.case.fields import concrete
-from jaxbeam.integrator.events import (
+from jaxbeam.integrator.growth import load_amplitude
+from jaxbeam.integrator.time_grid import (
     EventSchedule,
     Transmission,
     controller_schedule,
     moving_with_end,
 )
-from jaxbeam.integrator.growth import load_amplitude
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Layout
@@ -39,7 +39,7 @@ from jaxbeam.model.sensing.sensor_signals import (
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import Array, any_jax, block_diag, not_differentiated, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
-from jaxbeam.simulation.commands.path import command_path
+from jaxbeam.simulation.commands import command_path
 from jaxbeam.simulation.continuous_loop import ContinuousLoop
 from jaxbeam.simulation.sampled_loop import SampledLoop
 

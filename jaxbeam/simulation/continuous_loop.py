@@ -8,13 +8,13 @@ import jax
 from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractContinuousLaw, Measurement
-from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
+from jaxbeam.integrator.inputs import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.sensor_signals import filtered_reading
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, scan, vmap, xp
-from jaxbeam.simulation.commands.limits import limit_commands
+from jaxbeam.simulation.commands import limit_commands
 
 SHORTEST_STEP = 1e-12  # s, and of the time: far above the rounding of times
 NEWTON_ITERATIONS = 4  # for the commands of a step; one suffices for a linear law

@@ -21,11 +21,10 @@ from jaxbeam.model.sensing.sensor_signals import (
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation import section_forces
-from jaxbeam.simulation.errors import chosen_samples, truncation_errors
-from jaxbeam.simulation.extremes import Extremes
+from jaxbeam.simulation.errors import Extremes, chosen_samples, truncation_errors
 from jaxbeam.simulation.labels import contact_sentence
 from jaxbeam.simulation.record_envelope import RecordEnvelope, record_envelope
-from jaxbeam.simulation.views.record_views import RecordViews
+from jaxbeam.simulation.views import RecordViews
 
 if TYPE_CHECKING:
     pass

@@ -11,9 +11,9 @@ import jax
 from jaxtyping import Float
 
 from jaxbeam.case.controller import AbstractSampledLaw, Measurement
-from jaxbeam.integrator.events import EventSchedule
-from jaxbeam.integrator.input_policy import AbstractInputPolicy, StepInfo
+from jaxbeam.integrator.inputs import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.propagators import NODE_COUNT
+from jaxbeam.integrator.time_grid import EventSchedule
 from jaxbeam.model.contact import contact_at
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
@@ -21,7 +21,7 @@ from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.model.sensing.sensor_signals import filtered_reading, initial_filter_state
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, cond, is_jax, take, vmap, xp
-from jaxbeam.simulation.commands.path import CommandMemory, CommandPath
+from jaxbeam.simulation.commands import CommandMemory, CommandPath
 
 
 class LoopMemory(NamedTuple):

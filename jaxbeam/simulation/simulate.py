@@ -13,16 +13,20 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.discrete_model import DiscreteModel, discrete_model, signed_both_ways
-from jaxbeam.integrator.input_policy import AbstractInputPolicy
+from jaxbeam.integrator.inputs import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history
-from jaxbeam.integrator.peaks.running_peaks import Peaks
+from jaxbeam.integrator.peaks import Peaks
 from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES, end_weights
 from jaxbeam.integrator.time_grid import TimeGrid, grid_by_schedule
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.plausibility.check import warn_if_implausible
-from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
-from jaxbeam.model.sensing.output_rows import sensor_history, sensor_rows
+from jaxbeam.model.sensing.output_rows import (
+    corrected_places,
+    sensor_history,
+    sensor_rows,
+    static_correction,
+)
 from jaxbeam.model.sensing.sensor_signals import (
     VehicleMotion,
     relative_to_beam,
@@ -39,9 +43,8 @@ from jaxbeam.simulation.closed_loop import (
     with_fixed_events,
     with_fixed_losses,
 )
-from jaxbeam.simulation.commands.limits import acting_ranges
-from jaxbeam.simulation.errors import peak_errors
-from jaxbeam.simulation.extremes import monitored_sensors, sensor_extremes
+from jaxbeam.simulation.commands import acting_ranges
+from jaxbeam.simulation.errors import monitored_sensors, peak_errors, sensor_extremes
 from jaxbeam.simulation.integration_plan import (
     TOLERANCE,
     IntegrationPlan,
@@ -55,7 +58,7 @@ from jaxbeam.simulation.integration_plan import (
     sample_times,
     times_of_samples,
 )
-from jaxbeam.simulation.motion.at_samples import motion_at
+from jaxbeam.simulation.motion import motion_at
 from jaxbeam.simulation.record import Record, Result
 from jaxbeam.simulation.varied_plan import traced_ranges, varied_plan, within
 

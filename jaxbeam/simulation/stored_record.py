@@ -17,8 +17,8 @@ from jaxbeam.model.modes import Modes, mesh_layout, modes
 from jaxbeam.model.theory.elements import sections
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.runtime.input_file import check_input, not_as_named
+from jaxbeam.simulation.labels import MODE_FIELDS, MODE_VARIABLES, VARIABLES
 from jaxbeam.simulation.record import Record
-from jaxbeam.simulation.result_variables import MODE_FIELDS, MODE_VARIABLES, VARIABLES
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.integrator.input_policy import StepInfo
+from jaxbeam.integrator.inputs import StepInfo
 from jaxbeam.runtime.c_translation import Translation
 from jaxbeam.runtime.c_writer import (
     HEADERS,

@@ -12,9 +12,9 @@ from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.integrator import native_peaks
-from jaxbeam.integrator.events import sample_schedule
 from jaxbeam.integrator.integrate import max_stable_step
 from jaxbeam.integrator.static_shapes import StaticShapes, max_concurrent_loads
+from jaxbeam.integrator.time_grid import sample_schedule
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.runtime.vectorised import NotVectorisedError
@@ -25,13 +25,15 @@ from jaxbeam.sweeps.batches import Batches, common_layout, swept_masses
 from jaxbeam.sweeps.compiled_batches import CompiledBatches
 from jaxbeam.sweeps.known_batches import KnownBatches
 from jaxbeam.sweeps.known_inputs import KnownInputs, inputs_of_rows, known_model
-from jaxbeam.sweeps.path_times import PathTimes, path_times, step_limits
 from jaxbeam.sweeps.step_size import (
+    PathTimes,
+    Trials,
     choose_step_sizes,
+    path_times,
     rounding_error,
+    step_limits,
     stratified_sample,
 )
-from jaxbeam.sweeps.trials import Trials
 
 MAX_BLOCK_RUNS = 512  # about; a block is one call of the compiled program and one write
 # The same where batches are integrated at once: an H100 takes 65536 runs in 0.33 s, in blocks of

@@ -13,9 +13,9 @@ from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from jaxbeam.sweeps import store
 from jaxbeam.sweeps.blocks import Runner
 from jaxbeam.sweeps.specification import specification_from_dict
-from jaxbeam.sweeps.stores import store
 
 if TYPE_CHECKING:
     import distributed  # comes with the extra `cluster` only

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.integrator import native_peaks
-from jaxbeam.integrator.events import EventSchedule
+from jaxbeam.integrator.time_grid import EventSchedule
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.compiling import Compiled
 from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.batches import Batches
-from jaxbeam.sweeps.path_times import PathEvents
+from jaxbeam.sweeps.step_size import PathEvents
 
 
 class CompiledBatches:

@@ -23,12 +23,11 @@ from jaxbeam.runtime.garbage import rare_collections
 from jaxbeam.runtime.memory import size_text
 from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.simulation.integration_plan import sample_times
-from jaxbeam.simulation.result_variables import SWEEP_VARIABLES, sensor_coordinates
-from jaxbeam.sweeps import cluster
+from jaxbeam.simulation.labels import SWEEP_VARIABLES, sensor_coordinates
+from jaxbeam.sweeps import cluster, store as sweep_store
 from jaxbeam.sweeps.batches import Batches
 from jaxbeam.sweeps.specification import AnyRunner, SweepSpecification
-from jaxbeam.sweeps.stores import store as sweep_store
-from jaxbeam.sweeps.stores.block_store import BlockStore, MemoryStore
+from jaxbeam.sweeps.store import BlockStore, MemoryStore
 from jaxbeam.sweeps.truncation import WorstRun, estimated_errors, is_corrected
 
 if TYPE_CHECKING:

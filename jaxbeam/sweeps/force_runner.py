@@ -13,20 +13,30 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from jaxbeam.integrator.forces.paths import constant_speeds, force_paths, force_wheels
-from jaxbeam.integrator.forces.peaks import MAX_VALUES, peaks_of_forces, search_bytes
-from jaxbeam.integrator.forces.system import (
+from jaxbeam.integrator.force_peaks import (
+    MAX_VALUES,
+    constant_speeds,
+    force_paths,
+    force_wheels,
+    peaks_of_forces,
+    search_bytes,
+)
+from jaxbeam.integrator.force_system import (
     ForceResponses,
     ForceSystem,
     force_responses,
     force_system,
 )
-from jaxbeam.integrator.peaks.running_peaks import Peaks
+from jaxbeam.integrator.peaks import Peaks
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensing.corrected_rows import corrected_places, linear_outputs, static_correction
-from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.sensing.output_rows import (
+    corrected_places,
+    linear_outputs,
+    sensor_rows,
+    static_correction,
+)
 from jaxbeam.model.static_correction import is_supported
 from jaxbeam.runtime.remembering import remembered_within
 from jaxbeam.sweeps.batches import Batches, values_at

@@ -16,7 +16,7 @@ from jaxbeam.simulation.closed_loop import closed_loop
 from jaxbeam.simulation.integration_plan import runs_compiled
 from jaxbeam.sweeps import programs
 from jaxbeam.sweeps.batches import Batches
-from jaxbeam.sweeps.path_times import PathEvents
+from jaxbeam.sweeps.step_size import PathEvents
 
 # Paths and runs up to which NumPy gives the first answer sooner than a compiler: each path takes
 # some hundredths of a second, programs some seconds.

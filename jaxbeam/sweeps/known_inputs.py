@@ -16,13 +16,13 @@ from jaxbeam.integrator.time_grid import event_places, grid_between_events
 from jaxbeam.model.load_set import WheelSet, load_set
 from jaxbeam.model.modal_model import ModalModel, has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensing.corrected_rows import corrected_places
+from jaxbeam.model.sensing.output_rows import corrected_places
 from jaxbeam.runtime.remembering import remembered
 from jaxbeam.runtime.vectorised import vectorised
 from jaxbeam.sweeps.batches import Batches, values_at
 from jaxbeam.sweeps.native_loops import NativeLoops
-from jaxbeam.sweeps.path_times import PathEvents
 from jaxbeam.sweeps.programs import Outputs, Program, outputs_of
+from jaxbeam.sweeps.step_size import PathEvents
 
 GROUP_RUNS = 4096  # whose inputs are made at once; those of 512 take as long
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.growth import growth_limit, load_amplitude
-from jaxbeam.integrator.peaks.running_peaks import Peaks
+from jaxbeam.integrator.peaks import Peaks
 from jaxbeam.integrator.time_grid import grid_by_schedule
 from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime.c_writer import UntranslatedError

@@ -17,7 +17,6 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxbeam.case.case import Case, replace
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.discrete_model import discrete_model
-from jaxbeam.integrator.events import EventSchedule
 from jaxbeam.integrator.integrate import (
     integrate_history,
     integrate_peaks,
@@ -25,18 +24,20 @@ from jaxbeam.integrator.integrate import (
 )
 from jaxbeam.integrator.static_shapes import StaticShapes
 from jaxbeam.integrator.time_grid import (
+    EventSchedule,
     LoadEvents,
     grid_by_schedule,
     grid_by_step_length,
 )
 from jaxbeam.model.load_set import LoadSet, load_set, wheel_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
-from jaxbeam.model.sensing.corrected_rows import (
+from jaxbeam.model.sensing.output_rows import (
+    OutputRows,
     StaticCorrection,
     corrected_places,
+    sensor_rows,
     static_correction,
 )
-from jaxbeam.model.sensing.output_rows import OutputRows, sensor_rows
 from jaxbeam.runtime.arrays import Array, vmap, xp
 from jaxbeam.runtime.compiling import (
     LOW_OPTIMISATION,

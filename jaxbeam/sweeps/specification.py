@@ -15,11 +15,19 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.case import Case, addresses, list_sizes, own_addresses, replace, unit_at
+from jaxbeam.case.case import (
+    Case,
+    addresses,
+    each_address,
+    list_sizes,
+    overlap,
+    own_addresses,
+    replace,
+    unit_at,
+)
 from jaxbeam.case.declared_checks import describe_value
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.former_words import attribute_address
-from jaxbeam.case.joint_addresses import each_address, overlap
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.reading.units import in_si
 from jaxbeam.case.sensors import Sensor

@@ -20,8 +20,7 @@ from jaxbeam.model.statics import unchecked_influence_line
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.remembering import remembered
 from jaxbeam.simulation.errors import truncation_changes
-from jaxbeam.simulation.motion.at_samples import motion_at
-from jaxbeam.simulation.motion.moving_forces import motion_of_forces
+from jaxbeam.simulation.motion import motion_at, motion_of_forces
 
 SAMPLES = 200  # at least, of the run from which errors of corrected quantities are estimated
 

@@ -16,17 +16,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxbeam.case.case import Case, address_words, addresses
+from jaxbeam.case.case import ALL, Case, address_words, addresses
 from jaxbeam.case.former_words import attribute_address
-from jaxbeam.case.joint_addresses import ALL
 from jaxbeam.files.case_file import case_to_dict, with_settings
 from jaxbeam.runtime.progress import ProgressBar
-from jaxbeam.sweeps import MAX_RUNS
+from jaxbeam.sweeps import MAX_RUNS, store as sweep_store
 from jaxbeam.sweeps.computation import compute_sweep, worst_runs
 from jaxbeam.sweeps.specification import SweepSpecification, sweep_specification
 from jaxbeam.sweeps.step_size import largest_error
-from jaxbeam.sweeps.stores import store as sweep_store
-from jaxbeam.sweeps.stores.zarr_files import (
+from jaxbeam.sweeps.store import (
     BLOCKS_GROUP,
     FINGERPRINT_ATTRIBUTE,
     new_store,

@@ -12,9 +12,7 @@ from scipy.integrate import solve_ivp
 import jaxbeam as jb
 from jaxbeam.case.validation import check_case
 from jaxbeam.runtime.arrays import xp
-from jaxbeam.simulation.commands.limits import acting_ranges
-from jaxbeam.simulation.commands.operators import command_operator
-from jaxbeam.simulation.commands.path import with_exact_compensation
+from jaxbeam.simulation.commands import acting_ranges, command_operator, with_exact_compensation
 from jaxbeam.simulation.integration_plan import integration_plan
 from tests.case.test_hysteresis import OPERATOR, patch_case
 from tests.differences import central

@@ -12,7 +12,7 @@ import jaxbeam as jb
 from jaxbeam.case import former_words
 from jaxbeam.case.case import addresses
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.kinds import kinds
+from jaxbeam.case.fields import kinds
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict
 

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.analysis.bound.bound import held_command_limits
 from jaxbeam.case.validation import check_case
-from jaxbeam.simulation.commands.path import with_exact_compensation
+from jaxbeam.simulation.commands import with_exact_compensation
 from jaxbeam.simulation.stored_record import record_from_xarray
 
 OPERATOR = jb.Hysteresis([0.0, 0.5, 1.5, 3.0], [0.7, 0.15, 0.1, 0.15])

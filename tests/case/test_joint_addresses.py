@@ -5,8 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.case import own_addresses, unit_at, value_at
-from jaxbeam.case.joint_addresses import overlap
+from jaxbeam.case.case import overlap, own_addresses, unit_at, value_at
 from jaxbeam.files.case_file import with_settings
 from tests.differences import central
 

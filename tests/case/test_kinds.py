@@ -8,8 +8,7 @@ import pytest
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, part_classes
-from jaxbeam.case.fields import POSITIVE, number
-from jaxbeam.case.kinds import find_kind, import_modules, kind_of, kinds
+from jaxbeam.case.fields import POSITIVE, find_kind, import_modules, kind_of, kinds, number
 from jaxbeam.files.case_file import read_part
 from jaxbeam.runtime.arrays import Array
 

@@ -11,7 +11,7 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.case.case import part_classes, unit_at
-from jaxbeam.case.kinds import kinds
+from jaxbeam.case.fields import kinds
 from jaxbeam.case.reading.units import in_si, is_quantity
 from jaxbeam.files.case_file import case_from_dict
 

@@ -10,7 +10,7 @@ import pytest
 from jaxbeam.cli import main
 from jaxbeam.cli.commands import simulate
 from jaxbeam.runtime.interrupts import interruptible, keeping
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 from tuning.checkpoint import kept_in
 
 # A command that gets SIGINT when it first, or a given time ("name*2"), imports a module, or opens a

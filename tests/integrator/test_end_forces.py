@@ -5,17 +5,16 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.integrator.contact_forces import END_FRACTIONS, end_forces
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import _step_inputs, _weights, integrate_history
 from jaxbeam.integrator.load_path import load_path
-from jaxbeam.integrator.peaks.end_forces import END_FRACTIONS, end_forces
 from jaxbeam.integrator.propagators import GAUSS_NODES
 from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.contact import contact_at
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.sensing.corrected_rows import corrected_places, static_correction
-from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.sensing.output_rows import corrected_places, sensor_rows, static_correction
 
 BEAM = jb.Beam(1.2, 11.68, 0.535, 0.02, modes=3)
 RUN = jb.Run(0.5, sample_rate=100.0)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, strategies as st
 from numpy.testing import assert_allclose
 
-from jaxbeam.integrator.events import (
+from jaxbeam.integrator.time_grid import (
     Transmission,
     controller_schedule,
     sample_schedule,

@@ -7,16 +7,14 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.integrator.forces.paths import ForcePaths, force_paths, force_wheels
-from jaxbeam.integrator.forces.peaks import peaks_of_forces
+from jaxbeam.integrator.force_peaks import ForcePaths, force_paths, force_wheels, peaks_of_forces
+from jaxbeam.integrator.force_system import force_responses, force_system, particular_solutions
 from jaxbeam.integrator.forces.states import outputs_of_forces
-from jaxbeam.integrator.forces.system import force_responses, force_system, particular_solutions
 from jaxbeam.integrator.step_size import without_later_vibration
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.sensing.corrected_rows import linear_outputs
-from jaxbeam.model.sensing.output_rows import sensor_rows
-from jaxbeam.numerics.piecewise import piecewise_chebyshev
+from jaxbeam.model.sensing.output_rows import linear_outputs, sensor_rows
+from jaxbeam.numerics.polynomials import piecewise_chebyshev
 from jaxbeam.sweeps.force_runner import _systems, force_runner
 from jaxbeam.sweeps.specification import sweep_specification
 from jaxbeam.sweeps.truncation import SAMPLES, WorstRun, estimated_errors

@@ -24,7 +24,7 @@ from jaxbeam.numerics.peak_search import interpolation_matrix, refine_peak
 from jaxbeam.runtime import native_library
 from jaxbeam.sweeps import known_batches
 from jaxbeam.sweeps.specification import sweep_specification
-from jaxbeam.sweeps.stores.store import ZarrStore
+from jaxbeam.sweeps.store import ZarrStore
 
 pytestmark = pytest.mark.skipif(native_library.find_compiler() is None, reason="no C compiler here")
 

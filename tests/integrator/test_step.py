@@ -8,7 +8,7 @@ import pytest
 import jaxbeam as jb
 from jaxbeam.integrator.step import advance, advance_unforced
 from jaxbeam.integrator.step_matrices import StepMatrices
-from jaxbeam.integrator.vehicles.steps import StepInput
+from jaxbeam.integrator.vehicles import StepInput
 from jaxbeam.simulation.simulate import simulate_readings
 from tests.runs import plan_of
 

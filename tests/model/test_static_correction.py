@@ -13,8 +13,7 @@ import jaxbeam as jb
 from jaxbeam.case.case import replace
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensing.corrected_rows import LoadInfluence, static_correction
-from jaxbeam.model.sensing.output_rows import sensor_rows
+from jaxbeam.model.sensing.output_rows import LoadInfluence, sensor_rows, static_correction
 from jaxbeam.model.static_correction import (
     bending_moment,
     residual_actuator_gain,

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.case.kinds import kinds
+from jaxbeam.case.fields import kinds
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.model.modes import mesh_layout
 from tests.differences import central

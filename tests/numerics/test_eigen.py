@@ -4,7 +4,7 @@ import jax
 import numpy as np
 from numpy.testing import assert_allclose
 
-from jaxbeam.numerics import eigen as module
+from jaxbeam.numerics import matrices as module
 
 
 def matrices(seed: int) -> tuple[np.ndarray, np.ndarray]:

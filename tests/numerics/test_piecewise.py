@@ -7,7 +7,7 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebval
 from numpy.testing import assert_allclose
 
-from jaxbeam.numerics.piecewise import piecewise_chebyshev
+from jaxbeam.numerics.polynomials import piecewise_chebyshev
 
 RANDOM = np.random.default_rng(0)
 

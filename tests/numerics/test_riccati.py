@@ -10,8 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 
 from jaxbeam.numerics.batched_linalg import batch_axis_last
-from jaxbeam.numerics.lyapunov import lyapunov, stein
-from jaxbeam.numerics.riccati import care, dare, dlqr, lqr
+from jaxbeam.numerics.riccati import care, dare, dlqr, lqr, lyapunov, stein
 from jaxbeam.numerics.stages import GAUSS_NODES, collocated_stages, riccati_recursion
 from tests.differences import central
 

@@ -18,7 +18,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.runtime import compile_cache, compiling, program_key
+from jaxbeam.runtime import compile_cache, compiling
 from jaxbeam.runtime.compiling import compiled
 from tests.modules import ROOT
 
@@ -63,9 +63,9 @@ def first_array(pair: Pair):
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     """An empty cache folder; functions of this file can be cached."""
-    monkeypatch.setattr(program_key, "OWN_PACKAGES", ("jaxbeam", "tuning", "tests"))
-    packages = {*program_key.VERSIONED_PACKAGES, "tests"}
-    monkeypatch.setattr(program_key, "VERSIONED_PACKAGES", packages)
+    monkeypatch.setattr(compile_cache, "OWN_PACKAGES", ("jaxbeam", "tuning", "tests"))
+    packages = {*compile_cache.VERSIONED_PACKAGES, "tests"}
+    monkeypatch.setattr(compile_cache, "VERSIONED_PACKAGES", packages)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("JAXBEAM_CACHE_SIZE", "64")
     clear_process_caches()
@@ -76,7 +76,7 @@ def folder(tmp_path, monkeypatch):
 def clear_process_caches():
     """Clear all caches of this process, as in a new one."""
     compiling.clear_caches()
-    program_key.environment_hash.cache_clear()
+    compile_cache.environment_hash.cache_clear()
     TRACED.clear()
 
 
@@ -158,12 +158,12 @@ def changed_setting(patch):
 
 
 def changed_source(patch):
-    before = program_key.environment_hash()
-    patch.setattr(program_key, "environment_hash", lambda: before + b"changed")
+    before = compile_cache.environment_hash()
+    patch.setattr(compile_cache, "environment_hash", lambda: before + b"changed")
 
 
 def changed_machine(patch):
-    patch.setattr(program_key, "machine_description", lambda: "another")
+    patch.setattr(compile_cache, "machine_description", lambda: "another")
 
 
 def changed_flags(patch):
@@ -187,14 +187,14 @@ def test_the_key_depends_on_options_source_machine_and_settings(folder, change, 
 
 
 def test_a_changed_source_file_changes_the_environment_hash(tmp_path, monkeypatch):
-    hashes = [program_key.environment_hash()]
+    hashes = [compile_cache.environment_hash()]
     package = tmp_path / "jaxbeam"
     package.mkdir(exist_ok=True)
-    monkeypatch.setattr(program_key, "__file__", str(package / "runtime" / "program_key.py"))
+    monkeypatch.setattr(compile_cache, "__file__", str(package / "runtime" / "program_key.py"))
     for text in ("a = 1\n", "a = 2\n"):
         (package / "modes.py").write_text(text)
-        program_key.environment_hash.cache_clear()
-        hashes.append(program_key.environment_hash())
+        compile_cache.environment_hash.cache_clear()
+        hashes.append(compile_cache.environment_hash())
     assert len(set(hashes)) == 3
 
 
@@ -215,22 +215,22 @@ def test_versions_of_packages_that_compile_change_the_environment_hash(monkeypat
     for name in declared & {one.name.lower() for one in importlib.metadata.distributions()}:
         needs = importlib.metadata.requires(name) or []
         if any(re.match(r"jax(lib)?\b(?!.*extra ==)", one) for one in needs):
-            assert name in program_key.DEPENDENCIES
-    before, version = program_key.environment_hash(), importlib.metadata.version
+            assert name in compile_cache.DEPENDENCIES
+    before, version = compile_cache.environment_hash(), importlib.metadata.version
     for changed in ("diffrax", "jaxlib"):
-        program_key.environment_hash.cache_clear()
+        compile_cache.environment_hash.cache_clear()
 
         def newer(name, changed=changed):
             return "99" if name == changed else version(name)
 
         with monkeypatch.context() as patch:
             patch.setattr(importlib.metadata, "version", newer)
-            assert program_key.environment_hash() != before
+            assert compile_cache.environment_hash() != before
 
 
 def test_functions_that_depend_on_external_code_are_not_cached(folder, monkeypatch):
     packages = {"jaxbeam", "jax", "jaxlib", "numpy"}
-    monkeypatch.setattr(program_key, "VERSIONED_PACKAGES", packages)
+    monkeypatch.setattr(compile_cache, "VERSIONED_PACKAGES", packages)
     for constant in (Outsider(), CONSTANT, changed_flags):
         for _ in range(2):
             assert call(doubled, POINTS, constant)[1] == 1
@@ -238,7 +238,7 @@ def test_functions_that_depend_on_external_code_are_not_cached(folder, monkeypat
     for _ in range(2):
         assert call(first_array, Pair(POINTS, "a class of others"))[1] == 1
         clear_process_caches()
-    monkeypatch.setattr(program_key, "OWN_PACKAGES", ("jaxbeam", "tuning"))
+    monkeypatch.setattr(compile_cache, "OWN_PACKAGES", ("jaxbeam", "tuning"))
     assert call(unoptimised, POINTS)[1] == 1
     assert not programs(folder)
 
@@ -385,7 +385,7 @@ def test_jax_does_not_store_a_cached_program_again(folder, jax_cache):
 
 
 def test_jax_stores_programs_without_a_key(folder, jax_cache, monkeypatch):
-    monkeypatch.setattr(program_key, "OWN_PACKAGES", ("jaxbeam", "tuning"))
+    monkeypatch.setattr(compile_cache, "OWN_PACKAGES", ("jaxbeam", "tuning"))
     call(unoptimised, POINTS)
     assert not programs(folder)
     assert any("unoptimised" in path.name for path in jax_cache.iterdir())

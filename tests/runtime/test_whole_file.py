@@ -10,7 +10,7 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.files.matrices import write_state_space
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 from tests.modules import module_files, parse
 from tuning.checkpoint import save
 
@@ -117,7 +117,7 @@ def test_nothing_is_written_at_its_place():
     Except caches, stores of sweeps, which are written in blocks under a lock, and what the page in
     the browser writes into a temporary folder of its own.
     """
-    by_themselves = "jaxbeam.runtime.", "jaxbeam.sweeps.stores.zarr_files"
+    by_themselves = "jaxbeam.runtime.", "jaxbeam.sweeps.store"
     by_themselves += "jaxbeam.app.studies", "jaxbeam.app.take_away"
     writing = {"write_text", "write_bytes", "savefig", "savez", "to_netcdf", "to_zarr", "savemat"}
     wrong = []

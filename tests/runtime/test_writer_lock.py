@@ -11,12 +11,12 @@ import time
 
 import pytest
 
-from jaxbeam.runtime import writer_lock as locks
-from jaxbeam.runtime.writer_lock import InUseError, lock_file, writer_lock
+from jaxbeam.runtime import output_file as locks
+from jaxbeam.runtime.output_file import InUseError, lock_file, writer_lock
 
 HOLD = """
 import sys, time, pathlib
-from jaxbeam.runtime.writer_lock import writer_lock
+from jaxbeam.runtime.output_file import writer_lock
 with writer_lock(pathlib.Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)

@@ -15,7 +15,7 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.integrator.held_commands import HeldCommands
+from jaxbeam.integrator.inputs import HeldCommands
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.sensor_signals import noise_samples

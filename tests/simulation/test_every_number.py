@@ -14,7 +14,7 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.case.case import leaves_by_address
-from jaxbeam.case.kinds import PACKAGES, import_modules
+from jaxbeam.case.fields import PACKAGES, import_modules
 from jaxbeam.case.loads.planar.vehicle import PlanarVehicle
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.runtime.module import Module

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.case import value_at
-from jaxbeam.integrator.events import Transmission, controller_schedule
+from jaxbeam.integrator.time_grid import Transmission, controller_schedule
 from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import ContactLossWarning
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from jaxbeam.integrator.input_policy import StepInfo
+from jaxbeam.integrator.inputs import StepInfo
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.runtime.c_writer import UntranslatedError

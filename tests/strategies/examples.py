@@ -1,7 +1,7 @@
 """One part of every kind, from whose numbers random ones are made; a test finds missing kinds."""
 
 import jaxbeam as jb
-from jaxbeam.case.kinds import kind_of, kinds
+from jaxbeam.case.fields import kind_of, kinds
 from tests.c_code import cases as controlled
 
 PROFILES = {

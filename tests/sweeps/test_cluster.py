@@ -16,7 +16,7 @@ from jaxbeam.cli import main
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.sweeps import cluster
 from jaxbeam.sweeps.specification import specification_from_dict, sweep_specification
-from jaxbeam.sweeps.stores.store import ZarrStore, create_store
+from jaxbeam.sweeps.store import ZarrStore, create_store
 from tests.sweeps.test_store import files_of
 from tests.sweeps.test_sweep import CASE
 

@@ -14,7 +14,7 @@ import xarray
 import jaxbeam as jb
 from jaxbeam.simulation.stored_record import read_record
 from jaxbeam.sweeps.specification import SweepSpecification
-from jaxbeam.sweeps.stores.store import ZarrStore
+from jaxbeam.sweeps.store import ZarrStore
 from tests.modules import module_files, parse
 from tests.sweeps.test_sweep import CASE
 from tuning import read_logs

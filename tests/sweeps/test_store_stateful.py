@@ -12,7 +12,7 @@ from hypothesis import settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 
 import jaxbeam as jb
-from jaxbeam.sweeps.stores.store import ZarrStore
+from jaxbeam.sweeps.store import ZarrStore
 from tests.fuzzing import examples
 from tests.sweeps.test_sweep import CASE
 

@@ -18,8 +18,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxbeam as jb
 from jaxbeam.case import declared_checks
 from jaxbeam.case.case import replace
-from jaxbeam.integrator.forces.peaks import peaks_of_forces
-from jaxbeam.integrator.peaks.running_peaks import Peaks
+from jaxbeam.integrator.force_peaks import peaks_of_forces
+from jaxbeam.integrator.peaks import Peaks
 from jaxbeam.integrator.time_grid import event_places, grid_by_step_length
 from jaxbeam.model.influence import static_peak
 from jaxbeam.model.load_set import load_set
@@ -29,7 +29,7 @@ from jaxbeam.sweeps import force_runner
 from jaxbeam.sweeps.batches import make_batches
 from jaxbeam.sweeps.blocks import Runner
 from jaxbeam.sweeps.failures import FailedRunsWarning
-from jaxbeam.sweeps.path_times import path_times
+from jaxbeam.sweeps.step_size import path_times
 
 CASE = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, damping_ratio=[0.03, 0.02], modes=2),

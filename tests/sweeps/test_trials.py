@@ -5,7 +5,7 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.integrator import native_peaks
-from jaxbeam.sweeps.trials import Trials
+from jaxbeam.sweeps.step_size import Trials
 
 CASE = jb.Case(
     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, modes=2),

@@ -12,10 +12,9 @@ import pytest
 import xarray
 
 import jaxbeam as jb
-from jaxbeam.runtime.writer_lock import InUseError
-from jaxbeam.sweeps.stores import writing as store_writing
-from jaxbeam.sweeps.stores.store import ZarrStore, create_store, status
-from jaxbeam.sweeps.stores.writing import writing
+from jaxbeam.runtime.output_file import InUseError
+from jaxbeam.sweeps import store as store_writing
+from jaxbeam.sweeps.store import ZarrStore, create_store, status, writing
 from tests.sweeps.test_store import CASE, OVER, files_of, stop_after, sweep
 
 OTHER = jb.replace(CASE, {"beam.flexural_rigidity": 20.0})

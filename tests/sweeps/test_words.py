@@ -12,11 +12,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxbeam as jb
 from jaxbeam.case.case import own_addresses
 from jaxbeam.case.loads.axles import Axles
-from jaxbeam.case.loads.vehicle import VehicleLoad
+from jaxbeam.case.loads.planar.vehicle import VehicleLoad
 from jaxbeam.files.case_file import with_settings
 from jaxbeam.model.load_set import load_set
 from jaxbeam.sweeps import programs
-from jaxbeam.sweeps.stores.store import ZarrStore, status
+from jaxbeam.sweeps.store import ZarrStore, status
 from jaxbeam.sweeps.words import with_numbers
 
 BEAM = jb.Beam(25.0, 3.0e10, 15000.0, damping_ratio=0.01, modes=1)

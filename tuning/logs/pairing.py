@@ -7,8 +7,7 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.case.case import Case, crossing_times, replace
 from jaxbeam.case.controller import commanded
-from jaxbeam.case.fields import concrete
-from jaxbeam.case.kinds import kind_of
+from jaxbeam.case.fields import concrete, kind_of
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.quantities import unit_of
 from jaxbeam.case.trajectory import NEVER

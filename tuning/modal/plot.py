@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.plot.style import COLOURS, GREY, INK, colour, use_style
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 from tuning.modal.result import ModalEstimates
 
 LONG = 60  # letters of all names of channels, above which they stand upright

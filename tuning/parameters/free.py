@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.case import Case, list_sizes, replace, unit_at, value_at
+from jaxbeam.case.case import ALL, Case, list_sizes, overlap, replace, unit_at, value_at
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.joint_addresses import ALL, overlap
 from jaxbeam.runtime.arrays import Array, xp
 from tuning.parameters.prior import Prior, as_prior
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxbeam.case.case import Case, replace, stack_cases, value_at
-from jaxbeam.integrator.events import EventSchedule
+from jaxbeam.integrator.time_grid import EventSchedule
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.runtime.compiling import compiled, xla_options
 from jaxbeam.simulation.integration_plan import IntegrationPlan

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Modes, modes, normalised_modes
-from jaxbeam.numerics.eigen import eigen
+from jaxbeam.numerics.matrices import eigen
 
 RIGID_SUPPORT_STIFFNESS = 3.21e10  # N/m, reproduces Table 2.2 of the thesis to all printed digits
 

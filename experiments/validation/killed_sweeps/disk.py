@@ -18,7 +18,7 @@ AHEAD = float(os.environ.get("KILLED_SWEEPS_CLOCK", "0"))
 
 def change_writes() -> None:
     """Have blocks written slowly; the writing of some raises OSError, as without space."""
-    from jaxbeam.sweeps.stores.store import ZarrStore
+    from jaxbeam.sweeps.store import ZarrStore
 
     slow, full = (float(os.environ.get(f"KILLED_SWEEPS_{name}", "0")) for name in ("SLOW", "FULL"))
     draws, result_array = random.Random(os.getpid()), ZarrStore._result_array

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from jaxbeam.files.report import text_table
 from jaxbeam.runtime.arrays import Array, xp
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 
 
 class TrainCurve(NamedTuple):

@@ -13,13 +13,17 @@ from jaxbeam.case.case import Case, Run
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.axles import Axles
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.integrator.forces.paths import force_paths, force_wheels
-from jaxbeam.integrator.forces.peaks import peaks_of_forces
-from jaxbeam.integrator.forces.system import force_responses, force_system
+from jaxbeam.integrator.force_peaks import force_paths, force_wheels, peaks_of_forces
+from jaxbeam.integrator.force_system import force_responses, force_system
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import modes
-from jaxbeam.model.sensing.corrected_rows import LinearOutputs, linear_outputs, static_correction
-from jaxbeam.model.sensing.output_rows import SIDE_SHARE, sensor_rows
+from jaxbeam.model.sensing.output_rows import (
+    SIDE_SHARE,
+    LinearOutputs,
+    linear_outputs,
+    sensor_rows,
+    static_correction,
+)
 from jaxbeam.sweeps.computation import peaks_in_memory
 from jaxbeam.sweeps.failures import failure_sentence
 from jaxbeam.sweeps.force_runner import PHASE

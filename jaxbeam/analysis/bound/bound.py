@@ -31,7 +31,7 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedforward import Prescribed
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_peaks
-from jaxbeam.integrator.peaks.running_peaks import RunningPeaks
+from jaxbeam.integrator.peaks import RunningPeaks
 from jaxbeam.integrator.static_shapes import StaticShapes, static_shapes
 from jaxbeam.integrator.step_size import choose_step_size
 from jaxbeam.integrator.time_grid import grid_by_step_length
@@ -41,7 +41,7 @@ from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.module import Module
-from jaxbeam.simulation.commands.limits import acting_ranges
+from jaxbeam.simulation.commands import acting_ranges
 from jaxbeam.simulation.record import Record
 
 DEFAULT_PERIOD = 0.01  # s, over which commands are held without a sampled controller

@@ -17,13 +17,17 @@ from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.discrete_model import discrete_model
-from jaxbeam.integrator.events import EventSchedule, Transmission, controller_schedule
-from jaxbeam.integrator.input_policy import AbstractInputPolicy
+from jaxbeam.integrator.inputs import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history
 from jaxbeam.integrator.propagators import NODE_COUNT
 from jaxbeam.integrator.static_shapes import StaticShapes, static_shapes
 from jaxbeam.integrator.step_size import choose_step_size
-from jaxbeam.integrator.time_grid import grid_by_schedule
+from jaxbeam.integrator.time_grid import (
+    EventSchedule,
+    Transmission,
+    controller_schedule,
+    grid_by_schedule,
+)
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, take, xp

@@ -12,9 +12,8 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from jaxbeam.case.declared_checks import check_field, describe_value, missing_error, suggestion
-from jaxbeam.case.fields import describe_shape, fits_shape
+from jaxbeam.case.fields import describe_shape, find_kind, fits_shape, kinds
 from jaxbeam.case.former_words import with_attribute_names
-from jaxbeam.case.kinds import find_kind, kinds
 from jaxbeam.case.limits import check_entries, check_length
 from jaxbeam.case.quantities import OF_QUANTITY, unit_of
 from jaxbeam.case.reading.units import in_si

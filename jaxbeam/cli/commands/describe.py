@@ -174,7 +174,7 @@ def _sensor_words(case: "Case") -> list[str]:
 def _loads(source: str, content: dict[str, Any]) -> "Sequence[AbstractLoad]":
     """Loads of a case, or one of a vehicle file, a vehicle or a train."""
     from jaxbeam.case.loads.axles import Axles
-    from jaxbeam.case.loads.vehicle import VehicleLoad
+    from jaxbeam.case.loads.planar.vehicle import VehicleLoad
     from jaxbeam.files.case_file import load_case
     from jaxbeam.vehicles.library import trains
 

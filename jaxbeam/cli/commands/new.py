@@ -7,7 +7,7 @@ from pathlib import Path
 from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.cli.arguments import refuse_option
 from jaxbeam.cli.options import Output, OutputOptions
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 
 KINDS = ("footbridge", "road-bridge", "railway-bridge", "laboratory-rig")
 

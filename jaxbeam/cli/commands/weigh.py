@@ -73,7 +73,7 @@ def weigh(
 
     import tuning  # sets XLA's threads, therefore before the case is read
     from jaxbeam.files.case_file import save_case
-    from jaxbeam.runtime.whole_file import whole_file
+    from jaxbeam.runtime.output_file import whole_file
 
     parsed_case, read = options.read(case), tuning.read_log(log)
     if axles is None:

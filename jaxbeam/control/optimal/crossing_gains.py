@@ -10,14 +10,14 @@ from jaxtyping import Float
 from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.control.state_controller import AbstractStateLaw
-from jaxbeam.model.load_set import LoadSet
-from jaxbeam.model.state_space import Plant
-from jaxbeam.model.vehicle_contact import (
+from jaxbeam.model.contact import (
     contact_rows,
     has_known_disturbance,
     known_disturbance,
     vehicle_system,
 )
+from jaxbeam.model.load_set import LoadSet
+from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.coupled_stages import ConstantPlant, Coupling
 from jaxbeam.numerics.finite_horizon import (
     CouplingFunction,

@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbeam.control.optimal.crossing_gains import crossing_plant
+from jaxbeam.model.contact import vehicle_system
 from jaxbeam.model.state_space import Plant
-from jaxbeam.model.vehicle_contact import vehicle_system
 from jaxbeam.numerics.coupled_stages import (
     ConstantPlant,
     StageResponse,

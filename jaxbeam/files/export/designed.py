@@ -9,8 +9,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.fields import concrete
-from jaxbeam.case.kinds import kinds
+from jaxbeam.case.fields import concrete, kinds
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.optimal.crossing_gains import GainSchedule
 from jaxbeam.control.optimal.load_tables import ScheduledGainLaw
@@ -19,12 +18,12 @@ from jaxbeam.control.state_controller import AbstractStateLaw, GainLaw, StateFee
 from jaxbeam.estimation.observer import ConstantGainFilter, Observer
 from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.files.export.gains import Gains
+from jaxbeam.model.contact import vehicle_signals
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.sensor_signals import sensor_sections
 from jaxbeam.model.state_space import state_space
-from jaxbeam.model.vehicle_contact import vehicle_signals
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
 

@@ -20,7 +20,7 @@ from jaxbeam.files.export.gains import ARRAYS, Gains
 from jaxbeam.files.export.header import c_header
 from jaxbeam.files.tables import as_text_cell
 from jaxbeam.runtime.input_file import check_input, describe_content
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 
 FORMAT = "jaxbeam gains 3"
 SECTION_COEFFICIENTS = ("b0", "b1", "b2", "a0", "a1", "a2")

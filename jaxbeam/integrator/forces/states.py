@@ -3,9 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.integrator.forces.panels import force_panels
-from jaxbeam.integrator.forces.paths import ForcePaths
-from jaxbeam.integrator.forces.system import ForceSystem, force_responses
+from jaxbeam.integrator.force_peaks import ForcePaths, force_panels
+from jaxbeam.integrator.force_system import ForceSystem, force_responses
 
 
 def outputs_of_forces(

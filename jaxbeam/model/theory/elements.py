@@ -27,7 +27,7 @@ from jaxbeam.case.beam import (
 )
 from jaxbeam.case.case import Case
 from jaxbeam.model.layout import Layout, hinge_nodes, node_positions
-from jaxbeam.numerics.piecewise import legendre_to_chebyshev, piecewise_chebyshev
+from jaxbeam.numerics.polynomials import legendre_to_chebyshev, piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, add_at, set_at, xp
 from jaxbeam.runtime.module import Module
 

@@ -14,7 +14,7 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.plot.schematic import LOAD_MARKER, surface_height
 from jaxbeam.plot.style import COLOURS, GREY, INK
 from jaxbeam.plot.traffic.drawing import vehicle_art
-from jaxbeam.runtime.whole_file import whole_file
+from jaxbeam.runtime.output_file import whole_file
 from jaxbeam.simulation.record import Record
 
 WHEEL_SIZE, PLAIN_SIZE = 7.0, 10.0  # points, of wheels of vehicles and of other loads

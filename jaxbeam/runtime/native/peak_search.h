@@ -1,6 +1,6 @@
 /* Peak of the polynomial through the samples of a step: numerics/peak_search.py, with macros of the
  * same names for its constants. PEAK_POINTS samples include both ends; PEAK_MARGIN is that of
- * integrator/peaks/running_peaks.py, END_PEAK_MARGIN its equivalent beside an end. */
+ * integrator/peaks.py, END_PEAK_MARGIN its equivalent beside an end. */
 
 #pragma once
 

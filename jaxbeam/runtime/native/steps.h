@@ -1,5 +1,5 @@
 /* A chunk of steps for a group of runs: integrator/step.py, `advance`, and
- * integrator/peaks/running_peaks.py, `update_peaks`, with commands as states. */
+ * integrator/peaks.py, `update_peaks`, with commands as states. */
 
 #pragma once
 

@@ -1,4 +1,4 @@
-/* Propagators of vehicles, of each run its own: integrator/vehicles/propagators.py. */
+/* Propagators of vehicles, of each run its own: integrator/vehicles.py. */
 
 #pragma once
 

@@ -1,4 +1,4 @@
-/* Vehicles: integrator/vehicles/propagators.py and steps.py. Their springs press on the beam with
+/* Vehicles: integrator/vehicles.py. Their springs press on the beam with
  * s = S q - O z, from the forces q = k y + c y' of beam and profile at the nodes and their states z
  * at the start of a step. Blocks of S and O belong to wheels. */
 

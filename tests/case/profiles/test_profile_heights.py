@@ -9,7 +9,7 @@ from scipy.integrate import quad
 from scipy.interpolate import CubicSpline
 
 import jaxbeam as jb
-from jaxbeam.case.kinds import kinds
+from jaxbeam.case.fields import kinds
 from jaxbeam.case.profiles.shapes import AbstractProfile
 from tests.case.profiles.examples import AVERAGED, HEIGHTS, PLAIN, POSITIONS, PROFILES
 from tests.differences import central

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from experiments.studies.creep import fitted_creep, lags_of
-from jaxbeam.simulation.commands.operators import command_operator
+from jaxbeam.simulation.commands import command_operator
 from tests.case.test_creep import acting
 from tests.case.test_hysteresis import OPERATOR, by_hand
 from tests.tuning.fit.test_hysteresis import log_of

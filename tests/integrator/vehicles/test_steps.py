@@ -8,9 +8,13 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
-from jaxbeam.integrator.vehicles.maps import springs_of_wheels
-from jaxbeam.integrator.vehicles.propagators import vehicle_propagators, vehicle_state_norm
-from jaxbeam.integrator.vehicles.steps import VehicleStep, vehicles_of
+from jaxbeam.integrator.vehicles import (
+    VehicleStep,
+    springs_of_wheels,
+    vehicle_propagators,
+    vehicle_state_norm,
+    vehicles_of,
+)
 from jaxbeam.model.load_set import load_set
 from tests.case.loads import reference
 

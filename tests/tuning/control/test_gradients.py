@@ -10,7 +10,7 @@ import pytest
 import jaxbeam as jb
 import tuning
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.kinds import kinds
+from jaxbeam.case.fields import kinds
 from tests.differences import central
 from tests.modules import ROOT
 from tuning.control.run_set import make_run_set

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
+from jaxbeam.runtime.compile_cache import program_name
 from jaxbeam.runtime.compiling import _partition, _signature
-from jaxbeam.runtime.program_key import program_name
 from tuning import Log
 from tuning.fit.dataset import make_dataset
 from tuning.parameters.prediction import LogPrediction, readings_with_slopes

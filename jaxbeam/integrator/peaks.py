@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.trajectory import NEVER
+from jaxbeam.integrator.contact_forces import contact_minimum
 from jaxbeam.integrator.load_path import LoadPath
-from jaxbeam.integrator.peaks.contact_minimum import contact_minimum
 from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.integrator.step_matrices import StepMatrices
 from jaxbeam.numerics.peak_search import (

@@ -2,7 +2,7 @@
 
 The slope of a beam jumps at a hinge and, if it is flexible in shear, where the shear force or the
 shear stiffness does; that of a profile at the ends of a ramp. A wheel that stays on the surface
-then changes its velocity by |v| ([w'] + [r']) at once, from left to right: see `kinks.steps`.
+then changes its velocity by |v| ([w'] + [r']) at once, from left to right; see `with_impulses`.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ from jaxbeam.model.layout import kink_nodes
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.settlement import has_settlement
-from jaxbeam.numerics.piecewise import slope_jumps
+from jaxbeam.numerics.polynomials import slope_jumps
 from jaxbeam.runtime.arrays import Array, take, xp
 from jaxbeam.runtime.module import Module
 

@@ -4,23 +4,218 @@ Between two instants a time h apart an output y is at most h^2 / 8 max |y''| abo
 values there. Of free vibration y'' is bounded by the amplitudes of its poles, of the forces by the
 tables (see `ForceResponses`). So most of a run is left out without a look, and no peak is missed:
 what is left out is below a value that is reached.
+
+Panels are the intervals between the passages of breaks by forces.
 """
 
-import numpy as np
-from jaxtyping import Float
+from collections.abc import Sequence
+from typing import NamedTuple
 
-from jaxbeam.integrator.forces.panels import Panels, force_panels
-from jaxbeam.integrator.forces.paths import ForcePaths
-from jaxbeam.integrator.forces.products import product
-from jaxbeam.integrator.forces.system import (
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+
+from jaxbeam.case.case import ALL, Case, replace
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.loads.base import wheel_distances
+from jaxbeam.case.trajectory import NEVER
+from jaxbeam.integrator.force_system import (
     ForceResponses,
     ForceSystem,
+    product,
     solution_size,
     table_points,
 )
-from jaxbeam.integrator.peaks.running_peaks import Peaks
+from jaxbeam.integrator.peaks import Peaks
 from jaxbeam.integrator.propagators import PEAK_NODES
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.numerics.peak_search import estimate_peak, refine_peak
+
+
+class ForcePaths(NamedTuple):
+    """Forces upwards (N) at x = origin + speed t (m, m/s) until the `duration` (s) of each run."""
+
+    origin: Float[np.ndarray, "run wheel"]
+    speed: Float[np.ndarray, "run wheel"]
+    force: Float[np.ndarray, " wheel"]
+    duration: Float[np.ndarray, " run"]
+
+    def passages(
+        self, places: Float[np.ndarray, " place"]
+    ) -> tuple[Float[np.ndarray, "run wheel place"], Bool[np.ndarray, "run wheel place"]]:
+        """Times (s) at which the forces pass places, within the run, and whether they do in it."""
+        times = (places - self.origin[..., None]) / self.speed[..., None]
+        end = self.duration[:, None, None]
+        return np.clip(times, 0.0, end), (times >= 0) & (times < end)
+
+    def windows(self, left: float, right: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times (s) from and until which the forces (run, wheel) are between two ends (m)."""
+        times, _ = self.passages(np.array([left, right]))
+        return times.min(axis=-1), times.max(axis=-1)
+
+
+def constant_speeds(loads: LoadSet) -> bool:
+    """Whether all loads are forces that move at constant speeds."""
+    if not loads.massless or loads.wheels.histories or not loads.trajectories:
+        return False
+    times, cubics = (np.asarray(part) for part in loads.cubics())
+    straight = not np.any(cubics[:, 0, 2:]) and np.all(cubics[:, 0, 1])
+    return bool(straight and np.all(times[:, 1:] >= NEVER))
+
+
+class ForceWheels(NamedTuple):
+    """What the wheels of all runs share: forces upwards (N), distances behind the first (m)."""
+
+    force: Float[np.ndarray, " wheel"]
+    behind: tuple[Float[np.ndarray, " wheel_of_load"], ...]
+
+
+def force_wheels(case: Case) -> ForceWheels:
+    """Wheels of the loads of a case; once for all runs, as it takes longer than their paths."""
+    behind = tuple(_distances(case, i) for i in range(len(case.loads)))
+    return ForceWheels(-np.asarray(load_set(case).weight)[:, 0], behind)
+
+
+def _distances(case: Case, load: int) -> Float[np.ndarray, " wheel"]:
+    """Distances (m) of the wheels of a load behind its first."""
+    vehicle = case.loads[load].vehicle(case.run.gravity)
+    return np.asarray(concrete(wheel_distances(case.loads[load], vehicle)))
+
+
+def force_paths(
+    case: Case,
+    wheels: ForceWheels,
+    addresses: Sequence[str],
+    values: Float[np.ndarray, "run address"],
+) -> ForcePaths:
+    """Paths in runs of a case of constant speeds that differ in the values at some addresses.
+
+    These are speeds, entry times, start positions and spacings of loads, and the duration.
+    """
+    runs, length = len(values), float(case.beam.length)
+    column = dict(zip(addresses, values.T, strict=True))
+    origins, speeds = [], []
+    for i, load in enumerate(case.loads):
+
+        def of_load(name, default=0.0, i=i, load=load):
+            for address in (f"loads.{i}.{name}", f"loads.{ALL}.{name}"):
+                if address in column:
+                    return column[address]
+            given = getattr(load, name)
+            return np.broadcast_to(default if given is None else concrete(given), runs)
+
+        speed, entry = of_load("speed"), of_load("entry_time")
+        start = of_load("start_position", np.where(speed < 0, length, 0.0))
+        behind = wheels.behind[i]
+        if {f"loads.{i}.spacing", f"loads.{ALL}.spacing"} & set(addresses):
+            spacings, index = np.unique(of_load("spacing"), return_inverse=True)
+            own = [replace(case, {f"loads.{i}.spacing": one}) for one in spacings]
+            behind = np.stack([_distances(one, i) for one in own])[index]
+        first = (start - speed * entry)[:, None]
+        origins.append(first - np.sign(speed)[:, None] * behind)
+        speeds.append(np.broadcast_to(speed[:, None], origins[-1].shape))
+    duration = column.get("run.duration", np.full(runs, float(case.run.duration)))
+    return ForcePaths(np.concatenate(origins, 1), np.concatenate(speeds, 1), wheels.force, duration)
+
+
+SAME_TIME_SHARE = 1e-12  # of the duration: closer passages are at one time
+
+
+class Panels(NamedTuple):
+    """Panels of all runs in the order of time: run, start and length (s), free vibration, forces.
+
+    `amplitude` is that of the poles at the start. Of the `count` forces on the beam in each panel:
+    N upwards, position at t = 0 (m), speed (m/s) with its number, and piece of the beam.
+    """
+
+    run: Int[np.ndarray, " panel"]
+    start: Float[np.ndarray, " panel"]
+    length: Float[np.ndarray, " panel"]
+    amplitude: Complex[np.ndarray, "panel pole"]
+    count: Int[np.ndarray, " panel"]
+    force: Float[np.ndarray, "panel slot"]
+    origin: Float[np.ndarray, "panel slot"]
+    speed: Float[np.ndarray, "panel slot"]
+    response: Int[np.ndarray, "panel slot"]
+    piece: Int[np.ndarray, "panel slot"]
+
+    def forces_in(self, panel: Int[np.ndarray, " own"]):
+        """Forces in some of the panels: which of these, and indices of panel and slot."""
+        which, slot = np.nonzero(np.arange(self.force.shape[1]) < self.count[panel][:, None])
+        return which, (panel[which], slot)
+
+
+def force_panels(responses: ForceResponses, paths: ForcePaths) -> Panels:
+    """Panels of runs that begin at rest, with the free vibration in each."""
+    system, duration = responses.system, paths.duration
+    runs = duration.size
+    response = np.searchsorted(responses.speeds, paths.speed)
+    times, passed = paths.passages(system.breaks)
+    jumps = _jumps(responses, paths, response, passed)
+    times = times.reshape(runs, -1)
+    order = np.argsort(times, axis=1, kind="stable")
+    start = np.zeros((runs, order.shape[1] + 1))
+    start[:, 1:] = np.take_along_axis(times, order, axis=1)
+    length = np.diff(start, axis=1, append=duration[:, None])
+    jumps = np.take_along_axis(jumps.reshape(runs, -1, system.poles.size), order[..., None], axis=1)
+    decay = np.exp(system.poles * length[..., None])
+    amplitude = np.empty((start.shape[1], runs, system.poles.size), complex)
+    now = _of_forces_at_start(responses, paths, response)
+    for i in range(start.shape[1]):
+        amplitude[i] = now
+        if i < order.shape[1]:
+            now = now * decay[:, i] + jumps[:, i]
+    run, kept = np.nonzero(length > SAME_TIME_SHARE * duration[:, None])
+    start, length = start[run, kept], length[run, kept]
+    on_beam = _forces_on_beam(system, paths, run, start + length / 2)
+    count, force, piece = on_beam
+    parts = paths.force[force], paths.origin[run[:, None], force], paths.speed[run[:, None], force]
+    own_response = response[run[:, None], force]
+    return Panels(run, start, length, amplitude[kept, run], count, *parts, own_response, piece)
+
+
+def _jumps(responses: ForceResponses, paths: ForcePaths, response, passed):
+    """Jumps of the amplitudes (run, wheel, break, pole) where forces pass breaks.
+
+    Only nodes change them: there a force leaves one particular solution for another.
+    """
+    system = responses.system
+    change = np.zeros((responses.speeds.size, system.breaks.size, system.poles.size), complex)
+    change[:, np.searchsorted(system.breaks, system.nodes)] = responses.before - responses.after
+    change *= np.sign(responses.speeds)[:, None, None]
+    return change[response] * (passed * paths.force[:, None])[..., None]
+
+
+def _of_forces_at_start(responses: ForceResponses, paths: ForcePaths, response):
+    """Amplitudes (run, pole) at t = 0, of the forces that are on the beam then."""
+    system, nodes = responses.system, responses.system.nodes
+    amplitude = np.zeros((paths.duration.size, system.poles.size), complex)
+    x, speed = paths.origin, paths.speed
+    # One that enters at t = 0 passes the end then; one that leaves then was inside.
+    inside = np.where(
+        speed > 0, (nodes[0] < x) & (x <= nodes[-1]), (nodes[0] <= x) & (x < nodes[-1])
+    )
+    for run, wheel in np.argwhere(inside):
+        place = x[run, wheel]
+        side = "left" if speed[run, wheel] > 0 else "right"  # a node is passed at t = 0
+        segment = int(np.searchsorted(nodes[1:-1], place, side))
+        p = responses.particular(int(response[run, wheel]), segment, np.array([place]))[0]
+        amplitude[run] -= paths.force[wheel] * p
+    return amplitude
+
+
+def _forces_on_beam(system, paths: ForcePaths, run, middle):
+    """Number of the forces on the beam at the middles of panels; those forces, and their pieces."""
+    entry, leave = paths.windows(system.nodes[0], system.nodes[-1])
+    on_beam = (entry[run] < middle[:, None]) & (middle[:, None] < leave[run])
+    count = np.count_nonzero(on_beam, axis=1)
+    panel, wheel = np.nonzero(on_beam)
+    slot = np.arange(panel.size) - np.repeat(np.cumsum(count) - count, count)
+    force = np.zeros((run.size, max(1, count.max(initial=0))), int)
+    force[panel, slot] = wheel
+    x = paths.origin[run[:, None], force] + paths.speed[run[:, None], force] * middle[:, None]
+    piece = np.clip(np.searchsorted(system.breaks, x) - 1, 0, system.breaks.size - 2)
+    return count, force, piece
+
 
 CHUNK_STEPS = 16  # of a chunk, or FEW_STEPS of one that is no longer than these
 FEW_STEPS = 2

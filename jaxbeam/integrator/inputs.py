@@ -1,4 +1,4 @@
-"""Input policy: commands to the actuators, as the integrator asks for them."""
+"""Commands to the actuators, as the integrator asks for them: policies, and known commands."""
 
 import abc
 from typing import Any, ClassVar, NamedTuple
@@ -6,7 +6,9 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 from jaxtyping import Float, Int
 
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.integrator.propagators import NODE_COUNT
+from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.runtime.arrays import Array, cond, take, xp
 from jaxbeam.runtime.module import Module
 
 
@@ -51,3 +53,31 @@ class AbstractInputPolicy(Module):
     @abc.abstractmethod
     def observe(self, memory, info: StepInfo) -> Any:
         """Values to be saved at the start of a step with an event, batch axis last, or None."""
+
+
+class HeldCommands(AbstractInputPolicy):
+    """Input policy of commands that begin at the events of a schedule, as those of an earlier run.
+
+    At the nodes of a step each command is the same: (node and actuator) of a row.
+    """
+
+    model: ModalModel
+    commands: Float[Array, "event command batch"]
+    load_amplitude: Float[Array, " batch"]
+    holds_commands: ClassVar[bool] = True
+    implicit: ClassVar[bool] = False
+
+    def start(self, batch_size):
+        return xp.zeros(self.commands.shape[1:])
+
+    def inputs(self, memory, state, info, states):
+        memory = cond(
+            info.event >= 0,
+            lambda memory: take(self.commands, info.event),
+            lambda memory: memory,
+            memory,
+        )
+        return memory.reshape(NODE_COUNT, -1, memory.shape[-1]), memory
+
+    def observe(self, memory, info):
+        return None

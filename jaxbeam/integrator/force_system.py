@@ -21,9 +21,14 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 from numpy.polynomial import chebyshev
 
-from jaxbeam.integrator.forces.products import product
 from jaxbeam.model.modal_model import ModalModel
-from jaxbeam.model.sensing.corrected_rows import LinearOutputs
+from jaxbeam.model.sensing.output_rows import LinearOutputs
+
+
+def product(left, right) -> np.ndarray:
+    """left (row, term) times right (..., term, column)."""
+    return np.einsum("rt,...tc->...rc", left, right)
+
 
 MAX_CONDITION = 1e6  # of the eigenvectors; beyond, poles are nearly repeated
 TABLE_POINTS = 600  # of the beam, at least; peaks are searched on lines between them

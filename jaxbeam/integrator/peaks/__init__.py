@@ -1,1 +1,0 @@
-"""Peaks of what is monitored, in each step: rows, forces at its ends, and the largest so far."""

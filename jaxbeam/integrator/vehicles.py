@@ -1,0 +1,305 @@
+"""Vehicles on the beam: exact response of their states to the surface, and their steps.
+
+Within a step, the forces q = k y + c y' that the surface exerts on the springs of the wheels are
+polynomials through their values at the Gauss nodes, as the contact forces are. The states of a
+vehicle follow exactly (`propagators`), and the springs press on the surface at the nodes with
+
+    s = S q - O z_v
+
+where z_v are its states at the start of the step. With the motion of the beam
+y = R z + G f + D u under the wheels, the contact law
+
+    f = -W - m y'' - s
+
+is solved for f as an affine function of the states z of the beam and z_v of the vehicles, and of
+the commands u; the states of the vehicles at the end of the step follow. The maps of all steps are
+found at once, before the states are known.
+"""
+
+import math
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxbeam.integrator.propagators import (
+    GAUSS_NODES,
+    NODE_COUNT,
+    force_weights,
+    phi_functions_of,
+)
+from jaxbeam.integrator.step_matrices import StepMatrices
+from jaxbeam.model.load_set import LoadSet, VehicleGroup
+from jaxbeam.runtime.arrays import (
+    Array,
+    add_at,
+    cond,
+    is_jax,
+    map_elements,
+    solve_conditioned,
+    stop_gradient,
+    take,
+    with_blocks,
+    xp,
+)
+from jaxbeam.runtime.module import Module
+
+
+class VehiclePropagators(Module):
+    """Matrices of the vehicles of one load over steps of some lengths.
+
+    `transition` and `input` map states and q at the nodes to the states at the end;
+    `spring_states` is O and `spring_surface` is S. Rows are (wheel, node).
+    """
+
+    transition: Float[Array, "*length state state batch"]
+    input: Float[Array, "*length state row batch"]
+    spring_states: Float[Array, "*length row state batch"]
+    spring_surface: Float[Array, "*length row row batch"]
+
+
+def vehicle_state_norm(loads: LoadSet) -> Float[Array, ""]:
+    """Largest norm of the scaled state matrices of the vehicles, in 1/s; zero without any."""
+    norms = [
+        xp.max(xp.sum(xp.abs(_scaled_systems(group)[0]), axis=1)) for group in loads.wheels.vehicles
+    ]
+    return stop_gradient(xp.max(xp.stack(norms))) if norms else xp.zeros(())
+
+
+def _scaled_systems(group: VehicleGroup):
+    """State, input and output matrices with displacements scaled to the size of rates."""
+    dofs = group.A.shape[0] // 2
+    frequency = xp.sqrt(1.0 + xp.max(xp.sum(xp.abs(group.A[dofs:, :dofs]), axis=1), axis=0))
+    shape = (dofs, *frequency.shape)
+    scale = stop_gradient(xp.concatenate([xp.broadcast_to(frequency, shape), np.ones(shape)]))
+    return group.A * scale[:, None] / scale, group.B * scale[:, None], group.H / scale, scale
+
+
+@jax.named_scope("vehicles")
+def vehicle_propagators(
+    group: VehicleGroup, lengths: Float[Array, " length"]
+) -> VehiclePropagators:
+    """Propagators of the vehicles of a load over steps of the given lengths (s)."""
+    if not is_jax(lengths):
+        return _propagators(group, lengths)
+
+    def of_length(length):
+        """Most panels of a compiled program are empty."""
+        parts = cond(
+            length > 0, lambda t: _propagators(group, t), lambda t: _at_once(group, t), length[None]
+        )
+        return jax.tree.map(lambda part: part[0], parts)
+
+    return map_elements(of_length, lengths)
+
+
+def _at_once(group: VehicleGroup, lengths: Float[Array, " length"]) -> VehiclePropagators:
+    """Propagators over steps of no length (s), to first order: events at one time may part."""
+    A, B, H = (xp.asarray(part, lengths.dtype) for part in (group.A, group.B, group.H))
+    states, wheels, batch_size = B.shape
+    rows = wheels * NODE_COUNT
+    fractions = np.append(GAUSS_NODES, 1.0)
+    # Integrals of the polynomials of the nodes, up to each fraction of a step.
+    divisors = [math.factorial(power) for power in range(1, NODE_COUNT + 1)]
+    integrals = fractions[:, None] * (force_weights() / divisors).sum(axis=-1)
+    to_end = xp.einsum("f,swb->swfb", integrals[-1], B)
+    speeds = xp.einsum("c,wsb,stb->wctb", GAUSS_NODES, H, A)
+    response = xp.einsum("cf,wsb,svb->wcvfb", integrals[:NODE_COUNT], H, B)
+
+    def first_order(start, slope, columns):
+        shape = -1, columns, batch_size
+        start, slope = xp.asarray(start, lengths.dtype), slope.reshape(shape)
+        return xp.broadcast_to(start, slope.shape) + lengths[:, None, None, None] * slope
+
+    return VehiclePropagators(
+        first_order(np.eye(states)[..., None], A, states),
+        first_order(xp.zeros((states, rows, 1)), to_end, rows),
+        first_order(xp.repeat(H, NODE_COUNT, axis=0), speeds, states),
+        first_order(np.eye(rows)[..., None], -response, rows),
+    )
+
+
+def _propagators(group: VehicleGroup, lengths: Float[Array, " length"]) -> VehiclePropagators:
+    A, B, H, scale = _scaled_systems(group)
+    durations = lengths[:, None] * np.append(GAUSS_NODES, 1.0)
+    transition, phi_functions = phi_functions_of(A, B, durations, few_doublings=True)
+    inputs = xp.einsum("cfp,pswblc->lcfswb", force_weights(), phi_functions)
+    transition = xp.einsum("stblc->lcstb", transition)
+    nodes = slice(0, NODE_COUNT)
+    spring_states = xp.einsum("wsb,lcstb->lwctb", H, transition[:, nodes]) * scale
+    response = xp.einsum("wsb,lcfsvb->lwcvfb", H, inputs[:, nodes])
+    to_end = xp.einsum("lfswb->lswfb", inputs[:, -1])
+    count, rows, states, batch_size = lengths.shape[0], H.shape[0] * NODE_COUNT, *scale.shape
+    return VehiclePropagators(
+        transition=transition[:, -1] / scale[:, None] * scale,
+        input=to_end.reshape(count, states, rows, batch_size) / scale[:, None],
+        spring_states=spring_states.reshape(count, rows, states, batch_size),
+        spring_surface=np.eye(rows)[..., None] - response.reshape(count, rows, rows, batch_size),
+    )
+
+
+MAX_UNROLLED_ROWS = 24  # of contact equations whose elimination is spelt out
+
+
+class VehicleStep(Module):
+    """Wheels of the rows of a step, and the surface, for each step of a chunk.
+
+    `length_index` is that of the step's length; `on_beam` tells which wheels are there; `surface`
+    is the motion of the profile under all wheels (see `LoadPath`).
+    """
+
+    length_index: Int[Array, " *step"]
+    wheels: Int[Array, "*step wheel"]
+    on_beam: Bool[Array, "*step wheel"]
+    surface: Float[Array, "*step 3 all node"] | None
+
+
+class StepInput(Module):
+    """What a step of a batch takes: matrices, and inertia (kg) and weight (N) of the rows.
+
+    The weight includes the inertia forces of the profile. Without vehicles, `vehicles` is None.
+    """
+
+    matrices: StepMatrices
+    inertia: Float[Array, "*step row batch"]
+    weight: Float[Array, "*step row batch"]
+    vehicles: VehicleStep | None
+
+
+class Vehicles(Module):
+    """Loads with vehicles, and the propagators of the vehicles of each for all step lengths."""
+
+    loads: LoadSet
+    propagators: tuple[VehiclePropagators, ...]
+
+
+def vehicles_of(loads: LoadSet, lengths: Float[Array, " length"]) -> Vehicles | None:
+    """Vehicles of the loads for steps of the given lengths (s); None without any."""
+    groups = loads.wheels.vehicles
+    if not groups:
+        return None
+    return Vehicles(loads, tuple(vehicle_propagators(group, lengths) for group in groups))
+
+
+def vehicle_maps(vehicles: Vehicles, step: StepInput):
+    """Linear part and offset of the map to contact forces, and both of that to vehicles' states.
+
+    All (step, batch, row, column); columns are states of the beam, of the vehicles, and commands.
+    """
+    matrices, loads, wheels = step.matrices, vehicles.loads, vehicles.loads.wheels
+    steps, batch = step.inertia.shape[0], step.inertia.shape[-1]
+    inertia, weight = (xp.swapaxes(part, 1, 2)[..., None] for part in (step.inertia, step.weight))
+    at_rows = (take(part, step.vehicles.wheels) for part in (wheels.stiffness, wheels.damping))
+    stiffness, damping = (
+        xp.swapaxes(xp.repeat(part, NODE_COUNT, axis=1), 1, 2)[..., None] for part in at_rows
+    )
+
+    def on_springs(parts):
+        return stiffness * parts[:, 0, None] + damping * parts[:, 1, None]
+
+    springs, commands = matrices.springs, matrices.commands
+    rows = matrices.contact_response.shape[1]
+    no_vehicles = np.zeros((steps, batch, rows, loads.vehicle_states))
+    surface = [on_springs(springs.response), no_vehicles]
+    by_commands = no_vehicles[..., :0]
+    if commands is not None:
+        surface.append(on_springs(springs.commands))
+        by_commands = inertia * commands.contact_response[:, None]
+    coupling, by_states, by_profile = springs_of_wheels(vehicles, step.vehicles, batch)
+    surface = xp.concatenate(surface, axis=-1)
+    by_beam = inertia * matrices.contact_response[:, None]
+    right = xp.concatenate([by_beam, -by_states, by_commands], axis=-1) + coupling @ surface
+    right = xp.concatenate([right, weight + by_profile], axis=-1)
+    impedance = on_springs(springs.compliance)
+    system = np.eye(rows) + inertia * matrices.contact_compliance[:, None]
+    forces = -solve_conditioned(system + coupling @ impedance, right)
+    surface = xp.concatenate([surface, np.zeros((*surface.shape[:-1], 1))], axis=-1)
+    of_vehicles = _state_maps(vehicles, step, surface + impedance @ forces)
+    of_vehicles = of_vehicles[..., :-1], of_vehicles[..., -1:]
+    return forces[..., :-1], forces[..., -1:], of_vehicles
+
+
+def springs_of_wheels(vehicles: Vehicles, step: VehicleStep, batch: int):
+    """S and O at the rows, and S q of the profile, of the steps (step, batch, row, ...)."""
+    loads, wheels, length = vehicles.loads, step.wheels, step.length_index
+    on_beam = xp.repeat(step.on_beam, NODE_COUNT, axis=1)[:, None, :, None]
+    profile = _profile(vehicles, step, batch)
+    rows = (wheels[..., None] * NODE_COUNT + np.arange(NODE_COUNT)).reshape(len(wheels), -1)
+    all_rows = loads.wheel_count * NODE_COUNT
+    shape = len(length), profile.shape[1], all_rows
+    coupling_blocks, state_blocks, first = [], [], 0
+    for group, part in zip(loads.wheels.vehicles, vehicles.propagators, strict=True):
+        of_surface, of_states = (
+            xp.moveaxis(take(matrix, length), -1, 1)
+            for matrix in (part.spring_surface, part.spring_states)
+        )
+        states = of_states.shape[-1]
+        for i in range(group.count):
+            own = _rows_of(group, i)
+            coupling_blocks.append((np.s_[..., own, own], of_surface))
+            state_blocks.append((np.s_[..., own, first : first + states], of_states))
+            first += states
+    coupling = with_blocks((*shape, all_rows), coupling_blocks)
+    by_states = with_blocks((*shape, loads.vehicle_states), state_blocks)
+    by_profile = coupling @ profile
+    of_steps, of_batch = np.ogrid[: shape[0], : shape[1]]
+    index = of_steps[..., None], of_batch[..., None], rows[:, None]
+    pairs = (
+        *(part[..., None] for part in index[:2]),
+        rows[:, None, :, None],
+        rows[:, None, None],
+    )
+    return (
+        take(coupling, pairs) * on_beam,
+        take(by_states, index) * on_beam,
+        take(by_profile, index) * on_beam,
+    )
+
+
+def _profile(vehicles: Vehicles, step: VehicleStep, batch: int) -> Float[Array, "step batch row 1"]:
+    """q of the profile at all wheels and nodes of the steps."""
+    wheels = vehicles.loads.wheels
+    shape = len(step.wheels), batch, vehicles.loads.wheel_count * NODE_COUNT, 1
+    if step.surface is None:
+        return xp.zeros(shape)
+    height, rate, _ = xp.moveaxis(step.surface, 1, 0)[:, :, None]
+    stiffness, damping = (part.T[..., None] for part in (wheels.stiffness, wheels.damping))
+    return (stiffness * height + damping * rate).reshape(shape)
+
+
+def _state_maps(vehicles: Vehicles, step: StepInput, surface):
+    """Maps of the steps to the states of the vehicles at their ends; the last column is of one.
+
+    `surface` is the map to q = k y + c y' of the beam at the rows.
+    """
+    loads, wheels, length = vehicles.loads, step.vehicles.wheels, step.vehicles.length_index
+    (steps, batch, _, columns), states = surface.shape, step.matrices.state_count
+    parts = surface.reshape(steps, batch, -1, NODE_COUNT, columns)
+    parts = parts * step.vehicles.on_beam[:, None, :, None, None]
+    step_index, batch_index = np.ogrid[:steps, :batch]
+    by_wheel = add_at(
+        np.zeros((steps, batch, loads.wheel_count, NODE_COUNT, columns)),
+        (step_index[..., None], batch_index[..., None], wheels[:, None]),
+        parts,
+    )
+    by_row = by_wheel.reshape(steps, batch, -1, columns)
+    if step.vehicles.surface is not None:
+        by_row = add_at(by_row, np.s_[..., -1:], _profile(vehicles, step.vehicles, batch))
+    maps, first = [], states
+    for group, part in zip(loads.wheels.vehicles, vehicles.propagators, strict=True):
+        transition, to_end = (
+            xp.moveaxis(take(matrix, length), -1, 1) for matrix in (part.transition, part.input)
+        )
+        for i in range(group.count):
+            own = slice(first, first + transition.shape[-1])
+            next_state = to_end @ by_row[..., _rows_of(group, i), :]
+            maps.append(add_at(next_state, np.s_[..., own], transition))
+            first = own.stop
+    return xp.concatenate(maps, axis=2)
+
+
+def _rows_of(group: VehicleGroup, vehicle: int) -> slice:
+    """Rows (wheel and node) of a vehicle of a load among those of all wheels."""
+    rows = group.wheels_per_vehicle * NODE_COUNT
+    start = group.first_wheel * NODE_COUNT + vehicle * rows
+    return slice(start, start + rows)

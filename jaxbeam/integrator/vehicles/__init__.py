@@ -1,1 +1,0 @@
-"""Vehicles on the beam: their propagators, and their steps."""

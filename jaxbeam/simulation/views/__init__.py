@@ -1,1 +1,0 @@
-"""Views of records: as text, as tables, as labelled datasets."""
