@@ -233,7 +233,9 @@ def test_sweeps_of_peaks_in_double_precision_use_c():
         controller=jb.PD(gains=[300.0], rate_gains=[3.0], lag=[0.002], period=0.004),
         sensors=SENSORS[:1],
     )
-    assert not specification_of(controlled).uses_c()
+    assert specification_of(controlled).uses_c()
+    continuous = dataclasses.replace(controlled.controller, period=None)
+    assert not specification_of(dataclasses.replace(controlled, controller=continuous)).uses_c()
     moments = dataclasses.replace(PLAIN, sensors=[jb.Sensor(0.2, "moment")])
     assert specification_of(moments).uses_c()
     sheared = dataclasses.replace(BEAM, shear_stiffness=1e5)
