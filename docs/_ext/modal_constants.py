@@ -20,10 +20,10 @@ SOURCES = {
     r"ORDER|ROWS|BLOCKS|LAGS|SAMPLES|SEGMENTS|BINS|LINES|MAX_ADDED|MAX_TRIED|TAPERS": "resolution",
 }
 OTHERWISE = "judgement"
-EXPLAINED = """Each number stands in the code beside what it decides. Where it is from:
-*literature*; *statistics*, as probabilities of false alarms; *planted logs*, which show it;
-*resolution* and *numerics*, of which other values cost time and change little; *judgement*, chosen
-by hand on planted structures, without a derivation."""
+EXPLAINED = """Each number stands in the code beside what it decides. Where it is from is sorted by
+words of its name and comment, not by a record of how it was found: *literature*; *statistics*, as
+probabilities of false alarms; *planted logs*, which the comment names; *resolution* and *numerics*,
+sizes and tolerances; *judgement*, all others, chosen by hand without a derivation."""
 
 
 class Constant(NamedTuple):
