@@ -8,7 +8,7 @@ panels, so the grid can be compiled; a panel of zero length has no effect.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -87,7 +87,8 @@ def in_order(times: Float[Array, " event"]) -> Float[Array, " event"]:
     A compiler that multiplies and adds at once rounds `k * period` otherwise in each expression.
     Derivatives are those of the times.
     """
-    return jax.lax.cummax(times) if is_jax(times) else np.maximum.accumulate(times)
+    ordered: Any = jax.lax.cummax(times) if is_jax(times) else np.maximum.accumulate(times)
+    return ordered
 
 
 @in_order.defjvp

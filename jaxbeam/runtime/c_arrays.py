@@ -343,7 +343,10 @@ def _cumulative(name: str):
 
     def rule(writer: Writer, params, values, outs):
         value, axis = values[0], params["axis"]
-        found, text = writer.declare(*outs[0], value.varying), elementwise(name, params)
+        found, text = (
+            writer.declare(outs[0][0], outs[0][1], value.varying),
+            elementwise(name, params),
+        )
         assert text is not None
         writer.copy(found, value)
         own, length = strides_of(value.shape), value.shape[axis]

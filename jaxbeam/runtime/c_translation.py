@@ -24,7 +24,7 @@ def _cond(writer: Writer, params, values, outs):
         index.varying or any(flags)
         for flags in zip(*(writer.varies(branch, inputs) for branch in branches), strict=True)
     ]
-    found = [writer.declare(*out, flag) for out, flag in zip(outs, flags, strict=True)]
+    found = [writer.declare(out[0], out[1], flag) for out, flag in zip(outs, flags, strict=True)]
     for to in found if index.varying else []:
         writer.line(f"memset({to.name}, 0, sizeof {to.name});")
     last = len(branches) - 1
@@ -79,7 +79,9 @@ def _scan(writer: Writer, params, values, outs):
     rows = [v._replace(shape=v.shape[1:]) for v in inputs]
     carry = _carried(writer, body, values[constants : constants + carried], fixed, rows, False)
     flags = writer.varies(body, [*fixed, *carry, *rows])[carried:]
-    stacked = [writer.declare(*o, flag) for o, flag in zip(outs[carried:], flags, strict=True)]
+    stacked = [
+        writer.declare(o[0], o[1], flag) for o, flag in zip(outs[carried:], flags, strict=True)
+    ]
     i, at = writer.new_name("i"), writer.new_name("a")
     with writer.block(f"for (int64_t {i} = 0; {i} < {length}; {i}++)"):
         writer.line(f"const int64_t {at} = {f'{length} - 1 - {i}' if params['reverse'] else i};")

@@ -124,7 +124,9 @@ class NativeLoops:
     def _policy_of(self, batch: int) -> SampledLoop:
         case = self.program.case_with(self.batches.shared_values[batch])
         layout = self.program.shapes.layout
-        return closed_loop(case, layout, load_set(case, layout), self.program.schedule)
+        loop = closed_loop(case, layout, load_set(case, layout), self.program.schedule)
+        assert isinstance(loop, SampledLoop)
+        return loop
 
     def _is_shared(self) -> bool:
         """Whether all batches have one law: it depends on no number that differs between them."""
