@@ -28,6 +28,13 @@ class ModalSettings:
 
     Raises ValueError for a count below one, an order below four, frequencies to choose that are not
     positive, and a choice beside a count or excluded frequencies, as all modes are chosen then.
+
+        >>> ModalSettings(count=3, exclude=[50.0]).count
+        3
+        >>> ModalSettings(count=0)
+        Traceback (most recent call last):
+            ...
+        ValueError: count must be at least 1, not 0
     """
 
     count: int | None = None
