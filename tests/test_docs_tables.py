@@ -9,7 +9,6 @@ from tests.modules import ROOT
 
 # Pages whose tables have numbers in the source, and why.
 WRITTEN = {
-    "README.md": "`test_readme` compares the table with what the benchmark printed",
     "docs/explanation/thesis.md": "written by `experiments.thesis.page`",
     "docs/explanation/thesis_changes.md": "a history: verdicts before and after new rules",
 }

@@ -2,9 +2,8 @@
 
     python -m experiments.thesis.page out/reproduce/report.json
 
-writes docs/explanation/thesis.md, the tables of docs/explanation/results.md, and the sentences
-between the marks of README.md and of docs/howto/reproduce.md. Run it after
-`jaxbeam reproduce --all`.
+writes docs/explanation/thesis.md, the tables and the shares of docs/explanation/results.md, and the
+sentence between the marks of docs/howto/reproduce.md. Run it after `jaxbeam reproduce --all`.
 """
 
 import json
@@ -31,6 +30,7 @@ from experiments.thesis.verdicts import (
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "explanation" / "thesis.md"
+COUNTS = ROOT / "docs" / "howto" / "reproduce.md"
 BEGIN, END = "<!-- counts of verdicts -->", "<!-- end of counts -->"
 INTRODUCTION = """# The numbers of the thesis, and which are reproduced
 
@@ -133,14 +133,11 @@ def with_counts(text: str, report: dict) -> str:
 
 
 def write(report: dict) -> None:
-    """Write the page, the tables of results, and numbers of both in README and `reproduce.md`."""
+    """Write the page, the tables and shares of results, and the counts of `reproduce.md`."""
     PAGE.write_text(page(report), encoding="utf-8")
-    RESULTS.write_text(with_tables(RESULTS.read_text(encoding="utf-8"), report), encoding="utf-8")
-    readme = ROOT / "README.md"
-    shares = with_shares(readme.read_text(encoding="utf-8"), RESULTS.read_text(encoding="utf-8"))
-    readme.write_text(shares, encoding="utf-8")
-    for file in (readme, ROOT / "docs" / "howto" / "reproduce.md"):
-        file.write_text(with_counts(file.read_text(encoding="utf-8"), report), encoding="utf-8")
+    results = with_tables(RESULTS.read_text(encoding="utf-8"), report)
+    RESULTS.write_text(with_shares(results), encoding="utf-8")
+    COUNTS.write_text(with_counts(COUNTS.read_text(encoding="utf-8"), report), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -99,7 +99,7 @@ def with_tables(text: str, report: Mapping) -> str:
 
 
 def shares_paragraph(text: str) -> str:
-    """What README says of the laws, in numbers of the tables of the page.
+    """What the page says first of the laws, in numbers of its tables.
 
     Raises KeyError if the page lacks a row.
     """
@@ -130,13 +130,13 @@ def shares_paragraph(text: str) -> str:
     )
 
 
-def with_shares(text: str, results: str) -> str:
-    """A text with the paragraph on the laws between its marks, by the page on results.
+def with_shares(text: str) -> str:
+    """The page with the paragraph on the laws between its marks, by its tables.
 
     Raises ValueError if it has no marks.
     """
     old = _between(text, BEGIN_SHARES, END_SHARES)
-    return text.replace(old, f"\n{shares_paragraph(results)}\n")
+    return text.replace(old, f"\n{shares_paragraph(text)}\n")
 
 
 def _between(text: str, begin: str, end: str) -> str:

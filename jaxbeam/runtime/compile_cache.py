@@ -5,7 +5,7 @@ its name is a hash known before (`program_key`), in a folder private to the user
 Programs are for one CPU device. Loading unpickles, here and within JAX: `trusted_code` does so once
 the file's HMAC is verified.
 
-The README ("Speed") says how scripts switch it on and commands off.
+`docs/howto/speed.md` says how scripts switch it on and commands off.
 
 The key of a program is a hash of all that decides it, known before anything is traced.
 It covers the function, its static arguments, the shapes and dtypes of the others, settings of JAX

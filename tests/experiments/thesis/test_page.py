@@ -39,18 +39,14 @@ def test_counts_are_written_between_the_marks():
         page.with_counts("nothing", REPORT)
 
 
-def test_shares_in_readme_are_those_of_the_tables():
-    readme = (page.ROOT / "README.md").read_text(encoding="utf-8")
+def test_shares_on_the_page_are_those_of_its_tables():
     results = page.RESULTS.read_text(encoding="utf-8")
-    assert page.with_shares(readme, results) == readme
+    assert page.with_shares(results) == results
     with pytest.raises(ValueError, match="no marks"):
-        page.with_shares("nothing", results)
+        page.with_shares("nothing")
 
 
-def test_all_pages_have_the_same_counts():
-    sentences = set()
-    for name in ("README.md", "docs/howto/reproduce.md"):
-        text = (page.ROOT / name).read_text(encoding="utf-8")
-        sentences.add(text.partition(page.BEGIN)[2].partition(page.END)[0].strip())
-    (sentence,) = sentences
+def test_pages_have_the_same_counts():
+    text = page.COUNTS.read_text(encoding="utf-8")
+    sentence = text.partition(page.BEGIN)[2].partition(page.END)[0].strip()
     assert REPRODUCED in sentence and sentence in page.PAGE.read_text(encoding="utf-8")
