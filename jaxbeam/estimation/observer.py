@@ -13,7 +13,7 @@ from jaxbeam.estimation.observability import mode_count, observability_error
 from jaxbeam.estimation.sampled_plant import SampleTiming, Transition
 from jaxbeam.model.linear_system import StateSpace
 from jaxbeam.model.state_space import Plant
-from jaxbeam.numerics.discretisation import balance, c2d
+from jaxbeam.numerics.discretisation import balance, c2d, differentiable_balance
 from jaxbeam.numerics.riccati import care, dare
 from jaxbeam.runtime.arrays import Array, Number, set_at, solve, xp
 
@@ -89,7 +89,7 @@ def placed_gain(A: Square, C: Rows, desired: Square) -> Float[Array, "state outp
     Letters 1, 1982). A and `desired` must have no common eigenvalue, and both be observable through
     C; otherwise the result is NaN or meaningless.
     """
-    scale = balance(A)
+    scale = differentiable_balance(A)  # the share of each of several outputs depends on it
     A, desired = A * scale / scale[:, None], desired * scale / scale[:, None]
     rows = C * scale
     row_norms = xp.sqrt(xp.sum(rows**2, axis=1))

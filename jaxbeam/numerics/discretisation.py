@@ -82,8 +82,14 @@ def balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
     """Scale of the states with which rows and columns of the matrix have like norms.
 
     Without it, squaring an exponential of deflections in m and their rates in m/s loses digits.
-    The balanced matrix is A * scale / scale[:, None].
+    The balanced matrix is A * scale / scale[:, None]. Without a derivative: what follows must not
+    depend on the scale but by rounding, else take `differentiable_balance`.
     """
+    return stop_gradient(differentiable_balance(matrix))
+
+
+def differentiable_balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
+    """As `balance`, with its derivative."""
     size = xp.abs(matrix) * (1 - np.eye(matrix.shape[0]))
 
     def equalise(_, scale):
@@ -94,7 +100,7 @@ def balance(matrix: Float[Array, "state state"]) -> Float[Array, " state"]:
         return scale * ratio**0.25  # half the step for one state, as all change at once
 
     start = xp.ones_like(xp.diagonal(matrix))
-    return stop_gradient(fori_loop(0, 20, equalise, start))
+    return fori_loop(0, 20, equalise, start)
 
 
 def propagate(matrix, t, duration, substeps: int, start):

@@ -120,6 +120,20 @@ def test_placed_gain():
     assert_allclose(np.sort_complex(np.linalg.eigvals(A - both @ C)), np.sort_complex(poles))
 
 
+def test_a_placed_gain_of_unlike_sensors_has_the_derivative_by_the_stiffness():
+    """The shares of a deflection and a velocity depend on the scale of the states."""
+    rows = jnp.stack([C[0], jnp.roll(C[1], 3)])
+    stiffness = jnp.tril(jnp.ones((6, 6)), -3) > 0
+
+    @jax.jit
+    def gain(ratio):
+        return PLACED(jnp.where(stiffness, ratio, 1.0) * A, rows, 1.5 * A)
+
+    differences = (gain(1 + 1e-5) - gain(1 - 1e-5)) / 2e-5
+    size = np.max(np.abs(differences), axis=0)
+    assert_allclose(jax.jacfwd(gain)(1.0) / size, differences / size, rtol=0, atol=1e-7)
+
+
 def test_gradients_of_gains():
     step = transition(2e-3)
     matrix, noise = step.matrix, step.noise_covariance

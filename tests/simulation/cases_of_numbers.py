@@ -353,7 +353,11 @@ OF_CONTROLLERS = {
     "lqr-augmented": law(
         "lqr-augmented", estimator=jb.MovingHorizon(0.02, 1e-5, weight_deviation=1.0, window=2)
     ),
-    "lqr-observer": law("lqr-observer", design=DESIGN, feedback=array(1.0, 0.9, 0.8, 0.7, 0.6)),
+    "lqr-observer": law(
+        "lqr-observer",
+        design=DesignModel(force_per_volt=4.0, stiffness=1500.0, damping=4.0),
+        feedback=array(1.0, 0.9, 0.8, 0.7, 0.6),
+    ),
     "poles": law("lqr-observer", estimator=jb.Observer([[-30.0, 200.0], [-60.0, 800.0]])),
     "dlqr-kalman": law(
         "dlqr-kalman",

@@ -68,12 +68,10 @@ OPEN = {
     "kalman-extended",
     "lqr-augmented",
     "lqr-finite",
-    "lqr-observer",
     "lqr-position",
     "lqr-scheduled",
     "mpc-scenario",
     "mpc-soft",
-    "poles",
 }
 
 
