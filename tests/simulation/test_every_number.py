@@ -33,6 +33,8 @@ JUMPS = {
     "confirmation": DECIDES,
     "stepped masses": DECIDES,
 }
+# Those of an internal model that is scheduled, which counts the commands on their way.
+COUNTS = "needs known delays: leave period and delays out of what is traced"
 STEP, TOLERANCE = 4e-6, 1e-4  # of numbers; of the largest derivative of an output
 
 # Numbers that do not matter in these cases, or never.
@@ -63,7 +65,6 @@ OPEN = {
     "design with a patch",
     "gpc-adaptive",
     "h-infinity",
-    "internal-model-scheduled",
     "kalman",
     "kalman-extended",
     "lqr-augmented",
@@ -98,6 +99,9 @@ def jumps(case: jb.Case, address: str) -> str:
     """The sentence that refuses the derivative by a number; "" if there is none."""
     stepped = getattr(case.controller, "between", "") == "stepped"
     part, name = address.partition(".")[0], address.rpartition(".")[2]
+    kind = getattr(case.controller, "kind", "")
+    if kind == "internal-model-scheduled" and name in ("period", "delay"):
+        return COUNTS
     if part == "vehicle_sensors" and name == "jitter":
         return ""  # no law waits for these readings, which are taken from a smooth history
     return JUMPS.get(f"stepped {name}" if stepped and name == "masses" else name, "")
