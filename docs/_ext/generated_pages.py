@@ -87,6 +87,8 @@ def public_names() -> dict[str, list[tuple[str, str]]]:
     for package in (jaxbeam, tuning, jaxbeam.plot):
         for name in sorted(package.__all__, key=str.lower):
             one = getattr(package, name)
+            if one is tuning:  # has its own turn
+                continue
             if inspect.ismodule(one):
                 found = [(one.__name__, inner) for inner in one.__all__]
                 pages[group_of(one.__name__)] += found

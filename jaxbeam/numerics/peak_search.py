@@ -1,6 +1,8 @@
 """Peak of the polynomial through a few samples: its largest absolute value, or other magnitude."""
 
 import functools
+import itertools
+import operator
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -59,13 +61,16 @@ def polynomial(coefficients, position):
     """Value of a polynomial; coefficients with the lowest power first.
 
     Those of a list by Horner's rule, spelt out for programs that evaluate it often; those of an
-    array by its powers, of which programs compile sooner.
+    array by its powers, of which programs compile sooner: as products, since JAX's `0.0**0.0` has
+    no derivative.
     """
     if not isinstance(coefficients, list):
         count, *rest = coefficients.shape
         more = (1,) * (xp.ndim(position) - len(rest))
-        exponents = np.arange(count, dtype=float).reshape(-1, *(1,) * xp.ndim(position))
-        powers = position**exponents
+        factors = itertools.repeat(position, count - 1)
+        powers = xp.stack(
+            [*itertools.accumulate(factors, operator.mul, initial=xp.ones_like(position))]
+        )
         return xp.sum(coefficients.reshape(count, *more, *rest) * powers, axis=0)
     value = coefficients[-1]
     for coefficient in coefficients[-2::-1]:

@@ -101,3 +101,17 @@ def test_straight_and_flat_curves(points):
     assert estimate(line, points)[0] == pytest.approx(3.0)
     value, position = refine(line, points)
     assert value[0] == pytest.approx(3.0) and position[0] == 0
+
+
+@both_point_sets
+def test_derivatives_of_a_peak_in_the_middle_of_its_samples(points):
+    """That of s (1 - u^2) + t u over u in [-1, 1] is s + t^2 / 4 s."""
+    u = 2 * np.array(points) - 1
+
+    def peak(numbers):
+        scale, tilt = numbers
+        return refine((scale * (1 - u**2) + tilt * u)[:, None], points)[0][0]
+
+    at = jnp.array([2.0, 0.0])
+    np.testing.assert_allclose(jax.grad(peak)(at), [1.0, 0.0], atol=1e-14)
+    np.testing.assert_allclose(jax.hessian(peak)(at), [[0.0, 0.0], [0.0, 0.25]], atol=1e-13)
