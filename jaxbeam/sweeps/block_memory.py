@@ -68,12 +68,15 @@ class RunSizes(NamedTuple):
 
 
 def run_sizes(case: Case, speeds: Float[np.ndarray, " speed"], histories: bool) -> RunSizes:
-    """Sizes of the runs of a case, of which the loads have `speeds` (m/s) up to the largest."""
+    """Sizes of the runs of a case, of which the loads have `speeds` (m/s) up to the largest.
+
+    Those of loads that stand are NaN, and cross nothing.
+    """
     case = concrete_case(case)
     loads, layout, modes = load_set(case), mesh_layout(case), case.beam.modes
     pieces = loads.cubics()[0].shape[1] if loads.wheel_count else 0
     duration, length = float(case.run.duration), float(concrete(case.beam.length))
-    crossings = duration * np.abs(speeds).max(initial=0.0) / length
+    crossings = duration * np.nan_to_num(np.abs(speeds)).max(initial=0.0) / length
     samples, of_crossings, steps = 0, int(STEPS_PER_MODE * modes * crossings), 0
     if histories:
         samples = len(sample_times(case))

@@ -121,3 +121,29 @@ def test_the_progress_line_says_how_many_runs_a_block_has(capsys):
     case = case_of(UNIFORM, TRAIN, "moment", 1)
     jb.sweep(case, SPEEDS, memory="1 GB")
     assert "blocks of 12, each within " in capsys.readouterr().err
+
+
+STANDING = {
+    "force": jb.VaryingForce(force=1e5, position=10.0),
+    "line load": jb.LineLoad(force_per_length=1000.0, lengths=[25.0], position=25.0),
+}
+
+
+@pytest.mark.parametrize("name", STANDING)
+def test_sweeps_of_loads_that_stand_are_sized(name):
+    """They have no speed. Peaks by the closed form of modes under a constant force."""
+    case = case_of(UNIFORM, STANDING[name], "deflection", 1)
+    case = dataclasses.replace(case, sensors=(jb.Sensor(10.0),), run=jb.Run(1.0))
+    found = jb.sweep(case, {"beam.damping_ratio": [0.01, 0.05]}, progress=False)
+    n = np.arange(1, 5) * np.pi / 25.0
+    of_force = 1e5 * np.sin(10.0 * n)
+    points = 0.25 * (np.arange(100) + 0.5)  # m: a line load is forces at the middles of its parts
+    of_line = 1000.0 * 0.25 * np.sum(np.sin(np.outer(n, points)), axis=1)
+    forces = 2 / (25.0 * 15000.0) * {"force": of_force, "line load": of_line}[name]
+    omega = n**2 * np.sqrt(3e10 / 15000.0)
+    t = np.linspace(0.0, 1.0, 20_001)
+    for ratio, peak in zip((0.01, 0.05), found.peak_deflection.values[:, 0], strict=True):
+        pole = omega * (-ratio + 1j * np.sqrt(1 - ratio**2))
+        decay = np.real(np.exp(np.outer(t, pole)) * (1 - 1j * ratio / np.sqrt(1 - ratio**2)))
+        history = (1 - decay) @ (np.sin(10.0 * n) * forces / omega**2)
+        assert_allclose(peak, np.max(np.abs(history)), rtol=1e-6)
