@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.numerics.matrices import expm
+from jaxbeam.numerics.polynomials import powers
 from jaxbeam.runtime.arrays import (
     Array,
     fori_loop,
@@ -183,8 +184,5 @@ def evaluate_cubics(
     )
     start = take(times, interval)
     fraction = (query_times - start) / (take(times, interval + 1) - start)
-    fraction = xp.clip(fraction, 0.0, 1.0)[..., None]
-    interval_coefficients = take(coefficients, interval)
-    return xp.sum(
-        interval_coefficients * fraction ** np.arange(interval_coefficients.shape[-1]), axis=-1
-    )
+    own = xp.moveaxis(take(coefficients, interval), -1, 0)
+    return xp.sum(own * powers(xp.clip(fraction, 0.0, 1.0), own.shape[0]), axis=0)

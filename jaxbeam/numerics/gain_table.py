@@ -14,6 +14,7 @@ from jaxtyping import Float
 from jaxbeam.numerics.batched_linalg import hstack, matmul, transpose
 from jaxbeam.numerics.coupled_stages import ConstantPlant
 from jaxbeam.numerics.matrices import InputWeight, Square
+from jaxbeam.numerics.polynomials import powers
 from jaxbeam.numerics.riccati import lqr
 from jaxbeam.numerics.stages import GAUSS_NODES
 from jaxbeam.runtime.arrays import Array, take, xp
@@ -38,8 +39,8 @@ class GainTable(Module):
         start = take(self.breakpoints, i)
         length = take(self.breakpoints, i + 1) - start
         interval_fraction = (fraction - start) / xp.where(length > 0, length, 1.0)
-        powers = xp.clip(interval_fraction, 0.0, 1.0) ** np.arange(self.coefficients.shape[1])
-        return xp.tensordot(powers, take(self.coefficients, i), axes=1)
+        fractions = powers(xp.clip(interval_fraction, 0.0, 1.0), self.coefficients.shape[1])
+        return xp.tensordot(fractions, take(self.coefficients, i), axes=1)
 
 
 def breakpoints_between(

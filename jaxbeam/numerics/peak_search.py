@@ -1,8 +1,6 @@
 """Peak of the polynomial through a few samples: its largest absolute value, or other magnitude."""
 
 import functools
-import itertools
-import operator
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -10,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxbeam.numerics.polynomials import powers
 from jaxbeam.runtime.arrays import (
     Array,
     fori_loop,
@@ -61,17 +60,12 @@ def polynomial(coefficients, position):
     """Value of a polynomial; coefficients with the lowest power first.
 
     Those of a list by Horner's rule, spelt out for programs that evaluate it often; those of an
-    array by its powers, of which programs compile sooner: as products, since JAX's `0.0**0.0` has
-    no derivative.
+    array by its powers, of which programs compile sooner.
     """
     if not isinstance(coefficients, list):
         count, *rest = coefficients.shape
         more = (1,) * (xp.ndim(position) - len(rest))
-        factors = itertools.repeat(position, count - 1)
-        powers = xp.stack(
-            [*itertools.accumulate(factors, operator.mul, initial=xp.ones_like(position))]
-        )
-        return xp.sum(coefficients.reshape(count, *more, *rest) * powers, axis=0)
+        return xp.sum(coefficients.reshape(count, *more, *rest) * powers(position, count), axis=0)
     value = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
         value = coefficient + position * value

@@ -1,6 +1,8 @@
 """Polynomials: Gauss-Legendre quadrature and interpolation, and piecewise Chebyshev series."""
 
 import functools
+import itertools
+import operator
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +18,12 @@ from jaxbeam.runtime.arrays import (
     xp,
 )
 from jaxbeam.runtime.compiling import compiled_if_traced
+
+
+def powers(x: Float[Array, " *place"], count: int) -> Float[Array, "power *place"]:
+    """Powers 0 to count - 1 by products: those of JAX have no second derivatives at 0."""
+    factors = itertools.repeat(x, count - 1)
+    return xp.stack([*itertools.accumulate(factors, operator.mul, initial=xp.ones_like(x))])
 
 
 @functools.cache

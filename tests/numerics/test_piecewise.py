@@ -7,7 +7,7 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebval
 from numpy.testing import assert_allclose
 
-from jaxbeam.numerics.polynomials import piecewise_chebyshev
+from jaxbeam.numerics.polynomials import piecewise_chebyshev, powers
 
 RANDOM = np.random.default_rng(0)
 
@@ -38,3 +38,14 @@ def test_memory_does_not_grow_with_the_number_of_segments():
         return found
 
     assert peak(40) < 2 * peak(2)
+
+
+def test_derivatives_of_powers_at_zero():
+    """Of 2 + 3 x + 5 x^2 + 7 x^3."""
+    coefficients = np.array([2.0, 3.0, 5.0, 7.0])
+
+    def value(x):
+        return coefficients @ powers(x, 4)
+
+    zero = np.zeros(())
+    assert (value(zero), jax.grad(value)(zero), jax.hessian(value)(zero)) == (2.0, 3.0, 10.0)
