@@ -39,6 +39,7 @@ from jaxbeam.control.predictive.terminal import (
     limits_error,
     periods_needed,
     terminal_regulator,
+    unseen_modes,
 )
 from jaxbeam.control.state_controller import AbstractStateController, deflection_rows
 from jaxbeam.model.state_space import Plant
@@ -210,6 +211,12 @@ class MPC(AbstractStateController):
         if self.terminal != "dual-mode" or self.solver == "unconstrained":
             return None
         regulator = self._regulator(*self._sampled(design_plant), design_plant.case.driven)
+        unseen = unseen_modes(regulator, design_plant.case.beam.modes)
+        if self.terminal_weight is not None and unseen.size:
+            return (
+                f"positions must show mode {unseen[0]} where there is a terminal_weight, and are"
+                " nodes of it: add a position, or leave out terminal_weight"
+            )
         needed = periods_needed(regulator, self.terminal_periods)
         if needed == self.terminal_periods:
             self._warn_of_set(design_plant.case.loads)

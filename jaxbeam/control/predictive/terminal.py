@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.control.predictive.prediction import SampledPlant, incremental_model
@@ -22,6 +22,7 @@ from jaxbeam.numerics.riccati import dare, dlqr
 from jaxbeam.runtime.arrays import Array, scan, xp
 
 LP_ROUNDING = 1e-7  # of limits, within which a linear program counts a row as implied
+UNSEEN = 1e-12  # of the largest cost of a mode: less is rounding, as costs fall with frequency
 MAX_PERIODS = 2000  # of a terminal set that is searched for
 
 Square = Float[Array, "state state"]
@@ -170,6 +171,15 @@ def dual_mode_terminal(
     end_map = xp.concatenate([plant, command])
     weight = None if weight is None else weight * limit_cost(regulator)
     return Terminal(end_map, regulator.cost, regulator.rows(periods), weight)
+
+
+def unseen_modes(regulator: TerminalRegulator, modes: int) -> Int[np.ndarray, " mode"]:
+    """Numbers, from 1, of modes whose coordinates have no cost but rounding; numbers are known.
+
+    By them the cost of a limit has no scale (`limit_cost`). Coordinates are the first states.
+    """
+    costs = np.diag(concrete(regulator.cost))[:modes]
+    return 1 + np.flatnonzero(costs <= UNSEEN * costs.max())
 
 
 def limit_cost(regulator: TerminalRegulator) -> Float[Array, ""]:

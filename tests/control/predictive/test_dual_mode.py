@@ -232,6 +232,8 @@ def test_sets_that_outweigh_deflections_are_warned_of(weight):
         ({"moves": 3}, "moves must be as many as the horizon has periods"),
         ({"positions": []}, "positions must be given"),
         ({"terminal_periods": 1}, "terminal_periods must be at least"),
+        ({"positions": [0.3], "terminal_weight": 1.0}, "positions must show mode 2"),
+        ({"positions": [0.3], "terminal_weight": 1.0, "modes": 5}, "positions must show mode 2"),
         ({"terminal": "none", "terminal_weight": 1.0}, "terminal_weight is that of a terminal set"),
         ({"actuator": jb.PointForce(0.25, limits=[1.0, 5.0])}, "limits of actuators.0 are 1 and 5"),
     ],
