@@ -1,8 +1,6 @@
 """Polynomials: Gauss-Legendre quadrature and interpolation, and piecewise Chebyshev series."""
 
 import functools
-import itertools
-import operator
 
 import numpy as np
 from jaxtyping import Float
@@ -21,9 +19,21 @@ from jaxbeam.runtime.compiling import compiled_if_traced
 
 
 def powers(x: Float[Array, " *place"], count: int) -> Float[Array, "power *place"]:
-    """Powers 0 to count - 1 by products: those of JAX have no second derivatives at 0."""
-    factors = itertools.repeat(x, count - 1)
-    return xp.stack([*itertools.accumulate(factors, operator.mul, initial=xp.ones_like(x))])
+    """Powers 0 to count - 1; differentiable at 0 too, where those of JAX are not."""
+    return _powers(x, np.arange(count, dtype=float).reshape(-1, *(1,) * xp.ndim(x)))
+
+
+@custom_jvp
+def _powers(x, exponents):
+    return x**exponents
+
+
+@_powers.defjvp
+def _powers_jvp(primals, tangents):
+    x, exponents = primals
+    found = _powers(x, exponents)
+    lower = xp.concatenate([xp.zeros_like(found[:1]), found[:-1]])
+    return found, exponents * lower * tangents[0]
 
 
 @functools.cache
