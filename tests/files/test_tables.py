@@ -3,15 +3,38 @@
 import csv
 import dataclasses
 import importlib.util
+import json
+import re
 from pathlib import Path
 
+import hypothesis
 import numpy as np
+import openpyxl
 import pytest
+import scipy.io
 import xarray
+from hypothesis import strategies
+from matplotlib.figure import Figure
+from numpy.testing import assert_array_equal
+from openpyxl.utils.escape import unescape
 
 import jaxbeam as jb
+import tuning
+from jaxbeam.cli import main
 from jaxbeam.files.endings import RESULTS, TABLES, check_ending
-from jaxbeam.files.tables import sweep_columns, write_table
+from jaxbeam.files.matrices import write_state_space
+from jaxbeam.files.netcdf import write_netcdf
+from jaxbeam.files.report import (
+    ReportFigure,
+    ReportSection,
+    ReportTable,
+    check_report_folder,
+    html,
+    markdown,
+    text_table,
+    write_report,
+)
+from jaxbeam.files.tables import as_text_cell, from_text_cell, sweep_columns, write_table
 
 CASE = jb.Case(
     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535),
@@ -169,3 +192,196 @@ def test_rows_of_a_sweep_of_words_and_numbers(tmp_path):
     assert content["values"].shape == (6, len(columns) - 1)
     with pytest.raises(ValueError, match="not a sweep of jaxbeam"):
         sweep_columns(found.drop_vars("failed"))
+
+
+# Files of labelled variables, beside those that xarray writes.
+
+PARTS = (
+    {
+        "deflection": (("time", "sensor"), np.arange(6.0).reshape(3, 2), {"units": "m"}),
+        "shape": (("mode", "time"), np.array([[1.0, np.nan, -2.0]]), {"long_name": "Ä"}),
+        "count": (("time",), np.arange(3, dtype=np.int32), {}),
+        "scale": ((), np.array(2.5), {"units": "1"}),
+    },
+    {
+        "time": ("time", np.array([0.0, 0.1, 0.2]), {"units": "s"}),
+        "sensor": ("sensor", np.array(["0: deflection", "1: µ"])),
+        "frequency": ("mode", np.array([12.5]), {"units": "Hz"}),
+    },
+    {"title": "", "remark": "m²", "error": 1.5e-9, "steps": 12},
+)
+
+
+def test_xarray_reads_the_dataset_and_would_have_written_the_same_file(tmp_path):
+    ours, theirs = tmp_path / "ours.nc", tmp_path / "theirs.nc"
+    write_netcdf(ours, *PARTS)
+    dataset = xarray.Dataset(*PARTS)
+    dataset.to_netcdf(theirs, engine="scipy")
+    xarray.testing.assert_identical(xarray.load_dataset(ours, engine="scipy"), dataset)
+    raw, expected = (
+        xarray.load_dataset(path, engine="scipy", decode_cf=False) for path in (ours, theirs)
+    )
+    xarray.testing.assert_identical(raw, expected)
+    assert all(raw[name].dtype == expected[name].dtype for name in expected.variables)
+
+
+def test_variables_without_entries_are_left_out(tmp_path):
+    path = tmp_path / "file.nc"
+    empty = {"force": (("time", "load"), np.zeros((3, 0)), {})}
+    write_netcdf(path, PARTS[0] | empty, *PARTS[1:])
+    read = xarray.load_dataset(path, engine="scipy")
+    assert "force" not in read and "load" not in read.sizes
+
+
+# Texts that a spreadsheet would run as formulas: written as text, and read back as they were.
+
+FORMULAS = ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", "=cmd|' /C calc'!A0", "＝1+1"]
+RUNS = re.compile(r"[=+\-@\t\r\n＝＋－＠]")
+
+
+@hypothesis.given(strategies.text(alphabet="'=+-@\t\rab,\"", max_size=6))
+def test_any_text_comes_back_and_begins_no_formula(text):
+    cell = as_text_cell(text)
+    assert from_text_cell(cell) == text and not RUNS.match(cell)
+
+
+def rows_of(path):
+    if path.suffix == ".csv":
+        with path.open(encoding="utf-8", newline="") as file:
+            return list(csv.reader(file))
+    sheet = openpyxl.load_workbook(path).active
+    assert not any(cell.data_type == "f" for row in sheet.iter_rows() for cell in row)
+    return [
+        [unescape(cell) if isinstance(cell, str) else cell for cell in row]
+        for row in sheet.iter_rows(values_only=True)
+    ]
+
+
+@pytest.mark.parametrize("ending", ["csv", "xlsx"])
+@pytest.mark.parametrize("text", FORMULAS)
+def test_tables_hold_no_formulas(tmp_path, text, ending):
+    path = tmp_path / f"run.{ending}"
+    write_table(path, {text: np.array([-1.0, 2.0]), "word": np.array([text, "ok"], object)})
+    heads, first, _ = rows_of(path)
+    assert from_text_cell(heads[0]) == text and not RUNS.match(heads[0])
+    assert from_text_cell(first[1]) == text and not RUNS.match(first[1])
+    assert float(first[0]) == -1.0  # a number stays one
+
+
+@pytest.mark.parametrize("ending", ["csv", "xlsx"])
+@pytest.mark.parametrize("name", ["=cmd", "+a", "-b", "@c"])
+def test_names_of_sensors_come_back_from_files(tmp_path, name, ending):
+    case = jb.Case(
+        jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535),
+        sensors=[jb.Sensor(0.3, name=name)],
+        loads=[jb.MovingForce(force=5.0, speed=2.0)],
+        run=jb.Run(0.01),
+    )
+    path = tmp_path / f"run.{ending}"
+    jb.save(jb.simulate(case), path)
+    assert not any(RUNS.match(head) for head in rows_of(path)[0])
+    log = tuning.read_log(path, columns=[f"{name} deflection"])
+    assert log.names == (f"{name} deflection",)
+
+
+def test_gains_hold_no_formulas():
+    from jaxbeam.files.export.files import _csv_cell
+
+    assert _csv_cell("=K") == "'=K"
+
+
+# Files of state-space matrices, read back by the programs that they are for.
+
+
+def case() -> jb.Case:
+    return jb.Case(
+        jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2),
+        actuators=[jb.PointForce(0.22)],
+        sensors=[jb.Sensor(0.3)],
+        loads=[jb.MovingMass(mass=0.3, speed=1.0)],
+    )
+
+
+def test_each_format_has_all_digits_names_and_units(tmp_path):
+    system = jb.state_space(case()).at(0.3)
+    for suffix in (".mat", ".npz", ".json", ".csv"):
+        write_state_space(system, tmp_path / f"plant{suffix}")
+    matlab = scipy.io.loadmat(tmp_path / "plant.mat", squeeze_me=True, chars_as_strings=True)
+    with np.load(tmp_path / "plant.npz") as file:
+        numpy = dict(file)
+    text = json.loads((tmp_path / "plant.json").read_text())
+    for name in "ABCD":
+        expected = getattr(system, name)
+        for found in (matlab[name], numpy[name], text[name]):
+            assert_array_equal(np.reshape(found, expected.shape), expected)
+    assert text["inputs"] == ["command_0", "load_0"] and text["inputs_units"] == ["N", "N"]
+    with open(tmp_path / "plant.csv", encoding="utf-8", newline="") as file:
+        heads, *rows = csv.reader(file)
+    assert heads[1] == "q_1 (m kg^0.5)" and rows[-1][0] == "sensor_0_deflection (m)"
+    numbers = np.array([row[1:] for row in rows], float)
+    expected = np.block([[system.A, system.B], [system.C, system.D]])
+    assert_array_equal(numbers, expected)
+    with pytest.raises(FileExistsError, match="exists already"):
+        write_state_space(system, tmp_path / "plant.csv")
+    with pytest.raises(ValueError, match=".mat, .npz, .json, .csv"):
+        write_state_space(system, tmp_path / "plant.txt")
+
+
+def test_the_command_prints_and_writes_the_sampled_plant(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    jb.save_case(case(), "case.toml")
+    with pytest.raises(SystemExit) as ended:
+        main(["state-space", "case.toml", "--period", "0.01", "-o", "plant.npz", "--json"])
+    assert ended.value.code == 0
+    expected = jb.state_space(case()).unloaded.discretize(0.01)
+    with np.load("plant.npz") as found:
+        assert_array_equal(found["A"], expected.A)
+    assert json.loads(capsys.readouterr().out)["period"] == 0.01
+
+
+# Reports in Markdown, HTML and plain text, and the files written.
+
+TABLE = ReportTable(("load", "peak"), [("1 < 2", "good"), ("3", "bad")], {"good": "green"}.get)
+SECTIONS = [
+    ReportSection("", ["Preface & more."]),
+    ReportSection("Peaks", [TABLE], level=3),
+    ReportSection("Figure", [ReportFigure("drawn", Figure()), ReportFigure("elsewhere")]),
+]
+
+
+def test_markdown():
+    assert markdown("Title", SECTIONS) == "\n".join(
+        [
+            "# Title", "", "Preface & more.", "", "### Peaks", "", "| load | peak |",
+            "| --- | --- |", "| 1 < 2 | good |", "| 3 | bad |", "", "## Figure", "",
+            "![drawn](drawn.png)", "", "![elsewhere](elsewhere.png)", "",
+        ]
+    )  # fmt: skip
+
+
+def test_html_escapes_words_and_gives_cells_their_class():
+    page = html("Title & co", SECTIONS, ".green { color: green }")
+    assert "<h1>Title &amp; co</h1><p>Preface &amp; more.</p><h3>Peaks</h3>" in page
+    assert '<tr><td>1 &lt; 2</td><td class="green">good</td></tr>' in page
+    assert '<img src="drawn.png" alt="drawn">' in page and ".green { color: green }" in page
+
+
+def test_only_figures_that_are_given_are_saved(tmp_path):
+    write_report(tmp_path / "new" / "report", "Title", SECTIONS)
+    written = {path.name for path in (tmp_path / "new" / "report").iterdir()}
+    assert written == {"report.md", "report.html", "drawn.png"}
+
+
+def test_a_folder_with_files_is_kept(tmp_path):
+    (tmp_path / "other.txt").touch()
+    with pytest.raises(FileExistsError, match="is not empty; choose another, or overwrite it"):
+        write_report(tmp_path, "Title", SECTIONS)
+    assert len(list(tmp_path.iterdir())) == 1
+    check_report_folder(tmp_path, overwrite=True)
+    check_report_folder(tmp_path / "none", overwrite=False)
+
+
+def test_text_tables_are_aligned_column_by_column():
+    rows = [("a", "1.5"), ("longer", "10")]
+    assert text_table(("name", "m"), rows) == ["name    m", "a       1.5", "longer  10"]
+    assert text_table(("name", "m"), rows, "<>")[1:] == ["a       1.5", "longer   10"]

@@ -16,6 +16,7 @@ from jaxbeam.cli import main
 from jaxbeam.files.case_file import case_from_dict, case_to_dict, load_case, save_case
 from jaxbeam.files.json_schema import json_schema
 from tests.fuzzing import examples
+from tests.modules import ROOT
 from tests.strategies import ACTUATORS
 from tests.strategies.examples import (
     CONTROLLED,
@@ -77,3 +78,49 @@ def test_files_schema_and_commands(folder, case):
             main([command, str(path)])
         assert ended.value.code == 0 and printed.getvalue(), said.getvalue()
         assert all(line.startswith("jaxbeam: ") for line in said.getvalue().splitlines())
+
+
+# JSON Schema of case files: it accepts what is a case, and refuses what is none.
+
+CASES = sorted([*ROOT.glob("examples/*/case.toml"), *ROOT.glob("jaxbeam/**/rigs/*.toml")])
+
+
+def errors(content):
+    """Messages of jsonschema, which nbmake needs as well."""
+    jsonschema = pytest.importorskip("jsonschema")
+    return [error.message for error in jsonschema.Draft202012Validator(SCHEMA).iter_errors(content)]
+
+
+@pytest.mark.parametrize("path", CASES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_cases_are_accepted(path):
+    assert errors(tomllib.loads(path.read_text(encoding="utf-8"))) == []
+
+
+PARTS = {name: {"loads": (load,)} for name, load in LOADS.items()}
+PARTS |= {name: {"profile": profile} for name, profile in PROFILES.items()}
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_saved_loads_and_profiles_are_accepted(name):
+    assert errors(case_to_dict(dataclasses.replace(CONTROLLED["feedback"], **PARTS[name]))) == []
+
+
+def test_both_words_of_a_key_are_accepted():
+    for word in ("class", "road_class"):
+        assert errors({"beam": {"length": 1.0}, "profile": {"kind": "iso8608", word: "A"}}) == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"beam": {"length": -1.0}},
+        {"beam": {"lenght": 1.0}},
+        {"loads": [{"kind": "balloon"}]},
+        {"loads": [{"kind": "mass", "mass": [1.0]}]},
+        {"unknown": {}},
+        {"profile": {"kind": "iso8608"}},
+    ],
+)
+def test_mistakes_are_refused(change):
+    assert errors({"beam": {"length": 1.0}}) == []
+    assert errors({"beam": {"length": 1.0}} | change)

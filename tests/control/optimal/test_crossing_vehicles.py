@@ -12,10 +12,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.integrate import simpson, solve_ivp
+from scipy.linalg import solve_continuous_are
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
+from jaxbeam.case.estimator import Estimate
+from jaxbeam.case.validation import check_case
 from jaxbeam.control.optimal.crossing_gains import crossing_events
+from jaxbeam.control.optimal.load_tables import with_crossing_load
 from jaxbeam.control.state_controller import TrueState
 from jaxbeam.estimation.sampled_plant import SampleTiming
 from jaxbeam.estimation.simulated_vehicles import SampledWithVehicles
@@ -65,7 +69,7 @@ START = np.array([0.0] * 8 + [(CAR.body_mass + CAR.axle_mass) * GRAVITY, 1.0])
 
 
 def plant(t):
-    """A and B of the coupled plant at t (s) during the crossing."""
+    """A and B of the coupled plant at t (s) during the"""
     x = min(max(SPEED * t, 0.0), SPAN.length)
     shape, slope, (r, r_slope) = SPAN.shapes(x), SPAN.shapes(x, 1), profile(x)
     n, size = MODES, 2 * MODES + 6
@@ -244,3 +248,76 @@ def test_gradient_of_the_cost_by_the_suspension():
     expected = central(jax.jit(cost), np.zeros(2), 1e-2)
     assert np.all(np.abs(expected) > 0)
     assert_allclose(found, expected, rtol=1e-5)
+
+
+# Step-by-step and scheduled regulators with the states of a vehicle, against scipy.
+
+STATES = 2 * MODES + 4
+SETTINGS = {"state_weight": [50.0, 20.0, 1.0, 0.5], "command_weight": [1e-2]}
+POINTS = 40
+
+
+def test_step_by_step_gains_feed_back_the_vehicle():
+    law = jb.LQR(**WEIGHTS, points=POINTS, horizon="frozen")
+    shares = np.array([0.13, 0.5, 0.77])
+    found = np.asarray(jax.jit(jax.vmap(law.gain_table(jb.state_space(beam_case()))))(shares))[:, 0]
+    for gain, share in zip(found, shares, strict=True):
+        A, B = (part[:STATES] for part in plant(share * END))
+        A = A[:, :STATES]
+        P = solve_continuous_are(A, B, Q[:STATES, :STATES], np.array([[1e-2]]))
+        expected = B[:, 0] @ P / 1e-2
+        assert np.all(expected[2 * MODES :] != 0)
+        assert_allclose(gain, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_vehicles_without_damping_are_refused():
+    bouncing = jb.Oscillator(mass=0.3, stiffness=100.0, damping=0.0, speed=2.0)
+    case = beam_case(bouncing, jb.LQR(**SETTINGS, horizon="frozen"), profile=None)
+    with pytest.raises(ValueError, match="horizon needs vehicles with damping: loads.0 has"):
+        check_case(case)
+
+
+def test_a_scheduled_vehicle_is_similar():
+    """Twice the mass with twice the stiffness and damping, as a vehicle of its own."""
+    car, factor, speed = dataclasses.asdict(CAR), 2.0, 3.0
+    heavy = jb.QuarterCar(**{name: factor * value for name, value in car.items()}, speed=speed)
+    expected = jb.state_space(beam_case(heavy))
+    mass = factor * (CAR.body_mass + CAR.axle_mass)
+    found = with_crossing_load(jb.state_space(beam_case()), mass, speed)
+    for system, other in (
+        (found.at(0.2), expected.at(0.2)),
+        (found.augmented(0.3), expected.augmented(0.3)),
+    ):
+        assert_allclose(system.A, other.A, atol=1e-12 * np.abs(other.A).max())
+    assert_allclose(found.augmented_start, expected.augmented_start, rtol=1e-12)
+
+
+@pytest.mark.parametrize("augmented", ["none", "loads"])
+def test_a_scheduled_design_at_the_mass_of_the_load_is_that_of_the_crossing(augmented):
+    mass = CAR.body_mass + CAR.axle_mass
+    scheduled = jb.LQR(
+        **WEIGHTS,
+        masses=[mass, 2 * mass],
+        points=POINTS,
+        augmented=augmented,
+        period=0.01,
+        horizon="crossing",
+        schedule="load",
+    )
+    options = {"horizon": "crossing", "augmented": augmented}
+    single = jb.LQR(**WEIGHTS, points=POINTS, period=0.01, **options)
+    plant = jb.state_space(beam_case())
+    laws = [law.design_state_law(plant, plant) for law in (scheduled, single)]
+    assert laws[0].needs_vehicles
+    state = np.random.default_rng(3).normal(size=STATES) * 1e-3
+    estimate = Estimate(state[: 2 * MODES], vehicles=state[2 * MODES :])
+    measurement = Measurement(np.zeros(1), state[: 2 * MODES], np.zeros(1))
+    found, expected = (
+        jax.jit(
+            lambda law=law: (
+                law.step(law.initial_state(), estimate, measurement, np.asarray(0.4)).command
+            )
+        )()
+        for law in laws
+    )
+    assert_allclose(found, expected, rtol=1e-6)

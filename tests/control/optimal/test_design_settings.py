@@ -3,11 +3,17 @@
 Gains are compared by the poles of the loop, with those of explicit plants and scipy's gains.
 """
 
+import json
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import scipy.linalg
 import scipy.optimize
 from numpy.testing import assert_allclose
+from scipy.linalg import solve_continuous_are
 
 import jaxbeam as jb
 from jaxbeam.analysis.stability import frozen_poles, stability_limit
@@ -102,3 +108,48 @@ def test_stability_limit_in_mass():
     measure = lambda case: frozen_poles(case, np.zeros(1)).largest_real_part[0]  # noqa: E731
     found = stability_limit(case, "loads.0.mass", 0.01, 0.1, measure, points=3)
     assert found == pytest.approx(expected, rel=1e-5)
+
+
+# A table of default size, designed in a process with two threads: it must end.
+
+SHARE = 0.4375  # of the crossing
+TIME_LIMIT = 240  # s, of which an idle machine needs ten
+LOOP_STATES, LOOP_COMMANDS = [1e6] * 3 + [10.0] * 3, [1e-3]
+DESIGN = """
+import json
+import equinox as eqx
+import jaxbeam as jb
+from tests.control.optimal.test_design_settings import SHARE, loop
+case = loop()
+jb.simulate(case)
+gains = eqx.filter_jit(lambda plant: case.controller.gain_table(plant)(SHARE))
+print(json.dumps(gains(jb.state_space(case, "modal")).tolist()))
+"""
+
+
+def loop():
+    return jb.Case(
+        jb.Beam(0.6, 11.68, 0.535, 0.03, modes=3),
+        actuators=[jb.PointForce(0.25)],
+        sensors=[jb.Sensor(0.3)],
+        loads=[jb.MovingMass(mass=0.5, speed=1.0)],
+        controller=jb.LQR(LOOP_STATES, LOOP_COMMANDS, horizon="frozen"),
+        run=jb.Run(0.7),
+    )
+
+
+def test_a_run_with_the_default_number_of_points_ends():
+    environment = os.environ | {"PJRT_NPROC": "2"}
+    line = [sys.executable, "-c", DESIGN]
+    found = subprocess.run(
+        line, capture_output=True, text=True, env=environment, timeout=TIME_LIMIT
+    )
+    assert found.returncode == 0, found.stderr
+    plant = jb.state_space(loop(), "modal")
+    time = SHARE * 0.6
+    A, B = np.asarray(plant.A(time)), np.asarray(plant.B(time))
+    P = solve_continuous_are(A, B, np.diag(LOOP_STATES), np.diag(LOOP_COMMANDS))
+    expected = B.T @ P / LOOP_COMMANDS[0]
+    assert_allclose(
+        json.loads(found.stdout), expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max()
+    )

@@ -7,12 +7,31 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from experiments.thesis.cases import with_duration
+from experiments.thesis.chapter5 import observer, observer_loop
+from experiments.thesis.chapter5.fed_back_states import (
+    BUT_FOR_THE_END,
+    COMBINATIONS,
+    FED_BACK,
+    SHARES,
+    claims,
+    identical_gains,
+)
+from experiments.thesis.chapter5.regulator_limits import (
+    COMMAND_WEIGHT,
+    optimal_gain,
+    with_active_shaker,
+    with_other_shaker,
+)
+from experiments.thesis.chapter5.regulators import STATE_WEIGHTS
 from experiments.thesis.chapter6.derived_gains import (
     BestGain,
     best_gains,
     equivalent_gains,
     scheduled_controller,
 )
+from experiments.thesis.verdicts import LITERAL, NOT_REPRODUCED, REPRODUCED, assign_verdicts
+from jaxbeam import rigs
 from jaxbeam.case.validation import check_case
 from tests.analysis.test_compare import critical_gain
 from tests.control.test_scheduled_feedback import beam_case, gains_at, law
@@ -80,3 +99,76 @@ def test_other_controllers_are_refused():
         scheduled_controller(
             beam_case(law()), [BestGain(mass, 1.0, 1.0, 1.0) for mass in (0.2, 0.1)]
         )
+
+
+# Statements on the states fed back, and on both gains of chapter 3, from given peaks and gains.
+
+
+def ratios(varying, invariant):
+    """Peaks in percent by combination: those given, 90 for the others."""
+    return {
+        LITERAL: {
+            "time-varying": np.array([varying.get(name, 90.0) for name in COMBINATIONS]),
+            "time-invariant": np.array([invariant.get(name, 90.0) for name in COMBINATIONS]),
+        }
+    }
+
+
+def test_statements_hold_or_not():
+    as_printed = ratios({"q1 q2": 84.0, "q1 q2 q1'": 83.0, "q1": 85.0}, {"all": 101.0})
+    assert assign_verdicts([claims(as_printed)])[0].verdicts == [REPRODUCED] * 3
+    opposite = ratios({"q1 q2": 86.0, "q1 q2 q1'": 87.0, "q1": 85.0}, {"all": 99.0})
+    assert assign_verdicts([claims(opposite)])[0].verdicts == [NOT_REPRODUCED] * 3
+    diverging = claims(ratios({}, {"all": np.nan})).interpretations[LITERAL]
+    assert diverging.tolist() == [0.0, 0.0, 1.0]
+
+
+def test_difference_of_gains_in_percent_of_the_largest():
+    finite = np.outer(np.ones(SHARES.size), np.arange(1.0, FED_BACK.size + 1))
+    step = finite.copy()
+    step[100, 1] += 0.01  # half a percent of the gain of the second state
+    step[-1, 0] = 0.0  # at the end of the crossing
+    found = identical_gains({"finite-time": finite, "step-by-step": step, "constant": 2 * finite})
+    np.testing.assert_allclose(found.interpretations[LITERAL], 100.0)
+    np.testing.assert_allclose(found.interpretations[BUT_FOR_THE_END], 0.5)
+    np.testing.assert_allclose(found.null.values, 100.0)
+
+
+# The sampled regulator with an observer in its loop, against the product's gains and runs.
+
+LOAD = {"loads.0.mass": observer.MASS, "loads.0.speed": observer.SPEED}
+RIG = jb.replace(with_other_shaker(with_active_shaker(rigs.load("A"))), LOAD)
+PERIOD = 5e-3
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """A run without control and one under the observed regulator."""
+    gains = observer_loop.design(RIG, PERIOD, STATE_WEIGHTS, COMMAND_WEIGHT)
+    return [
+        observer_loop.simulate_observed(RIG, PERIOD, each, after_exit=0.1) for each in (None, gains)
+    ]
+
+
+def test_gain_is_that_of_the_sampled_regulator():
+    gains = observer_loop.design(RIG, PERIOD, STATE_WEIGHTS, COMMAND_WEIGHT)
+    expected = np.asarray(optimal_gain(RIG, PERIOD, STATE_WEIGHTS)[0])[0]
+    np.testing.assert_allclose(gains.regulator, expected, rtol=1e-5)
+
+
+def test_beam_without_control_is_that_of_the_integrator(runs):
+    record = jb.simulate(with_duration(RIG, 1.3, 200.0))
+    free = runs[0].deflection
+    expected = np.asarray(record.deflection)
+    peak = np.abs(expected).max()
+    np.testing.assert_allclose(free, expected[: len(free)], atol=5e-3 * peak)
+
+
+def test_at_5_ms_the_regulator_worsens_the_deflection_though_the_observer_is_right(runs):
+    """As the thesis finds: not the observer is to blame, but the sampled gain (Figs 5.6, 5.7)."""
+    uncontrolled, controlled = runs
+    peaks = [np.abs(one.deflection[:, observer_loop.SENSOR]).max() for one in runs]
+    assert peaks[1] > 1.1 * peaks[0]
+    off = np.abs(controlled.states[:, 0] - controlled.estimates[:, 0]).max()
+    assert off < 0.05 * np.abs(controlled.states[:, 0]).max()
+    assert not np.any(uncontrolled.estimates) and not np.any(uncontrolled.commands)

@@ -9,12 +9,25 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from experiments.thesis import reproduction
-from experiments.thesis.published_numbers import PublishedNumbers
+from experiments.thesis import page, reproduction, results_tables
+from experiments.thesis.chapter2.identification import HAND_FITTED, LOGS, fit_rig
+from experiments.thesis.published_numbers import PublishedNumbers, Tolerance
 from experiments.thesis.report import ALL_VERDICTS
-from experiments.thesis.verdicts import EXPLAINED, NOT_REPRODUCED, REPRODUCED
+from experiments.thesis.verdicts import (
+    EXPLAINED,
+    FITTED,
+    IRREPRODUCIBLE,
+    NOT_REPRODUCED,
+    NULL_MET,
+    REPEATED,
+    REPRODUCED,
+    assign_verdicts,
+    likeliest_interpretation,
+    make_finding,
+)
 from jaxbeam import rigs
 from jaxbeam.cli import main
+from tests.tuning import make_rig_logs
 
 CHAPTERS = [
     importlib.import_module(f"experiments.thesis.chapter{number}.published")
@@ -113,3 +126,187 @@ def test_experiments_in_two_processes(tmp_path):
         for figure in run.outcome.figures:
             assert (tmp_path / f"{run.experiment.name}-{figure}.png").stat().st_size > 1000
             assert f"{run.experiment.name}-{figure}.png" in report
+
+
+# Verdicts on published numbers: tolerances, null models, fitted and repeated numbers, readings.
+
+RELATIVE = Tolerance("for a test", relative=0.1)
+TWO = PublishedNumbers("here", "two numbers", "m", "computed", RELATIVE, "1.0 20", "a b")
+FAR = ("nothing", 0.0)
+
+
+def verdicts(*findings):
+    return [assigned.verdicts for assigned in assign_verdicts(findings)]
+
+
+def test_verdicts():
+    assert verdicts(make_finding(TWO, [1.1, 22.1], null=FAR)) == [[REPRODUCED, NOT_REPRODUCED]]
+    proof = make_finding(TWO, [1.1, 22.1], null=FAR, impossible="of that")
+    assert verdicts(proof) == [[REPRODUCED, IRREPRODUCIBLE]]
+    other = make_finding(TWO, [1.1, 0.0], {"else": [1.1, 20.0]}, null=FAR)
+    assert verdicts(other) == [[REPRODUCED, EXPLAINED]]
+    nearer = make_finding(TWO, [1.1, 0.0], {"else": [1.0, 20.0]}, null=FAR)
+    assert verdicts(nearer) == [[EXPLAINED, EXPLAINED]]
+    nothing = make_finding(TWO, [np.nan, np.inf], null=FAR)
+    assert verdicts(nothing) == [[NOT_REPRODUCED, NOT_REPRODUCED]]
+    with pytest.raises(ValueError, match="2 numbers are printed"):
+        make_finding(TWO, [1.0], null=FAR)
+    with pytest.raises(ValueError, match="none: 2 numbers are printed"):
+        make_finding(TWO, [1.0, 2.0], null=("none", [0.0, 0.0, 0.0]))
+
+
+def test_what_the_null_model_meets_counts_for_nothing():
+    one = make_finding(TWO, [1.0, 20.0], null=("no control", [0.95, 17.0]))
+    assert verdicts(one) == [[NULL_MET, REPRODUCED]]
+    missed = make_finding(TWO, [1.15, 20.0], null=("no control", [1.0, 16.0]))
+    assert verdicts(missed) == [[NOT_REPRODUCED, REPRODUCED]]
+
+
+def test_an_interpretation_less_likely_than_the_null_model_explains_nothing():
+    one = make_finding(TWO, [0.0, 0.0], {"p": [1.1, 0.0]}, null=("static", [1.11, 22.2]))
+    assert verdicts(one) == [[NOT_REPRODUCED, NOT_REPRODUCED]]
+
+
+def test_a_number_that_a_parameter_was_fitted_to_counts_for_nothing():
+    one = make_finding(TWO, [0, 0], {"p": [1.0, 20.0]}, null=FAR, fitted={"p": "b"})
+    assert verdicts(one) == [[EXPLAINED, FITTED]]
+    assert one.misfit("p") == 2.0 and one.misfit("as printed") == 72.0
+
+
+def test_numbers_that_repeat_others_count_for_nothing():
+    published = PublishedNumbers(
+        "here", "", "", "computed", RELATIVE, "1.0 20", "a b", repeats="there", repeated_labels="a"
+    )
+    one = make_finding(published, [1.0, 20.0], null=FAR)
+    assert verdicts(one) == [[REPEATED, REPRODUCED]]
+    assert make_finding(published, [5.0, 20.0], null=FAR).misfit("as printed") == 0.0
+
+
+def test_one_interpretation_serves_for_all_numbers():
+    """The likeliest is taken, for hits and for misses; nothing is picked from the others."""
+    first = make_finding(TWO, [1, 0], {"p": [0.0, 20.0], "q": [0.0, 0.0]}, null=FAR)
+    second = make_finding(TWO, [0, 0], {"p": [1.0, 0.0], "q": [1.0, 0.0]}, null=FAR)
+    assert likeliest_interpretation([first, second]) == "p"
+    assert verdicts(first, second) == [[NOT_REPRODUCED, EXPLAINED], [EXPLAINED, NOT_REPRODUCED]]
+
+
+def test_parameters_that_explain_no_more_than_themselves_do_not_make_an_interpretation_likelier():
+    near = make_finding(TWO, [1.05, 20.0], {"p": [1.0, 20.0]}, null=FAR, fitted={"p": "a"})
+    assert likeliest_interpretation([near]) == "as printed"
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "values", "allowed"),
+    [
+        (RELATIVE, "2 -30", [0.2, 3.0]),
+        (Tolerance("", absolute=1.0), "2 0.5", [1.0, 1.0]),
+        (Tolerance("", digits=1), "20.387 326.2 100660 21 340", [0.001, 0.1, 10.0, 1.0, 1.0]),
+        (Tolerance("", digits=1), "8.292e-4 -6250 3e12", [1e-7, 10.0, 1e12]),
+    ],
+)
+def test_tolerances(tolerance, values, allowed):
+    printed = PublishedNumbers("", "", "", "", tolerance, values)
+    np.testing.assert_allclose(printed.allowed_error, allowed)
+
+
+# The tables of the page on results are those of the report.
+
+
+def rig(*shares: tuple[str, float, float]) -> list[str]:
+    return [f"{k}: at least {a}% of the achievable, {b}% in the mean" for k, a, b in shares]
+
+
+TABLES = (results_tables.TUNED_ROWS, results_tables.SENSED_ROWS)
+LABELS = [labels for rows in TABLES for labels in rows.values()]
+SHARES = [
+    ["B: one span", *rig(*((labels[0], 90.0, 95.0) for labels in LABELS))],
+    ["C: two spans", "0.4 kg: tuned 3%; at most 4%", *rig(*((x[-1], -8.0, 9.0) for x in LABELS))],
+]
+FRAGILE = [
+    "0.4 kg; shares",
+    "as tuned: hand-set trapezium 98.4%, tuned, bench 97.1%",
+    "filter: tuned, sensors only -2.0%",
+    "lift: tuned, bench 0.35 mm",
+]
+REPORT = {
+    "experiments": {
+        "tuned": {"remarks": sum(SHARES, [])},
+        "sensed": {"remarks": sum(SHARES, [])},
+        "fragile": {"remarks": FRAGILE},
+    }
+}
+MARKED = "".join(f"<!-- {n} -->old<!-- end of {n} -->\n" for n in ("tuned", "sensed", "fragile"))
+
+
+def test_tables_are_written_between_their_marks():
+    written = results_tables.with_tables(MARKED, REPORT)
+    assert "old" not in written and results_tables.with_tables(written, REPORT) == written
+    assert "| tuned table | 90.0 % (95.0 %) | worse than no control |" in written
+    assert "| as tuned | 98.4 % | 97.1 % |  |  |  |" in written
+    assert "| filter |  |  |  |  | worse than no control |" in written and "lift" not in written
+    with pytest.raises(ValueError, match="no marks <!-- sensed -->"):
+        results_tables.with_tables(MARKED.replace("sensed", "x"), REPORT)
+
+
+# Counts of verdicts on the pages: computed from a report, and the same on all pages.
+
+FINDING = {
+    "where": "Table 9",
+    "what": "peaks",
+    "published": [1.0, 2.0, 3.0],
+    "readings": {"as printed": [1.0, 2.5, 3.0], "else": [1.1, 2.0, float("nan")]},
+    "reading": "else",
+    "null model": "no control",
+    "verdicts": [NULL_MET, EXPLAINED, NOT_REPRODUCED],
+    "impossible because": "",
+    "repeats": "",
+    "remark": "the speed is not printed",
+}
+VERDICTS = {"experiments": {"one": {"findings": [FINDING]}, "none": {"findings": []}}}
+
+
+def test_numbers_are_counted_and_listed_with_their_reasons():
+    assert page.counts(VERDICTS) == {NULL_MET: 1, EXPLAINED: 1, NOT_REPRODUCED: 1}
+    assert "Of the 3 numbers of the thesis that can be computed 2 count" in page.sentence(VERDICTS)
+    text = page.page(VERDICTS)
+    assert "- Table 9, peaks: 2 (2): else." in text
+    assert "- Table 9, peaks: 3: the speed is not printed." in text
+    assert "- Table 9, peaks: 1 (1.1): no control." in text
+    assert "| all | 0 | 1 | 0 | 1 | 1 | 0 | 0 |" in text and "| none |" not in text
+
+
+def test_counts_are_written_between_the_marks():
+    text = f"before\n{page.BEGIN}\nold\n{page.END}\nafter"
+    written = page.with_counts(text, VERDICTS)
+    assert written == f"before\n{page.BEGIN}\n{page.sentence(VERDICTS)}\n{page.END}\nafter"
+    assert page.with_counts(written, VERDICTS) == written
+    with pytest.raises(ValueError, match="no marks"):
+        page.with_counts("nothing", VERDICTS)
+
+
+def test_shares_on_the_page_are_those_of_its_tables():
+    results = page.RESULTS.read_text(encoding="utf-8")
+    assert page.with_shares(results) == results
+    with pytest.raises(ValueError, match="no marks"):
+        page.with_shares("nothing")
+
+
+def test_pages_have_the_same_counts():
+    text = page.COUNTS.read_text(encoding="utf-8")
+    sentence = text.partition(page.BEGIN)[2].partition(page.END)[0].strip()
+    assert REPRODUCED in sentence and sentence in page.PAGE.read_text(encoding="utf-8")
+
+
+# Identification of the numbers fitted by hand, from logs made by finite elements.
+
+
+def test_intervals_of_rig_b_contain_the_true_values():
+    """The log in the repository is the one that `make_rig_logs` makes."""
+    stored = np.loadtxt(LOGS / "B.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(stored, make_rig_logs.make("B"), atol=2e-5)
+    assert (LOGS / "B.toml").read_text(encoding="utf-8") == make_rig_logs.description("B")
+    fit = fit_rig("B", rigs.load)
+    low, high = fit.intervals.T
+    truth = np.array(list(HAND_FITTED["B"].values()))
+    assert np.all((low < truth) & (truth < high)), str(fit)
+    assert np.all(high - low < 0.1 * truth)

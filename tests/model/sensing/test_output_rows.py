@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.quantities import QUANTITIES, Quantity, quantity_of
 from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.sensing.output_rows import modal_row, quantity_history, sensor_rows
+from jaxbeam.model.sensing.output_rows import band_weights, modal_row, quantity_history, sensor_rows
 from jaxbeam.model.static_correction import Motion
 
 FIBRE, MODULUS = 0.003, 2e-6
@@ -103,3 +103,47 @@ def test_active_moments_of_commands_belong_to_moment_and_stress():
     assert_allclose(rows.on_commands[:, 0], [2e-3, 2e-3 / MODULUS, 0.0, 0.0])
     _, D = rows.of_system(modal_model(case), np.eye(8), np.ones((8, 1)))
     assert_allclose(D, rows.on_commands)
+
+
+# Accelerations of the modes that count by EN 1990 against the sum of the lowest modes.
+
+# 4, 16, 36, 64 Hz: three of the four count, the third beyond 30 Hz.
+RIGIDITY = (4.0 * 2 * np.pi) ** 2 * 15000.0 * 25.0**4 / np.pi**4
+BANDED = jb.Sensor(12.5, "acceleration", mode_band="en1990")
+BAND_CASE = jb.Case(
+    jb.Beam(25.0, RIGIDITY, 15000.0, damping_ratio=0.01, modes=5),
+    sensors=[BANDED, jb.Sensor(12.5, "acceleration")],
+    loads=[jb.MovingForce(force=1e5, speed=50.0)],
+    run=jb.Run(0.7, sample_rate=2000.0),
+)
+
+
+def test_modes_of_the_band():
+    assert_allclose(band_weights(jb.modes(BAND_CASE), "en1990"), [1, 1, 1, 0, 0])
+
+
+def test_readings_extremes_and_sweeps_have_the_modes_of_the_band():
+    record = jb.simulate(BAND_CASE)
+    fewer = dataclasses.replace(
+        BAND_CASE,
+        beam=dataclasses.replace(BAND_CASE.beam, modes=3),
+        sensors=[jb.Sensor(12.5, "acceleration")],
+    )
+    expected = np.asarray(jb.simulate(fewer).sensor_values[:, 0])
+    values = np.asarray(record.sensor_values)
+    size = np.abs(expected).max()
+    assert_allclose(values[:, 0], expected, rtol=0, atol=1e-6 * size)
+    assert np.abs(values[:, 1] - expected).max() > 0.05 * size
+    assert_allclose(record.measured[:, 0], values[:, 0], rtol=1e-12)
+    largest = max(record.extremes.largest[0], -record.extremes.smallest[0])
+    assert_allclose(largest, size, rtol=2e-3)
+    assert largest >= size * (1 - 1e-7)
+    swept = jb.sweep(BAND_CASE, {"loads.0.speed": [50.0]}, progress=False)
+    assert_allclose(swept["peak_acceleration"][0, 0], largest, rtol=1e-6)
+
+
+def test_corrected_quantities_have_no_band():
+    with pytest.raises(ValueError, match=r"sensors.0.mode_band would have no effect .* moment"):
+        jb.simulate(
+            dataclasses.replace(BAND_CASE, sensors=[jb.Sensor(1.0, "moment", mode_band="en1990")])
+        )

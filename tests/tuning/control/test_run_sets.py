@@ -1,10 +1,110 @@
-"""Sets of runs: those without control in groups that fit into memory."""
+"""Tuning with vehicles and profiles as load cases, in training and held-out runs."""
+
+import dataclasses
+import os
+import subprocess
+import sys
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+import tuning
+from jaxbeam.simulation.integration_plan import integration_plan
+from jaxbeam.simulation.simulate import simulate_histories
+from tests.tuning.small_rig import rig
 from tuning.control import run_set
+from tuning.control.load_cases import run_case, run_cases
+
+GAIN = "controller.gains.0"
+CAR = {
+    "body_mass": 0.4,
+    "axle_mass": 0.1,
+    "suspension_stiffness": 300.0,
+    "suspension_damping": 2.0,
+    "tyre_stiffness": 4000.0,
+    "tyre_damping": 1.0,
+}
+
+
+def case() -> jb.Case:
+    """Small rig under a quarter car on a random road."""
+    car = jb.QuarterCar(**CAR, speed=2.0, start_position=-0.1)
+    road = jb.profiles.ISO8608Profile(
+        road_class="A", scale=0.02, lowest_wavenumber=1.0, highest_wavenumber=8.0, waves=6,
+        switch_on=[-0.1, -0.05],
+    )  # fmt: skip
+    return dataclasses.replace(rig(), loads=(car,), profile=road)
+
+
+TRAINING = tuning.full_grid({"loads.0.body_mass": [0.3, 0.5], "profile.seed": [0, 1]})
+HELD_OUT = tuning.full_grid(
+    {"loads.0.suspension_stiffness": [200.0], "profile.scale": [0.03], "profile.seed": [2]}
+)
+
+
+def test_runs_have_their_own_vehicles_and_roads():
+    cases = run_cases(case(), TRAINING)
+    assert [float(own.loads[0].body_mass) for own in cases] == [0.3, 0.3, 0.5, 0.5]
+    for own, run in zip(cases, TRAINING, strict=True):
+        expected = dataclasses.replace(case().profile, seed=int(run["profile.seed"]))
+        heights = own.profile.heights(np.linspace(-0.2, 0.8, 50))
+        np.testing.assert_allclose(heights, expected.heights(np.linspace(-0.2, 0.8, 50)))
+    assert run_case(case(), {"profile.seed": 3.0}).profile.seed == 3
+    with pytest.raises(ValueError, match="profile.seed takes a whole number, not 0.5"):
+        run_case(case(), {"profile.seed": 0.5})
+    longer = dataclasses.replace(case(), loads=(jb.Axles(offsets=[0.0], forces=[1.0], speed=2.0,
+                                                         spacing=0.1),))  # fmt: skip
+    with pytest.raises(ValueError, match="differ in loads.0.count cannot be simulated together"):
+        run_cases(longer, tuning.full_grid({"loads.0.count": [1, 2]}))
+
+
+def test_load_cases_are_read_from_a_file(tmp_path):
+    path = tmp_path / "cases.toml"
+    path.write_text(
+        '[training]\n"loads.0.body_mass" = [0.3, 0.5]\n"profile.seed" = [0, 1]\n'
+        '[held_out]\n"profile.seed" = [2]\n'
+    )
+    read = tuning.read_load_cases(path)
+    assert read.training == TRAINING and read.held_out == ({"profile.seed": 2.0},)
+
+
+def test_contact_forces_of_a_run_are_those_on_the_beam():
+    """What the road does to a wheel on the ground is nothing that a controller can change."""
+    own = dataclasses.replace(run_case(case(), HELD_OUT[0]), controller=None)
+    times = np.linspace(0.0, 0.5, 101)
+    plan = integration_plan(own, times)
+    found = simulate_histories(own, times, plan, np.array([0.25])).contact_force[:, 0]
+    record = jb.simulate(own, times, plan)
+    on_beam = np.isfinite(record.load_position[:, 0])
+    assert 0 < on_beam.sum() < 101
+    np.testing.assert_array_equal(found, np.where(on_beam, record.contact_force[:, 0], 0.0))
+
+
+def test_a_gain_is_tuned_on_vehicles_and_checked_on_others():
+    cases = tuning.LoadCases(TRAINING[::2], HELD_OUT)
+    stable = tuning.StabilityConstraint(max_real_part=0.5, instants=2)
+    free = {GAIN: (0.0, 20000.0)}
+    tuned = tuning.tune(
+        case(), free, cases, steps=6, stable=stable, least_peaks=False, progress=False
+    )
+    training, held_out = tuned.run_sets
+    assert [run["profile.seed"] for run in held_out.runs] == [2.0]
+    assert tuned.stability_violation == 0.0
+    assert np.max(training.peaks_after / training.uncontrolled_peaks) < np.max(
+        training.peaks_before / training.uncontrolled_peaks
+    )
+    own = jb.replace(run_case(case(), HELD_OUT[0]), {GAIN: float(tuned.values[0])})
+    record = jb.simulate(own)
+    plain = jb.simulate(dataclasses.replace(own, controller=None))
+    assert held_out.peaks_after[0] == pytest.approx(float(record.peak_deflection[0]), rel=1e-3)
+    assert held_out.uncontrolled_peaks[0] == pytest.approx(
+        np.abs(np.asarray(plain.deflection)).max(), rel=1e-3
+    )
+
+
+# Sets of runs: those without control in groups that fit into memory.
 
 BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=2)
 CASE = jb.Case(
@@ -28,3 +128,28 @@ def test_runs_in_groups_have_the_same_histories(monkeypatch):
     found = run_set._uncontrolled_histories(cases, *wanted)
     assert found.deflection.shape == expected.deflection.shape == (3, 80, 2)
     assert_allclose(found.deflection, expected.deflection, atol=1e-12)
+
+
+# Number of XLA threads in a process that imports tuning: with two, XLA deadlocks.
+
+COUNT = """
+import pathlib
+import jaxbeam, tuning
+import jax.numpy as jnp
+jnp.ones(3).block_until_ready()
+names = [(task / "comm").read_text() for task in pathlib.Path("/proc/self/task").iterdir()]
+print(sum("XLAEigen" in name for name in names))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads are counted in /proc")
+@pytest.mark.parametrize(
+    ("requested", "least", "most"), [(None, 8, os.cpu_count() or 8), (3, 3, 3)]
+)
+def test_xla_has_at_least_eight_threads_unless_set_otherwise(requested, least, most):
+    environment = {name: value for name, value in os.environ.items() if name != "PJRT_NPROC"}
+    if requested is not None:
+        environment["PJRT_NPROC"] = str(requested)
+    line = [sys.executable, "-c", COUNT]
+    counted = subprocess.run(line, capture_output=True, text=True, env=environment, check=True)
+    assert least <= int(counted.stdout) <= max(least, most)

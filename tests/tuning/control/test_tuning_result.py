@@ -1,9 +1,17 @@
 """What a tuning says: the metrics that were tuned, and peaks on either side of no control."""
 
+import dataclasses
+import tempfile
+from pathlib import Path
+
 import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
 
 import jaxbeam as jb
 import tuning
+from tests.tuning.small_rig import GAIN, rig
+from tuning.control.load_cases import run_case
 from tuning.control.tuning_result import RunSetResult, TuningResult
 
 
@@ -49,3 +57,73 @@ def test_the_metrics_that_were_tuned_are_shown():
     assert lines[start + 2].split() == ["rms", "2", "-", "0.7", "0.4"]
     assert lines[start + 3].split() == ["effort", "-", "0.15", "0.1", "0.2"]
     assert "peak" not in "".join(lines[start : start + 4])
+
+
+# Properties of every tuning, on random cases.
+
+CUTOFF, POSITION = "sensors.0.filter.cutoff", "sensors.0.position"
+FREE = {GAIN: (-9000.0, 9000.0), CUTOFF: (5.0, 45.0), POSITION: (0.1, 0.5)}
+
+PROBLEMS = {
+    "gain": st.floats(-4000.0, 8000.0),
+    "rigidity": st.floats(9.0, 16.0),
+    "damping": st.floats(0.0, 0.1),
+    "position": st.floats(0.15, 0.45),
+    "cutoff": st.floats(8.0, 40.0),
+    "masses": st.lists(st.floats(0.05, 0.6), min_size=3, max_size=3, unique=True),
+    "speeds": st.lists(st.floats(1.3, 2.5), min_size=3, max_size=3),
+}
+
+
+def small(gain, rigidity, damping, position, cutoff) -> jb.Case:
+    """A rig of two modes with one sensor behind a filter, under linear feedback."""
+    case = rig(jb.Feedback([gain], period=0.01))
+    beam = dataclasses.replace(
+        case.beam,
+        modes=2,
+        flexural_rigidity=np.asarray(rigidity),
+        damping_ratio=np.asarray(damping),
+    )
+    sensor = jb.Sensor(position, filter=jb.Filter(cutoff, order=2))
+    return dataclasses.replace(case, beam=beam, sensors=(sensor,))
+
+
+def peak(case: jb.Case, position: float) -> float:
+    """Largest deflection (m) at samples, at a position that does not move with the sensor."""
+    return float(np.abs(jb.simulate(case).at([position])).max())
+
+
+def relative_peak(case: jb.Case, position: float) -> float:
+    """Peak relative to that of the run without control."""
+    return peak(case, position) / peak(dataclasses.replace(case, controller=None), position)
+
+
+@settings(max_examples=4)
+@given(st.fixed_dictionaries(PROBLEMS))
+def test_the_objective_never_rises_and_is_that_of_the_saved_case(problem):
+    speeds = problem.pop("speeds")
+    runs = [
+        {"loads.0.mass": mass, "loads.0.speed": speed}
+        for mass, speed in zip(problem.pop("masses"), speeds, strict=True)
+    ]
+    cases = tuning.LoadCases(tuple(runs[:2]), tuple(runs[2:]))
+    case = small(**problem)
+    tuned = tuning.tune(case, FREE, cases, steps=4, least_peaks=False, progress=False)
+    training, held_out = tuned.run_sets
+    before, after = training.objective
+    assert after <= before
+    assert all(low <= value <= high for (low, high), value in
+               zip(FREE.values(), tuned.values, strict=True))  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "tuned.toml"
+        jb.save_case(tuned.case, file)
+        saved = jb.load_case(file)
+    # The true objective is that of the saved case, simulated run by run.
+    position = float(case.sensors[0].position)
+    peaks = [relative_peak(run_case(saved, run), position) for run in cases.training]
+    assert after == pytest.approx(max(peaks), rel=1e-3)
+    # The same for the held-out run; peaks between samples may be slightly larger.
+    saved_run = run_case(saved, cases.held_out[0])
+    assert 1 - 1e-3 < held_out.peaks_after[0] / peak(saved_run, position) < 1.02
+    below = 1 - held_out.peaks_after[0] / held_out.uncontrolled_peaks[0]
+    assert f"worst held out run: peak {below:.1%} below no control" in tuned.verdict

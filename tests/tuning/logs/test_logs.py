@@ -1,10 +1,14 @@
 """Logs read from text written by the tests, with known values."""
 
+import math
+
 import numpy as np
 import pytest
 
 from jaxbeam.case.loads.point import MovingMass
+from jaxbeam.case.quantities import QUANTITIES
 from tuning import Log, read_log
+from tuning.logs.units import UNITS, unit
 
 EXPECTED = [[1.5e-3, -2e-3], [2.5e-3, 0.0], [3.5e-3, 1e-3]]
 FORMATS = {
@@ -196,3 +200,41 @@ def test_long_names_and_units_are_refused_in_a_sentence(tmp_path):
         with pytest.raises(ValueError, match=f"the {what} of column 2 has 500 characters") as error:
             read_log(path)
         assert len(str(error.value)) < 300
+
+
+# Units against their definitions.
+
+
+@pytest.mark.parametrize(
+    ("text", "si", "factor", "quantity"),
+    [
+        ("mm", "m", 1e-3, "deflection"),
+        ("µm", "m", 1e-6, "deflection"),
+        ("in", "m", 0.0254, "deflection"),
+        ("g", "m/s^2", 9.80665, "acceleration"),
+        ("mg", "m/s^2", 9.80665e-3, "acceleration"),
+        ("m/s²", "m/s^2", 1.0, "acceleration"),
+        ("m/s2", "m/s^2", 1.0, "acceleration"),
+        ("deg", "rad", math.pi / 180, "slope"),
+        ("°", "rad", math.pi / 180, "slope"),
+        ("µε", "1", 1e-6, "strain"),
+        ("kN", "N", 1e3, "force"),
+        (" ms ", "s", 1e-3, "time"),
+    ],
+)
+def test_unit(text, si, factor, quantity):
+    assert unit(text) == (si, pytest.approx(factor, rel=1e-15), quantity)
+
+
+def test_quantities_are_those_of_sensors():
+    """The SI unit of each quantity in a log is that of the sensor."""
+    for entry in UNITS.values():
+        if entry.quantity in QUANTITIES:
+            assert entry.si == QUANTITIES[entry.quantity].unit
+    assert {entry.si for entry in UNITS.values()} >= {entry.unit for entry in QUANTITIES.values()}
+
+
+@pytest.mark.parametrize("text", ["milimeter", "G", "kn", "furlong", ""])
+def test_unknown_unit(text):
+    with pytest.raises(ValueError, match="unknown unit"):
+        unit(text)

@@ -4,12 +4,15 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.signal
 
-from tests.oracles import modal_equations
-from tests.oracles.loads import Load
+import jaxbeam as jb
+from tests.oracles import finite_elements, modal_equations, vehicle_elements
+from tests.oracles.loads import GRAVITY, Load
 from tests.tuning.fit.test_identify import deviations, log_of, one_span
+from tuning import Log, identify, weigh
 from tuning.weighing.matching_pursuit import MatchingPursuit
-from tuning.weighing.weigh import weigh
+from tuning.weighing.unit_force import UnitForce
 
 SPAN = modal_equations.Span(0.6, 11.68, 0.535, modes=3, damping_ratio=0.03)
 TIMES = np.arange(301) / 250
@@ -59,3 +62,114 @@ def test_logs_and_cases_that_cannot_be_weighed():
     upwards = dataclasses.replace(log, values=np.abs(log.values))
     with pytest.raises(ValueError, match="no load is found in it at these speeds"):
         weigh(CASE, upwards, (1.0, 2.0))
+
+
+# Strain gauges and accelerometers weigh, and fits have the cusp of strain under an axle.
+#
+# The readings are those of finite elements in small steps; the load is a mass on a stiff spring.
+
+LENGTH, RIGIDITY, DENSITY, DAMPING = 20.0, 1e10, 8000.0, 0.02
+MASS, SPEED, LEAD, FIBRE = 8000.0, 12.0, 3.6, -0.5  # kg, m/s, m, m
+PLACES = [LENGTH / 2, LENGTH / 4]
+CUTOFF, ORDER = 20.0, 4  # Hz, of the filter before the accelerometer's samples
+STEP, EVERY = 5e-4, 10
+NOISE = {"strain": 3e-7, "acceleration": 0.005}
+
+
+def case(*quantities, modes=4) -> jb.Case:
+    """Bridge with a sensor of each quantity, at midspan and then at the quarter point."""
+    beam = jb.Beam(
+        length=LENGTH, flexural_rigidity=RIGIDITY, mass_per_length=DENSITY,
+        damping_ratio=DAMPING, modes=modes,
+    )  # fmt: skip
+    sensors = [
+        jb.Sensor(x, quantity, fibre_distance=FIBRE)
+        if quantity == "strain"
+        else jb.Sensor(x, quantity, filter=jb.Filter(CUTOFF, ORDER, realisation="analogue"))
+        for x, quantity in zip(PLACES, quantities, strict=False)
+    ]
+    load = jb.MovingMass(mass=MASS, speed=SPEED, entry_time=LEAD / SPEED)
+    return jb.Case(beam, sensors=sensors, loads=[load], run=jb.Run(duration=2.5, sample_rate=200.0))
+
+
+@pytest.fixture(scope="module")
+def readings():
+    one = np.ones((1, 1))
+    mass = vehicle_elements.Vehicle(
+        MASS * one, 0 * one, 0 * one, one, np.array([1e9]), np.array([1e6]), np.zeros(1),
+        np.array([MASS * GRAVITY]),
+    )  # fmt: skip
+    beam = finite_elements.Beam(LENGTH, RIGIDITY, DENSITY, damping_ratio=DAMPING, elements=20)
+    run = vehicle_elements.cross(beam, mass, SPEED, -LEAD, PLACES, 2.5, step=STEP)
+    low_pass = scipy.signal.butter(ORDER, CUTOFF, fs=1 / STEP, output="sos")
+    filtered = scipy.signal.sosfilt(low_pass, run.acceleration, axis=0)[::EVERY]
+    # The axis sags towards the fibre below it: M / (E I) times its distance.
+    strain = -FIBRE * run.moment / RIGIDITY
+    return run.times[::EVERY], {"strain": strain[::EVERY], "acceleration": filtered}
+
+
+def quantity_log(readings, *quantities) -> Log:
+    times, histories = readings
+    rng = np.random.default_rng(0)
+    columns = [histories[name][:, i] for i, name in enumerate(quantities)]
+    values = [
+        c + NOISE[n] * rng.normal(size=c.size) for c, n in zip(columns, quantities, strict=True)
+    ]
+    units = {"strain": "1", "acceleration": "m/s^2"}
+    return Log(
+        times, np.stack(values, 1), quantities, quantities, tuple(units[n] for n in quantities)
+    )
+
+
+@pytest.mark.parametrize("quantity", ["strain", "acceleration"])
+def test_the_pursuit_finds_a_load_by_one_sensor(readings, quantity):
+    log = quantity_log(readings, quantity)
+    (load,) = MatchingPursuit(case(quantity), log, (6.0, 25.0), both_ways=False).find(1).loads
+    assert float(load.mass) == pytest.approx(MASS, rel=0.1)
+    assert float(load.speed) == pytest.approx(SPEED, rel=0.05)
+    assert float(load.entry_time) == pytest.approx(LEAD / SPEED, abs=0.05)
+
+
+def test_readings_of_a_unit_force_are_those_of_a_simulation():
+    sensors = [
+        jb.Sensor(7.0, "acceleration"), jb.Sensor(7.0, "velocity"), jb.Sensor(9.0, "deflection"),
+        jb.Sensor(8.0, "moment"),
+    ]  # fmt: skip
+    slow = jb.MovingForce(force=1.0, speed=-0.5, entry_time=1.0)
+    fast = dataclasses.replace(slow, speed=np.array(-30.0))
+    own = dataclasses.replace(case(), sensors=sensors)
+    for load, compared, duration in ((fast, slice(0, 2), 2.5), (slow, slice(2, 4), 40.0)):
+        times = np.linspace(0.0, duration, 501)
+        run = jb.Run(duration=duration)
+        record = jb.simulate(dataclasses.replace(own, loads=[load], run=run), times)
+        expected = np.asarray(record.measured)[:, compared]
+        unit_force = UnitForce(own, duration)
+        found = unit_force.readings(float(load.speed), times - 1.0)[:, compared]
+        error = np.abs(found - expected).max(axis=0) / np.abs(expected).max(axis=0)
+        assert np.all(error < 0.02), error
+
+
+def test_strain_gauge_and_accelerometer_weigh(readings):
+    names = "strain", "acceleration"
+    weighed = weigh(case(*names), quantity_log(readings, *names), (6.0, 25.0), 1, both_ways=False)
+    fit = weighed.fit
+    truth = {
+        "loads.0.mass": MASS, "loads.0.speed": SPEED, "loads.0.entry_time": LEAD / SPEED,
+        "sensors.0.offset": 0.0, "sensors.1.offset": 0.0,
+    }  # fmt: skip
+    deviations = (fit.values - [truth[address] for address in fit.addresses]) / fit.errors
+    assert np.all(np.abs(deviations) < 3.5), dict(zip(fit.addresses, deviations, strict=True))
+    assert fit.errors[0] < 0.01 * MASS
+    assert weighed.to_dict()["loads"][0]["mass"]["value"] == pytest.approx(MASS, rel=0.02)
+
+
+def test_a_fit_of_strain_has_the_cusp_under_the_axle(readings):
+    """With two modes, whose sums are 10 % low at the peak, the rigidity is right."""
+    own = case("strain", modes=2)
+    start = dataclasses.replace(own, beam=dataclasses.replace(own.beam, flexural_rigidity=9e9))
+    fit = identify(start, quantity_log(readings, "strain"), ["beam.flexural_rigidity"])
+    assert fit.values[0] == pytest.approx(RIGIDITY, rel=0.005)
+    peak = np.abs(fit.fitted[0, :, 0]).max()
+    assert peak == pytest.approx(np.abs(readings[1]["strain"][:, 0]).max(), rel=0.01)
+    modes = jb.simulate(own).coordinates @ jb.modes(own).fields(LENGTH / 2, (2,))[0]
+    assert np.abs(-FIBRE * modes).max() < 0.95 * peak  # without the correction

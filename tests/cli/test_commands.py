@@ -1,0 +1,250 @@
+"""`jaxbeam describe`: vehicles of files, of cases, of the library."""
+
+import inspect
+import json
+
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+from jaxbeam.cli import main
+from jaxbeam.cli.app import RENAMED_COMMANDS, RENAMED_OPTIONS, app, refuse_former_words
+from jaxbeam.cli.arguments import bounds_in_si, pair_in_si, parse_bounds, parse_prior
+from jaxbeam.cli.commands.new import KINDS
+
+CART = """
+[[bodies]]
+name = "cart"
+mass = 800.0
+inertia = 500.0
+[[axles]]
+body = "cart"
+position = 1.5
+tyre_stiffness = 2.0e5
+[[axles]]
+body = "cart"
+position = -1.5
+tyre_stiffness = 2.0e5
+"""
+
+
+def test_vehicle_file(folder, run):
+    (folder / "cart.toml").write_text(CART)
+    printed = run("describe cart.toml")
+    assert "weight 7.848 kN, mass 800 kg, wheelbase 3 m" in printed
+    assert "degrees of freedom: cart, cart pitch" in printed
+    (vehicle,) = run("describe cart.toml --json")["vehicles"]
+    assert vehicle["static_loads"] == pytest.approx([3924.0, 3924.0])
+    expected = np.sqrt([4e5 / 800, 4e5 * 1.5**2 / 500]) / (2 * np.pi)
+    assert vehicle["frequencies_hz"] == pytest.approx(expected)
+
+
+def test_case_file(run):
+    printed = run("describe case.toml")
+    assert "loads.0: mass" in printed and "weight 4.905 N, mass 0.5 kg" in printed
+
+
+def test_settled_supports(folder, run):
+    """3 E I s / l^2 over the middle support."""
+    text = (folder / "case.toml").read_text()
+    (folder / "case.toml").write_text(text + '[[supports]]\nposition = 0.3\nsettlement = "1 mm"\n')
+    moment = 3 * 11.68 * 1e-3 / 0.3**2
+    expected = f"settled: supports.0 by 1 mm; moments locked in from 0 N m to {moment:.4g} N m"
+    assert expected in run("describe case.toml")
+    assert f"{expected}; sensors read changes from there" in run("simulate case.toml")
+
+
+def test_case_of_a_train_in_words(run, folder):
+    """Units with prefixes, when the loads are on the beam, the first and the last of 50 axles."""
+    run("new railway-bridge")
+    printed = run("describe railway-bridge.toml")
+    for text in (
+        "beam of 25 m, pinned-pinned: E I = 30 GN m², 15000 kg/m",
+        "1/3732 of the span of 25 m",
+        "critical speed: 177.7 m/s (639.8 km/h)",
+        "loads.0: HSLM-A1 at 60 m/s (216 km/h), on the beam from 0 s to 7.042 s",
+        "the run ends at 18 s",
+        "sensors: midspan (deflection at 12.5 m), deck (acceleration at 12.5 m)",
+        "50 wheels, of which",
+        "397.525",
+    ):
+        assert text in printed
+    assert len(printed.splitlines()) < 35
+
+
+def test_library(run):
+    assert "truck-5-axle" in run("describe") and "HSLM-A10" in run("describe")
+    assert "55.1622" in run("describe truck-5-axle")
+    assert "weight 8500 kN" in run("describe HSLM-A1")
+
+
+def test_unknown_names_are_refused(refused):
+    assert "did you mean 'truck-5-axle'?" in refused("describe truck-5-axel")
+    assert "cannot read the file none.toml" in refused("describe none.toml")
+
+
+def test_picture(folder, run):
+    (folder / "cart.toml").write_text(CART)
+    for source, picture in (("cart.toml", "cart.png"), ("case.toml", "case.png")):
+        assert f"written: {picture}" in run(f"describe {source} --plot {picture}")
+        assert (folder / picture).read_bytes().startswith(b"\x89PNG")
+
+
+# Command `compare` over random runs.
+
+CASE = """
+[beam]
+length = 0.6
+flexural_rigidity = 12.0
+mass_per_length = 0.5
+damping_ratio = 0.03
+modes = 1
+[[sensors]]
+position = 0.3
+[[actuators]]
+kind = "point"
+position = 0.3
+limits = [-2.0, 5.0]
+[[loads]]
+kind = "mass"
+mass = 0.4
+speed = 2.0
+entry_time = 0.1
+[controller]
+kind = "feedback"
+gains = [500.0]
+period = 0.02
+[run]
+duration = 0.5
+sample_rate = 100.0
+"""
+RUNS = """
+[training]
+draws = 2
+"loads.0.mass" = [0.3, 0.4]
+"beam.flexural_rigidity" = [11.0, 13.0]
+"""
+
+
+def test_compare_over_the_runs_of_a_file(tmp_path, capsys):
+    case, runs = tmp_path / "weak.toml", tmp_path / "runs.toml"
+    case.write_text(CASE)
+    runs.write_text(RUNS)
+    with pytest.raises(SystemExit, match="0"):
+        main(["compare", str(case), "--cases", str(runs), "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert list(found["over_all"]) == ["weak", "drawn by hand"]
+    assert len(found["cases"]) == 2
+    assert all(11 < one["values"]["beam.flexural_rigidity"] < 13 for one in found["cases"])
+    shares = [one["controllers"]["weak"]["share"] for one in found["cases"]]
+    assert found["over_all"]["weak"]["worst_share"] == min(shares)
+    with pytest.raises(SystemExit, match="1"):
+        main(["compare", str(case), "--cases", str(runs), "--over", "loads.0.mass=1,2"])
+    assert "--cases has runs of its own" in capsys.readouterr().err
+
+
+# Bounds of free parameters, with and without units.
+
+FORCE_CASE = jb.Case(jb.Beam(25.0, 3e10, 1.5e4), loads=[jb.MovingForce(force=1e5, speed=20.0)])
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("beam.flexural_rigidity=8 GN m^2:12 GN m^2", (8e9, 12e9)),
+        ("beam.flexural_rigidity=8000 MN m^2 : 1.2e10 N m^2", (8e9, 12e9)),
+        ("loads.*.speed=36 km/h:20 m/s", (10.0, 20.0)),
+        ("beam.length=20:30", (20.0, 30.0)),
+        ("beam.length", None),
+    ],
+)
+def test_bounds_in_si_units(text, expected):
+    address, pair = parse_bounds(text)
+    found = bounds_in_si(FORCE_CASE, {address: pair})[address]
+    assert found == (expected and pytest.approx(expected))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("beam.length=25 m:20 m", "--free beam.length: bounds are LOW:HIGH"),
+        ("beam.length=25 m:30 kg", "must be in m, or a unit of the same kind, not '30 kg'"),
+        ("beam.lenght=25 m:30 m", "did you mean .beam.length"),
+    ],
+)
+def test_bounds_that_are_refused(text, message):
+    with pytest.raises(ValueError, match=message):
+        bounds_in_si(FORCE_CASE, dict([parse_bounds(text)]))
+
+
+def test_priors_in_si_units():
+    address, pair = parse_prior("beam.flexural_rigidity=30 GN m^2:500 MN m^2")
+    assert pair_in_si(FORCE_CASE, address, pair, "--prior") == pytest.approx((3e10, 5e8))
+    assert parse_prior("beam.length=25:0.1") == ("beam.length", (25.0, 0.1))
+    with pytest.raises(ValueError, match="give both numbers a unit, as in"):
+        parse_prior("beam.length=25 m:0.1")
+    with pytest.raises(ValueError, match="--prior beam.length.1 must be in m"):
+        pair_in_si(FORCE_CASE, "beam.length", ("25 m", "1 kg"), "--prior")
+
+
+# Former words of commands and options are refused by a sentence that names the present ones.
+
+OPTIONS = [
+    (command, old, new) for command, names in RENAMED_OPTIONS.items() for old, new in names.items()
+]
+
+
+def parameters(command: str) -> set[str]:
+    """Options of a command."""
+    return {
+        name for argument in app[command].assemble_argument_collection() for name in argument.names
+    }
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED_COMMANDS.items())
+def test_former_commands(old, new):
+    with pytest.raises(ValueError, match=f"^{old} is called {new} now$"):
+        refuse_former_words([old, "case.toml"])
+    assert inspect.isfunction(app[new].default_command)
+
+
+@pytest.mark.parametrize(("command", "old", "new"), OPTIONS)
+def test_former_options(command, old, new):
+    for given in ([old, "1"], [f"{old}=1=2"]):
+        with pytest.raises(ValueError, match=f"^{old} is called {new} now$"):
+            refuse_former_words([command, "a.toml", *given])
+    assert new in parameters(command)
+    assert old not in parameters(command)
+
+
+def test_present_words_and_those_of_other_commands_pass():
+    refuse_former_words(["sweep", "case.toml", "--over", "loads.0.mass=1,2"])
+    refuse_former_words([])
+
+
+def test_a_former_option_ends_the_command(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["design-experiment", "case.toml", "--over", "loads.0.speed=1:2"])
+    assert ended.value.code != 0
+    assert capsys.readouterr().err == "jaxbeam: --over is called --vary now\n"
+
+
+# Cases to start from: they are plausible, and run as they are.
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_starter_case_runs_as_it_is(run, folder, kind):
+    assert f"written: {kind}.toml" in run(f"new {kind}")
+    assert run(f"check {kind}.toml --json")["warnings"] == []
+    found = run(f"simulate {kind}.toml --json")
+    assert found["error_estimate"] < 1e-3
+    assert all(sensor["smallest"] < sensor["largest"] for sensor in found["sensors"])
+
+
+def test_a_file_is_not_overwritten(refused, run, folder):
+    (folder / "mine.toml").write_text("precious")
+    assert "mine.toml exists" in refused("new footbridge -o mine.toml")
+    assert (folder / "mine.toml").read_text() == "precious"
+    run("new footbridge -o mine.toml --overwrite")
+    assert "Footbridge" in (folder / "mine.toml").read_text()
+    assert "no case of kind 'bridge'" in refused("new bridge")
