@@ -211,6 +211,11 @@ class AbstractController(ReprWithUnits, Module, metaclass=ExplainsArguments):
         """Whether the design depends on masses and weights of the loads."""
         return True
 
+    @property
+    def design_depends_on_paths(self) -> bool:
+        """Whether the design depends on speeds and entry times of the loads."""
+        return self.design_depends_on_loads
+
     @abc.abstractmethod
     def design_law(self, plant: Any) -> Any:
         """Law designed for a plant, a `jaxbeam.model.state_space.Plant`.

@@ -99,7 +99,10 @@ class AbstractEstimator(ReprWithUnits, Module, metaclass=ExplainsArguments):
 
     @property
     def varies(self) -> bool:
-        """Whether the gain changes as the loads cross, so that a loop has no equilibrium."""
+        """Whether the gain changes as the loads cross, so that a loop has no equilibrium.
+
+        Otherwise the filter depends on no number of the loads.
+        """
         return False
 
     @abc.abstractmethod

@@ -164,6 +164,14 @@ class Feedforward(AbstractController):
         "m", "distance by which each gate is farther along than the law has it", default=(0.0, 0.0)
     )
 
+    @property
+    def design_depends_on_loads(self) -> bool:
+        return False
+
+    @property
+    def design_depends_on_paths(self) -> bool:
+        return True
+
     def validate(self, case):
         if self.period is None:
             return "period must be given: kind 'feedforward' acts at samples"

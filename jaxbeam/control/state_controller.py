@@ -151,7 +151,7 @@ class AbstractStateController(AbstractController):
 
     @property
     def design_depends_on_loads(self) -> bool:
-        return self.estimator is not None
+        return self.estimator is not None and self.estimator.varies
 
     @abc.abstractmethod
     def design_state_law(self, plant: Plant, design_plant: Plant) -> AbstractStateLaw:

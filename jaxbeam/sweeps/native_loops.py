@@ -130,6 +130,7 @@ class NativeLoops:
 
     def _is_shared(self) -> bool:
         """Whether all batches have one law: it depends on no number that differs between them."""
-        if self.program.case.controller.design_depends_on_loads:
+        controller = self.program.case.controller
+        if controller.design_depends_on_loads or controller.design_depends_on_paths:
             return len(self.batches.shared_values) == 1
         return not any(name.startswith("controller.") for name in self.batches.shared_addresses)

@@ -145,7 +145,8 @@ class MPC(AbstractStateController):
 
     @property
     def design_depends_on_loads(self) -> bool:
-        return True
+        predicted = self.loads == "known" or self.prediction == "time-varying"
+        return predicted or super().design_depends_on_loads
 
     def validate(self, case):
         outputs = len(case.sensors) if self.positions is None else self.positions.shape[0]
