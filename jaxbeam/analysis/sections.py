@@ -347,6 +347,7 @@ def _static(case: Case, sensor: Sensor) -> float | None:
     channel = {
         name: getattr(sensor, name) for name in ("quantity", "fibre_distance", "section_modulus")
     }
+    channel["side"] = sensor.side or "right"
     try:
         value = float(static_peak(case, sensor.position, **channel))
     except ValueError:

@@ -6,6 +6,7 @@ responses, and histories of records derive from it (rows: `model.sensing.output_
 
 from typing import NamedTuple
 
+SIDES = ("left", "right")  # of a position
 OF_QUANTITY = "unit of quantity"  # unit of the entries of a sensor that are in that of its quantity
 
 

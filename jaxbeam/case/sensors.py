@@ -18,7 +18,7 @@ from jaxbeam.case.fields import (
     part,
 )
 from jaxbeam.case.filters import Filter
-from jaxbeam.case.quantities import OF_QUANTITY, QUANTITIES
+from jaxbeam.case.quantities import OF_QUANTITY, QUANTITIES, SIDES
 from jaxbeam.case.reading.units import in_si
 from jaxbeam.runtime.arrays import Array, Number, xp
 from jaxbeam.runtime.module import Module
@@ -29,12 +29,13 @@ class Sensor(ReprWithUnits, Module):
 
     `strain` is the bending strain -z d2w/dx2 of the fibre at z = `fibre_distance` above the neutral
     axis, `moment` the bending moment, positive where the beam sags, `shear` its x-derivative, and
-    `stress` the moment over the `section_modulus`. `name` is the label in results. `offset` and
-    noise are added to the quantity; the reading is limited to the range and rounded to the
-    resolution (see `jaxbeam.model.sensing.sensor_signals`). With the probability `dropout` a
-    reading is lost: the last one stays, and a controller knows that it is missing. The others are
-    up to `jitter` older than `delay`, equally distributed. Both are drawn by the seed of the run.
-    What is left out is ideal.
+    `stress` the moment over the `section_modulus`. What jumps at the position, as a shear force at
+    a support, is read on one `side` of it, by default the right one. `name` is the label in
+    results. `offset` and noise are added to the quantity; the reading is limited to the range and
+    rounded to the resolution (see `jaxbeam.model.sensing.sensor_signals`). With the probability
+    `dropout` a reading is lost: the last one stays, and a controller knows that it is missing. The
+    others are up to `jitter` older than `delay`, equally distributed. Both are drawn by the seed of
+    the run. What is left out is ideal.
 
     >>> import jaxbeam as jb
     >>> sensor = jb.Sensor(0.3, quantity="strain", fibre_distance=0.0025, name="midspan")
@@ -75,6 +76,13 @@ class Sensor(ReprWithUnits, Module):
         default="all",
     )
     name: str = choice("label in results; its number and quantity if left out", default="")
+    side: str = choice(
+        "side of the position on which it reads what jumps there; the right one if left out",
+        "",
+        *SIDES,
+        default="",
+        kw_only=True,
+    )
     dropout: Float[Number, ""] | None = number(
         "1", "probability that a reading is lost", PROBABILITY, default=None, kw_only=True
     )
@@ -151,6 +159,11 @@ class Sensor(ReprWithUnits, Module):
             return (
                 f"{address}.mode_band would have no effect on {words}, which has all modes by the"
                 " static correction; leave it out"
+            )
+        if self.side and not quantity.x_derivative:
+            return (
+                f"{address}.side would have no effect on {words}, which is the same on both sides;"
+                " leave it out"
             )
         if modulus is not None and is_concrete(modulus) and concrete(modulus) == 0:
             return f"{address}.section_modulus must not be zero"

@@ -13,7 +13,7 @@ from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam, suggestion
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.quantities import QUANTITIES, quantity_of
+from jaxbeam.case.quantities import QUANTITIES, SIDES, quantity_of
 from jaxbeam.model import statics
 from jaxbeam.model.flexibility import flexibility
 from jaxbeam.model.layout import Layout, is_uniform
@@ -25,7 +25,6 @@ from jaxbeam.runtime.compiling import compiled_if_traced
 
 DEFAULT_POSITIONS = 101
 REACTION = "reaction"
-SIDES = ("left", "right")
 # Quantities with an influence line: what moves or accelerates has no static value.
 STATIC_QUANTITIES = (
     *(name for name, quantity in QUANTITIES.items() if quantity.time_derivative == 0),
@@ -187,7 +186,7 @@ def _line(case: Case, layout: Layout, x, kind: _Kind, fibre_distance, section_mo
     if kind.quantity == "deflection":
         return field(x, kind.derivative)
     entry = quantity_of(kind.quantity, fibre_distance, section_modulus)
-    at = beside(case, x, kind.side) if entry.bends else x
+    at = beside(case, x, kind.side) if entry.x_derivative else x
     line, breaks = field(at, 1 if entry.of_axis and is_uniform(case) else entry.field)
     factor = quantity_factor(case, at, entry, fibre_distance, section_modulus)
     return (lambda y: factor * line(y)), breaks

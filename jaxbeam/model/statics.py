@@ -26,6 +26,8 @@ from jaxbeam.runtime.compiling import compiled_if_traced
 PEAK_POSITIONS = tuple(float(share) for share in np.linspace(0, 1, 11))
 BLOCK = 4_000_000  # values of lines under all wheels at a time
 END_SHARE = 1e-5  # of an interval, by which its ends are left out
+# Of all times: shorter intervals lie between a place and the section beside it, and are left out.
+SHORTEST = 1e-9
 # Positions from the middle at which samples are taken, and what takes them to PEAK_POSITIONS: the
 # first two terms of the Taylor series of their polynomial.
 WITHIN = (1 - 2 * END_SHARE) * (np.array(PEAK_POSITIONS) - 0.5)
@@ -176,6 +178,7 @@ def peak_under_loads(
         position = xp.clip(loads.kinematics(within)[0], 0.0, length)
         forces = loads.varying_weight(within)[..., 0]
         active = (windows[:, :1] < middle) & (middle < windows[:, 1:])
+        active = active & (ends[part] - starts[part] > SHORTEST * (times[-1] - times[0]))
         if is_known(active):
             wheel, at = np.nonzero(active)
         else:

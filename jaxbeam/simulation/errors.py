@@ -16,7 +16,7 @@ from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.sensing.output_rows import band_weights, beside, modal_row, sensor_history
+from jaxbeam.model.sensing.output_rows import band_weights, modal_row, place_of, sensor_history
 from jaxbeam.model.static_correction import Motion, corrected_history, is_supported
 from jaxbeam.runtime.arrays import Array, stop_gradient, xp
 from jaxbeam.simulation.motion import motion_at
@@ -168,7 +168,7 @@ def truncation_changes(case: Case, modes: Modes, motion: Motion) -> Float[Array,
             change = xp.nan
         elif quantity.time_derivative == 0 and not quantity.bends:
             order = quantity.x_derivative
-            change = corrected_history(case, modes, motion, sensor.position, order)
+            change = corrected_history(case, modes, motion, place_of(case, sensor), order)
             change = change - sensor_history(case, modes, motion, sensor)
         elif case.beam.modes == 1:
             change = xp.nan
@@ -185,8 +185,8 @@ def _highest_modes(
     quantity = quantity_of(sensor.quantity, sensor.fibre_distance, sensor.section_modulus)
     highest = np.s_[max(1, case.beam.modes - LEFT_OUT) :]
     parameters = sensor.quantity, sensor.fibre_distance, sensor.section_modulus
-    x = beside(case, sensor.position) if quantity.bends else sensor.position
-    row = modal_row(modes.fields, case, x, *parameters) * band_weights(modes, sensor.mode_band)
+    place = place_of(case, sensor)
+    row = modal_row(modes.fields, case, place, *parameters) * band_weights(modes, sensor.mode_band)
     amplitudes = tuple(part[:, highest] for part in motion[:3])
     if quantity.bends and is_supported(case, modes.layout):
         _, rates, accelerations = amplitudes

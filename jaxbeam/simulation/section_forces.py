@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.quantities import quantity_of
+from jaxbeam.case.quantities import SIDES, quantity_of
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.output_rows import SIDE_SHARE, beside, quantity_factor, quantity_history
 from jaxbeam.model.settlement import has_settlement, settled_beam
@@ -16,12 +16,9 @@ from jaxbeam.model.static_correction import (
     Motion,
     corrected_history,
     port_forces,
-    shear_force as shear_of_third_derivative,
 )
 from jaxbeam.model.theory.elements import SLOPE
 from jaxbeam.runtime.arrays import Array, xp
-
-SIDES = ("left", "right")
 
 
 def history(
@@ -32,17 +29,18 @@ def history(
     name: str,
     fibre_distance=None,
     section_modulus=None,
+    side: str = "right",
 ) -> Float[Array, "time *position"]:
-    """History of a quantity at positions x (m); raises as `quantity_history`.
+    """History of a quantity at positions x (m), on one side of them; raises as `quantity_history`.
 
     Moments, shear forces and stresses have those of settled supports in them. Displacements,
     strains and curvatures are measured from the settled beam at rest.
     """
     parameters = fibre_distance, section_modulus
-    changes = quantity_history(case, modes, motion, x, name, *parameters)
+    changes = quantity_history(case, modes, motion, x, name, *parameters, side=side)
     if not (quantity_of(name, *parameters).section_force and has_settlement(case)):
         return changes
-    return changes + locked_in(case, modes, beside(case, x), name, *parameters)
+    return changes + locked_in(case, modes, beside(case, x, side), name, *parameters)
 
 
 def locked_in(
@@ -66,11 +64,7 @@ def shear_force(
     """
     if side not in SIDES:
         raise ValueError(f"side must be 'left' or 'right' of x, not {side!r}")
-    if side == "right":
-        return history(case, modes, motion, x, "shear")
-    x = beside(case, x, side)
-    shear = shear_of_third_derivative(case, x, corrected_history(case, modes, motion, x, 3))
-    return shear + locked_in(case, modes, x, "shear") if has_settlement(case) else shear
+    return history(case, modes, motion, x, "shear", side=side)
 
 
 def support_positions(case: Case, modes: Modes) -> Float[Array, " support"]:

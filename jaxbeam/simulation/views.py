@@ -162,7 +162,8 @@ def _sensor_rows(case: Case, extremes: Extremes) -> list[tuple[str, ...]]:
     rows = []
     columns = zip(case.sensors, sensor_labels(case.sensors), *extremes, strict=True)
     for sensor, label, low, low_time, high, high_time in columns:
-        position, unit = f"{float(sensor.position):.4g} m", sensor.unit
+        side = f" {sensor.side}" if sensor.side else ""
+        position, unit = f"{float(sensor.position):.4g} m{side}", sensor.unit
         name = sensor.name or label.partition(":")[0]
         row = (name, position, sensor.quantity, with_prefix(float(low), unit))
         row += (f"{low_time:.4g} s", with_prefix(float(high), unit), f"{high_time:.4g} s")

@@ -30,7 +30,6 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.model.along_beam import left_of
 from jaxbeam.model.influence import REACTION
 from jaxbeam.vehicles.library import trains as library
 
@@ -58,7 +57,7 @@ def train_checks(
     sections = [*measured, *inner]
     sensors = (
         *(Sensor(p.x, "acceleration") for p in decks),
-        *(Sensor(_sensor_position(case, section), section.quantity) for section in measured),
+        *(Sensor(p.x, p.quantity, side=p.side if p.quantity == "shear" else "") for p in measured),
     )
     reactions = tuple(section.x for section in inner)
     responses = [train_response(case, train, sensors, *speeds, reactions) for train in trains]
@@ -111,12 +110,6 @@ def checked_sections(case: Case) -> list[CheckedSection]:
             sections.append(CheckedSection(f"end rotation at {p.name}", "rotation", p.x))
     sections += [CheckedSection(f"reaction at {p.name}", REACTION, p.x) for p in supports]
     return sections
-
-
-def _sensor_position(case: Case, section: CheckedSection) -> float:
-    """Position (m) of a sensor for a section; shear forces are measured just right of sensors."""
-    left = section.quantity == "shear" and section.side == "left"
-    return float(left_of(case, section.x)) if left else section.x
 
 
 def _unit(section: CheckedSection) -> str:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.beam import END_CONDITIONS, Support
+from jaxbeam.case.beam import END_CONDITIONS, Support, segment_edges
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.loads.base import AbstractLoad, wheel_distances
 from jaxbeam.case.quantities import QUANTITIES
@@ -327,6 +327,26 @@ class Facts:
                 yield x, math.inf, name
         for i, support in enumerate(self.case.supports):
             yield float(support.position), stiffness_of(support), f"supports.{i}"
+
+    @functools.cached_property
+    def jumps(self) -> dict[Any, list[tuple[float, str]]]:
+        """Positions (m) and names of where derivatives of the deflection jump, by their order.
+
+        As "bend" those where only the curvature does, not the moment.
+        """
+        beam, found = self.case.beam, {0: [], 1: [], 2: [], 3: [], "bend": []}
+        for i, hinge in enumerate(beam.hinges):
+            found[1].append((float(hinge.position), f"beam.hinges.{i}"))
+        for i, support in enumerate(self.case.supports):
+            place, name = float(support.position), f"supports.{i}"
+            found[3].append((place, name))
+            if float(support.rotational_stiffness):
+                found[2].append((place, name))
+        for i, actuator in enumerate(self.case.actuators):
+            for place, order, _ in actuator.displacement_map():
+                found[3 - order].append((float(place), f"actuators.{i}"))
+        edges = [(float(x), "a change of section") for x in segment_edges(beam)]
+        return found | {"bend": edges}
 
     @functools.cached_property
     def shapes(self) -> np.ndarray:

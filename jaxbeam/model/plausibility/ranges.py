@@ -533,6 +533,13 @@ OTHERS = (
         unless=("stiffness", "weight"),
     ),
     Range(
+        values.sides_of_jumps,
+        0.0,
+        0.0,
+        "the {quantity} jumps at {name}, at {x:.4g} m, and the sensor reads it to the right of it",
+        above='write side = "right" if that is meant, "left" for the other side',
+    ),
+    Range(
         values.delay_over_duration,
         0.0,
         1.0,

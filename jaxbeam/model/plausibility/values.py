@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxbeam.case.actuators.electrodynamic import Electrodynamic
+from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.trajectory import NEVER
+from jaxbeam.model.layout import NODE_TOLERANCE
 from jaxbeam.model.linear_system import poles
 from jaxbeam.model.plausibility.facts import GRAVITY, Facts
 
@@ -561,6 +563,21 @@ def _error_of(sensor, size: float, name: str, given: float) -> Iterator[Value]:
         unit = "m/m" if sensor.unit == "1" else sensor.unit
         words = {"given": abs(given), "unit": unit, "size": size, "small": small}
         yield Value(name, abs(given) / size, words)
+
+
+def sides_of_jumps(facts):
+    """1 for a sensor, at a place where its quantity jumps, of which it has one side by default."""
+    where, at = facts.jumps, [(float(s.position), s.quantity) for s in facts.case.sensors]
+    for (address, sensor), (x, quantity) in zip(_parts(facts, "sensors"), at, strict=True):
+        entry, tolerance = QUANTITIES[quantity], NODE_TOLERANCE * facts.length
+        bends = entry.x_derivative == 2 and not entry.section_force
+        kinds = (entry.x_derivative, "bend") if bends else (entry.x_derivative,)
+        found = (
+            name for kind in kinds for place, name in where[kind] if abs(place - x) < tolerance
+        )
+        name = next(found, "") if 0 < x < facts.length and not sensor.side else ""
+        if name:
+            yield Value(f"{address}.side", 1.0, {"quantity": quantity, "x": x, "name": name})
 
 
 def _delays(facts):

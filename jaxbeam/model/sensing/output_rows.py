@@ -172,16 +172,17 @@ class OutputRows(Module):
 
 def sensor_rows(model: ModalModel, case: Case, sensors: Sequence[Sensor]) -> OutputRows:
     """Output rows of sensors on a case, as ideal ones, on the coordinates of its modal model."""
-    alike: dict[tuple[str, str], list[int]] = {}
+    alike: dict[tuple[str, str, str], list[int]] = {}
     for i, sensor in enumerate(sensors):
-        alike.setdefault((sensor.quantity, sensor.mode_band), []).append(i)
+        alike.setdefault((sensor.quantity, sensor.mode_band, sensor.side), []).append(i)
     rows, on_commands = [xp.zeros((0, model.mode_count))], [xp.zeros((0, len(case.actuators)))]
-    for (name, band), index in alike.items():
+    for (name, band, side), index in alike.items():
         x, fibre_distance, section_modulus = (
             _stacked([getattr(sensors[i], field) for i in index])
             for field in ("position", "fibre_distance", "section_modulus")
         )
         quantity = quantity_of(name, fibre_distance, section_modulus)
+        x = beside(case, x, side) if side else x
         fields = banded_fields(model, band)
         rows.append(modal_row(fields, case, x, name, fibre_distance, section_modulus))
         active = active_moments(case, x).T
@@ -220,20 +221,22 @@ def quantity_history(
     fibre_distance=None,
     section_modulus=None,
     mode_band: str = "all",
+    side: str = "",
 ) -> Float[Array, "time *position"]:
     """History of a quantity at positions x (m) from the motion of the modes (of a band).
 
-    Curvature and what follows from it are statically corrected (see `corrected_history`); at a load
-    or support, and at the end of a patch, the shear force to the right of it. Raises ValueError for
-    an unknown quantity, a missing `fibre_distance` (m) or `section_modulus` (m^3).
+    Curvature and what follows from it are statically corrected (see `corrected_history`). What
+    jumps at x, as a shear force at a load or support, is that on one side, by default the right
+    one. Raises ValueError for an unknown quantity, a missing `fibre_distance` (m) or
+    `section_modulus` (m^3).
     """
     parameters = fibre_distance, section_modulus
     quantity = quantity_of(name, *parameters)
+    x = beside(case, x, side or "right") if side or quantity.bends else x
     if not quantity.bends:
         rows = modal_row(modes.fields, case, x, name, *parameters) * band_weights(modes, mode_band)
         amplitudes = (motion.coordinates, motion.rates, motion.accelerations)
         return xp.tensordot(amplitudes[quantity.time_derivative], rows, axes=[1, -1])
-    x = beside(case, x)
     history = corrected_history(case, modes, motion, x, quantity.x_derivative)
     history = quantity_factor(case, x, quantity, *parameters) * history
     if quantity.has_active_moment and case.actuators:
@@ -248,7 +251,14 @@ def sensor_history(
 ) -> Float[Array, " time"]:
     """History of the true quantity of a sensor, in its SI unit; see `quantity_history`."""
     channel = sensor.position, sensor.quantity, sensor.fibre_distance, sensor.section_modulus
-    return quantity_history(case, modes, motion, *channel, sensor.mode_band)
+    return quantity_history(case, modes, motion, *channel, sensor.mode_band, sensor.side)
+
+
+def place_of(case: Case, sensor: Sensor) -> Float[Array, ""]:
+    """Position (m) at which the quantity of a sensor is taken, beside its own where it may jump."""
+    if sensor.side or sensor.bends:
+        return beside(case, sensor.position, sensor.side or "right")
+    return sensor.position
 
 
 def beside(case: Case, x, side: str = "right") -> Float[Array, "*position"]:
@@ -399,7 +409,7 @@ def static_correction(
     all_greens, factors = [], []
     length = case.beam.length
     for order, index in groups.items():
-        x = beside(case, xp.stack([sensors[i].position for i in index]))
+        x = xp.stack([place_of(case, sensors[i]) for i in index])
         own = xp.stack([_factor(case, sensors[i], x[n]) for n, i in enumerate(index)])
         all_greens.append(flexibility(case, layout, x, order))
         factors.append(own * length ** (3 - order) / case.beam.bending_stiffness)
