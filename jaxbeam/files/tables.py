@@ -2,7 +2,8 @@
 
 A cell that begins with = + - @, a tab or a line break is a formula, or may become one, to Excel,
 LibreOffice and Google Sheets, in .csv files as in .xlsx. An apostrophe before it makes it text
-("CSV Injection", OWASP).
+("CSV Injection", OWASP); also behind a semicolon, tab or line break, as where the comma is the
+decimal mark these separate cells.
 """
 
 import itertools
@@ -26,7 +27,9 @@ if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
 
 
-_FORMULA = re.compile(r"'*[=+\-@\t\r\n＝＋－＠]")
+_START = r"(^|[;\t\r\n])"
+_FORMULA = re.compile(_START + r"(?='*[=+\-@\t\r\n＝＋－＠﹢﹣﹦﹫])")
+_AS_TEXT = re.compile(_START + r"'(?='*[=+\-@\t\r\n＝＋－＠﹢﹣﹦﹫])")
 
 
 def as_text_cell(text: str) -> str:
@@ -35,7 +38,7 @@ def as_text_cell(text: str) -> str:
     >>> as_text_cell("=1+1"), as_text_cell("midspan")
     ("'=1+1", 'midspan')
     """
-    return f"'{text}" if _FORMULA.match(text) else text
+    return _FORMULA.sub(r"\1'", text)
 
 
 def from_text_cell(cell: str) -> str:
@@ -44,7 +47,7 @@ def from_text_cell(cell: str) -> str:
     >>> from_text_cell("'=1+1"), from_text_cell("'t Zand")
     ('=1+1', "'t Zand")
     """
-    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
+    return _AS_TEXT.sub(r"\1", cell)
 
 
 Columns = Mapping[str, np.ndarray]  # equally long, of numbers or texts, by their heads
