@@ -327,9 +327,9 @@ MISTAKES = [
     ("bridge", "run.duration", 0.5, "loads.0", "lengthen run.duration"),
     ("bridge", "run.duration", 2000.0, "", "in s, not in ms"),
     ("bridge", "run.gravity", 9810.0, "", "in m/s^2, 9.81 on earth, not in mm/s^2"),
-    ("bridge", "run.sample_rate", 0.001, "", "samples per second, not a time step"),
-    ("bridge", "run.sample_rate", 5.0, "", "in Hz, not in kHz"),
-    ("railway", "run.sample_rate", 40.0, "", "in Hz"),
+    ("bridge", "run.sample_rate", 0.001, "", "or 1000 Hz if it is the time step in s"),
+    ("bridge", "run.sample_rate", 5.0, "", "give more than 7.11 Hz, or is it in kHz?"),
+    ("railway", "run.sample_rate", 40.0, "", "give more than 64 Hz"),
     ("bridge", "sensors", [], "", "[[sensors]]"),
     # Vehicles
     ("cars", "loads.0.suspension_stiffness", 400.0, "", "in N/m, not in kN/m"),
@@ -369,12 +369,14 @@ MISTAKES = [
     # People and machines
     ("footbridge", "loads.0.weight", 75.0, "", "in N, not in kg"),
     ("footbridge", "loads.0.weight", 75e3, "", "one person in N"),
+    ("footbridge", "loads.1", dict(kind="mass", mass=750.0, speed=1.4), ".mass", "750 N are 76 kg"),
     ("footbridge", "loads.0.pace", 12.6, "", "in Hz, not in rad/s"),
     ("footbridge", "loads.0.speed", 25.0, "", "in m/s, not in km/h"),
     ("footbridge", "loads.0.factors", [40.0, 10.0], "loads.0.factors.0", "40 per cent"),
     ("footbridge", "loads.1.phases", [90.0], "loads.1.phases.0", "in rad, not in degrees"),
     # Surface
     ("cars", "profile.amplitude", 2.0, "", "in m, not in mm"),
+    ("cars", "profile.amplitude", 0.5, "", "in m, not in mm"),
     ("cars", "profile.wavelength", 40e3, "", "in m, not in mm"),
     ("cars", "profile.phase", 90.0, "", "in rad, not in degrees"),
     ("cars", "profile", dict(kind="bump", start=1.0, end=2.0, height=30.0), ".height", "in mm"),

@@ -94,6 +94,14 @@ WEIGHTS = (
         cause="weight",
     ),
     Range(
+        values.mass_on_foot,
+        0.0,
+        300.0,
+        "{value:.3g} kg move at {speed:.3g} m/s, as people walk",
+        above="is it in kg, not a weight in N? {value:.3g} N are {people:.2g} kg",
+        cause="weight",
+    ),
+    Range(
         of_parts("loads", "weight", kinds=("pedestrian", "crowd")),
         100.0,
         3000.0,
@@ -488,6 +496,15 @@ OTHERS = (
         cause="profile",
     ),
     Range(
+        values.rise_of_waves,
+        0.0,
+        0.3,
+        "the surface rises and falls by {value:.3g} m",
+        above="is it in m, not in mm?",
+        unit="m",
+        cause="profile",
+    ),
+    Range(
         values.slope_of_profile,
         0.0,
         1.0,
@@ -566,10 +583,10 @@ OTHERS = (
     ),
     Range(
         values.samples_of_record,
-        2.0,
+        values.LEAST_SAMPLES,
         INF,
         "{rate:.4g} Hz make {value:.2g} samples in a period of {what} at {frequency:.4g} Hz",
-        "is it {likely}?",
+        "{likely}",
         unless=("stiffness",),
     ),
     Range(

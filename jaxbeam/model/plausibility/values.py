@@ -16,10 +16,13 @@ from jaxbeam.model.plausibility.facts import GRAVITY, Facts
 
 INF = math.inf
 SOUND_SPEED = 5000.0  # m/s, of waves in steel, aluminium, timber along the grain; concrete 3500
+WALKING, LARGEST_PERSON = (0.5, 3.0), 1200.0  # m/s, N
 ROAD_KINDS = ("quarter-car", "half-car")
 ROAD_SPEED, RAIL_SPEED = 60.0, 120.0  # m/s; 1.2 times 350 km/h is 117 m/s
 CLAMPING_STIFFNESS = 10.0  # E I / L: of two springs that hold the rotation, too
 SUPPORTED = 1e-3  # of the largest influence on a mode: a place that moves as little is held
+LEAST_SAMPLES = 2.0  # in a period
+LARGEST_IN_KHZ = 10.0  # of a sample rate of 10 kHz
 SMALL_UNITS = {"m": "mm", "m/s": "mm/s", "m/s^2": "mm/s^2", "1": "1e-6", "Pa": "MPa"}
 
 
@@ -393,6 +396,16 @@ def weight_of_load(facts):
     return _weights(facts, ("mass", "force", "oscillator"))
 
 
+def mass_on_foot(facts):
+    """Mass (kg) of a load that moves as fast as people walk, if it may be a weight in N."""
+    for address, load in facts.loads("mass", "oscillator"):
+        mass = float(load.mass)
+        walks = load.speed is not None and WALKING[0] <= abs(float(load.speed)) <= WALKING[1]
+        if facts.is_bridge and walks and mass <= LARGEST_PERSON:
+            words = {"speed": abs(float(load.speed)), "people": mass / GRAVITY}
+            yield Value(f"{address}.mass", mass, words)
+
+
 def weight_over_force(facts):
     """Weight of the masses of axles over the forces with which they press."""
     for address, load in facts.loads("axles"):
@@ -496,6 +509,7 @@ def speed_ratio(facts):
 # Profile, sensors, controller, run
 
 
+WAVES = {"sine": ("amplitude", 2.0), "bump": ("height", 1.0), "step": ("height", 1.0)}
 PROFILE_FIELDS = ("amplitude", "height", "point_heights", "amplitudes", "scale")
 
 
@@ -507,6 +521,14 @@ def height_of_profile(facts):
         height = float(np.ptp(heights))
         words = {"height": height, "should": _profile_unit(name)}
         yield Value(f"{address}{name}", height / facts.length, words)
+
+
+def rise_of_waves(facts):
+    """Rise (m) of a sine, bump or step of the surface of a bridge, whose height is one number."""
+    for address, profile in _parts(facts, "profile"):
+        if facts.is_bridge and profile.kind in WAVES:
+            name, share = WAVES[profile.kind]
+            yield Value(f"{address}.{name}", share * abs(float(getattr(profile, name))))
 
 
 def slope_of_profile(facts):
@@ -633,9 +655,11 @@ def samples_of_record(facts):
     if any(sensor.quantity == "acceleration" for sensor in facts.case.sensors):
         mode = min(3, facts.frequencies.size)
     frequency = float(facts.frequencies[mode - 1])
-    likely = "in Hz, not in kHz"
+    likely = f"give more than {LEAST_SAMPLES * frequency:.3g} Hz"
     if rate < 1:
-        likely = f"samples per second, not a time step, of which {1 / rate:.4g} Hz is the inverse"
+        likely += f", or {1 / rate:.4g} Hz if it is the time step in s"
+    elif rate < LARGEST_IN_KHZ:
+        likely += ", or is it in kHz?"
     words = {"rate": rate, "what": f"mode {mode}", "frequency": frequency, "likely": likely}
     yield Value("run.sample_rate", rate / frequency, words)
 
