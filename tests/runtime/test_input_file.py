@@ -189,7 +189,7 @@ GARBAGE = {
         ("x.tdms", tuning.read_log, "x.tdms: this is no LabVIEW"),
         ("x.mat", tuning.read_log, "x.mat: this is no MATLAB file"),
         ("x.xlsx", tuning.read_log, "x.xlsx: this is no Excel file"),
-        ("x.uff", tuning.read_log, "x.uff: this is no universal file"),
+        ("x.uff", tuning.read_log, "x.uff: this is no universal file, whatever"),
         ("x.nc", tuning.read_log, "x.nc: this is no netCDF file"),
         ("x.nc", jb.read_record, "x.nc is no classic netCDF file"),
         ("x.mat", read_gains, "x.mat: not a file of gains"),

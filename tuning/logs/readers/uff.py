@@ -127,4 +127,4 @@ def _direction(code: int) -> str:
     return f"-{axis}" if code < 0 else axis
 
 
-FORMAT = LogFormat("universal file", read_uff, suffixes=(".uff", ".unv"), magics=MAGICS)
+FORMAT = LogFormat("universal", read_uff, suffixes=(".uff", ".unv"), magics=MAGICS)
