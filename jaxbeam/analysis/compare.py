@@ -130,7 +130,9 @@ def metrics_over_cases(comparisons: Sequence[Comparison]) -> dict[str, MetricsOv
     table = {}
     for name in comparisons[0].metrics:
         metrics = [comparison.metrics[name] for comparison in comparisons]
-        shares = [one.share for one in metrics]
+        # Not of runs in which nothing can be attained; NaN where one diverges.
+        shares = [one.share for one in metrics if np.isnan(one.peak) or not np.isnan(one.share)]
+        shares = shares or [np.nan]
         table[name] = MetricsOverCases(
             peak=float(np.max([one.peak for one in metrics])),
             worst_share=float(np.min(shares)),
@@ -139,6 +141,16 @@ def metrics_over_cases(comparisons: Sequence[Comparison]) -> dict[str, MetricsOv
             saturated=float(np.max([one.saturated for one in metrics])),
         )
     return table
+
+
+def worst_comparison(comparisons: Sequence[Comparison], name: str) -> int:
+    """Number of the comparison with the least share of a controller; none is less than divergence.
+
+    Runs in which nothing can be attained count last.
+    """
+    metrics = [comparison.metrics[name] for comparison in comparisons]
+    shares = [-np.inf if np.isnan(one.peak) else one.share for one in metrics]
+    return int(np.argmin(np.nan_to_num(shares, nan=np.inf, neginf=-np.inf)))
 
 
 def _simulate_with(case: Case, name: str, controller: AbstractController) -> Record:

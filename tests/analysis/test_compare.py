@@ -11,7 +11,13 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from jaxbeam.analysis.compare import compare
+from jaxbeam.analysis.compare import (
+    Comparison,
+    PerformanceMetrics,
+    compare,
+    metrics_over_cases,
+    worst_comparison,
+)
 from jaxbeam.analysis.margins import LOAD_POSITIONS, stability_margin
 from jaxbeam.cli import main
 from jaxbeam.files.case_file import load_controller
@@ -254,3 +260,24 @@ def test_errors_are_named(folder, monkeypatch, capsys, line, message):
     code, printed, errors = run(line, folder, monkeypatch, capsys)
     assert (code, printed) == (2 if "leave out -o" in message else 1, "")
     assert message in errors
+
+
+@pytest.mark.parametrize(
+    ("peaks", "shares", "worst", "least"),
+    [
+        ([1.0, 2.0, 3.0], [0.9, 0.2, 0.5], 1, 0.2),
+        ([1.0, np.nan, 3.0], [0.9, np.nan, 0.2], 1, np.nan),  # it diverges
+        ([1.0, 2.0, 3.0], [0.9, np.nan, 0.2], 2, 0.2),  # nothing can be attained
+        ([1.0, np.nan, np.nan], [np.nan, np.nan, np.nan], 1, np.nan),
+        ([1.0], [np.nan], 0, np.nan),
+    ],
+)
+def test_the_worst_run_is_the_one_that_is_named(peaks, shares, worst, least):
+    comparisons = []
+    for peak, share in zip(peaks, shares, strict=True):
+        metrics = PerformanceMetrics(peak, 0.0, 0.0, np.zeros(1), np.zeros(1), share, None, ())
+        comparison = object.__new__(Comparison)
+        object.__setattr__(comparison, "metrics", {"law": metrics})
+        comparisons.append(comparison)
+    assert worst_comparison(comparisons, "law") == worst
+    assert_allclose(metrics_over_cases(comparisons)["law"].worst_share, least)

@@ -395,6 +395,29 @@ def test_sweep_prints_where_peaks_are_and_writes_rows(run, folder):
     assert "no run loses contact" in printed
 
 
+def test_prescribed_forces_pull_as_given_and_lose_no_contact(run, folder):
+    (folder / "pull.toml").write_text(
+        """
+        beam = {length = 20.0, flexural_rigidity = 5e9, mass_per_length = 8e3}
+        sensors = [{position = 10.0}]
+        run = {duration = 2.5}
+        [[loads]]
+        kind = "varying-force"
+        force = 1e4
+        frequencies = [3.0]
+        amplitudes = [2e4]
+        phases = [0.0]
+        speed = 10.0
+        """
+    )
+    printed = run("sweep pull.toml --over loads.0.speed=10,12")
+    assert "smallest contact force -10000 N" in printed
+    assert "no run loses contact, as the force is prescribed" in printed
+    printed = run("simulate pull.toml")
+    assert "is negative at times, down to -1e+04 N, as given" in printed
+    assert "pulls, as given" in printed and "would lift" not in printed
+
+
 def test_fractiles_of_a_sweep_over_seeds(run, folder):
     """Of three seeds the median is the middle one; what is written is whole."""
     profile = "--set profile.kind=iso8608 --set profile.class=A --set profile.scale=0.02"

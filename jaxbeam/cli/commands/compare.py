@@ -101,7 +101,7 @@ def compare(
 
 def _report_runs(case, laws, path: Path, period, options: CaseOptions) -> None:
     """Report the controllers over the runs of a file."""
-    from jaxbeam.analysis.compare import metrics_over_cases
+    from jaxbeam.analysis.compare import metrics_over_cases, worst_comparison
     from tuning.control.load_cases import read_load_cases
     from tuning.control.tuning_result import compare_runs
 
@@ -111,8 +111,7 @@ def _report_runs(case, laws, path: Path, period, options: CaseOptions) -> None:
     overall = metrics_over_cases(comparisons)
     lines = [f"over {len(runs)} runs of {path}:", *_overall_table(overall)]
     for name in overall:
-        shares = [one.metrics[name].share for one in comparisons]
-        worst = shares.index(min(shares))
+        worst = worst_comparison(comparisons, name)
         where = ", ".join(f"{address} = {value:.4g}" for address, value in runs[worst].items())
         verdicts = [one.metrics[name].stability_margin.verdict for one in comparisons]
         unstable = verdicts.count("unstable")

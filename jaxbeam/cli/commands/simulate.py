@@ -105,7 +105,11 @@ def _wheel_lines(record: "jb.Record") -> list[str]:
         if wheels.size > MAX_WHEELS:
             names = _extreme_wheels(names, unloading=unloading, lowest=-lowest, largest=largest)
         rows += [
-            (name, *(f"{f[i]:.6g}" for f in (static, lowest, largest)), _percent(unloading[i]))
+            (
+                name,
+                *(f"{f[i]:.6g}" for f in (static, lowest, largest)),
+                _percent(unloading[i], bool(loads.prescribed[i])),
+            )
             for i, name in names.items()
         ]
     forces = ("static load (N)", "lowest contact force (N)", "largest (N)")
@@ -145,9 +149,10 @@ def _extreme_wheels(labels: dict[int, str], **values) -> dict[int, str]:
     }
 
 
-def _percent(share: float) -> str:
+def _percent(share: float, prescribed: bool) -> str:
+    """Unloading of a wheel; a prescribed force that pulls does so because it was given so."""
     if share > 1:
-        return "would lift"
+        return "pulls, as given" if prescribed else "would lift"
     return "-" if share != share else f"{max(share, 0.0):.1%}"
 
 
