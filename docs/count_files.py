@@ -64,7 +64,7 @@ def record_files(run: str, names: dict) -> None:
     sys.setprofile(profile)
     exec(run, names)
     sys.setprofile(None)
-    called = {code.co_filename for code in codes if code.co_name != "<module>"}
+    called = {code.co_filename for code in codes.copy() if code.co_name != "<module>"}
     inside = {Path(name) for name in called if Path(name).is_relative_to(ROOT)}
     parts = sorted(path.relative_to(ROOT) for path in inside)
     print("\n".join(str(path) for path in parts if path.parts[0] in PACKAGES))
