@@ -19,6 +19,10 @@ SAMPLING = re.compile(
     r"|controller\.(period|delay|dropout|jitter|times\.\d+)"
 )
 SENSOR_DELAY = re.compile(r"sensors\.[^.]+\.delay")
+# Numbers with which laws compare something at samples (`deciding`).
+DECIDING = re.compile(
+    r"controller\.(confirmation|(load_identification\.)?until|load_identification\.threshold)"
+)
 LOG_ADDRESS = re.compile(r"logs\.(\d+)\.(.+)")
 BOUND_MARGIN = 1e-3  # of the typical size: how far a start on a bound is moved in
 
@@ -154,7 +158,8 @@ def free_parameters(
 def check_continuous(case: Case, address: str) -> None:
     """Raises ValueError for a number that a search by derivatives cannot change.
 
-    It decides when samples are taken, which a search keeps, or how they are rounded.
+    It decides when samples are taken, which a search keeps, how they are rounded, or what a law
+    does at samples.
     """
     own_delay = SENSOR_DELAY.fullmatch(address)
     sampled = case.controller is not None and case.controller.period is not None
@@ -167,6 +172,12 @@ def check_continuous(case: Case, address: str) -> None:
         raise ValueError(
             f"{address} cannot be free: what is rounded to it jumps, so that it has no derivative;"
             " compare several of its values"
+        )
+    stepped = getattr(case.controller, "between", None) == "stepped"
+    if DECIDING.fullmatch(address) or (stepped and address.startswith("controller.masses.")):
+        raise ValueError(
+            f"{address} cannot be free: it decides at samples, so that commands jump with it and it"
+            " has no derivative; compare several of its values"
         )
 
 
