@@ -58,6 +58,7 @@ class CSource:
         self.notes: list[str] = []
         self.missing: list[str] = []
         self.operations = 0
+        self.difference_step = 1.0  # relative; derivatives by differences divide rounding by it
 
     def constant(self, name: str, values) -> str:
         """Constant array of numbers; its name in C, which is unique. Of one number its value."""

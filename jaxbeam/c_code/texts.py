@@ -28,9 +28,9 @@ def at_samples(function: Callable, code: CSource, varies: bool = True) -> tuple[
     )
 
 
-# Of commands, relative to the largest, in double and single precision. Rounding makes 1e-12 and
+# Of commands, relative to the largest, in double and single precision. Rounding makes ROUNDING and
 # less; filters that invert their sensors and programs with many limits may magnify it.
-TOLERANCE, FLOAT_TOLERANCE = 1e-10, 1e-2
+ROUNDING, TOLERANCE, FLOAT_TOLERANCE = 1e-12, 1e-10, 1e-2
 
 
 def header_text(name: str, title: list[str], code: CSource) -> str:
@@ -158,7 +158,7 @@ def check_text(name: str, code: CSource, received: Sequence[str]) -> str:
             "\n            /* The actuators received the recorded command: without the loop a"
             f"\n               law may be unstable, and multiply its own rounding. */{receive}"
         )
-    gates = ""
+    gates, tolerance = "", max(TOLERANCE, ROUNDING / code.difference_step)
     if code.gate_loads:
         gates = f"""
         while (event < GATE_EVENTS && gate_event[2 * event] <= sample_time[k]) {{
@@ -182,7 +182,7 @@ enum {{ INPUTS = {big}_SENSORS + {big}_GIVEN_STATES }};
 int main(void)
 {{
     const int is_single = sizeof({name}_real) < sizeof(double);
-    const double tolerance = is_single ? {FLOAT_TOLERANCE!r} : {TOLERANCE!r};
+    const double tolerance = is_single ? {FLOAT_TOLERANCE!r} : {tolerance!r};
     static {name}_state state;
     {name}_real measurements[INPUTS + 1] = {{0}}, commands[{big}_COMMANDS];
     double largest = 0, error = 0;

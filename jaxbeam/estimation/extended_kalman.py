@@ -19,7 +19,9 @@ from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.runtime.arrays import Array, Number, set_at, xp
 
-STEP = 1e-4  # of length, speed and mass of the design; over these derivatives are differences
+DIFFERENCE_STEP = (
+    1e-4  # of length, speed and mass of the design; over these derivatives are differences
+)
 
 
 class ExtendedKalman(AbstractKalmanEstimator):
@@ -108,7 +110,7 @@ class ExtendedKalman(AbstractKalmanEstimator):
             xp.pad(intensity, (0, NUMBERS * loads)) + xp.diag(noise),
             set_at(no_state, of_numbers, numbers),
             covariance,
-            STEP * xp.concatenate([length, xp.abs(speed) + length, masses]),
+            DIFFERENCE_STEP * xp.concatenate([length, xp.abs(speed) + length, masses]),
             plant.loads.inertia[:, 0] / masses,
             plant.modal_model.state_count,
         )

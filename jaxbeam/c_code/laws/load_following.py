@@ -23,6 +23,7 @@ from jaxbeam.control.load_identification import (
     GivenLoad,
 )
 from jaxbeam.estimation.crossing_filter import NUMBERS, LoadFollowingFilter
+from jaxbeam.estimation.extended_kalman import DIFFERENCE_STEP
 from jaxbeam.estimation.observer import sensor_offsets
 from jaxbeam.numerics.discretisation import DOUBLINGS, SERIES_TERMS
 
@@ -369,6 +370,7 @@ def _constants(filter: LoadFollowingFilter, code: CSource) -> dict:
         "variance": np.diagonal(filter.sensor_chain.noise_covariance),
     }
     found = {name: code.constant(f"filter_{name}", value) for name, value in values.items()}
+    code.difference_step = DIFFERENCE_STEP
     return found | {"segments": segments, "degrees": degrees}
 
 
