@@ -22,7 +22,9 @@ MODULES = {
     "ride": "jaxbeam.analysis",
     "receptance_method": "jaxbeam.control",
     "frequency_responses": "jaxbeam.model",
-    "planar": "jaxbeam.case.loads",
+    "vehicles": "jaxbeam.case.loads",
+    "actuators": "jaxbeam.case",
+    "statics": "jaxbeam.model",
     "profiles": "jaxbeam.case",
     "sections": "jaxbeam.analysis",
 }

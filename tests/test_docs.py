@@ -24,8 +24,8 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.estimator import AbstractEstimator
 from jaxbeam.case.fields import PACKAGES, import_modules
 from jaxbeam.case.loads.base import AbstractLoad
-from jaxbeam.case.loads.planar.vehicle import load_vehicle
-from jaxbeam.case.loads.planar.vehicle_parts import VehicleSensor
+from jaxbeam.case.loads.vehicles.vehicle import load_vehicle
+from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSensor
 from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.files.case_file import case_from_dict

@@ -13,7 +13,7 @@ from tests.modules import PACKAGES, ROOT, module_files, parse
 # no longer name here covers. One import may point down: methods of results that are called `plot`
 # or `plot_...` forward to `jaxbeam.plot`.
 ORDER = """
-jaxbeam.runtime  jaxbeam.vehicles
+jaxbeam.runtime  jaxbeam.library
 jaxbeam.case
 jaxbeam.numerics
 jaxbeam.model

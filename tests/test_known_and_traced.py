@@ -25,12 +25,12 @@ from jaxbeam.integrator.propagators import propagators
 from jaxbeam.integrator.static_shapes import static_shapes
 from jaxbeam.integrator.time_grid import grid_by_step_length
 from jaxbeam.model.contact import contact_at
+from jaxbeam.model.deflection_lines import static_deflection_per_command
 from jaxbeam.model.flexibility import flexibility
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.output_rows import sensor_rows
-from jaxbeam.model.statics import static_deflection_per_command
 from jaxbeam.runtime.arrays import any_jax, xp
 from jaxbeam.runtime.compiling import LOW_OPTIMISATION, xla_options
 from jaxbeam.simulation.integration_plan import integration_plan, sample_times
@@ -137,13 +137,13 @@ FUNCTIONS = {
         jb.influence_line(case, X, X[:2, None], derivative, layout) for derivative in (0, 2, 3)
     ],
     "influence at a point": lambda case, layout: jb.influence_line(case, 0.3, 0.8, layout=layout),
-    "static deflection": lambda case, layout: jb.static_deflection(
+    "static deflection": lambda case, layout: jb.statics.static_deflection(
         case, X, X[:2], np.array([2.0, -1.0]), layout=layout
     ),
     "deflection per command": lambda case, layout: static_deflection_per_command(
         case, X, layout=layout
     ),
-    "static peak": lambda case, layout: jb.static_peak(case, X, layout),
+    "static peak": lambda case, layout: jb.statics.static_peak(case, X, layout),
     "frequency response": lambda case, layout: jb.frequency_response(
         case,
         np.array([1.0, 20.0, 70.0]),

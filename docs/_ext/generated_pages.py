@@ -90,7 +90,8 @@ def public_names() -> dict[str, list[tuple[str, str]]]:
             if one is tuning:  # has its own turn
                 continue
             if inspect.ismodule(one):
-                found = [(one.__name__, inner) for inner in one.__all__]
+                inner_names = [inner for inner in one.__all__ if inner not in package.__all__]
+                found = [(one.__name__, inner) for inner in inner_names]
                 pages[group_of(one.__name__)] += found
             else:
                 pages[group_of(one.__module__)].append((package.__name__, name))

@@ -15,11 +15,11 @@ import jaxbeam as jb
 import tuning
 from experiments.studies.creep import CreepFit, fitted_creep
 from jaxbeam import rigs
-from jaxbeam.model.statics import static_deflection_per_command
+from jaxbeam.model.deflection_lines import static_deflection_per_command
 from jaxbeam.simulation.commands import command_operator
 
-HYSTERESIS = jb.Hysteresis([0.0, 0.5, 1.5, 3.0], [0.75, 0.12, 0.08, 0.08])
-CREEP = jb.Creep([10.0, 1.0, 0.1], [0.02, 0.02, 0.02])
+HYSTERESIS = jb.actuators.Hysteresis([0.0, 0.5, 1.5, 3.0], [0.75, 0.12, 0.08, 0.08])
+CREEP = jb.actuators.Creep([10.0, 1.0, 0.1], [0.02, 0.02, 0.02])
 TURNS = np.array([0.0, 3.0, 3.0, -1.0, -1.0, 6.0, 6.0, -2.0, 7.0, 7.0, 0.0])  # V, a turn each 3 s
 INTERVAL, NOISE = 0.1, 2e-7  # s; m
 PERIOD = 0.05

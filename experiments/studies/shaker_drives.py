@@ -20,10 +20,12 @@ FREQUENCIES = np.geomspace(1.0, 100.0, 600)  # Hz
 TOLERANCE = 0.1  # of the force at 1 Hz, by which a precise force may differ
 LOOPS: dict[str, AbstractInnerLoop | None] = {
     "voltage": None,
-    "current, 2000 1/s": jb.CurrentLoop(bandwidth=2e3),
-    "force, 2000 1/s": jb.ForceLoop(bandwidth=2e3),
-    "force, 20000 1/s": jb.ForceLoop(bandwidth=2e4),
-    "force, 2000 1/s, sensor of 50 Hz": jb.ForceLoop(bandwidth=2e3, sensor_bandwidth=314.0),
+    "current, 2000 1/s": jb.actuators.CurrentLoop(bandwidth=2e3),
+    "force, 2000 1/s": jb.actuators.ForceLoop(bandwidth=2e3),
+    "force, 20000 1/s": jb.actuators.ForceLoop(bandwidth=2e4),
+    "force, 2000 1/s, sensor of 50 Hz": jb.actuators.ForceLoop(
+        bandwidth=2e3, sensor_bandwidth=314.0
+    ),
 }
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 import jaxbeam as jb
 from experiments.validation.check import Check, max_entrywise_error, max_relative_error
-from jaxbeam.model.influence import static_peak
+from jaxbeam.model.statics import static_peak
 from jaxbeam.simulation.integration_plan import integration_plan
 from tests.adaptive_reference import simulate_adaptive
 from tests.as_oracle import as_oracle

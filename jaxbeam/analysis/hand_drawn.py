@@ -6,7 +6,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.controller import commanded
 from jaxbeam.case.fields import concrete
 from jaxbeam.control.feedforward import Feedforward
-from jaxbeam.model.statics import influence_line, static_deflection_per_command
+from jaxbeam.model.deflection_lines import influence_line, static_deflection_per_command
 
 POINTS = 21  # shares of the crossing at which the table is drawn
 RAMP_UP, RAMP_DOWN = 0.2, 0.1  # shares of the crossing, at entry and exit

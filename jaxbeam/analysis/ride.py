@@ -209,7 +209,7 @@ class RideMeasures(NamedTuple):
     those at the centre of mass.
 
     >>> import jaxbeam as jb
-    >>> wagon = jb.VehicleLoad(model="manchester-wagon", speed=50.0)
+    >>> wagon = jb.vehicles.VehicleLoad(model="manchester-wagon", speed=50.0)
     >>> case = jb.Case(jb.Beam(20.0, 1e10, 12e3), loads=[wagon], run=jb.Run(1.5))
     >>> ride = jb.ride.ride_measures(jb.simulate(case))
     >>> print(ride.bodies, f"{ride.wheel_unloading.max():.3f}")

@@ -1,4 +1,4 @@
-"""Dynamic amplification, influence lines and characteristic points of sections."""
+"""Quantities along the beam: envelopes, amplification, moments and forces of sections."""
 
 import dataclasses
 import itertools
@@ -16,16 +16,18 @@ from jaxbeam.case.quantities import QUANTITIES, quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.integrate import integrate_peaks
 from jaxbeam.model.along_beam import LEFT_SHARE, positions_along, refined, sections
-from jaxbeam.model.influence import (
+from jaxbeam.model.load_set import load_set
+from jaxbeam.model.static_correction import bending_moment, shear_force
+from jaxbeam.model.statics import (
     REACTION,
     held_positions,
     influence_line,
     static_peak,
 )
-from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.module import Module
+from jaxbeam.simulation.corrected_deflection import corrected_deflection
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import integration_setup
@@ -33,8 +35,11 @@ from jaxbeam.simulation.simulate import integration_setup
 __all__ = [
     "Envelope",
     "amplification",
+    "bending_moment",
     "characteristic_points",
+    "corrected_deflection",
     "envelope",
+    "shear_force",
 ]
 
 AMPLIFIED = tuple(name for name, entry in QUANTITIES.items() if not entry.time_derivative)

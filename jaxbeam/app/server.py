@@ -23,9 +23,9 @@ from starlette.staticfiles import StaticFiles
 import jaxbeam as jb
 from jaxbeam.app import take_away, views
 from jaxbeam.app.workspace import MAX_BYTES, Workspace
-from jaxbeam.case.loads.planar.vehicle import vehicle_names
+from jaxbeam.case.loads.vehicles.vehicle import vehicle_names
+from jaxbeam.library.published import trains
 from jaxbeam.model.plausibility.check import leave_warnings_to_caller
-from jaxbeam.vehicles.library import trains
 
 STATIC = Path(__file__).parent / "static"
 LOOPBACK = "127.0.0.1"

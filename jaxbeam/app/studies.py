@@ -149,7 +149,7 @@ def describe_log(log: Any) -> dict[str, Any]:
             for name, quantity, unit in zip(log.names, log.quantities, log.units, strict=True)
         ],
         "loads": None if log.loads is None else [load.kind for load in log.loads],
-        "faults": [str(fault) for fault in tuning.find_faults(log)],
+        "faults": [str(fault) for fault in tuning.logs.find_faults(log)],
         "notes": list(log.notes),
         "times": log.times[chosen],
         "values": log.values[chosen].T,

@@ -8,7 +8,7 @@ import jaxbeam as jb
 from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.loads.planar.vehicle import vehicle_names
+from jaxbeam.case.loads.vehicles.vehicle import vehicle_names
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.model.along_beam import positions_along
 from jaxbeam.model.load_set import LoadSet, load_set
@@ -85,7 +85,7 @@ def vehicles() -> list[dict[str, Any]]:
     """Vehicles of the library: names, masses (kg), and what to draw of them."""
     found = []
     for name in vehicle_names():
-        load = jb.VehicleLoad(model=name, speed=1.0)
+        load = jb.vehicles.VehicleLoad(model=name, speed=1.0)
         drawn = drawn_vehicle(load)
         model = load.vehicle(np.float64(9.81))
         entry = {"name": name, "positions": drawn.wheels.tolist()}

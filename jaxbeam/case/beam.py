@@ -55,8 +55,8 @@ def rayleigh_coefficients(frequencies, ratios) -> Float[Array, "2"]:
     zeta = a / (2 omega) + b omega / 2 holds at both `frequencies` (2,) in Hz for the damping
     `ratios` (2,): `rayleigh_damping` of a beam. Raises ValueError for equal frequencies.
 
-    >>> import jaxbeam as jb
-    >>> print(jb.rayleigh_coefficients([2.0, 8.0], [0.01, 0.01]).round(6))
+    >>> from jaxbeam.case.beam import rayleigh_coefficients
+    >>> print(rayleigh_coefficients([2.0, 8.0], [0.01, 0.01]).round(6))
     [0.201062 0.000318]
     """
     omega, ratios = 2 * xp.pi * xp.asarray(frequencies, float), xp.asarray(ratios, float)

@@ -27,7 +27,7 @@ from jaxbeam.case.fields import (
 )
 from jaxbeam.case.former_words import attribute_address, present_address
 from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
-from jaxbeam.case.loads.planar.vehicle_parts import VehicleSensor
+from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSensor
 from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.quantities import OF_QUANTITY
 from jaxbeam.case.reading.units import in_si

@@ -32,7 +32,7 @@ from jaxbeam.case.loads.base import (
     trajectory,
     wheel_distances,
 )
-from jaxbeam.case.loads.planar.vehicle_parts import VehicleSensor
+from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSensor
 from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor, sensor_labels

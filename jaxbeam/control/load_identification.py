@@ -85,9 +85,9 @@ class AbstractLoadIdentifier(AbstractLoadSource):
 
     `influence_lines` (m/N) are deflections at the sensors `sensor_indices` under a unit force at
     positions spaced evenly along the beam, by the modes of the design model (exact ones:
-    `jaxbeam.model.statics.influence_line`); `static_lift` is the static deflection there per unit
-    of each command, `offset` the offset of the readings (m). `until` is the share of the crossing
-    up to which samples are used. Samples at which a deflection is missing are left out.
+    `jb.influence_line`); `static_lift` is the static deflection there per unit of each command,
+    `offset` the offset of the readings (m). `until` is the fraction of the crossing up to which
+    samples are used. Samples at which a deflection is missing are left out.
     """
 
     length: Float[Array, ""]
@@ -367,6 +367,7 @@ def identified_load(record: Any, settings: LoadIdentification) -> IdentifiedLoad
     Raises ValueError for settings that do not suit the case.
 
     >>> import jaxbeam as jb
+    >>> from jaxbeam.control.load_identification import identified_load
     >>> case = jb.Case(
     ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=2),
     ...     actuators=[jb.PointForce(0.3)],
@@ -378,7 +379,7 @@ def identified_load(record: Any, settings: LoadIdentification) -> IdentifiedLoad
     ...     run=jb.Run(0.15),
     ... )
     >>> settings = jb.LoadIdentification(gates=[-0.1, -0.05])
-    >>> found = jb.identified_load(jb.simulate(case), settings)
+    >>> found = identified_load(jb.simulate(case), settings)
     >>> print(f"{found.mass:.2f} kg at {found.speed:.2f} m/s")
     0.41 kg at 4.00 m/s
     """

@@ -21,7 +21,7 @@ from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.declared_checks import describe_value, suggestion
 from jaxbeam.case.fields import concrete, kind_of, kinds
 from jaxbeam.case.former_words import attribute_address
-from jaxbeam.case.loads.planar.vehicle import IMPLIED, is_path
+from jaxbeam.case.loads.vehicles.vehicle import IMPLIED, is_path
 from jaxbeam.case.reading.tables import read_part, read_parts
 from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.case.validation import check_case

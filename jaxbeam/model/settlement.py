@@ -188,7 +188,7 @@ def settlement_response(
     >>> two_spans = jb.Case(
     ...     jb.Beam(length=4.0, flexural_rigidity=6.0, mass_per_length=1.0), [jb.Support(2.0)]
     ... )
-    >>> curvature = jb.settlement_response(two_spans, [0.1], x=2.0, derivative=2)
+    >>> curvature = jb.statics.settlement_response(two_spans, [0.1], x=2.0, derivative=2)
     >>> print(f"{6.0 * curvature:.3f} N m")  # 3 E I s / l^2
     0.450 N m
     """

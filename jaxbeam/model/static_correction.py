@@ -14,14 +14,14 @@ from jaxtyping import Float
 from jaxbeam.case.beam import has
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import is_concrete
-from jaxbeam.model.flexibility import check_supported
-from jaxbeam.model.modal_model import modal_model
-from jaxbeam.model.modes import Layout, Modes, mesh_layout
-from jaxbeam.model.statics import (
+from jaxbeam.model.deflection_lines import (
     static_deflection_per_port_force,
     unchecked_influence_line,
     validated_layout,
 )
+from jaxbeam.model.flexibility import check_supported
+from jaxbeam.model.modal_model import modal_model
+from jaxbeam.model.modes import Layout, Modes, mesh_layout
 from jaxbeam.model.theory.elements import rigidity_at
 from jaxbeam.runtime.arrays import Array, is_known, set_at, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
@@ -206,7 +206,7 @@ def bending_moment(case: Case, x, curvature, commands=None) -> Float[Array, "...
     >>> import jaxbeam as jb
     >>> beam = jb.Case(jb.Beam(length=2.0, flexural_rigidity=6.0, mass_per_length=1.0))
     >>> curvature = jb.influence_line(beam, x=0.5, load_positions=1.0, derivative=2)
-    >>> print(f"{jb.bending_moment(beam, 0.5, curvature):.3f} N m")  # F x / 2
+    >>> print(f"{jb.sections.bending_moment(beam, 0.5, curvature):.3f} N m")  # F x / 2
     0.250 N m
     """
     x = xp.asarray(x, float)
@@ -238,7 +238,7 @@ def shear_force(case: Case, x, third_derivative) -> Float[Array, "..."]:
     >>> import jaxbeam as jb
     >>> beam = jb.Case(jb.Beam(length=2.0, flexural_rigidity=6.0, mass_per_length=1.0))
     >>> third = jb.influence_line(beam, x=0.5, load_positions=1.0, derivative=3)
-    >>> print(f"{jb.shear_force(beam, 0.5, third):.3f} N")  # half of 1 N at midspan
+    >>> print(f"{jb.sections.shear_force(beam, 0.5, third):.3f} N")  # half of 1 N at midspan
     0.500 N
     """
     return section_stiffness(case, xp.asarray(x, float)) * third_derivative

@@ -38,15 +38,15 @@ def coil_history(
     Raises ValueError as `simulate` does, and if the actuator is no electrodynamic shaker.
 
     >>> import jaxbeam as jb
+    >>> from jaxbeam.simulation.coil_history import coil_history
+    >>> loop = jb.actuators.CurrentLoop(bandwidth=2e3)
     >>> case = jb.Case(
     ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.2, modes=2),
-    ...     actuators=[
-    ...         jb.Electrodynamic(0.3, 3.0, 1e-3, 8.0, inner_loop=jb.CurrentLoop(bandwidth=2e3))
-    ...     ],
+    ...     actuators=[jb.Electrodynamic(0.3, 3.0, 1e-3, 8.0, inner_loop=loop)],
     ...     controller=jb.Prescribed(offsets=[0.5], period=0.01),
     ...     run=jb.Run(0.4, sample_rate=200.0),
     ... )
-    >>> coil = jb.coil_history(case)
+    >>> coil = coil_history(case)
     >>> print(f"{coil.current[-1]:.3f} A, {coil.voltage[-1]:.2f} V, {coil.force[-1]:.2f} N")
     0.500 A, 1.50 V, 4.00 N
     """

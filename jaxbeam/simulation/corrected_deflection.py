@@ -19,7 +19,7 @@ def corrected_deflection(record: Record, x, derivative: int = 0) -> Float[Array,
     >>> case = jb.Case(
     ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingMass(mass=0.5, speed=2.0)]
     ... )
-    >>> print(jb.corrected_deflection(jb.simulate(case), 0.3).shape)
+    >>> print(jb.sections.corrected_deflection(jb.simulate(case), 0.3).shape)
     (1001,)
     """
     return corrected_history(record.case, record.modes, record.motion, x, derivative)

@@ -23,8 +23,8 @@ from jaxbeam.analysis.assessment.static_checks import (
 )
 from jaxbeam.analysis.assessment.train_checks import checked_sections
 from jaxbeam.analysis.sections import characteristic_points
+from jaxbeam.library.published import trains
 from jaxbeam.model.sensing.output_rows import counted_frequency
-from jaxbeam.vehicles.library import trains
 from tests.modules import ROOT
 
 DATA = json.loads((ROOT / "tests" / "data" / "railway_code.json").read_text())

@@ -59,8 +59,8 @@ def test_moment_of_a_lorry_on_one_span():
     lorry = jb.Axles(offsets=offsets, forces=forces, speed=1.0)
     case = jb.Case(beam(published["length"]), loads=[lorry])
     near = published["at"] + np.linspace(-0.5, 0.5, 21)
-    moments = RIGIDITY * np.asarray(jb.static_peak(case, near, derivative=2))
-    at_place = RIGIDITY * float(jb.static_peak(case, published["at"], derivative=2))
+    moments = RIGIDITY * np.asarray(jb.statics.static_peak(case, near, derivative=2))
+    at_place = RIGIDITY * float(jb.statics.static_peak(case, published["at"], derivative=2))
     assert_allclose(at_place, published["moment"], rtol=2e-4)
     assert at_place >= published["moment"] * (1 - 1e-6)
     assert moments.max() < published["moment"] * (1 + 1e-3)
@@ -79,7 +79,7 @@ def test_moments_of_the_table_of_a_code(i):
     train = jb.Axles(offsets=offsets, forces=1e3 * np.array(forces), speed=1.0)
     case = jb.Case(beam(float(length)), loads=[train])
     x = length * np.linspace(0.4, 0.6, 21)
-    moment = RIGIDITY * np.asarray(jb.static_peak(case, x, derivative=2)).max()
+    moment = RIGIDITY * np.asarray(jb.statics.static_peak(case, x, derivative=2)).max()
     assert_allclose(moment, expected, rtol=1e-3, atol=5e3)
 
 
@@ -138,7 +138,7 @@ def test_frequencies_and_statics_of_a_railway_bridge():
         peak = weight * max(np.convolve(lines[:, i], pattern).max() for i in range(nodes))
         assert_allclose(peak, published[name], rtol=1e-6)
     # The largest value at any place of the train is a little above it.
-    exact = float(jb.static_peak(case, x=12.5))
+    exact = float(jb.statics.static_peak(case, x=12.5))
     assert published["deflection"] < exact < 1.003 * published["deflection"]
 
 

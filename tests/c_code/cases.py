@@ -36,10 +36,10 @@ WEIGHTS = {
 }
 WEAK = WEIGHTS | {"command_weight": [1e-2, 1e-1]}
 OPERATORS = {
-    "hysteresis": jb.Hysteresis([0.0, 0.2, 0.5], [0.7, 0.2, 0.2]),
-    "compensation": jb.Hysteresis([0.0, 0.3], [0.75, 0.3]),
-    "creep": jb.Creep([9.0], [0.1]),
-    "creep_compensation": jb.Creep([10.0, 1.0], [0.06, 0.05]),
+    "hysteresis": jb.actuators.Hysteresis([0.0, 0.2, 0.5], [0.7, 0.2, 0.2]),
+    "compensation": jb.actuators.Hysteresis([0.0, 0.3], [0.75, 0.3]),
+    "creep": jb.actuators.Creep([9.0], [0.1]),
+    "creep_compensation": jb.actuators.Creep([10.0, 1.0], [0.06, 0.05]),
 }
 KALMAN = jb.Kalman(0.02, 1e-5)
 TWO_LOADS = [
@@ -178,7 +178,7 @@ CASES = {
             sampling="exact",
         ),
         actuators=[
-            jb.Patch(0.2, 0.3, 0.15, compensation=jb.Hysteresis([0.0, 0.1], [0.8, 0.3])),
+            jb.Patch(0.2, 0.3, 0.15, compensation=jb.actuators.Hysteresis([0.0, 0.1], [0.8, 0.3])),
             jb.PointForce(0.45),
         ],
     ),

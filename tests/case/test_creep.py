@@ -17,8 +17,8 @@ from jaxbeam.simulation.integration_plan import integration_plan
 from tests.case.test_hysteresis import OPERATOR, patch_case
 from tests.differences import central
 
-CREEP = jb.Creep([20.0, 2.0, 0.2], [0.05, 0.04, 0.03])
-OTHER = jb.Creep([12.0, 1.0], [0.06, 0.05])
+CREEP = jb.actuators.Creep([20.0, 2.0, 0.2], [0.05, 0.04, 0.03])
+OTHER = jb.actuators.Creep([12.0, 1.0], [0.06, 0.05])
 PERIOD = np.asarray(0.01)
 
 
@@ -51,7 +51,7 @@ def test_mean_over_each_period_is_that_of_the_equations():
 
 def test_step_response_rises_as_the_logarithm_of_time():
     """Equal weights a decade apart: as much in each decade, 0.02 a decade (within 8 %)."""
-    creep = jb.Creep(10.0 ** np.arange(3.0, -4.0, -1), np.full(7, 0.02))
+    creep = jb.actuators.Creep(10.0 ** np.arange(3.0, -4.0, -1), np.full(7, 0.02))
     times = np.array([0.1, 1.0, 10.0])
     final = 1 + 0.02 * np.sum(1 - np.exp(-creep.rates * times[:, None]), axis=1)
     found = [creep.outputs(np.ones(2), t)[1] for t in times]
@@ -105,8 +105,10 @@ def test_range_of_what_acts_holds_under_any_command():
 def loop(values, commands):
     """Sum of squares of what acts under commands, with feedback of what acted before."""
     weights, rates, gain = values[:3], values[3:5], values[5]
-    hysteresis = jb.Hysteresis(xp.asarray([0.0, 0.5, 1.5]), weights)
-    operator = command_operator(hysteresis, jb.Creep(rates, xp.asarray([0.1, 0.2])), PERIOD)
+    hysteresis = jb.actuators.Hysteresis(xp.asarray([0.0, 0.5, 1.5]), weights)
+    operator = command_operator(
+        hysteresis, jb.actuators.Creep(rates, xp.asarray([0.1, 0.2])), PERIOD
+    )
     state, total, output = operator.start(1), 0.0, xp.zeros(1)
     for command in commands:
         state = operator.follow(state, command - gain * output)
@@ -149,9 +151,15 @@ def test_derivatives_of_a_peak_in_the_loop():
 @pytest.mark.parametrize(
     ("creep", "message"),
     [
-        (jb.Creep([1.0, 2.0], [0.5]), "actuators.0.creep.weights must be as many as rates"),
-        (jb.Creep([0.0], [0.5]), "actuators.0.creep.rates.0 must be positive; it is 0 1/s"),
-        (jb.Creep([1.0], [-0.5]), "actuators.0.creep.weights.0 must not be negative"),
+        (
+            jb.actuators.Creep([1.0, 2.0], [0.5]),
+            "actuators.0.creep.weights must be as many as rates",
+        ),
+        (
+            jb.actuators.Creep([0.0], [0.5]),
+            "actuators.0.creep.rates.0 must be positive; it is 0 1/s",
+        ),
+        (jb.actuators.Creep([1.0], [-0.5]), "actuators.0.creep.weights.0 must not be negative"),
     ],
 )
 def test_errors(creep, message):

@@ -9,6 +9,7 @@ import tomllib
 import pytest
 
 import jaxbeam as jb
+import tuning
 from jaxbeam.case import former_words
 from jaxbeam.case.case import addresses
 from jaxbeam.case.controller import AbstractController
@@ -25,6 +26,8 @@ CASE = {
 SCHEDULED = {"kind": "feedback-scheduled", "masses": [0.2, 0.6], "gains": [[2e3, 4e3]]}
 GATES = {"gates": [-0.2, -0.1], "until": 0.3}
 
+MOVED = {jb: former_words.MOVED, tuning: tuning.MOVED}
+
 
 def with_controller(**table) -> jb.Case:
     return case_from_dict(CASE | {"controller": table | {"period": 0.01}})
@@ -34,7 +37,10 @@ def test_present_words_exist():
     words, classes = former_words.WORDS, kinds(AbstractController)
     assert {words["passage"], words["relief"]} <= set(classes)
     assert not words.keys() & set(classes)
-    assert {name.partition("(")[0] for name in former_words.NAMES.values()} <= set(jb.__all__)
+    assert {name.partition("(")[0] for name in former_words.NAMES.values()} <= {
+        *jb.__all__,
+        *former_words.MOVED,
+    }
     assert not former_words.KINDS.keys() & set(classes)
     assert {kind for kind, _ in former_words.KINDS.values()} <= set(classes)
     assert not set(former_words.NAMES) & set(jb.__all__)
@@ -52,12 +58,16 @@ def test_former_words_are_refused():
         jb.LQR([1.0], [1.0], places=[0.3])
 
 
-@pytest.mark.parametrize(("name", "module"), former_words.MOVED.items())
-def test_names_that_are_in_a_module_now(name, module):
-    with pytest.raises(AttributeError, match=re.escape(f"{name} is jaxbeam.{module}.{name} now")):
-        getattr(jb, name)
-    found = getattr(jb, module, None) or importlib.import_module(f"jaxbeam.{module}")
-    assert hasattr(found, name)
+@pytest.mark.parametrize(
+    ("package", "name", "module"),
+    [(one, *pair) for one in (jb, tuning) for pair in MOVED[one].items()],
+)
+def test_names_that_are_in_a_module_now(package, name, module):
+    present = f"{package.__name__}.{module}"
+    with pytest.raises(AttributeError, match=re.escape(f"{name} is {present}.{name} now")):
+        getattr(package, name)
+    found = getattr(package, module, None) or importlib.import_module(present)
+    assert hasattr(found, name) and name not in package.__all__
 
 
 @pytest.mark.parametrize(("old", "present"), former_words.KINDS.items())

@@ -15,8 +15,8 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.simulation.commands import with_exact_compensation
 from jaxbeam.simulation.stored_record import record_from_xarray
 
-OPERATOR = jb.Hysteresis([0.0, 0.5, 1.5, 3.0], [0.7, 0.15, 0.1, 0.15])
-OTHER = jb.Hysteresis([0.0, 0.8, 2.0], [0.75, 0.2, 0.15])
+OPERATOR = jb.actuators.Hysteresis([0.0, 0.5, 1.5, 3.0], [0.7, 0.15, 0.1, 0.15])
+OTHER = jb.actuators.Hysteresis([0.0, 0.8, 2.0], [0.75, 0.2, 0.15])
 COMMANDS = arrays(float, st.integers(2, 12), elements=st.floats(-6, 6, allow_subnormal=False))
 
 
@@ -115,7 +115,7 @@ def test_derivative_by_the_weights():
 )
 def test_errors(operator, message):
     with pytest.raises(ValueError, match=re.escape(message)):
-        check_case(patch_case(hysteresis=jb.Hysteresis(*operator)))
+        check_case(patch_case(hysteresis=jb.actuators.Hysteresis(*operator)))
 
 
 def test_hysteresis_needs_samples():

@@ -15,6 +15,7 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.model.frequency_responses import frequency_response
 from jaxbeam.model.linear_system import poles
 from jaxbeam.runtime.arrays import xp
+from jaxbeam.simulation.coil_history import coil_history
 from jaxbeam.simulation.integration_plan import integration_plan
 from tests.differences import central
 
@@ -22,10 +23,12 @@ R, L, KF, KV, MASS, DAMPING, STIFFNESS = 0.82, 5e-3, 4.2, 3.9, 0.03, 0.55, 900.0
 PLACE, GAIN, PERIOD, SPEED, DURATION = 0.35, 300.0, 0.01, 6.0, 0.12
 BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=2)
 LOOPS = {
-    "current": jb.CurrentLoop(bandwidth=900.0),
-    "current, proportional": jb.CurrentLoop(proportional=3.0),
-    "force": jb.ForceLoop(proportional=0.4, integral=90.0),
-    "force, with the lag of its sensor": jb.ForceLoop(bandwidth=150.0, sensor_bandwidth=2000.0),
+    "current": jb.actuators.CurrentLoop(bandwidth=900.0),
+    "current, proportional": jb.actuators.CurrentLoop(proportional=3.0),
+    "force": jb.actuators.ForceLoop(proportional=0.4, integral=90.0),
+    "force, with the lag of its sensor": jb.actuators.ForceLoop(
+        bandwidth=150.0, sensor_bandwidth=2000.0
+    ),
 }
 
 
@@ -53,7 +56,7 @@ def by_its_equations(loop, times):
     omega = wave**2 * np.sqrt(11.68 / 0.535)
     size = np.sqrt(2 / (0.535 * 0.6))
     at_coil, at_sensor = size * np.sin(wave * PLACE), size * np.sin(wave * 0.3)
-    of_force = isinstance(loop, jb.ForceLoop)
+    of_force = isinstance(loop, jb.actuators.ForceLoop)
     output = KF if of_force else 1.0
     p = L * loop.bandwidth / output if loop.proportional is None else loop.proportional
     q = R * loop.bandwidth / output if loop.bandwidth is not None else loop.integral or 0.0
@@ -100,7 +103,7 @@ def by_its_equations(loop, times):
 @pytest.mark.parametrize("name", LOOPS)
 def test_crossing_under_outer_feedback(name):
     case = crossing(shaker(LOOPS[name]))
-    record, coil = jb.simulate(case), jb.coil_history(case)
+    record, coil = jb.simulate(case), coil_history(case)
     expected, *of_coil = by_its_equations(LOOPS[name], np.asarray(record.times))
     assert_allclose(record.deflection[:, 0], expected, atol=1e-6 * np.abs(expected).max())
     for history, own in zip((coil.current, coil.voltage[:-1]), of_coil, strict=True):
@@ -109,10 +112,13 @@ def test_crossing_under_outer_feedback(name):
 
 def test_poles_of_the_loop_with_the_coil_at_rest():
     """L p^2 + (R + P) p + Q = 0; from a bandwidth -b and the cancelled pole of the coil, -R / L."""
-    given = shaker(jb.CurrentLoop(proportional=3.0, integral=700.0)).attachment()
+    given = shaker(jb.actuators.CurrentLoop(proportional=3.0, integral=700.0)).attachment()
     found = np.linalg.eigvals(given.state_matrix)
     assert_allclose(np.sort(found), np.sort(np.roots([L, R + 3.0, 700.0])), rtol=1e-12)
-    for loop in (jb.CurrentLoop(bandwidth=900.0), jb.ForceLoop(bandwidth=900.0)):
+    for loop in (
+        jb.actuators.CurrentLoop(bandwidth=900.0),
+        jb.actuators.ForceLoop(bandwidth=900.0),
+    ):
         found = np.linalg.eigvals(shaker(loop).attachment().state_matrix)
         assert_allclose(np.sort(found), [-900.0, -R / L], rtol=1e-10)
 
@@ -120,11 +126,15 @@ def test_poles_of_the_loop_with_the_coil_at_rest():
 @pytest.mark.parametrize(
     ("loop", "gain", "stiffness"),
     [
-        (jb.CurrentLoop(bandwidth=900.0), KF, STIFFNESS),
-        (jb.CurrentLoop(proportional=3.0), KF * 3.0 / (3.0 + R), STIFFNESS),
-        (jb.ForceLoop(bandwidth=900.0, sensor_bandwidth=50.0), 1.0, 0.0),
+        (jb.actuators.CurrentLoop(bandwidth=900.0), KF, STIFFNESS),
+        (jb.actuators.CurrentLoop(proportional=3.0), KF * 3.0 / (3.0 + R), STIFFNESS),
+        (jb.actuators.ForceLoop(bandwidth=900.0, sensor_bandwidth=50.0), 1.0, 0.0),
         # F = K_f I - k s with I = P (u - F) / R.
-        (jb.ForceLoop(proportional=3.0), 3.0 * KF / (R + 3.0 * KF), STIFFNESS * R / (R + 3.0 * KF)),
+        (
+            jb.actuators.ForceLoop(proportional=3.0),
+            3.0 * KF / (R + 3.0 * KF),
+            STIFFNESS * R / (R + 3.0 * KF),
+        ),
     ],
 )
 def test_steady_force(loop, gain, stiffness):
@@ -136,8 +146,8 @@ def test_steady_force(loop, gain, stiffness):
 @pytest.mark.parametrize(
     ("loop_class", "suspension", "factor"),
     [
-        (jb.CurrentLoop, (jb.SpringDamper(PLACE, STIFFNESS, DAMPING),), KF),
-        (jb.ForceLoop, (), 1.0),
+        (jb.actuators.CurrentLoop, (jb.SpringDamper(PLACE, STIFFNESS, DAMPING),), KF),
+        (jb.actuators.ForceLoop, (), 1.0),
     ],
 )
 def test_ideal_source_in_the_limit_of_its_bandwidth(loop_class, suspension, factor):
@@ -170,7 +180,9 @@ def test_damping_by_the_back_emf_vanishes_under_current_drive():
     quick = dataclasses.replace(shaker(**light), inductance=np.array(1e-6))
     assert_allclose(ratio(quick), ratio(damper), rtol=1e-3)
     assert ratio(quick) > 0.2
-    assert_allclose(ratio(shaker(jb.CurrentLoop(bandwidth=1e6), **light)), 0.03, rtol=1e-3)
+    assert_allclose(
+        ratio(shaker(jb.actuators.CurrentLoop(bandwidth=1e6), **light)), 0.03, rtol=1e-3
+    )
 
 
 @pytest.mark.parametrize("name", LOOPS)
@@ -198,7 +210,9 @@ def test_derivatives_of_the_model_by_the_numbers_of_a_loop():
     def numbers(values):
         changed = dict(zip(names, values[:3], strict=True))
         coil = dict(zip(("inductance", "mass", "stiffness"), values[3:], strict=True))
-        actuator = dataclasses.replace(shaker(), inner_loop=jb.ForceLoop(**changed), **coil)
+        actuator = dataclasses.replace(
+            shaker(), inner_loop=jb.actuators.ForceLoop(**changed), **coil
+        )
         found = jax.tree.leaves(actuator.attachment())
         return xp.concatenate([xp.ravel(leaf) for leaf in found]) / 1e3
 
@@ -208,7 +222,9 @@ def test_derivatives_of_the_model_by_the_numbers_of_a_loop():
 
 
 def test_derivatives_of_a_peak():
-    case = crossing(shaker(jb.ForceLoop(proportional=0.4, integral=90.0, sensor_bandwidth=2e3)))
+    case = crossing(
+        shaker(jb.actuators.ForceLoop(proportional=0.4, integral=90.0, sensor_bandwidth=2e3))
+    )
     plan = integration_plan(case)
     keys = ("proportional", "integral", "sensor_bandwidth")
     point = np.array([0.4, 90.0, 2e3])
@@ -225,17 +241,20 @@ def test_derivatives_of_a_peak():
 @pytest.mark.parametrize(
     ("actuator", "message"),
     [
-        (shaker(jb.CurrentLoop()), "actuators.0.inner_loop.proportional is missing; give it, or"),
         (
-            shaker(jb.CurrentLoop(bandwidth=1.0, integral=2.0)),
+            shaker(jb.actuators.CurrentLoop()),
+            "actuators.0.inner_loop.proportional is missing; give it, or",
+        ),
+        (
+            shaker(jb.actuators.CurrentLoop(bandwidth=1.0, integral=2.0)),
             "actuators.0.inner_loop.integral contradicts bandwidth",
         ),
         (
-            shaker(jb.ForceLoop(bandwidth=1.0), limits=[-5.0, 5.0]),
+            shaker(jb.actuators.ForceLoop(bandwidth=1.0), limits=[-5.0, 5.0]),
             "actuators.0.limits bound the voltage, which actuators.0.inner_loop sets beyond them",
         ),
         (
-            shaker(jb.ForceLoop(bandwidth=-1.0)),
+            shaker(jb.actuators.ForceLoop(bandwidth=-1.0)),
             "actuators.0.inner_loop.bandwidth must be positive",
         ),
     ],
@@ -247,11 +266,11 @@ def test_errors(actuator, message):
 
 def test_a_patch_has_no_coil():
     with pytest.raises(ValueError, match="actuators.0 is no electrodynamic shaker"):
-        jb.coil_history(crossing(jb.PointForce(PLACE)))
+        coil_history(crossing(jb.PointForce(PLACE)))
 
 
 def test_commands_stay_within_the_limits_of_the_loop():
-    limited = shaker(jb.CurrentLoop(bandwidth=900.0, limits=[-0.1, 0.2]))
+    limited = shaker(jb.actuators.CurrentLoop(bandwidth=900.0, limits=[-0.1, 0.2]))
     law = jb.Feedback([8e3], period=PERIOD)
     record = jb.simulate(crossing(limited, controller=law))
     assert_allclose([np.min(record.command), np.max(record.command)], [-0.1, 0.2], rtol=1e-12)
@@ -259,6 +278,8 @@ def test_commands_stay_within_the_limits_of_the_loop():
 
 
 def test_a_loop_that_the_beam_makes_unstable_is_warned_of():
-    steady, wild = (jb.ForceLoop(bandwidth=b, sensor_bandwidth=30.0) for b in (1.0, 1000.0))
+    steady, wild = (
+        jb.actuators.ForceLoop(bandwidth=b, sensor_bandwidth=30.0) for b in (1.0, 1000.0)
+    )
     assert not any("inner_loop" in line for line in jb.check(crossing(shaker(steady))).warnings)
     assert any("inner_loop" in line for line in jb.check(crossing(shaker(wild))).warnings)

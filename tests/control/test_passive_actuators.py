@@ -8,6 +8,7 @@ import scipy.linalg
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.analysis.bound.least_integral import least_integral
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.files.export.designed import export_gains
@@ -95,7 +96,7 @@ def test_optimal_commands_run_beside_a_spring():
     run = jb.simulate(dataclasses.replace(case, controller=best.controller()))
     assert_allclose(np.max(run.peak_deflection), best.peak, rtol=2e-3)
     assert best.peak < 0.9 * best.uncontrolled
-    least = jb.least_integral(case, period=0.015)
+    least = least_integral(case, period=0.015)
     run = jb.simulate(dataclasses.replace(case, controller=least.controller()))
     assert_allclose(least.of_record(run), least.integral, rtol=5e-3)
 

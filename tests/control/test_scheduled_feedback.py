@@ -12,6 +12,7 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedback import ScheduledFeedback
+from jaxbeam.control.load_identification import identified_load
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from tests.loop_as_oracle import span_of
 
@@ -98,11 +99,11 @@ def test_mass_from_a_record_is_that_of_the_loop(record):
         gains = np.interp(mass, MASSES, GAINS[0])
         return np.clip(-gains * readings[after], -2.5, 7.5)
 
-    mass = jb.identified_load(record, identification).mass
+    mass = identified_load(record, identification).mass
     assert np.sum((commands(mass) < 7.5) & (commands(mass) > 0.1)) >= 3
     assert_allclose(record.command[after, 0], commands(mass), rtol=1e-10, atol=1e-12)
     without_commands = eqx.tree_at(lambda r: r.command, record, jnp.zeros_like(record.command))
-    assert abs(jb.identified_load(without_commands, identification).mass / mass - 1) > 0.02
+    assert abs(identified_load(without_commands, identification).mass / mass - 1) > 0.02
 
 
 def test_case_file_keeps_the_controller():

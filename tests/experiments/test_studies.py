@@ -85,7 +85,7 @@ def test_other_rates_and_noise_leave_little():
     found = fitted_creep(log_of(readings + noise, COMMANDS), "u", "w")
     assert found.residual < 4e-7 < found.linear_residual / 10
     period, held = np.asarray(0.1), np.full(200, 2.0)
-    true = command_operator(OPERATOR, jb.Creep(RATES, WEIGHTS), period)
+    true = command_operator(OPERATOR, jb.actuators.Creep(RATES, WEIGHTS), period)
     fitted = command_operator(found.hysteresis, found.creep, period)
     sent, _ = acting(fitted.inverse(), held)
     drifts = [np.ptp(acted) / acted[-1] for acted in (acting(true, held)[0], acting(true, sent)[0])]
@@ -311,7 +311,7 @@ def test_force_under_a_force_loop():
     bandwidth, s = 2e3, 2j * np.pi * frequencies
     open_loop = force(data_physics_v4()) * bandwidth / 4.2 * (5e-5 + 0.82 / s)
     coil = (0.5, 0.82, 5e-5, 4.2, 4.2, 0.02, 9700.0, 0.55)
-    closed = force(jb.Electrodynamic(*coil, inner_loop=jb.ForceLoop(bandwidth=bandwidth)))
+    closed = force(jb.Electrodynamic(*coil, inner_loop=jb.actuators.ForceLoop(bandwidth=bandwidth)))
     assert_allclose(closed, open_loop / (1 + open_loop), rtol=1e-9)
 
 

@@ -94,7 +94,7 @@ def test_steps_of_any_length():
         ),
         (
             BeamSteps,
-            rig(actuators=[jb.Patch(0.2, 0.3, 1e-3, creep=jb.Creep([1.0], [0.1]))]),
+            rig(actuators=[jb.Patch(0.2, 0.3, 1e-3, creep=jb.actuators.Creep([1.0], [0.1]))]),
             "actuators.0 has a hysteresis or creep",
         ),
     ],

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.case import replace
+from jaxbeam.model.deflection_lines import influence_line, static_deflection_per_command
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.output_rows import LoadInfluence, sensor_rows, static_correction
@@ -20,7 +21,6 @@ from jaxbeam.model.static_correction import (
     residual_flexibility,
     shear_force,
 )
-from jaxbeam.model.statics import influence_line, static_deflection_per_command
 from jaxbeam.simulation.corrected_deflection import corrected_deflection
 from tests.as_oracle import as_oracle
 from tests.differences import central

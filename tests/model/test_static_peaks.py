@@ -37,7 +37,7 @@ def loaded(*loads) -> jb.Case:
 
 
 def peak(case, x=X, quantity="moment", **options) -> float:
-    return float(jb.static_peak(case, x, quantity=quantity, **options))
+    return float(jb.statics.static_peak(case, x, quantity=quantity, **options))
 
 
 # Loads that stand
@@ -49,7 +49,7 @@ def test_a_force_that_stands():
     case = loaded(jb.VaryingForce(force=force, position=a))
     assert_allclose(peak(case), force * a * b / LENGTH, rtol=1e-9)
     deflection = force * (a * b) ** 2 / (3 * RIGIDITY * LENGTH)
-    assert_allclose(jb.static_peak(case, a), deflection, rtol=1e-9)
+    assert_allclose(jb.statics.static_peak(case, a), deflection, rtol=1e-9)
     assert_allclose(peak(case, 0.0, "reaction"), force * b / LENGTH, rtol=1e-9)
     assert_allclose(peak(case, a, "shear"), force * a / LENGTH, rtol=1e-9)
     assert_allclose(peak(case, a, "shear", side="left"), force * b / LENGTH, rtol=1e-9)
@@ -120,7 +120,7 @@ def test_waves_and_tables():
 def test_a_long_run_is_searched_in_blocks(monkeypatch):
     case = loaded(jb.VaryingForce(force=1e5, frequencies=[5.0], amplitudes=[2e4], speed=V))
     expected = peak(case)
-    monkeypatch.setattr("jaxbeam.model.statics.BLOCK", 100)
+    monkeypatch.setattr("jaxbeam.model.deflection_lines.BLOCK", 100)
     assert_allclose(peak(case), expected, rtol=1e-14)
 
 
@@ -130,7 +130,7 @@ def test_traced_waves_are_refused_and_constant_forces_are_not():
     def of_force(load):
         def value(force):
             case = jb.replace(loaded(load), {"loads.0.force": force})
-            return jb.static_peak(case, X, layout, quantity="moment")
+            return jb.statics.static_peak(case, X, layout, quantity="moment")
 
         return value
 
@@ -144,12 +144,12 @@ def test_traced_waves_are_refused_and_constant_forces_are_not():
 
 # Every kind, by its wheels: distances behind the first (m), and weights (N)
 
-WAGON = jb.Wagon(
+WAGON = jb.vehicles.Wagon(
     4e4, 2e6, 3e3, 4e3, 1e3, 2e6, 1e4, 1e6, 1e4, bogie_distance=14.0, wheelset_distance=2.0,
     speed=V,
 )  # fmt: skip
 WAGON_AXLE = (4e4 + 2 * 3e3 + 4 * 1e3) / 4 * G
-HALF_CAR = jb.HalfCar(
+HALF_CAR = jb.vehicles.HalfCar(
     1e4, 3e4, [2.0, -3.0], [500.0, 800.0], [1e5, 1e5], [1e3, 1e3], [1e6, 1e6], [1e3, 1e3],
     speed=V,
 )  # fmt: skip
@@ -163,11 +163,11 @@ KINDS = {
     "half-car": (HALF_CAR, {0.0: (6e3 + 500) * G, 5.0: (4e3 + 800) * G}),
     "wagon": (WAGON, {y: WAGON_AXLE for y in (0.0, 2.0, 14.0, 16.0)}),
     "vehicle": (
-        jb.VehicleLoad(model="quarter-truck", speed=V, count=2, spacing=7.0),
+        jb.vehicles.VehicleLoad(model="quarter-truck", speed=V, count=2, spacing=7.0),
         {0.0: 1.1e4 * G, 7.0: 1.1e4 * G},
     ),
     "train": (
-        jb.TrainLoad(speed=V, coaches=[jb.Coach("manchester-wagon", count=2)]),
+        jb.vehicles.TrainLoad(speed=V, coaches=[jb.vehicles.Coach("manchester-wagon", count=2)]),
         {a + b: MANCHESTER_AXLE for a in (0.0, 25.0) for b in (0.0, 2.56, 19.0, 21.56)},
     ),
     "axles": (

@@ -17,9 +17,9 @@ from jaxbeam.case.beam import END_CONDITIONS, Beam, Support
 from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.loads.base import trajectory
 from jaxbeam.case.loads.point import MovingForce, MovingMass
-from jaxbeam.model.influence import static_peak
+from jaxbeam.model.deflection_lines import influence_line, static_deflection
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.statics import influence_line, static_deflection
+from jaxbeam.model.statics import static_peak
 from tests.as_oracle import as_oracle
 from tests.differences import central
 from tests.oracles import closed_forms, finite_elements

@@ -44,7 +44,7 @@ def test_parts_of_a_wagon_are_found_from_its_matrices():
 @pytest.mark.parametrize("model", ["manchester-wagon", "half-truck", "quarter-truck"])
 def test_described_vehicles_are_drawn_as_their_matrices_say(model):
     """Positions from the tables of a vehicle file, and from its matrices as for other kinds."""
-    load = jb.VehicleLoad(model=model, speed=20.0)
+    load = jb.vehicles.VehicleLoad(model=model, speed=20.0)
     described = drawn_vehicle(load)
 
     class Other(jb.Oscillator):
@@ -59,7 +59,7 @@ def test_described_vehicles_are_drawn_as_their_matrices_say(model):
 
 
 def test_hinged_bodies_share_the_height_of_their_hinge():
-    load = jb.VehicleLoad(model="truck-5-axle", speed=20.0)
+    load = jb.vehicles.VehicleLoad(model="truck-5-axle", speed=20.0)
     tractor, trailer, *axles = drawn_vehicle(load).parts
     hinge = float(load.hinges[0].position - load.axles[0].position)
     u = np.random.default_rng(1).normal(size=len(load.vehicle(np.float64(9.81)).names))

@@ -13,6 +13,7 @@ import jaxbeam as jb
 import tuning
 from jaxbeam.files.case_file import load_case_with
 from jaxbeam.files.export import read_gains
+from jaxbeam.files.profile_file import profile_from_file
 from jaxbeam.runtime import input_file
 from jaxbeam.runtime.input_file import describe_content, read_input
 from tests.modules import module_files, parse
@@ -73,8 +74,8 @@ def special_file(kind, path):
     ("name", "read"),
     [
         ("case.toml", jb.load_case),
-        ("road.csv", jb.profile_from_file),
-        ("cart.toml", jb.load_vehicle),
+        ("road.csv", profile_from_file),
+        ("cart.toml", jb.vehicles.load_vehicle),
         ("log.csv", tuning.read_log),
         ("log.h5", tuning.read_log),
         ("log.tdms", tuning.read_log),
@@ -155,7 +156,7 @@ def test_sizes_are_limited(folder, monkeypatch):
     with open(path, "wb") as file:
         file.truncate(65 * 2**20)
     with pytest.raises(ValueError, match=r"road.csv has 65 MB; a profile may have 64 MB"):
-        jb.profile_from_file(path)
+        profile_from_file(path)
     monkeypatch.setitem(input_file.MAX_BYTES, "log", 5)
     with pytest.raises(ValueError, match="has more|5 bytes"):
         read_input("/proc/self/status", "log")
@@ -236,12 +237,12 @@ def test_descriptions():
 # Modules that open files of the package, of the system or of the cache, or after `check_input`.
 BY_THEMSELVES = (
     "jaxbeam.runtime.",
-    "jaxbeam.vehicles.",
+    "jaxbeam.library.",
     "jaxbeam.c_code.source",
     "jaxbeam.analysis.assessment.assessment",
     "jaxbeam.app.server",  # of the package
     "jaxbeam.app.take_away",  # what it wrote into a temporary folder
-    "jaxbeam.case.loads.planar.vehicle",
+    "jaxbeam.case.loads.vehicles.vehicle",
     "jaxbeam.cli.",
     "jaxbeam.files.export.files",
     "jaxbeam.files.netcdf",

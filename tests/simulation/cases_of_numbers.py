@@ -8,7 +8,7 @@ import dataclasses
 import numpy as np
 
 import jaxbeam as jb
-from jaxbeam import planar
+from jaxbeam import vehicles
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.control.load_identification import LoadIdentification
 from tests.c_code.cases import LATE, PERIOD
@@ -35,18 +35,18 @@ def changed(name: str, **changes):
 
 AXLE = {"mass": 0.05, "suspension_stiffness": 60.0, "suspension_damping": 0.2}
 TYRE = {"tyre_stiffness": 900.0, "tyre_damping": 0.1}
-ARTICULATED = jb.VehicleLoad(
+ARTICULATED = jb.vehicles.VehicleLoad(
     bodies=[
-        planar.VehicleBody("tractor", mass=0.3, inertia=1e-3, position=0.02),
-        planar.VehicleBody("frame", mass=0.1, inertia=4e-4, position=-0.02),
-        planar.VehicleBody("trailer", mass=0.4, inertia=2e-3, position=-0.25),
+        vehicles.VehicleBody("tractor", mass=0.3, inertia=1e-3, position=0.02),
+        vehicles.VehicleBody("frame", mass=0.1, inertia=4e-4, position=-0.02),
+        vehicles.VehicleBody("trailer", mass=0.4, inertia=2e-3, position=-0.25),
     ],
-    springs=[planar.VehicleSpring("tractor", "frame", -0.02, 400.0, 1.0, 3.0, 0.01)],
-    hinges=[planar.VehicleHinge("frame", "trailer", position=-0.06)],
+    springs=[vehicles.VehicleSpring("tractor", "frame", -0.02, 400.0, 1.0, 3.0, 0.01)],
+    hinges=[vehicles.VehicleHinge("frame", "trailer", position=-0.06)],
     axles=[
-        planar.VehicleAxle("frame", 0.05, **AXLE, **TYRE),
-        planar.VehicleAxle("frame", -0.05, **AXLE),
-        planar.VehicleAxle("trailer", -0.3, **AXLE, **TYRE),
+        vehicles.VehicleAxle("frame", 0.05, **AXLE, **TYRE),
+        vehicles.VehicleAxle("frame", -0.05, **AXLE),
+        vehicles.VehicleAxle("trailer", -0.3, **AXLE, **TYRE),
     ],
     count=2,
     spacing=0.5,
@@ -157,13 +157,17 @@ ACTUATORS = {
                 damping=1.0,
                 limits=(-1.0, 2.0),
             ),
-            jb.Electrodynamic(0.35, **COIL, inner_loop=jb.CurrentLoop(900.0, limits=(-0.2, 0.3))),
+            jb.Electrodynamic(
+                0.35, **COIL, inner_loop=jb.actuators.CurrentLoop(900.0, limits=(-0.2, 0.3))
+            ),
         ],
         controller=driving(2, period=0.0113),
     ),
     "gains of loops of the current": rig(
         [LOADS["axles"]],
-        actuators=[jb.Electrodynamic(0.4, **COIL, inner_loop=jb.CurrentLoop(None, 2.0, 900.0))],
+        actuators=[
+            jb.Electrodynamic(0.4, **COIL, inner_loop=jb.actuators.CurrentLoop(None, 2.0, 900.0))
+        ],
         controller=driving(1, period=0.0113),
     ),
     "loops of the force": rig(
@@ -172,9 +176,9 @@ ACTUATORS = {
             jb.Electrodynamic(
                 0.45,
                 **COIL,
-                inner_loop=jb.ForceLoop(400.0, sensor_bandwidth=3e3, limits=(-0.5, 1.0)),
+                inner_loop=jb.actuators.ForceLoop(400.0, sensor_bandwidth=3e3, limits=(-0.5, 1.0)),
             ),
-            jb.Electrodynamic(0.5, **COIL, inner_loop=jb.ForceLoop(None, 0.4, 300.0)),
+            jb.Electrodynamic(0.5, **COIL, inner_loop=jb.actuators.ForceLoop(None, 0.4, 300.0)),
         ],
         controller=driving(2, period=0.0113),
     ),
@@ -216,7 +220,7 @@ JUMPS_OF_ALL = rig(
     actuators=[jb.PointForce(0.3)],
     sensors=[jb.Sensor(0.25, resolution=1e-5, dropout=0.1, jitter=1e-3)],
     loads=[LOADS["quarter-car"]],
-    vehicle_sensors=[planar.VehicleSensor(dropout=0.1, jitter=1e-3)],
+    vehicle_sensors=[vehicles.VehicleSensor(dropout=0.1, jitter=1e-3)],
     controller=jb.Feedback(
         [2e3], period=0.0052, delay=1e-3, resolution=0.01, dropout=0.1, jitter=1e-3
     ),
@@ -260,7 +264,7 @@ OF_LOADS = {
             changed("half-car", **START),
         ],
         vehicle_sensors=[
-            planar.VehicleSensor(
+            vehicles.VehicleSensor(
                 load=5,
                 position=0.05,
                 offset=1e-3,

@@ -85,7 +85,7 @@ CASES = {
         jb.Axles(offsets=[0.0, 3.0, 9.0], forces=[1e4] * 3, masses=[0.0, 300.0, 200.0], speed=30.0)
     ),
     "a half car": _road(
-        jb.HalfCar(
+        jb.vehicles.HalfCar(
             3e3,
             4e3,
             [1.5, -1.5],

@@ -379,8 +379,8 @@ def test_tuned_absorber_refusals():
 
 def test_sensors_on_absorbers():
     sensors = [
-        jb.planar.VehicleSensor(absorber=1, quantity="stroke"),
-        jb.planar.VehicleSensor(absorber=0, quantity="acceleration", offset=0.5),
+        jb.vehicles.VehicleSensor(absorber=1, quantity="stroke"),
+        jb.vehicles.VehicleSensor(absorber=0, quantity="acceleration", offset=0.5),
     ]
     absorbers = [
         jb.Absorber(x, mass=3e3, frequency=3.4, damping_ratio=0.1, inertance=200.0)
@@ -398,14 +398,14 @@ def test_sensors_on_absorbers():
     assert np.array_equal(record.vehicle_readings, np.transpose(expected))
     for faulty, words in (
         (
-            jb.planar.VehicleSensor(absorber=2),
+            jb.vehicles.VehicleSensor(absorber=2),
             "vehicle_sensors.0.absorber is 2, but the case has 2",
         ),
         (
-            jb.planar.VehicleSensor(absorber=0, body="axle 1"),
+            jb.vehicles.VehicleSensor(absorber=0, body="axle 1"),
             "leave out load, vehicle, body",
         ),
-        (jb.planar.VehicleSensor(quantity="stroke"), "give its number"),
+        (jb.vehicles.VehicleSensor(quantity="stroke"), "give its number"),
     ):
         with pytest.raises(ValueError, match=words):
             jb.simulate(dataclasses.replace(case, vehicle_sensors=[faulty]))

@@ -15,7 +15,7 @@ import pytest
 import jaxbeam as jb
 from jaxbeam.case.case import leaves_by_address
 from jaxbeam.case.fields import PACKAGES, import_modules
-from jaxbeam.case.loads.planar.vehicle import PlanarVehicle
+from jaxbeam.case.loads.vehicles.vehicle import PlanarVehicle
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.runtime.module import Module
 from tests.simulation.cases_of_numbers import CASES, JUMPING

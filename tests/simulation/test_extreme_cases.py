@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from experiments.benchmarks.rivals.baselines import reference_peaks
 from experiments.benchmarks.rivals.pinned_beam import PinnedBeam
-from jaxbeam.model.influence import static_peak
+from jaxbeam.model.statics import static_peak
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 MASS = 0.535 * 0.6  # of the beam, kg

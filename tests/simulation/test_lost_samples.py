@@ -121,8 +121,8 @@ def test_readings_in_vehicles():
         sensors=[jb.Sensor(0.3)],
         loads=[jb.QuarterCar(0.05, 0.02, 60.0, 0.6, 400.0, 0.1, speed=5.0)],
         vehicle_sensors=[
-            jb.planar.VehicleSensor(),
-            jb.planar.VehicleSensor(dropout=0.5),
+            jb.vehicles.VehicleSensor(),
+            jb.vehicles.VehicleSensor(dropout=0.5),
         ],
         run=jb.Run(0.1, 500.0, seed=2),
     )

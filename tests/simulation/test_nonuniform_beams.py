@@ -12,11 +12,11 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.beam import rigidity
 from jaxbeam.case.case import replace
-from jaxbeam.case.loads.cars import Oscillator
+from jaxbeam.case.loads.vehicles.cars import Oscillator
 from jaxbeam.integrator import native_peaks
+from jaxbeam.model.deflection_lines import static_deflection_per_command
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import Motion, corrected_history
-from jaxbeam.model.statics import static_deflection_per_command
 from jaxbeam.simulation.corrected_deflection import corrected_deflection
 from jaxbeam.simulation.stored_record import record_from_xarray
 from tests.differences import central

@@ -57,7 +57,7 @@ def test_quantities_at_any_position(record):
     assert middle.shape == (101, 2, 2)
     size = np.max(np.abs(middle))
     assert_allclose(record.at(x, "slope"), (high - low) / (2 * h), rtol=0, atol=1e-5 * size)
-    low, middle, high = (jb.corrected_deflection(record, x + d) for d in (-h, 0.0, h))
+    low, middle, high = (jb.sections.corrected_deflection(record, x + d) for d in (-h, 0.0, h))
     bend = -0.002 * (high - 2 * middle + low) / h**2
     loads_near = np.abs(record.load_position[..., None] - x.ravel()).min(axis=1) < h
     away = ~loads_near.reshape(bend.shape)

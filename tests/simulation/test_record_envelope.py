@@ -10,10 +10,10 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.analysis.sections import influence_table
 from jaxbeam.case.case import replace
+from jaxbeam.library.published import trains
 from jaxbeam.plot import plot_envelope
 from jaxbeam.simulation import record_envelope as module
 from jaxbeam.simulation.integration_plan import integration_plan
-from jaxbeam.vehicles.library import trains
 
 BEAM = jb.Beam(length=30.0, flexural_rigidity=3e10, mass_per_length=1e4, damping_ratio=0.1)
 SLOW = jb.Case(
@@ -189,7 +189,7 @@ def test_moments_over_piers_of_a_truck():
     )
     assert_allclose(moments.min(), -1004.8e3, rtol=1e-6)
     case = dataclasses.replace(CONTINUOUS, loads=(jb.Axles(train="HL93-truck", speed=0.5),))
-    static = [float(jb.static_peak(case, x, quantity="moment")) for x in PIERS]
+    static = [float(jb.statics.static_peak(case, x, quantity="moment")) for x in PIERS]
     assert_allclose(static, np.abs(moments).max(axis=0), rtol=1e-6)
     table = influence_table(case, ("moment",), tuple(PIERS))
     lines = [[pier_moments(1.0, y)[i] for y in table.positions] for i in (0, 1)]
@@ -254,5 +254,5 @@ def test_moments_over_piers_of_a_haunched_bridge():
     assert_allclose(np.min(record.bending_moment([100.0])), moments[:, 1].min(), rtol=1e-3)
     grid = record.envelope("moment", np.linspace(0.0, 140.0, 101))
     assert grid.smallest.min() > 0.985 * found.smallest.min()
-    static = [float(jb.static_peak(HAUNCHED, x, quantity="moment")) for x in (40.0, 100.0)]
+    static = [float(jb.statics.static_peak(HAUNCHED, x, quantity="moment")) for x in (40.0, 100.0)]
     assert_allclose(static, np.abs(moments).max(axis=0), rtol=1e-4)

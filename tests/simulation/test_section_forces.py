@@ -162,7 +162,7 @@ def test_reaction_of_an_elastic_support_is_its_own_force():
         CASES["elastic, damped"], loads=LOADS, run=jb.Run(2.0, sample_rate=100.0, gravity=5.0)
     )
     record = jb.simulate(case)
-    pushed = jb.corrected_deflection(record, np.array([0.0, 0.8]))
+    pushed = jb.sections.corrected_deflection(record, np.array([0.0, 0.8]))
     expected = -np.array([300.0, 80.0]) * pushed - np.array([0.0, 2.0]) * record.at(
         np.array([0.0, 0.8]), "velocity"
     )

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.case.case import replace
-from jaxbeam.case.loads.cars import Oscillator
+from jaxbeam.case.loads.vehicles.cars import Oscillator
 from jaxbeam.case.profiles.shapes import RampProfile
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.settlement import surface
@@ -110,7 +110,7 @@ def test_equilibrium(others):
         points, weights = np.polynomial.legendre.leggauss(12)
         for start, end in ((0.0, 1.0), (1.0, 3.0), (3.0, 4.0)):
             x = (start + end) / 2 + (end - start) / 2 * points
-            w = jb.settlement_response(case, [0.1, -0.2], x)
+            w = jb.statics.settlement_response(case, [0.1, -0.2], x)
             reaction -= float(weights @ w) * 3.0 * (end - start) / 2
     assert_allclose(reaction, 0.0, atol=1e-10 * np.abs(record.reactions).max())
 

@@ -53,7 +53,7 @@ def test_correction_is_nearer_than_the_modes(shear_stiffness, rotary_inertia):
         record = jb.simulate(jb.Case(beam, loads=loads, run=jb.Run(LENGTH / SPEED)), TIMES)
         for order, exact in enumerate(fields):
             raw = np.asarray(record.coordinates) @ np.asarray(record.modes.fields(X, (order,))[0]).T
-            found = raw, np.asarray(jb.corrected_deflection(record, X, order))
+            found = raw, np.asarray(jb.sections.corrected_deflection(record, X, order))
             errors[modes, order] = [
                 np.max(np.abs(one - exact) * (away if order == 3 else 1.0), axis=0)
                 / np.abs(exact).max()

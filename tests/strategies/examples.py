@@ -15,7 +15,7 @@ PROFILES = {
     "rail": jb.profiles.RailProfile("fra-3", seed=2, waves=12, contact_length=0.05),
 }
 
-COACH = jb.Coach("quarter-truck", count=2, length=8.0)
+COACH = jb.vehicles.Coach("quarter-truck", count=2, length=8.0)
 WAGON = {
     "body_mass": 0.3,
     "body_inertia": 1e-3,
@@ -33,7 +33,7 @@ LOADS = {
     "mass": jb.MovingMass(mass=0.4, speed=2.4, entry_time=0.02),
     "force": jb.MovingForce(mass=0.4, times=[0.0, 0.1, 0.2], positions=[0.0, 0.4, 0.3]),
     "axles": jb.Axles(offsets=[0.0, 0.2], forces=[3.0, 2.0], count=2, spacing=0.3, speed=2.4),
-    "train": jb.TrainLoad(coaches=[COACH], speed=2.4, start_position=-1.0),
+    "train": jb.vehicles.TrainLoad(coaches=[COACH], speed=2.4, start_position=-1.0),
     "line-load": jb.LineLoad(
         force_per_length=[5.0, 2.0], lengths=[0.2, 0.1], gaps=[0.0, 0.1], points=8, speed=2.4
     ),
@@ -46,7 +46,7 @@ LOADS = {
         tyre_stiffness=900.0,
         speed=-2.4,
     ),
-    "half-car": jb.HalfCar(
+    "half-car": jb.vehicles.HalfCar(
         body_mass=0.4,
         body_inertia=1e-3,
         axle_positions=[0.1, -0.1],
@@ -57,11 +57,11 @@ LOADS = {
         tyre_damping=[0.1, 0.1],
         speed=2.4,
     ),
-    "wagon": jb.Wagon(**WAGON, speed=2.4, start_position=-0.3),
-    "vehicle": jb.VehicleLoad(
-        bodies=[jb.planar.VehicleBody("body", mass=0.4, inertia=1e-3, position=0.0)],
+    "wagon": jb.vehicles.Wagon(**WAGON, speed=2.4, start_position=-0.3),
+    "vehicle": jb.vehicles.VehicleLoad(
+        bodies=[jb.vehicles.VehicleBody("body", mass=0.4, inertia=1e-3, position=0.0)],
         axles=[
-            jb.planar.VehicleAxle(
+            jb.vehicles.VehicleAxle(
                 "body", p, mass=0.05, suspension_stiffness=60.0, suspension_damping=0.2
             )
             for p in (0.1, -0.1)

@@ -21,10 +21,10 @@ from jaxbeam.case.case import replace
 from jaxbeam.integrator.force_peaks import peaks_of_forces
 from jaxbeam.integrator.peaks import Peaks
 from jaxbeam.integrator.time_grid import event_places, grid_by_step_length
-from jaxbeam.model.influence import static_peak
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.statics import static_peak
 from jaxbeam.sweeps import force_runner
 from jaxbeam.sweeps.batches import make_batches
 from jaxbeam.sweeps.blocks import Runner

@@ -71,7 +71,7 @@ def tune_integers(
     >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
     >>> options = {"steps": 1, "least_peaks": False, "progress": False}
     >>> free = {"controller.move_weight": (1e-10, 1e-8)}
-    >>> found = tuning.tune_integers(
+    >>> found = tuning.control.tune_integers(
     ...     case, {"controller.horizon": [2, 4]}, free, loads, **options
     ... )
     >>> print(found.choices)

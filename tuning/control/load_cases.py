@@ -66,8 +66,8 @@ class LoadCases:
     ) -> "LoadCases":
         """Every training run on each of the plants, every held-out run on each of the `others`.
 
-        Plants are values by address, as `tuning.draw_plants` returns them; without `others`,
-        held-out runs have the plant of the case.
+        Plants are values by address, as `tuning.control.draw_plants` returns them; without
+        `others`, held-out runs have the plant of the case.
         """
         held_out = _all_pairs(self.held_out, others) if others else self.held_out
         return LoadCases(_all_pairs(self.training, plants), held_out)

@@ -135,7 +135,7 @@ def lexicographic(
     >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
     >>> free = {"controller.gains.0": (100.0, 5000.0)}
     >>> options = {"steps": 3, "least_peaks": False, "progress": False}
-    >>> results = tuning.lexicographic(case, free, loads, ["peak", "effort"], **options)
+    >>> results = tuning.control.lexicographic(case, free, loads, ["peak", "effort"], **options)
     >>> print(len(results), "results")
     2 results
     """

@@ -81,7 +81,7 @@ def tune_reduced(
     >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
     >>> free = {"controller.command_weight.0": (1e-4, 1.0)}
     >>> options = {"steps": 2, "least_peaks": False, "progress": False}
-    >>> found = tuning.tune_reduced(case, 1, free, loads, **options)
+    >>> found = tuning.control.tune_reduced(case, 1, free, loads, **options)
     >>> print(len(found.fed_back), "of", len(found.shares), "states")
     1 of 2 states
     """

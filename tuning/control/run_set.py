@@ -43,7 +43,7 @@ def with_identified_plant(case: Case, found: Fit | Posterior) -> Case:
 
     >>> import tuning
     >>> fit = tuning.load_fit("fit.npz")
-    >>> round(float(tuning.with_identified_plant(fit.case, fit).beam.flexural_rigidity), 2)
+    >>> round(float(tuning.control.with_identified_plant(fit.case, fit).beam.flexural_rigidity), 2)
     11.0
     """
     values = found.means if isinstance(found, Posterior) else found.values
@@ -64,7 +64,8 @@ def draw_plants(found: Fit | Posterior, count: int, seed: int = 0) -> tuple[Addr
 
     >>> import tuning
     >>> fit = tuning.load_fit("fit.npz")
-    >>> [round(one["beam.flexural_rigidity"], 2) for one in tuning.draw_plants(fit, 2, seed=1)]
+    >>> plants = tuning.control.draw_plants(fit, 2, seed=1)
+    >>> [round(one["beam.flexural_rigidity"], 2) for one in plants]
     [11.15, 10.72]
     """
     if count < 1:

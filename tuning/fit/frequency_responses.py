@@ -44,7 +44,7 @@ class Responses:
     >>> import tuning
     >>> frequencies = np.array([10.0, 20.0, 40.0])
     >>> values = 1 / (20.0**2 - frequencies**2 + 0.8j * frequencies)
-    >>> measured = tuning.Responses(
+    >>> measured = tuning.fit.Responses(
     ...     frequencies, values[:, None], (("actuators.0", "sensors.0"),)
     ... )
     >>> print(measured.values.shape)
@@ -94,7 +94,7 @@ def responses_of(log: Log, segment: float | None = None, min_coherence: float = 
     >>> values = np.column_stack([u, 2e-3 * np.roll(u, 1)])
     >>> columns = ("u", "w1"), ("voltage", "deflection"), ("V", "m")
     >>> index = {"sensors": (None, 0), "actuators": (0, None)}
-    >>> found = tuning.responses_of(
+    >>> found = tuning.fit.responses_of(
     ...     tuning.Log(0.001 * np.arange(4000), values, *columns, **index)
     ... )
     >>> print(f"{abs(found.values).mean():.1e} m/V")
@@ -231,7 +231,7 @@ def identify_responses(
     ... )
     >>> frequencies = np.array([10.0, 20.0, 40.0])
     >>> values = jb.frequency_response(case, frequencies).values
-    >>> measured = tuning.Responses(frequencies, values, (("actuators.0", "sensors.0"),))
+    >>> measured = tuning.fit.Responses(frequencies, values, (("actuators.0", "sensors.0"),))
     >>> start = jb.replace(case, {"beam.flexural_rigidity": 11.0})
     >>> fit = tuning.identify_responses(start, measured, ["beam.flexural_rigidity"])
     >>> print(f"{fit.values[0]:.2f} N m^2")

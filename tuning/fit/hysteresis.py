@@ -44,7 +44,7 @@ def fitted_hysteresis(
 
     >>> import jaxbeam as jb, numpy as np, tuning
     >>> from tuning.fit.hysteresis import fitted_hysteresis
-    >>> true = jb.Hysteresis([0.0, 1.0], [0.8, 0.25])
+    >>> true = jb.actuators.Hysteresis([0.0, 1.0], [0.8, 0.25])
     >>> commands = np.concatenate([np.linspace(0, 5, 50), np.linspace(5, -5, 99)[1:]])
     >>> values = np.stack([commands, 1e-5 * true.outputs(commands)], axis=1)
     >>> kinds = ("voltage", "deflection"), ("V", "m")

@@ -53,7 +53,7 @@ def compare_fits(fits: Mapping[str, Fit]) -> list[ModelCriteria]:
 
     >>> import tuning
     >>> fit = tuning.load_fit("fit.npz")
-    >>> [model.name for model in tuning.compare_fits({"one": fit, "the same": fit})]
+    >>> [model.name for model in tuning.fit.compare_fits({"one": fit, "the same": fit})]
     ['one', 'the same']
     """
     if len(fits) < 2:
@@ -139,7 +139,7 @@ def cross_validate(fit: Fit) -> list[HeldOutPrediction]:
     ...     )
     >>> start = jb.replace(case, {"beam.flexural_rigidity": 10.0})
     >>> fit = tuning.identify(start, logs, "beam.flexural_rigidity")
-    >>> for held_out in tuning.cross_validate(fit):
+    >>> for held_out in tuning.fit.cross_validate(fit):
     ...     print(held_out.log, held_out.residual_ratio.round(1))
     2.0 m/s [1.]
     2.5 m/s [1.]
@@ -180,7 +180,7 @@ def predict_held_out(fit: Fit, logs: Sequence[Log]) -> list[HeldOutPrediction]:
     ...     )
     >>> start = jb.replace(case, {"beam.flexural_rigidity": 10.0})
     >>> fit = tuning.identify(start, logs, "beam.flexural_rigidity")
-    >>> for held_out in tuning.predict_held_out(fit, logs[:1]):
+    >>> for held_out in tuning.fit.predict_held_out(fit, logs[:1]):
     ...     print(held_out.log, held_out.residual_ratio.round(1))
     2.0 m/s [1.]
     """

@@ -33,7 +33,7 @@ def write_report(
 
     >>> from pathlib import Path
     >>> import tuning
-    >>> tuning.write_report("report", tuning.load_fit("fit.npz"))
+    >>> tuning.fit.write_report("report", tuning.load_fit("fit.npz"))
     >>> Path("report/report.md").exists()
     True
     """

@@ -36,7 +36,7 @@ def align_logs(logs: Sequence[Log]) -> Log:
     >>> times, rest = 0.01 * np.arange(400), (("acceleration",), ("m/s^2",))
     >>> a = tuning.Log(times, signal[:, None], ("a",), *rest)
     >>> b = tuning.Log(times, np.roll(signal, 7)[:, None], ("b",), *rest)  # 0.07 s late
-    >>> tuning.align_logs([a, b]).names
+    >>> tuning.logs.align_logs([a, b]).names
     ('a', 'b')
     """
     if len(logs) < 2:

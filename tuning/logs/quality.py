@@ -49,7 +49,7 @@ def find_faults(log: Log) -> list[Fault]:
     >>> import tuning
     >>> times = 0.01 * np.arange(200)
     >>> values = np.where(times == 0.5, 9.0, np.sin(6 * times))[:, None]
-    >>> print(*tuning.find_faults(tuning.Log(times, values, ("d1",), ("deflection",), ("m",))))
+    >>> print(*tuning.logs.find_faults(tuning.Log(times, values, ("d1",), ("deflection",), ("m",))))
     log: d1 has spikes (one sample), first at t = 0.5 s
     """
     found = [*_gaps(log), *_clock_drift(log), *_offsets(log), *_held(log)]
@@ -73,7 +73,7 @@ def mask(log: Log, kinds: Sequence[str]) -> Log:
     >>> times = 0.01 * np.arange(200)
     >>> values = np.where(times == 0.5, 9.0, np.sin(6 * times))[:, None]
     >>> log = tuning.Log(times, values, ("d1",), ("deflection",), ("m",))
-    >>> int((~tuning.mask(log, ["spikes"]).valid).sum())
+    >>> int((~tuning.logs.mask(log, ["spikes"]).valid).sum())
     1
     """
     for kind in kinds:

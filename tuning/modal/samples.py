@@ -90,7 +90,8 @@ def samples_of(logs: Sequence[Log], window: tuple[float, float] | None) -> Sampl
                 f"{log.source}: logs identified together must have the same channels, positions "
                 f"and sampling rate; {logs[0].source} has {', '.join(logs[0].names)} at "
                 f"{rates[0]:.6g} Hz, this one {', '.join(log.names)} at {rate:.6g} Hz. Modes of "
-                "setups with other sensors are found one by one and merged by tuning.merge_setups"
+                "setups with other sensors are found one by one and merged by"
+                " tuning.modal.merge_setups"
             )
     return Samples(tuple(records), tuple(starts), rates[0], tuple(dict.fromkeys(notes)))
 

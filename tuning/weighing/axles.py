@@ -52,7 +52,7 @@ class AxleWeighing:
     >>> record = jb.simulate(case)
     >>> columns = ("w",), ("deflection",), ("m",), "log", (0,)
     >>> log = tuning.Log(record.times, record.measured, *columns)
-    >>> found = tuning.weigh_axles(case, log, (1.0, 3.0), axles=1)
+    >>> found = tuning.weighing.weigh_axles(case, log, (1.0, 3.0), axles=1)
     >>> print(f"{found.fit.gross_weight[0]:.1f} N")
     4.0 N
     """
@@ -178,7 +178,7 @@ def weigh_axles(
     >>> record = jb.simulate(case)
     >>> columns = ("w",), ("deflection",), ("m",), "log", (0,)
     >>> log = tuning.Log(record.times, record.measured, *columns)
-    >>> found = tuning.weigh_axles(case, log, (1.0, 3.0), axles=1)
+    >>> found = tuning.weighing.weigh_axles(case, log, (1.0, 3.0), axles=1)
     >>> print(f"{found.load.forces[0]:.1f} N at {found.load.speed:.1f} m/s")
     4.0 N at 2.0 m/s
     """

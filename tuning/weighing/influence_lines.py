@@ -53,7 +53,7 @@ class InfluenceLines(NamedTuple):
 
     >>> import numpy as np
     >>> import tuning
-    >>> lines = tuning.InfluenceLines(
+    >>> lines = tuning.weighing.InfluenceLines(
     ...     np.array([0.0, 5.0, 10.0]), np.array([[0.0], [-2e-8], [0.0]])
     ... )
     >>> print(lines.at(np.array([2.5])))
@@ -208,7 +208,7 @@ def model_influence_lines(case: Case) -> InfluenceLines:
     >>> import jaxbeam as jb
     >>> import tuning
     >>> case = jb.Case(jb.Beam(20.0, 8e9, 12e3), sensors=[jb.Sensor(10.0)])
-    >>> lines = tuning.model_influence_lines(case)
+    >>> lines = tuning.weighing.model_influence_lines(case)
     >>> print(f"{lines.at(np.array([10.0]))[0, 0]:.2e} m/N, {-(20**3) / 48 / 8e9:.2e} m/N")
     -2.08e-08 m/N, -2.08e-08 m/N
     """
@@ -258,7 +258,7 @@ def calibrate_influence_lines(
     >>> record = jb.simulate(case)
     >>> columns = ("w1",), ("deflection",), ("m",)
     >>> log = tuning.Log(record.times, record.deflection, *columns, sensors=(0,))
-    >>> lines = tuning.calibrate_influence_lines(case, log)
+    >>> lines = tuning.weighing.calibrate_influence_lines(case, log)
     >>> print(f"{lines.at(np.array([10.0]))[0, 0]:.2g} m/N")
     -2.1e-08 m/N
     """

@@ -158,7 +158,8 @@ class Row(NamedTuple):
 
 SETUP = """
 import dataclasses, numpy as np, jaxbeam as jb
-jb.modes, jb.simulate, jb.sweep, jb.state_space, jb.frequency_response, jb.static_peak, jb.bound
+jb.modes, jb.simulate, jb.sweep, jb.state_space, jb.frequency_response, jb.bound
+jb.statics.static_peak
 from jaxbeam.analysis.linearised_loop import linearised_loop
 from jaxbeam.analysis.margins import margins
 from jaxbeam.analysis.stability import frozen_poles, growth
@@ -236,7 +237,7 @@ ROWS = (
         code='jb.frequency_response(case, np.geomspace(1, 400, 2000), [("force@0.3", '
         '"deflection@0.8")])',
     ),
-    Row("`jb.static_peak`", 0.3, code="jb.static_peak(case, [0.2, 0.8])"),
+    Row("`jb.statics.static_peak`", 0.3, code="jb.statics.static_peak(case, [0.2, 0.8])"),
     Row("`jb.influence_line`", 0.3, code="jb.influence_line(case, 0.8, np.linspace(0, 1.2, 101))"),
     Row("`jb.bound`, commands every 10 ms", 2.0, code="jb.bound(case)", case=TWO_SPANS + PATCHES),
     Row(

@@ -27,7 +27,7 @@ from experiments.thesis.chapter2.amplification_figures import (
     draw_map,
 )
 from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
-from jaxbeam.model.influence import static_peak
+from jaxbeam.model.statics import static_peak
 from jaxbeam.simulation.simulate import ContactLossWarning
 
 MASSES = np.append(np.linspace(0.05, 0.6, 18), [0.26, 0.261, 0.5])  # kg; the last as printed

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments.thesis.chapter2 import published
 from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
-from jaxbeam.model.statics import static_deflection_per_command
+from jaxbeam.model.deflection_lines import static_deflection_per_command
 from jaxbeam.plot.style import colour, set_title, use_style
 
 WIDTH, MODULUS, DENSITY = 0.1, 65e9, 2800.0  # m, Pa, kg/m^3

@@ -16,6 +16,7 @@ from experiments.thesis.cases import with_modes
 from experiments.thesis.chapter5 import published
 from experiments.thesis.verdicts import Finding, make_finding
 from jaxbeam.analysis.stability import frozen_poles, growth, stability_limit
+from jaxbeam.control.optimal.sampled_lqr import sampling_limit
 from jaxbeam.numerics.riccati import dlqr
 from jaxbeam.plot.modes import plot_poles
 
@@ -66,9 +67,9 @@ def sampling_findings(rig: jb.Case, weights) -> list[Finding]:
         (published.MOVED_SHAKER_GAIN, moved_shaker, 1e-2, two_mode_weights),
         (published.FAST_GAIN, rig, 2e-4, weights),
     )
-    bare = jb.sampling_limit(dataclasses.replace(rig, actuators=()))
+    bare = sampling_limit(dataclasses.replace(rig, actuators=()))
     limits = make_finding(
-        published.SAMPLING_LIMITS, jb.sampling_limit(rig), null=("beam without shaker", bare)
+        published.SAMPLING_LIMITS, sampling_limit(rig), null=("beam without shaker", bare)
     )
     return [limits, *(_gain_finding(printed, *problem) for printed, *problem in gains)]
 

@@ -18,7 +18,7 @@ from jaxbeam.case.case import Case, replace
 from jaxbeam.case.fields import concrete
 from jaxbeam.control.feedback import Feedback, ScheduledFeedback
 from jaxbeam.control.load_identification import LoadIdentification
-from jaxbeam.model.statics import influence_line, static_deflection_per_command
+from jaxbeam.model.deflection_lines import influence_line, static_deflection_per_command
 from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 

@@ -9,7 +9,7 @@ from experiments.thesis.chapter6 import published
 from experiments.thesis.chapter6.patch_rigs import simulate_changes
 from experiments.thesis.figures import plot_deflections
 from experiments.thesis.verdicts import Finding, make_finding
-from jaxbeam.model.statics import static_deflection_per_command
+from jaxbeam.model.deflection_lines import static_deflection_per_command
 from jaxbeam.plot.style import set_title, use_style
 
 SPEED, MASS = 0.28, 0.509  # m/s, kg

@@ -19,10 +19,10 @@ from jaxbeam.case.declared_checks import suggestion
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.reading.units import number_in_si
 from jaxbeam.case.validation import check_case
+from jaxbeam.library.published import trains as library
 from jaxbeam.model.modes import modes
 from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.model.sensing.output_rows import counted_frequency
-from jaxbeam.vehicles.library import trains as library
 
 CODES = ("en1991-2",)
 DECKS = ("ballasted", "slab")

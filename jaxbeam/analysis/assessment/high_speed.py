@@ -15,6 +15,7 @@ from jaxbeam.case.loads.axles import Axles
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.force_peaks import force_paths, force_wheels, peaks_of_forces
 from jaxbeam.integrator.force_system import force_responses, force_system
+from jaxbeam.library.published import trains as library
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import modes
 from jaxbeam.model.sensing.output_rows import (
@@ -28,7 +29,6 @@ from jaxbeam.sweeps.computation import peaks_in_memory
 from jaxbeam.sweeps.failures import failure_sentence
 from jaxbeam.sweeps.force_runner import PHASE
 from jaxbeam.sweeps.specification import sweep_specification
-from jaxbeam.vehicles.library import trains as library
 
 # Ratio of speeds: N axles at a spacing build up resonance of order i over a share 2 / (N i) of the
 # speed, 3 % for the longest trains at third order, with at least one speed within.

@@ -21,7 +21,7 @@ from jaxbeam.case.beam import MATERIALS
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.model.along_beam import SETTLED, refined
-from jaxbeam.model.influence import held_positions, influence_line
+from jaxbeam.model.statics import held_positions, influence_line
 
 LINE_POINTS = 801  # along the beam, between which influence lines are linear
 FRONT_POSITIONS = 8001  # of the first axle of a train

@@ -30,8 +30,8 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.model.influence import REACTION
-from jaxbeam.vehicles.library import trains as library
+from jaxbeam.library.published import trains as library
+from jaxbeam.model.statics import REACTION
 
 
 class TrackState(NamedTuple):

@@ -87,6 +87,7 @@ def least_integral(
     not one a position; RuntimeError if the quadratic program fails.
 
     >>> import jaxbeam as jb
+    >>> from jaxbeam.analysis.bound.least_integral import least_integral
     >>> case = jb.Case(
     ...     jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, damping_ratio=0.03),
     ...     actuators=[jb.PointForce(0.3, limits=[-1.0, 1.0])],
@@ -94,7 +95,7 @@ def least_integral(
     ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
     ...     run=jb.Run(0.3),
     ... )
-    >>> best = jb.least_integral(case, period=0.02)
+    >>> best = least_integral(case, period=0.02)
     >>> print(f"{best.reduction:.0%} of the integral, at most")
     43% of the integral, at most
     """

@@ -88,7 +88,7 @@ class CurrentLoop(AbstractInnerLoop):
 
     >>> import jaxbeam as jb
     >>> shaker = jb.Electrodynamic(
-    ...     0.3, 3.0, 1e-3, 8.0, inner_loop=jb.CurrentLoop(bandwidth=2e3, limits=(-1.0, 1.0))
+    ...     0.3, 3.0, 1e-3, 8.0, inner_loop=jb.actuators.CurrentLoop(2e3, limits=(-1.0, 1.0))
     ... )
     >>> print(shaker.command_unit, f"{shaker.attachment().static_gain:.1f} N/A")
     A 8.0 N/A
@@ -128,7 +128,7 @@ class ForceLoop(AbstractInnerLoop):
 
     >>> import jaxbeam as jb
     >>> shaker = jb.Electrodynamic(
-    ...     0.3, 3.0, 1e-3, 8.0, stiffness=2e3, inner_loop=jb.ForceLoop(bandwidth=500.0)
+    ...     0.3, 3.0, 1e-3, 8.0, stiffness=2e3, inner_loop=jb.actuators.ForceLoop(bandwidth=500.0)
     ... )
     >>> attachment = shaker.attachment()
     >>> print(shaker.command_unit, f"{attachment.static_gain:.1f}, {attachment.stiffness:.1f} N/m")
@@ -257,7 +257,7 @@ class Electrodynamic(AbstractActuator):
     With an `inner_loop` the amplifier sets the voltage, and the command is a current in A
     (`CurrentLoop`) or a force in N (`ForceLoop`), bounded by the `limits` of the loop. Where the
     amplifier runs out of voltage is not modelled: `limits` of the voltage are refused with a loop;
-    the voltage of a run is in `jb.coil_history`, that per command in `jaxbeam frf`.
+    the voltage of a run is in `jaxbeam.simulation.coil_history`, that per command in `jaxbeam frf`.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(

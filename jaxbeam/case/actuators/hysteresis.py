@@ -37,7 +37,7 @@ class Hysteresis(ReprWithUnits):
 
     >>> import jaxbeam as jb
     >>> patch = jb.Patch(0.25, 0.35, moment_per_volt=8e-4)
-    >>> hysteresis = jb.Hysteresis(thresholds=[0.0, 1.0], weights=[0.8, 0.4])
+    >>> hysteresis = jb.actuators.Hysteresis(thresholds=[0.0, 1.0], weights=[0.8, 0.4])
     >>> print(hysteresis.outputs([0.0, 5.0, 3.0, 0.0]))
     [0.  5.6 4.  0.4]
     """
@@ -105,7 +105,7 @@ class Creep(ReprWithUnits):
     A steady command of 1 acts as 1 at once and as 1 + sum of the weights in the end.
 
     >>> import jaxbeam as jb, numpy as np
-    >>> creep = jb.Creep(rates=[10.0, 1.0, 0.1], weights=[0.02, 0.02, 0.02])
+    >>> creep = jb.actuators.Creep(rates=[10.0, 1.0, 0.1], weights=[0.02, 0.02, 0.02])
     >>> print(creep.outputs(np.ones(4), period=10.0).round(4))  # before, and 10, 20, 30 s after
     [1.     1.0526 1.0573 1.059 ]
     """

@@ -19,8 +19,8 @@ from jaxbeam.case.fields import (
 )
 from jaxbeam.case.loads.base import AbstractRowLoad, AbstractVehicleLoad, length_error, plain_wheels
 from jaxbeam.case.trajectory import StandingTrajectory
+from jaxbeam.library.published import LEFT_OUT, Train, line_loads, trains
 from jaxbeam.runtime.arrays import Number, xp
-from jaxbeam.vehicles.library import LEFT_OUT, Train, line_loads, trains
 
 
 class Axles(AbstractRowLoad):

@@ -52,7 +52,7 @@ def describe(
     elif "beam" in content or "loads" in content:
         results = _of_case(source)
     else:
-        from jaxbeam.case.loads.planar.vehicle import load_vehicle
+        from jaxbeam.case.loads.vehicles.vehicle import load_vehicle
 
         vehicle = load_vehicle(Path(source))
         title = vehicle.title or Path(source).stem
@@ -174,9 +174,9 @@ def _sensor_words(case: "Case") -> list[str]:
 def _loads(source: str, content: dict[str, Any]) -> "Sequence[AbstractLoad]":
     """Loads of a case, or one of a vehicle file, a vehicle or a train."""
     from jaxbeam.case.loads.axles import Axles
-    from jaxbeam.case.loads.planar.vehicle import VehicleLoad
+    from jaxbeam.case.loads.vehicles.vehicle import VehicleLoad
     from jaxbeam.files.case_file import load_case
-    from jaxbeam.vehicles.library import trains
+    from jaxbeam.library.published import trains
 
     if "beam" in content or "loads" in content:
         return load_case(source).loads
@@ -188,8 +188,8 @@ def _loads(source: str, content: dict[str, Any]) -> "Sequence[AbstractLoad]":
 def _of_library(name: str) -> dict[str, Any]:
     from jaxbeam.case.declared_checks import suggestion
     from jaxbeam.case.loads.axles import Axles
-    from jaxbeam.case.loads.planar.vehicle import load_vehicle, vehicle_names
-    from jaxbeam.vehicles.library import trains
+    from jaxbeam.case.loads.vehicles.vehicle import load_vehicle, vehicle_names
+    from jaxbeam.library.published import trains
 
     if name in trains():
         return _result(name, trains()[name].source, Axles(train=name, speed=1.0).vehicle, GRAVITY)
@@ -268,8 +268,8 @@ def _lines(result: dict[str, Any], is_part: bool) -> list[str]:
 
 
 def _list_library(options: PrintOptions) -> None:
-    from jaxbeam.case.loads.planar.vehicle import load_vehicle, vehicle_names
-    from jaxbeam.vehicles.library import line_loads, trains
+    from jaxbeam.case.loads.vehicles.vehicle import load_vehicle, vehicle_names
+    from jaxbeam.library.published import line_loads, trains
 
     vehicles = {name: load_vehicle(name).title for name in vehicle_names()}
     rows = [(name, title) for name, title in vehicles.items()]

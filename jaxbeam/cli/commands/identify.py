@@ -166,7 +166,7 @@ def _read_logs(files, fault_kinds) -> list:
     missing = "mask" if "missing" in fault_kinds else "refuse"
     logs = [log for path in files for log in tuning.read_logs(path, missing=missing)]
     masked_kinds = [kind for kind in fault_kinds if kind != "missing"]
-    return [tuning.mask(log, masked_kinds) for log in logs] if masked_kinds else logs
+    return [tuning.logs.mask(log, masked_kinds) for log in logs] if masked_kinds else logs
 
 
 def _prior_arguments(free, prior, scale) -> tuple[dict, dict, dict]:

@@ -48,9 +48,9 @@ def compare_models(
 
     fits_by_name = dict(zip(names, map(tuning.load_fit, fits), strict=True))
     logs = [log for path in held_out for log in tuning.read_logs(path)]
-    criteria = tuning.compare_fits(fits_by_name) if len(fits_by_name) > 1 else []
+    criteria = tuning.fit.compare_fits(fits_by_name) if len(fits_by_name) > 1 else []
     predictions = {
-        name: tuning.predict_held_out(fit, logs) if logs else []
+        name: tuning.fit.predict_held_out(fit, logs) if logs else []
         for name, fit in fits_by_name.items()
     }
     error_ratios = {

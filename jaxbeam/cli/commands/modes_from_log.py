@@ -148,7 +148,7 @@ def modes_from_log(
 
     read = [tuning.read_log(path, columns=columns, rate=rate) for path in logs]
     if align:
-        read = [tuning.align_logs(read)]
+        read = [tuning.logs.align_logs(read)]
     setups = logs_of_setups(read, _names(references), _names(channels))
     several = [f"_setup{k + 1}" for k in range(len(setups))] if len(setups) > 1 else [""]
     pictures = [_picture(logs[0], word) for word in several if plot]
@@ -180,7 +180,7 @@ def modes_from_log(
             progress=None if options.json_ or not sys.stderr.isatty() else print_message,
         )
         if responses:
-            tuning.measured_responses(
+            tuning.modal.measured_responses(
                 setup,
                 forces,
                 window=window,
@@ -192,7 +192,7 @@ def modes_from_log(
         fits.append(fit)
     found, lines = fits[0], [str(fit) for fit in fits]
     if len(fits) > 1:
-        found = tuning.merge_setups(fits, references=_names(references))
+        found = tuning.modal.merge_setups(fits, references=_names(references))
         lines += ["", str(found)]
     for fit, picture in zip(dict.fromkeys([*fits, found]), pictures, strict=False):
         fit.plot(picture, length=length)

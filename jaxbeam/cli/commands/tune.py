@@ -168,19 +168,19 @@ def tune(
         tuned = result.tuned
     elif lexicographic:
         metrics = lexicographic.split(",")
-        results = tuning.lexicographic(
+        results = tuning.control.lexicographic(
             parsed_case, bounds, loads, metrics, aggregation=aggregate, **search_options
         )
         result = results[-1]
         tuned = (result,)
     elif integers:
-        result = tuning.tune_integers(
+        result = tuning.control.tune_integers(
             parsed_case, integer_choices, bounds, loads, total_objective,
             **start_options, **search_options,
         )  # fmt: skip
         tuned = (result.best,)
     elif states is not None:
-        result = tuning.tune_reduced(
+        result = tuning.control.tune_reduced(
             parsed_case, states, bounds, loads, total_objective, **start_options, **search_options
         )
         tuned = (result.tuned,)
@@ -272,9 +272,11 @@ def _with_identified_plant(case, loads, file: Path, count: int, posterior: bool,
     import tuning
 
     fit = tuning.load_fit(file.with_suffix(".npz"))
-    source = tuning.sample(fit, seed=seed) if posterior else fit
-    drawn = tuning.draw_plants(source, 2 * count, seed)
-    return tuning.with_identified_plant(case, fit), loads.across(drawn[:count], drawn[count:])
+    source = tuning.fit.sample(fit, seed=seed) if posterior else fit
+    drawn = tuning.control.draw_plants(source, 2 * count, seed)
+    return tuning.control.with_identified_plant(case, fit), loads.across(
+        drawn[:count], drawn[count:]
+    )
 
 
 def _output_files(output: Path | None, count: int) -> list[Path]:

@@ -80,7 +80,7 @@ def weigh(
         weighing = tuning.weigh(parsed_case, read, speed_range, max_loads, both_ways=not one_way)
     else:
         calibrated = _lines_of(parsed_case, calibration) if calibration else None
-        weighing = tuning.weigh_axles(
+        weighing = tuning.weighing.weigh_axles(
             parsed_case, read, speed_range, number, both_ways=not one_way,
             influence_lines=calibrated,
         )  # fmt: skip
@@ -104,7 +104,9 @@ def _lines_of(case, calibration: tuple[Path, ...]):
         except json.JSONDecodeError as error:
             raise ValueError(f"{calibration[0]} is not JSON: {error}") from error
         return lines_from_dict(content)
-    return tuning.calibrate_influence_lines(case, [tuning.read_log(path) for path in calibration])
+    return tuning.weighing.calibrate_influence_lines(
+        case, [tuning.read_log(path) for path in calibration]
+    )
 
 
 def _axle_count(text: str) -> int:
@@ -147,7 +149,7 @@ def identify_responses(
     from jaxbeam.files.case_file import save_case
 
     parsed_case = options.read(case)
-    measured = tuning.responses_of(tuning.read_log(log), segment)
+    measured = tuning.fit.responses_of(tuning.read_log(log), segment)
     fit = tuning.identify_responses(parsed_case, measured, bounds_in_si(parsed_case, bounds))
     if output:
         save_case(fit.case, output, overwrite=True)  # checked before the work

@@ -154,6 +154,7 @@ def sampling_limit(case: Case) -> Float[Array, " mode"]:
     Raises ValueError for an invalid case.
 
     >>> import jaxbeam as jb
+    >>> from jaxbeam.control.optimal.sampled_lqr import sampling_limit
     >>> case = jb.Case(
     ...     jb.Beam(
     ...         length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, damping_ratio=0.03
@@ -162,7 +163,7 @@ def sampling_limit(case: Case) -> Float[Array, " mode"]:
     ...     sensors=[jb.Sensor(0.3)],
     ...     loads=[jb.MovingMass(mass=0.5, speed=2.0)],
     ... )
-    >>> print(jb.sampling_limit(case).round(4))
+    >>> print(sampling_limit(case).round(4))
     [0.0245 0.0061 0.0027]
     """
     check_case(case)

@@ -25,7 +25,7 @@ from jaxbeam.case.filters import (
     second_order_sections,
     steady_filter_state,
 )
-from jaxbeam.case.loads.planar.vehicle_parts import VehicleSensor
+from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSensor
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel

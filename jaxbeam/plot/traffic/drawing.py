@@ -11,7 +11,7 @@ from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.base import AbstractLoad, VehicleModel
-from jaxbeam.case.loads.planar.vehicle import VehicleLoad
+from jaxbeam.case.loads.vehicles.vehicle import VehicleLoad
 from jaxbeam.model.load_set import VehicleGroup, load_set
 from jaxbeam.plot.style import GREY, INK, load_colour, tinted
 

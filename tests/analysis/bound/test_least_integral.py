@@ -9,6 +9,7 @@ from scipy.optimize import lsq_linear
 
 import jaxbeam as jb
 from jaxbeam.analysis.bound.input_influence import input_influence
+from jaxbeam.analysis.bound.least_integral import least_integral
 
 LIMITS, PERIOD = [-1.0, 1.5], 0.015
 
@@ -26,7 +27,7 @@ def beam_case(controller=None, limits=LIMITS) -> jb.Case:
 
 @pytest.fixture(scope="module")
 def least():
-    return jb.least_integral(beam_case(), weights=[1.0, 3.0], period=PERIOD)
+    return least_integral(beam_case(), weights=[1.0, 3.0], period=PERIOD)
 
 
 def problem(case):
@@ -58,7 +59,7 @@ def test_against_scipy(least):
 
 def test_commands_are_at_the_limits():
     """Bang-bang, as the thesis says of this criterion, where limits are tight, but for the end."""
-    least = jb.least_integral(beam_case(limits=[-0.3, 0.3]), period=PERIOD)
+    least = least_integral(beam_case(limits=[-0.3, 0.3]), period=PERIOD)
     crossing = least.commands[: int(0.6 / 2.5 / PERIOD)]
     assert np.abs(least.commands).max() <= 0.3
     assert np.mean(np.abs(crossing) > 0.3 * (1 - 1e-6)) > 0.85
@@ -82,7 +83,7 @@ def test_limits_of_rates():
         dataclasses.replace(beam_case(), actuators=(jb.Patch(0.25, 0.35, 8.3e-4, **patch, **rate),))
         for rate in ({}, {"rate_limit": 60.0})
     )
-    fast, slow = (jb.least_integral(case, period=PERIOD) for case in (free, limited))
+    fast, slow = (least_integral(case, period=PERIOD) for case in (free, limited))
     assert np.abs(np.diff(slow.commands, axis=0, prepend=0.0)).max() <= 60.0 * PERIOD * (1 + 1e-12)
     assert 1.02 * fast.integral < slow.proven <= slow.integral
     assert slow.integral - slow.proven < 1e-6 * slow.uncontrolled
@@ -91,6 +92,6 @@ def test_limits_of_rates():
 def test_errors():
     unlimited = dataclasses.replace(beam_case(), actuators=(jb.PointForce(0.2),))
     with pytest.raises(ValueError, match=r"^actuators.0.limits must be given"):
-        jb.least_integral(unlimited)
+        least_integral(unlimited)
     with pytest.raises(ValueError, match="weights must list 2 numbers"):
-        jb.least_integral(beam_case(), weights=[1.0])
+        least_integral(beam_case(), weights=[1.0])

@@ -8,8 +8,8 @@ from scipy.integrate import quad
 import jaxbeam as jb
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
+from jaxbeam.library.published import line_loads
 from jaxbeam.model.load_set import load_set
-from jaxbeam.vehicles.library import line_loads
 from tests.differences import central
 
 LENGTH, RIGIDITY = 20.0, 1e10
@@ -41,7 +41,7 @@ def test_a_load_all_over_the_span_is_the_uniform_load():
     expected, errors = 5 * 1e4 * LENGTH**4 / (384 * RIGIDITY), []
     for points in (50, 100, 200):
         load = jb.LineLoad(force_per_length=1e4, lengths=3 * LENGTH, speed=1.0, points=points)
-        peak = float(jb.static_peak(case_of(load), LENGTH / 2))
+        peak = float(jb.statics.static_peak(case_of(load), LENGTH / 2))
         errors.append(peak / expected - 1)
     assert 0 < errors[2] < 1e-4
     assert 3.5 < errors[1] / errors[2] < 4.5 and 3.5 < errors[0] / errors[1] < 4.5
@@ -55,7 +55,7 @@ def test_a_standing_load_bends_the_beam_to_its_static_deflection():
     record = jb.simulate(case)
 
     def under(x):
-        return float(jb.static_deflection(case, LENGTH / 2, [x], [1.0]))
+        return float(jb.statics.static_deflection(case, LENGTH / 2, [x], [1.0]))
 
     expected = 2e4 * quad(under, 4.0, 11.0)[0] + 1e4 * quad(under, 0.0, 2.0)[0]
     assert record.deflection[-1, 0] == pytest.approx(expected, rel=2e-3)  # and truncated modes
@@ -95,7 +95,7 @@ def test_in_case_files_and_gradients():
 
     def peak(numbers):
         load = jb.LineLoad(force_per_length=numbers[0], lengths=numbers[1], speed=1.0, points=10)
-        return jb.static_peak(case_of(load), LENGTH / 2)
+        return jb.statics.static_peak(case_of(load), LENGTH / 2)
 
     point = np.array([1e4, 6.0])
     found = jax.grad(peak)(jax.numpy.asarray(point))

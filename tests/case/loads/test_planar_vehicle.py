@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from jaxbeam.case.loads.planar.vehicle import PlanarVehicle, check_vehicle, load_vehicle
-from jaxbeam.case.loads.planar.vehicle_parts import (
+from jaxbeam.case.loads.vehicles.vehicle import PlanarVehicle, check_vehicle, load_vehicle
+from jaxbeam.case.loads.vehicles.vehicle_parts import (
     VehicleAxle,
     VehicleBody,
     VehicleHinge,

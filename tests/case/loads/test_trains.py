@@ -8,10 +8,10 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.case.loads.axles import Axles
-from jaxbeam.case.loads.planar.vehicle import load_vehicle
+from jaxbeam.case.loads.vehicles.vehicle import load_vehicle
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from jaxbeam.vehicles.library import trains
+from jaxbeam.library.published import trains
 
 GRAVITY = np.float64(9.81)
 
@@ -122,10 +122,13 @@ def case_of(*loads) -> jb.Case:
     return jb.Case(beam, sensors=[jb.Sensor(10.0)], loads=loads, run=run, profile=road)
 
 
-def train(**changes) -> jb.TrainLoad:
-    coaches = [jb.Coach(FIRST, length=LENGTHS[0]), jb.Coach(SECOND, count=2, length=LENGTHS[1])]
+def train(**changes) -> jb.vehicles.TrainLoad:
+    coaches = [
+        jb.vehicles.Coach(FIRST, length=LENGTHS[0]),
+        jb.vehicles.Coach(SECOND, count=2, length=LENGTHS[1]),
+    ]
     return dataclasses.replace(
-        jb.TrainLoad(coaches=coaches, speed=SPEED, start_position=-1.0), **changes
+        jb.vehicles.TrainLoad(coaches=coaches, speed=SPEED, start_position=-1.0), **changes
     )
 
 
@@ -135,7 +138,7 @@ def test_a_train_is_its_vehicles():
     overhang = (LENGTHS[1] - wheelbase) / 2
     firsts = [0.0, LENGTHS[0] / 2 + overhang, LENGTHS[0] / 2 + overhang + LENGTHS[1]]
     alone = [
-        jb.VehicleLoad(model, speed=SPEED, start_position=-1.0 - at)
+        jb.vehicles.VehicleLoad(model, speed=SPEED, start_position=-1.0 - at)
         for model, at in zip((FIRST, SECOND, SECOND), firsts, strict=True)
     ]
     together, apart = jb.simulate(case_of(train())), jb.simulate(case_of(*alone))
@@ -178,10 +181,16 @@ def test_vehicle_files_are_relative_to_the_case_file(tmp_path):
     ("changes", "words"),
     [
         ({"coaches": ()}, r"loads.0.coaches has no entry"),
-        ({"coaches": (jb.Coach("half-car"),)}, r"coaches.0.model: there is no vehicle 'half-car'"),
-        ({"coaches": (jb.Coach(FIRST),)}, r"coaches.0.length is missing, and quarter-truck has no"),
         (
-            {"coaches": (jb.Coach(SECOND, length=1.0),)},
+            {"coaches": (jb.vehicles.Coach("half-car"),)},
+            r"coaches.0.model: there is no vehicle 'half-car'",
+        ),
+        (
+            {"coaches": (jb.vehicles.Coach(FIRST),)},
+            r"coaches.0.length is missing, and quarter-truck has no",
+        ),
+        (
+            {"coaches": (jb.vehicles.Coach(SECOND, length=1.0),)},
             r"coaches.0.length must exceed the wheelbase",
         ),
     ],

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.case.loads.planar.vehicle import check_vehicle, load_vehicle, vehicle_names
+from jaxbeam.case.loads.vehicles.vehicle import check_vehicle, load_vehicle, vehicle_names
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import (
     case_from_dict,
@@ -17,7 +17,7 @@ from jaxbeam.files.case_file import (
     save_case,
     with_settings,
 )
-from jaxbeam.vehicles.library import trains
+from jaxbeam.library.published import trains
 from tests.modules import ROOT
 
 GRAVITY = np.float64(9.81)
@@ -69,7 +69,7 @@ WAGONS = {
 @pytest.mark.parametrize("name", WAGONS)
 def test_wagons_of_the_library(name):
     axle_load, spacing = WAGONS[name]
-    load = jb.VehicleLoad(model=name, count=3, speed=50.0)
+    load = jb.vehicles.VehicleLoad(model=name, count=3, speed=50.0)
     assert load.validate("loads.0") is None
     np.testing.assert_allclose(load.vehicle(GRAVITY).static_loads, 1e3 * axle_load * GRAVITY)
     np.testing.assert_allclose(load.spacings(), spacing * np.arange(3))
@@ -77,7 +77,7 @@ def test_wagons_of_the_library(name):
 
 def test_truck_of_five_axles_has_the_published_static_loads():
     """As printed by VBI-2D, kN."""
-    loads = jb.VehicleLoad(model="truck-5-axle", speed=20.0).vehicle(GRAVITY).static_loads
+    loads = jb.vehicles.VehicleLoad(model="truck-5-axle", speed=20.0).vehicle(GRAVITY).static_loads
     np.testing.assert_allclose(loads / 1e3, [55.162, 105.278, 78.252, 77.320, 76.387], atol=6e-4)
 
 

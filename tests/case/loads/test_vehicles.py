@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbeam.case.loads.cars import Oscillator, QuarterCar
-from jaxbeam.case.loads.planar.vehicle_parts import VehicleSpring
+from jaxbeam.case.loads.vehicles.cars import Oscillator, QuarterCar
+from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSpring
 from tests.case.loads.reference import COORDINATES, LOADS, REFERENCE, coordinate_map
 from tests.differences import central
 

@@ -11,6 +11,7 @@ import jaxbeam as jb
 from jaxbeam.case.case import replace, unit_at, value_at
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict, with_settings
+from jaxbeam.files.profile_file import profile_from_file
 from tests.case.profiles.examples import PROFILES
 
 BEAM = jb.Beam(length=25.0, flexural_rigidity=1e10, mass_per_length=1e4)
@@ -98,7 +99,7 @@ def test_a_measured_profile_from_a_file(text, tmp_path):
     jb.save_case(case, tmp_path / "saved.toml")
     again = jb.load_case(tmp_path / "saved.toml").profile
     assert_array_equal(again.point_heights, case.profile.point_heights)
-    profile = jb.profile_from_file(tmp_path / "data" / "profile.csv")
+    profile = profile_from_file(tmp_path / "data" / "profile.csv")
     assert_array_equal(profile.positions, case.profile.positions)
 
 
@@ -115,7 +116,7 @@ def test_a_measured_profile_from_a_file(text, tmp_path):
 def test_wrong_files_of_points(text, message, tmp_path):
     (tmp_path / "profile.csv").write_text(text)
     with pytest.raises(ValueError, match=message) as raised:
-        jb.profile_from_file(tmp_path / "profile.csv")
+        profile_from_file(tmp_path / "profile.csv")
     assert "profile.csv" in str(raised.value)
 
 
@@ -228,7 +229,7 @@ CAR = {
 RIGID = {
     "mass": jb.MovingMass(1000.0, speed=20.0),
     "wheel": jb.Oscillator(1e4, 1e6, wheel_mass=10.0, speed=20.0),
-    "wagon": jb.VehicleLoad(model="manchester-wagon", speed=20.0),
+    "wagon": jb.vehicles.VehicleLoad(model="manchester-wagon", speed=20.0),
     "masses": jb.Axles(offsets=[0.0, 2.0], masses=1e3, speed=20.0),
 }
 
@@ -265,7 +266,7 @@ def test_tables_are_known_where_vehicles_come_from(path, travel):
 
 
 def test_all_wheels_travel():
-    load = jb.VehicleLoad(model="truck-5-axle", speed=20.0)
+    load = jb.vehicles.VehicleLoad(model="truck-5-axle", speed=20.0)
     profile = jb.profiles.TableProfile([-5.0, 10.0, 50.0], [0.01, 0.0, 0.01])
     with pytest.raises(ValueError, match=r"loads travel from -12\.8 to 37\.8 m"):
         check_case(jb.Case(BEAM, loads=[load], profile=profile, run=jb.Run(3.0)))

@@ -20,6 +20,7 @@ from jaxbeam.control.optimal.sampled_lqr import (
     SamplingWarning,
     discrete_lq_problem,
     sampled_reachability,
+    sampling_limit,
 )
 from jaxbeam.model.modes import mesh_layout
 
@@ -170,8 +171,8 @@ def test_sampling_limits():
     omega = (np.arange(1, 4) * np.pi / 0.6) ** 2 * np.sqrt(11.68 / 0.535)
     unsprung = beam_case(stiffness=0.0, damping=0.0)
     expected = np.pi / (omega * np.sqrt(1 - 0.03**2))
-    assert_allclose(jb.sampling_limit(unsprung), expected, rtol=1e-9)
-    stiffer = jb.sampling_limit(beam_case(damping=0.0))
+    assert_allclose(sampling_limit(unsprung), expected, rtol=1e-9)
+    stiffer = sampling_limit(beam_case(damping=0.0))
     assert stiffer.shape == (3,) and np.all(stiffer < expected)
 
 
@@ -179,7 +180,7 @@ def test_controllability_is_lost_at_the_sampling_limit():
     """Of one mode: by Gramians, by the rank of (B, A B), and by poles under the optimal gain."""
     case = beam_case(modes=1, stiffness=0.0, damping=0.0, bandwidth=1e5)
     model = plant_of(case)
-    plant, limit = model.unloaded, float(jb.sampling_limit(case)[0])
+    plant, limit = model.unloaded, float(sampling_limit(case)[0])
 
     def reachability(period):
         """Smallest ratio of the sampled to the continuous modal Gramian, by scipy's equations."""

@@ -12,11 +12,12 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
+from jaxbeam.control.load_identification import identified_load
 from jaxbeam.control.optimal.crossing_gains import GainSchedule
 from jaxbeam.control.optimal.lqr import LQR
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
+from jaxbeam.model.deflection_lines import influence_line, static_deflection_per_command
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.statics import influence_line, static_deflection_per_command
 from jaxbeam.numerics.gain_table import GainTable
 
 WEIGHTS = {
@@ -120,7 +121,7 @@ def test_load_is_identified_from_gates_in_the_loop(speed):
     passed = 0.2 - 0.05 / 0.8
     assert np.all(record.command[np.asarray(record.times) < passed] == 0)
     assert np.max(np.abs(record.command)) > 0.01
-    found = jb.identified_load(record, identification)
+    found = identified_load(record, identification)
     assert found.speed == pytest.approx(speed, rel=1e-9)
     assert found.speed_error == pytest.approx(0.0, abs=1e-9)
     assert found.mass == pytest.approx(0.5, rel=0.05)
@@ -220,7 +221,7 @@ def test_load_is_identified_without_gates_in_the_loop():
     before = np.asarray(record.times) < 0.2 + 0.3 * 0.75
     assert np.all(record.command[before] == 0)
     assert np.max(np.abs(record.command)) > 0.01
-    found = jb.identified_load(record, identification)
+    found = identified_load(record, identification)
     assert abs(found.speed_error) < 0.1
     assert abs(found.mass_error) < 0.1
 

@@ -33,7 +33,7 @@ CAR = jb.QuarterCar(
     tyre_damping=1e4,
 )
 # Longer than the beam: for a while it vibrates without a wheel on it.
-LONG_CAR = jb.HalfCar(
+LONG_CAR = jb.vehicles.HalfCar(
     speed=-50.0,
     entry_time=0.1,
     body_mass=10000.0,
@@ -47,10 +47,12 @@ LONG_CAR = jb.HalfCar(
 )
 SENSORS = [jb.Sensor(7.0), jb.Sensor(10.0, "acceleration")]
 # Body on a wheel with mass: inertia and springs in the same rows; vehicles in a row.
-ROW = jb.VehicleLoad(
-    bodies=[jb.planar.VehicleBody("body", mass=3e4, inertia=4e5, position=0.0)],
+ROW = jb.vehicles.VehicleLoad(
+    bodies=[jb.vehicles.VehicleBody("body", mass=3e4, inertia=4e5, position=0.0)],
     axles=[
-        jb.planar.VehicleAxle("body", p, mass=500.0, suspension_stiffness=k, suspension_damping=2e4)
+        jb.vehicles.VehicleAxle(
+            "body", p, mass=500.0, suspension_stiffness=k, suspension_damping=2e4
+        )
         for p, k in ((2.0, 2e6), (-2.5, 3e6))
     ],
     count=2,

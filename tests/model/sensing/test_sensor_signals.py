@@ -272,8 +272,8 @@ def test_invalid_sensors_are_refused(changes, message):
     ],
 )
 def test_vehicle_sensors_are_refused_before_work_too(changes, message):
-    load = jb.VehicleLoad(model="half-truck", speed=2.0)
-    sensors = (jb.planar.VehicleSensor(body="axle 1", **changes),)
+    load = jb.vehicles.VehicleLoad(model="half-truck", speed=2.0)
+    sensors = (jb.vehicles.VehicleSensor(body="axle 1", **changes),)
     with pytest.raises(ValueError, match="vehicle_sensors.0.*" + message):
         check_case(dataclasses.replace(CASE, loads=(load,), vehicle_sensors=sensors))
 

@@ -38,7 +38,7 @@ def load_of(run: dict[str, Any]):
     numbers, start = run["vehicle"], run["start"]
     path = {"speed": run["speed"], "start_position": start or None}
     if "a2" in numbers:
-        return jb.VehicleLoad(model="truck-5-axle", **path)
+        return jb.vehicles.VehicleLoad(model="truck-5-axle", **path)
     if "mc" in numbers:
         row = {"count": run["count"], "spacing": run["spacing"]} if "count" in run else {}
         return reference.wagon(numbers, **path, **row)

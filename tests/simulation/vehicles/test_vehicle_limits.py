@@ -205,7 +205,7 @@ def test_travel_to_the_left_mirrors():
         "tyre_damping": [2e3, 4e3],
     }
     loads = [
-        jb.HalfCar(12000.0, 6e4, **numbers, speed=v, start_position=x, deceleration=1.0)
+        jb.vehicles.HalfCar(12000.0, 6e4, **numbers, speed=v, start_position=x, deceleration=1.0)
         for v, x in ((20.0, -2.0), (-20.0, 22.0))
     ]
     profiles = jb.profiles.BumpProfile(-3.0, 8.0, 0.02), jb.profiles.BumpProfile(12.0, 23.0, 0.02)

@@ -11,7 +11,7 @@ from jaxbeam.simulation.labels import contact_sentence, wheel_labels
 from jaxbeam.simulation.stored_record import record_from_xarray
 from tests.simulation.test_record import assert_same
 
-WAGON = jb.Wagon(
+WAGON = jb.vehicles.Wagon(
     body_mass=32000.0,
     body_inertia=1.97e6,
     bogie_mass=2615.0,
@@ -99,7 +99,7 @@ def test_a_body_on_a_slope_is_inclined_as_it_is(speed):
     sensor but for the start, which lasts. The wheels are 2 m before the end at t = 0.
     """
     x = np.linspace(-60.0, 80.0, 15)
-    car = jb.HalfCar(
+    car = jb.vehicles.HalfCar(
         speed=speed,
         body_mass=1000.0,
         body_inertia=1500.0,
@@ -118,7 +118,7 @@ def test_a_body_on_a_slope_is_inclined_as_it_is(speed):
         loads=[car],
         profile=jb.profiles.TableProfile(positions=x, point_heights=0.01 * x + 0.3),
         vehicle_sensors=[
-            jb.planar.VehicleSensor(quantity="displacement", position=p) for p in places
+            jb.vehicles.VehicleSensor(quantity="displacement", position=p) for p in places
         ],
         run=jb.Run(3.0, sample_rate=10.0),
     )

@@ -34,7 +34,7 @@ def test_runs_are_those_of_the_reference(name):
     record, at = simulated(run, MODES.get(name, 16), SAMPLES.get(name, 301))
     deflection, peaks = record.deflection, record.peak_deflection
     if MODES.get(name) != 40:
-        deflection = jb.corrected_deflection(record, record.case.sensor_positions)
+        deflection = jb.sections.corrected_deflection(record, record.case.sensor_positions)
         peaks = [largest(-history) for history in deflection.T]
     for i, expected in enumerate(run["deflection"].values()):
         found = deflection[[at(share * run["duration"]) for share in run["fractions"]], i]

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.analysis.hand_drawn import hand_drawn_law
 from jaxbeam.case.controller import Measurement
-from jaxbeam.model.statics import influence_line
+from jaxbeam.model.deflection_lines import influence_line
 from tuning.control.tuning_result import (
     HAND_DRAWN,
     RunSetResult,

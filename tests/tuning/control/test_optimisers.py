@@ -94,7 +94,7 @@ def regulated():
 
 
 def test_the_states_selected_are_the_best_of_all_choices(regulated):
-    reduced = tuning.tune_reduced(regulated, FED_BACK_COUNT, FREE, CASES, **OPTIONS)
+    reduced = tuning.control.tune_reduced(regulated, FED_BACK_COUNT, FREE, CASES, **OPTIONS)
     objectives = {}
     for fed_back in itertools.combinations(range(STATE_COUNT), FED_BACK_COUNT):
         shares = np.isin(np.arange(STATE_COUNT), fed_back).astype(float)
@@ -116,8 +116,8 @@ def test_the_states_selected_are_the_best_of_all_choices(regulated):
 
 def test_wrong_controllers_and_numbers_of_states_are_refused(regulated):
     with pytest.raises(ValueError, match="only regulators, such as kind 'lqr'"):
-        tuning.tune_reduced(rig(), 1, FREE, CASES)
+        tuning.control.tune_reduced(rig(), 1, FREE, CASES)
     with pytest.raises(ValueError, match="keep must be 1 to 3 of the 4 states; it is 4"):
-        tuning.tune_reduced(regulated, 4, FREE, CASES)
+        tuning.control.tune_reduced(regulated, 4, FREE, CASES)
     with pytest.raises(ValueError, match="leave controller.feedback out of what is free"):
-        tuning.tune_reduced(regulated, 2, {"controller.feedback.0": None}, CASES)
+        tuning.control.tune_reduced(regulated, 2, {"controller.feedback.0": None}, CASES)

@@ -58,7 +58,7 @@ def test_a_pareto_front(swept):
 
 
 def test_lexicographic_order(swept):
-    first, second = tuning.lexicographic(
+    first, second = tuning.control.lexicographic(
         rig(), FREE, CASES, ["peak", "effort"], slack=0.03, **OPTIONS
     )
     best, allowed = first.run_sets[0].metrics["peak"], second.objective.limits["peak"]
@@ -102,12 +102,12 @@ def test_integers():
         with pytest.raises(ValueError, match=message):
             with_integers(rig(), {address: 2})
     with pytest.raises(ValueError, match="at least one integer"):
-        tuning.tune_integers(rig(), {}, FREE, CASES)
+        tuning.control.tune_integers(rig(), {}, FREE, CASES)
 
 
 def test_the_best_integer_is_selected():
     """A power of 1 or 3 of the reading: with such gains a cubic law hardly acts."""
-    search = tuning.tune_integers(
+    search = tuning.control.tune_integers(
         rig(), {"controller.power": [1, 3]}, FREE, CASES, **(OPTIONS | {"steps": 3})
     )
     objectives = [each.run_sets[0].objective[1] for each in search.tuned]
@@ -138,7 +138,7 @@ def test_limits_are_checked():
     with pytest.raises(ValueError, match="there is no metric 'costs'"):
         tuning.pareto(rig(), FREE, CASES, tuning.Objective(), "costs", [1.0])
     with pytest.raises(ValueError, match="each once, the most important first"):
-        tuning.lexicographic(rig(), FREE, CASES, ["peak", "peak"])
+        tuning.control.lexicographic(rig(), FREE, CASES, ["peak", "peak"])
 
 
 def test_latin_hypercube_of_load_cases(tmp_path):

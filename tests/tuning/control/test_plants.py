@@ -21,7 +21,7 @@ def identified_fit():
 
 
 def drawn_plants(identified_fit, count=4000, seed=0):
-    rows = tuning.draw_plants(identified_fit, count, seed)
+    rows = tuning.control.draw_plants(identified_fit, count, seed)
     return np.array([list(row.values()) for row in rows])
 
 
@@ -63,11 +63,11 @@ def test_plants_are_within_bounds(identified_fit):
 def test_draws_of_a_posterior_are_plants():
     draws = np.random.default_rng(0).normal(size=(2, 50, 2))
     posterior = Posterior(["beam.length", "loads.0.mass"], draws, np.ones(2), np.ones(2), 0)
-    rows = tuning.draw_plants(posterior, 100)
+    rows = tuning.control.draw_plants(posterior, 100)
     assert sorted(row["beam.length"] for row in rows) == sorted(draws[..., 0].ravel())
     assert set(rows[0]) == {"beam.length"}
     with pytest.raises(ValueError, match="101 plants need as many draws; the posterior has 100"):
-        tuning.draw_plants(posterior, 101)
+        tuning.control.draw_plants(posterior, 101)
 
 
 def test_fits_from_which_no_plants_can_be_drawn_are_refused(identified_fit):
@@ -75,17 +75,17 @@ def test_fits_from_which_no_plants_can_be_drawn_are_refused(identified_fit):
     with pytest.raises(
         ValueError, match="not identifiable from the data: beam.damping_ratio; to draw plants"
     ):
-        tuning.draw_plants(unidentifiable, 3)
+        tuning.control.draw_plants(unidentifiable, 3)
     with pytest.raises(ValueError, match="must be 1 or more, not 0"):
-        tuning.draw_plants(identified_fit, 0)
+        tuning.control.draw_plants(identified_fit, 0)
     loads = Posterior(["logs.0.loads.0.mass"], np.ones((1, 5, 1)), np.ones(1), np.ones(1), 0)
     with pytest.raises(ValueError, match="no parameter of the plant was identified"):
-        tuning.draw_plants(loads, 3)
+        tuning.control.draw_plants(loads, 3)
 
 
 def test_a_case_with_the_identified_plant(identified_fit):
     other = dataclasses.replace(CASE, loads=(jb.MovingMass(mass=0.1, speed=2.0),))
-    changed = tuning.with_identified_plant(other, identified_fit)
+    changed = tuning.control.with_identified_plant(other, identified_fit)
     assert float(changed.beam.flexural_rigidity) == identified_fit.values[0]
     assert float(changed.sensors[0].offset) == identified_fit.values[2]
     assert float(changed.loads[0].mass) == 0.1

@@ -109,9 +109,9 @@ def test_arguments_of_the_other_kinds_of_tuning(call, monkeypatch):
 
     margin = margins.StabilityMargin(2.0, 0.1)
     monkeypatch.setattr(margins, "stability_margin", lambda case: margin)
-    monkeypatch.setattr(tuning, "lexicographic", lexicographic)
-    monkeypatch.setattr(tuning, "tune_reduced", tune_reduced)
-    monkeypatch.setattr(tuning, "tune_integers", tune_integers)
+    monkeypatch.setattr(tuning.control, "lexicographic", lexicographic)
+    monkeypatch.setattr(tuning.control, "tune_reduced", tune_reduced)
+    monkeypatch.setattr(tuning.control, "tune_integers", tune_integers)
     printed = {"verdict": "fine", "stability": "stable"}
     assert json.loads(call(f"{TUNE} --lexicographic peak,effort --json")[1]) == printed
     assert json.loads(call(f"{TUNE} --integers controller.power=1,3 --json")[1])

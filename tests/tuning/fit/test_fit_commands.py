@@ -46,7 +46,7 @@ def test_weighing(call, tmp_path, monkeypatch):
 
 def test_influence_lines_of_several_logs_are_kept(call, tmp_path, monkeypatch):
     """Those found from two logs weigh a third at once, and a fourth from the file."""
-    found = tuning.InfluenceLines(
+    found = tuning.weighing.InfluenceLines(
         np.array([0.0, 0.3, 0.6]), np.array([[0.0], [-2e-6], [0.0]]), np.eye(3)[None], 20.0,
         np.array([[0.0], [1.0], [0.0]]), np.array([1.0]), np.array([0.02]),
     )  # fmt: skip
@@ -66,8 +66,8 @@ def test_influence_lines_of_several_logs_are_kept(call, tmp_path, monkeypatch):
         calibrated.extend(log.source for log in logs)
         return found
 
-    monkeypatch.setattr(tuning, "weigh_axles", Weighed)
-    monkeypatch.setattr(tuning, "calibrate_influence_lines", calibrate)
+    monkeypatch.setattr(tuning.weighing, "weigh_axles", Weighed)
+    monkeypatch.setattr(tuning.weighing, "calibrate_influence_lines", calibrate)
     for name in ("log", "first", "second"):
         (tmp_path / f"{name}.csv").write_text("t [s],a [mm]\n0,1\n1,2\n2,1\n")
     weigh = "weigh case.toml log.csv --speeds 0.5:3 --axles auto"
@@ -92,7 +92,7 @@ def test_models_compared_and_held_out_logs(call, tmp_path, monkeypatch):
         (tmp_path / f"{name}.npz").touch()
     monkeypatch.setattr(tuning, "load_fit", lambda path: fits[path.stem])
     predictions = [HeldOutPrediction("new", np.array([1.1]))]
-    monkeypatch.setattr(tuning, "predict_held_out", lambda fit, logs: predictions)
+    monkeypatch.setattr(tuning.fit, "predict_held_out", lambda fit, logs: predictions)
     code, out, err = call("compare-models three.npz one.npz --held-out runs.csv")
     assert code == 1 and "the cell is empty" in err
     code, out, err = call("compare-models three.npz one.npz")
@@ -100,7 +100,7 @@ def test_models_compared_and_held_out_logs(call, tmp_path, monkeypatch):
     header, first, second = out.splitlines()
     assert header.split() == ["model", "parameters", "log", "likelihood", "AIC", "BIC", "weight"]
     assert first.split()[:2] == ["one", "1"] and second.split()[:2] == ["three", "3"]
-    assert float(first.split()[4]) == pytest.approx(tuning.compare_fits(fits)[0].bic, rel=1e-5)
+    assert float(first.split()[4]) == pytest.approx(tuning.fit.compare_fits(fits)[0].bic, rel=1e-5)
     (tmp_path / "new.csv").write_text("t [s],a [mm],b [mm]\n0,1,3\n1,2,2\n2,1,1\n")
     code, out, _ = call("compare-models one.npz --held-out new.csv")
     assert out == "one: new: predicted; residuals are 1.1 times the noise at most\n"
@@ -147,7 +147,7 @@ def test_fit_to_responses(call, monkeypatch):
         arguments.update(measured=measured, free=free)
         return fit
 
-    monkeypatch.setattr(tuning, "responses_of", lambda log, segment: (log.source, segment))
+    monkeypatch.setattr(tuning.fit, "responses_of", lambda log, segment: (log.source, segment))
     monkeypatch.setattr(tuning, "identify_responses", identify_responses)
     line = "identify-responses case.toml new.csv --free beam.flexural_rigidity=5:20"
     assert "new.csv" in call(line)[2]

@@ -61,8 +61,8 @@ def case() -> jb.Case:
         sensors=[jb.Sensor(LENGTH / 2)],
         loads=[jb.QuarterCar(**CAR, speed=SPEED, start_position=START)],
         vehicle_sensors=[
-            jb.planar.VehicleSensor(body="body"),
-            jb.planar.VehicleSensor(body="axle"),
+            jb.vehicles.VehicleSensor(body="body"),
+            jb.vehicles.VehicleSensor(body="axle"),
         ],
         profile=jb.profiles.SpectrumProfile(*WAVES.T),
         run=jb.Run(duration=DURATION, sample_rate=RATE),
@@ -196,11 +196,11 @@ def test_sensors_of_no_vehicle_are_refused():
 def test_a_sensor_away_from_the_centre_of_mass_feels_the_pitch(tmp_path):
     axles = {name: np.full(2, value) for name, value in list(CAR.items())[1:]}
     axles["axle_masses"] = axles.pop("axle_mass")
-    car = jb.HalfCar(
+    car = jb.vehicles.HalfCar(
         body_mass=16000.0, body_inertia=40000.0, axle_positions=np.array([2.0, -2.0]), **axles,
         speed=SPEED, start_position=START,
     )  # fmt: skip
-    point = jb.planar.VehicleSensor(quantity="velocity", position=1.5, offset="2 cm/s")
+    point = jb.vehicles.VehicleSensor(quantity="velocity", position=1.5, offset="2 cm/s")
     whole = dataclasses.replace(case(), loads=[car], vehicle_sensors=[point])
     jb.save_case(whole, tmp_path / "case.toml")
     record = jb.simulate(jb.load_case(tmp_path / "case.toml"))

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from tuning import Log, align_logs, find_faults, read_log
+from tuning import Log, read_log
+from tuning.logs import align_logs, find_faults
 from tuning.logs.records import even_records
 
 TIMES = np.arange(40) / 500

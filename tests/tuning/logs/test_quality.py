@@ -8,7 +8,8 @@ import pytest
 import jaxbeam as jb
 from jaxbeam.case.validation import check_case
 from tests.tuning.small_rig import rig
-from tuning import Log, find_faults, mask
+from tuning import Log
+from tuning.logs import find_faults, mask
 from tuning.logs.pairing import case_of_log, check_loads, pad_cases
 
 TIMES = np.arange(600) / 500

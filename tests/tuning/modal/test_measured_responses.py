@@ -58,7 +58,7 @@ def hammer_log(seed=0, noise=0.02, duration=60.0):
     ],
 )
 def test_noise_biases_as_theory_says(estimator, noise_in, noise_out, expected):
-    found = tuning.measured_responses(
+    found = tuning.modal.measured_responses(
         gain_log(noise_in, noise_out), estimator=estimator, segment=5.0
     )
     values, coherence = found.values[2:-2, 0, 0], found.coherence[2:-2, 0]
@@ -79,11 +79,11 @@ def test_two_forces_are_told_apart():
         np.arange(20_000) / RATE, values, ("f1", "f2", "v"), ("force", "force", "velocity"),
         ("N", "N", "m/s"), "two",
     )  # fmt: skip
-    found = tuning.measured_responses(log)
+    found = tuning.modal.measured_responses(log)
     expected = np.tile([2.0, -3.0], (found.frequencies.size - 6, 1))
     np.testing.assert_allclose(found.values[3:-3, 0], expected, rtol=1e-6)
     with pytest.raises(ValueError, match="H2 is for one force, not 2; use H1"):
-        tuning.measured_responses(log, estimator="H2")
+        tuning.modal.measured_responses(log, estimator="H2")
 
 
 def test_windows_of_blows(tmp_path):
@@ -95,7 +95,7 @@ def test_windows_of_blows(tmp_path):
     for fit in (plain, windowed):
         np.testing.assert_allclose(fit.frequencies, structure.frequencies, rtol=2e-3)
         np.testing.assert_allclose(fit.damping_ratios, structure.damping_ratios, rtol=0.1)
-    found = tuning.measured_responses(log, exponential=4.0)
+    found = tuning.modal.measured_responses(log, exponential=4.0)
     assert found.averages == 3 and found.decay_rate == 0.25
     w = 2 * np.pi * structure.frequencies[0]
     assert found.true_damping_ratio(structure.frequencies[0], 0.02) == 0.02 - 0.25 / w
@@ -105,7 +105,7 @@ def test_windows_of_blows(tmp_path):
 
 def test_responses_to_blows_are_those_of_the_structure():
     structure, log = hammer_log(noise=0.0)
-    found = tuning.measured_responses(log, exponential=3.0)
+    found = tuning.modal.measured_responses(log, exponential=3.0)
     w = 2 * np.pi * found.frequencies
     expected = 0
     for pole, shape, inputs in zip(
@@ -133,4 +133,4 @@ def test_responses_to_blows_are_those_of_the_structure():
 )
 def test_mistakes(arguments, message):
     with pytest.raises(ValueError, match=message):
-        tuning.measured_responses(gain_log(0.0, 0.1), **arguments)
+        tuning.modal.measured_responses(gain_log(0.0, 0.1), **arguments)

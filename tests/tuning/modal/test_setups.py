@@ -9,7 +9,8 @@ from pyoma2.functions.gen import merge_mode_shapes
 from scipy.linalg import eigh
 
 from tests.oracles.planted_structures import Structure, beam_matrices, coloured_noise, response
-from tuning import Log, identify_modes, merge_setups
+from tuning import Log, identify_modes
+from tuning.modal import merge_setups
 from tuning.modal.fit import ModalFit
 from tuning.modal.harmonics import Line
 from tuning.modal.result import IdentifiedMode, mac_matrix

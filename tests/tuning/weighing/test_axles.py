@@ -10,7 +10,8 @@ import pytest
 
 import jaxbeam as jb
 from tests.oracles import finite_elements, vehicle_elements
-from tuning import Log, calibrate_influence_lines, model_influence_lines, weigh_axles
+from tuning import Log
+from tuning.weighing import calibrate_influence_lines, model_influence_lines, weigh_axles
 from tuning.weighing.axle_fit import fit_axles
 from tuning.weighing.axles import AxleWeighing
 from tuning.weighing.influence_lines import AxleGeometry, lines_from_dict

@@ -156,7 +156,7 @@ def sample(
     ...     )
     >>> start = jb.replace(case, {"beam.flexural_rigidity": 10.0})
     >>> fit = tuning.identify(start, logs, "beam.flexural_rigidity")
-    >>> posterior = tuning.sample(fit, draws=20, chains=2, warmup=20)
+    >>> posterior = tuning.fit.sample(fit, draws=20, chains=2, warmup=20)
     >>> print(posterior.addresses, f"{posterior.means[0]:.1f}")
     ['beam.flexural_rigidity'] 12.0
     """

@@ -80,7 +80,7 @@ def profile(fit: Fit, address: str, points: int = 4) -> Profile:
     ...     )
     >>> start = jb.replace(case, {"beam.flexural_rigidity": 10.0})
     >>> fit = tuning.identify(start, logs, "beam.flexural_rigidity")
-    >>> found = tuning.profile(fit, "beam.flexural_rigidity", points=1)
+    >>> found = tuning.fit.profile(fit, "beam.flexural_rigidity", points=1)
     >>> print(f"{found.interval[0]:.1f} to {found.interval[1]:.1f} {found.unit}")
     12.0 to 12.1 N m^2
     """

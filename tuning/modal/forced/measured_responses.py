@@ -40,7 +40,7 @@ class MeasuredResponses:
     >>> log = tuning.Log(
     ...     0.001 * np.arange(4000), np.column_stack([force, 2e-3 * force]), *columns
     ... )
-    >>> found = tuning.measured_responses(log)
+    >>> found = tuning.modal.measured_responses(log)
     >>> print(f"{abs(found.values).mean():.1e} m/s/N, coherence {found.coherence.mean():.2f}")
     2.0e-03 m/s/N, coherence 1.00
     """
@@ -108,7 +108,7 @@ def measured_responses(
     >>> force = np.random.default_rng(0).normal(size=1000)
     >>> columns = ("f", "v1"), ("force", "velocity"), ("N", "m/s")
     >>> log = tuning.Log(0.01 * np.arange(1000), np.stack([force, 3.0 * force], axis=1), *columns)
-    >>> found = tuning.measured_responses(log, estimator="H2", segment=1.0)
+    >>> found = tuning.modal.measured_responses(log, estimator="H2", segment=1.0)
     >>> print(found.frequencies[:3].round(2), f"{abs(found.values).mean():.2f} m/s/N")
     [1. 2. 3.] 3.00 m/s/N
     """

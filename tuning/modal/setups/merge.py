@@ -40,7 +40,7 @@ class MultiSetupFit(ModalEstimates):
     ...     values = np.multiply.outer(decay, [1.0, size]) + 1e-3 * random.normal(size=(1600, 2))
     ...     columns = ("a1", name), ("acceleration",) * 2, ("m/s^2",) * 2
     ...     return tuning.identify_modes(tuning.Log(times, values, *columns))
-    >>> fit = tuning.merge_setups([setup("a2", 0.5), setup("a3", -0.5)])
+    >>> fit = tuning.modal.merge_setups([setup("a2", 0.5), setup("a3", -0.5)])
     >>> print(fit.channels.names, np.round(fit.shapes[0].real, 2))
     ('a1', 'a2', 'a3') [ 1.   0.5 -0.5]
     """
@@ -132,7 +132,7 @@ def merge_setups(
     ...     values = np.multiply.outer(decay, [1.0, size]) + 1e-3 * random.normal(size=(1600, 2))
     ...     columns = ("fixed", "moved"), ("acceleration",) * 2, ("m/s^2",) * 2
     ...     return tuning.identify_modes(tuning.Log(times, values, *columns, f"{size}.csv"))
-    >>> fit = tuning.merge_setups([setup(0.5), setup(-0.8)], references=["fixed"])
+    >>> fit = tuning.modal.merge_setups([setup(0.5), setup(-0.8)], references=["fixed"])
     >>> print(f"{fit.frequencies[0]:.2f} Hz", np.round(fit.shapes[0].real, 2))
     3.20 Hz [ 1.   0.5 -0.8]
     """

@@ -14,7 +14,7 @@ from jaxbeam.case.loads.base import (
     positive_error,
     static_load_error,
 )
-from jaxbeam.case.loads.planar.assembly import Bodies, Links, Wheels, assemble
+from jaxbeam.case.loads.vehicles.assembly import Bodies, Links, Wheels, assemble
 from jaxbeam.runtime.arrays import Number, xp
 
 NO_LINKS = Links((), np.zeros(0), np.zeros(0), np.zeros(0))
@@ -128,7 +128,7 @@ class HalfCar(AbstractVehicleLoad):
     ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
     ...     sensors=[jb.Sensor(10.0)],
     ...     loads=[
-    ...         jb.HalfCar(
+    ...         jb.vehicles.HalfCar(
     ...             speed=20.0,
     ...             body_mass=16600.0,
     ...             body_inertia=95765.0,
@@ -223,7 +223,7 @@ class Wagon(AbstractRowLoad):
     ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
     ...     sensors=[jb.Sensor(10.0)],
     ...     loads=[
-    ...         jb.Wagon(
+    ...         jb.vehicles.Wagon(
     ...             speed=50.0,
     ...             body_mass=32e3,
     ...             body_inertia=2e6,

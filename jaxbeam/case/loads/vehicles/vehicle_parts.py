@@ -38,14 +38,14 @@ class VehicleBody(ReprWithUnits):
     ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
     ...     sensors=[jb.Sensor(10.0)],
     ...     loads=[
-    ...         jb.VehicleLoad(
+    ...         jb.vehicles.VehicleLoad(
     ...             speed=20.0,
-    ...             bodies=[jb.planar.VehicleBody("car", mass=1500.0, inertia=2500.0)],
+    ...             bodies=[jb.vehicles.VehicleBody("car", mass=1500.0, inertia=2500.0)],
     ...             axles=[
-    ...                 jb.planar.VehicleAxle(
+    ...                 jb.vehicles.VehicleAxle(
     ...                     "car", 1.2, suspension_stiffness=4e4, suspension_damping=3e3
     ...                 ),
-    ...                 jb.planar.VehicleAxle(
+    ...                 jb.vehicles.VehicleAxle(
     ...                     "car", -1.5, suspension_stiffness=4e4, suspension_damping=3e3
     ...                 ),
     ...             ],
@@ -75,18 +75,18 @@ class VehicleSpring(ReprWithUnits):
     ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
     ...     sensors=[jb.Sensor(10.0)],
     ...     loads=[
-    ...         jb.VehicleLoad(
+    ...         jb.vehicles.VehicleLoad(
     ...             speed=20.0,
     ...             bodies=[
-    ...                 jb.planar.VehicleBody("body", mass=8000.0),
-    ...                 jb.planar.VehicleBody("frame", mass=2000.0),
+    ...                 jb.vehicles.VehicleBody("body", mass=8000.0),
+    ...                 jb.vehicles.VehicleBody("frame", mass=2000.0),
     ...             ],
     ...             springs=[
-    ...                 jb.planar.VehicleSpring(
+    ...                 jb.vehicles.VehicleSpring(
     ...                     "body", "frame", position=0.0, stiffness=4e5, damping=1e4
     ...                 )
     ...             ],
-    ...             axles=[jb.planar.VehicleAxle("frame", 0.0, suspension_stiffness=1e6)],
+    ...             axles=[jb.vehicles.VehicleAxle("frame", 0.0, suspension_stiffness=1e6)],
     ...         )
     ...     ],
     ...     run=jb.Run(1.0),
@@ -116,21 +116,21 @@ class VehicleHinge(ReprWithUnits):
     ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
     ...     sensors=[jb.Sensor(10.0)],
     ...     loads=[
-    ...         jb.VehicleLoad(
+    ...         jb.vehicles.VehicleLoad(
     ...             speed=20.0,
     ...             bodies=[
-    ...                 jb.planar.VehicleBody("tractor", mass=5000.0, inertia=2e4, position=0.0),
-    ...                 jb.planar.VehicleBody("trailer", mass=15000.0, inertia=8e4, position=-6.0),
+    ...                 jb.vehicles.VehicleBody("tractor", mass=5000.0, inertia=2e4, position=0.0),
+    ...                 jb.vehicles.VehicleBody("trailer", mass=15e3, inertia=8e4, position=-6.0),
     ...             ],
-    ...             hinges=[jb.planar.VehicleHinge("tractor", "trailer", position=-1.5)],
+    ...             hinges=[jb.vehicles.VehicleHinge("tractor", "trailer", position=-1.5)],
     ...             axles=[
-    ...                 jb.planar.VehicleAxle(
+    ...                 jb.vehicles.VehicleAxle(
     ...                     "tractor", 2.0, suspension_stiffness=4e5, suspension_damping=1e4
     ...                 ),
-    ...                 jb.planar.VehicleAxle(
+    ...                 jb.vehicles.VehicleAxle(
     ...                     "tractor", -2.0, suspension_stiffness=4e5, suspension_damping=1e4
     ...                 ),
-    ...                 jb.planar.VehicleAxle(
+    ...                 jb.vehicles.VehicleAxle(
     ...                     "trailer", -9.0, suspension_stiffness=1e6, suspension_damping=2e4
     ...                 ),
     ...             ],
@@ -158,14 +158,14 @@ class VehicleAxle(ReprWithUnits):
     ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
     ...     sensors=[jb.Sensor(10.0)],
     ...     loads=[
-    ...         jb.VehicleLoad(
+    ...         jb.vehicles.VehicleLoad(
     ...             speed=20.0,
-    ...             bodies=[jb.planar.VehicleBody("car", mass=1500.0, inertia=2500.0)],
+    ...             bodies=[jb.vehicles.VehicleBody("car", mass=1500.0, inertia=2500.0)],
     ...             axles=[
-    ...                 jb.planar.VehicleAxle(
+    ...                 jb.vehicles.VehicleAxle(
     ...                     "car", 1.2, suspension_stiffness=4e4, suspension_damping=3e3
     ...                 ),
-    ...                 jb.planar.VehicleAxle(
+    ...                 jb.vehicles.VehicleAxle(
     ...                     "car", -1.5, suspension_stiffness=4e4, suspension_damping=3e3
     ...                 ),
     ...             ],
@@ -303,8 +303,8 @@ class VehicleSensor(ReprWithUnits, Module):
     >>> import jaxbeam as jb
     >>> case = jb.Case(
     ...     jb.Beam(20.0, 1e10, 12e3),
-    ...     loads=[jb.VehicleLoad(model="half-truck", speed=20.0)],
-    ...     vehicle_sensors=[jb.planar.VehicleSensor(body="axle 1", quantity="acceleration")],
+    ...     loads=[jb.vehicles.VehicleLoad(model="half-truck", speed=20.0)],
+    ...     vehicle_sensors=[jb.vehicles.VehicleSensor(body="axle 1", quantity="acceleration")],
     ...     run=jb.Run(1.0),
     ... )
     >>> print(case.vehicle_sensors[0].unit)

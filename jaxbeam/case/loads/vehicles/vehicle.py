@@ -29,8 +29,8 @@ from jaxbeam.case.loads.base import (
     known_numbers,
     static_load_error,
 )
-from jaxbeam.case.loads.planar.assembly import Bodies, Hinges, Links, Wheels, assemble
-from jaxbeam.case.loads.planar.vehicle_parts import (
+from jaxbeam.case.loads.vehicles.assembly import Bodies, Hinges, Links, Wheels, assemble
+from jaxbeam.case.loads.vehicles.vehicle_parts import (
     VehicleAxle,
     VehicleBody,
     VehicleHinge,
@@ -146,7 +146,7 @@ def is_path(model: str) -> bool:
 @functools.cache
 def vehicle_names() -> tuple[str, ...]:
     """Names of the vehicles of the library."""
-    folder = resources.files("jaxbeam.vehicles") / "models"
+    folder = resources.files("jaxbeam.library") / "models"
     names = (entry.name for entry in folder.iterdir())
     return tuple(sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml")))
 
@@ -160,7 +160,7 @@ def load_vehicle(model: str | os.PathLike) -> PlanarVehicle:
     `model` is the name, or the path of the file.
 
     >>> import jaxbeam as jb
-    >>> print(jb.load_vehicle("truck-5-axle").title)
+    >>> print(jb.vehicles.load_vehicle("truck-5-axle").title)
     Articulated truck: tractor with two axles, trailer with three
     """
     if isinstance(model, str) and not is_path(model):
@@ -194,7 +194,7 @@ def check_vehicle(vehicle: PlanarVehicle) -> None:
 
 @functools.cache
 def _library_vehicle(name: str) -> PlanarVehicle:
-    text = (resources.files("jaxbeam.vehicles") / "models" / f"{name}.toml").read_text("utf-8")
+    text = (resources.files("jaxbeam.library") / "models" / f"{name}.toml").read_text("utf-8")
     return read_part("", tomllib.loads(text), PlanarVehicle)
 
 
@@ -209,7 +209,7 @@ class Coach(Module):
     middle of it.
 
     >>> import jaxbeam as jb
-    >>> coach = jb.Coach("manchester-wagon", count=4)
+    >>> coach = jb.vehicles.Coach("manchester-wagon", count=4)
     >>> print(coach.count, "coaches of", coach.coupler_length(), "m")
     4 coaches of 25.0 m
     """
@@ -233,10 +233,11 @@ class TrainLoad(AbstractVehicleLoad):
     They are one load with one trajectory, that of the first wheel of the train.
 
     >>> import jaxbeam as jb
+    >>> wagons = jb.vehicles.Coach("manchester-wagon", count=2)
     >>> case = jb.Case(
     ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
     ...     sensors=[jb.Sensor(10.0)],
-    ...     loads=[jb.TrainLoad(speed=50.0, coaches=[jb.Coach("manchester-wagon", count=2)])],
+    ...     loads=[jb.vehicles.TrainLoad(speed=50.0, coaches=[wagons])],
     ...     run=jb.Run(1.0),
     ... )
     >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")
@@ -313,7 +314,7 @@ class VehicleLoad(AbstractRowLoad):
     >>> case = jb.Case(
     ...     jb.Beam(20.0, 1e10, 12e3, damping_ratio=0.01, modes=3),
     ...     sensors=[jb.Sensor(10.0)],
-    ...     loads=[jb.VehicleLoad(model="half-truck", speed=20.0)],
+    ...     loads=[jb.vehicles.VehicleLoad(model="half-truck", speed=20.0)],
     ...     run=jb.Run(1.0),
     ... )
     >>> print(f"{1e3 * jb.simulate(case).peak_deflection[0]:.3f} mm")

@@ -1,0 +1,248 @@
+"""Exact static solutions without modes: deflections, influence lines, static gains of actuators,
+and peaks of a slow crossing (see `flexibility`).
+"""
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.case.declared_checks import check_on_beam
+from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.trajectory import NEVER
+from jaxbeam.case.validation import check_case
+from jaxbeam.model.flexibility import check_supported, flexibility
+from jaxbeam.model.load_set import LoadSet, load_set
+from jaxbeam.model.modes import Layout, mesh_layout
+from jaxbeam.numerics.peak_search import estimate_peak, refine_peak
+from jaxbeam.runtime.arrays import Array, add_at, is_known, set_at, xp
+from jaxbeam.runtime.compiling import compiled_if_traced
+
+# Positions on an interval between events that determine the deflection exactly there: eleven for a
+# cubic (flexibility) of a cubic (trajectory) times a table of forces, a polynomial of degree ten.
+# Half a period of a sine is interpolated to 1e-7 of its amplitude.
+PEAK_POSITIONS = tuple(float(share) for share in np.linspace(0, 1, 11))
+BLOCK = 4_000_000  # values of lines under all wheels at a time
+END_SHARE = 1e-5  # of an interval, by which its ends are left out
+# Of all times: shorter intervals lie between a place and the section beside it, and are left out.
+SHORTEST = 1e-9
+# Positions from the middle at which samples are taken, and what takes them to PEAK_POSITIONS: the
+# first two terms of the Taylor series of their polynomial.
+WITHIN = (1 - 2 * END_SHARE) * (np.array(PEAK_POSITIONS) - 0.5)
+
+
+def _to_ends() -> Float[np.ndarray, "point point"]:
+    x = 2 * np.array(PEAK_POSITIONS) - 1
+    powers = np.arange(x.size)
+    slopes = powers * x[:, None] ** np.maximum(powers - 1, 0)
+    derivative = slopes @ np.linalg.inv(x[:, None] ** powers)
+    step = (2 * END_SHARE * x)[:, None]
+    return step * derivative + step**2 / 2 * (derivative @ derivative)
+
+
+TO_ENDS = _to_ends()
+
+
+@compiled_if_traced
+def unchecked_influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
+    """`influence_line` of a case and positions (arrays) that are known to be valid."""
+    greens = flexibility(case, layout, x.reshape(-1), derivative)
+    length = case.beam.length
+    order = abs(derivative)  # that of the slope is 1, too
+    line = -greens(load_positions / length) * length ** (3 - order) / case.beam.bending_stiffness
+    return line.reshape((*load_positions.shape, *x.shape))
+
+
+def influence_line(
+    case: Case, x, load_positions, derivative: int = 0, layout: Layout | None = None
+) -> Float[Array, "..."]:
+    """Influence line: static deflection at x under 1 N downwards at each load position, in m/N.
+
+    Exact for E I w'''' = p with the case's supports, bonded patches and suspensions; commands are
+    zero. `x` and `load_positions` (m from the left end) may have any shapes; the result has the
+    shape (load position..., x...). `derivative` (up to 3) gives that x-derivative instead, in
+    m^(1-derivative)/N. By reciprocity the line is also the deflected shape under 1 N at x.
+    Differentiable in every number. Inside `jit`, pass the `layout` found outside by
+    `model.modes.mesh_layout(case)`.
+
+    Raises ValueError for an invalid case, a position off the beam, or a beam that can move as a
+    rigid body.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Case(jb.Beam(length=2.0, flexural_rigidity=6.0, mass_per_length=1.0))
+    >>> print(f"{jb.influence_line(beam, x=1.0, load_positions=1.0):.6f}")  # -L^3 / (48 E I)
+    -0.027778
+    """
+    x, load_positions = xp.asarray(x, float), xp.asarray(load_positions, float)
+    layout = validated_layout(case, layout, x=x, positions=load_positions)
+    return unchecked_influence_line(case, layout, x, load_positions, derivative)
+
+
+def static_deflection(
+    case: Case,
+    x,
+    load_positions,
+    forces=None,
+    derivative: int = 0,
+    layout: Layout | None = None,
+) -> Float[Array, "*position"]:
+    """Static deflection at x (m) under stationary forces, in m, positive upwards.
+
+    `forces` (load,) are in N, positive downwards, at `load_positions` (load,) in m; by default the
+    static loads of the wheels of the case. `derivative` and `layout` are those of `influence_line`.
+
+    Raises ValueError as `influence_line` does, and where forces and positions differ in number.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Case(jb.Beam(length=2.0, flexural_rigidity=6.0, mass_per_length=1.0))
+    >>> print(f"{jb.statics.static_deflection(beam, 1.0, load_positions=[1.0], forces=[18.0]):.3f}")
+    -0.500
+    """
+    positions = xp.atleast_1d(xp.asarray(load_positions, float))
+    if forces is None:
+        forces = load_set(case).weight[:, 0]
+        described = "wheels of the case"
+    else:
+        forces = xp.atleast_1d(xp.asarray(forces, float))
+        described = "forces"
+    if forces.shape != positions.shape or forces.ndim != 1:
+        raise ValueError(
+            f"load_positions must be one for each of the {forces.size} {described};"
+            f" their shape is {positions.shape}"
+        )
+    return xp.tensordot(forces, influence_line(case, x, positions, derivative, layout), axes=1)
+
+
+def static_deflection_per_command(
+    case: Case, x, derivative: int = 0, layout: Layout | None = None
+) -> Float[Array, "actuator *position"]:
+    """Static deflection at x (m) per unit of each actuator's steady command, in m/V or m/N.
+
+    Exact, without the loads of the case. `derivative` (up to 3) gives that x-derivative instead; at
+    a discontinuity, such as that of the curvature at the end of a patch, its value to the right.
+    Inside `jit`, pass the `layout`. Raises ValueError as `influence_line` does.
+    """
+    per_force = static_deflection_per_port_force(case, x, derivative, layout)
+    gains = xp.array([a.attachment().static_gain for a in case.actuators]).reshape(-1)
+    return gains.reshape(-1, *(1,) * (per_force.ndim - 1)) * per_force
+
+
+def static_deflection_per_port_force(
+    case: Case, x, derivative: int = 0, layout: Layout | None = None
+) -> Float[Array, "actuator *position"]:
+    """Static deflection at x (m) per unit of each actuator's generalised force on the beam.
+
+    In m/N for a force, 1/N for a couple; otherwise as `static_deflection_per_command`.
+    """
+    x = xp.asarray(x, float)
+    layout = validated_layout(case, layout, x=x)
+    return _deflection_per_port_force(case, layout, x, derivative)
+
+
+@compiled_if_traced
+def _deflection_per_port_force(case: Case, layout: Layout, x, derivative: int):
+    length = case.beam.length
+    greens = flexibility(case, layout, x.reshape(-1), derivative)  # by reciprocity: forces at x
+    gains = xp.zeros((len(case.actuators), x.size))
+    for i, actuator in enumerate(case.actuators):
+        terms = actuator.displacement_map()
+        displacement = sum(f / length**d * greens(position / length, d) for position, d, f in terms)
+        gains = set_at(gains, i, displacement)
+    return (gains * length ** (3 - derivative) / case.beam.bending_stiffness).reshape(-1, *x.shape)
+
+
+def peak_under_loads(
+    case: Case,
+    line: Callable[[Float[Array, "*position"]], Float[Array, "*position x"]],
+    breaks: Float[Array, " break"],
+    wave_intervals: int = 0,
+) -> Float[Array, " x"]:
+    """Largest absolute value of the sums F_l(t) line(y_l(t)) over the loads l and all times.
+
+    `line` is that of a quantity per newton over the position y (m) of a force, a cubic between the
+    `breaks` (m). Between events the sum is a polynomial in time, of degree POINTS - 1 at most;
+    under waves it is interpolated in `wave_intervals` more (see `intervals_of_waves`).
+    """
+    loads, length = load_set(case), case.beam.length
+    windows, times = _intervals(case, loads, breaks, wave_intervals)
+    starts, ends = times[:-1], times[1:]
+    count = line(xp.zeros(0)).shape[-1]
+    size = starts.shape[0] * len(PEAK_POSITIONS) * loads.wheel_count * max(1, count)
+    samples, estimates = [], []
+    for part in np.array_split(np.arange(starts.shape[0]), -(-size // BLOCK)):
+        middle = (starts[part] + ends[part]) / 2
+        # At a break, where the line of a shear force jumps, the side on which the wheel is.
+        within = middle + (ends[part] - starts[part]) * WITHIN[:, None]
+        position = xp.clip(loads.kinematics(within)[0], 0.0, length)
+        forces = loads.varying_weight(within)[..., 0]
+        active = (windows[:, :1] < middle) & (middle < windows[:, 1:])
+        active = active & (ends[part] - starts[part] > SHORTEST * (times[-1] - times[0]))
+        if is_known(active):
+            wheel, at = np.nonzero(active)
+        else:
+            wheel, at = np.divmod(np.arange(loads.wheel_count * part.size), part.size)
+        force = (forces[:, at, wheel] * active[wheel, at])[..., None]
+        total = xp.zeros((len(PEAK_POSITIONS), part.size, count))
+        total = add_at(total, np.s_[:, at], force * line(position[wheel, :, at].T))
+        total = total + xp.tensordot(TO_ENDS, total, axes=1)
+        estimate = estimate_peak(total, PEAK_POSITIONS)
+        best = xp.argmax(estimate, axis=0)[None]
+        estimates.append(xp.take_along_axis(estimate, best, axis=0)[0])
+        samples.append(xp.take_along_axis(total, best[None], axis=1)[:, 0])
+    best = xp.argmax(xp.stack(estimates), axis=0)[None, None]
+    chosen = xp.take_along_axis(xp.stack(samples, axis=1), best, axis=1)[:, 0]
+    return refine_peak(chosen, PEAK_POSITIONS)[0]
+
+
+def _intervals(case: Case, loads: LoadSet, breaks, wave_intervals: int):
+    """Entry and exit of each wheel, and times (s) between which forces and motions are smooth.
+
+    The last interval is that after all events, in which loads that stay still press.
+    """
+    windows, events = loads.events(breaks)
+    happens = events < NEVER
+    happening = xp.any(happens)
+    first = xp.where(happening, xp.min(xp.where(happens, events, NEVER)), 0.0)
+    last = xp.where(happening, xp.max(xp.where(happens, events, -NEVER)), 0.0)
+    end = xp.maximum(last, case.run.duration) if wave_intervals else last + 1.0
+    grid = first + (end - first) * np.linspace(0.0, 1.0, wave_intervals + 2)
+    times = xp.concatenate([xp.where(happens, events, first), grid])
+    return windows, np.unique(times) if is_known(times) else xp.sort(times)
+
+
+def intervals_of_waves(case: Case) -> int:
+    """Half periods of the fastest wave of a force of the case from its first event on; 0 without.
+
+    Waves last until the end of the run, or the last event if that is later. Raises ValueError where
+    there is a wave and a number of the loads or the run is traced.
+    """
+    histories = load_set(case).wheels.histories.values()
+    frequencies = [history.frequencies for history in histories if history.frequencies.size]
+    if not frequencies:
+        return 0
+    if not all(map(is_concrete, jax.tree.leaves((case.loads, case.run, case.beam.length)))):
+        raise ValueError(
+            "the static peak under a force with waves needs known numbers of loads, run and length:"
+            " leave them out of what jax.jit or jax.grad traces"
+        )
+    known = concrete_case(case)
+    _, times = _intervals(known, load_set(known), np.zeros(0), 1)
+    fastest = max(float(np.max(np.abs(concrete(one)))) for one in frequencies)
+    return int(np.ceil(2 * fastest * float(times[-1] - times[0]))) + 1
+
+
+def validated_layout(case: Case, layout: Layout | None, **positions) -> Layout:
+    """Layout of a case, after checks of its concrete numbers, positions and supports.
+
+    Raises ValueError as `influence_line` does.
+    """
+    check_case(case)
+    for name, position in positions.items():
+        check_on_beam(name, position, case.beam.length)
+    layout = mesh_layout(case) if layout is None else layout
+    unloaded_case = Case(case.beam, case.supports, case.actuators)
+    if all(is_concrete(leaf) for leaf in jax.tree.leaves(unloaded_case)):
+        check_supported(concrete_case(unloaded_case), layout)
+    return layout
