@@ -61,31 +61,16 @@ def _draw(record: "jb.Record", path: Path) -> None:
 
 def report(record: "jb.Record") -> str:
     """A page to print: what the run is, its peaks and contact forces, the picture, the case."""
-    import base64
-    import html
-    import io
-
     from jaxbeam.files.case_file import case_to_dict
-    from jaxbeam.files.report import PAGE_STYLE
+    from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable, html
     from jaxbeam.plot import plot_record
 
-    content, safe = jb.api.content(record), html.escape
-    picture = io.BytesIO()
-    plot_record(record).savefig(picture, format="png")
-    image = base64.b64encode(picture.getvalue()).decode()
-
-    def table(header, rows):
-        cells = "".join(
-            "<tr>" + "".join(f"<td>{safe(str(cell))}</td>" for cell in row) + "</tr>"
-            for row in rows
-        )
-        heads = "".join(f"<th>{safe(head)}</th>" for head in header)
-        return f"<table><tr>{heads}</tr>{cells}</table>"
+    content = jb.api.content(record)
 
     def number(value):
         return "-" if value is None else f"{value:.5g}"
 
-    sensors = table(
+    sensors = ReportTable(
         ("sensor", "quantity", "unit", "smallest", "at (s)", "largest", "at (s)", "amplification"),
         [
             (s["name"], s["quantity"], s["unit"], *(number(s[key]) for key in PEAKS))
@@ -93,20 +78,22 @@ def report(record: "jb.Record") -> str:
         ],
     )
     forces = zip(content["lowest_contact_force"], content["largest_contact_force"], strict=True)
-    wheels = table(
+    wheels = ReportTable(
         ("wheel", "lowest contact force (N)", "largest (N)"),
-        [(i, number(low), number(high)) for i, (low, high) in enumerate(forces)],
+        [(str(i), number(low), number(high)) for i, (low, high) in enumerate(forces)],
     )
-    title = safe(record.case.title or "Run")
     parts = case_to_dict(record.case)
-    entries = [(f"{key}", _short(value)) for key, value in parts.items() if key != "title"]
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-        f"<style>{PAGE_STYLE}</style></head><body><h1>{title}</h1>"
-        f"<p>{safe(content['verdict'])}</p><h2>Sensors</h2>{sensors}"
-        f'<img alt="histories of the run" src="data:image/png;base64,{image}">'
-        f"<h2>Wheels</h2>{wheels}<h2>Case (SI units)</h2>{table(('part', 'numbers'), entries)}"
-        f"<p>jaxbeam {safe(_version())}</p></body></html>"
+    entries = [(key, _short(value)) for key, value in parts.items() if key != "title"]
+    picture = ReportFigure("histories of the run", plot_record(record), embedded=True)
+    return html(
+        record.case.title or "Run",
+        [
+            ReportSection("", [content["verdict"]]),
+            ReportSection("Sensors", [sensors, picture]),
+            ReportSection("Wheels", [wheels]),
+            ReportSection("Case (SI units)", [ReportTable(("part", "numbers"), entries)]),
+            ReportSection("", [f"jaxbeam {_version()}"]),
+        ],
     )
 
 

@@ -3,7 +3,9 @@
 write_report(folder, "Crossing", [ReportSection("Peaks", ["Largest deflections.", table])])
 """
 
+import base64
 import html as html_library
+import io
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -32,13 +34,22 @@ class ReportTable(NamedTuple):
 
 
 class ReportFigure(NamedTuple):
-    """Figure of a report, in the file NAME.png beside it.
+    """Figure of a report, in the file NAME.png beside it, or in the page itself if `embedded`.
 
     `figure` (matplotlib) is saved with the report; None if the file is written elsewhere.
     """
 
     name: str
     figure: Any = None
+    embedded: bool = False
+
+    def source(self) -> str:
+        """Where a page finds the figure: a file, or its content in base 64."""
+        if not self.embedded:
+            return f"{self.name}.png"
+        picture = io.BytesIO()
+        self.figure.savefig(picture, format="png")
+        return f"data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}"
 
 
 class ReportSection(NamedTuple):
@@ -80,7 +91,7 @@ def write_report(
         folder.mkdir(parents=True, exist_ok=True)
     for section in sections:
         for part in section.parts:
-            if isinstance(part, ReportFigure) and part.figure is not None:
+            if isinstance(part, ReportFigure) and part.figure is not None and not part.embedded:
                 with whole_file(folder / f"{part.name}.png", overwrite) as beside:
                     part.figure.savefig(beside)
     pages = {"report.md": markdown(title, sections), "report.html": html(title, sections, style)}
@@ -99,7 +110,7 @@ def markdown(title: str, sections: Sequence[ReportSection]) -> str:
             if isinstance(part, ReportTable):
                 lines += _markdown_table(part)
             elif isinstance(part, ReportFigure):
-                lines += [f"![{part.name}]({part.name}.png)", ""]
+                lines += [f"![{part.name}]({part.source()})", ""]
             else:
                 lines += [part, ""]
     return "\n".join(lines)
@@ -116,7 +127,7 @@ def html(title: str, sections: Sequence[ReportSection], style: str = "") -> str:
             if isinstance(part, ReportTable):
                 body.append(_html_table(part))
             elif isinstance(part, ReportFigure):
-                body.append(f'<img src="{safe(part.name)}.png" alt="{safe(part.name)}">')
+                body.append(f'<img src="{safe(part.source())}" alt="{safe(part.name)}">')
             else:
                 body.append(f"<p>{safe(part)}</p>")
     head = f'<meta charset="utf-8"><title>{safe(title)}</title><style>{PAGE_STYLE}{style}</style>'

@@ -4,13 +4,14 @@ import dataclasses
 import functools
 import os
 import tomllib
+from collections.abc import Iterable
 from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.files.report import text_table
+from jaxbeam.files.report import ReportSection, ReportTable, markdown, text_table
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.output_file import whole_file
 
@@ -275,24 +276,31 @@ class Assessment:
 
     def to_markdown(self) -> str:
         """The report as Markdown, with the sources of the numbers of the code."""
-        effects = []
-        if self.effects:
-            effects = ["## Largest effects of each train", markdown_table(*self.effects.rows())]
-        parts = [
-            f"# {self.title}",
-            f"Checks by {self.code}. {self.verdict}",
-            "\n".join(f"- {line}" for line in self._inputs),
-            markdown_table(HEADER, *self._rows()),
-            "\n".join(f"- {c.subject}: {c.remark}" for c in self.checks if c.remark),
-            *effects,
-            "## Not checked",
-            "\n".join(f"- {item}" for item in self.not_checked),
-            "## Not in the model, hence not certified",
-            "\n".join(f"- {item}" for item in self.not_in_model),
-            "## Sources of the numbers",
-            "\n".join(f"- {clause}: {source}" for clause, source in self.sources.items()),
+        inputs = _listed(self._inputs)
+        remarks = _listed(f"{c.subject}: {c.remark}" for c in self.checks if c.remark)
+        sections = [
+            ReportSection(
+                "",
+                [
+                    f"Checks by {self.code}. {self.verdict}",
+                    *inputs,
+                    ReportTable(HEADER, self._rows()),
+                    *remarks,
+                ],
+            )
         ]
-        return "\n\n".join(part for part in parts if part) + "\n"
+        if self.effects:
+            head, *rows = self.effects.rows()
+            title = "Largest effects of each train"
+            sections.append(ReportSection(title, [ReportTable(head, rows)]))
+        sources = (f"{clause}: {source}" for clause, source in self.sources.items())
+        for title, items in (
+            ("Not checked", self.not_checked),
+            ("Not in the model, hence not certified", self.not_in_model),
+            ("Sources of the numbers", sources),
+        ):
+            sections.append(ReportSection(title, _listed(items)))
+        return markdown(self.title, sections)
 
     def plot(self, **options):
         """Figure of the effects over speed with limit lines; see `jaxbeam.plot.plot_assessment`."""
@@ -306,9 +314,10 @@ class Assessment:
             beside.write_text(self.to_markdown(), encoding="utf-8")
 
 
-def markdown_table(head: list[str], *rows: list[str]) -> str:
-    """A table in Markdown."""
-    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows))
+def _listed(items: Iterable[str]) -> list[str]:
+    """A list in Markdown, or nothing without items."""
+    text = "\n".join(f"- {item}" for item in items)
+    return [text] if text else []
 
 
 HEADER = ["check", "value", "limit", "unit", "outcome", "clause"]
