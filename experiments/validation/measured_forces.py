@@ -3,7 +3,7 @@
     python -m experiments.validation.measured_forces 10
 
 Random structures by finite elements (`tests/oracles/planted_structures.py`), each struck by one,
-three or ten blows of a hammer at one place, or shaken by one random force or two, with coloured
+three or ten impacts of a hammer at one place, or shaken by one random force or two, with coloured
 noise of 5 to 30 % rms on the responses. Forces are measured, through the anti-alias filter of the
 logger like the responses.
 """
@@ -27,7 +27,7 @@ from tests.oracles.planted_structures import (
 from tuning.logs.log import Log
 from tuning.modal.identify_modes import identify_modes
 
-EXCITATIONS = ("1 blow", "3 blows", "10 blows", "random force", "two random forces")
+EXCITATIONS = ("1 impact", "3 impacts", "10 impacts", "random force", "two random forces")
 DURATION = 60.0  # s
 
 
@@ -43,9 +43,9 @@ def forced_log(
     if shakers:
         forces[:, :shakers] = random.normal(size=(len(forces), shakers))
     else:
-        blows = int(excitation.split()[0])
-        starts = 0.05 + 0.9 * (np.arange(blows) + random.uniform(0, 0.5, blows)) / blows
-        for start in starts * (1 if blows > 1 else 0.2):
+        impacts = int(excitation.split()[0])
+        starts = 0.05 + 0.9 * (np.arange(impacts) + random.uniform(0, 0.5, impacts)) / impacts
+        for start in starts * (1 if impacts > 1 else 0.2):
             first = int(start * len(forces))
             shape = np.sin(np.pi * (np.arange(2 * FINER) + 0.5) / (2 * FINER))
             forces[first : first + 2 * FINER, 0] += random.uniform(0.5, 1.5) * shape

@@ -20,14 +20,14 @@ from tuning.logs.log import Log
 from tuning.modal.identify_modes import identify_modes
 from tuning.modal.result import ModalEstimates
 
-KINDS = ("ambient", "motor", "shaken", "blows", "decay", "crossing")
+KINDS = ("ambient", "motor", "shaken", "impacts", "decay", "crossing")
 MATCH_SHARE = 0.02  # relative error of a frequency within which a mode is one of the structure
 MIN_ENERGY = 0.05  # energy share of the modes that must be found
 DURATIONS = {
     "ambient": 300.0,
     "motor": 300.0,
     "shaken": 300.0,
-    "blows": 60.0,
+    "impacts": 60.0,
     "decay": 20.0,
     "crossing": 60.0,
 }  # s
@@ -36,12 +36,12 @@ WORDS = {
     "ambient": "ambient",
     "motor": "ambient, and a motor with its harmonic",
     "shaken": "shaker with four harmonics, unmeasured",
-    "blows": "blows, unmeasured",
+    "impacts": "impacts, unmeasured",
     "decay": "one free decay",
     "crossing": "load that crosses and leaves",
-    "1 blow": "one blow, measured",
-    "3 blows": "three blows, measured",
-    "10 blows": "ten blows, measured",
+    "1 impact": "one impact, measured",
+    "3 impacts": "three impacts, measured",
+    "10 impacts": "ten impacts, measured",
     "random force": "random force, measured",
     "two random forces": "two random forces, measured",
 }

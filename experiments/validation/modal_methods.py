@@ -38,7 +38,7 @@ from tuning.modal.identify_modes import identify_modes
 
 TABLE_FILE = Path(__file__).parents[2] / "docs" / "_static" / "modal_methods.md"
 EXCITATIONS_FILE = TABLE_FILE.with_name("modal_excitations.md")
-EXCITATIONS = ("motor", "shaken", "blows", "decay", "1 blow", "10 blows", "random force")
+EXCITATIONS = ("motor", "shaken", "impacts", "decay", "1 impact", "10 impacts", "random force")
 JAXBEAM = "jaxbeam, by itself"
 METHODS = ("covariance", "data", "plscf")
 PYOMA = "pyOMA-2, SSI-COV"

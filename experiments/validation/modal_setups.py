@@ -1,7 +1,7 @@
 """Modes of planted structures from several setups, merged, against the truth.
 
     python -m experiments.validation.modal_setups 30
-    python -m experiments.validation.modal_setups 30 ambient blows
+    python -m experiments.validation.modal_setups 30 ambient impacts
 
 Random structures by finite elements, as in `modal_identification`, those with four channels or
 more: two are references, and the others are measured in two or three setups, each excited anew.
@@ -28,7 +28,7 @@ from tuning.modal.identify_modes import identify_modes
 from tuning.modal.setups.merge import merge_setups
 
 TABLE_FILE = Path(__file__).parents[2] / "docs" / "_static" / "modal_setups.md"
-KINDS = ("ambient", "blows", "decay", "crossing")
+KINDS = ("ambient", "impacts", "decay", "crossing")
 REFERENCES = (0, 1)
 MAX_SETUPS = 3
 HEADER = (

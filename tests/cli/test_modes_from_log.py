@@ -50,7 +50,7 @@ def test_modes_that_the_user_chooses(run, decay_log):
 
 
 def test_a_measured_force(run, refused, decay_log):
-    """The first column is a blow of a hammer, in N by the unit given to it."""
+    """The first column is an impact of a hammer, in N by the unit given to it."""
     rows = np.loadtxt(decay_log / "node.csv", delimiter=",")
     rows[:, 1] = np.arange(1500) == 0
     np.savetxt(decay_log / "hammer.csv", rows, delimiter=",", fmt="%.6f")

@@ -149,7 +149,7 @@ def _shaken(forces, structure, random, fine):
 
 
 def sampled(structure: Structure, kind: str, seed: int, duration: float) -> Planted:
-    """A log of a structure; `kind` is ambient, motor (with harmonics), blows, decay, shaken or
+    """A log of a structure; `kind` is ambient, motor (with harmonics), impacts, decay, shaken or
     crossing (a rough load over the exciters in the first half of the log)."""
     random = np.random.default_rng(1000 + seed)
     rate = 2.56 * structure.frequencies[-1] * random.uniform(1.2, 2.5)
@@ -159,7 +159,7 @@ def sampled(structure: Structure, kind: str, seed: int, duration: float) -> Plan
     lines: tuple[float, ...] = ()
     if kind in ("ambient", "motor"):
         forces[:] = random.normal(size=forces.shape)
-    elif kind == "blows":
+    elif kind == "impacts":
         period = min(duration / 4, 12 / (structure.damping_ratios * structure.frequencies).min())
         starts = np.arange(0.05 * duration, duration - 0.5 * period, period)
         for start in starts:

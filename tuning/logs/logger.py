@@ -1,8 +1,8 @@
 """What a logger stores besides readings: zeros until a sensor answers, and each reading repeated.
 
 A wireless node or a data logger may start a record before its sensor has answered, and may ask the
-sensor more often than it reads. Both look like blows: a zero far from gravity is a spike, and held
-values change by steps.
+sensor more often than it reads. Both look like impacts: a zero far from gravity is a spike, and
+held values change by steps.
 """
 
 import dataclasses

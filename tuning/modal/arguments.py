@@ -22,7 +22,7 @@ class ModalSettings:
     identified, and no others. `order` is the highest order of the stabilisation diagram. `force`
     are the names of the channels of forces that were measured, of a hammer or shaker, by default
     all in N; a force that one of several logs lacks, as of a hammer that strikes another place in
-    each, is zero there. `force_window` (s) is the time after each blow of a hammer from which on
+    each, is zero there. `force_window` (s) is the time after each impact of a hammer from which on
     the force is taken for zero. Readings that a logger repeats are decimated, and zeros before a
     sensor has answered interpolated, but with samples `as_logged`.
 

@@ -248,7 +248,7 @@ def band_of(
 def lines_besides(lines: tuple[Line, ...], modes: Sequence[IdentifiedMode]) -> tuple[Line, ...]:
     """Lines that are no modes of free decays.
 
-    After blows at equal intervals a mode of little damping may look like a line.
+    After impacts at equal intervals a mode of little damping may look like a line.
     """
     return tuple(
         line

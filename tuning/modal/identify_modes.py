@@ -4,11 +4,11 @@
     print(fit)
     fit.plot("modes.png")
 
-The excitation is recognised: free decays, after one blow or many or after a load has left the beam,
-are fitted together by poles (`decay.poles`), starting from those of a subspace method; all else is
-a response to ambient excitation (`ambient`, or from spectra: `spectral`). Harmonic lines are
-subtracted. Modes that the log
-determines well are the result; others are listed with the reason for rejecting them.
+The excitation is recognised: free decays, after one impact or many or after a load has left the
+beam, are fitted together by poles (`decay.poles`), starting from those of a subspace method; all
+else is a response to ambient excitation (`ambient`, or from spectra: `spectral`). Harmonic lines
+are subtracted. Modes that the log determines well are the result; others are listed with the reason
+for rejecting them.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,9 +29,9 @@ from tuning.modal.arguments import (
     check_method,
     chosen_modes,
 )
-from tuning.modal.decay.modes import Decays, excited, free_decay_modes
+from tuning.modal.decay.modes import Decays, find_excited, free_decay_modes
 from tuning.modal.fit import Choice, ModalFit
-from tuning.modal.forced.forces import force_at_blows, force_names, force_records, without_forces
+from tuning.modal.forced.forces import force_at_impacts, force_names, force_records, without_forces
 from tuning.modal.forced.modes import forced_modes
 from tuning.modal.harmonics import (
     band_of,
@@ -41,20 +41,20 @@ from tuning.modal.harmonics import (
     lines_besides,
     steady_candidates,
 )
+from tuning.modal.impacts.whole_log import (
+    FromDecays,
+    impacts_left_out,
+    modes_after_unseen_impacts,
+    modes_of_decays,
+)
 from tuning.modal.plscf import plscf_modes
 from tuning.modal.preprocessing import energy_band, kinetic_band, prepare
 from tuning.modal.samples import Samples, samples_of, with_channels, without_constant
 from tuning.modal.stabilisation import Diagram
-from tuning.modal.struck.whole_log import (
-    FromDecays,
-    blows_left_out,
-    modes_after_unseen_blows,
-    modes_of_decays,
-)
 
 FORCED = "measured force"
 NARROW = 0.005  # damping ratio of a mode below which it may be a harmonic
-TRANSIENT_SHARE = 0.01  # struck samples of a log with transients of crossing loads
+TRANSIENT_SHARE = 0.01  # excited samples of a log with transients of crossing loads
 
 
 def identify_modes(
@@ -81,7 +81,7 @@ def identify_modes(
 
     Raises ValueError for a log without evenly sampled records, or too short, a window outside the
     log, a band above half the sampling rate, unknown channels, kinds and methods, a kind or forces
-    that the method cannot use, channels that are no forces, a force window without blows,
+    that the method cannot use, channels that are no forces, a force window without impacts,
     frequencies to choose that have no pole within 2 %, and logs that differ in channels or sampling
     rate.
 
@@ -114,7 +114,7 @@ def identify_modes(
         used_band = band or energy_band(samples.records, samples.rate, derivatives)
         driving = force_records(measured, forces, window, samples)
         if force_window is not None:
-            driving = tuple(force_at_blows(one, samples.rate, force_window) for one in driving)
+            driving = tuple(force_at_impacts(one, samples.rate, force_window) for one in driving)
         if progress:
             progress("responses to the measured forces")
         found, explained = _forced(samples, driving, used_band, order, progress)
@@ -135,13 +135,13 @@ def identify_modes(
     used_band = wide
     if readings_differ:
         used_band = band_of(kinetic_band, samples, derivatives, cleaned if lines else None)
-    struck = excited(samples, derivatives, used_band)
+    excited = find_excited(samples, derivatives, used_band)
     kind = "free decay" if method == DECAY else kind
     how = {"kind": kind, "whole": window is not None, "order": order}
     told, may_decay = None, kind != "ambient" and method in (None, DECAY)
     if may_decay:
         bands, narrow = (used_band, wide), band is None
-        told = modes_of_decays(samples, struck, derivatives, bands, narrow, how)
+        told = modes_of_decays(samples, excited, derivatives, bands, narrow, how)
     found, used_band = (_of_decays(told), told.band) if told else (None, wide)
     if kind == "free decay" and found is None:
         raise ValueError(f"{logs[0].source}: no free decay found; give its window, or kind ambient")
@@ -149,11 +149,11 @@ def identify_modes(
     if found is None:
         found = _ambient_modes(cleaned, samples, used_band, used_method, order, progress)
         if may_decay:
-            found = _of_unseen_blows(found, samples, struck, used_band)
+            found = _of_unseen_impacts(found, samples, excited, used_band)
         if may_decay and window is None and all(one.reason for one in found.candidates):
             # The energy of a short decay falls little, but damped vibrations explain all of it.
             how["whole"] = True
-            whole = free_decay_modes(samples, struck, derivatives, used_band, **how)
+            whole = free_decay_modes(samples, excited, derivatives, used_band, **how)
             found = _Found(*whole) if whole else found
     if found.is_ambient:
         if lines:
@@ -170,14 +170,14 @@ def identify_modes(
         ]
     else:
         used_method = DECAY
-        if found.decays is not None and not found.blows:
+        if found.decays is not None and not found.impacts:
             choices += [
                 Choice(text, "--from and --to")
-                for text in blows_left_out(samples, struck, found.decays.stretches, used_band)
+                for text in impacts_left_out(samples, excited, found.decays.stretches, used_band)
             ]
         lines = lines_besides(lines, [one.mode for one in found.candidates if not one.reason])
     if kind is None:
-        says = _kind_words(found, struck, lines)
+        says = _kind_words(found, excited, lines)
         choices.append(Choice(says, "--kind ambient, --kind 'free decay', --from and --to"))
     if method is None:
         choices.append(Choice(f"method {used_method}", f"--method {', '.join(METHODS)}"))
@@ -202,22 +202,22 @@ def _band_choice(band, used: tuple[float, float]) -> list[Choice]:
 
 
 class _Found(NamedTuple):
-    """Candidates, diagrams, decays that were fitted if any, kind, blows."""
+    """Candidates, diagrams, decays that were fitted if any, kind, impacts."""
 
     candidates: tuple[Candidate, ...]
     diagrams: tuple[Diagram, ...]
     decays: Decays | None
     kind: str = "ambient"
-    blows: int = 0
+    impacts: int = 0
 
     @property
     def is_ambient(self) -> bool:
-        """Whether neither decays nor blows explain the log."""
-        return self.decays is None and not self.blows
+        """Whether neither decays nor impacts explain the log."""
+        return self.decays is None and not self.impacts
 
 
 def _of_decays(told: FromDecays) -> _Found:
-    return _Found(told.candidates, told.diagrams, told.decays, blows=told.blows)
+    return _Found(told.candidates, told.diagrams, told.decays, impacts=told.impacts)
 
 
 def _add_order(choices, order, found: _Found) -> None:
@@ -243,18 +243,18 @@ def _ambient_modes(cleaned, samples: Samples, band, method, order, progress) -> 
     return _Found(*found, None)
 
 
-def _of_unseen_blows(found: _Found, samples: Samples, struck, band) -> _Found:
-    """Modes of a log without clear decays, of whole records if blows alone explain them."""
-    told = modes_after_unseen_blows(found.candidates, samples, struck, band)
+def _of_unseen_impacts(found: _Found, samples: Samples, excited, band) -> _Found:
+    """Modes of a log without clear decays, of whole records if impacts alone explain them."""
+    told = modes_after_unseen_impacts(found.candidates, samples, excited, band)
     if told is None:
         return found
-    return found._replace(candidates=told[0], kind="free decay", blows=told[1])
+    return found._replace(candidates=told[0], kind="free decay", impacts=told[1])
 
 
-def _kind_words(found: _Found, struck, lines) -> str:
+def _kind_words(found: _Found, excited, lines) -> str:
     """Sentence on the excitation."""
-    if found.blows:
-        return f"excitation: {found.blows} blows, between which records are fitted as a whole"
+    if found.impacts:
+        return f"excitation: {found.impacts} impacts, between which records are fitted as a whole"
     if found.decays is not None:
         number = len(found.decays.stretches)
         return f"excitation: {number} free decays, used together" if number > 1 else (
@@ -262,8 +262,8 @@ def _kind_words(found: _Found, struck, lines) -> str:
         )  # fmt: skip
     if sum(line.share for line in lines) > 0.5:
         return "excitation: steady shaking, whose harmonic lines are no modes, and ambient"
-    if np.mean(np.concatenate(struck)) > TRANSIENT_SHARE:
-        return "excitation: transients (crossing loads or blows) without a clear free decay"
+    if np.mean(np.concatenate(excited)) > TRANSIENT_SHARE:
+        return "excitation: transients (crossing loads or impacts) without a clear free decay"
     return "excitation: ambient"
 
 

@@ -1,12 +1,12 @@
 """Stochastic subspace identification from output covariances, with uncertainties.
 
-The outputs of a linear structure under broadband excitation have covariances R_l = C A^(l-1) G
-(l > 0), so that the block Hankel matrix of R_1 ... R_(p+q) is the product of observability and
+The outputs of a linear structure under broadband excitation have covariances R_l = C A^(l-1) G (l >
+0), so that the block Hankel matrix of R_1 ... R_(p+q) is the product of observability and
 controllability matrices (Peeters and De Roeck 1999). Its column space gives C, and A by shift
 invariance. The data-driven variant weights the columns by the inverse square root of the covariance
 of the past outputs, which makes the left singular vectors those of the projection of future on past
-outputs (Van Overschee and De Moor 1996, unweighted principal components). The response after a blow
-obeys the same equations if each covariance is a sum over the same instants.
+outputs (Van Overschee and De Moor 1996, unweighted principal components). The response after an
+impact obeys the same equations if each covariance is a sum over the same instants.
 
 Uncertainties are those of the covariances, estimated from blocks of the records, propagated through
 singular value decomposition and eigenvalue problem to first order (Pintelon, Guillaume and

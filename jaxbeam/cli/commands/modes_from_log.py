@@ -53,7 +53,7 @@ def modes_from_log(
 ) -> None:
     """Natural frequencies, damping ratios and mode shapes from logs of unknown excitation.
 
-    Free decays after blows, ambient vibration, and the harmonic lines of machines in it are
+    Free decays after impacts, ambient vibration, and the harmonic lines of machines in it are
     recognised. Every choice is printed with the option that overrides it. Logs whose sensors are at
     other places are setups, whose modes are merged. With `--case`, parameters of a case are fitted
     to the modes that were found, with 95 % intervals.
@@ -88,12 +88,12 @@ def modes_from_log(
         NAME,NAME,...: channels of measured forces (N), of a hammer or shaker; by default all in N.
         The responses to them are fitted by p-LSCF.
     force_window
-        Time (s) after each blow from which on the force is taken for zero.
+        Time (s) after each impact from which on the force is taken for zero.
     responses
         H1, H2 or Hv: draw frequency responses to the forces, by this estimate, with their coherence
         to a PNG named after the first log.
     exponential
-        Time constant (s) of an exponential window from each blow on, for `--responses`. Modes are
+        Time constant (s) of an exponential window from each impact on, for `--responses`. Modes are
         found without it.
     kind
         ambient or "free decay".

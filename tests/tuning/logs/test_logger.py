@@ -78,8 +78,8 @@ def test_one_channel_that_is_not_held_keeps_the_rate():
 FREQUENCIES, DAMPING = np.array([12.0, 17.5, 26.0]), np.array([0.01, 0.008, 0.006])
 
 
-def after_a_blow(frequencies, damping, rate, duration):
-    """Accelerations (m/s^2) of a structure after one blow, with noise, and its random numbers."""
+def after_an_impact(frequencies, damping, rate, duration):
+    """Accelerations (m/s^2) of a structure after one impact, with noise, and its random numbers."""
     whole, random = random_structure(1), np.random.default_rng(0)
     planted = Structure(frequencies, damping, whole.shapes[:3, :1], whole.inputs[:3])
     forces = np.zeros((int(duration * rate), 4))
@@ -88,26 +88,26 @@ def after_a_blow(frequencies, damping, rate, duration):
     return 0.3 * clean / clean.std() + 0.005 * random.normal(size=clean.shape), random
 
 
-def test_steps_of_held_readings_look_like_blows_and_readings_do_not():
-    clean, _ = after_a_blow(FREQUENCIES, DAMPING, 1600.0, 4.0)
+def test_steps_of_held_readings_look_like_impacts_and_readings_do_not():
+    clean, _ = after_an_impact(FREQUENCIES, DAMPING, 1600.0, 4.0)
     asked = np.arange(int(4 * 7200) - 8) / 7200
     held = np.round(clean[(asked * 1600).astype(int)] - 9.81, 3)
     log = Log(asked, held, ("a",), ("acceleration",), ("m/s^2",))
-    struck_late = []
+    excited_late = []
     for one in (log, sensor_readings(log)):
         values = one.values - one.values.mean(axis=0)
         marks = excited_samples(values, one.sample_rate, 1 / FREQUENCIES[0])
-        struck_late.append(bool(marks[one.times > 0.1].any()))
-    assert struck_late == [True, False]
+        excited_late.append(bool(marks[one.times > 0.1].any()))
+    assert excited_late == [True, False]
 
 
 def test_modes_of_a_hammer_test_from_a_node_that_repeats_readings():
-    """As a wireless node writes: gravity, a zero first, readings held, a pause before the blow.
+    """As a wireless node writes: gravity, a zero first, readings held, a pause before the impact.
 
     The modes are those of the same test without these faults, and the truth.
     """
     rate, frequencies, damping = 1600.0, FREQUENCIES, DAMPING
-    clean, random = after_a_blow(frequencies, damping, rate, 6.0)
+    clean, random = after_an_impact(frequencies, damping, rate, 6.0)
     asked = np.arange(int(6 * 7200) - 8) / 7200 + 1e-4
     held = np.round(clean[(asked * rate).astype(int), 0] - 9.81, 3)
     held[0] = 0.0

@@ -1,4 +1,4 @@
-"""Free decays of planted structures: found between blows, and fitted together."""
+"""Free decays of planted structures: found between impacts, and fitted together."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from tuning.modal.decay.stretches import (
     excited_samples,
     free_decays,
     stacked,
-    until_soft_blow,
+    until_soft_impact,
 )
 from tuning.modal.harmonics import harmonic_lines
 from tuning.modal.preprocessing import kinetic_band, prepare, strongest_frequency
@@ -28,7 +28,7 @@ def structure(damping=(0.01, 0.03, 0.008)):
 
 
 @pytest.mark.parametrize(
-    ("kind", "duration"), [("blows", 40.0), ("decay", 15.0), ("crossing", 30.0)]
+    ("kind", "duration"), [("impacts", 40.0), ("decay", 15.0), ("crossing", 30.0)]
 )
 def test_modes_of_planted_decays(kind, duration):
     """All strong modes, no false one, and truths within the intervals, for several excitations."""
@@ -36,7 +36,7 @@ def test_modes_of_planted_decays(kind, duration):
     for seed in range(3):
         planted = sampled(structure(), kind, seed, duration)
         fit = identify_modes(log_of(planted))
-        assert fit.kind == "free decay" and len(fit.windows) >= (2 if kind == "blows" else 1)
+        assert fit.kind == "free decay" and len(fit.windows) >= (2 if kind == "impacts" else 1)
         found.append(compare(fit, planted))
     assert all(seen for one in found for seen in one.found)
     assert not any(one.false_modes for one in found)
@@ -46,7 +46,7 @@ def test_modes_of_planted_decays(kind, duration):
 
 
 def struck(times, rate=800.0, duration=10.0):
-    """Velocities of heavily damped modes under blows at some times (s), finely sampled."""
+    """Velocities of heavily damped modes under impacts at some times (s), finely sampled."""
     random = np.random.default_rng(0)
     forces = np.zeros((int(duration * rate), 4))
     for time in times:
@@ -57,7 +57,7 @@ def struck(times, rate=800.0, duration=10.0):
     return planted, clean + 0.02 * clean.std() * random.normal(size=clean.shape)
 
 
-def test_instants_of_blows_whatever_the_band():
+def test_instants_of_impacts_whatever_the_band():
     times = (1.0, 2.7, 3.9, 6.1, 8.0)
     _, values = struck(times)
     marks = excited_samples(values, 800.0, 1 / 6.0)
@@ -68,7 +68,7 @@ def test_instants_of_blows_whatever_the_band():
     np.testing.assert_allclose([one.start / 800 for one in decays], times[:5], atol=0.02)
 
 
-def test_decays_after_blows_in_quick_succession_are_used_together():
+def test_decays_after_impacts_in_quick_succession_are_used_together():
     planted, values = struck((1.0, 2.7, 3.9, 6.1, 8.0))
     log = log_of(planted_log := sampled(planted, "decay", 0, 10.0))
     log = type(log)(
@@ -82,7 +82,7 @@ def test_decays_after_blows_in_quick_succession_are_used_together():
 
 
 @pytest.mark.parametrize("seed", [512, 518])
-def test_a_record_that_begins_with_a_blow_is_a_decay(seed):
+def test_a_record_that_begins_with_an_impact_is_a_decay(seed):
     """Close modes beat, or the decay is over within a tenth of the record."""
     planted = sampled(random_structure(seed), "decay", seed, 20.0)
     quiet, velocities = (np.zeros(len(planted.values), bool),), (1,) * planted.values.shape[1]
@@ -94,9 +94,9 @@ def test_a_record_that_begins_with_a_blow_is_a_decay(seed):
 
 
 @pytest.mark.parametrize(
-    ("shift", "blows"), [(0.0, [1.0]), (0.01, [1.0]), (0.01, [1.0, 0.7]), (0.04, [1.0])]
+    ("shift", "impacts"), [(0.0, [1.0]), (0.01, [1.0]), (0.01, [1.0, 0.7]), (0.04, [1.0])]
 )
-def test_what_nonlinearity_adds_is_no_mode(shift, blows):
+def test_what_nonlinearity_adds_is_no_mode(shift, impacts):
     """Cubic stiffness raises the first frequency by 1 or 4 %: the response has a part that decays
     as the cube of the rest, three times as fast, and may have more energy than the rest."""
     times, omega, damping = np.arange(1500) / 100, 2 * np.pi * 3.7, 0.008
@@ -106,8 +106,8 @@ def test_what_nonlinearity_adds_is_no_mode(shift, blows):
         return [state[1], -2 * damping * omega * state[1] - force]
 
     values, state = [], np.zeros(2)
-    for blow in blows:
-        start = [state[0] + blow, state[1]]
+    for impact in impacts:
+        start = [state[0] + impact, state[1]]
         solved = solve_ivp(slope, (0, 15), start, t_eval=times, rtol=1e-7, atol=1e-9)
         state = solved.y[:, -1]
         values.append(np.outer(solved.y[0], [1.0, 0.7]))
@@ -116,19 +116,21 @@ def test_what_nonlinearity_adds_is_no_mode(shift, blows):
     times = np.arange(len(values)) / 100
     log = Log(times, values, ("d1", "d2"), ("deflection",) * 2, ("m",) * 2)
     fit = identify_modes(log, band=(1.0, 12.0))
-    assert len(fit.windows) == len(blows)
+    assert len(fit.windows) == len(impacts)
     assert fit.kind == "free decay" and fit.frequencies == pytest.approx([3.7], rel=0.005)
     assert ("nonlinearity" in str(fit)) == (shift > 0)
 
 
 @pytest.mark.parametrize(("power", "is_mode"), [(1, True), (3, False)])
 def test_a_fast_decay_beside_a_slow_one_grows_as_its_cube_or_is_a_mode(power, is_mode):
-    """After three blows of different strength at one place, close modes keep their proportion."""
+    """After three impacts of different strength at one place, close modes keep their proportion."""
     times, random = np.arange(1500) / 100, np.random.default_rng(0)
     slow = np.exp((-0.2 + 2j * np.pi * 3.7) * times)
     fast = np.exp((-0.6 + 2j * np.pi * 3.76) * times + 1j)
-    blows = [1.0, 0.5, 0.7]
-    values = np.concatenate([(blow * slow + 0.4 * blow**power * fast).real for blow in blows])
+    impacts = [1.0, 0.5, 0.7]
+    values = np.concatenate(
+        [(impact * slow + 0.4 * impact**power * fast).real for impact in impacts]
+    )
     values += 0.01 * random.normal(size=values.size)
     fit = identify_modes(one_channel(np.arange(values.size) / 100, values), band=(1.0, 12.0))
     assert len(fit.windows) == 3
@@ -213,8 +215,8 @@ def test_a_mode_of_ambient_response_that_falls_by_chance_is_no_decay():
     assert fit.kind == "ambient" and not one.missed and not one.false_modes
 
 
-@pytest.mark.parametrize(("soft_blow", "stops_before"), [(5.0, 5.0), (None, 10.0)])
-def test_a_decay_ends_where_a_blow_too_soft_to_be_found_adds_to_it(soft_blow, stops_before):
+@pytest.mark.parametrize(("soft_impact", "stops_before"), [(5.0, 5.0), (None, 10.0)])
+def test_a_decay_ends_where_an_impact_too_soft_to_be_found_adds_to_it(soft_impact, stops_before):
     """Neither do the beats of close modes end it, which make the energy rise ten times."""
     times = np.arange(2000) / 200
     decays = [
@@ -222,17 +224,17 @@ def test_a_decay_ends_where_a_blow_too_soft_to_be_found_adds_to_it(soft_blow, st
         for f, size in ((8.0, 1.0), (8.4, 0.7))
     ]
     record = np.sum(decays, axis=0)
-    if soft_blow is not None:
-        late = times - soft_blow
+    if soft_impact is not None:
+        late = times - soft_impact
         record += np.where(late > 0, np.exp(-0.3 * late) * np.sin(2 * np.pi * 8.0 * late), 0)
     marks = np.zeros(times.size, bool)
     marks[1] = True
     found, *others = free_decays((marks,), (record[:, None],), 200.0, 8.2)
     assert stops_before - 1.0 < found.stop / 200 <= stops_before
-    # The soft blow begins another decay, a cycle or two later.
-    instants = [] if soft_blow is None else [soft_blow + 1.5 / 8.2]
+    # The soft impact begins another decay, a cycle or two later.
+    instants = [] if soft_impact is None else [soft_impact + 1.5 / 8.2]
     np.testing.assert_allclose([one.start / 200 for one in others], instants, atol=1 / 8.2)
-    until = until_soft_blow(record[:, None], 50) / 200
+    until = until_soft_impact(record[:, None], 50) / 200
     assert stops_before - 1.0 < until <= stops_before
 
 
@@ -249,31 +251,31 @@ def test_noise_long_after_a_decay_is_no_part_of_it():
 
 
 @pytest.mark.parametrize("first", [0.5, 1.0])
-def test_the_first_of_several_blows_may_be_the_softest(first):
+def test_the_first_of_several_impacts_may_be_the_softest(first):
     """By the energy alone, which is the first to tell of a structure at rest."""
     times = np.arange(6000) / 100
     record = 0.01 * np.random.default_rng(0).normal(size=times.size)
-    for blow, size in ((4.0, first), (22.0, 1.0), (41.0, 1.0)):
-        since = np.maximum(times - blow, 0.0)
+    for impact, size in ((4.0, first), (22.0, 1.0), (41.0, 1.0)):
+        since = np.maximum(times - impact, 0.0)
         record += size * np.exp(-0.3 * since) * np.sin(2 * np.pi * 4.0 * since)
     found = free_decays((np.zeros(times.size, bool),), (record[:, None],), 100.0, 4.0)
     assert [one.start / 100 for one in found] == pytest.approx([4.0, 22.0, 41.0], abs=0.5)
 
 
-def test_noise_between_hard_blows_is_no_soft_blow():
+def test_noise_between_hard_impacts_is_no_soft_impact():
     """Energy is that of two cycles of a fast mode, of few samples: that of noise varies."""
-    times, blows = np.arange(5000) / 80, np.array([3.0, 18.0, 33.0, 48.0])
-    since = np.maximum(times - blows[:, None], 0.0)
+    times, impacts = np.arange(5000) / 80, np.array([3.0, 18.0, 33.0, 48.0])
+    since = np.maximum(times - impacts[:, None], 0.0)
     motion = np.sum(np.exp(-1.0 * since) * np.sin(2 * np.pi * 20.3 * since), axis=0)
-    marks = np.isin(np.arange(times.size), np.round(blows * 80))
+    marks = np.isin(np.arange(times.size), np.round(impacts * 80))
     for seed in range(6):
         noise = 0.02 * np.random.default_rng(seed).normal(size=times.size)
         found = free_decays((marks,), ((motion + noise)[:, None],), 80.0, 20.3)
-        assert [one.start / 80 for one in found] == pytest.approx(blows.tolist(), abs=0.1)
+        assert [one.start / 80 for one in found] == pytest.approx(impacts.tolist(), abs=0.1)
 
 
 @pytest.mark.parametrize("rest", [0.0, 2.0])
-def test_the_rest_before_a_blow_that_was_not_found_is_no_part_of_its_decay(rest):
+def test_the_rest_before_an_impact_that_was_not_found_is_no_part_of_its_decay(rest):
     times = np.arange(6000) / 200 - rest
     decay = np.where(times >= 0, np.exp(-0.5 * times) * np.cos(2 * np.pi * 8.0 * times), 0.0)
     record = decay + np.random.default_rng(0).normal(scale=0.01, size=times.size)
@@ -282,8 +284,8 @@ def test_the_rest_before_a_blow_that_was_not_found_is_no_part_of_its_decay(rest)
     assert rest <= found.start / 400 <= rest + 2 / 8.0
 
 
-def test_the_energy_tells_of_blows_but_makes_none_of_ambient_vibration():
-    """A mode of 4 Hz after three blows in noise, and under forces: its energy rises, too."""
+def test_the_energy_tells_of_impacts_but_makes_none_of_ambient_vibration():
+    """A mode of 4 Hz after three impacts in noise, and under forces: its energy rises, too."""
     times, ratio, count = np.arange(3000) / 50, 0.01, 0
     since = times - np.array([[4.0], [22.0], [41.0]])
     decays = np.exp(-2 * np.pi * 4 * ratio * since) * np.sin(2 * np.pi * 4 * since)
@@ -307,9 +309,9 @@ def one_channel(times, values):
     return Log(times, values[:, None], ("a",), ("acceleration",), ("m/s^2",))
 
 
-def test_a_mode_of_blows_at_equal_intervals_is_no_harmonic_line():
-    """Four blows, two too soft to be found: in phase, the decays of one mode look like a line."""
-    planted = sampled(random_structure(930), "blows", 930, 60.0)
+def test_a_mode_of_impacts_at_equal_intervals_is_no_harmonic_line():
+    """Four impacts, two too soft to be found: in phase, the decays of one mode look like a line."""
+    planted = sampled(random_structure(930), "impacts", 930, 60.0)
     fit = identify_modes(log_of(planted))
     assert not fit.lines and "subtracted" not in str(fit)
     one = compare(fit, planted)
@@ -317,9 +319,9 @@ def test_a_mode_of_blows_at_equal_intervals_is_no_harmonic_line():
 
 
 @pytest.mark.parametrize("seed", [1114, 1126])
-def test_decays_before_a_soft_blow_count_too(seed):
-    """Of four blows one or three are too soft; the last of them is where the free end begins."""
-    planted = sampled(random_structure(seed), "blows", seed, 60.0)
+def test_decays_before_a_soft_impact_count_too(seed):
+    """Of four impacts one or three are too soft; the last of them is where the free end begins."""
+    planted = sampled(random_structure(seed), "impacts", seed, 60.0)
     fit = identify_modes(log_of(planted))
     one = compare(fit, planted)
     assert len(fit.windows) > 1 and not one.missed and not one.false_modes
@@ -332,14 +334,18 @@ def test_decays_before_a_soft_blow_count_too(seed):
         ("decay", 1416, 20.0),  # its energy falls to a quarter, on the way up and down
         ("crossing", 1411, 60.0),  # two nepers after the load has left, a quarter of the energy
         ("crossing", 1480, 60.0),  # 12.3 Hz, gone within 0.4 s of the end of the crossing
-        ("blows", 1606, 60.0),  # a mode with three times the decay rate of a weaker one beside it
+        ("impacts", 1606, 60.0),  # a mode with three times the decay rate of a weaker one beside it
         ("decay", 2022, 20.0),  # most energy is gone within two cycles of the slowest mode
-        ("blows", 1824, 60.0),  # four blows in noise, of which the errors of one stand out
-        ("blows", 1310, 60.0),  # a pair within its bandwidth, with a fifth of the energy in one
-        ("blows", 2548, 60.0),  # four blows in noise, of which only the energy tells
-        ("blows", 2814, 60.0),  # the first with half the energy; a mode of three times the rate
-        ("blows", 2929, 60.0),  # hard blows, between which the noise of a channel rises and falls
-        ("blows", 2680, 60.0),  # poles in noise that cancel each other
+        ("impacts", 1824, 60.0),  # four impacts in noise, of which the errors of one stand out
+        ("impacts", 1310, 60.0),  # a pair within its bandwidth, with a fifth of the energy in one
+        ("impacts", 2548, 60.0),  # four impacts in noise, of which only the energy tells
+        ("impacts", 2814, 60.0),  # the first with half the energy; a mode of three times the rate
+        (
+            "impacts",
+            2929,
+            60.0,
+        ),  # hard impacts, between which the noise of a channel rises and falls
+        ("impacts", 2680, 60.0),  # poles in noise that cancel each other
     ],
 )
 def test_all_strong_modes_of_decays_that_fall_little_or_have_weak_partners(kind, seed, duration):
@@ -350,8 +356,8 @@ def test_all_strong_modes_of_decays_that_fall_little_or_have_weak_partners(kind,
     assert one.covered.sum() >= one.covered.size - 2
 
 
-def rattling_blow(seed, rattle, noise):
-    """Accelerations of three neighbouring sensors after a blow at 1 s, and the modes' ranges.
+def rattling_impact(seed, rattle, noise):
+    """Accelerations of three neighbouring sensors after an impact at 1 s, and the modes' ranges.
 
     Amplitudes follow da/dt = -(l + m a) a from 1 on, damping ratios falling from twice the last
     ones, frequencies rising by 1 %. Parts rattle sixty times a second, by up to the amplitude.
@@ -376,8 +382,8 @@ def rattling_blow(seed, rattle, noise):
 
 @pytest.mark.parametrize(("rattle", "noise"), [(1.0, 0.003), (2.0, 0.01)])
 @pytest.mark.parametrize("seed", [10, 11, 12])
-def test_the_own_decay_of_a_blow_is_used_though_parts_rattle_in_it(seed, rattle, noise):
-    values, rate, ranges = rattling_blow(seed, rattle, noise)
+def test_the_own_decay_of_an_impact_is_used_though_parts_rattle_in_it(seed, rattle, noise):
+    values, rate, ranges = rattling_impact(seed, rattle, noise)
     names, quantities, units = ("a1", "a2", "a3"), ("acceleration",) * 3, ("m/s2",) * 3
     fit = identify_modes(Log(np.arange(len(values)) / rate, values, names, quantities, units))
     assert fit.kind == "free decay" and 1.0 <= fit.windows[0][0] < 1.1

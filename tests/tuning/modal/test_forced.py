@@ -15,7 +15,7 @@ RATE = 40.0
 
 
 def measured(structure, kind, seed, noise, duration=60.0):
-    """Log of responses to one force: five blows whose responses overlap, or a random force."""
+    """Log of responses to one force: five impacts whose responses overlap, or a random force."""
     random = np.random.default_rng(seed)
     fine = FINER * RATE
     forces = np.zeros((int(duration * fine), structure.inputs.shape[1]))
@@ -53,8 +53,9 @@ def test_exact_responses_have_exact_poles():
     np.testing.assert_allclose(found[np.argsort(np.abs(found))], poles, rtol=1e-6)
 
 
-def test_shapes_of_an_early_blow_do_not_depend_on_the_degree():
-    """The spectrum of a blow early in a record is nearly a sum of powers of z, as a transient is.
+def test_shapes_of_an_early_impact_do_not_depend_on_the_degree():
+    """The spectrum of an impact early in a record is nearly a sum of powers of z, as a transient
+    is.
 
     Of high degrees both gains had been large and of opposite sign, and shapes arbitrary.
     """
@@ -76,7 +77,7 @@ def test_shapes_of_an_early_blow_do_not_depend_on_the_degree():
         assert np.all(mac > 0.95), (degree, mac)
 
 
-@pytest.mark.parametrize("kind", ["blows", "shaker"])
+@pytest.mark.parametrize("kind", ["impacts", "shaker"])
 def test_modes_are_found_within_their_intervals(kind):
     structure = small_structure(0)
     covered = []
@@ -101,7 +102,7 @@ def test_close_modes_of_a_hammer_test_are_told_apart():
     structure = small_structure(0)._replace(
         frequencies=np.array([4.0, 4.04, 9.0]), damping_ratios=np.array([0.004, 0.005, 0.008])
     )
-    logs = [measured(structure, "blows", seed, 0.05) for seed in range(2)]
+    logs = [measured(structure, "impacts", seed, 0.05) for seed in range(2)]
     fit = identify_modes(logs, band=(2.0, 11.0), settings=ModalSettings(force=["hammer"]))
     np.testing.assert_allclose(fit.frequencies, structure.frequencies, rtol=1e-3)
 
@@ -114,7 +115,7 @@ def test_a_hammer_that_strikes_another_place_in_each_log():
     logs = []
     for place in range(2):
         turned = structure._replace(inputs=np.roll(structure.inputs, -place, axis=1))
-        one = measured(turned, "blows", place, 0.05, 30.0)
+        one = measured(turned, "impacts", place, 0.05, 30.0)
         names = (f"at {place}", *one.names[1:])
         logs.append(Log(one.times, one.values, names, one.quantities, one.units, one.source))
     fit = identify_modes(logs, band=(2.0, 11.0))
@@ -172,7 +173,7 @@ def test_a_force_is_no_response():
         ({"force": ["hammer"], "method": "data"}, "used by method 'plscf', not by 'data'"),
         ({"force": ["hammer"], "kind": "ambient"}, "leave out kind 'ambient'"),
         ({"channels": ["hammer"]}, "the log has forces only, and no response to them"),
-        ({"force_window": 1.0}, "the measured force has no blows of a hammer"),
+        ({"force_window": 1.0}, "the measured force has no impacts of a hammer"),
         ({"force": ["zero"]}, "a measured force is zero throughout; leave it out"),
     ],
 )
@@ -189,7 +190,7 @@ def test_mistakes(arguments, message):
 
 
 def test_steps_by_products_are_those_of_orthogonal_columns():
-    """The factor of the products is that of QR, also where products would lose it (one blow)."""
+    """The factor of the products is that of QR, also where products would lose it (one impact)."""
     random = np.random.default_rng(3)
     columns = random.normal(size=(400, 5)) + 1j * random.normal(size=(400, 5))
     other = random.normal(size=400)

@@ -17,7 +17,7 @@ from tuning.modal.decay.leaving import (
     undisturbed,
     without_excitation,
 )
-from tuning.modal.decay.stretches import Stretch, after_blow
+from tuning.modal.decay.stretches import Stretch, after_impact
 from tuning.modal.result import IdentifiedMode
 
 
@@ -47,7 +47,7 @@ def test_errors_in_proportion_to_a_decay_are_no_forces():
 
 
 def test_decays_with_more_than_noise_do_not_count():
-    """Three decays of two channels after blows of other strength; forces act in the second."""
+    """Three decays of two channels after impacts of other strength; forces act in the second."""
     random = np.random.default_rng(1)
     fitted = np.exp(-np.arange(2000) / 800)[:, None] * np.repeat([1.0, 0.5, 3.0], 2)
     measured = fitted + 0.05 * random.normal(size=fitted.shape)
@@ -92,7 +92,7 @@ def test_three_close_modes_of_one_shape_are_made_by_forces(frequencies, third, a
         channels=2,
         rate=100.0,
         independent=0.5,
-        after_blow=after,
+        after_impact=after,
     )
     assert rest.start - decay.start == (2000 // PARTS if is_cut else 0)
 
@@ -128,14 +128,14 @@ def test_three_close_poles_in_two_places_are_made_by_forces():
     assert has_split(tuple(found))
 
 
-def test_after_a_blow_and_after_a_lasting_excitation():
+def test_after_an_impact_and_after_a_lasting_excitation():
     struck = np.zeros(1000, bool)
     struck[400:403] = True
     decay = Stretch(0, 404, 1000, 2.5)
-    assert after_blow(decay, struck, 20.0)
-    assert not after_blow(decay._replace(start=410), struck, 20.0)
+    assert after_impact(decay, struck, 20.0)
+    assert not after_impact(decay._replace(start=410), struck, 20.0)
     struck[:403] = True
-    assert not after_blow(decay, struck, 20.0)
+    assert not after_impact(decay, struck, 20.0)
 
 
 def test_a_smooth_load_whose_end_is_found_early_makes_no_false_modes():
@@ -200,8 +200,8 @@ def test_lasting_forces_and_noise_have_no_free_end(seed):
     assert free_end(noise, CYCLE, 1.0) is None
 
 
-def test_the_free_end_of_what_follows_a_blow():
-    """One that begins with the blow is known; forces after it are not."""
+def test_the_free_end_of_what_follows_an_impact():
+    """One that begins with the impact is known; forces after it are not."""
     record = forced(white(1, until=600), seed=1)
     step = COUNT // 60
     for since, known in ((0, False), (200, False), (590, True)):

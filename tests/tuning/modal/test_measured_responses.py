@@ -1,4 +1,4 @@
-"""Frequency responses to measured forces: closed forms of H1, H2, Hv; windows of blows."""
+"""Frequency responses to measured forces: closed forms of H1, H2, Hv; windows of impacts."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def gain_log(noise_in, noise_out):
 
 
 def hammer_log(seed=0, noise=0.02, duration=60.0):
-    """Three blows, a pulse of half a sine, and responses of a structure by finite elements."""
+    """Three impacts, a pulse of half a sine, and responses of a structure by finite elements."""
     structure = small_structure(0)
     fine = FINER * RATE
     forces = np.zeros((int(duration * fine), structure.inputs.shape[1]))
@@ -86,7 +86,7 @@ def test_two_forces_are_told_apart():
         tuning.modal.measured_responses(log, estimator="H2")
 
 
-def test_windows_of_blows(tmp_path):
+def test_windows_of_impacts(tmp_path):
     structure, log = hammer_log()
     plain = tuning.identify_modes(log, band=(2.0, 11.0))
     windowed = tuning.identify_modes(
@@ -103,7 +103,7 @@ def test_windows_of_blows(tmp_path):
     assert (tmp_path / "responses.png").stat().st_size > 10_000
 
 
-def test_responses_to_blows_are_those_of_the_structure():
+def test_responses_to_impacts_are_those_of_the_structure():
     structure, log = hammer_log(noise=0.0)
     found = tuning.modal.measured_responses(log, exponential=3.0)
     w = 2 * np.pi * found.frequencies
@@ -126,7 +126,7 @@ def test_responses_to_blows_are_those_of_the_structure():
     [
         ({"estimator": "H3"}, "estimator must be H1, H2, Hv, not 'H3'"),
         ({"exponential": -1.0}, "the exponential window must last longer than 0 s"),
-        ({"exponential": 1.0}, "windows are for blows of a hammer"),
+        ({"exponential": 1.0}, "windows are for impacts of a hammer"),
         ({"segment": 1e9}, "a segment of .* samples is not within"),
         ({"channels": ["v1"], "force": ["v1"]}, "which is no force"),
     ],

@@ -267,7 +267,7 @@ def share_of_modes(found: tuple[Candidate, ...], fits: BandFits, duration: float
 
     That is the first tenth: the energy over all of a decay would count steady hum for more, that at
     the first sample a pole that is gone at the next. Poles damped too strongly for modes, which
-    stand for leakage into the band or the end of a blow, do not count.
+    stand for leakage into the band or the end of an impact, do not count.
     """
     good = rejected = 0.0
     for part, fit in fits:

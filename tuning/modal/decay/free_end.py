@@ -76,7 +76,7 @@ def free_end(
 
     `cycle` is that of the strongest vibration in samples, `independent` the share of samples that
     are, in the band of the record. The end is one of the part `since` a sample, after the last
-    blow; if it begins soon after that, nothing but the blow is known to excite the structure.
+    impact; if it begins soon after that, nothing but the impact is known to excite the structure.
     """
     values = record / np.maximum(record.std(axis=0), 1e-300)
     count, channels = values.shape

@@ -30,13 +30,13 @@ def without_excitation(
     channels: int,
     rate: float,
     independent: float,
-    after_blow: bool,
+    after_impact: bool,
 ) -> tuple[Stretch, ...]:
     """Those of several fitted decays that are undisturbed, or the part of one; all if nothing is.
 
     Columns are the `channels` of each decay, at a `rate` (Hz). `candidates` are the modes of the
-    fit, `independent` is the share of samples that are, in its band; `after_blow` says that nothing
-    acts from the beginning.
+    fit, `independent` is the share of samples that are, in its band; `after_impact` says that
+    nothing acts from the beginning.
     """
     first, *others = decays
     split = has_split(candidates)
@@ -45,7 +45,7 @@ def without_excitation(
         least = 0.0 if grows or split else MIN_UNEXPLAINED
         return undisturbed(decays, measured, fitted, channels, least)
     shaken = shaken_until(measured, fitted, independent)
-    if not shaken and not after_blow and split:
+    if not shaken and not after_impact and split:
         shaken = len(measured) // PARTS
     return (first._replace(start=first.start + shaken),)
 
@@ -137,7 +137,7 @@ def undisturbed(
 ) -> tuple[Stretch, ...]:
     """Those of several fitted decays that have no more errors than others.
 
-    Noise is the same in all, however hard the blows were; errors of less than a share `least` of
+    Noise is the same in all, however hard the impacts were; errors of less than a share `least` of
     the energy may be nonlinearity. Columns are the channels of each decay; if they are combinations
     of decays, all are returned.
     """

@@ -26,13 +26,13 @@ from tuning.modal.decay.leaving import (
 )
 from tuning.modal.decay.stretches import (
     Stretch,
-    after_blow,
-    after_soft_blows,
+    after_impact,
+    after_soft_impacts,
     dominate,
     excited_samples,
     free_decays,
     stacked,
-    until_soft_blow,
+    until_soft_impact,
 )
 from tuning.modal.preprocessing import HALF_POWER, kinetic_band, prepare, strongest_frequency
 from tuning.modal.samples import MIN_SAMPLES, Samples
@@ -44,9 +44,9 @@ MIN_LEVEL_AT_START = 3.0  # energy of the first part of such a decay over the me
 SHORTER_PARTS = 0.6, 0.35  # of an impact's decay, that may tell more than all of it
 MAX_CUTS = 3  # of a decay in which the structure is found to be excited
 MAX_RESIDUAL_OF_WINDOW = 0.05  # the same for a window that the user gives and that falls little
-# The same after blows that only the energy tells of: those of three planted logs left 0.003 at
+# The same after impacts that only the energy tells of: those of three planted logs left 0.003 at
 # most, what falls in fifteen short records of ambient vibration 0.01 at least.
-MAX_RESIDUAL_AFTER_SOFT_BLOWS = 0.007
+MAX_RESIDUAL_AFTER_SOFT_IMPACTS = 0.007
 
 
 class Decays(NamedTuple):
@@ -57,12 +57,12 @@ class Decays(NamedTuple):
     fitted: Float[np.ndarray, "sample channel"]
 
 
-def excited(
+def find_excited(
     samples: Samples, derivatives: tuple[int, ...], band: tuple[float, float]
 ) -> tuple[Bool[np.ndarray, " time"], ...]:
     """Samples of each record at which the structure is excited, at the rate of the log.
 
-    They are those struck by blows, and all until a crossing load has left (`free_end`).
+    They are those of impacts, and all until a crossing load has left (`free_end`).
 
     Below half the band (Hz) drift is removed; above it all frequencies count.
     """
@@ -80,8 +80,8 @@ def excited(
         last = int(np.flatnonzero(marks)[-1] * len(end) / marks.size) + 1 if marks.any() else 0
         start = free_end(end, cycle, independent, last)
         if start is not None:
-            # Decays before it, between blows, are told from others by their errors.
-            decayed = until_soft_blow(end[last:start], max(int(2 * cycle), 4)) if last else 0
+            # Decays before it, between impacts, are told from others by their errors.
+            decayed = until_soft_impact(end[last:start], max(int(2 * cycle), 4)) if last else 0
             first = last + (decayed if decayed < start - last else 0)
             places = np.arange(marks.size) * len(end) / marks.size
             marks = marks | ((places >= first) & (places < start))
@@ -104,25 +104,25 @@ def band_of_ends(
 
 def follow_impacts(
     samples: Samples,
-    struck: tuple[Bool[np.ndarray, " time"], ...],
+    excited: tuple[Bool[np.ndarray, " time"], ...],
     derivatives: tuple[int, ...],
     band: tuple[float, float],
 ) -> bool:
     """Whether the free decays in a band are impacts' own."""
-    decays = _decays_in_band(samples, struck, derivatives, band)[2]
-    return bool(decays) and all(one.impact for one in decays)
+    decays = _decays_in_band(samples, excited, derivatives, band)[2]
+    return bool(decays) and all(one.from_rest for one in decays)
 
 
-def _decays_in_band(samples: Samples, struck, derivatives, band):
+def _decays_in_band(samples: Samples, excited, derivatives, band):
     """The records prepared for a band, the strongest frequency (Hz), and the free decays."""
     prepared = prepare(samples.records, samples.starts, samples.rate, band)
     frequency = strongest_frequency(prepared.records, prepared.rate, derivatives, band)
-    return prepared, frequency, free_decays(struck, prepared.records, prepared.rate, frequency)
+    return prepared, frequency, free_decays(excited, prepared.records, prepared.rate, frequency)
 
 
 def free_decay_modes(
     samples: Samples,
-    struck: tuple[Bool[np.ndarray, " time"], ...],
+    excited: tuple[Bool[np.ndarray, " time"], ...],
     derivatives: tuple[int, ...],
     band: tuple[float, float],
     *,
@@ -130,13 +130,13 @@ def free_decay_modes(
     whole: bool = False,
     order: int | None = None,
 ) -> tuple[tuple[Candidate, ...], tuple[Diagram, ...], Decays] | None:
-    """Modes of the free decays between struck samples; None without any that stand for the log.
+    """Modes of the free decays between excited samples; None without any that stand for the log.
 
     `derivatives` are the orders of the channels as time derivatives. Of a log in which none is
     found, all is one decay if it is said to be (`kind`) or may be (`whole`, of a window that the
     user gives).
     """
-    prepared, frequency, decays = _decays_in_band(samples, struck, derivatives, band)
+    prepared, frequency, decays = _decays_in_band(samples, excited, derivatives, band)
     given = not decays and (kind == "free decay" or whole)
     if given:
         decays = tuple(Stretch(i, 0, len(r), 0.0) for i, r in enumerate(samples.records))
@@ -144,27 +144,27 @@ def free_decay_modes(
     if not decays or not (
         kind
         or given
-        or dominate(decays, struck, prepared.records, ratio, prepared.rate / frequency)
+        or dominate(decays, excited, prepared.records, ratio, prepared.rate / frequency)
     ):
         return None
     cycle = samples.rate / frequency
     one = _fitted(decays, samples, band, order)
     if one is None:
         return None
-    if all(one.impact for one in decays):
+    if all(one.from_rest for one in decays):
         return _told(_of_best_length(one, samples, band, order), samples)
     for _ in range(MAX_CUTS):
-        rest = one.used if given else _rest(one, samples, struck, band, cycle)
+        rest = one.used if given else _rest(one, samples, excited, band, cycle)
         if rest == one.used:
             break
         one = _fitted(rest, samples, band, order)
         if one is None:
             return None
     else:
-        if kind is None and _rest(one, samples, struck, band, cycle) != one.used:
+        if kind is None and _rest(one, samples, excited, band, cycle) != one.used:
             return None
-    if given or after_soft_blows(decays, struck):
-        most = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_AFTER_SOFT_BLOWS
+    if given or after_soft_impacts(decays, excited):
+        most = MAX_RESIDUAL_OF_WINDOW if given else MAX_RESIDUAL_AFTER_SOFT_IMPACTS
         explained = _unexplained(one.measured, one.fitted) < most
         # In a long record many poles that are no modes explain ambient vibration as well.
         explained = explained and (given or _has_few_others(one.candidates))
@@ -237,7 +237,7 @@ def _fitted(decays, samples: Samples, band, order) -> _Fitted | None:
         for name in ("measured", "fitted")
     )
     duration = len(windows) / samples.rate
-    is_free = all(one.impact for one in used)
+    is_free = all(one.from_rest for one in used)
     found = decay_candidates(fits, len(used), channels, duration, band, is_free)
     return _Fitted(used, duration, found, fits, diagrams, measured, fitted)
 
@@ -248,7 +248,7 @@ def _has_few_others(candidates: tuple[Candidate, ...]) -> bool:
     return 2 * rejected <= len(candidates)
 
 
-def _rest(one: _Fitted, samples: Samples, struck, band, cycle) -> tuple[Stretch, ...]:
+def _rest(one: _Fitted, samples: Samples, excited, band, cycle) -> tuple[Stretch, ...]:
     """Fitted decays, or what is left of them, in which nothing excites the structure."""
     return without_excitation(
         one.used,
@@ -258,7 +258,7 @@ def _rest(one: _Fitted, samples: Samples, struck, band, cycle) -> tuple[Stretch,
         channels=samples.records[0].shape[1],
         rate=samples.rate,
         independent=2 * (band[1] - band[0]) / samples.rate,
-        after_blow=after_blow(one.used[0], struck[one.used[0].record], cycle),
+        after_impact=after_impact(one.used[0], excited[one.used[0].record], cycle),
     )
 
 

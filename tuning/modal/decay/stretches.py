@@ -1,10 +1,10 @@
-"""Free decays in a log: stretches after blows, or after a load has left, without excitation.
+"""Free decays in a log: stretches after impacts, or after a load has left, without excitation.
 
-Between blows the samples are predicted by the past ones, but for noise. An autoregressive model of
-each channel tells excitation by its prediction errors: a blow is an error far beyond those of the
-quietest parts of the log, and beyond those before it or not small beside the signal itself. The
+Between impacts the samples are predicted by the past ones, but for noise. An autoregressive model
+of each channel tells excitation by its prediction errors: an impact is an error far beyond those of
+the quietest parts of the log, and beyond those before it or not small beside the signal itself. The
 model is that of the log at its own rate, whose highest frequencies show a contact best, whatever
-the band in which modes are sought. Blows too soft, or in too much noise, for that are told by the
+the band in which modes are sought. Impacts too soft, or in too much noise, for that are told by the
 energy, which rises at once. The last functions say whether decays stand for a log.
 """
 
@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.signal import lfilter
 
-MIN_ENERGY_RISE = 2.0  # energy in two cycles after a blow over that before it
+MIN_ENERGY_RISE = 2.0  # energy in two cycles after an impact over that before it
 RISE_WIDTHS = 5  # of two cycles each, before such a rise
-MIN_START_RATIO = 10.0  # energy right after a blow over that of a structure at rest
-MAX_HARDER = 10.0  # energy right after the hardest blow over that after the softest; less is noise
+MIN_START_RATIO = 10.0  # energy right after an impact over that of a structure at rest
+MAX_HARDER = 10.0  # energy after the hardest impact over that after the softest; less is noise
 
 
 def vibration_energy(
@@ -38,16 +38,16 @@ def moving_mean(values: Float[np.ndarray, " sample"], width: int) -> Float[np.nd
     return (total[high] - total[low]) / (high - low)
 
 
-def until_soft_blow(record: Float[np.ndarray, "sample channel"], width: int) -> int:
-    """Samples of a record before a blow too soft to be found by its errors; all if there is none.
+def until_soft_impact(record: Float[np.ndarray, "sample channel"], width: int) -> int:
+    """Samples of a record before an impact too soft to be found by its errors, or all.
 
     `width` are two cycles of the strongest vibration in samples.
     """
-    return until_blow(vibration_energy(record, width), width)
+    return until_impact(vibration_energy(record, width), width)
 
 
-def after_first_blow(energy: Float[np.ndarray, " sample"], width: int) -> int | None:
-    """Sample of most energy after a blow that strikes a structure at rest; None without one."""
+def after_first_impact(energy: Float[np.ndarray, " sample"], width: int) -> int | None:
+    """Sample of most energy after an impact that strikes a structure at rest; None without one."""
     rise = _until_rise(energy, width, width, MIN_START_RATIO)
     if rise == energy.size:
         return None
@@ -55,12 +55,12 @@ def after_first_blow(energy: Float[np.ndarray, " sample"], width: int) -> int | 
     return highest if MAX_HARDER * energy[highest] > energy.max() else None
 
 
-def between_soft_blows(
+def between_soft_impacts(
     energy: Float[np.ndarray, " sample"], first: int, last: int, width: int
 ) -> Iterator[tuple[int, int]]:
-    """First and last samples of the parts of a stretch before and after soft blows."""
+    """First and last samples of the parts of a stretch before and after soft impacts."""
     while True:
-        rise = first + until_blow(energy[first:last], width)
+        rise = first + until_impact(energy[first:last], width)
         yield first, rise
         if rise == last:
             return
@@ -68,12 +68,12 @@ def between_soft_blows(
 
 
 def _highest_after(energy, rise, width) -> int:
-    """Sample of most energy after a blow, where nothing acts any longer."""
+    """Sample of most energy after an impact, where nothing acts any longer."""
     return rise + int(np.argmax(energy[rise : rise + 4 * width]))
 
 
-def until_blow(energy: Float[np.ndarray, " sample"], width: int) -> int:
-    """Samples before a blow too soft to be found by its errors.
+def until_impact(energy: Float[np.ndarray, " sample"], width: int) -> int:
+    """Samples before an impact too soft to be found by its errors.
 
     Close modes make the energy rise, too, but not above what it was as long before its least.
     """
@@ -93,17 +93,17 @@ AR_ORDER = 24  # of the model by which samples are predicted
 AR_ITERATIONS = 6  # of reweighting
 AR_ROWS = 20_000  # equations from which its coefficients are found
 QUIET_QUANTILE = 0.2  # of the blocks, by their prediction errors
-BLOW_SD = 10.0  # prediction errors of quiet blocks, beyond which the structure is struck
-BLOW_SIGNAL_SHARE = 0.25  # of the rms of the signal around, likewise
-BLOW_LOCAL_SD = 8.0  # or of the errors before it; normal errors reach six in a day of samples
-CONTACT_SAMPLES = 4  # within which past and future fail after a blow
+IMPACT_SD = 10.0  # prediction errors of quiet blocks, beyond which the structure is excited
+IMPACT_SIGNAL_SHARE = 0.25  # of the rms of the signal around, likewise
+IMPACT_LOCAL_SD = 8.0  # or of the errors before it; normal errors reach six in a day of samples
+CONTACT_SAMPLES = 4  # within which past and future fail after an impact
 MIN_DECAY_CYCLES = 5.0  # of the strongest vibration
 MIN_FALL_NEPERS = 1.0  # of the energy over a decay
 MIN_LINEARITY = 0.6  # share of the variance of the log energy that a straight line explains
 MAX_COLUMNS = 24  # channels times decays that are fitted together
-# Of a record's energy, in decays after blows that the energy alone tells of. Ambient vibration
+# Of a record's energy, in decays after impacts that the energy alone tells of. Ambient vibration
 # rises and falls, too: what falls held as much in one of eight short records of one mode.
-MIN_ENERGY_AFTER_SOFT_BLOWS = 0.7
+MIN_ENERGY_AFTER_SOFT_IMPACTS = 0.7
 FALL_PARTS = 10  # parts of a decay whose mean energies tell its fall
 NOISE_QUANTILE = 0.25  # of the energy of a stretch: that of the noise, if the decay has ended
 CORES_BEFORE_NOISE = 8  # times that of 95 % of the energy above noise: 12 decay times of one mode
@@ -113,7 +113,7 @@ CORE, WHOLE = 0.95, 0.999  # shares of the energy of a decay: for its fall, and 
 # Of the information of an impact's own decay, that other decays must have to be taken instead:
 # with less than a tenth, their intervals are more than three times as wide.
 LITTLE_INFORMATION = 0.1
-CONTACT_CYCLES = 0.5  # of the strongest vibration, in which marks are those of the blow itself
+CONTACT_CYCLES = 0.5  # of the strongest vibration, in which marks are those of the impact itself
 # Nepers after which the instants of the fall of the energy are compared. One exponential needs half
 # of the time to the second for the first, several need less. What a load shakes that crosses stays
 # up until it has left: the first neper takes most of the time to the second.
@@ -124,27 +124,27 @@ MAX_FIRST_SHARE = 0.6  # of the time to the second, for the first
 class Stretch(NamedTuple):
     """Samples (start, stop) of a record between excitations, and the fall of energy in nepers.
 
-    `impact` says that it is the own decay of a blow on a structure at rest.
+    `from_rest` says that it is the own decay of an impact on a structure at rest.
     """
 
     record: int
     start: int
     stop: int
     fall: float
-    impact: bool = False
+    from_rest: bool = False
 
 
 def excited_samples(
     record: Float[np.ndarray, "time channel"], rate: float, cycle: float
 ) -> Bool[np.ndarray, " time"]:
-    """Samples at which the structure is struck; `cycle` (s) is that of its strongest vibration.
+    """Samples at which the structure is excited; `cycle` (s) is that of its strongest vibration.
 
-    Neither the past samples predict them nor the coming ones: after a blow the past fails for as
+    Neither the past samples predict them nor the coming ones: after an impact the past fails for as
     many samples as the model has coefficients, before it the future. Two models must fail, one of
     errors relative to the signal around, one of absolute errors, in which the loud parts count.
     """
     span = max(int(2 * cycle * rate), 16)
-    struck = np.zeros(len(record), bool)
+    excited = np.zeros(len(record), bool)
     for values in record.T:
         if not values.any():
             continue
@@ -154,20 +154,20 @@ def excited_samples(
             forward &= _is_large(prediction_errors(values, scale), around, span)
             errors = prediction_errors(values[::-1], scale[::-1])[::-1]
             backward &= _is_large(errors, around, span)
-        struck |= _widened(forward) & _widened(backward)
-    return struck
+        excited |= _widened(forward) & _widened(backward)
+    return excited
 
 
 def _is_large(error, around, span):
     """Errors beyond those of the quietest blocks, and not small beside the signal."""
     size, found = max(span, 32), np.abs(error)
     if error.size < 2 * size:
-        return found > BLOW_SIGNAL_SHARE * around
+        return found > IMPACT_SIGNAL_SHARE * around
     blocks = found[: error.size // size * size].reshape(-1, size)
     quiet = np.sqrt(np.quantile(np.mean(blocks**2, axis=1), QUIET_QUANTILE))
     local = _level_before(error, max(span // 4, 16))
-    return (found > BLOW_SD * quiet) & (
-        (found > BLOW_SIGNAL_SHARE * around) | (found > BLOW_LOCAL_SD * local)
+    return (found > IMPACT_SD * quiet) & (
+        (found > IMPACT_SIGNAL_SHARE * around) | (found > IMPACT_LOCAL_SD * local)
     )
 
 
@@ -212,29 +212,29 @@ def prediction_errors(
 
 
 def free_decays(
-    struck: tuple[Bool[np.ndarray, " time"], ...],
+    excited: tuple[Bool[np.ndarray, " time"], ...],
     records: tuple[Float[np.ndarray, "sample channel"], ...],
     rate: float,
     frequency: float,
 ) -> tuple[Stretch, ...]:
-    """Decays between the struck samples of records, in samples of these.
+    """Decays between the excited samples of records, in samples of these.
 
     `records` are those of the band, at the `rate` (Hz) after decimation; `frequency` (Hz) is that
-    of the strongest vibration. A decay lasts at least five cycles, in which the energy falls by
-    one neper, along a line or after a blow that raised it; it ends when 99.9 % of the energy above
-    the least has passed, or sooner if a long rest is noise. A record may begin right after a blow:
-    its energy is then far above that at its end, though close modes make it rise and fall on the
-    way. What is at rest before a first blow that was not found does not count. In a record without
-    a lasting excitation the energy also tells of blows too soft, or in too much noise, to be found
-    by their errors, down to a tenth of the highest energy.
+    of the strongest vibration. A decay lasts at least five cycles, in which the energy falls by one
+    neper, along a line or after an impact that raised it; it ends when 99.9 % of the energy above
+    the least has passed, or sooner if a long rest is noise. A record may begin right after an
+    impact: its energy is then far above that at its end, though close modes make it rise and fall
+    on the way. What is at rest before a first impact that was not found does not count. In a record
+    without a lasting excitation the energy also tells of impacts too soft, or in too much noise, to
+    be found by their errors, down to a tenth of the highest energy.
 
-    The own decay of a blow on a structure at rest takes their place in its record where they tell
-    far less than it.
+    The own decay of an impact on a structure at rest takes their place in its record where they
+    tell far less than it.
     """
     shortest = int(np.ceil(MIN_DECAY_CYCLES * rate / frequency))
     width = max(int(2 * rate / frequency), 4)
     found = []
-    for number, (marks, record) in enumerate(zip(struck, records, strict=True)):
+    for number, (marks, record) in enumerate(zip(excited, records, strict=True)):
         energy = vibration_energy(record, width)
         decays = _decays_of_record(number, marks, energy, shortest, width)
         own = _decay_of_impact(number, marks, energy, shortest, width)
@@ -243,26 +243,26 @@ def free_decays(
 
 
 def _decay_of_impact(number, marks, energy, shortest, width) -> Stretch | None:
-    """The decay right after the strongest blow, if that strikes a structure at rest.
+    """The decay right after the strongest impact, if that strikes a structure at rest.
 
     A hammer leaves the structure after milliseconds. Friction, rattling parts and frequencies that
-    depend on amplitude make samples stand out in the decay that nothing has struck, and no linear
+    depend on amplitude make samples stand out in the decay that nothing has excited, and no linear
     model explains it: it is known by the energy, which rises at once and falls from then on.
     """
     ratio = marks.size / len(energy)
     highest = int(np.argmax(energy))
-    # The moving mean is highest where it begins with the blow.
-    blow = max(highest - width // 2, 0)
-    past = energy[max(blow - RISE_WIDTHS * width, 0) : max(blow - width // 2, 0)]
+    # The moving mean is highest where it begins with the impact.
+    impact = max(highest - width // 2, 0)
+    past = energy[max(impact - RISE_WIDTHS * width, 0) : max(impact - width // 2, 0)]
     if past.size < width or MIN_START_RATIO * past.max() > energy[highest]:
         return None
-    struck = marks[int((blow - width) * ratio) : int((blow + width) * ratio)]
-    if not struck.any() or not _falls_at_once(energy[highest:]):
+    excited = marks[int((impact - width) * ratio) : int((impact + width) * ratio)]
+    if not excited.any() or not _falls_at_once(energy[highest:]):
         return None
-    exact, contact = int(blow * ratio), int(CONTACT_CYCLES * width / 2 * ratio)
+    exact, contact = int(impact * ratio), int(CONTACT_CYCLES * width / 2 * ratio)
     start = exact + int(np.flatnonzero(marks[exact : exact + contact])[-1:].sum()) + 2
     first = int(np.ceil(start / ratio))
-    last = highest + until_blow(energy[highest:], width)
+    last = highest + until_impact(energy[highest:], width)
     part = energy[first:last]
     if part.size < shortest:
         return None
@@ -295,24 +295,24 @@ def _tell_enough(decays, own: Stretch, marks, energy) -> bool:
 
 
 def _decays_of_record(number, marks, energy, shortest, width) -> list[Stretch]:
-    """Decays between the struck samples of a record, from the energy of its vibration.
+    """Decays between the excited samples of a record, from the energy of its vibration.
 
-    Without struck samples the energy may tell of blows, if the decays hold most of it.
+    Without excited samples the energy may tell of impacts, if the decays hold most of it.
     """
     ratio = marks.size / len(energy)
-    only_blows = _longest_run(marks) < shortest * ratio
-    found = _decays_between(number, marks, energy, shortest, width, only_blows)
+    only_impacts = _longest_run(marks) < shortest * ratio
+    found = _decays_between(number, marks, energy, shortest, width, only_impacts)
     if marks.any():
         return found
     spans = [(int(one.start / ratio), int(one.stop / ratio)) for one in found]
     held = sum(energy[start:stop].sum() for start, stop in spans)
-    if len(found) > 1 and held > MIN_ENERGY_AFTER_SOFT_BLOWS * energy.sum():
+    if len(found) > 1 and held > MIN_ENERGY_AFTER_SOFT_IMPACTS * energy.sum():
         return found
     return _decays_between(number, marks, energy, shortest, width, False)
 
 
-def _decays_between(number, marks, energy, shortest, width, only_blows: bool) -> list[Stretch]:
-    """Decays between struck samples, and soft blows if nothing but blows excites the record."""
+def _decays_between(number, marks, energy, shortest, width, only_impacts: bool) -> list[Stretch]:
+    """Decays between excited samples, and soft impacts if nothing but impacts excites it."""
     ratio, highest = marks.size / len(energy), energy.max()
     found, excited_from = [], 0
     for start, stop in _free_stretches(marks, shortest * ratio):
@@ -321,14 +321,14 @@ def _decays_between(number, marks, energy, shortest, width, only_blows: bool) ->
         if last - first < shortest:
             continue
         risen = energy[first : first + width].mean()
-        blow = start > 0 and (before < 0 or risen > MIN_ENERGY_RISE * energy[before])
-        parts = _parts(energy, (first, last), start == 0, only_blows, shortest, width)
+        impact = start > 0 and (before < 0 or risen > MIN_ENERGY_RISE * energy[before])
+        parts = _parts(energy, (first, last), start == 0, only_impacts, shortest, width)
         for begins, ends in parts:
-            part, after_soft_blow = energy[begins:ends], begins > parts[0][0]
-            # Noise rises and falls, too, but little beside the hardest blow.
-            if part.size < shortest or (after_soft_blow and MAX_HARDER * part[0] < highest):
+            part, after_soft_impact = energy[begins:ends], begins > parts[0][0]
+            # Noise rises and falls, too, but little beside the hardest impact.
+            if part.size < shortest or (after_soft_impact and MAX_HARDER * part[0] < highest):
                 continue
-            raised = blow or after_soft_blow or (start == 0 and _begins_high(part))
+            raised = impact or after_soft_impact or (start == 0 and _begins_high(part))
             fall = _fall_of_decay(part, raised)
             if fall > MIN_FALL_NEPERS:
                 exact = start if begins == first else int(np.ceil(begins * ratio))
@@ -339,7 +339,7 @@ def _decays_between(number, marks, energy, shortest, width, only_blows: bool) ->
 
 
 def _free_stretches(marks, shortest) -> list[tuple[int, int]]:
-    """First sample and end of each stretch between struck samples that is long enough."""
+    """First sample and end of each stretch between excited samples that is long enough."""
     edges = np.concatenate([[-1], np.flatnonzero(marks), [marks.size]])
     return [
         (0 if i == 0 else int(edges[i]) + 2, int(edges[i + 1]) - (i + 2 < edges.size))
@@ -347,22 +347,22 @@ def _free_stretches(marks, shortest) -> list[tuple[int, int]]:
     ]
 
 
-def _parts(energy, stretch, is_first, only_blows, shortest, width) -> list[tuple[int, int]]:
-    """Parts of a stretch in which a decay may be: all of it, or those between soft blows.
+def _parts(energy, stretch, is_first, only_impacts, shortest, width) -> list[tuple[int, int]]:
+    """Parts of a stretch in which a decay may be: all of it, or those between soft impacts.
 
-    After another excitation than blows, that before the first soft blow.
+    After another excitation than impacts, that before the first soft impact.
     """
     first, last = stretch
     begins = first
     if is_first:
         begins += _at_rest(energy[first:last], width)
         begins = begins if last - begins >= shortest else first
-        if not only_blows:
+        if not only_impacts:
             return [(begins, last)]
-        blow = after_first_blow(energy[first:last], width)
-        begins = begins if blow is None else min(begins, first + blow)
-    parts = list(between_soft_blows(energy, begins, last, width))
-    return parts if only_blows else parts[:1]
+        impact = after_first_impact(energy[first:last], width)
+        begins = begins if impact is None else min(begins, first + impact)
+    parts = list(between_soft_impacts(energy, begins, last, width))
+    return parts if only_impacts else parts[:1]
 
 
 def _longest_run(marks) -> int:
@@ -378,7 +378,7 @@ def _begins_high(energy):
 
 
 def _at_rest(energy, width):
-    """Samples of the beginning of a record before a blow that was not found by its errors.
+    """Samples of the beginning of a record before an impact that was not found by its errors.
 
     The least energy of its first cycles is then a tenth of the most in the record, or less, and it
     does not begin with much energy, as a fast decay does.
@@ -389,19 +389,21 @@ def _at_rest(energy, width):
     return rises + width // 2
 
 
-def _fall_of_decay(energy, blow):
-    """Fall in nepers of the energy of a decay; zero if it is neither after a blow nor linear.
+def _fall_of_decay(energy, impact):
+    """Fall in nepers of the energy of a decay; zero if it is neither after an impact nor linear.
 
     A decay that goes on to the end of a stretch has most of the energy above its least. Noise that
     lasts long after a decay holds much energy, too, but as much below its level as above it. What
-    holds most energy after a blow may be one beat of close modes, which does not fall.
+    holds most energy after an impact may be one beat of close modes, which does not fall.
     """
     whole = np.cumsum(energy - np.quantile(energy, NOISE_QUANTILE))
     lengths = [_length(energy, CORE), int(np.argmax(whole >= CORE * whole.max())) + 1]
-    if blow:
+    if impact:
         lengths.append(_length(energy, WHOLE))
     falls = [_fall(energy[:length]) for length in lengths]
-    return max((fall for fall, linearity in falls if blow or linearity > MIN_LINEARITY), default=0)
+    return max(
+        (fall for fall, linearity in falls if impact or linearity > MIN_LINEARITY), default=0
+    )
 
 
 def _until_noise(energy):
@@ -465,16 +467,16 @@ MIN_START_LEVEL = 0.2  # energy at the start of such a decay over the mean energ
 
 def dominate(
     decays: tuple[Stretch, ...],
-    struck: tuple[Bool[np.ndarray, " time"], ...],
+    excited: tuple[Bool[np.ndarray, " time"], ...],
     records: tuple[Float[np.ndarray, "sample channel"], ...],
     ratio: float,
     cycle: float,
 ) -> bool:
     """Whether decays hold much of the energy of a log, or one falls far, or follows a load.
 
-    `struck` are samples of the log, `ratio` those of `records` over these; `cycle` is that of the
+    `excited` are samples of the log, `ratio` those of `records` over these; `cycle` is that of the
     strongest vibration in samples of `records`. A decay that begins far below the level of the log,
-    long after blows, lacks the modes that were gone by then; one that begins where a lasting
+    long after impacts, lacks the modes that were gone by then; one that begins where a lasting
     excitation ends has them all, however much stronger the excitation was, and how far it falls is
     of no matter.
     """
@@ -488,30 +490,30 @@ def dominate(
     first = records[longest.record][start : start + int(2 * cycle) + 1]
     begins = np.sum(first**2) / len(first) > MIN_START_LEVEL * level
     falls = begins and longest.fall > LONG_FALL_NEPERS
-    has_followed = follows(longest, struck[longest.record], cycle / ratio)
+    has_followed = follows(longest, excited[longest.record], cycle / ratio)
     return bool(inside > MIN_DECAY_ENERGY * whole or falls or has_followed)
 
 
-def after_soft_blows(
-    decays: tuple[Stretch, ...], struck: tuple[Bool[np.ndarray, " time"], ...]
+def after_soft_impacts(
+    decays: tuple[Stretch, ...], excited: tuple[Bool[np.ndarray, " time"], ...]
 ) -> bool:
     """Whether there are several decays in records in which no excitation was found."""
-    return len(decays) > len(struck) and not any(marks.any() for marks in struck)
+    return len(decays) > len(excited) and not any(marks.any() for marks in excited)
 
 
-def follows(decay: Stretch, struck: Bool[np.ndarray, " time"], cycle: float) -> bool:
+def follows(decay: Stretch, excited: Bool[np.ndarray, " time"], cycle: float) -> bool:
     """Whether a decay begins where the structure was excited for five cycles or more.
 
-    `cycle` is that of the strongest vibration in samples of the log, as are `struck` ones.
+    `cycle` is that of the strongest vibration in samples of the log, as are `excited` ones.
     """
-    before = struck[: max(decay.start - 2, 0)][-int(MIN_DECAY_CYCLES * cycle) :]
+    before = excited[: max(decay.start - 2, 0)][-int(MIN_DECAY_CYCLES * cycle) :]
     return bool(before.size and before.all())
 
 
-def after_blow(decay: Stretch, struck: Bool[np.ndarray, " time"], cycle: float) -> bool:
-    """Whether a decay begins right after a blow, not after a lasting excitation.
+def after_impact(decay: Stretch, excited: Bool[np.ndarray, " time"], cycle: float) -> bool:
+    """Whether a decay begins right after an impact, not after a lasting excitation.
 
-    `cycle` is that of the strongest vibration in samples of the log, as are `struck` ones.
+    `cycle` is that of the strongest vibration in samples of the log, as are `excited` ones.
     """
-    before = struck[max(decay.start - CONTACT_SAMPLES, 0) : decay.start]
-    return bool(before.any()) and not follows(decay, struck, cycle)
+    before = excited[max(decay.start - CONTACT_SAMPLES, 0) : decay.start]
+    return bool(before.any()) and not follows(decay, excited, cycle)

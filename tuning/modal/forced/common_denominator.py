@@ -21,7 +21,7 @@ HIGHEST_LINE = 1.15  # of transforms, over the upper end of a band
 MAX_ANGLE = 2.8  # of z on the circle, of a band from 0
 PART_LINES = 4096  # lines whose products are formed at once
 # Products of driving signals over the largest, below which they are none: a thousandth of the
-# signals, less than noise. Early blows are nearly powers of z; a shape would be a difference of
+# signals, less than noise. Early impacts are nearly powers of z; a shape would be a difference of
 # large gains of them and of the transient, whatever their sum fits.
 MIN_DRIVING = 1e-6
 
@@ -130,7 +130,7 @@ def fit_common_denominator(system: Products, degree: int) -> CommonDenominator:
     """Polynomials of a degree, at most that of the products.
 
     A shape is what all numerators at a root make of the signals at the line nearest to it: how much
-    is forced and how much free, which one blow leaves open, does not matter.
+    is forced and how much free, which one impact leaves open, does not matter.
     """
     size, outputs = degree + 1, system.outputs
     part = system.gram[:, :size, :, :size]

@@ -12,10 +12,10 @@ from tuning.logs.log import Log
 from tuning.modal.forced.forces import (
     Windows,
     check_windows,
-    find_blows,
+    find_impacts,
     force_names,
     force_records,
-    pieces_of_blows,
+    pieces_of_impacts,
     without_forces,
 )
 from tuning.modal.samples import samples_of, with_channels
@@ -31,7 +31,8 @@ class MeasuredResponses:
 
     `values` are complex, in SI units of each channel per N; `coherence` is that of each output with
     all forces together, NaN of a single average, which tells none; `averages` is the number of
-    segments or blows. `decay_rate` (1/s) is what an exponential window added to that of each mode.
+    segments or impacts. `decay_rate` (1/s) is what an exponential window added to that of each
+    mode.
 
     >>> import numpy as np
     >>> import tuning
@@ -95,13 +96,13 @@ def measured_responses(
     With spectra S averaged over segments, H1 = S_yf S_ff^-1 is free of the bias of noise in the
     responses, H2 = S_yy / S_fy of that of noise in the force, Hv = sqrt(S_yy / S_ff) with the phase
     of H1 shares it between both (Rocklin, Crowley and Vold 1985); the last two are for one force.
-    Of a hammer a segment is the time from one blow to the next, all as long as the shortest; else
+    Of a hammer a segment is the time from one impact to the next, all as long as the shortest; else
     segments of `segment` s (an eighth of the log) have a window of Hann and overlap by half.
-    `exponential` (s) is the time constant of a window on blows and responses, `force_window` (s)
+    `exponential` (s) is the time constant of a window on impacts and responses, `force_window` (s)
     the time after which the force is taken for zero. `window` (s) is the part of the log used.
 
     Raises ValueError for an unknown estimator, an H2 or Hv of several forces, windows without
-    blows, no force, fewer segments than forces, and what `identify_modes` raises for its logs.
+    impacts, no force, fewer segments than forces, and what `identify_modes` raises for its logs.
 
     >>> import numpy as np
     >>> import tuning
@@ -126,17 +127,17 @@ def measured_responses(
     samples = samples_of(measured, window)
     driving = force_records(logs, names, window, samples)
     records = [record - np.median(record, axis=0) for record in samples.records]
-    hammer = all(find_blows(one).size for one in driving)
+    hammer = all(find_impacts(one).size for one in driving)
     if hammer and segment is None:
         pieces = [
             piece
             for record, own in zip(records, driving, strict=True)
-            for piece in pieces_of_blows(record, own, samples.rate, windows)
+            for piece in pieces_of_impacts(record, own, samples.rate, windows)
         ]
         taper = None
     elif windows != Windows():
         raise ValueError(
-            f"{logs[0].source}: windows are for blows of a hammer; leave out exponential and "
+            f"{logs[0].source}: windows are for impacts of a hammer; leave out exponential and "
             f"force_window with {'a segment' if hammer else 'a steady force'}"
         )
     else:

@@ -112,7 +112,7 @@ def modes_of_model(
     modes = []
     for k, pole in enumerate(poles):
         # Residues and transients are multiples of one shape. What they are together is known well,
-        # but hardly each, if one blow at the beginning is all that excites.
+        # but hardly each, if one impact at the beginning is all that excites.
         terms = resonances[:, [k]] * plain.inputs, transients[:, [k]] * plain.unforced
         signals = np.concatenate(terms, axis=1)
         response = signals @ coefficients[k]

@@ -36,13 +36,13 @@ SPLITS = 0.5 * np.array([1j, 1.0, 3j, 1 + 1j, 1 - 1j])  # of a pole, over its de
 def mode_chances(model: FittedModel) -> Float[np.ndarray, " mode"]:
     """Probability that noise explains what each mode does, forced and free, at any of the lines.
 
-    Both together, as the response to a blow at the start of a record is like a free one.
+    Both together, as the response to an impact at the start of a record is like a free one.
     """
     outputs, found = model.fit.errors.shape[1], []
     variance = _local_variance(model.fit.errors, model.free.free)
     for k in range(model.poles.size):
         # Without its coefficients x the sum of squared errors is more by x^T (F F^T)^-1 x. After a
-        # blow at the start forced and free ones are nearly one: F F^T would lose what is known.
+        # impact at the start forced and free ones are nearly one: F F^T would lose what is known.
         own = coefficient_places(model.lines, model.poles.size, k)
         directions, sizes, _ = np.linalg.svd(model.fit.inverse_factor[own], full_matrices=False)
         kept = sizes > MIN_SIZE * sizes[0]

@@ -11,47 +11,47 @@ from tuning.modal.decay.fit import NONLINEARITY
 from tuning.modal.decay.modes import (
     Decays,
     band_of_ends,
-    excited,
+    find_excited,
     follow_impacts,
     free_decay_modes,
 )
 from tuning.modal.decay.stretches import MIN_DECAY_CYCLES, Stretch
+from tuning.modal.impacts.impact_records import (
+    AFTER_IMPACTS,
+    AFTER_UNSEEN_IMPACTS,
+    FROM_AMBIENT,
+    MIN_IMPACTS,
+    WEAK,
+    Impact,
+    Search,
+    alike,
+    impact_modes,
+    marked_impacts,
+)
 from tuning.modal.preprocessing import HALF_POWER, kinetic_band, prepare
 from tuning.modal.result import is_at_edge
 from tuning.modal.samples import Samples
 from tuning.modal.stabilisation import Diagram
-from tuning.modal.struck.blows import (
-    AFTER_BLOWS,
-    AFTER_UNSEEN_BLOWS,
-    FROM_AMBIENT,
-    MIN_BLOWS,
-    WEAK,
-    Blow,
-    Search,
-    alike,
-    marked_blows,
-    struck_modes,
-)
 
-AFTER_CYCLES = 2.0  # of the lowest frequency, in which a blow's energy is compared
+AFTER_CYCLES = 2.0  # of the lowest frequency, in which an impact's energy is compared
 
 Band = tuple[float, float]
-Struck = tuple[Bool[np.ndarray, " time"], ...]
+Excited = tuple[Bool[np.ndarray, " time"], ...]
 
 
 class FromDecays(NamedTuple):
-    """Candidates, diagrams, decays, the band (Hz) used, and how many blows were used together."""
+    """Candidates, diagrams, decays, the band (Hz) used, and how many impacts were used together."""
 
     candidates: tuple[Candidate, ...]
     diagrams: tuple[Diagram, ...]
     decays: Decays
     band: Band
-    blows: int = 0
+    impacts: int = 0
 
 
 def modes_of_decays(
     samples: Samples,
-    struck: Struck,
+    excited: Excited,
     derivatives: tuple[int, ...],
     bands: tuple[Band, Band],
     may_narrow: bool,
@@ -59,37 +59,37 @@ def modes_of_decays(
 ) -> FromDecays | None:
     """Modes of the decays of a log in two bands (Hz), the latter as wide or wider; None without.
 
-    `struck` are samples excited in the former, `derivatives` the orders of the channels as time
+    `excited` are samples excited in the former, `derivatives` the orders of the channels as time
     derivatives, `how` what else `free_decay_modes` takes. A decay is sought in a narrower band,
     too, if it `may_narrow`: it drowns sooner in the noise of a wide one.
     """
     band, wide = bands
-    found = _in_band(samples, struck, derivatives, band, may_narrow, how)
+    found = _in_band(samples, excited, derivatives, band, may_narrow, how)
     if found is None:
         return None
-    if all(one.impact for one in found.decays.stretches):
+    if all(one.from_rest for one in found.decays.stretches):
         return found
     if wide != band:
-        more = free_decay_modes(samples, struck, derivatives, wide, **how)
+        more = free_decay_modes(samples, excited, derivatives, wide, **how)
         found = _with_others(found, more, wide)
-    return _with_blows(found, samples, struck, wide)
+    return _with_impacts(found, samples, excited, wide)
 
 
-def _in_band(samples, struck, derivatives, band, may_narrow, how) -> FromDecays | None:
-    if may_narrow and follow_impacts(samples, struck, derivatives, band):
+def _in_band(samples, excited, derivatives, band, may_narrow, how) -> FromDecays | None:
+    if may_narrow and follow_impacts(samples, excited, derivatives, band):
         # Contacts and rattling parts have most of the velocities above what the structure moves.
         displacements = tuple(order + 1 for order in derivatives)
         narrower = kinetic_band(samples.records, samples.rate, displacements)
-        marks = excited(samples, derivatives, narrower)
+        marks = find_excited(samples, derivatives, narrower)
         told = free_decay_modes(samples, marks, derivatives, narrower, **how)
         if told is not None:
             return FromDecays(*told, narrower)
-    found = free_decay_modes(samples, struck, derivatives, band, **how)
+    found = free_decay_modes(samples, excited, derivatives, band, **how)
     if found is None and may_narrow:
         lower = kinetic_band(samples.records, samples.rate, derivatives, HALF_POWER)
         others = dict.fromkeys((lower, band_of_ends(samples, derivatives, lower)))
         for narrower in (one for one in others if one != band):
-            marks = excited(samples, derivatives, narrower)
+            marks = find_excited(samples, derivatives, narrower)
             found = free_decay_modes(samples, marks, derivatives, narrower, **how)
             if found is not None:
                 return FromDecays(*found, narrower)
@@ -111,24 +111,24 @@ def _with_others(found: FromDecays, more, wide: Band) -> FromDecays:
     return found._replace(candidates=without_duplicates([*found.candidates, *others]), band=wide)
 
 
-def _with_blows(found: FromDecays, samples: Samples, struck: Struck, band: Band) -> FromDecays:
-    """Modes of decays, with those of whole records if blows are all that excites them."""
-    seen = marked_blows(struck, samples.rate, band)
+def _with_impacts(found: FromDecays, samples: Samples, excited: Excited, band: Band) -> FromDecays:
+    """Modes of decays, with those of whole records if impacts are all that excites them."""
+    seen = marked_impacts(excited, samples.rate, band)
     poles = [one.mode.pole for one in found.candidates if not one.reason]
-    search = AFTER_BLOWS if len(seen) >= MIN_BLOWS else AFTER_UNSEEN_BLOWS
+    search = AFTER_IMPACTS if len(seen) >= MIN_IMPACTS else AFTER_UNSEEN_IMPACTS
     told = _of_whole_records(found.candidates, samples, band, seen, poles, search)
     if told is None:
         return found
-    return found._replace(candidates=told[0], band=band, blows=told[1])
+    return found._replace(candidates=told[0], band=band, impacts=told[1])
 
 
-def modes_after_unseen_blows(
-    candidates: tuple[Candidate, ...], samples: Samples, struck: Struck, band: Band
+def modes_after_unseen_impacts(
+    candidates: tuple[Candidate, ...], samples: Samples, excited: Excited, band: Band
 ) -> tuple[tuple[Candidate, ...], int] | None:
-    """Candidates of whole records, and the number of blows, of a log without clear decays.
+    """Candidates of whole records, and the number of impacts, of a log without clear decays.
 
-    Lightly damped structures may hardly fall from one blow to the next, which looks like ambient
-    vibration, of which some candidates are given. None if blows are not all that excites.
+    Lightly damped structures may hardly fall from one impact to the next, which looks like ambient
+    vibration, of which some candidates are given. None if impacts are not all that excites.
     """
     poles = [
         one.mode.pole
@@ -137,18 +137,18 @@ def modes_after_unseen_blows(
     ]
     if not poles:
         return None
-    seen = marked_blows(struck, samples.rate, band)
+    seen = marked_impacts(excited, samples.rate, band)
     return _of_whole_records(candidates, samples, band, seen, poles, FROM_AMBIENT)
 
 
 def _of_whole_records(candidates, samples: Samples, band, seen, poles, search: Search):
-    """Candidates of whole records, and the number of blows, if these are all that excites them.
+    """Candidates of whole records, and the number of impacts, if these are all that excites them.
 
     Whole records must tell of all strong modes among some candidates, too; others of these, and
     what they know as nonlinearity, are kept.
     """
     starts = np.array(poles, complex)
-    whole = struck_modes(samples.records, samples.rate, band, seen, starts, search)
+    whole = impact_modes(samples.records, samples.rate, band, seen, starts, search)
     if whole is None:
         return None
     strong = [
@@ -166,30 +166,31 @@ def _of_whole_records(candidates, samples: Samples, band, seen, poles, search: S
         if one.reason.startswith(NONLINEARITY) or not any(alike(one.mode, mode) for mode in modes)
     ]
     every = [*(Candidate(mode, "", 1) for mode in modes), *others]
-    return tuple(sorted(every, key=lambda one: one.mode.frequency)), len(whole.blows)
+    return tuple(sorted(every, key=lambda one: one.mode.frequency)), len(whole.impacts)
 
 
-def blows_left_out(
-    samples: Samples, struck: Struck, decays: Sequence[Stretch], band: Band
+def impacts_left_out(
+    samples: Samples, excited: Excited, decays: Sequence[Stretch], band: Band
 ) -> list[str]:
-    """A sentence if no decay that is used follows the blow that leaves most energy in a band (Hz).
+    """A sentence if no decay that is used follows the impact that leaves most energy in a band
+    (Hz).
 
-    `struck` are the samples at which the structure is excited.
+    `excited` are the samples at which the structure is excited.
     """
-    blows = marked_blows(struck, samples.rate, band)
-    if not blows:
+    impacts = marked_impacts(excited, samples.rate, band)
+    if not impacts:
         return []
     prepared = prepare(samples.records, samples.starts, samples.rate, band)
     ratio = prepared.rate / samples.rate
     cycles = int(AFTER_CYCLES * samples.rate / band[0])
 
-    def energy(blow: Blow) -> float:
-        first = int(blow.sample * ratio)
-        part = prepared.records[blow.record][first : first + max(int(cycles * ratio), 1)]
+    def energy(impact: Impact) -> float:
+        first = int(impact.sample * ratio)
+        part = prepared.records[impact.record][first : first + max(int(cycles * ratio), 1)]
         return float(np.sum(part**2))
 
-    hardest = max(blows, key=energy)
-    later = [b.sample for b in blows if b.record == hardest.record and b.sample > hardest.sample]
+    hardest = max(impacts, key=energy)
+    later = [b.sample for b in impacts if b.record == hardest.record and b.sample > hardest.sample]
     last = min([hardest.sample + cycles, *later])
     if any(
         one.record == hardest.record and one.start <= last and hardest.sample < one.stop
@@ -200,5 +201,5 @@ def blows_left_out(
     wait = (min(later) - hardest.sample) / samples.rate if later else np.inf
     why = "what follows it is not the free decay that tells most"
     if wait * band[0] < MIN_DECAY_CYCLES:
-        why = f"the next blow comes {wait:.3g} s later"
-    return [f"the hardest blow, at {start:.4g} s, is left out: {why}"]
+        why = f"the next impact comes {wait:.3g} s later"
+    return [f"the hardest impact, at {start:.4g} s, is left out: {why}"]

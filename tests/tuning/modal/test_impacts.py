@@ -1,4 +1,4 @@
-"""Modes of whole records after blows whose forces nobody measured, against sums of exponentials."""
+"""Modes of whole records after impacts of unmeasured force, against sums of exponentials."""
 
 import numpy as np
 import pytest
@@ -10,22 +10,22 @@ from tuning import Log, identify_modes
 from tuning.modal.decay.stretches import Stretch
 from tuning.modal.forced.likelihood import linear_fit, refined_poles, whitened
 from tuning.modal.forced.significance import criterion, criterion_with
+from tuning.modal.impacts.impact_records import (
+    FROM_AMBIENT,
+    Impact,
+    ImpactRecords,
+    after_impacts,
+    alike,
+    from_early_impacts,
+    from_rests,
+    impact_modes,
+    marked_impacts,
+    response_in_band,
+    with_missed_impacts,
+)
+from tuning.modal.impacts.whole_log import impacts_left_out
 from tuning.modal.result import IdentifiedMode
 from tuning.modal.samples import Samples
-from tuning.modal.struck.blows import (
-    FROM_AMBIENT,
-    Blow,
-    StruckRecords,
-    after_blows,
-    alike,
-    from_early_blows,
-    from_rests,
-    marked_blows,
-    response_in_band,
-    struck_modes,
-    with_missed_blows,
-)
-from tuning.modal.struck.whole_log import blows_left_out
 
 RATE, BAND, FINER = 40.0, (0.5, 8.0), 8
 FREQUENCIES, DAMPING = np.array([0.83, 1.46, 3.7, 6.3]), np.array([0.006, 0.0054, 0.003, 0.012])
@@ -41,7 +41,7 @@ SLOW_POLES = 2 * np.pi * SLOW_FREQUENCIES * (-SLOW_DAMPING + 1j * np.sqrt(1 - SL
 
 
 def after(times, noise=0.1, seed=0, channels=3, duration=60.0, poles=POLES, rate=RATE):
-    """Velocities of some modes after blows at some times (s), in closed form, with white noise."""
+    """Velocities of modes after impacts at some times (s), in closed form, with white noise."""
     random = np.random.default_rng(seed)
     shapes = random.normal(size=(poles.size, channels))
     fine = np.arange(int(duration * rate) * FINER) / (rate * FINER)
@@ -55,42 +55,42 @@ def after(times, noise=0.1, seed=0, channels=3, duration=60.0, poles=POLES, rate
     return values + noise * values.std() * random.normal(size=values.shape)
 
 
-def blows(times):
-    return tuple(Blow(0, int(round(time * RATE))) for time in times)
+def impacts(times):
+    return tuple(Impact(0, int(round(time * RATE))) for time in times)
 
 
 def test_poles_are_those_of_the_vibration():
     """With noise of a thousandth, a hundred times as certain as in logs."""
-    found = struck_modes((after(TIMES, 1e-3),), RATE, BAND, blows(TIMES), POLES)
-    assert found is not None and len(found.blows) == len(TIMES)
+    found = impact_modes((after(TIMES, 1e-3),), RATE, BAND, impacts(TIMES), POLES)
+    assert found is not None and len(found.impacts) == len(TIMES)
     poles = np.array([mode.pole for mode in found.modes])
     nearest = [poles[np.argmin(np.abs(poles - pole))] for pole in POLES]
     assert np.all(np.abs(nearest - POLES) < 1e-3 * np.abs(POLES.real))
 
 
 @pytest.mark.parametrize("known", [0, 2, 5])
-def test_blows_are_found_where_the_vibration_tells_of_them(known):
+def test_impacts_are_found_where_the_vibration_tells_of_them(known):
     response = response_in_band((after(TIMES),), RATE, BAND)
-    found = with_missed_blows(response, blows(TIMES[:known]), POLES)
-    instants = [blow.sample / RATE for blow in found]
+    found = with_missed_impacts(response, impacts(TIMES[:known]), POLES)
+    instants = [impact.sample / RATE for impact in found]
     # An eighth of a period of the highest frequency is not seen in the band.
     assert instants == pytest.approx(TIMES, abs=0.02 + 1 / RATE)
 
 
-def test_no_blow_is_found_in_a_free_vibration():
+def test_no_impact_is_found_in_a_free_vibration():
     response = response_in_band((after(TIMES[:1])[int(TIMES[0] * RATE) :],), RATE, BAND)
-    assert with_missed_blows(response, (), POLES) == ()
+    assert with_missed_impacts(response, (), POLES) == ()
 
 
 def test_intervals_of_slow_modes_hold():
-    """Modes that one blow excites and the next does not find at rest, without one of the poles."""
-    inside, known, start = [], blows(TIMES[1:4]), POLES[[0, 2, 3]]
+    """Modes that one impact excites and the next does not find at rest, lacking one pole."""
+    inside, known, start = [], impacts(TIMES[1:4]), POLES[[0, 2, 3]]
     logs = [after(TIMES, 0.2, seed) for seed in range(8)]
-    every = [struck_modes((values,), RATE, BAND, known, start) for values in logs]
+    every = [impact_modes((values,), RATE, BAND, known, start) for values in logs]
     fits = [found for found in every if found is not None]
-    assert len(fits) >= 7  # where a strong mode is not known blows may be missed: said by None
+    assert len(fits) >= 7  # where a strong mode is not known impacts may be missed: said by None
     for found in fits:
-        assert len(found.blows) == len(TIMES)
+        assert len(found.impacts) == len(TIMES)
         modes = sorted(found.modes, key=lambda mode: mode.frequency)
         assert [mode.frequency for mode in modes] == pytest.approx(FREQUENCIES, rel=0.005)
         for mode, frequency, damping in zip(modes, FREQUENCIES, DAMPING, strict=True):
@@ -104,7 +104,7 @@ def test_whole_records_tell_more_than_decays_of_one_length():
     """The slowest mode needs all of the record; the excitation is named, and shares are sums."""
     fit = identify_modes(Log(np.arange(2400) / RATE, after(TIMES), *COLUMNS), band=BAND)
     assert fit.kind == "free decay" and fit.frequencies == pytest.approx(FREQUENCIES, rel=0.001)
-    assert "5 blows, between which records are fitted as a whole" in str(fit)
+    assert "5 impacts, between which records are fitted as a whole" in str(fit)
     widths = np.ptp(fit.damping_intervals, axis=1) / fit.damping_ratios
     assert np.all(widths < 0.2)  # decays side by side miss the third mode
     assert all(0.01 < mode.energy_share < 1.2 for mode in fit.modes)
@@ -115,18 +115,18 @@ def slow(seed, noise=0.15):
 
 
 @pytest.mark.parametrize("seed", [6, 8, 9])
-def test_blows_are_found_where_no_decay_is_seen(seed):
-    """Modes that hardly fall from one blow to the next look like ambient vibration."""
+def test_impacts_are_found_where_no_decay_is_seen(seed):
+    """Modes that hardly fall from one impact to the next look like ambient vibration."""
     fit = identify_modes(Log(np.arange(600) / SLOW_RATE, slow(seed), *COLUMNS))
     assert fit.kind == "free decay" and fit.method == "decay"
     assert fit.frequencies == pytest.approx(SLOW_FREQUENCIES, rel=0.003)
-    assert "5 blows, between which records are fitted as a whole" in str(fit)
+    assert "5 impacts, between which records are fitted as a whole" in str(fit)
     within = fit.damping_intervals
     assert np.all((within[:, 0] < SLOW_DAMPING) & (within[:, 1] > SLOW_DAMPING))
 
 
-def test_ambient_vibration_has_no_blows():
-    """White noise in place of blows, of the same modes for as long."""
+def test_ambient_vibration_has_no_impacts():
+    """White noise in place of impacts, of the same modes for as long."""
     random = np.random.default_rng(3)
     forces = random.normal(size=(6000, SLOW_POLES.size))
     filtered = [
@@ -136,16 +136,18 @@ def test_ambient_vibration_has_no_blows():
     values = decimate(np.stack(filtered, axis=1) @ random.normal(size=(3, 3)), 10, axis=0)
     values += 0.1 * values.std() * random.normal(size=values.shape)
     fit = identify_modes(Log(np.arange(len(values)) / SLOW_RATE, values, *COLUMNS))
-    assert fit.kind == "ambient" and "blows," not in str(fit)
-    assert struck_modes((values,), SLOW_RATE, (0.5, 2.6), (), SLOW_POLES, FROM_AMBIENT) is None
+    assert fit.kind == "ambient" and "impacts," not in str(fit)
+    assert impact_modes((values,), SLOW_RATE, (0.5, 2.6), (), SLOW_POLES, FROM_AMBIENT) is None
 
 
 def test_records_begin_at_the_end_of_an_early_rest():
-    """The first blow is not sought; no vibration from the start on fits the rest before it."""
+    """The first impact is not sought; no vibration from the start on fits the rest before it."""
     values = slow(0, 0.05)
-    found = struck_modes((values,), SLOW_RATE, (0.5, 2.6), (), SLOW_POLES[:2], FROM_AMBIENT)
+    found = impact_modes((values,), SLOW_RATE, (0.5, 2.6), (), SLOW_POLES[:2], FROM_AMBIENT)
     assert found is not None
-    assert [blow.sample / SLOW_RATE for blow in found.blows] == pytest.approx(SLOW_TIMES, abs=0.6)
+    assert [impact.sample / SLOW_RATE for impact in found.impacts] == pytest.approx(
+        SLOW_TIMES, abs=0.6
+    )
 
 
 @pytest.mark.parametrize("louder, begin", [(1.0, 0), (4.0, 40), (0.25, 0)])
@@ -154,56 +156,58 @@ def test_a_rest_ends_where_errors_become_less(louder, begin):
     noise = np.random.default_rng(5).normal(size=(600, 3))
     noise[:40] *= louder
     response = response_in_band((noise,), SLOW_RATE, (0.5, 4.0))
-    later = from_rests(StruckRecords((noise,), (0,), ()), response, response.lines)
+    later = from_rests(ImpactRecords((noise,), (0,), ()), response, response.lines)
     assert later.begins[0] == pytest.approx(begin, abs=4)
     assert len(later.records[0]) == 600 - later.begins[0]
-    # Records that begin at a blow have no rest.
-    struck = StruckRecords((noise,), (1,), (Blow(0, 300),))
+    # Records that begin at an impact have no rest.
+    struck = ImpactRecords((noise,), (1,), (Impact(0, 300),))
     assert from_rests(struck, response, response.lines).begins == (1,)
 
 
-def test_blows_are_counted_in_samples_of_whole_records():
+def test_impacts_are_counted_in_samples_of_whole_records():
     records = np.zeros((100, 1)), np.zeros((100, 1))
-    struck = StruckRecords(records, (0, 0), (Blow(0, 4), Blow(0, 7), Blow(0, 50), Blow(1, 60)))
-    later = from_early_blows(struck)
-    assert later.begins == (7, 0) and later.blows == (Blow(0, 43), Blow(1, 60))
-    assert later.every_blow() == (Blow(0, 7), Blow(0, 50), Blow(1, 60))
+    struck = ImpactRecords(
+        records, (0, 0), (Impact(0, 4), Impact(0, 7), Impact(0, 50), Impact(1, 60))
+    )
+    later = from_early_impacts(struck)
+    assert later.begins == (7, 0) and later.impacts == (Impact(0, 43), Impact(1, 60))
+    assert later.every_impact() == (Impact(0, 7), Impact(0, 50), Impact(1, 60))
 
 
 def test_poles_leave_a_start_that_hardly_decays():
     """Steps are compared with the distance of lines, too: less is not told from nothing."""
-    lines = after_blows(response_in_band((after(TIMES),), RATE, BAND), blows(TIMES))
+    lines = after_impacts(response_in_band((after(TIMES),), RATE, BAND), impacts(TIMES))
     starts = np.append(POLES.imag[:3] * (1j - 1e-6), POLES[3])
     found = refined_poles(lines, starts, np.arange(POLES.size))
     assert np.all(np.abs(found - POLES) < 0.15 * np.abs(POLES.real))
 
 
-def test_a_crossing_load_is_no_blow():
+def test_a_crossing_load_is_no_impact():
     planted = sampled(random_structure(1), "crossing", 1, 60.0)
     structure = planted.structure
     damped = np.sqrt(1 - structure.damping_ratios**2)
     poles = 2 * np.pi * structure.frequencies * (-structure.damping_ratios + 1j * damped)
     band = (0.6 * structure.frequencies[0], 1.3 * structure.frequencies[-1])
-    assert struck_modes((planted.values,), planted.rate, band, (), poles) is None
-    assert "blows," not in str(identify_modes(log_of(planted)))
+    assert impact_modes((planted.values,), planted.rate, band, (), poles) is None
+    assert "impacts," not in str(identify_modes(log_of(planted)))
 
 
-def test_one_blow_or_many_are_left_to_decays():
-    assert struck_modes((after(TIMES[:1]),), RATE, BAND, blows(TIMES[:1]), POLES) is None
-    many = tuple(Blow(0, 100 * k) for k in range(1, 24))
-    assert struck_modes((after(TIMES),), RATE, BAND, many, POLES) is None
+def test_one_impact_or_many_are_left_to_decays():
+    assert impact_modes((after(TIMES[:1]),), RATE, BAND, impacts(TIMES[:1]), POLES) is None
+    many = tuple(Impact(0, 100 * k) for k in range(1, 24))
+    assert impact_modes((after(TIMES),), RATE, BAND, many, POLES) is None
 
 
 def test_a_first_choice_has_the_criterion_of_a_fit_with_the_pole():
     lines = whitened(
-        after_blows(response_in_band((after(TIMES),), RATE, BAND), blows(TIMES)), POLES
+        after_impacts(response_in_band((after(TIMES),), RATE, BAND), impacts(TIMES)), POLES
     )
     fit = linear_fit(lines, POLES[:3])
     with_it = criterion(linear_fit(lines, POLES), 4)
     assert criterion_with(lines, fit, 3, complex(POLES[3])) == pytest.approx(with_it, rel=1e-9)
 
 
-def two_blows(first=3.0, second=6.0):
+def two_impacts(first=3.0, second=6.0):
     """Samples of a mode of 4 Hz, struck hard at 3 s and softly at another time, and the marks."""
     rate = 100.0
     times = np.arange(1200) / rate
@@ -218,23 +222,23 @@ def two_blows(first=3.0, second=6.0):
     [
         (6.0, (302, 602), ""),
         (6.0, (602,), "is left out: what follows it is not the free decay that tells most"),
-        (4.5, (452,), "is left out: the next blow comes 1.5 s later"),
+        (4.5, (452,), "is left out: the next impact comes 1.5 s later"),
     ],
 )
-def test_a_hard_blow_whose_decay_is_not_used_is_named(second, starts, said):
-    samples, marks = two_blows(second=second)
+def test_a_hard_impact_whose_decay_is_not_used_is_named(second, starts, said):
+    samples, marks = two_impacts(second=second)
     decays = [Stretch(0, start, start + 250, 2.0) for start in starts]
-    found = blows_left_out(samples, marks, decays, (2.0, 10.0))
-    assert found == ([f"the hardest blow, at 13 s, {said}"] if said else [])
-    assert blows_left_out(samples, (np.zeros(1200, bool),), decays, (2.0, 10.0)) == []
+    found = impacts_left_out(samples, marks, decays, (2.0, 10.0))
+    assert found == ([f"the hardest impact, at 13 s, {said}"] if said else [])
+    assert impacts_left_out(samples, (np.zeros(1200, bool),), decays, (2.0, 10.0)) == []
 
 
-def test_marks_of_a_blow_and_its_rebounds_are_one():
+def test_marks_of_an_impact_and_its_rebounds_are_one():
     marks = np.zeros(4000, bool)
     for start, stop in ((400, 409), (430, 436), (2000, 2010), (3000, 3500)):
         marks[start:stop] = True
-    found = marked_blows((marks,), 100.0, (1.0, 20.0))
-    assert found == (Blow(0, 404), Blow(0, 2004))  # what lasts for seconds is no blow
+    found = marked_impacts((marks,), 100.0, (1.0, 20.0))
+    assert found == (Impact(0, 404), Impact(0, 2004))  # what lasts for seconds is no impact
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,1 @@
+"""Modes after impacts that were not measured, from whole records."""

@@ -1,1 +1,0 @@
-"""Modes after blows that were not measured, from whole records."""
