@@ -13,7 +13,6 @@ import jaxbeam as jb
 from jaxbeam.case.validation import check_case
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.commands import acting_ranges, command_operator, with_exact_compensation
-from jaxbeam.simulation.integration_plan import integration_plan
 from tests.case.test_hysteresis import OPERATOR, patch_case
 from tests.differences import central
 
@@ -122,30 +121,6 @@ def test_derivatives_through_hysteresis_and_creep():
     commands = 2 * np.sin(0.8 * np.arange(9.0))
     found = jax.jit(jax.grad(lambda values: loop(values, commands)))(jax.numpy.asarray(point))
     assert_allclose(found, central(lambda values: loop(values, commands), point), rtol=1e-8)
-
-
-def test_derivatives_of_a_peak_in_the_loop():
-    """Through hysteresis, creep, and the inverses of other ones, by simulation."""
-    case = patch_case(
-        hysteresis=OPERATOR, creep=CREEP, compensation=OPERATOR, creep_compensation=OTHER
-    )
-    plan = integration_plan(case)
-    names = ("hysteresis.weights", "creep.weights", "creep.rates", "compensation.thresholds")
-    addresses = [f"actuators.0.{name}" for name in names]
-    values = [jb.addresses(case)[name] for name in addresses]
-
-    def peak(shares):
-        changed = {
-            name: value * (1 + 0.1 * (shares[i] - 1) * np.arange(1, len(value) + 1))
-            for i, (name, value) in enumerate(zip(addresses, values, strict=True))
-        }
-        changed["controller.gains"] = case.controller.gains * shares[-1]
-        return 1e3 * jb.simulate(jb.replace(case, changed), plan=plan).peak_deflection[0]
-
-    point = np.ones(len(names) + 1)
-    found = jax.jit(jax.jacfwd(peak))(jax.numpy.asarray(point))
-    assert_allclose(found, central(peak, point, 1e-3), rtol=1e-6, atol=1e-8)
-    assert np.all(np.abs(found) > 1e-6)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from jaxbeam.model.frequency_responses import frequency_response
 from jaxbeam.model.linear_system import poles
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.coil_history import coil_history
-from jaxbeam.simulation.integration_plan import integration_plan
 from tests.differences import central
 
 R, L, KF, KV, MASS, DAMPING, STIFFNESS = 0.82, 5e-3, 4.2, 3.9, 0.03, 0.55, 900.0
@@ -219,23 +218,6 @@ def test_derivatives_of_the_model_by_the_numbers_of_a_loop():
     point = np.array([0.4, 9.0, 20.0, 0.5, 0.3, 9.0])
     found = jax.jit(jax.jacfwd(numbers))(jax.numpy.asarray(point))
     assert_allclose(found, central(numbers, point), rtol=1e-7, atol=1e-8)
-
-
-def test_derivatives_of_a_peak():
-    case = crossing(
-        shaker(jb.actuators.ForceLoop(proportional=0.4, integral=90.0, sensor_bandwidth=2e3))
-    )
-    plan = integration_plan(case)
-    keys = ("proportional", "integral", "sensor_bandwidth")
-    point = np.array([0.4, 90.0, 2e3])
-
-    def peak(shares):
-        names = [f"actuators.0.inner_loop.{key}" for key in keys]
-        changed = jb.replace(case, dict(zip(names, shares * point, strict=True)))
-        return 1e3 * jb.simulate(changed, plan=plan).peak_deflection[0]
-
-    found = jax.jit(jax.jacfwd(peak))(jax.numpy.ones(3))
-    assert_allclose(found, central(peak, np.ones(3), 0.01), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import re
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -157,30 +156,6 @@ def test_errors_of_tables(table, message):
     content = case_to_dict(HELD) | {"controller": table}
     with pytest.raises(ValueError, match=re.escape(message)):
         case_from_dict(content)
-
-
-CONTROLLERS = [
-    HELD.controller,
-    jb.Feedback([1.0], 3, resolution=0.1, period=0.01),
-    jb.Feedback([1.0], higher_gains=[[2.0], [3.0]], period=0.01),
-    jb.StateFeedback([[1.0, 2.0, 3.0, 4.0, 5.0]], period=1e-3, delay=2e-3),
-    jb.Prescribed(
-        [0.1],
-        amplitudes=[[1.0, 2.0]],
-        frequencies=[3.0, 4.0],
-        phases=[[0.0, 1.0]],
-        times=[0.0, 1.0, 1.5],
-        values=[[1.0, -1.0, 0.5]],
-    ),
-]
-
-
-@pytest.mark.parametrize("controller", CONTROLLERS, ids=lambda c: type(c).__name__)
-def test_case_file_keeps_the_controller(controller, tmp_path):
-    sensor = jb.Sensor(0.25)
-    case = dataclasses.replace(HELD, controller=controller, sensors=(sensor,))
-    jb.save_case(case, tmp_path / "case.toml")
-    assert eqx.tree_equal(jb.load_case(tmp_path / "case.toml"), case)
 
 
 def test_addresses_of_matrix_entries():

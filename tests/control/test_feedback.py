@@ -4,7 +4,6 @@ import dataclasses
 import re
 
 import control
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -282,12 +281,3 @@ def test_oscillator_above_the_nyquist_frequency_is_refused():
         ValueError, match=r"below half the sampling frequency, 41.6667 Hz; it is 45"
     ):
         check_case(dataclasses.replace(CASE, controller=law))
-
-
-@pytest.mark.parametrize("name", COMPENSATORS)
-def test_case_file_keeps_the_compensator(name, tmp_path):
-    case = dataclasses.replace(CASE, controller=COMPENSATORS[name][0])
-    jb.save_case(case, tmp_path / "case.toml")
-    kind = "pd" if name == "lead" else name
-    assert f'kind = "{kind}"' in (tmp_path / "case.toml").read_text()
-    assert eqx.tree_equal(jb.load_case(tmp_path / "case.toml"), case)

@@ -11,7 +11,6 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
-from jaxbeam.files.case_file import case_from_dict, case_to_dict
 
 SHARES = [0.0, 0.2, 0.7, 1.0]
 VALUES = [[0.5, 6.0, 4.0, 1.0]]
@@ -111,11 +110,8 @@ def test_a_load_that_shows_too_late_is_not_confirmed():
         jb.simulate(none)
 
 
-def test_case_file_and_errors_of_settings():
+def test_errors_of_settings():
     case = beam_case()
-    assert jax.tree.all(
-        jax.tree.map(np.array_equal, case_from_dict(case_to_dict(case)).controller, LAW)
-    )
     slow = (jb.MovingMass(mass=0.4, speed=0.1, deceleration=0.1),)
     for changes, loads, message in (
         ({"period": None}, case.loads, "period must be given"),

@@ -3,8 +3,6 @@
 import dataclasses
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
@@ -12,10 +10,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.analysis.stability import frozen_poles
-from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
-from jaxbeam.files.case_file import case_from_dict, case_to_dict
-from tests.differences import central
 
 LENGTH, RIGIDITY, MODES = 0.6, 13.2, 3
 START, END, MOMENT = 0.25, 0.35, 8.3e-4 * 0.3 * 200
@@ -94,14 +89,6 @@ def test_stable_where_plain_feedback_of_the_same_slope_is_unstable():
         for law in (internal_model, feedback)
     ]
     assert rates[0] < -1.0 and rates[1] > 1.0
-
-
-def test_case_file_keeps_the_controller():
-    case = beam_case()
-    assert case_to_dict(case)["controller"]["kind"] == "internal-model"
-    restored = case_from_dict(case_to_dict(case))
-    assert_allclose(restored.controller.readings, READINGS)
-    assert_allclose(restored.controller.values, VALUES)
 
 
 ERRORS = [
@@ -206,28 +193,6 @@ def test_a_patch_that_presses_down_is_commanded_the_other_way():
     mirrored = dataclasses.replace(upright, actuators=(turned,))
     found = [np.asarray(jb.simulate(case).command) for case in (upright, mirrored)]
     assert_allclose(found[1], -found[0], atol=1e-9)
-
-
-def test_derivatives_of_commands():
-    """By a value, a share, the cutoffs of filter and reference, and the rigidity."""
-    reading = jnp.linspace(0, -4e-4, 4)
-
-    def commands(logarithms):
-        value, share, reference, cutoff, rigidity = jnp.exp(logarithms)
-        table = {"shares": jnp.stack([0.0, share]), "values": jnp.stack([0.0, value])}
-        law = jb.ScheduledInternalModel(**table, reference=reference, period=PERIOD)
-        law = law.design_law(jb.state_space(rig(law, cutoff, rigidity, order=2)))
-        state, found = law.initial_state(), []
-        for one in reading:
-            measurement = Measurement(one[None], jnp.zeros(4), jnp.ones(1))
-            command, state, _ = law.step(state, measurement, jnp.zeros(()))
-            found.append(command[0])
-        return jnp.stack(found)
-
-    numbers = jnp.log(jnp.array([0.9, 2.0, 0.5, 9.0, 13.2]))
-    found, expected = jax.jacfwd(commands)(numbers), central(commands, numbers, 1e-2)
-    assert np.all(np.max(np.abs(expected), axis=0) > 1e-2)
-    assert_allclose(found, expected, atol=1e-7)
 
 
 SCHEDULED_ERRORS = [

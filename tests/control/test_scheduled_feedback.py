@@ -13,7 +13,6 @@ from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedback import ScheduledFeedback
 from jaxbeam.control.load_identification import identified_load
-from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from tests.loop_as_oracle import span_of
 
 PATCH = jb.Patch(
@@ -104,15 +103,6 @@ def test_mass_from_a_record_is_that_of_the_loop(record):
     assert_allclose(record.command[after, 0], commands(mass), rtol=1e-10, atol=1e-12)
     without_commands = eqx.tree_at(lambda r: r.command, record, jnp.zeros_like(record.command))
     assert abs(identified_load(without_commands, identification).mass / mass - 1) > 0.02
-
-
-def test_case_file_keeps_the_controller():
-    case = beam_case(
-        law(between="stepped", load_identification=jb.LoadIdentification(gates=[-0.1, -0.05]))
-    )
-    check_case(case)
-    assert case_to_dict(case)["controller"]["kind"] == "feedback-scheduled"
-    assert eqx.tree_equal(case, case_from_dict(case_to_dict(case)))
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Sliding-mode control against the scalar equation of its surface, and errors of its settings."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
@@ -13,7 +11,6 @@ from jaxbeam.case.estimator import Estimate
 from jaxbeam.case.validation import check_case
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, sample_times, static_shapes
-from tests.differences import central
 from tests.loop_as_oracle import span_of
 
 LENGTH, RATE, LAYER, PLACE = 0.6, 40.0, 0.01, 0.3
@@ -104,23 +101,6 @@ def test_commands_against_modal_sums():
     rest = Measurement(np.zeros(2), np.zeros(7), np.zeros(3))
     found = law.step((), estimate, rest, np.zeros(())).command
     assert_allclose(found, commands, rtol=1e-9)  # of the actuators that take any
-
-
-def test_derivatives_of_commands():
-    """By rate, reaching rate and layer, within the layer, against differences."""
-    numbers = jnp.log(jnp.array([RATE, 30.0, LAYER]))
-    plant = jb.state_space(beam_case(sliding()))
-    estimate = Estimate(jnp.array([2e-5, 1e-3]))
-    rest = Measurement(jnp.zeros(2), jnp.zeros(2), jnp.zeros(1))
-
-    def commands(logarithms):
-        settings = jb.SlidingMode(*jnp.exp(logarithms))
-        law = settings.design_state_law(plant, plant)
-        return law.step((), estimate, rest, jnp.zeros(())).command
-
-    found, expected = jax.jacfwd(commands)(numbers), central(commands, numbers, 1e-3)
-    assert np.all(np.abs(expected) > 1e-6)
-    assert_allclose(found, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

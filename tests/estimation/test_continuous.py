@@ -21,7 +21,6 @@ from jaxbeam.control.design_model import DesignModel
 from jaxbeam.estimation.inversion import Inversion
 from jaxbeam.estimation.kalman import Kalman
 from jaxbeam.estimation.observer import Observer
-from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
 from tests.differences import central
@@ -187,11 +186,6 @@ def test_gradients():
     at = jnp.ones(3)
     expected = central(cost, at, 1e-2)
     assert_allclose(jax.jit(jax.jacfwd(cost))(at), expected, rtol=1e-6)
-
-
-def test_case_file_keeps_the_estimator():
-    case = loop(ESTIMATORS["estimated"])
-    assert case_from_dict(case_to_dict(case)).controller.estimator.points == 80
 
 
 @pytest.mark.parametrize(

@@ -40,11 +40,18 @@ def test_every_kind_is_drawn():
     assert {name: kinds_of_jaxbeam(family) for name, family in families.items()} == drawn
 
 
-@pytest.mark.parametrize("name", [*LOADS, *PROFILES])
-def test_examples_are_valid(name):
-    case = CONTROLLED["feedback"]
-    part = {"loads": (LOADS[name],)} if name in LOADS else {"profile": PROFILES[name]}
-    check_case(dataclasses.replace(case, **part))
+@pytest.mark.parametrize("name", [*CONTROLLED, *LOADS, *PROFILES])
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of slow sampling
+def test_files_keep_every_kind(name, tmp_path):
+    """With words and numbers that are not the defaults; the case stays valid."""
+    case = CONTROLLED.get(name, CONTROLLED["feedback"])
+    part = {"loads": (LOADS[name],)} if name in LOADS else {}
+    part |= {"profile": PROFILES[name]} if name in PROFILES else {}
+    case = dataclasses.replace(case, **part)
+    check_case(case)
+    save_case(case, tmp_path / "case.toml")
+    assert eqx.tree_equal(load_case(tmp_path / "case.toml"), case)
+    assert eqx.tree_equal(case_from_dict(case_to_dict(case)), case)
 
 
 @pytest.fixture(scope="module")

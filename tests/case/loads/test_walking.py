@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -13,7 +12,6 @@ from jaxbeam.case.loads.walking import contact_time, jogging_factors, walking_fa
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.model.load_set import load_set
-from tests.differences import central
 
 BEAM = jb.Beam(
     length=30.0, flexural_rigidity=2.87e9, mass_per_length=1500.0, damping_ratio=0.005, modes=2
@@ -104,17 +102,6 @@ def test_a_crowd_is_its_pedestrians():
     assert len({w.pace.item() for w in walkers}) == 5
     other = load_set(case_of(dataclasses.replace(crowd, seed=4)))
     assert not np.allclose(other.behind[0], loads.behind[0])
-
-
-def test_gradient_by_pace_and_weight():
-    def peak(numbers):
-        load = jb.Pedestrian(pace=numbers[0], weight=numbers[1], position=12.0)
-        return jb.simulate(case_of(load, duration=2.0), tolerance=1e-8).deflection[-1, 0]
-
-    point = np.array([2.1, 700.0])
-    found = jax.grad(peak)(jax.numpy.asarray(point))
-    assert_allclose(found[0], central(lambda x: peak([x[0], 700.0]), point[:1], 1e-3)[0], rtol=1e-5)
-    assert_allclose(found[1], central(lambda x: peak([2.1, x[0]]), point[1:], 1.0)[0], rtol=1e-6)
 
 
 def test_in_case_files():

@@ -13,7 +13,6 @@ import jaxbeam as jb
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.control.optimal.lqr import LQR
-from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from tests.modules import DATA
 
 REFERENCE = json.loads((DATA / "optimal_control.json").read_text())
@@ -146,21 +145,6 @@ def test_cost_of_the_optimal_gain(model):
     )
     assert second_difference > 1e-3 * predicted
     assert_allclose(slope, 0.0, atol=1e-6 * predicted)
-
-
-def test_case_file_keeps_the_controller():
-    controller = LQR(
-        **WEIGHTS,
-        feedback=PARTIAL_FEEDBACK,
-        design=DESIGN,
-        after="hold",
-        horizon="crossing",
-        augmented="loads",
-    )
-    case = beam_case(controller, 2.5)
-    check_case(case)
-    restored = case_from_dict(case_to_dict(case))
-    assert eqx.tree_equal(case, restored)
 
 
 def test_intervals_needed_follow_from_the_modes_of_the_design():

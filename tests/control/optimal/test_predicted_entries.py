@@ -16,7 +16,6 @@ import jaxbeam as jb
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.control.optimal.lqr import LQR
-from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.simulation.closed_loop import loop_schedule
 from tests.control.optimal.test_crossing_lqr import (
     ENTRIES,
@@ -140,12 +139,6 @@ def test_exact_prediction_has_the_least_cost():
     # At its minimum the cost is flat: half the error costs a quarter.
     half = cost(masses=1.15 * masses)
     assert (large_masses - exact) / (half - exact) == pytest.approx(4.0, rel=0.02)
-
-
-def test_case_file_keeps_predicted_entries():
-    case = beam_case(LAW)
-    check_case(case)
-    assert case_from_dict(case_to_dict(case)).controller.entries == "predicted"
 
 
 def test_errors_of_predicted_entries():

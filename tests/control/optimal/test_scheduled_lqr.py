@@ -15,7 +15,6 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.control.load_identification import identified_load
 from jaxbeam.control.optimal.crossing_gains import GainSchedule
 from jaxbeam.control.optimal.lqr import LQR
-from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.model.deflection_lines import influence_line, static_deflection_per_command
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.gain_table import GainTable
@@ -261,21 +260,6 @@ def test_influence_lines_and_lift_are_static():
     assert_allclose(found.influence_lines, exact, rtol=0, atol=tail)
     lift = static_deflection_per_command(case, jnp.array([0.2, 0.45])).T
     assert_allclose(found.static_lift, lift, rtol=1e-3)
-
-
-def test_case_file_keeps_the_controller():
-    case = beam_case(
-        LQR(
-            **WEIGHTS,
-            **GRID,
-            period=4e-3,
-            load_identification=GATE_IDENTIFICATION,
-            horizon="crossing",
-            schedule="load",
-        )
-    )
-    check_case(case)
-    assert eqx.tree_equal(case, case_from_dict(case_to_dict(case)))
 
 
 @pytest.mark.parametrize(

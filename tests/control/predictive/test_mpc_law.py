@@ -13,7 +13,6 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.predictive.prediction import incremental_model
-from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.numerics.riccati import dlqr
 from tests.control.predictive.test_mpc import PATCH, PERIOD, beam_case, mpc
 
@@ -112,12 +111,6 @@ def test_without_a_solution_the_last_command_is_held():
     step = eqx.filter_jit(law.step)(law.initial_state(), measurement, jnp.zeros(()))
     assert_array_equal(step.command, 0.7)
     assert not step.solved
-
-
-def test_case_file_keeps_the_controller():
-    case = beam_case(mpc(positions=[0.2, 0.4], soft_limit=1e-3, loads="known", delay=0.002))
-    check_case(case)
-    assert eqx.tree_equal(case, case_from_dict(case_to_dict(case)))
 
 
 @pytest.mark.parametrize(
