@@ -41,7 +41,7 @@ def test_shear_beside_a_pier_under_a_slow_force():
         at_pier = record.shear_force(SPAN, side.side)
         assert_allclose(record.sensor_values[:, i], at_pier, atol=1e-9 * FORCE)
         assert_allclose(record.at(SPAN, "shear") if i else at_pier, at_pier)
-        assert_allclose(jb.static_peak(case, SPAN, quantity="shear", side=side.side), FORCE)
+        assert_allclose(jb.statics.static_peak(case, SPAN, quantity="shear", side=side.side), FORCE)
     behind = np.asarray(record.load_position)[:, 0] > SPAN + 0.1
     assert np.min(record.sensor_values[behind, 0]) == pytest.approx(-beyond, rel=1e-2)
 
@@ -76,7 +76,7 @@ def test_rotations_beside_a_hinge():
     slopes = [-1e4 * at**2 / 2 / 2e8, 1e4 * at**3 / 3 / 2e8 / (length - at)]
     record = jb.simulate(case)
     for i, (sensor, slope) in enumerate(zip(case.sensors, slopes, strict=True)):
-        static = jb.static_peak(case, at, quantity="rotation", side=sensor.side)
+        static = jb.statics.static_peak(case, at, quantity="rotation", side=sensor.side)
         assert static == pytest.approx(abs(slope), rel=1e-9)
         values = np.asarray(record.sensor_values)[:, i]
         assert np.sign(values[np.argmax(np.abs(values))]) == np.sign(slope)
