@@ -90,7 +90,7 @@ CONTROLLED |= {
         jb.LQR(
             **WEIGHTS,
             points=60,
-            estimator=jb.MovingHorizon(0.02, 1e-5),
+            estimator=jb.MovingHorizon(0.02, 1e-5, weight_deviation=1.0),
             horizon="crossing",
             augmented="loads",
         )
@@ -100,9 +100,10 @@ CONTROLLED |= {
     ),
     "lqr-integral": controlled.rig(
         jb.LQR(
-            [1e4, 1e2, 1.0, 0.1],
+            [1e4, 1e2, 1.0, 0.1, 0.0],
             [1e-4, 1e-3],
             positions=[0.3, 0.4],
+            position_weight=[1e5, 2e5],
             integral_weight=[1.0, 2.0],
             reference=[1e-4, 0.0],
             period=PERIOD,
@@ -116,7 +117,9 @@ CONTROLLED |= {
         )
     ),
     "mpc-scenario": controlled.rig(
-        jb.ScenarioMPC(**PREDICTIVE, stiffness_factors=[0.8, 1.2], mass_factors=[1.0, 1.1])
+        jb.ScenarioMPC(
+            **PREDICTIVE, loads="known", stiffness_factors=[0.8, 1.2], mass_factors=[1.0, 1.1]
+        )
     ),
     "gpc-adaptive": controlled.rig(
         jb.AdaptiveGPC(**PREDICTIVE, until=0.1, probe=0.5, measurement_noise=1e-7), **ONE_EACH
