@@ -36,9 +36,8 @@ from jaxbeam.runtime.compiling import LOW_OPTIMISATION, xla_options
 from jaxbeam.simulation.integration_plan import integration_plan, sample_times
 
 TOLERANCE = 1e-11  # relative to the largest entry of each array
-# Where a curve is flat, its values differ by the square of a difference in time; an error of 1e-9
-# is the difference of two peaks, of which rounding is 1e-16.
-CANCELLED, CANCELLED_TOLERANCE = ("peak_time", "error_estimate", "step_errors"), 1e-7
+# Where a curve is flat, its values differ by the square of a difference in time.
+CANCELLED, CANCELLED_TOLERANCE = "peak_time", 1e-7
 
 BEAM = jb.Beam(
     length=1.2,
@@ -208,8 +207,13 @@ def test_records_of_known_and_traced_numbers_are_the_same(name):
     """Histories of the modes and of every quantity at the sensors, contact forces and peaks."""
     plan, times = integration_plan(CASES[name]), sample_times(CASES[name])
 
+    def errors(record):
+        return record.error_estimate, record.step_errors
+
     def simulate(case):
         record = jb.simulate(case, times, plan)
+        # A known run takes the steps of its peaks as two halves, for their errors.
+        record = eqx.tree_at(errors, record, (np.zeros(()), np.zeros(len(case.sensors))))
         histories = [record.at(0.33, quantity, 1e-3, 1e-6) for quantity in QUANTITIES]
         left = record.shear_force(0.33, "left")
         return record, histories, record.measured, record.strain, left, record.reactions

@@ -175,7 +175,7 @@ def _longest_step(case: Case, layout: Layout) -> Array:
 @compiled_if_traced
 def _run(case: Case, plan: IntegrationPlan, times) -> tuple[Array, Array, Array]:
     """Readings, states of the plant and commands sent to the actuators at the samples."""
-    discrete, loads, policy, sample_steps, steps = integration_setup(case, plan, times, None)
+    discrete, loads, policy, sample_steps, steps, _ = integration_setup(case, plan, times, None)
     policy = _Recorder(**{field.name: getattr(policy, field.name) for field in fields(policy)})
     _, states, _, (readings, commands), _ = integrate_history(
         discrete, loads, max_loads=plan.shapes.max_loads, steps=steps, policy=policy

@@ -9,6 +9,7 @@ advances the states (`step`), and peaks are updated for the chunk at once (`runn
 Commands to the actuators are polynomials through the same nodes, given by an input policy.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -31,13 +32,14 @@ from jaxbeam.integrator.inputs import AbstractInputPolicy, StepInfo
 from jaxbeam.integrator.load_path import LoadPath, load_path
 from jaxbeam.integrator.peaks import RunningPeaks, initial_peaks, update_peaks
 from jaxbeam.integrator.propagators import GAUSS_NODES, MAX_STEP_NORM, NODE_COUNT, state_matrix_norm
-from jaxbeam.integrator.step import advance_free, advance_unforced
+from jaxbeam.integrator.step import advance_free, advance_unforced, step_maps
 from jaxbeam.integrator.step_matrices import (
     chunk_length,
     step_matrices,
     weights_with_impulses,
     with_impulses,
 )
+from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.integrator.vehicles import (
     StepInput,
     VehicleStep,
@@ -47,6 +49,7 @@ from jaxbeam.integrator.vehicles import (
 from jaxbeam.model.contact import initial_vehicle_states
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.numerics.polynomials import lagrange_coefficients
 from jaxbeam.runtime.arrays import (
     Array,
     any_jax,
@@ -177,22 +180,66 @@ def _chunk_function(
                 policy, vehicles, steps, infos, state, memory
             )
         if running_peaks is not None:
-            count = discrete.model.state_count
-            before, ends = states[:, :count], None
-            if path.influence is not None:
-                ends = end_forces(
-                    path.ends,
-                    steps.inertia,
-                    _weights(loads, path, END_FRACTIONS),
-                    before,
-                    state[:count],
-                    forces,
-                )
+            before = states[:, : discrete.model.state_count]
+            ends = _end_forces(loads, path, steps, before, state, forces)
             inputs = [before, forces, ends, commands]
             running_peaks = update_peaks(running_peaks, steps.matrices, path, inputs)
         return state, memory, running_peaks, end, (states, commands, observed)
 
     return chunk, chunk_steps
+
+
+def _end_forces(loads: LoadSet, path: LoadPath, steps: StepInput, before, last, forces):
+    """Contact forces (N) at the ends of steps from the beam's states there; None if not needed."""
+    if path.influence is None:
+        return None
+    weight = _weights(loads, path, END_FRACTIONS)
+    return end_forces(path.ends, steps.inertia, weight, before, last[: before.shape[1]], forces)
+
+
+def peaks_of_halves(
+    on_grid: Callable[[TimeGrid], DiscreteModel],
+    grid: TimeGrid,
+    loads: LoadSet,
+    max_loads: int,
+    running_peaks: RunningPeaks,
+    states: Float[np.ndarray, "boundary state batch"],
+    commands: Float[np.ndarray, "step command batch"] | None,
+) -> RunningPeaks:
+    """Peaks of a known run in the steps that hold them, each of which is taken as two halves.
+
+    A step begins with its state in the run, and has its commands. The discrete model is made
+    `on_grid`, for the lengths of these halves only.
+    """
+    _, starts, _ = grid.locate_steps(np.arange(int(grid.step_count)))
+    index = np.unique(np.searchsorted(starts, running_peaks.step_start, side="right") - 1)
+    discrete = on_grid(grid.with_halves(index))
+    path = load_path(discrete, loads, max_loads, (2 * index[:, None] + np.arange(2)).ravel())
+    steps = _step_inputs(discrete, loads, path)
+    maps = step_maps(steps, vehicles_of(loads, discrete.grid.lengths))
+    state, sources, ends = np.swapaxes(states[index], 1, 2), [], None
+    for half in range(2):
+        parts = [state]
+        if commands is not None:
+            powers = (0.5 * (half + GAUSS_NODES))[:, None] ** np.arange(NODE_COUNT)
+            by_node = commands[index].reshape(index.size, NODE_COUNT, -1)
+            own = powers @ lagrange_coefficients(NODE_COUNT).T @ by_node
+            parts.append(np.swapaxes(own.reshape(index.size, *commands.shape[1:]), 1, 2))
+        sources.append(np.concatenate(parts, axis=2))
+        state = maps.states.at(np.s_[half::2], sources[-1])
+    columns = np.stack(sources, axis=1).reshape(path.start.size, *sources[0].shape[1:])
+    forces, columns = (np.swapaxes(part, 1, 2) for part in (maps.forces(columns), columns))
+    before, count = columns[:, : discrete.model.state_count], states.shape[1]
+    if path.influence is not None:
+        pairs = []
+        for i, last in enumerate(np.swapaxes(state, 1, 2)):
+            own = np.s_[2 * i : 2 * i + 2]
+            path_steps = jax.tree.map(lambda part, own=own: part[own], (path, steps))
+            pairs.append(_end_forces(loads, *path_steps, before[own], last, forces[own]))
+        ends = np.concatenate(pairs)
+    first = initial_peaks(discrete.position_count, *loads.inertia.shape, discrete.magnitude)
+    inputs = before, forces, ends, None if commands is None else columns[:, count:]
+    return update_peaks(first, steps.matrices, path, inputs)
 
 
 def _initial_state(discrete: DiscreteModel, loads: LoadSet, policy) -> Float[Array, "state batch"]:

@@ -42,8 +42,10 @@ class AffineMap(NamedTuple):
     linear: Float[Array, "*step shared_or_batch row column"]
     offset: Float[Array, "*step batch row"]
 
-    def at(self, i: int, columns: Float[Array, "batch column"]) -> Float[Array, "batch row"]:
-        """Values of one of several steps."""
+    def at(
+        self, i: int | slice, columns: Float[Array, "*step batch column"]
+    ) -> Float[Array, "*step batch row"]:
+        """Values of one of several steps, or of some."""
         return AffineMap(self.linear[i], self.offset[i])(columns)
 
     def __call__(

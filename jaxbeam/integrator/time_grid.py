@@ -399,6 +399,18 @@ class TimeGrid(Module):
         """Whether each of some steps is the first one of its panel."""
         return (index == self._first_step(panel)) & (index < self.step_count)
 
+    def with_halves(self, index: Int[np.ndarray, " step"]) -> "TimeGrid":
+        """Grid with twice the steps, that has the lengths of the halves of some steps only."""
+        _, _, kinds = self.locate_steps(index)
+        own = np.unique(kinds)
+        return dataclasses.replace(
+            self,
+            counts=2 * self.counts,
+            cumulative_counts=2 * self.cumulative_counts,
+            length_index=np.minimum(np.searchsorted(own, self.length_index), own.size - 1),
+            lengths=np.append(0.5 * self.lengths[own], 0.0),
+        )
+
     def _first_step(self, panel):
         """Index of the first step of a panel."""
         return take(self.cumulative_counts, panel) - take(self.counts, panel)

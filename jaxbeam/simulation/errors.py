@@ -119,18 +119,27 @@ def peak_errors(
     case: Case,
     model: ModalModel,
     running_peaks: RunningPeaks,
+    of_halves: RunningPeaks | None,
     heights: Float[Array, " output"],
     motion: Motion,
 ) -> tuple[Float[Array, ""], Float[Array, " sensor"]]:
     """Errors of the interpolated peaks of a run, of `monitored_sensors` up and down.
 
     Of the deflection, relative to its largest value along the beam, and of what each sensor
-    measures, relative to its largest. `heights` are the refined peaks.
+    measures, relative to its largest. `heights` are the refined peaks. Errors are the changes of
+    these as the steps that hold them are taken as two halves: such a step has the errors of its
+    polynomials and of its contact forces. In traced runs they are `interpolation_errors` only.
     """
     count, own = len(case.sensors), own_outputs(case.sensors)
     if not count:
         return xp.zeros(()), xp.zeros(0)
-    absolute = xp.max(xp.stack(xp.split(interpolation_errors(model, running_peaks)[:, 0], 2)), 0)
+    if of_halves is None:
+        absolute = interpolation_errors(model, running_peaks)[:, 0]
+    else:
+        # Peaks in steps of no length, as an impulse acts there, are not between steps.
+        change = xp.abs(of_halves.refined_peak()[0][:, 0] - heights)
+        absolute = xp.where(running_peaks.step_length[:, 0] > 0, change, 0.0)
+    absolute = xp.max(xp.stack(xp.split(absolute, 2)), 0)
     up, down = xp.split(heights, 2)
     largest = stop_gradient(xp.maximum(up, down))
     rows = model.modes.shapes(trial_positions(case))

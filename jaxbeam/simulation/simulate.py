@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -14,8 +14,8 @@ from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.discrete_model import DiscreteModel, discrete_model, signed_both_ways
 from jaxbeam.integrator.inputs import AbstractInputPolicy
-from jaxbeam.integrator.integrate import integrate_history
-from jaxbeam.integrator.peaks import Peaks
+from jaxbeam.integrator.integrate import integrate_history, peaks_of_halves
+from jaxbeam.integrator.peaks import Peaks, RunningPeaks
 from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES, end_weights
 from jaxbeam.integrator.time_grid import TimeGrid, grid_by_schedule
 from jaxbeam.model.load_set import LoadSet, load_set
@@ -223,7 +223,8 @@ def _substeps_for_peaks(record: Record, plan: IntegrationPlan, tolerance: float)
     if not excess > 1:  # or the run diverges
         return plan.substeps
     factor = min((2 * excess) ** (1 / len(PEAK_NODES)), LARGEST_SHORTENING)
-    return int(np.ceil(factor * plan.substeps))
+    # Steps that begin elsewhere might have a larger error than the plan states.
+    return int(np.ceil(factor)) * plan.substeps
 
 
 class _FirstRun:
@@ -284,9 +285,8 @@ def _record(case: Case, integration: "Integration", times) -> Record:
     # Each wheel at its own time.
     lost_positions = xp.diagonal(loads.kinematics(lost_times)[0])
     diverged = xp.any(xp.isnan(outputs.motion.coordinates))  # errors are not defined
-    of_peaks = peak_errors(
-        case, integration.model, integration.running_peaks, heights, outputs.motion
-    )
+    both = integration.running_peaks, integration.of_halves
+    of_peaks = peak_errors(case, integration.model, *both, heights, outputs.motion)
     return Record(
         case=case,
         modes=integration.model.modes,
@@ -383,7 +383,7 @@ class IntegrationSetup(NamedTuple):
     """Input of one integration: discrete model, loads, input policy (None without controller).
 
     `sample_steps` are the indices of the steps that start at the samples, `steps` is the number of
-    steps.
+    steps; `on_grid` makes the same model on another grid.
     """
 
     model: DiscreteModel
@@ -391,6 +391,7 @@ class IntegrationSetup(NamedTuple):
     policy: AbstractInputPolicy | None
     sample_steps: Int[Array, " time"]
     steps: int
+    on_grid: Callable[[TimeGrid], DiscreteModel]
 
 
 def integration_setup(
@@ -423,27 +424,27 @@ def integration_setup(
         model = policy.model
     places = None if monitored is None else corrected_places(case, model, monitored)
     grid = grid_by_schedule(case, model, schedule, plan.substeps, places)
-    if monitored is None:
-        discrete = discrete_model(model, grid, None, policy)
-    else:
-        outputs = sensor_rows(model, case, monitored)
-        correction = static_correction(model, case, monitored, outputs)
+    outputs = None if monitored is None else sensor_rows(model, case, monitored)
+    correction = outputs and static_correction(model, case, monitored, outputs)
+
+    def on_grid(grid):
         discrete = discrete_model(model, grid, None, policy, outputs, correction)
-        discrete = signed_both_ways(discrete)
+        return discrete if outputs is None else signed_both_ways(discrete)
+
     sample_steps = plan.substeps * grid.event_panels[schedule.sample_events]
-    return IntegrationSetup(
-        discrete, loads, policy, sample_steps, grid.counts.shape[0] * plan.substeps
-    )
+    steps = grid.counts.shape[0] * plan.substeps
+    return IntegrationSetup(on_grid(grid), loads, policy, sample_steps, steps, on_grid)
 
 
 class Integration(NamedTuple):
     """Running peaks, outputs at the sample times, model, grid, states (boundary, state, batch).
 
     `sampled_states` (time, state) are those at the sample times, `commands` (step, command, batch)
-    those at the nodes of each step.
+    those at the nodes of each step. `of_halves` are the `peaks_of_halves` of a known run.
     """
 
     running_peaks: Any
+    of_halves: RunningPeaks | None
     outputs: "Outputs"
     model: ModalModel
     grid: TimeGrid
@@ -455,13 +456,16 @@ class Integration(NamedTuple):
 
 def run_integration(case: Case, plan: IntegrationPlan, times, monitored, noisy=True, policy=None):
     """An integration as planned, under the input policy of the case unless one is given."""
-    discrete, loads, policy, sample_steps, steps = integration_setup(
+    discrete, loads, policy, sample_steps, steps, on_grid = integration_setup(
         case, plan, times, monitored, noisy, policy
     )
-    model = discrete.model
+    model, max_loads = discrete.model, plan.shapes.max_loads
     running_peaks, all_states, node_commands, observed, _ = integrate_history(
-        discrete, loads, max_loads=plan.shapes.max_loads, steps=steps, policy=policy
+        discrete, loads, max_loads=max_loads, steps=steps, policy=policy
     )
+    of_halves, in_steps = None, (running_peaks, all_states, node_commands)
+    if monitored and not any_jax(discrete, loads, in_steps):
+        of_halves = peaks_of_halves(on_grid, discrete.grid, loads, max_loads, *in_steps)
     states = all_states[sample_steps]
 
     def at_samples(part):
@@ -480,6 +484,7 @@ def run_integration(case: Case, plan: IntegrationPlan, times, monitored, noisy=T
     outputs = Outputs(motion, vehicles, readings, failures, sent)
     return Integration(
         running_peaks,
+        of_halves,
         outputs,
         model,
         discrete.grid,

@@ -64,12 +64,15 @@ def with_feedback(case: jb.Case) -> jb.Case:
 
 
 def true_errors(coarse: jb.Record, fine: jb.Record) -> np.ndarray:
-    """Errors of the samples of each sensor, relative to its largest value."""
+    """Errors of the samples and of the extremes of each sensor, relative to its largest value."""
     errors = []
-    for sensor in coarse.case.sensors:
+    for i, sensor in enumerate(coarse.case.sensors):
         own = sensor.position, sensor.quantity, sensor.fibre_distance, sensor.section_modulus
-        exact = fine.at(*own)
-        errors.append(np.max(np.abs(coarse.at(*own) - exact)) / np.max(np.abs(exact)))
+        values = [
+            np.array([*record.at(*own), record.smallest[i], record.largest[i]])
+            for record in (coarse, fine)
+        ]
+        errors.append(np.max(np.abs(values[0] - values[1])) / np.max(np.abs(values[1])))
     return np.array(errors)
 
 
