@@ -180,6 +180,19 @@ def test_fit():
         plot_fit([])
 
 
+def test_samples_left_out_of_a_fit_do_not_count():
+    """A spike that was masked is a cross, and neither scales the residuals nor spreads them."""
+    fitted = 1e-3 * np.sin(np.arange(50) / 10.0)[:, None]
+    noise = np.random.default_rng(1).normal(0, 1e-5, fitted.shape)
+    measured = fitted + noise
+    measured[20], valid = 9.0, np.arange(50)[:, None] != 20
+    figure = plot_fit([FitPanel("log", np.arange(50.0), measured, fitted, ("w",), "m", valid)])
+    deviation = format_number(np.std(noise[valid]) * 1e6)
+    said = words(figure)
+    assert f"residual sd {deviation} \N{MICRO SIGN}m" in said and "left out" in said
+    assert figure.axes[1].get_ylim()[1] < 50
+
+
 def test_a_perfect_fit():
     zeros = np.zeros((5, 1))
     said = words(plot_fit([FitPanel("log", np.arange(5.0), zeros, zeros, ("w",))]))

@@ -170,6 +170,7 @@ class Fit:
                         fitted=self.fitted[i, :count, channels].T,
                         names=[channel_names[n] for n in channels],
                         unit=str(unit_of(quantity)),
+                        valid=self.dataset.mask[i, :count, channels].T > 0,
                     )
                 )
         return plot_fit(panels, title=self.case.title)
