@@ -122,7 +122,7 @@ def _padded_times(times: Float[np.ndarray, " time"], count: int) -> Float[np.nda
 
 
 LJUNG_BOX_LAGS = 20  # lags of the autocorrelation in the whiteness test
-WHITENESS_SIGNIFICANCE = 0.01  # p-value below which residuals are called autocorrelated
+WHITENESS_SIGNIFICANCE = 0.01  # probability of calling white residuals of a fit autocorrelated
 MIN_TIME_SHIFT_SD = 4.0  # standard errors beyond which a time shift is reported
 
 
@@ -198,6 +198,22 @@ def channel_residuals(
     return found
 
 
+def coloured(channels: Sequence[ChannelResiduals]) -> list[ChannelResiduals]:
+    """Those whose residuals are no white noise, at a level that counts how many were looked at."""
+    return [one for one in channels if one.p_value < WHITENESS_SIGNIFICANCE / len(channels)]
+
+
+def explained(channels: Sequence[ChannelResiduals]) -> str:
+    """Whether a model explains logs that leave these residuals, in words."""
+    found = coloured(channels)
+    if not found:
+        return "the model explains the logs: residuals are white noise"
+    return (
+        f"the model misses something: residuals of {len(found)} of {len(channels)} signals are no"
+        " white noise, and intervals are unreliable"
+    )
+
+
 def residual_remarks(
     channels: Sequence[ChannelResiduals], sources: Sequence[str], names: Sequence[str]
 ) -> list[str]:
@@ -205,13 +221,13 @@ def residual_remarks(
 
     `sources` are the names of the logs, `names` those of the channels.
     """
-    remarks = []
+    remarks, missed = [], coloured(channels)
     for i, source in enumerate(sources):
         own = [channel for channel in channels if channel.log == i]
-        coloured = [channel for channel in own if channel.p_value < WHITENESS_SIGNIFICANCE]
-        if coloured:
+        found = [channel for channel in own if channel in missed]
+        if found:
             factors = ", ".join(
-                f"{c.autocorrelation_factor:.2g} at {names[c.sensor]}" for c in coloured
+                f"{c.autocorrelation_factor:.2g} at {names[c.sensor]}" for c in found
             )
             remarks.append(
                 f"{source}: residuals are no white noise, so the model misses something and its "

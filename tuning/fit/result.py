@@ -9,7 +9,14 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.quantities import unit_of
 from tuning.fit import summary
-from tuning.fit.dataset import ChannelResiduals, Dataset, channel_residuals, residual_remarks
+from tuning.fit.dataset import (
+    ChannelResiduals,
+    Dataset,
+    channel_residuals,
+    coloured,
+    explained,
+    residual_remarks,
+)
 from tuning.fit.least_squares import MAX_STEPS, LeastSquares, LeastSquaresSolution
 from tuning.fit.multi_start import LocalMinimum
 from tuning.fit.uncertainty.covariance import confidence_intervals
@@ -27,12 +34,12 @@ class Fit:
     (`logs.1.loads.0.speed`) are in `cases`, one for each log. `autocorrelation_factor` is the
     factor by which autocorrelation of the residuals raises variances and has widened the
     intervals; `degrees_of_freedom` the number of independent samples left. `minima` are those
-    found from several starts, lowest first.
+    found from several starts, lowest first. `search` says how the search for the minimum ended.
 
     >>> import tuning
     >>> fit = tuning.load_fit("fit.npz")
     >>> print(
-    ...     fit.addresses[0], f"{fit.values[0]:.0f} +- {fit.errors[0]:.1f} N m^2,", fit.verdict
+    ...     fit.addresses[0], f"{fit.values[0]:.0f} +- {fit.errors[0]:.1f} N m^2,", fit.search
     ... )
     beam.flexural_rigidity 11 +- 0.2 N m^2, converged
     """
@@ -43,7 +50,7 @@ class Fit:
     correlation: Float[np.ndarray, "parameter parameter"]
     unidentifiable: list[dict[str, float]]
     noise: Float[np.ndarray, "log channel"]
-    verdict: str
+    search: str
     case: Case
     dataset: Dataset
     fitted: Float[np.ndarray, "log time channel"]
@@ -64,6 +71,11 @@ class Fit:
         return channel_residuals(
             self.dataset.times, self.fitted, self.residuals, self.noise, self.autocorrelation_factor
         )
+
+    @property
+    def verdict(self) -> str:
+        """Whether the model explains the logs, so that intervals can be believed; the search."""
+        return f"{explained(self.channel_residuals)}; the search {self.search}"
 
     @property
     def widened_noise(self) -> Float[np.ndarray, "log channel"]:
@@ -124,7 +136,7 @@ class Fit:
     def __str__(self) -> str:
         table = summary.parameter_table(self.parameters, self.values, self.intervals)
         minima = summary.minima_lines(self.minima)
-        return "\n".join([*table, *minima, "", *self.remarks, self.verdict])
+        return "\n".join([self.verdict, "", *table, *minima, "", *self.remarks])
 
     def to_dict(self) -> dict:
         """Plain numbers and words for JSON; None for what is not identifiable."""
@@ -141,11 +153,12 @@ class Fit:
                 "at_bound": parameter.at_bound(value),
             }
         return {
+            "verdict": self.verdict,
+            "explained": not coloured(self.channel_residuals),
             "numbers": parameters,
             "correlation": _nan_to_none(self.correlation),
             "unseen": self.unidentifiable,
             "noise": _nan_to_none(self.noise),
-            "verdict": self.verdict,
         }
 
     def plot(self):
@@ -186,10 +199,10 @@ def fit_result(
     dataset, parameters = least_squares.data, least_squares.parameters
     pairs = zip(parameters, solution.values, strict=True)
     values = {parameter.address: float(value) for parameter, value in pairs}
-    verdict = (
+    search = (
         "converged"
         if solution.converged
-        else f"not converged after {MAX_STEPS} steps: start closer"
+        else f"has not converged after {MAX_STEPS} steps: start closer"
     )
     return Fit(
         parameters=parameters,
@@ -198,7 +211,7 @@ def fit_result(
         correlation=solution.uncertainty.correlation,
         unidentifiable=solution.uncertainty.unidentifiable,
         noise=np.where(dataset.mask.any(axis=1), solution.noise, np.nan),
-        verdict=verdict + dataset.validity_warning(values),
+        search=search + dataset.validity_warning(values),
         case=_fitted_case(case, dataset, values),
         dataset=dataset,
         fitted=solution.predicted,

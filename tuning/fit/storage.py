@@ -47,7 +47,7 @@ def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None
         "nominal_case": case_to_dict(fit.dataset.nominal_case),
         "parameters": [dataclasses.asdict(parameter) for parameter in fit.parameters],
         "unidentifiable": fit.unidentifiable,
-        "verdict": fit.verdict,
+        "search": fit.search,
         "degrees_of_freedom": fit.degrees_of_freedom,
         "loss": fit.least_squares.loss,
         "logs": [_log_header(log, fit.case) for log in logs],
@@ -68,7 +68,7 @@ def load_fit(path: str | os.PathLike) -> Fit:
     read.
 
     >>> import tuning
-    >>> print(str(tuning.load_fit("fit.npz")).splitlines()[1])
+    >>> print(str(tuning.load_fit("fit.npz")).splitlines()[3])
     beam.flexural_rigidity  N m^2   12.1      11  10.545 to 11.455
     """
     path = Path(path)
@@ -93,7 +93,7 @@ def load_fit(path: str | os.PathLike) -> Fit:
         parameters=parameters,
         **{name: arrays[name] for name in _FIT_ARRAYS},
         unidentifiable=header["unidentifiable"],
-        verdict=header["verdict"],
+        search=header.get("search") or header["verdict"],  # so called before 0.3
         case=case_from_dict(header["case"]),
         dataset=dataset,
         degrees_of_freedom=header["degrees_of_freedom"],

@@ -100,7 +100,7 @@ def test_shaker_and_patch_together():
     truth = np.array([4.6, 3500.0, 80.0, 0.32])
     np.testing.assert_allclose(fit.values, truth, rtol=0.02)
     assert np.all(np.abs(fit.values - truth) < 4 * fit.errors)
-    assert fit.verdict == "converged" and not fit.unidentifiable
+    assert fit.search == "converged" and not fit.unidentifiable
     np.testing.assert_allclose(fit.noise, 2e-7, rtol=0.1)
 
 
