@@ -1,7 +1,6 @@
 """Tables of the page on results, written from a report of `reproduce` between marks of the page.
 
-The remarks of the experiments `tuned`, `sensed` and `fragile` have the numbers. README has a
-paragraph on the same tables, between marks too.
+The remarks of the experiments `tuned`, `sensed` and `fragile` have the numbers.
 """
 
 import re
