@@ -205,6 +205,9 @@ def application(workspace: Workspace, opened: str | None, token: str, port: int)
         "take": take,
         "sweep": lambda q: {"job": workspace.start_sweep(q["text"], q["axes"])},
         "fit": lambda q: {"job": workspace.start_fit(q["text"], q["logs"], q["free"])},
+        "modes": lambda q: {
+            "job": workspace.start_modes(q["logs"], q.get("band"), q.get("choose", ()))
+        },
         "compare": lambda q: {"job": workspace.start_comparison(q["text"], q["names"])},
         "tune": lambda q: {
             "job": workspace.start_tuning(q["text"], q["free"], q["vary"], q["spread"], q["steps"])

@@ -202,6 +202,46 @@ def fit(case: Case, logs: Sequence[Any], free: Mapping[str, Any]) -> dict[str, A
     }
 
 
+def modes(
+    logs: Sequence[Any], band: Sequence[float] | None, choose: Sequence[float]
+) -> dict[str, Any]:
+    """Modes of logs, the stabilisation diagram that they were chosen in, and their shapes.
+
+    The `band` (Hz) is found if it is left out; of frequencies to `choose` (Hz) the nearest modes
+    are kept, and no others.
+    """
+    import tuning
+    from tuning.modal.plot import amplitude_spectrum, strongest_channel
+
+    settings = tuning.ModalSettings(choose=tuple(map(float, choose)))
+    within = None if band is None else (float(band[0]), float(band[1]))
+    found = tuning.identify_modes(list(logs), band=within, settings=settings)
+    channel = strongest_channel(found)
+    frequencies, amplitudes = amplitude_spectrum(found, channel)
+    pieces = np.array_split(np.arange(frequencies.size), min(frequencies.size, MAX_SHOWN // 2))
+    highest = [piece[np.argmax(amplitudes[piece])] for piece in pieces]
+    poles = [
+        {"frequency": diagram.poles.frequencies[i], "order": diagram.poles.orders[i]}
+        for diagram in found.diagrams
+        for i in np.flatnonzero(diagram.stable)
+    ]
+    return {
+        "modes": [mode.to_dict() for mode in found.modes],
+        "rejected": [one.to_dict() | {"reason": reason} for one, reason in found.rejected],
+        "summary": str(found),
+        "window": found.window,
+        "band": found.band,
+        "poles": poles,
+        "spectrum": {
+            "channel": found.log.names[channel],
+            "unit": found.log.units[channel],
+            "frequencies": frequencies[highest],
+            "amplitudes": amplitudes[highest],
+        },
+        "channels": found.channels._asdict(),
+    }
+
+
 def compare(case: Case, controllers: Mapping[str, Any]) -> dict[str, Any]:
     """Metrics and runs of controllers, without control, and with the least peak of any."""
     from jaxbeam.analysis.compare import compare as compare_controllers

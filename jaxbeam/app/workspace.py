@@ -12,7 +12,7 @@ import re
 import tempfile
 import threading
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -250,6 +250,18 @@ class Workspace:
         if not logs or not free:
             raise ValueError("a fit needs a log and a free number at least")
         return self._start(jb.api.Job(studies.fit, self.case(text), logs, dict(free)))
+
+    def start_modes(
+        self, names: Iterable[str], band: Sequence[float] | None, choose: Sequence[float]
+    ) -> str:
+        """Begin the search for modes in logs that were given; returns its number for `job`.
+
+        Raises ValueError without a log.
+        """
+        logs = [log for name in names for log in self.log(name)]
+        if not logs:
+            raise ValueError("drop a log on the page: modes are found in it")
+        return self._start(jb.api.Job(studies.modes, logs, band, list(choose)))
 
     def start_comparison(self, text: str, names: Iterable[str]) -> str:
         """Begin a comparison of the controller of a case, if any, with those of other files."""

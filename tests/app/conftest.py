@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 RIG = """# A rig of two spans, for tests of the page.
@@ -32,6 +33,19 @@ duration = 1.3
 sample_rate = 500.0
 """
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+def decay(folder):
+    """Log of two modes that decay, 4 Hz in phase and 11 Hz in antiphase at two channels."""
+    times = np.arange(1200) / 100
+    slow, fast = (
+        np.exp(-2 * np.pi * f * 0.01 * times) * np.cos(2 * np.pi * f * times) for f in (4, 11)
+    )
+    noise = 1e-2 * np.random.default_rng(2).normal(size=(2, times.size))
+    columns = np.stack([times, slow + fast + noise[0], slow - fast + noise[1]], axis=1)
+    path = folder / "ring.csv"
+    np.savetxt(path, columns, delimiter=",", header="time [s],a1 [m/s^2],a2 [m/s^2]", comments="")
+    return path
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ import pytest
 
 from jaxbeam.app.server import STATIC
 from jaxbeam.plot.style import ALARM, COLOURS, LOAD_COLOURS
-from tests.app.conftest import RIG, Server, go
+from tests.app.conftest import RIG, Server, decay, go
 from tests.modules import ROOT
 
 TIMEOUT = 5000  # ms, from a slider to its picture
@@ -303,6 +303,21 @@ def test_a_log_is_dropped_and_shown_as_read(page, server):
         {"name": "log.exe", "mimeType": "text/plain", "buffer": b"no"}
     )
     wait_for(lambda: "is no log" in page.locator("#status").inner_text())
+
+
+def test_modes_are_found_and_one_is_left_out_by_a_click(page, server):
+    page.get_by_role("tab", name="Identify").click()
+    page.locator("#log-files").set_input_files(decay(server.path.parent))
+    page.wait_for_selector(".log")
+    page.get_by_role("button", name="Find modes").click()
+    page.wait_for_selector(".diagram .mode", state="attached", timeout=120_000)
+    assert page.locator(".diagram .mode").count() == 2
+    before = page.locator(".shape").first.get_attribute("points")
+    wait_for(lambda: page.locator(".shape").first.get_attribute("points") != before)
+    page.get_by_role("checkbox", name=re.compile("^keep (4|3[.]9)")).uncheck()
+    wait_for(lambda: page.locator(".diagram .mode").count() == 1, 120)
+    page.get_by_role("button", name="Choose automatically").click()
+    wait_for(lambda: page.locator(".diagram .mode").count() == 2, 120)
 
 
 def test_a_controller_is_compared_with_the_bound(page):

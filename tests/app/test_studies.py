@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from tests.app.conftest import RIG
+from tests.app.conftest import RIG, decay
 from tests.modules import ROOT
 
 SPEED = {"address": "loads.0.speed", "from": "1.8 km/h", "to": 1.5, "count": 4}
@@ -135,6 +135,22 @@ def test_a_dropped_log_is_shown_as_read_and_fitted(workspace):
     assert abs(own["value"] - truth) < abs(own["start"] - truth)
     assert len(result["runs"][0]["fitted"]) == 3
     assert not any("/" in remark.split("standard")[0] for remark in result["remarks"])
+
+
+def test_modes_of_a_log_are_found_and_chosen(workspace, tmp_path):
+    path = decay(tmp_path)
+    workspace.take_log(path.name, path.read_bytes())
+    result = finished(workspace, workspace.start_modes([path.name], None, []))["result"]
+    assert [mode["frequency_hz"] for mode in result["modes"]] == pytest.approx([4, 11], rel=2e-3)
+    signs = [np.sign(np.prod(mode["shape_real"])) for mode in result["modes"]]
+    assert signs == [1, -1] and result["poles"]
+    peak = np.argmax(result["spectrum"]["amplitudes"])
+    assert result["spectrum"]["frequencies"][peak] == pytest.approx(4, abs=0.1)
+    number = workspace.start_modes([path.name], [1.0, 30.0], [11.0])
+    (only,) = finished(workspace, number)["result"]["modes"]
+    assert only["frequency_hz"] == pytest.approx(11, rel=2e-3)
+    with pytest.raises(ValueError, match="drop a log"):
+        workspace.start_modes([], None, [])
 
 
 @pytest.mark.parametrize("name", ["../log.csv", "a/b.csv", ".csv", "log.exe", "", "a\0.csv"])

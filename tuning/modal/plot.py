@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from jaxbeam.case.quantities import QUANTITIES
@@ -79,7 +80,7 @@ def plot_modal_fit(fit, path: str | Path | None = None, length: float | None = N
     heights = (1, 1.6) + (1.3, 0.6) * decays + (1.4,) * shapes
     figure = Figure(figsize=(9, 2.3 * sum(heights)))
     rows = figure.subplots(len(heights), 1, height_ratios=heights)
-    strongest = int(np.argmax(np.sum(fit.measured**2, axis=0)))
+    strongest = strongest_channel(fit)
     quantity = QUANTITIES.get(fit.log.quantities[strongest])
     unit = fit.log.units[strongest] if quantity is None else quantity.unit
     _draw_log(rows[0], fit, strongest, unit)
@@ -119,15 +120,27 @@ def _draw_log(axes, fit, channel, unit):
     axes.set_xlim(times[0], times[-1])
 
 
-def _draw_spectrum(axes, fit, channel, unit):
-    """Amplitude spectrum of the window, with the modes."""
+def amplitude_spectrum(
+    fit, channel: int
+) -> tuple[Float[np.ndarray, " line"], Float[np.ndarray, " line"]]:
+    """Frequencies (Hz) in the band of a `ModalFit`, and amplitudes of a channel in its window."""
     inside = slice(*np.searchsorted(fit.log.times, [fit.window[0], fit.window[1]]))
     values = fit.log.values[inside, channel]
     window = np.hanning(values.size)
     amplitude = np.abs(np.fft.rfft((values - values.mean()) * window)) * 2 / window.sum()
     bins = np.fft.rfftfreq(values.size, np.ptp(fit.log.times[inside]) / (values.size - 1))
     keep = (bins >= fit.band[0]) & (bins <= fit.band[1])
-    axes.semilogy(bins[keep], amplitude[keep], color=INK, linewidth=0.9)
+    return bins[keep], amplitude[keep]
+
+
+def strongest_channel(fit) -> int:
+    """Channel of a `ModalFit` with most energy."""
+    return int(np.argmax(np.sum(fit.measured**2, axis=0)))
+
+
+def _draw_spectrum(axes, fit, channel, unit):
+    """Amplitude spectrum of the window, with the modes."""
+    axes.semilogy(*amplitude_spectrum(fit, channel), color=INK, linewidth=0.9)
     for mode, reason in fit.rejected:
         if reason and fit.band[0] <= mode.frequency <= fit.band[1]:
             axes.axvline(mode.frequency, color=GREY, linewidth=0.7, linestyle=":")

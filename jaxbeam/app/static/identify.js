@@ -3,6 +3,7 @@
 import { upload } from "./api.js";
 import { html, number, raised } from "./dom.js";
 import { addressChoice, createJob } from "./job.js";
+import { createModes } from "./modes.js";
 import { Plot } from "./plot.js";
 
 /** @param {import("./store.js").Store} store */
@@ -111,7 +112,7 @@ export function createIdentify(store) {
     })));
   }
 
-  const element = html("div.identify", {}, input, drop, logs, html("div.form", {}, choice.element, chips, job.element), results, plots);
+  const element = html("div.identify", {}, input, drop, logs, html("div.form", {}, choice.element, chips, job.element), results, plots, createModes(store, names).element);
   return { element };
 }
 
