@@ -74,7 +74,7 @@ class Fit:
 
     @property
     def verdict(self) -> str:
-        """Whether the model explains the logs, so that its intervals can be relied on, and the search."""
+        """Whether the model explains the logs, so that intervals are reliable, and the search."""
         return f"{explained(self.channel_residuals)}; the search {self.search}"
 
     @property
