@@ -306,12 +306,15 @@ def test_a_log_is_dropped_and_shown_as_read(page, server):
 
 
 def test_modes_are_found_and_one_is_left_out_by_a_click(page, server):
+    from axe_playwright_python.sync_playwright import Axe
+
     page.get_by_role("tab", name="Identify").click()
     page.locator("#log-files").set_input_files(decay(server.path.parent))
     page.wait_for_selector(".log")
     page.get_by_role("button", name="Find modes").click()
     page.wait_for_selector(".diagram .mode", state="attached", timeout=120_000)
     assert page.locator(".diagram .mode").count() == 2
+    assert Axe().run(page).violations_count == 0
     before = page.locator(".shape").first.get_attribute("points")
     wait_for(lambda: page.locator(".shape").first.get_attribute("points") != before)
     page.get_by_role("checkbox", name=re.compile("^keep (4|3[.]9)")).uncheck()

@@ -54,7 +54,7 @@ export function createIdentify(store) {
       const quantities = [...new Set(log.channels.map((/** @type {any} */ one) => one.quantity))];
       const rows = log.channels.map((/** @type {any} */ one) => html("tr", {}, html("td", {}, one.name), html("td", {}, one.quantity), html("td", {}, one.unit)));
       const remarks = [...log.notes, ...log.faults].map((words) => html("li", {}, words));
-      const card = html("section.log", {}, html("h3", {}, `${log.source}: ${number(log.duration)} s at ${number(log.rate)} Hz`, log.loads ? html("small", {}, `loads: ${log.loads.join(", ")}`) : ""),
+      const card = html("section.log", {}, html("h3", { "aria-level": 2 }, `${log.source}: ${number(log.duration)} s at ${number(log.rate)} Hz`, log.loads ? html("small", {}, `loads: ${log.loads.join(", ")}`) : ""),
         html("div.log-parts", {},
           html("table.data", {}, html("thead", {}, html("tr", {}, html("th", {}, "column"), html("th", {}, "quantity"), html("th", {}, "unit"))), html("tbody", {}, ...rows)),
           html("ul.remarks", {}, ...(remarks.length ? remarks : [html("li", {}, "no faults were found")]))),
@@ -100,7 +100,7 @@ export function createIdentify(store) {
     });
     const keep = html("button", { type: "button", onclick: () => store.change(...Object.entries(fit.numbers).filter(([address]) => !address.startsWith("logs.")).map(([address, one]) => ({ set: address, to: Number(/** @type {any} */ (one).value.toPrecision(8)) }))) }, "Put them into the case");
     results.replaceChildren(
-      html("h3", {}, "Fitted numbers", keep),
+      html("h3", { "aria-level": 2 }, "Fitted numbers", keep),
       html("table.data", {}, html("thead", {}, html("tr", {}, ...["number", "start", "fitted", "95 % interval", "unit"].map((words) => html("th", {}, words)))), html("tbody", {}, ...rows)),
       html("p", {}, fit.verdict),
       ...(fit.remarks.length ? [html("ul.remarks", {}, ...fit.remarks.map((/** @type {string} */ words) => html("li", {}, words)))] : []));

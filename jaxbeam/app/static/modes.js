@@ -46,9 +46,9 @@ export function createModes(store, names) {
       chosen = [];
       job.run();
     } }, "Choose automatically");
-    const heads = ["", "frequency (Hz)", "damping (%)", "energy (%)", "why not"].map((words) => html("th", { scope: "col" }, words));
+    const heads = ["keep", "frequency (Hz)", "damping (%)", "energy (%)", "why not"].map((words) => html("th", { scope: "col" }, words));
     found.replaceChildren(
-      html("h3", {}, `Modes, from ${number(result.window[0])} to ${number(result.window[1])} s`, all),
+      html("h3", { "aria-level": 2 }, `Modes, from ${number(result.window[0])} to ${number(result.window[1])} s`, all),
       diagram(result, (frequency) => choose(result, frequency)),
       html("table.data", {}, html("thead", {}, html("tr", {}, ...heads)), html("tbody", {}, ...rows)),
       ...shapes(result), html("details", {}, html("summary", {}, "What was chosen, and how to choose otherwise"), html("pre.code", {}, result.summary)));
@@ -77,7 +77,7 @@ export function createModes(store, names) {
     };
     if (!matchMedia("(prefers-reduced-motion: reduce)").matches) requestAnimationFrame(step);
     const title = known ? "over the positions of the sensors" : `over the channels ${order.map((i) => labels[i]).join(", ")}`;
-    return [html("h3", {}, "Shapes ", html("small", {}, title)), html("div.shapes", {}, ...lines.map((/** @type {any} */ { mode, line }) => {
+    return [html("h3", { "aria-level": 2 }, "Shapes ", html("small", {}, title)), html("div.shapes", {}, ...lines.map((/** @type {any} */ { mode, line }) => {
       const level = svg("line", { x1: 10, x2: 170, y1: 40, y2: 40, class: "level" });
       const words = `${number(mode.frequency_hz)} Hz`;
       return html("figure", {}, svg("svg", { viewBox: "0 0 180 80", role: "img", "aria-label": `shape at ${words}` }, level, line), html("figcaption", {}, words));
