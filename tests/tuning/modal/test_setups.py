@@ -277,7 +277,9 @@ def test_logs_are_grouped_by_their_channels():
         logs_of_setups([same, other], channels=["b", "c"])
     with pytest.raises(ValueError, match="references connect several setups, and this is one log"):
         logs_of_setups([same], ["a"])
-    with pytest.raises(ValueError, match=r"the same channels, positions.*merged by tuning.modal.merge_s"):
+    with pytest.raises(
+        ValueError, match=r"the same channels, positions.*merged by tuning.modal.merge_s"
+    ):
         identify_modes([placed, record("ab", (1.0, 3.0))])
 
 
