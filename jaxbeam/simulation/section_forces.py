@@ -29,7 +29,7 @@ def history(
     name: str,
     fibre_distance=None,
     section_modulus=None,
-    side: str = "right",
+    side: str = "",
 ) -> Float[Array, "time *position"]:
     """History of a quantity at positions x (m), on one side of them; raises as `quantity_history`.
 
@@ -40,7 +40,7 @@ def history(
     changes = quantity_history(case, modes, motion, x, name, *parameters, side=side)
     if not (quantity_of(name, *parameters).section_force and has_settlement(case)):
         return changes
-    return changes + locked_in(case, modes, beside(case, x, side), name, *parameters)
+    return changes + locked_in(case, modes, beside(case, x, side or "right"), name, *parameters)
 
 
 def locked_in(

@@ -232,7 +232,8 @@ def quantity_history(
     """
     parameters = fibre_distance, section_modulus
     quantity = quantity_of(name, *parameters)
-    x = beside(case, x, side or "right") if side or quantity.bends else x
+    jumps = quantity.bends or (side and quantity.x_derivative)
+    x = beside(case, x, side or "right") if jumps else x
     if not quantity.bends:
         rows = modal_row(modes.fields, case, x, name, *parameters) * band_weights(modes, mode_band)
         amplitudes = (motion.coordinates, motion.rates, motion.accelerations)
