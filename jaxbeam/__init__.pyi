@@ -16,6 +16,10 @@ from .case.actuators.point import (
 )
 from .case.beam import Beam as Beam, Hinge as Hinge, Segment as Segment, Support as Support
 from .case.case import Case as Case, Run as Run, addresses as addresses, replace as replace
+from .case.contact import (
+    BilateralContact as BilateralContact,
+    UnilateralContact as UnilateralContact,
+)
 from .case.filters import Filter as Filter
 from .case.loads import vehicles as vehicles
 from .case.loads.axles import Axles as Axles, LineLoad as LineLoad

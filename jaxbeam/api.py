@@ -22,6 +22,7 @@ from jaxbeam.files.case_file import case_from_tables, load_case_with
 from jaxbeam.model.plausibility.check import leave_warnings_to_caller
 from jaxbeam.model.plausibility.facts import Plausibility
 from jaxbeam.runtime.progress import watching
+from jaxbeam.simulation.labels import OF_FLIGHTS
 from jaxbeam.simulation.record import Record
 
 if TYPE_CHECKING:
@@ -160,6 +161,8 @@ def _content_of_record(record: Record) -> dict[str, Any]:
         "error_estimate": record.error_estimate,
         "steps": record.steps,
     }
+    if record.flights is not None:
+        found["flights"] = {name: getattr(record.flights, name) for name in OF_FLIGHTS}
     if record.case.absorbers:
         found["absorbers"] = {
             "position": [absorber.position for absorber in record.case.absorbers],

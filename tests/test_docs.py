@@ -20,6 +20,7 @@ from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Run
+from jaxbeam.case.contact import AbstractContact
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.estimator import AbstractEstimator
 from jaxbeam.case.fields import PACKAGES, import_modules
@@ -279,6 +280,7 @@ PARTS = {
     "vehicle_sensors": VehicleSensor,
     "loads": AbstractLoad,
     "profile": AbstractProfile,
+    "contact": AbstractContact,
     "controller": AbstractController,
     "controller.estimator": AbstractEstimator,
     "run": Run,

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
+from jaxbeam.case.contact import AbstractContact
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.display import ReprWithUnits, case_html, case_text
 from jaxbeam.case.fields import (
@@ -93,7 +94,7 @@ class Run(ReprWithUnits):
 
 
 class Case(Module):
-    """Beam, supports, absorbers, actuators, sensors, loads, profile, controller, run settings.
+    """Beam, supports, absorbers, actuators, sensors, loads, profile, contact, controller, run.
 
     Sensors are on the beam; `vehicle_sensors` are on bodies and axles of the loads.
 
@@ -114,6 +115,7 @@ class Case(Module):
     loads: tuple[AbstractLoad, ...] = ()
     vehicle_sensors: tuple[VehicleSensor, ...] = ()
     profile: AbstractProfile | None = None
+    contact: AbstractContact | None = None
     controller: AbstractController | None = None
     run: Run | None = None
     title: str = choice("title of the case", default="")
@@ -131,6 +133,7 @@ class Case(Module):
         profile=None,
         vehicle_sensors: Iterable = (),
         absorbers: Iterable = (),
+        contact=None,
     ):
         self.beam = beam
         self.supports = tuple(supports)
@@ -140,6 +143,7 @@ class Case(Module):
         self.loads = tuple(loads)
         self.vehicle_sensors = tuple(vehicle_sensors)
         self.profile = profile
+        self.contact = contact
         self.controller = controller
         self.run = Run(duration=1.0) if run is None else run
         self.title = title
@@ -164,6 +168,11 @@ class Case(Module):
     def carried(self) -> tuple[AbstractLoad | Absorber, ...]:
         """What presses on the beam, in the order of its wheels: loads, then absorbers."""
         return (*self.loads, *self.absorbers)
+
+    @property
+    def lifts(self) -> bool:
+        """Whether the wheels of loads leave the beam where they would have to pull."""
+        return self.contact is not None and self.contact.lifts and bool(self.loads)
 
     @property
     def all_sensors(self) -> tuple[Sensor | VehicleSensor, ...]:

@@ -16,6 +16,7 @@ from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support, has
 from jaxbeam.case.case import Case, list_sizes, parts
+from jaxbeam.case.contact import ONE_RUN, AbstractContact
 from jaxbeam.case.declared_checks import (
     POSITION_TOLERANCE,
     check_fields,
@@ -39,7 +40,9 @@ from jaxbeam.case.sensors import Sensor, sensor_labels
 from jaxbeam.runtime.arrays import Array
 
 # Parts with a method `validate(address)`.
-SELF_VALIDATING = Beam | Absorber | AbstractActuator | Sensor | AbstractLoad | AbstractProfile
+SELF_VALIDATING = (
+    Beam | Absorber | AbstractActuator | Sensor | AbstractLoad | AbstractProfile | AbstractContact
+)
 
 
 def check_case(case: Case) -> None:
@@ -284,6 +287,8 @@ def _check_sampling(address: str, sensor: Sensor | VehicleSensor, case: Case) ->
 
 
 def _check_controller(case: Case) -> None:
+    if case.lifts:
+        raise ValueError(ONE_RUN)
     controller = case.controller
     if not case.driven:
         raise ValueError(

@@ -86,6 +86,15 @@ class RunningPeaks(Module):
             (contact, lost, finite),
         )
 
+    def with_contact(
+        self, lowest: Float[Array, "load batch"], lost_time: Float[Array, "load batch"]
+    ) -> "RunningPeaks":
+        """The running peaks with other lowest contact forces (N) and times of loss (s)."""
+        parts = lowest, lost_time
+        return eqx.tree_at(
+            lambda own: (own.lowest_contact_force, own.contact_lost_time), self, parts
+        )
+
     def peaks(self) -> Peaks:
         """Peaks at the end of the runs, with the batch axis first."""
         lost = xp.where(self.contact_lost_time < NEVER, self.contact_lost_time, xp.nan)
@@ -140,7 +149,7 @@ def update_peaks(
         )
 
     if whole_run:
-        running_peaks = _of_whole_run(running_peaks, samples, start, length)
+        running_peaks = peaks_of_steps(running_peaks, samples, start, length)
     else:
         # Most chunks stay far below the peak so far and lose no contact: they skip the refinement.
         running_peaks = cond(
@@ -169,8 +178,8 @@ def update_peaks(
     )
 
 
-def _of_whole_run(initial: RunningPeaks, samples, start, length) -> RunningPeaks:
-    """Peaks of a traced run whose steps are all known at once: by products, without branches."""
+def peaks_of_steps(initial: RunningPeaks, samples, start, length) -> RunningPeaks:
+    """Peaks of a run whose steps are all known at once: by products, without branches."""
     fixed, magnitude = stop_gradient(samples), initial.magnitude
     steps = steps_beside_peak(fixed, PEAK_NODES, magnitude)
     candidates = xp.moveaxis(xp.take_along_axis(samples, steps[:, None], axis=0), 0, 1)

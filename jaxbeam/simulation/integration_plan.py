@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.case.contact import ONE_RUN
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.limits import MAX_SAMPLED, MAX_SAMPLES
 from jaxbeam.case.validation import check_case
@@ -251,6 +252,8 @@ def integration_plan(
     if times is not None:
         check_times(times)
     check_case(case)
+    if case.lifts:
+        raise ValueError(ONE_RUN)
     moving = case.controller is not None and (moving or moves_events(case, times))
     case = concrete_case(case)
     shapes = static_shapes(case)

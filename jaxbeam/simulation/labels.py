@@ -1,12 +1,13 @@
 """Labels of results: wheels of a case in words, and the variables of records and sweeps."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.model.load_set import LoadSet, load_set
+from jaxbeam.runtime.module import Module
 
 MAX_LISTED = 4  # wheels in a sentence
 ROUNDING = 1e-12  # of a given force
@@ -58,6 +59,50 @@ def contact_sentence(case: Case, lost_times, lost_positions, lowest_forces) -> s
     ]
     more = lost.size - first.size
     return "; ".join([*parts, f"{more} more wheels lose contact"] if more else parts)
+
+
+class Flights(Module):
+    """Flights of wheels over the beam, in the order in which they begin; see `OF_FLIGHTS`.
+
+    A wheel that has not landed when the run ends has a landing time of NaN; one may land behind the
+    beam. The impulse is that of an impact, zero on springs.
+    """
+
+    wheel: Int[np.ndarray, " flight"]
+    lift_time: Float[np.ndarray, " flight"]
+    lift_position: Float[np.ndarray, " flight"]
+    landing_time: Float[np.ndarray, " flight"]
+    landing_position: Float[np.ndarray, " flight"]
+    approach_speed: Float[np.ndarray, " flight"]
+    impulse: Float[np.ndarray, " flight"]
+    gap: Float[np.ndarray, " flight"]
+
+
+def flights_sentence(case: Case, flights: Flights) -> str:
+    """When and where wheels leave the beam and land, how high they fly, how hard they land.
+
+    The first flight of each of the first wheels, and how many more there are.
+    """
+    labels, length, parts = wheel_labels(case), float(concrete(case.beam.length)), []
+    wheels = list(dict.fromkeys(flights.wheel.tolist()))
+    for wheel in wheels[:MAX_LISTED]:
+        own = np.flatnonzero(flights.wheel == wheel)
+        i, more = own[0], own.size - 1
+        landing, place = flights.landing_time[i], flights.landing_position[i]
+        if np.isnan(landing):
+            lands = "has not landed when the run ends"
+        else:
+            where = "on the beam" if 0 <= place <= length else "beside the beam"
+            hard = f" with an impulse of {flights.impulse[i]:.4g} N s" if flights.impulse[i] else ""
+            lands = f"lands {where} at t = {landing:.4g} s, x = {place:.4g} m{hard}"
+        again = f", and flies {more} times more" if more > 1 else ", and flies once more" * more
+        parts.append(
+            f"load {labels[wheel]} leaves at t = {flights.lift_time[i]:.4g} s,"
+            f" x = {flights.lift_position[i]:.4g} m, flies up to {flights.gap[i]:.3g} m above the"
+            f" beam and {lands}{again}"
+        )
+    more = len(wheels) - MAX_LISTED
+    return "; ".join([*parts, f"{more} more wheels fly"] if more > 0 else parts)
 
 
 def _given_forces(loads: LoadSet) -> Float[np.ndarray, " wheel"]:
@@ -130,6 +175,17 @@ OF_ABSORBERS = {
     "stroke": (("time", "absorber"), "m", "motion of the absorber's body relative to the beam"),
     "absorber_force": (("time", "absorber"), "N", "force on the beam, positive downwards"),
     "absorber_energy": (("time", "absorber"), "J", "energy dissipated so far"),
+}
+# With unilateral contact; names in files begin with flight_.
+OF_FLIGHTS = {
+    "wheel": ("1", "index of the wheel that flies"),
+    "lift_time": ("s", "time at which it leaves"),
+    "lift_position": ("m", "position at which it leaves"),
+    "landing_time": ("s", "time at which it lands"),
+    "landing_position": ("m", "position at which it lands"),
+    "approach_speed": ("m/s", "speed at which wheel and surface meet"),
+    "impulse": ("N s", "impulse of the impact"),
+    "gap": ("m", "largest height above the surface"),
 }
 # Where an actuator has a hysteresis or creep.
 ACTING_COMMAND = (("time", "actuator"), "unit of a command", "command that acts on the beam")

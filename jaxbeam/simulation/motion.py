@@ -7,7 +7,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.integrator.force_peaks import constant_speeds, force_paths, force_wheels
 from jaxbeam.integrator.force_system import force_system
 from jaxbeam.integrator.forces.states import outputs_of_forces
-from jaxbeam.model.contact import contact_at, split_states
+from jaxbeam.model.contact import ContactState, contact_at, split_states
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.output_rows import LinearOutputs
@@ -30,6 +30,19 @@ def motion_at(
     """
     columns = None if commands is None else commands[..., None]
     contact = contact_at(model, loads, times, states, columns)
+    return motion_of(case, model, loads, times, states, contact, commands)
+
+
+def motion_of(
+    case: Case,
+    model: ModalModel,
+    loads: LoadSet,
+    times: Float[Array, " time"],
+    states: Float[Array, "time state 1"],
+    contact: ContactState,
+    commands: Float[Array, "time command"] | None = None,
+) -> tuple[Motion, VehicleMotion]:
+    """`motion_at` with known contact forces and accelerations."""
     vehicles = _vehicle_motion(model, loads, states, contact.vehicle_acceleration)
     force, accelerations = contact.force[..., 0], contact.modal_acceleration[..., 0]
     count = 2 * accelerations.shape[1]

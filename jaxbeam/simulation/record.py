@@ -22,7 +22,7 @@ from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation import section_forces
 from jaxbeam.simulation.errors import Extremes, chosen_samples, truncation_errors
-from jaxbeam.simulation.labels import contact_sentence
+from jaxbeam.simulation.labels import Flights, contact_sentence, flights_sentence
 from jaxbeam.simulation.record_envelope import RecordEnvelope, record_envelope
 from jaxbeam.simulation.views import RecordViews
 
@@ -58,8 +58,9 @@ class Record(RecordViews):
     their units. The `bodies` of vehicles have displacements in m (or rad) from static
     equilibrium, positive upwards. Peaks are those in continuous time. `contact_lost_time` (s) and
     `contact_lost_position` (m) are those of the first negative contact force, which the bilateral
-    model allows; NaN without one. `command` is that of the actuators, within their limits; at a
-    change, the one just after. `failures` counts the steps of the controller so far without a
+    model allows; NaN without one. With unilateral contact they are those of the first flight, and
+    `flights` are all of them, else None. `command` is that of the actuators, within their limits;
+    at a change, the one just after. `failures` counts the steps of the controller so far without a
     solution of its optimisation. If the closed loop diverges, which its growth shows (see
     `jaxbeam.integrator.growth`), the samples are NaN from then on, and so are the peaks.
     `error_estimate`, of steps and peaks, is relative to the largest deflection, `step_errors` to
@@ -110,6 +111,7 @@ class Record(RecordViews):
     controller_readings: Float[Array, "time sensor"] | None = None
     acting_command: Float[Array, "time actuator"] | None = None
     result: Int[Array, ""] | None = None
+    flights: Flights | None = None
 
     @property
     def bodies(self) -> list[str]:
@@ -348,7 +350,11 @@ class Record(RecordViews):
                 f" t = {diverged:.4g} s; lower the gains, or shorten period and delay"
             )
         contact = self.contact_lost_time, self.contact_lost_position, self.lowest_contact_force
-        parts = [contact_sentence(self.case, *(np.asarray(concrete(part)) for part in contact))]
+        if self.flights is None or not self.flights.wheel.size:
+            contact = (np.asarray(concrete(part)) for part in contact)
+            parts = [contact_sentence(self.case, *contact)]
+        else:
+            parts = [flights_sentence(self.case, self.flights)]
         parts += self._stroke_sentences()
         failures = int(concrete(self.failures)[-1])
         if failures:

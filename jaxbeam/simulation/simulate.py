@@ -10,14 +10,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case
+from jaxbeam.case.contact import ONE_RUN
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.discrete_model import DiscreteModel, discrete_model, signed_both_ways
 from jaxbeam.integrator.inputs import AbstractInputPolicy
 from jaxbeam.integrator.integrate import integrate_history, peaks_of_halves
 from jaxbeam.integrator.peaks import Peaks, RunningPeaks
 from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES, end_weights
-from jaxbeam.integrator.time_grid import TimeGrid, grid_by_schedule
+from jaxbeam.integrator.time_grid import TimeGrid, event_places, grid_by_schedule
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel, modal_model
 from jaxbeam.model.plausibility.check import warn_if_implausible
@@ -58,6 +60,7 @@ from jaxbeam.simulation.integration_plan import (
     sample_times,
     times_of_samples,
 )
+from jaxbeam.simulation.labels import Flights
 from jaxbeam.simulation.motion import motion_at
 from jaxbeam.simulation.record import Record, Result
 from jaxbeam.simulation.varied_plan import traced_ranges, varied_plan, within
@@ -112,6 +115,8 @@ def simulate(
             " traced by jax.jit or vmap: they fix the number of samples"
         )
     inside = np.ones((), bool)
+    if case.lifts:
+        return _simulate_lifting(case, times, plan, tolerance)
     if plan is not None:
         if tolerance != TOLERANCE and plan.error > tolerance:
             raise ValueError(
@@ -130,6 +135,48 @@ def simulate(
         middle, ranges = traced_ranges(case)
         plan, inside = varied_plan(middle, ranges, times, tolerance), within(case, ranges)
     return simulate_planned(case, plan, times, tolerance, inside)
+
+
+def _simulate_lifting(case: Case, times, plan: IntegrationPlan | None, tolerance: float) -> Record:
+    """Record of a run whose wheels press or fly, in steps halved until two runs agree.
+
+    Raises ValueError for a run that is traced or has a `plan`, RuntimeError if no runs agree.
+    """
+    from jaxbeam.simulation import unilateral_record as lifting  # late: few runs need it
+
+    if plan is not None or any_jax(case, times):
+        raise ValueError(ONE_RUN)
+    check_case(case)
+    warn_if_implausible(case if times is None else _until(case, times))
+    held = dataclasses.replace(case, contact=None)
+    plan = integration_plan(held, times, tolerance)
+    samples = np.asarray(sample_times(held) if times is None else times, float)
+    plan, coarse = lifting.with_short_steps(case, plan, samples), None
+    for _ in range(lifting.MAX_HALVINGS):
+        fine = _lifting_run(case, held, plan, samples)
+        if coarse is not None:
+            motions = coarse.outputs.motion, fine.outputs.motion
+            errors = lifting.change_of_runs(held, fine.model, *motions)
+            if errors[0] <= tolerance:
+                return _with_result(_record(case, fine, samples), errors, tolerance, np.True_)
+        coarse, plan = fine, dataclasses.replace(plan, substeps=2 * plan.substeps)
+    raise RuntimeError(lifting.NO_LANDING.format(tolerance))
+
+
+def _lifting_run(case: Case, held: Case, plan: IntegrationPlan, times) -> "Integration":
+    """A run of a case by a plan for the same case with bilateral contact, which is `held`."""
+    from jaxbeam.simulation.unilateral import run_unilateral
+    from jaxbeam.simulation.unilateral_record import motion_at_samples, peaks_of_run
+
+    monitored = monitored_sensors(case.sensors)
+    setup = integration_setup(held, plan, times, monitored)
+    model, loads, grid = setup.model.model, setup.loads, setup.model.grid
+    events = np.asarray(loads.events(event_places(model, None))[1])
+    run = run_unilateral(case, model, loads, grid, events)
+    motion = motion_at_samples(held, model, loads, run, times, setup.sample_steps)
+    peaks = peaks_of_run(held, model, loads, run, monitored)
+    outputs, none, steps = Outputs(*motion, None, None), np.zeros(0), len(run.pieces)
+    return Integration(peaks, None, outputs, model, grid, none, none, None, steps, run.flights)
 
 
 def is_concrete_tree(tree) -> bool:
@@ -173,7 +220,7 @@ def _with_result(record: Record, errors, tolerance: float, inside) -> Record:
     of_steps = record.error_estimate + errors[:1]
     lost = xp.isfinite(record.contact_lost_time) & ~load_set(record.case).prescribed
     flags = {
-        Result.CONTACT_LOST: xp.any(lost),
+        Result.CONTACT_LOST: xp.any(lost) & (record.flights is None),
         Result.STEPS_TOO_LONG: xp.any(of_steps > tolerance),
         Result.DIVERGED: xp.any(xp.isnan(record.coordinates)),
         Result.OUT_OF_RANGE: xp.logical_not(inside),
@@ -272,7 +319,7 @@ def _simulate_record(
 
 
 def _record(case: Case, integration: "Integration", times) -> Record:
-    """Record of a run, whose errors are those of its peaks only."""
+    """Record of a run, whose errors are those of its peaks only, and which has no result yet."""
     outputs = integration.outputs
     peaks = Peaks(*(part[0] for part in integration.running_peaks.peaks()))
     heights = peaks.peak_deflection
@@ -301,6 +348,7 @@ def _record(case: Case, integration: "Integration", times) -> Record:
         error_estimate=xp.where(diverged, xp.nan, of_peaks[0]),
         step_errors=xp.where(diverged, xp.nan, of_peaks[1]),
         steps=integration.steps,
+        flights=integration.flights,
     )
 
 
@@ -452,6 +500,7 @@ class Integration(NamedTuple):
     sampled_states: Array
     commands: Array | None
     steps: int
+    flights: Flights | None = None
 
 
 def run_integration(case: Case, plan: IntegrationPlan, times, monitored, noisy=True, policy=None):

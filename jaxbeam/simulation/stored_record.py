@@ -17,7 +17,7 @@ from jaxbeam.model.modes import Modes, mesh_layout, modes
 from jaxbeam.model.theory.elements import sections
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.runtime.input_file import check_input, not_as_named
-from jaxbeam.simulation.labels import MODE_FIELDS, MODE_VARIABLES, VARIABLES
+from jaxbeam.simulation.labels import MODE_FIELDS, MODE_VARIABLES, OF_FLIGHTS, VARIABLES, Flights
 from jaxbeam.simulation.record import Record
 
 if TYPE_CHECKING:
@@ -76,8 +76,20 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
         controller_readings=xp.asarray(dataset["measured"].values) if _is_sampled(case) else None,
         acting_command=None if acting is None else xp.asarray(acting.values),
         result=None if result is None else xp.asarray(int(result)),
+        flights=_flights(dataset, case),
         **values,
     )
+
+
+def _flights(dataset: "xarray.Dataset", case: Case) -> Flights | None:
+    """Flights of a run with unilateral contact; a file without any lacks their variables."""
+    if not (case.lifts and case.loads):
+        return None
+    parts = {
+        name: np.asarray(dataset[f"flight_{name}"].values if f"flight_{name}" in dataset else [])
+        for name in OF_FLIGHTS
+    }
+    return Flights(**parts | {"wheel": parts["wheel"].astype(int)})
 
 
 def _rotation_series(dataset: "xarray.Dataset", case: Case, layout: Layout):

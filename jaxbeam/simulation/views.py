@@ -32,6 +32,7 @@ from jaxbeam.simulation.labels import (
     MODE_FIELDS,
     MODE_VARIABLES,
     OF_ABSORBERS,
+    OF_FLIGHTS,
     ROTATION_SERIES,
     VARIABLES,
     sensor_coordinates,
@@ -65,6 +66,15 @@ def dataset_parts(
         variables |= {
             name: (dims, np.asarray(value(name)), {"units": unit, "long_name": words})
             for name, (dims, unit, words) in OF_ABSORBERS.items()
+        }
+    if (flights := value("flights")) is not None:
+        variables |= {
+            f"flight_{name}": (
+                "flight",
+                np.asarray(getattr(flights, name), float),
+                {"units": unit, "long_name": words},
+            )
+            for name, (unit, words) in OF_FLIGHTS.items()
         }
     # Modes of repeated frequencies are not unique, so they are stored.
     variables |= {

@@ -25,6 +25,7 @@ from jaxbeam.case.case import (
     replace,
     unit_at,
 )
+from jaxbeam.case.contact import ONE_RUN
 from jaxbeam.case.declared_checks import describe_value
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.former_words import attribute_address
@@ -258,6 +259,8 @@ def sweep_specification(
     """
     check_tolerance(tolerance)
     check_case(case)
+    if case.lifts:
+        raise ValueError(ONE_RUN)
     if precision not in PRECISIONS:
         raise ValueError(
             f"precision must be {' or '.join(PRECISIONS)}, not {describe_value(precision)}"

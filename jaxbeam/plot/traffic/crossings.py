@@ -107,12 +107,16 @@ def _mark_losses(axes, record) -> None:
         return
     axes.axhline(0, color=GREY, linewidth=0.8)
     axes.plot(times[lost], 0 * times[lost], "X", color=ALARM, markersize=7, zorder=3)
+    if record.flights is not None:
+        for flight in zip(record.flights.lift_time, record.flights.landing_time, strict=True):
+            axes.plot(flight, [0, 0], color=ALARM, linewidth=3, solid_capstyle="butt")
     first = lost[np.argmin(times[lost])]
     label = wheel_labels(record.case)[first]
     wheel = f", load {label}" if len(times) > 1 else ""
     left = times[first] > np.mean(np.asarray(record.times)[[0, -1]])
     style = {"ha": "right" if left else "left", "va": "top", "color": ALARM}
-    annotate(axes, f"contact loss{wheel}", (times[first], 0), (-6 if left else 6, -6), **style)
+    word = "contact loss" if record.flights is None else "leaves the beam"
+    annotate(axes, f"{word}{wheel}", (times[first], 0), (-6 if left else 6, -6), **style)
 
 
 def has_bodies(record: Record) -> bool:

@@ -1,0 +1,382 @@
+"""Runs with unilateral contact: wheels press, leave where they would have to pull, fly, and land.
+
+Between these events the set of wheels that press is fixed; steps are those of
+`jaxbeam.integrator.lifting_steps`. An event is the zero of a contact force (or of the compression
+of a spring of contact), or of the gap between a wheel in flight and the surface. A step that has
+one inside is cut there, by the state at its end. Landing, and where the velocity of the surface
+jumps under a rigid wheel, impulses follow from the law of `jaxbeam.case.contact`. A surface that
+rises at once, as at the end of a beam on springs, lifts a rigid wheel without an impulse.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxbeam.case.case import Case
+from jaxbeam.case.contact import UnilateralContact
+from jaxbeam.case.fields import concrete
+from jaxbeam.integrator.contact_forces import FORCE_FRACTIONS, force_weights_at_fractions
+from jaxbeam.integrator.lifting_steps import (
+    NODE_COUNT,
+    POINTS,
+    ContactLaw,
+    Instants,
+    Piece,
+    Steps,
+    advance,
+    contact_law,
+    prepare,
+)
+from jaxbeam.integrator.time_grid import TimeGrid
+from jaxbeam.model.contact import initial_vehicle_states
+from jaxbeam.model.load_set import LoadSet
+from jaxbeam.model.modal_model import ModalModel
+from jaxbeam.simulation.labels import Flights
+
+ROUNDING = 1e-9  # of forces, gaps and velocities
+LEAST = 1e-300
+RATES = 1e2  # of the rounding of gaps times frequencies
+EXACT = 1e-2  # of ROUNDING: value at an event
+JUMP = 10.0  # of ROUNDING: a smaller one is none
+SAME_TIME = 1e-12  # of the duration of a run
+MAX_EVENTS = 20000
+MAX_TRIALS = 40  # cuts of a step until it ends at an event
+CHUNK_ENTRIES = 2**22  # of the largest array of the steps that are prepared together
+OF_FORCES = force_weights_at_fractions()
+_OF_POINTS = np.linalg.inv(POINTS[:, None] ** np.arange(POINTS.size))
+SLOPE_AT_END = np.arange(POINTS.size) @ _OF_POINTS  # derivative at 1, of values at the points
+OF_POINTS = FORCE_FRACTIONS[:, None] ** np.arange(POINTS.size) @ _OF_POINTS
+
+
+class UnilateralRun(NamedTuple):
+    """Pieces of a run one after the other, the piece that begins at each step, and the flights.
+
+    `last` is the state of beam and vehicles at the end, with the wheels that press there.
+    """
+
+    pieces: list[Piece]
+    first_piece: Int[np.ndarray, " step"]
+    flights: Flights
+    last: Piece
+    law: ContactLaw
+
+
+def run_unilateral(
+    case: Case,
+    model: ModalModel,
+    loads: LoadSet,
+    grid: TimeGrid,
+    events: Float[np.ndarray, " time"],
+) -> UnilateralRun:
+    """Run of a case over the steps of a grid, cut at events of contact.
+
+    `events` are the times (s) of load events, at which velocities may jump.
+
+    Raises RuntimeError if there are too many events, as of a wheel that rebounds ever faster.
+    """
+    return _LiftingRun(case, model, loads).over(grid, events)
+
+
+def law_of(case: Case, loads: LoadSet) -> ContactLaw:
+    """Contact law of a case with unilateral contact."""
+    assert isinstance(case.contact, UnilateralContact)
+    return contact_law(loads, case.contact.spring())
+
+
+class _LiftingRun:
+    """A run: the state of beam, heights and vehicles, what presses or flies, and what has been."""
+
+    def __init__(self, case: Case, model: ModalModel, loads: LoadSet):
+        self.model, self.loads, self.law = model, loads, law_of(case, loads)
+        self.count, self.duration = loads.wheel_count, float(concrete(case.run.duration))
+        self.state, self.e = np.zeros(model.state_count), np.zeros(self.law.A.shape[0])
+        start = initial_vehicle_states(loads)
+        if start is not None:
+            self.e[: start.shape[0]] = np.asarray(start)[:, 0]
+        self.pressing = self.law.contact.copy()
+        motion = loads.surface_motion(*loads.kinematics(np.zeros(())))
+        if motion is not None:
+            self.follow(np.asarray(motion[0]), np.asarray(motion[1]), self.law.contact)
+        self.pieces: list[Piece] = []
+        self.flying: dict[int, dict] = {}
+        self.landed: list[dict] = []
+        self.switches = 0
+        self.force_scale, self.gap_scale, self.rate_scale = self.scales(case)
+
+    def scales(self, case: Case) -> tuple[float, float, float]:
+        """What is rounding of forces (N), gaps (m) and velocities (m/s)."""
+        length = float(concrete(case.beam.length))
+        weight = np.abs(np.asarray(self.loads.weight)[:, 0])
+        stiffness = np.asarray(self.model.modes.stiffness)
+        soft = np.where(stiffness > 0, stiffness, np.inf)
+        shapes = np.asarray(self.model.shapes(length * np.linspace(0.0, 1.0, 33), (0,))[0])
+        height = np.sum(weight) * np.max(np.sum(shapes**2 / soft, axis=1))
+        times = np.linspace(0.0, self.duration, 257)
+        position, speed, _ = map(np.asarray, self.loads.kinematics(times))
+        if self.loads.profile is not None:
+            height += np.ptp(np.asarray(self.loads.profile.heights(position)[0]))
+        frequency = np.pi * np.max(np.abs(speed)) / length + np.sqrt(np.min(stiffness))
+        gap = ROUNDING * max(float(height), LEAST)
+        force = ROUNDING * max(float(np.max(weight)), LEAST)
+        return force, gap, RATES * gap * max(float(frequency), LEAST)
+
+    def over(self, grid: TimeGrid, events) -> UnilateralRun:
+        """The run over the steps of a grid."""
+        index = np.arange(int(grid.step_count))
+        panel, start, kind = map(np.asarray, grid.locate_steps(index))
+        length, on_beam = np.asarray(grid.lengths)[kind], np.asarray(grid.loads_on_beam)[panel]
+        tolerance = SAME_TIME * self.duration
+        nearest = np.min(np.abs(start[:, None] - np.asarray(events)), axis=1, initial=np.inf)
+        moving = np.flatnonzero(length > tolerance)
+        entries = (NODE_COUNT * self.count) * max(
+            POINTS.size * self.model.state_count, NODE_COUNT * self.count
+        )
+        size, first_piece, former = max(1, CHUNK_ENTRIES // entries), np.zeros(index.size, int), -1
+        for begin in range(0, moving.size, size):
+            chunk = moving[begin : begin + size]
+            steps = self.prepare(start[chunk], length[chunk], on_beam[chunk])
+            for i, step in enumerate(chunk.tolist()):
+                if nearest[step] <= tolerance:
+                    self.jump(steps, i)
+                first_piece[former + 1 : step + 1], former = len(self.pieces), step
+                self.cross(steps, i)
+        first_piece[former + 1 :] = len(self.pieces)
+        last = self.pieces[-1]
+        end = last._replace(
+            start=last.start + last.length,
+            pressing=self.pressing,
+            states=self.state[None],
+            heights=self.e[None],
+        )
+        return UnilateralRun(self.pieces, first_piece, self.flights(), end, self.law)
+
+    def prepare(self, start, length, on_beam) -> Steps:
+        """Steps of given starts and lengths (s)."""
+        return prepare(self.model, self.loads, self.law, start, length, on_beam)
+
+    def follow(self, height, rate, wheels) -> None:
+        """Put wheels with a height of their own on the surface, with its height and velocity."""
+        for index, value in ((self.law.height_index, height), (self.law.rate_index, rate)):
+            own = wheels & (index >= 0)
+            self.e[index[own]] = value[own]
+
+    def cross(self, steps: Steps, i: int) -> None:
+        """Pass a step, cut at every event of contact inside."""
+        end, on_beam = float(steps.start[i] + steps.length[i]), steps.at.on_beam[i, 0]
+        while True:
+            piece = advance(self.law, steps, i, self.pressing, self.state, self.e)
+            event = self.first_event(piece, steps, i)
+            if event is None:
+                self.keep(piece, steps, i)
+                return
+            wheel, cut = event
+            if cut is None:
+                self.switch(wheel, steps, i, 0)
+                continue
+            part, until = cut
+            self.keep(part, until, 0)
+            self.switch(wheel, until, 0, -1)
+            now = part.start + part.length
+            if end - now <= SAME_TIME * self.duration:
+                return
+            steps, i = self.prepare(np.array([now]), np.array([end - now]), on_beam[None]), 0
+
+    def keep(self, piece: Piece, steps: Steps, i: int) -> None:
+        """Go to the end of a piece; wheels that press are on the surface there."""
+        self.pieces.append(piece)
+        self.state, self.e = piece.states[-1].copy(), piece.heights[-1].copy()
+        for wheel, flight in self.flying.items():
+            if piece.on_beam[wheel]:
+                flight["gap"] = max(flight["gap"], float(np.max(OF_POINTS @ piece.gap[wheel])))
+        height, rate = self.surface(steps, i, -1)
+        self.follow(height, rate, self.pressing & ~self.law.sprung)
+
+    def surface(self, steps: Steps, i: int, point: int) -> Float[np.ndarray, "2 wheel"]:
+        """Heights (m) and velocities (m/s) of the surface under the wheels at an end of a step."""
+        return steps.at.rows[i, point, :2] @ self.state + steps.at.profile[i, point, :2]
+
+    def first_event(self, piece: Piece, steps: Steps, i: int):
+        """First wheel that leaves or lands in a step, and the piece until then with its steps.
+
+        Those are None if that is at the start. None without any event.
+        """
+        by_force = piece.pressing & ~self.law.sprung
+        sign = np.where(piece.pressing, -1.0, 1.0)[:, None] / self.gap_scale
+        values = sign * piece.gap @ OF_POINTS.T
+        values[by_force] = piece.force[by_force] @ OF_FORCES.T / self.force_scale
+        below = (values < -1.0) & (self.law.contact & ~self.law.held)[:, None]
+        for fraction in np.flatnonzero(below.any(axis=0)):
+            found = []
+            for wheel in np.flatnonzero(below[:, fraction]).tolist():
+                # The start is known from the states, better than by extrapolation.
+                if fraction <= 1 and self.value(piece, steps, i, 0, wheel) < -1.0:
+                    return wheel, None
+                if fraction:
+                    ends = FORCE_FRACTIONS[fraction - 1], FORCE_FRACTIONS[fraction]
+                    cut = self.cut(piece, wheel, ends, values[wheel, fraction - 1 : fraction + 1])
+                    found += [] if cut is None else [(wheel, cut)]
+            if found:
+                wheel, cut = min(found, key=lambda one: one[1][0].length)
+                return wheel, cut if cut[0].length > SAME_TIME * self.duration else None
+        return None
+
+    def value(self, piece: Piece, steps: Steps, i: int, point: int, wheel: int) -> float:
+        """What is positive until a wheel leaves or lands, at an end of a piece, from the states."""
+        gap = float(piece.gap[wheel, point]) / self.gap_scale
+        if not piece.pressing[wheel]:
+            return gap
+        if self.law.sprung[wheel]:
+            return -gap
+        at = Instants(*(part[i, point] for part in steps.at))
+        parts = piece.pressing, piece.states[point], piece.heights[point]
+        return float(at.forces(self.law, *parts)[wheel]) / self.force_scale
+
+    def cut(self, piece: Piece, wheel: int, ends, near):
+        """The piece until an event of a wheel between two fractions, with its steps; None if none.
+
+        What is positive until then is `near` two values at the `ends`.
+        """
+
+        def until(fraction):
+            length = np.array([fraction * piece.length])
+            steps = self.prepare(np.array([piece.start]), length, piece.on_beam[None])
+            part = advance(self.law, steps, 0, piece.pressing, self.state, self.e)
+            return (part, steps), self.value(part, steps, 0, -1, wheel)
+
+        low, high = ends
+        best, value = until(high)
+        if value > -EXACT:
+            return None
+        slope = (near[1] - near[0]) / (high - low)
+        fraction = low + (high - low) * np.clip(near[0] / (near[0] - near[1]), 0.0, 1.0)
+        for _ in range(MAX_TRIALS):
+            if not low < fraction < high:
+                fraction = (low + high) / 2
+            trial, value = until(fraction)
+            if abs(value) <= EXACT:
+                return trial
+            if value > 0:
+                low = fraction
+            else:
+                high, best = fraction, trial
+            if (high - low) * piece.length <= SAME_TIME * self.duration:
+                break
+            fraction = fraction - value / slope
+        return best
+
+    def switch(self, wheel: int, steps: Steps, i: int, point: int) -> None:
+        """A wheel that presses leaves, or one that flies lands, at an end of a step.
+
+        Raises RuntimeError if that happens too often.
+        """
+        self.switches += 1
+        if self.switches > MAX_EVENTS:
+            raise RuntimeError(
+                f"wheels leave and land more than {MAX_EVENTS} times: keep fewer modes"
+                " (beam.modes), or give the contact a spring (contact.hertz_stiffness)"
+            )
+        if self.pressing[wheel]:
+            self.lift(wheel, steps, i, point)
+            return
+        law, (height, rate) = self.law, self.surface(steps, i, point)
+        self.pressing[wheel] = True
+        time, position = self.place(wheel, steps, i, point)
+        landing = {"landing_time": time, "landing_position": position}
+        if law.rigid[wheel]:
+            self.e[law.height_index[wheel]] = height[wheel]
+            landing["approach_speed"] = rate[wheel] - self.e[law.rate_index[wheel]]
+            landing["impulse"] = self.impact(steps, i, point)[wheel]
+        else:
+            self.follow(height, rate, (np.arange(self.count) == wheel) & law.tyre)
+            last = self.pieces[-1]
+            landing["approach_speed"] = -float(SLOPE_AT_END @ last.gap[wheel]) / last.length
+            landing["impulse"] = 0.0
+        self.landed.append(self.flying.pop(wheel) | landing)
+
+    def lift(self, wheel: int, steps: Steps, i: int, point: int) -> None:
+        """A wheel leaves at an end of a step."""
+        time, position = self.place(wheel, steps, i, point)
+        self.pressing[wheel] = False
+        names = [field.name for field in dataclasses.fields(Flights)]
+        known = {"wheel": wheel, "lift_time": time, "lift_position": position, "gap": 0.0}
+        self.flying[wheel] = dict.fromkeys(names, np.nan) | known
+
+    def place(self, wheel: int, steps: Steps, i: int, point: int) -> tuple[float, float]:
+        """Time (s) of an end of a step, and position (m) of a wheel."""
+        time = float(steps.start[i] + (steps.length[i] if point else 0.0))
+        return time, float(np.asarray(self.loads.kinematics(np.asarray(time))[0])[wheel])
+
+    def jump(self, steps: Steps, i: int) -> None:
+        """Start of a step at which the surface may rise, fall or change its velocity at once."""
+        law, (height, rate) = self.law, self.surface(steps, i, 0)
+        rigid = np.flatnonzero(law.rigid & ~law.held)
+        gap = self.e[law.height_index[rigid]] - height[rigid]
+        for wheel in rigid[(gap > JUMP * self.gap_scale) & self.pressing[rigid]].tolist():
+            self.lift(wheel, steps, i, 0)
+        for wheel in rigid[gap < -JUMP * self.gap_scale].tolist():
+            self.e[law.height_index[wheel]] = height[wheel]
+            if not self.pressing[wheel]:
+                self.switch(wheel, steps, i, 0)
+        rigid = rigid[self.pressing[rigid]]
+        if np.any(np.abs(self.e[law.rate_index[rigid]] - rate[rigid]) > self.rate_scale):
+            self.impact(steps, i, 0)
+
+    def impact(self, steps: Steps, i: int, point: int) -> Float[np.ndarray, " wheel"]:
+        """Impulses (N s) by which rigid wheels that touch the surface press on it at once.
+
+        They change the velocities of wheels and beam; wheels that none holds back leave.
+        """
+        law, touching = self.law, self.law.rigid & self.pressing
+        index, impulses = np.flatnonzero(touching), np.zeros(self.count)
+        shape, rates = steps.at.shape[i, point, index], law.rate_index[index]
+        relative = self.e[rates] - self.surface(steps, i, point)[1, index]
+        mobility = np.diag(1 / law.mass[index]) + shape @ shape.T
+        found = impulses_of(mobility, relative, law.held[index])
+        self.e[rates] += found / law.mass[index]
+        self.state[self.model.rate_index] -= shape.T @ found
+        after = relative + mobility @ found
+        for wheel in index[(after > self.rate_scale) & ~law.held[index]].tolist():
+            self.lift(wheel, steps, i, point)
+        impulses[index] = found
+        return impulses
+
+    def flights(self) -> Flights:
+        """Flights that are in part over the beam, in the order in which they begin."""
+        windows, found = np.asarray(self.loads.entry_exit_times()), []
+        for flight in [*self.landed, *self.flying.values()]:
+            entry, leave = windows[flight["wheel"]]
+            end = np.fmin(flight["landing_time"], self.duration)
+            over = min(end, leave) - max(flight["lift_time"], entry)
+            if over > SAME_TIME * self.duration and flight["gap"] > self.gap_scale:
+                found.append(flight)
+        found.sort(key=lambda flight: (flight["lift_time"], flight["wheel"]))
+        names = [field.name for field in dataclasses.fields(Flights)]
+        columns = {name: np.array([flight[name] for flight in found], float) for name in names}
+        return Flights(**columns | {"wheel": columns["wheel"].astype(int)})
+
+
+def impulses_of(
+    mobility: Float[np.ndarray, "wheel wheel"],
+    relative: Float[np.ndarray, " wheel"],
+    held: Bool[np.ndarray, " wheel"],
+) -> Float[np.ndarray, " wheel"]:
+    """Impulses p (N s): relative + mobility p >= 0, p >= 0, one of both zero; held: equal to zero.
+
+    `relative` are the velocities (m/s) of wheels away from the surface, `mobility` in 1/kg.
+    """
+    from scipy.optimize import nnls  # late: it takes long to import
+
+    free, fixed = np.flatnonzero(~held), np.flatnonzero(held)
+    coupling, found = mobility[np.ix_(free, fixed)], np.zeros(relative.size)
+    of_fixed = np.linalg.solve(
+        mobility[np.ix_(fixed, fixed)], np.column_stack([coupling.T, relative[fixed]])
+    )
+    if free.size:
+        reduced = mobility[np.ix_(free, free)] - coupling @ of_fixed[:, :-1]
+        factor = np.linalg.cholesky(reduced)
+        right = relative[free] - coupling @ of_fixed[:, -1]
+        found[free] = nnls(factor.T, -np.linalg.solve(factor, right))[0]
+    found[fixed] = -of_fixed[:, -1] - of_fixed[:, :-1] @ found[free]
+    return found
