@@ -26,6 +26,9 @@ MORE_EXACT = (
     "a load within the run",
     "an oscillator that brakes",
 )
+# Their answers are those at a tolerance of 1e-12: 0.2.0 chose steps by another error of peaks
+# between them, too small for the mass on a ramp (1.2e-8 in its peak), too large for the half car.
+OTHER_STEPS = ("a mass on a ramp", "a half car")
 SAMPLES = 3  # of each history that is kept
 LOOP_NAMES = (
     "feedback",
@@ -109,9 +112,10 @@ CASES = {
 }
 
 
-def answers(case: jb.Case) -> dict[str, list]:
-    """Peaks, contact, and samples of the histories of a run; None for NaN."""
-    record = jb.simulate(case)
+def answers(name: str) -> dict[str, list]:
+    """Peaks, contact, and samples of the histories of the run of a case; None for NaN."""
+    exact = {"tolerance": 1e-12} if name in OTHER_STEPS else {}
+    record = jb.simulate(CASES[name], **exact)
     rows = np.linspace(0, record.times.size - 1, SAMPLES + 2).astype(int)[1:-1]
     parts = {
         "peaks": record.peak_deflection,
@@ -136,5 +140,5 @@ if __name__ == "__main__":
     import warnings
 
     warnings.simplefilter("ignore")
-    found = {name: answers(case) for name, case in CASES.items()}
+    found = {name: answers(name) for name in CASES}
     print(json.dumps(found))
