@@ -10,6 +10,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from experiments.thesis.cases import critical_speed, two_spans, with_modes, with_sensors
+from jaxbeam import rigs
 from jaxbeam.integrator.time_grid import event_places
 from jaxbeam.simulation.integration_plan import integration_plan, sample_times
 from jaxbeam.simulation.simulate import integration_setup
@@ -339,3 +341,23 @@ def test_record_of_flights_in_files_and_figures(tmp_path):
     assert any("leaves the beam" in text for text in texts)
     nothing = jb.simulate(dataclasses.replace(case, loads=[]))
     assert nothing.flights is None
+
+
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+def test_mass_of_fig_2_27_flies():
+    """Held down, it pulls with many times its weight, and peaks depend on the number of modes."""
+    two = with_sensors(two_spans(rigs.load), 0.3, 0.9, duration=0.15)
+    values = {"loads.0.mass": 0.261, "loads.0.speed": 1.75 * critical_speed(two)}
+    peaks = []
+    for modes in (8, 16):
+        held = jb.replace(with_modes(two, modes), values)
+        bilateral, flying = (
+            jb.simulate(dataclasses.replace(held, contact=contact), tolerance=1e-9)
+            for contact in (None, LIFTING)
+        )
+        assert bilateral.lowest_contact_force[0] < -100 * 0.261 * 9.81
+        assert flying.lowest_contact_force[0] == 0
+        assert_allclose(flying.flights.lift_time[0], bilateral.contact_lost_time[0], rtol=1e-6)
+        peaks.append([bilateral.peak_deflection.max(), flying.peak_deflection.max()])
+    change = np.abs(np.subtract(*peaks) / peaks[1])
+    assert change[0] > 0.2 and change[1] < 0.05
