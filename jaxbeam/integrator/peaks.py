@@ -181,7 +181,7 @@ def update_peaks(
 def peaks_of_steps(initial: RunningPeaks, samples, start, length) -> RunningPeaks:
     """Peaks of a run whose steps are all known at once: by products, without branches."""
     fixed, magnitude = stop_gradient(samples), initial.magnitude
-    steps = steps_beside_peak(fixed, PEAK_NODES, magnitude)
+    steps = steps_beside_peak(fixed, stop_gradient(length), PEAK_NODES, magnitude)
     candidates = xp.moveaxis(xp.take_along_axis(samples, steps[:, None], axis=0), 0, 1)
     positions, heights = locate_peak(stop_gradient(candidates), PEAK_NODES, magnitude)
     highest = xp.argmax(heights, axis=0) == np.arange(len(steps))[:, None, None]

@@ -21,6 +21,7 @@ from jaxbeam.runtime.arrays import (
 
 ESTIMATE_ITERATIONS = 2  # of Newton's method in an estimate
 TIE_ROUNDING_UNITS = 8  # by which equal numbers may differ
+SHORT_STEP = 1e-6  # of the longest step, within which nothing is higher than at its ends
 START_POINTS = 17  # of the search, closer to each other than extrema of the curve can be
 NEWTON_ITERATIONS = 6  # from each start point
 
@@ -121,17 +122,26 @@ def estimate_peak(
 
 
 def steps_beside_peak(
-    samples: Float[Array, "step point *rest"], points: tuple[float, ...], magnitude: Callable
+    samples: Float[Array, "step point *rest"],
+    lengths: Float[Array, " step"],
+    points: tuple[float, ...],
+    magnitude: Callable,
 ) -> Int[Array, "candidate *rest"]:
     """Three steps, one of which has the peak of the polynomials through the samples of each.
 
-    That with the largest of values at equal distances, and those beside it.
+    That with the largest of values at equal distances, and those beside it: the next ones that are
+    not of (nearly) no `lengths`, as are those between events at one time.
     """
     grid = np.linspace(-1.0, 1.0, START_POINTS)[:, None] ** np.arange(len(points))
     weights = grid @ interpolation_matrix(points)[: len(points)]
     largest = xp.max(magnitude(xp.einsum("gp,tp...->tg...", weights, samples)), axis=1)
-    beside = np.arange(-1, 2).reshape(-1, *(1,) * (samples.ndim - 2))
-    return xp.clip(xp.argmax(largest, axis=0) + beside, 0, samples.shape[0] - 1)
+    highest, last = xp.argmax(largest, axis=0), samples.shape[0] - 1
+    column = -1, *(1,) * (samples.ndim - 2)
+    index = np.arange(last + 1).reshape(column)
+    long = (lengths > SHORT_STEP * xp.max(lengths)).reshape(column)
+    before = xp.max(xp.where(long & (index < highest), index, 0), axis=0)
+    after = xp.min(xp.where(long & (index > highest), index, last), axis=0)
+    return xp.stack([before, highest, after])
 
 
 @jax.named_scope("peaks")

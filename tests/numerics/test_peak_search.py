@@ -115,3 +115,21 @@ def test_derivatives_of_a_peak_in_the_middle_of_its_samples(points):
     at = jnp.array([2.0, 0.0])
     np.testing.assert_allclose(jax.grad(peak)(at), [1.0, 0.0], atol=1e-14)
     np.testing.assert_allclose(jax.hessian(peak)(at), [[0.0, 0.0], [0.0, 0.25]], atol=1e-13)
+
+
+@pytest.mark.parametrize("short", [0.0, 1e-9])
+@pytest.mark.parametrize("peak", [0.99, 1.01, 2.0])
+def test_steps_of_no_length_hide_no_peak(short, peak):
+    """Of the parabola 4 - (t - peak)^2, beside steps between events at (nearly) one time."""
+    lengths = jnp.array([1.0, short, short, short, 2.0])
+    start = jnp.cumsum(lengths) - lengths
+    times = start[:, None] + lengths[:, None] * np.array(PEAK_NODES)
+    curves = 4.0 - (times - peak) ** 2
+    steps = jaxbeam.numerics.peak_search.steps_beside_peak(
+        curves[..., None], lengths, PEAK_NODES, jnp.abs
+    )
+    positions, heights = jaxbeam.numerics.peak_search.locate_peak(curves[steps[:, 0]].T, PEAK_NODES)
+    best = jnp.argmax(heights)
+    assert float(heights[best]) == pytest.approx(4.0, rel=1e-13)
+    found = start[steps[best, 0]] + (positions[best] + 1) / 2 * lengths[steps[best, 0]]
+    assert float(found) == pytest.approx(peak, abs=1e-7)
