@@ -27,6 +27,7 @@ MODULES = {
     "statics": "jaxbeam.model",
     "profiles": "jaxbeam.case",
     "sections": "jaxbeam.analysis",
+    "benchmark": "jaxbeam",
 }
 
 # Matrices are small and runs share the cores: threads of LAPACK would wait for each other, on a

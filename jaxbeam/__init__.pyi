@@ -1,4 +1,4 @@
-from . import api as api, tuning as tuning
+from . import api as api, benchmark as benchmark, tuning as tuning
 from .analysis import ride as ride, sections as sections
 from .analysis.absorber_tuning import tuned_absorber as tuned_absorber
 from .analysis.assessment.assess import assess as assess

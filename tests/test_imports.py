@@ -23,7 +23,7 @@ jaxbeam.files
 jaxbeam.rigs  jaxbeam.simulation
 jaxbeam.sweeps  jaxbeam.c_code  jaxbeam.fmi
 jaxbeam.analysis
-jaxbeam.plot
+jaxbeam.plot  jaxbeam.benchmark
 jaxbeam  jaxbeam.api
 tuning.checkpoint  tuning.optional
 tuning.logs

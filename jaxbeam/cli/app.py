@@ -22,6 +22,7 @@ from cyclopts import (
 
 from jaxbeam.cli.arguments import UsageError
 from jaxbeam.cli.commands.app import app as app_command
+from jaxbeam.cli.commands.benchmark import benchmark
 from jaxbeam.cli.commands.compare import compare
 from jaxbeam.cli.commands.describe import describe
 from jaxbeam.cli.commands.engineering import assess, check, influence
@@ -44,7 +45,7 @@ from jaxbeam.runtime.interrupts import interruptible
 COMMANDS = {
     "Simulation": (new, check, describe, modes, frf, simulate, sweep),
     "Engineering": (assess, influence),
-    "Control": (compare, stability, state_space, tune, export),
+    "Control": (compare, benchmark, stability, state_space, tune, export),
     "Identification": (
         identify,
         modes_from_log,

@@ -118,7 +118,7 @@ def _weights(loads: LoadSet, path: LoadPath, fractions) -> Float[Array, "step lo
     return weight
 
 
-def _step_inputs(discrete: DiscreteModel, loads: LoadSet, path: LoadPath) -> StepInput:
+def step_inputs(discrete: DiscreteModel, loads: LoadSet, path: LoadPath) -> StepInput:
     """Matrices and wheels of the steps of a chunk."""
     weight = collapse(_weights(loads, path, GAUSS_NODES), 1, 3)
     inertia = xp.repeat(_of_wheels(loads.inertia, path)[:, :, 0], NODE_COUNT, axis=1)
@@ -164,14 +164,14 @@ def _chunk_function(
         if policy is None and running_peaks is None and vehicles is None:
 
             def under_loads():
-                return advance_unforced(_step_inputs(discrete, loads, path), state, None)[:2]
+                return advance_unforced(step_inputs(discrete, loads, path), state, None)[:2]
 
             def in_free_vibration():
                 return advance_free(discrete.propagators.transition_end[path.length_index], state)
 
             state, states = cond(xp.any(path.on_beam), under_loads, in_free_vibration)
             return state, memory, running_peaks, end, (states, commands, observed)
-        steps = _step_inputs(discrete, loads, path)
+        steps = step_inputs(discrete, loads, path)
         if policy is None:
             state, states, forces = advance_unforced(steps, state, vehicles)
         else:
@@ -215,7 +215,7 @@ def peaks_of_halves(
     index = np.unique(np.searchsorted(starts, running_peaks.step_start, side="right") - 1)
     discrete = on_grid(grid.with_halves(index))
     path = load_path(discrete, loads, max_loads, (2 * index[:, None] + np.arange(2)).ravel())
-    steps = _step_inputs(discrete, loads, path)
+    steps = step_inputs(discrete, loads, path)
     maps = step_maps(steps, vehicles_of(loads, discrete.grid.lengths))
     state, sources, ends = np.swapaxes(states[index], 1, 2), [], None
     for half in range(2):

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.integrator.contact_forces import END_FRACTIONS, end_forces
 from jaxbeam.integrator.discrete_model import discrete_model
-from jaxbeam.integrator.integrate import _step_inputs, _weights, integrate_history
+from jaxbeam.integrator.integrate import _weights, integrate_history, step_inputs
 from jaxbeam.integrator.load_path import load_path
 from jaxbeam.integrator.propagators import GAUSS_NODES
 from jaxbeam.integrator.time_grid import grid_by_step_length
@@ -56,7 +56,7 @@ def test_forces_at_ends_follow_from_the_states(name):
         return discrete, load_path(discrete, loads, loads.wheel_count, np.arange(count)), states
 
     discrete, path, states = run(1)
-    steps = _step_inputs(discrete, loads, path)
+    steps = step_inputs(discrete, loads, path)
     both = states[:-1], states[-1]
     at_nodes = _forces_at_nodes(model, loads, path, states, steps)
     weight = _weights(loads, path, END_FRACTIONS)

@@ -1,0 +1,5 @@
+"""Benchmark of controllers under moving loads: frozen problems, scores, environments, baselines."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,289 @@
+"""Frozen problems, certificates of their bounds against other programs, scores, the command."""
+
+import dataclasses
+import functools
+import hashlib
+import json
+from importlib import resources
+
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.optimize
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.benchmark import scoring
+from jaxbeam.benchmark.problem import TEST_SEEDS, VERSION, load, names
+from jaxbeam.benchmark.scoring import attainable, compute_attainable, published
+from jaxbeam.integrator.static_shapes import static_shapes
+from jaxbeam.simulation.commands import command_ranges
+from tests.modules import ROOT
+
+# Of all that v1 is. Numbers under it are cited: what must change is a new version beside it.
+CHECKSUM = "854ffd262aad45b4f4cd238b06d190848ad63581668951e682ada89ad4f105b5"
+FROZEN = ("problems.toml", "bounds.json", "baselines.json", "problems")
+
+
+def frozen_text() -> bytes:
+    top = ROOT / "jaxbeam" / "benchmark"
+    files = [
+        path for name in FROZEN for path in ([top / name] if "." in name else top.glob(name + "/*"))
+    ]
+    return b"".join(path.name.encode() + path.read_bytes() for path in sorted(files))
+
+
+def test_version_1_does_not_change():
+    assert VERSION == "v1" and TEST_SEEDS == (1, 2, 3, 4, 5)
+    assert scoring.LEAST_SHARE == -1.0
+    assert hashlib.sha256(frozen_text()).hexdigest() == CHECKSUM
+
+
+def test_there_are_ten_problems_with_all_that_is_published():
+    assert len(names()) == 10
+    assert set(jb.benchmark.baselines()) == set(names())
+    for name in names():
+        problem, stored = load(name), published(name)
+        assert_allclose([one.load for one in stored["training"]], problem.training)
+        loads = [problem.test_load(seed) for seed in TEST_SEEDS]
+        assert_allclose([one.load for one in stored["test"]], loads, rtol=1e-11)
+        for one in [*stored["training"], *stored["test"]]:
+            assert 0 < one.bound < one.uncontrolled
+            assert_allclose(np.abs(one.weights).sum(), 1, rtol=1e-6)
+        duration, period = float(problem.case.run.duration), problem.period
+        assert_allclose(duration / period, round(duration / period), rtol=1e-12)
+        shares = np.array([problem.shares(one) for one in problem.training])
+        assert np.all((shares >= -1e-12) & (shares <= 1 + 1e-12))
+
+
+@pytest.mark.parametrize("name", names())
+def test_no_load_has_more_wheels_on_the_beam(name):
+    problem = load(name)
+    corners = [problem.numbers(np.full(len(problem.vary), share)) for share in (0.0, 1.0)]
+    for numbers in [*corners, *(problem.test_load(seed) for seed in range(20))]:
+        shapes = static_shapes(problem.with_load(problem.case, numbers))
+        assert shapes.max_loads <= problem.max_loads
+
+
+def weighted_sum(problem, stored, commands) -> float:
+    """Weighted sum of the deflections (m) of a run under held commands, by `simulate`."""
+    times = np.arange(len(commands) + 1) * problem.period
+    values = np.concatenate([commands, commands[-1:]]).T
+    law = jb.Prescribed(
+        offsets=np.zeros(len(values)), period=problem.period, times=times, values=values
+    )
+    case = dataclasses.replace(problem.run_case(stored.load), controller=law)
+    deflections = np.asarray(jb.simulate(case).at(np.array(problem.positions)))
+    return float(stored.weights @ deflections[tuple(stored.places)])
+
+
+def held_commands(problem, draw):
+    """Commands of a run within the limits and rates of the actuators, from rest."""
+    low, high, rate = command_ranges(dataclasses.replace(problem.case, controller=None))
+    low, high, rate = (np.asarray(part)[list(problem.driven)] for part in (low, high, rate))
+    count = round(float(problem.case.run.duration) / problem.period)
+    rows, last = [], np.zeros(len(low))
+    for _ in range(count):
+        wanted = draw(low, high)
+        last = np.clip(wanted, last - rate * problem.period, last + rate * problem.period)
+        rows.append(last)
+    return np.array(rows)
+
+
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+@pytest.mark.parametrize("name", names())
+def test_the_certificate_holds_for_commands_within_the_limits(name):
+    """Without any linear program: the weighted sum is at least the bound, whatever is done."""
+    problem, random = load(name), np.random.default_rng(0)
+    stored = published(name)["test"][0]
+    for draw in (
+        lambda low, high: random.uniform(low, high),
+        lambda low, high: np.where(random.random(len(low)) < 0.5, low, high),
+        lambda low, high: high,
+    ):
+        found = weighted_sum(problem, stored, held_commands(problem, draw))
+        assert found >= stored.bound * (1 - 1e-5)
+
+
+def test_the_least_weighted_sum_is_the_bound():
+    """Over all commands, from the influence of each, by runs of `simulate` under one at a time."""
+    problem = load("unknown_mass")
+    stored = published("unknown_mass")["test"][0]
+    count = round(float(problem.case.run.duration) / problem.period)
+    nothing = np.zeros((count, 1))
+    base = weighted_sum(problem, stored, nothing)
+    influence = np.zeros(count)
+    last = int(np.ceil(stored.places[0].max() / problem.case.run.sample_rate / problem.period))
+    for k in range(min(last, count)):
+        commands = nothing.copy()
+        commands[k] = 1.0
+        influence[k] = weighted_sum(problem, stored, commands) - base
+    (limits,) = [one.command_limits() for one in problem.case.driven]
+    least = base + sum(min(float(c) * influence_k for c in limits) for influence_k in influence)
+    assert_allclose(least, stored.bound, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["patch", "late_sensor", "saturated"])
+def test_bounds_are_found_again(name):
+    problem = load(name)
+    seed = TEST_SEEDS[-1]
+    found, stored = compute_attainable(problem, problem.test_load(seed)), attainable(problem, seed)
+    assert_allclose(found.bound, stored.bound, rtol=1e-6)
+    assert_allclose(found.uncontrolled, stored.uncontrolled, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["unknown_mass", "late_sensor", "footbridge"])
+def test_baselines_have_the_stored_scores(name):
+    seeds = TEST_SEEDS[:2]
+    found, stored = jb.benchmark.score(name, seed=seeds), jb.benchmark.baselines()[name]
+    assert_allclose(found.shares, stored.shares[:2], atol=1e-4)
+    assert found.seeds == seeds and found.worst <= found.mean <= 1
+
+
+class Waiting:
+    """A policy that does nothing, and counts the starts of runs."""
+
+    def __init__(self):
+        self.starts = 0
+
+    def reset(self):
+        self.starts += 1
+
+    def __call__(self, observation):
+        assert observation.shape == (2,)
+        return [0.0]
+
+
+def test_a_policy_that_does_nothing_has_the_share_zero():
+    policy = Waiting()
+    found = jb.benchmark.score("unknown_mass", policy, seed=[1, 7])
+    assert policy.starts == 2
+    assert_allclose(found.shares, 0, atol=1e-6)
+    other = compute_attainable(load("unknown_mass"), load("unknown_mass").test_load(7))
+    assert_allclose(found.peaks[1], other.uncontrolled, rtol=1e-6)
+
+
+def test_a_run_that_diverges_counts_minus_one():
+    found = dataclasses.replace(
+        jb.benchmark.baselines()["patch"], shares=np.array([0.5, np.nan, -7.0, 0.5, 0.5])
+    )
+    assert_allclose(found.mean, -0.1)
+    assert found.worst == -1
+
+
+def test_controllers_of_other_loops_are_refused():
+    problem = load("patch")
+    law = problem.case.controller
+    for change, sentence in (
+        ({"period": np.array(0.02)}, r"controller.period must be 0.01"),
+        ({"delay": np.array(0.01)}, "controller.delay must be left out"),
+        ({"estimator": None}, "controller.estimator must be given"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            jb.benchmark.score(problem, dataclasses.replace(law, **change))
+    with pytest.raises(ValueError, match="no problem 'rope'"):
+        load("rope")
+    with pytest.raises(ValueError, match="takes a controller"):
+        jb.benchmark.score("patch", 3.0)
+
+
+def test_data_are_part_of_the_package():
+    top = resources.files("jaxbeam.benchmark")
+    assert {f"{name}.toml" for name in names()} == {
+        path.name for path in (top / "problems").iterdir()
+    }
+    assert json.loads((top / "bounds.json").read_text("utf-8"))
+
+
+@functools.cache
+def _response(name: str):
+    """Deflections (m) without commands, and those of each command, from the environment's maps."""
+    environment = jb.benchmark.Environment(load(name))
+    state, _ = environment.reset(TEST_SEEDS[0])
+    of_states, of_deflections = state.maps
+    count, states = environment.steps, state.plant.size
+    columns = np.zeros((states, 1 + count))
+    columns[:, 0] = state.plant
+    rows = []
+    for k in range(count):
+        unit = np.zeros(1 + count)
+        unit[1 + k] = 1
+        inputs = np.concatenate([columns, unit[None]])
+        deflection = np.asarray(of_deflections.linear[k, 0]) @ inputs
+        deflection[:, 0] += np.asarray(of_deflections.offset[k, 0])
+        rows.append(deflection)
+        columns = np.asarray(of_states.linear[k, 0]) @ inputs
+        columns[:, 0] += np.asarray(of_states.offset[k, 0])
+    return np.concatenate(rows)
+
+
+def test_a_linear_program_of_the_environment_has_the_same_bound():
+    """Another program: all rows at once, from the maps of the environment, without generation."""
+    problem, rows = load("unknown_mass"), _response("unknown_mass")
+    count = rows.shape[1] - 1
+    scale = np.abs(rows[:, 0]).max()
+    base, response = rows[:, 0] / scale, rows[:, 1:] / scale
+    matrix = np.concatenate([response, -response])
+    matrix = np.concatenate([matrix, -np.ones((len(matrix), 1))], axis=1)
+    (limits,) = [tuple(map(float, one.command_limits())) for one in problem.case.driven]
+    solution = scipy.optimize.linprog(
+        np.append(np.zeros(count), 1.0),
+        matrix,
+        -np.concatenate([base, -base]),
+        bounds=[limits] * count + [(0, None)],
+    )
+    assert_allclose(solution.x[-1] * scale, published("unknown_mass")["test"][0].bound, rtol=1e-6)
+
+
+def test_an_ode_of_scipy_has_the_same_peaks():
+    """Moving mass on three sine modes with the couples of the patch, written down by hand."""
+    problem = load("unknown_mass")
+    numbers = problem.test_load(TEST_SEEDS[0])
+    length, stiffness, density, damping = 0.6, 13.211, 0.812, 0.03
+    speed, gravity, (mass,) = 1.2, 9.81, numbers
+    per_volt = 8.292e-4 * 200.0 * 0.32  # N m/V
+    n = np.arange(1, 4) * np.pi / length
+    frequency, modal_mass = n**2 * np.sqrt(stiffness / density), density * length / 2
+    couple = n * (np.cos(n * 0.3425) - np.cos(n * 0.2575))
+    commands = held_commands(problem, np.random.default_rng(1).uniform)[:, 0]
+
+    def rates(t, z, on_beam, command):
+        q, v = z[:3], z[3:]
+        right = -modal_mass * (2 * damping * frequency * v + frequency**2 * q)
+        right -= per_volt * command * couple
+        inertia = modal_mass * np.eye(3)
+        if on_beam:
+            shape, slope = np.sin(n * speed * t), n * np.cos(n * speed * t)
+            # y'' = s q'' + 2 v s' q' + v^2 s'' q under the mass, which presses downwards.
+            inertia += mass * np.outer(shape, shape)
+            carried = 2 * speed * slope @ v - speed**2 * (n**2 * shape) @ q
+            right -= mass * (gravity + carried) * shape
+        return np.concatenate([v, np.linalg.solve(inertia, right)])
+
+    for used, law in ((np.zeros_like(commands), None), (commands, "held")):
+        z, deflections = np.zeros(6), []
+        for k, command in enumerate(used):
+            start, end = k * problem.period, (k + 1) * problem.period
+            samples = start + problem.period * np.arange(1, 5) / 4
+            parts = sorted({start, end, min(max(length / speed, start), end)})
+            for a, b in zip(parts[:-1], parts[1:], strict=True):
+                wanted = samples[(samples > a) & (samples < b - 1e-9)]
+                of_end = bool(np.any(np.abs(samples - b) <= 1e-9))
+                on_beam = (a + b) / 2 < length / speed
+                found = scipy.integrate.solve_ivp(
+                    rates, (a, b), z, "DOP853", np.append(wanted, b),
+                    args=(on_beam, command), rtol=1e-10, atol=1e-13,
+                )  # fmt: skip
+                z = found.y[:, -1]
+                deflections += list(np.sin(n * 0.3) @ found.y[:3, : len(wanted) + of_end])
+        case = problem.run_case(numbers)
+        times = np.arange(len(used) + 1) * problem.period
+        values = np.append(used, used[-1])[None]
+        controller = law and jb.Prescribed(
+            offsets=[0.0], period=problem.period, times=times, values=values
+        )
+        peak = scoring.sampled_peak(problem, dataclasses.replace(case, controller=controller))
+        assert_allclose(np.abs(deflections).max(), peak, rtol=1e-7)
+        if law is None:
+            stored = published("unknown_mass")["test"][0]
+            assert_allclose(peak, stored.uncontrolled, rtol=1e-7)
