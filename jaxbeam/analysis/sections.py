@@ -27,7 +27,7 @@ from jaxbeam.model.statics import (
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.module import Module
-from jaxbeam.simulation.corrected_deflection import corrected_deflection
+from jaxbeam.simulation.derived_histories import corrected_deflection
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import integration_setup

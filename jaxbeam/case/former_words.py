@@ -70,7 +70,7 @@ MOVED = {  # names of the package, each with the module in which it is now
     "sampling_limit": "control.optimal.sampled_lqr",
     "rayleigh_coefficients": "case.beam",
     "least_integral": "analysis.bound.least_integral",
-    "coil_history": "simulation.coil_history",
+    "coil_history": "simulation.derived_histories",
     "profile_from_file": "files.profile_file",
     "identified_load": "control.load_identification",
     "Assessment": "analysis.assessment.assessment",

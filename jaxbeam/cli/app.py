@@ -39,8 +39,8 @@ from jaxbeam.cli.commands.thesis import demo, reproduce
 from jaxbeam.cli.commands.tune import tune
 from jaxbeam.cli.commands.weigh import identify_responses, weigh
 from jaxbeam.cli.options import print_message
-from jaxbeam.runtime.garbage import RARELY
 from jaxbeam.runtime.interrupts import interruptible
+from jaxbeam.runtime.memory import RARELY
 
 COMMANDS = {
     "Simulation": (new, check, describe, modes, frf, simulate, sweep),

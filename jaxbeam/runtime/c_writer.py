@@ -252,6 +252,14 @@ def flat_index(index: Sequence[str], strides: Sequence[int], first: Any = 0) -> 
 # --- One entry after the other. A rule is an expression for (kind, whether runs differ).
 
 
+def clipped(start: str, most: int) -> str:
+    return f"within({start}, {most})"
+
+
+def filled(number: str, kind: str, varying: bool) -> str:
+    return PROMOTED[kind].format(number) if varying else number
+
+
 def _both(text: str) -> Callable[[str, bool], str]:
     return lambda kind, varying: text
 

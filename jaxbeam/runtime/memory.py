@@ -1,7 +1,10 @@
-"""Memory that is free, and the part of it that the blocks of a computation may take."""
+"""Memory that is free, the part that blocks take, and rare collections of garbage."""
 
+import contextlib
+import gc
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 DEFAULT_PART = 4  # blocks take a quarter of what is free: other programs need some, too
@@ -9,6 +12,8 @@ UNKNOWN = 2 * 2**30  # bytes, of a machine that does not say what is free
 UNITS = {"": 1.0, "B": 1.0, "kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12}
 UNITS |= {"KiB": 2.0**10, "MiB": 2.0**20, "GiB": 2.0**30, "TiB": 2.0**40}
 GROUPS = Path("/sys/fs/cgroup")  # of control groups, by which containers limit memory
+# Of new objects, and of younger collections for an older one. JAX alone has 400 000 objects.
+RARELY = (500_000, 20, 100)
 
 
 def block_memory(given: float | str | None = None) -> float:
@@ -82,3 +87,19 @@ def _of_process() -> float | None:
         return float(limit - pages * os.sysconf("SC_PAGE_SIZE"))
     except (ImportError, OSError, ValueError):
         return None
+
+
+@contextlib.contextmanager
+def rare_collections() -> Iterator[None]:
+    """A context in which Python seldom looks for cyclic garbage.
+
+    Imports and tracing make a million objects and hardly any garbage: the first sweep of a process
+    takes 0.15 s less of 1.4 s.
+    """
+    former = gc.get_threshold()
+    gc.set_threshold(*RARELY)
+    try:
+        yield
+    finally:
+        if former != RARELY:  # else another thread, or the command line, has set and restores it
+            gc.set_threshold(*former)

@@ -4,9 +4,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.integrator.force_peaks import constant_speeds, force_paths, force_wheels
-from jaxbeam.integrator.force_system import force_system
-from jaxbeam.integrator.forces.states import outputs_of_forces
+from jaxbeam.integrator.force_peaks import (
+    ForcePaths,
+    constant_speeds,
+    force_panels,
+    force_paths,
+    force_wheels,
+)
+from jaxbeam.integrator.force_system import ForceSystem, force_responses, force_system
 from jaxbeam.model.contact import ContactState, contact_at, split_states
 from jaxbeam.model.load_set import LoadSet
 from jaxbeam.model.modal_model import ModalModel
@@ -14,6 +19,27 @@ from jaxbeam.model.sensing.output_rows import LinearOutputs
 from jaxbeam.model.sensing.sensor_signals import VehicleMotion
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, xp
+
+
+def outputs_of_forces(
+    system: ForceSystem, paths: ForcePaths, times: Float[np.ndarray, " time"]
+) -> Float[np.ndarray, "time output"]:
+    """Outputs Re(C eta) of one run, from rest, at times (s); without their static parts."""
+    responses = force_responses(system, np.unique(paths.speed))
+    panels = force_panels(responses, paths)
+    panel = np.maximum(np.searchsorted(panels.start, times, side="right") - 1, 0)
+    since = (times - panels.start[panel])[:, None]
+    eta = panels.amplitude[panel] * np.exp(since * system.poles)
+    which, at = panels.forces_in(panel)
+    piece, number = panels.piece[at], panels.response[at]
+    x = panels.origin[at] + panels.speed[at] * times[which]
+    x = np.clip(x, system.breaks[piece], system.breaks[piece + 1])
+    segment = system.segment[piece]
+    for u, s in np.unique(np.stack([number, segment]), axis=1).T.tolist():
+        here = (number == u) & (segment == s)
+        p = responses.particular(u, s, x[here])
+        np.add.at(eta, which[here], panels.force[at][here, None] * p)
+    return (eta @ system.on_outputs.T).real
 
 
 def motion_at(

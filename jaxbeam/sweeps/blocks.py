@@ -1,9 +1,12 @@
-"""Runner of a sweep: its batches in blocks of equal shape, with the longest steps allowed."""
+"""Runner of a sweep: its batches in blocks of equal shape, with the longest steps allowed.
+
+Sensors that are too many for one integration are integrated in groups, one after the other.
+"""
 
 import dataclasses
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -20,15 +23,20 @@ from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.runtime.vectorised import NotVectorisedError
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import sample_times, steps_per_interval
-from jaxbeam.sweeps import known_batches, programs
 from jaxbeam.sweeps.batches import Batches, common_layout, swept_masses
-from jaxbeam.sweeps.compiled_batches import CompiledBatches
-from jaxbeam.sweeps.known_batches import KnownBatches
-from jaxbeam.sweeps.known_inputs import KnownInputs, inputs_of_rows, known_model
+from jaxbeam.sweeps.integration import (
+    CompiledBatches,
+    KnownBatches,
+    Program,
+    in_sequence,
+    suits_numpy,
+)
+from jaxbeam.sweeps.native_integration import KnownInputs, inputs_of_rows, known_model
 from jaxbeam.sweeps.step_size import (
     PathTimes,
     Trials,
     choose_step_sizes,
+    largest_error,
     path_times,
     rounding_error,
     step_limits,
@@ -44,6 +52,7 @@ MAX_TRIAL_RUNS = 256  # about; runs per call while step sizes are measured
 MIN_TRIAL_BATCHES = 4  # for which step sizes are measured
 MAX_CHECKED_RUNS = 256  # of paths of their own: to check all takes three times as long
 MAX_TRIAL_BATCHES = 16  # more of one run each cost more than the steps that they would save
+OF_SENSORS = {"peak_deflection": -1, "peak_time": -1, "deflection": -1}  # axis of the sensors
 
 
 class Runner:
@@ -97,7 +106,7 @@ class Runner:
         self.pool = ThreadPoolExecutor((os.cpu_count() or 1) * (2 if waiting else 1))
         self.compiled: CompiledBatches | KnownBatches | None = None
         if self.known_inputs is None:
-            small = small and known_batches.suits(case, batches, self.schedule)
+            small = small and suits_numpy(case, batches, self.schedule)
             self.compiled = self._known_batches() if small else self._compile()
         longest = None
         if self.schedule is not None and case.controller is not None:  # steps end at events
@@ -105,7 +114,7 @@ class Runner:
         limits = self._path_times, self._stable_steps(), longest, tolerance
         self.limits = step_limits(case, batches, *limits)
 
-    def _make_program(self, native: bool) -> programs.Program:
+    def _make_program(self, native: bool) -> Program:
         """Data of the programs that compute peaks."""
         case, batches = self.case, self.batches
         shapes = StaticShapes(common_layout(case, batches), has_coupling(case), 1, native)
@@ -114,7 +123,7 @@ class Runner:
         if max_loads > 1:
             max_loads = max(map(max_concurrent_loads, self._path_times.load_events[0]))
         shared = self.known_model is not None and case.controller is None
-        return programs.Program(
+        return Program(
             case,
             dataclasses.replace(shapes, max_loads=max_loads),
             batches.shared_addresses,
@@ -162,7 +171,7 @@ class Runner:
         """
         count, batch_size = self.batches.run_index.shape
         self.devices = len(jax.local_devices())
-        vectorised = not (self.histories or programs.in_sequence())
+        vectorised = not (self.histories or in_sequence())
         block_runs = MAX_VECTORISED_RUNS if vectorised else MAX_BLOCK_RUNS
         max_batches, trial_batches = (
             max(1, min(runs // batch_size, most_batches)) * self.devices
@@ -314,3 +323,46 @@ class Runner:
 def _round_up(count: int, unit: int) -> int:
     """Smallest multiple of a unit that is at least a count."""
     return -(-count // unit) * unit
+
+
+class SensorGroups:
+    """Runners of the same batches with other sensors each, as one (see `blocks.Runner`).
+
+    `groups` are the numbers of the sensors of each.
+    """
+
+    trials = None  # are not kept
+
+    def __init__(self, runners: Sequence[Runner], groups: Sequence[Sequence[int]]):
+        self.runners, self.groups = runners, groups
+        self.batches, self.block_count = runners[0].batches, runners[0].block_count
+        self.run_count = runners[0].run_count
+
+    @property
+    def pool(self) -> ThreadPoolExecutor:
+        """Threads that compute blocks."""
+        return self.runners[0].pool
+
+    def choose_step_sizes(self) -> tuple[Float[np.ndarray, " path"], float]:
+        """Step sizes (s) of all batches that suit all sensors, and the estimated error of peaks."""
+        found = [runner.choose_step_sizes() for runner in self.runners]
+        steps, errors = zip(*found, strict=True)
+        return np.min(steps, axis=0), largest_error(errors)
+
+    def block_function(
+        self, steps: Float[np.ndarray, " path"], trials: None = None
+    ) -> Callable[[int], dict[str, np.ndarray]]:
+        """Function of a block's number: its results (path, batch, ...) by name."""
+        functions = [runner.block_function(steps) for runner in self.runners]
+        order = np.argsort(np.concatenate(self.groups))
+
+        def compute(block: int) -> dict[str, np.ndarray]:
+            parts = [function(block) for function in functions]
+            joined = {
+                name: np.concatenate([part[name] for part in parts], axis)[..., order]
+                for name, axis in OF_SENSORS.items()
+                if name in parts[0]
+            }
+            return parts[0] | joined
+
+        return compute

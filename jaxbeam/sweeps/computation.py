@@ -19,16 +19,15 @@ from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime.arrays import collapse
 from jaxbeam.runtime.dataset import labelled_dataset
-from jaxbeam.runtime.garbage import rare_collections
-from jaxbeam.runtime.memory import size_text
+from jaxbeam.runtime.memory import rare_collections, size_text
 from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.simulation.integration_plan import sample_times
 from jaxbeam.simulation.labels import SWEEP_VARIABLES, sensor_coordinates
 from jaxbeam.sweeps import cluster, store as sweep_store
 from jaxbeam.sweeps.batches import Batches
+from jaxbeam.sweeps.quality import WorstRun, estimated_errors, is_corrected
 from jaxbeam.sweeps.specification import AnyRunner, SweepSpecification
 from jaxbeam.sweeps.store import BlockStore, MemoryStore
-from jaxbeam.sweeps.truncation import WorstRun, estimated_errors, is_corrected
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX

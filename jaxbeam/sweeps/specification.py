@@ -38,12 +38,18 @@ from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.step_size import check_tolerance
 from jaxbeam.runtime.memory import block_memory
 from jaxbeam.sweeps import MAX_RUNS
-from jaxbeam.sweeps.batches import MAX_BATCH_SIZE, Batches, addresses_within_batches, make_batches
-from jaxbeam.sweeps.block_memory import RunSizes, largest_group, run_sizes
-from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner
+from jaxbeam.sweeps.batches import (
+    MAX_BATCH_SIZE,
+    Batches,
+    RunSizes,
+    addresses_within_batches,
+    largest_group,
+    make_batches,
+    run_sizes,
+)
+from jaxbeam.sweeps.blocks import MAX_BLOCK_RUNS, Runner, SensorGroups
 from jaxbeam.sweeps.force_runner import FORCE_BLOCK_RUNS, ForceRunner, force_runner
-from jaxbeam.sweeps.sensor_groups import SensorGroups
-from jaxbeam.sweeps.truncation import is_corrected
+from jaxbeam.sweeps.quality import is_corrected
 
 # Positions and list entries, whose values are valid only in combination.
 JOINTLY_CHECKED = re.compile(

@@ -14,10 +14,9 @@ from jaxbeam.runtime.interrupts import keeping
 from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.simulation.integration_plan import TOLERANCE
 from jaxbeam.sweeps.computation import compute_sweep
-from jaxbeam.sweeps.failures import warn_of_failures
+from jaxbeam.sweeps.quality import warn_of_failures, warn_of_truncation
 from jaxbeam.sweeps.specification import sweep_specification
 from jaxbeam.sweeps.store import read_dataset, writing
-from jaxbeam.sweeps.truncation import warn_of_truncation
 from jaxbeam.sweeps.words import compute_word_sweep, split_words, word_sweep
 
 if TYPE_CHECKING:

@@ -22,6 +22,7 @@ from jaxbeam.files.case_file import case_to_dict, with_settings
 from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.sweeps import MAX_RUNS, store as sweep_store
 from jaxbeam.sweeps.computation import compute_sweep, worst_runs
+from jaxbeam.sweeps.quality import estimated_errors
 from jaxbeam.sweeps.specification import SweepSpecification, sweep_specification
 from jaxbeam.sweeps.step_size import largest_error
 from jaxbeam.sweeps.store import (
@@ -30,7 +31,6 @@ from jaxbeam.sweeps.store import (
     new_store,
     replace_blocks,
 )
-from jaxbeam.sweeps.truncation import estimated_errors
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX

@@ -15,7 +15,7 @@ from jaxbeam.case.validation import check_case
 from jaxbeam.model.frequency_responses import frequency_response
 from jaxbeam.model.linear_system import poles
 from jaxbeam.runtime.arrays import xp
-from jaxbeam.simulation.coil_history import coil_history
+from jaxbeam.simulation.derived_histories import coil_history
 from tests.differences import central
 
 R, L, KF, KV, MASS, DAMPING, STIFFNESS = 0.82, 5e-3, 4.2, 3.9, 0.03, 0.55, 900.0

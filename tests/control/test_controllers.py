@@ -15,7 +15,7 @@ import jaxbeam as jb
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
-from jaxbeam.sweeps.failures import FailedRunsWarning
+from jaxbeam.sweeps.quality import FailedRunsWarning
 from tests.differences import central
 from tests.loop_as_oracle import expected
 

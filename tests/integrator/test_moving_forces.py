@@ -9,15 +9,15 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.integrator.force_peaks import ForcePaths, force_paths, force_wheels, peaks_of_forces
 from jaxbeam.integrator.force_system import force_responses, force_system, particular_solutions
-from jaxbeam.integrator.forces.states import outputs_of_forces
 from jaxbeam.integrator.step_size import without_later_vibration
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.sensing.output_rows import linear_outputs, sensor_rows
 from jaxbeam.numerics.polynomials import piecewise_chebyshev
+from jaxbeam.simulation.motion import outputs_of_forces
 from jaxbeam.sweeps.force_runner import _systems, force_runner
+from jaxbeam.sweeps.quality import SAMPLES, WorstRun, estimated_errors
 from jaxbeam.sweeps.specification import sweep_specification
-from jaxbeam.sweeps.truncation import SAMPLES, WorstRun, estimated_errors
 
 BEAM = jb.Beam(12.0, 4e8, 2000.0, 0.02, modes=3)
 QUANTITIES = ("deflection", "velocity", "acceleration", "slope", "moment", "shear")

@@ -22,7 +22,7 @@ from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.propagators import PEAK_NODES
 from jaxbeam.numerics.peak_search import interpolation_matrix, refine_peak
 from jaxbeam.runtime import native_library
-from jaxbeam.sweeps import known_batches
+from jaxbeam.sweeps import blocks
 from jaxbeam.sweeps.specification import sweep_specification
 from jaxbeam.sweeps.store import ZarrStore
 
@@ -114,7 +114,7 @@ def sweep_by_c_and_xla(case, over):
     native = jb.sweep(case, over, progress=False)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(native_peaks, "available", lambda: False)
-        patch.setattr(known_batches, "suits", lambda *_: False)
+        patch.setattr(blocks, "suits_numpy", lambda *_: False)
         return native, jb.sweep(case, over, progress=False)
 
 

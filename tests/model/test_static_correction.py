@@ -21,7 +21,7 @@ from jaxbeam.model.static_correction import (
     residual_flexibility,
     shear_force,
 )
-from jaxbeam.simulation.corrected_deflection import corrected_deflection
+from jaxbeam.simulation.derived_histories import corrected_deflection
 from tests.as_oracle import as_oracle
 from tests.differences import central
 from tests.oracles import finite_elements

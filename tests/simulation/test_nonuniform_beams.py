@@ -17,7 +17,7 @@ from jaxbeam.integrator import native_peaks
 from jaxbeam.model.deflection_lines import static_deflection_per_command
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import Motion, corrected_history
-from jaxbeam.simulation.corrected_deflection import corrected_deflection
+from jaxbeam.simulation.derived_histories import corrected_deflection
 from jaxbeam.simulation.stored_record import record_from_xarray
 from tests.differences import central
 from tests.modules import ROOT

@@ -16,7 +16,7 @@ from jaxbeam.runtime.c_writer import UntranslatedError
 from jaxbeam.runtime.native_library import C_FOLDER, find_compiler
 from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
 from jaxbeam.simulation.integration_plan import sample_times
-from jaxbeam.simulation.translated_loop import translated_loop
+from jaxbeam.sweeps.native_integration import translated_loop
 from tests.c_code.cases import CASES
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")

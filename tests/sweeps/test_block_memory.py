@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 import jaxbeam as jb
 from jaxbeam.integrator import native_peaks
 from jaxbeam.sweeps import computation
+from jaxbeam.sweeps.blocks import SensorGroups
 from jaxbeam.sweeps.force_runner import FORCE_BLOCK_RUNS, LEAST_BYTES, PHASE
-from jaxbeam.sweeps.sensor_groups import SensorGroups
 from jaxbeam.sweeps.specification import sweep_specification
 
 TRAIN = jb.Axles(speed=50.0, offsets=np.arange(10) * 3.0, forces=[1e5] * 10)

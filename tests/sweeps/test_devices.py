@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from experiments.benchmarks.common import without_native
-from jaxbeam.sweeps import programs
+from jaxbeam.sweeps import blocks, integration
 
 CASE = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=3),
@@ -50,7 +50,8 @@ def test_single_precision_meets_its_error_estimate():
 def test_batches_at_once_as_on_accelerators(monkeypatch, option):
     options = {"histories": True} if option == "histories" else {"precision": option}
     expected = jb.sweep(CASE, OVER, progress=False, **options)
-    monkeypatch.setattr(programs, "in_sequence", lambda: False)
+    for module in (blocks, integration):
+        monkeypatch.setattr(module, "in_sequence", lambda: False)
     jax.clear_caches()
     with without_native():
         found = jb.sweep(CASE, OVER, progress=False, **options)

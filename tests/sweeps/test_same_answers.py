@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.integrator import native_peaks
 from jaxbeam.simulation.integration_plan import common_plan, integration_plan, sample_times
-from jaxbeam.sweeps import known_batches
+from jaxbeam.sweeps import blocks
 from jaxbeam.sweeps.blocks import Runner
 from tests.strategies import numbers
 
@@ -82,7 +82,7 @@ def swept(case, runs, native: bool = False, known: bool = False, **options) -> n
         if known:
             patch.setattr(Runner, "_compile", None)
         else:
-            patch.setattr(known_batches, "suits", lambda *_: False)
+            patch.setattr(blocks, "suits_numpy", lambda *_: False)
         assert native_peaks.chosen_for(case, 1) == (native and case.controller is None)
         found = jb.sweep(case, over, paired=True, progress=False, **options)
     return found.peak_deflection.values

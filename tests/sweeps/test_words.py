@@ -15,7 +15,7 @@ from jaxbeam.case.loads.axles import Axles
 from jaxbeam.case.loads.vehicles.vehicle import VehicleLoad
 from jaxbeam.files.case_file import with_settings
 from jaxbeam.model.load_set import load_set
-from jaxbeam.sweeps import programs
+from jaxbeam.sweeps import integration
 from jaxbeam.sweeps.store import ZarrStore, status
 from jaxbeam.sweeps.words import with_numbers
 
@@ -74,10 +74,10 @@ def test_trains_with_equally_many_axles_share_programs(monkeypatch):
     In single precision, as in double precision forces at constant speeds compile nothing.
     """
     signatures = []
-    original = programs.integrate_block.precompile
+    original = integration.integrate_block.precompile
 
     def precompile(*arguments):
-        signatures.append(programs.integrate_block._entry(*_split(arguments)))
+        signatures.append(integration.integrate_block._entry(*_split(arguments)))
         return original(*arguments)
 
     from jaxbeam.runtime.compiling import _partition
@@ -87,7 +87,7 @@ def test_trains_with_equally_many_axles_share_programs(monkeypatch):
         return arrays, rest
 
     case = with_settings(CASE, {"loads.0.train": "HSLM-A6", "run.duration": 9.0})
-    monkeypatch.setattr(programs.integrate_block, "precompile", precompile)
+    monkeypatch.setattr(integration.integrate_block, "precompile", precompile)
     over = {"loads.0.train": ["HSLM-A6", "HSLM-A7"], "loads.0.speed": [60.0, 70.0]}
     sweep(over, case)
     assert not signatures

@@ -26,8 +26,8 @@ from jaxbeam.model.sensing.output_rows import (
     static_correction,
 )
 from jaxbeam.sweeps.computation import peaks_in_memory
-from jaxbeam.sweeps.failures import failure_sentence
 from jaxbeam.sweeps.force_runner import PHASE
+from jaxbeam.sweeps.quality import failure_sentence
 from jaxbeam.sweeps.specification import sweep_specification
 
 # Ratio of speeds: N axles at a spacing build up resonance of order i over a share 2 / (N i) of the

@@ -65,7 +65,7 @@ enum {
 enum { PEAK, PEAK_TIME, LOWEST_FORCE, CONTACT_LOSS_TIME, FAILURES, AMPLITUDES, RESULT_COUNT };
 
 /* A sampled loop: what happens at an event, to the memory of the runs of a group and their commands
- * (simulation/translated_loop.py); numbers of commands and of marks in time up to which amplitudes
+ * (sweeps/native_integration.py); numbers of commands and of marks in time up to which amplitudes
  * are compared (integrator/growth.py), and the place of the failures in the memory. Commands are
  * states that do not change between events, in each block. NULL without a loop. */
 typedef struct {

@@ -1,7 +1,7 @@
-"""Histories of the coil of an electrodynamic shaker: its current, and the voltage across it.
+"""Histories that follow from a record: statically corrected deflection, and those of coils.
 
-With an inner loop the amplifier sets the voltage, which nothing bounds in the model; here it can be
-compared with what the amplifier has.
+With an inner loop the amplifier of a shaker sets the voltage of its coil, which nothing bounds in
+the model; here it can be compared with what the amplifier has.
 """
 
 from typing import NamedTuple
@@ -10,9 +10,29 @@ from jaxtyping import Float
 
 from jaxbeam.case.actuators.electrodynamic import Electrodynamic, PortSignal
 from jaxbeam.case.case import Case
+from jaxbeam.model.static_correction import corrected_history
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
+from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import run_integration
+
+
+def corrected_deflection(record: Record, x, derivative: int = 0) -> Float[Array, "time *position"]:
+    """Statically corrected history of a record's deflection at x (m), in m.
+
+    Sum of the modes, plus the residual of the modes under the forces of each instant (see
+    `corrected_history`); `derivative` (up to 3) gives that x-derivative instead. Accurate where
+    forces and commands change slowly compared with the first truncated mode.
+
+    >>> import jaxbeam as jb
+    >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
+    >>> case = jb.Case(
+    ...     beam, sensors=[jb.Sensor(0.3)], loads=[jb.MovingMass(mass=0.5, speed=2.0)]
+    ... )
+    >>> print(jb.sections.corrected_deflection(jb.simulate(case), 0.3).shape)
+    (1001,)
+    """
+    return corrected_history(record.case, record.modes, record.motion, x, derivative)
 
 
 class CoilHistory(NamedTuple):
@@ -38,7 +58,7 @@ def coil_history(
     Raises ValueError as `simulate` does, and if the actuator is no electrodynamic shaker.
 
     >>> import jaxbeam as jb
-    >>> from jaxbeam.simulation.coil_history import coil_history
+    >>> from jaxbeam.simulation.derived_histories import coil_history
     >>> loop = jb.actuators.CurrentLoop(bandwidth=2e3)
     >>> case = jb.Case(
     ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.2, modes=2),

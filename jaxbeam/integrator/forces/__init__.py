@@ -1,1 +1,0 @@
-"""Forces that move at constant speeds, in closed form."""

@@ -1,0 +1,417 @@
+"""Integration of the batches of a sweep in C: what C needs to know, and events of sampled loops.
+
+The inputs of batches that share a model are made in NumPy, without a compiler. The events of a
+sampled loop are the functions of `sampled_loop`, traced and translated (`runtime/c_translation`),
+for eight runs at once. Numbers of the loop are arguments, so that loops of one structure share the
+compiled code.
+"""
+
+import dataclasses
+import functools
+import itertools
+import threading
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxbeam.case.case import Case, concrete_case, structure_of
+from jaxbeam.integrator import native_peaks
+from jaxbeam.integrator.growth import growth_limit, load_amplitude
+from jaxbeam.integrator.inputs import StepInfo
+from jaxbeam.integrator.peaks import Peaks
+from jaxbeam.integrator.time_grid import event_places, grid_between_events, grid_by_schedule
+from jaxbeam.model.load_set import WheelSet, load_set
+from jaxbeam.model.modal_model import ModalModel, has_coupling, modal_model
+from jaxbeam.model.modes import mesh_layout
+from jaxbeam.model.sensing.output_rows import corrected_places
+from jaxbeam.runtime.c_translation import Translation
+from jaxbeam.runtime.c_writer import (
+    HEADERS,
+    CArray,
+    UntranslatedError,
+    Writer,
+    kind_of,
+    used_variables,
+    without_unused,
+)
+from jaxbeam.runtime.native_library import Library
+from jaxbeam.runtime.remembering import remembered
+from jaxbeam.runtime.vectorised import NotVectorisedError, vectorised
+from jaxbeam.simulation.closed_loop import closed_loop
+from jaxbeam.simulation.sampled_loop import LoopMemory, SampledLoop
+from jaxbeam.sweeps.batches import Batches, values_at
+from jaxbeam.sweeps.integration import Outputs, Program, outputs_of
+from jaxbeam.sweeps.step_size import PathEvents
+
+UNUSED = CArray("d", (), "", False)
+HEAD = """
+void process_event(const void *const *inputs, int64_t event, double time, Register *memory,
+                   const Register *state, Register *commands) {
+"""
+
+MAX_DESIGNS = 64  # laws of more batches are sooner designed by one program
+LOOP_HEADERS = "registers.h", "translated.h"
+GROUP_RUNS = 4096  # whose inputs are made at once; those of 512 take as long
+
+
+class TranslatedLoop(NamedTuple):
+    """C code of the events of a loop, its arguments, and its memory at the start of a run.
+
+    `failures` is the place in the memory of the number of samples without a solution.
+    """
+
+    text: str
+    inputs: tuple[np.ndarray, ...]
+    memory: Float[np.ndarray, " memory"]
+    failures: int
+
+
+def translated_loop(loop: SampledLoop) -> TranslatedLoop:
+    """Events of a loop in C.
+
+    Raises UntranslatedError for a loop with a part that is not translated: accelerations, which
+    follow from the contact forces, and a law with other functions than `c_translation` has.
+    """
+    if loop.measured_rows is not None:
+        raise UntranslatedError("readings of accelerations")
+    numbers, rest = eqx.partition(loop, _is_number)
+    numbers, memory = (jax.tree.map(np.asarray, tree) for tree in (numbers, loop.start(1)))
+
+    def process(numbers, event, time, memory, state):
+        own = eqx.combine(numbers, rest)
+        memory = own._process_event(memory, state, StepInfo(time, jnp.zeros(()), event))
+        return own.path.acting(memory.commands), memory
+
+    state = np.zeros((loop.model.state_count, 1))
+    closed = jax.make_jaxpr(process)(numbers, np.int64(0), np.float64(0), memory, state)
+    jaxpr = without_unused(closed.jaxpr)
+    variables = [*jaxpr.constvars, *jaxpr.invars]
+    used = used_variables(jaxpr)
+    arrays = [*map(np.asarray, closed.consts), *jax.tree.leaves(numbers)]
+    arrays = [a if v in used else None for a, v in zip(arrays, variables, strict=False)]
+    leaves = jax.tree.leaves(memory)
+    text = _text(jaxpr, arrays, leaves, state)
+    place = sum(np.size(leaf) for leaf in leaves[:-1])  # failures are the last
+    assert isinstance(memory, LoopMemory)
+    start = np.concatenate([np.ravel(leaf).astype(float) for leaf in leaves])
+    given = tuple(_as_argument(array) for array in arrays if array is not None)
+    return TranslatedLoop(text, given, start, place)
+
+
+def _is_number(leaf: Any) -> bool:
+    """Whether a leaf is a number that another loop of the same structure may have otherwise."""
+    return isinstance(leaf, np.ndarray | np.generic | float | jax.Array) and jnp.issubdtype(
+        jnp.result_type(leaf), jnp.floating
+    )
+
+
+def _as_argument(array) -> np.ndarray:
+    """An array as C takes it: of float64 or int64."""
+    kind = float if np.issubdtype(np.asarray(array).dtype, np.floating) else np.int64
+    return np.ascontiguousarray(array, kind)
+
+
+def _text(jaxpr, arrays, leaves, state) -> str:
+    """File of C of the program of an event."""
+    writer = Translation()
+    given: list[CArray] = []
+    number = itertools.count()
+    for array in arrays:
+        if array is None:
+            given.append(UNUSED)
+            continue
+        value = CArray(kind_of(array), np.shape(array), writer.new_name(), False)
+        writer.line(f"const {value.type} *{value.name} = inputs[{next(number)}];")
+        given.append(value)
+    event, time = CArray("i", (), "&event", False), CArray("d", (), "&time", False)
+    given += [event._replace(name="(&event)"), time._replace(name="(&time)")]
+    place, kept = 0, []
+    for leaf in leaves:
+        stored = CArray("d", leaf.shape, f"(memory + {place})", True)
+        kept.append(stored)
+        given.append(_loaded(writer, stored, kind_of(leaf)))
+        place += leaf.size
+    given.append(CArray("d", state.shape, "state", True))
+    commands, *after = writer.run(jaxpr, given)
+    writer.copy(CArray("d", commands.shape, "commands", True), commands)
+    for stored, value in zip(kept, after, strict=True):
+        writer.copy(stored, writer.converted(value, "d"))
+    return "\n".join([HEADERS + HEAD.rstrip("\n"), *writer.lines, "}", ""])
+
+
+def _loaded(writer: Writer, stored: CArray, kind: str) -> CArray:
+    """A part of the memory, which the program may change while it reads it."""
+    texts = {"d": "{}", "i": "__builtin_convertvector({}, Mask)", "b": "{} != 0"}
+    return writer.each(texts[kind], kind, stored.shape, [stored], True)
+
+
+class NativeLoops:
+    """Sampled loops of the batches of a sweep in C, whose law is designed once where it is one.
+
+    Raises NotVectorisedError where a loop cannot be translated or compiled.
+    """
+
+    def __init__(self, program: Program, batches: Batches):
+        self.program, self.batches = program, batches
+        self._policy = functools.cache(self._policy_of)
+        self.shared = self._is_shared()
+        if not self.shared and len(batches.shared_values) > MAX_DESIGNS:
+            raise NotVectorisedError("a law for each of many runs")
+        designs = range(1 if self.shared else len(batches.shared_values))
+        try:
+            self.translations = [translated_loop(self._policy(batch)) for batch in designs]
+            first = self.translations[0]
+            if any(one.text != first.text for one in self.translations):
+                raise NotVectorisedError("laws of several structures")
+            library = Library((), LOOP_HEADERS, (), first.text)
+            if not library.available():
+                library.build()
+            self.process = library.load().process_event
+        except (UntranslatedError, RuntimeError) as error:
+            raise NotVectorisedError(str(error)) from error
+        commands = len(program.case.actuators)
+        self.loop = native_peaks.NativeLoop(self.process, commands, first.failures)
+        self.addresses = np.array(
+            [[array.ctypes.data for array in one.inputs] for one in self.translations], np.int64
+        )
+
+    def model_inputs(self) -> dict[str, Any]:
+        """Those of the `NativeInputs` that the model of the loop determines, which all share."""
+        policy = self._policy(0)
+        return native_peaks.loop_model_inputs(
+            policy.model, *outputs_of(self.program.case, policy.model)
+        )
+
+    def of_batches(
+        self, batch_indices, max_steps, extra_steps, events, loads
+    ) -> dict[str, np.ndarray | None]:
+        """Those of the `NativeInputs` that differ between batches; see `KnownInputs.of_batches`.
+
+        From the times of the load events, and from cubics and wheels of the loads.
+        """
+        rows, schedule = [], self.program.schedule
+        windows, times = events
+        cubics, wheels = loads
+        for row, batch in enumerate(batch_indices):
+            case = self.program.case_with(self.batches.shared_values[batch])
+            longest = schedule.lengths.max()
+            substeps = int(np.ceil(longest / max_steps[row])) + int(extra_steps[row])
+            own = windows[row], times[row]
+            grid = grid_by_schedule(
+                case, self._policy(0).model, schedule, substeps, known_events=own
+            )
+            paths = jax.tree.map(lambda part, row=row: part[row], (cubics, wheels))
+            of_batch = native_peaks.batch_inputs(grid, *paths)
+            of_batch |= {"lengths_of_panels": grid.length_index, "events": grid.event}
+            rows.append(of_batch)
+        design = np.zeros(len(batch_indices), int) if self.shared else batch_indices
+        starts = np.stack([self.translations[i].memory for i in design])
+        found = {
+            name: None if part is None else np.stack([one[name] for one in rows])
+            for name, part in rows[0].items()
+        }
+        return found | {"memory": starts, "loop_numbers": self.addresses[design]}
+
+    def integrate(
+        self,
+        batch_indices: Int[np.ndarray, " path"],
+        max_loads: int,
+        mask: Bool[np.ndarray, " path"],
+        inputs: native_peaks.NativeInputs,
+    ) -> dict[str, np.ndarray]:
+        """Results by name; those of runs that diverge are NaN."""
+        found = native_peaks.integrate_loops(max_loads, mask, inputs, self.loop)
+        peaks, failures, amplitudes = found
+        for row in np.flatnonzero(mask):
+            grown = np.moveaxis(amplitudes[row], -1, 0)
+            if not np.isfinite(growth_limit(grown, np.zeros(grown.shape[1]))).any():
+                continue
+            least = self._least_amplitude(int(batch_indices[row]))
+            failed = grown[0] > growth_limit(grown, least)
+            for part in peaks:
+                part[row, failed] = np.nan
+        return Peaks(*peaks)._asdict() | {"controller_failures": failures}
+
+    def _least_amplitude(self, batch: int) -> Float[np.ndarray, " run"]:
+        """Amplitudes from which growth is divergence, of the runs of a batch."""
+        if self.program.case.controller.open_loop:
+            return np.full(self.batches.run_index.shape[1], np.inf)
+        shared = self.batches.shared_values[batch]
+        loads = self.program.loads(shared, self.batches.batched_values[batch])
+        model = self._policy(0).plant.modal_model
+        return np.asarray(load_amplitude(self.program.case_with(shared), model, loads))
+
+    def _policy_of(self, batch: int) -> SampledLoop:
+        case = self.program.case_with(self.batches.shared_values[batch])
+        layout = self.program.shapes.layout
+        loop = closed_loop(case, layout, load_set(case, layout), self.program.schedule)
+        assert isinstance(loop, SampledLoop)
+        return loop
+
+    def _is_shared(self) -> bool:
+        """Whether all batches have one law: it depends on no number that differs between them."""
+        controller = self.program.case.controller
+        if controller.design_depends_on_loads or controller.design_depends_on_paths:
+            return len(self.batches.shared_values) == 1
+        return not any(name.startswith("controller.") for name in self.batches.shared_addresses)
+
+
+class KnownModel(NamedTuple):
+    """What a structure determines: its modal model, and the outputs of its sensors.
+
+    At the `event_places` (m) a passing wheel is a load event.
+    """
+
+    model: ModalModel
+    outputs: Outputs
+    event_places: Float[np.ndarray, " place"]
+
+
+def known_model(case: Case) -> KnownModel:
+    """Model that all batches share whose loads and settings of the run alone differ."""
+    return _model_of(structure_of(concrete_case(case)))
+
+
+@remembered
+def _model_of(structure: Case) -> KnownModel:
+    layout = mesh_layout(structure)
+    model = modal_model(structure, layout, has_coupling(structure))
+    places = event_places(model, corrected_places(structure, model, structure.sensors))
+    found = KnownModel(model, outputs_of(structure, model), places)
+    return jax.tree.map(np.asarray, found)
+
+
+class KnownInputs:
+    """Inputs of the C integrator of batches of known numbers that share a model and outputs.
+
+    `events` are those of all paths. Raises NotVectorisedError where loads cannot be vectorised.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        known: KnownModel,
+        events: PathEvents,
+        batches: Batches,
+    ):
+        self.program, self.batches = program, batches
+        self.known, self.loops = known, None
+        self.events = events, values_at(program.case, batches, "run.duration")
+        with np.errstate(all="ignore"):  # as in compiled code
+            if program.schedule is None:
+                of_model = native_peaks.model_inputs(known.model, *known.outputs)
+            else:
+                self.loops = NativeLoops(program, batches)
+                of_model = self.loops.model_inputs()
+        self.of_model = {
+            name: None if part is None else part[None] for name, part in of_model.items()
+        }
+        # Those of large sweeps are made for each call; a single batch tells whether they can be.
+        count, runs = batches.run_index.shape
+        few = count * runs <= GROUP_RUNS
+        loads = _paths_and_wheels(program, batches, np.arange(count if few else 1))
+        self.all_loads = loads if few else None
+
+    def of_batches(
+        self,
+        batch_indices: Int[np.ndarray, " task"],
+        max_steps: Float[np.ndarray, " task"],
+        extra_steps: Int[np.ndarray, " task"],
+    ) -> native_peaks.NativeInputs:
+        """Inputs of some batches, with steps (s) at most and extra steps in each panel."""
+
+        def of_batch(events, duration, max_step, extra_steps, *loads):
+            grid = grid_between_events(events, duration, max_step, extra_steps)
+            return native_peaks.batch_inputs(grid, *loads)
+
+        events = jax.tree.map(lambda part: part[batch_indices], self.events)
+        with np.errstate(all="ignore"):
+            loads = self._loads(batch_indices)
+            if self.loops is None:
+                found = vectorised(of_batch)(*events, max_steps, extra_steps, *loads)
+            else:
+                stepping = max_steps, extra_steps, events[0]
+                found = self.loops.of_batches(batch_indices, *stepping, loads)
+        if native_peaks.has_courses(self.program.case):
+            found |= self._over_time(batch_indices, loads[1], found)
+        return native_peaks.NativeInputs(**self.of_model, **found)
+
+    def _over_time(self, batch_indices, wheels: WheelSet, found) -> dict[str, np.ndarray]:
+        """Inputs of batches that are functions of time, for the steps that have been found."""
+        batches = []
+        for row, batch in enumerate(batch_indices):
+            case = self.program.case_with(self.batches.shared_values[batch])
+            own = jax.tree.map(lambda part, row=row: part[row], wheels)
+            loads = load_set(case, self.program.shapes.layout)
+            batches.append(dataclasses.replace(loads, wheels=own))
+        names = "panel_starts", "step_counts", "step_lengths"
+        starts, counts, lengths = (found[name] for name in names)
+        if self.loops is not None:
+            lengths = np.take_along_axis(lengths, found["lengths_of_panels"], axis=1)
+        panels = starts, counts, lengths
+        swept = any(name.startswith("profile.") for name in self.batches.shared_addresses)
+        return native_peaks.inputs_over_time(batches, *panels, one_profile=not swept)
+
+    def of_blocks(
+        self, max_steps: Float[np.ndarray, " path"], batches_per_block: int, most_batches: int
+    ) -> Callable[[int], native_peaks.NativeInputs]:
+        """Function of a block's number: its inputs, which are made for several blocks at once.
+
+        `max_steps` (s) are those of all batches, of which inputs of `most_batches` are made at once
+        if a block has no more.
+        """
+        count, runs = self.batches.run_index.shape
+        most = max(1, min(GROUP_RUNS // runs, most_batches) // batches_per_block)
+        blocks = min(-(-count // batches_per_block), most)
+        group_size = blocks * batches_per_block
+
+        lock = threading.Lock()  # threads that ask for the same group wait for it
+
+        @functools.lru_cache(maxsize=4)  # blocks are taken in their order, by few threads
+        def of_group(group: int) -> native_peaks.NativeInputs:
+            batch_indices = np.arange(group * group_size, (group + 1) * group_size) % count
+            no_more = np.zeros(batch_indices.size, int)
+            return self.of_batches(batch_indices, max_steps[batch_indices], no_more)
+
+        def of_block(block: int) -> native_peaks.NativeInputs:
+            group, place = divmod(block, blocks)
+            rows = slice(place * batches_per_block, (place + 1) * batches_per_block)
+            with lock:
+                inputs = of_group(group)
+            return inputs_of_rows(inputs, rows)
+
+        return of_block
+
+    def integrate(self, batch_indices, mask, inputs: native_peaks.NativeInputs):
+        """Results (path, batch, ...) by name of batches with these inputs."""
+        max_loads = self.program.shapes.max_loads
+        if self.loops is None:
+            return native_peaks.integrate_peaks(max_loads, mask, inputs)._asdict()
+        return self.loops.integrate(batch_indices, max_loads, mask, inputs)
+
+    def _loads(self, batch_indices):
+        """Cubics and wheels of the loads of some batches."""
+        if self.all_loads is None:
+            return _paths_and_wheels(self.program, self.batches, batch_indices)
+        return jax.tree.map(lambda part: part[batch_indices], self.all_loads)
+
+
+def _paths_and_wheels(program: Program, batches: Batches, batch_indices):
+    def of_batch(*values):
+        loads = program.loads(*values)
+        return loads.cubics(), loads.wheels
+
+    values = batches.shared_values[batch_indices], batches.batched_values[batch_indices]
+    with np.errstate(all="ignore"):
+        return vectorised(of_batch)(*values)
+
+
+def inputs_of_rows(inputs: native_peaks.NativeInputs, rows) -> native_peaks.NativeInputs:
+    """Inputs of some of the batches; what all share stays as it is."""
+    parts = (part if part is None or len(part) == 1 else part[rows] for part in inputs)
+    return native_peaks.NativeInputs(*parts)
