@@ -253,10 +253,12 @@ def flat_index(index: Sequence[str], strides: Sequence[int], first: Any = 0) -> 
 
 
 def clipped(start: str, most: int) -> str:
+    """An index within 0 and the `most`, as XLA clips it."""
     return f"within({start}, {most})"
 
 
 def filled(number: str, kind: str, varying: bool) -> str:
+    """A number of one run, for all runs of a register where they vary."""
     return PROMOTED[kind].format(number) if varying else number
 
 
