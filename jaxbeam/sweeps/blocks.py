@@ -3,6 +3,7 @@
 Sensors that are too many for one integration are integrated in groups, one after the other.
 """
 
+import contextlib
 import dataclasses
 import functools
 import os
@@ -22,16 +23,19 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import has_coupling
 from jaxbeam.runtime.vectorised import NotVectorisedError
 from jaxbeam.simulation.closed_loop import loop_schedule
-from jaxbeam.simulation.integration_plan import sample_times, steps_per_interval
+from jaxbeam.simulation.integration_plan import (
+    runs_compiled,
+    sample_times,
+    steps_per_interval,
+)
 from jaxbeam.sweeps.batches import Batches, common_layout, swept_masses
 from jaxbeam.sweeps.integration import (
     CompiledBatches,
-    KnownBatches,
+    NumpyBatches,
     Program,
     in_sequence,
-    suits_numpy,
 )
-from jaxbeam.sweeps.native_integration import KnownInputs, inputs_of_rows, known_model
+from jaxbeam.sweeps.native_integration import NativeBatches, known_model
 from jaxbeam.sweeps.step_size import (
     PathTimes,
     Trials,
@@ -52,6 +56,9 @@ MAX_TRIAL_RUNS = 256  # about; runs per call while step sizes are measured
 MIN_TRIAL_BATCHES = 4  # for which step sizes are measured
 MAX_CHECKED_RUNS = 256  # of paths of their own: to check all takes three times as long
 MAX_TRIAL_BATCHES = 16  # more of one run each cost more than the steps that they would save
+# Paths and runs up to which NumPy gives the first answer sooner than a compiler: each path takes
+# some hundredths of a second, programs some seconds.
+MAX_PATHS, MAX_RUNS = 8, 1024
 OF_SENSORS = {"peak_deflection": -1, "peak_time": -1, "deflection": -1}  # axis of the sensors
 
 
@@ -87,7 +94,6 @@ class Runner:
         elif histories:
             self.schedule = sample_schedule(sample_times(case), True, end=case.run.duration)
         self.trials = Trials()
-        self.most_inputs = most_inputs
         self._set_block_size(most_batches)
         # Loads, profiles, settings of the run and controllers do not change the model, which all
         # batches then share; not on several devices, each of which has the models of its part.
@@ -97,17 +103,13 @@ class Runner:
         )
         self.known_model = known_model(case) if same_model and self.devices == 1 else None
         self.program = self._make_program(native)
-        self.known_inputs = self._known_inputs() if native else None
-        needs_inputs = native_peaks.has_courses(case) or case.controller is not None
-        if native and self.known_inputs is None and needs_inputs:
-            self.program = self._make_program(native=False)
+        in_c = self._native_batches(most_inputs) if native else None
         # More threads than cores where some wait for others.
-        waiting = self.known_inputs is None
-        self.pool = ThreadPoolExecutor((os.cpu_count() or 1) * (2 if waiting else 1))
-        self.compiled: CompiledBatches | KnownBatches | None = None
-        if self.known_inputs is None:
-            small = small and suits_numpy(case, batches, self.schedule)
-            self.compiled = self._known_batches() if small else self._compile()
+        self.pool = ThreadPoolExecutor((os.cpu_count() or 1) * (1 if in_c else 2))
+        small = small and suits_numpy(case, batches, self.schedule)
+        self.backend: NativeBatches | NumpyBatches | CompiledBatches = in_c or (
+            self._numpy_batches() if small else self._compile()
+        )
         longest = None
         if self.schedule is not None and case.controller is not None:  # steps end at events
             longest = self.schedule.lengths.max()
@@ -146,18 +148,18 @@ class Runner:
             compilation.result()  # raises its error, if any
         return compiled
 
-    def _known_batches(self) -> KnownBatches:
+    def _numpy_batches(self) -> NumpyBatches:
         """Batches of a small sweep, without a program."""
         known, events = self.known_model, None
         if known is not None and self.schedule is None:
             events = self._path_times.load_events
         model = known and known.model
-        return KnownBatches(self.program, self.batches, model, events, self.schedule)
+        return NumpyBatches(self.program, self.batches, model, events, self.schedule)
 
     def _stable_steps(self) -> Float[np.ndarray, " path"]:
         """Longest stable steps (s), infinite where there is none: a run fails with any step."""
         if self.known_model is None:
-            limits = self.compiled.make_models()
+            limits = self.backend.make_models()
         else:
             loads = load_set(concrete_case(self.case), self.program.shapes.layout)
             limit = max_stable_step(self.known_model.model, loads)
@@ -192,16 +194,19 @@ class Runner:
         found = path_times(case, self.batches.shared_addresses, self.batches.shared_values, places)
         return jax.tree.map(np.asarray, found)
 
-    def _known_inputs(self) -> KnownInputs | None:
-        """What the C integrator needs to know, if all batches share a model; else None."""
-        if self.known_model is None:
-            return None
-        program = self.program._replace(case=concrete_case(self.case))
-        events = self._path_times.load_events
-        try:
-            return KnownInputs(program, self.known_model, events, self.batches)
-        except NotVectorisedError:
-            return None
+    def _native_batches(self, most_inputs: int) -> NativeBatches | None:
+        """Batches in C with inputs made by NumPy, if all share a model; else None.
+
+        Programs then make the inputs of C, unless they lack some.
+        """
+        if self.known_model is not None:
+            program = self.program._replace(case=concrete_case(self.case))
+            given = self.known_model, self._path_times.load_events, self.batches
+            with contextlib.suppress(NotVectorisedError):
+                return NativeBatches(program, *given, self.batches_per_block, most_inputs)
+        if native_peaks.has_courses(self.case) or self.case.controller is not None:
+            self.program = self._make_program(native=False)
+        return None
 
     def choose_step_sizes(self) -> tuple[Float[np.ndarray, " path"], float]:
         """Step sizes (s) of all batches, and the estimated relative error of their peaks.
@@ -209,7 +214,7 @@ class Runner:
         Raises RuntimeError if no time step meets the tolerance.
         """
         count = MIN_TRIAL_BATCHES
-        if isinstance(self.compiled, CompiledBatches):  # calls of a program take equally many
+        if isinstance(self.backend, CompiledBatches):  # calls of a program take equally many
             count = _round_up(count, self.trial_batches)
 
         def peaks(batch_indices, steps, extra_steps, single=False):
@@ -252,7 +257,10 @@ class Runner:
 
         `steps` (s) are those of all batches. Results among the `trials` are not computed again.
         """
-        integrate, known_results = self._block_integrator(steps), trials or Trials()
+        substeps, known_results = None, trials or Trials()
+        if self.histories:
+            substeps = steps_per_interval(float(self.schedule.lengths.max()), steps.min())
+        integrate = self.backend.block_integrator(self._batches_of, steps, substeps, self.single)
         if self.histories or self.single:
             known_results = Trials()  # trials are of peaks, in double precision
 
@@ -271,53 +279,25 @@ class Runner:
         first, count = block * self.batches_per_block, self.batches.run_index.shape[0]
         return np.arange(first, first + self.batches_per_block) % count
 
-    def _block_integrator(self, steps) -> Callable:
-        """Function of a block's number and a mask of its batches: results of those in the mask."""
-        if self.known_inputs is not None:
-            known, limits = self.known_inputs, (self.batches_per_block, self.most_inputs)
-            inputs_of_block = known.of_blocks(steps, *limits)
-            return lambda block, mask: known.integrate(
-                self._batches_of(block), mask, inputs_of_block(block)
-            )
-        substeps = None
-        if self.histories:
-            substeps = steps_per_interval(float(self.schedule.lengths.max()), steps.min())
-
-        def integrate_block(block, mask):
-            rows = self._batches_of(block)
-            stepping = steps[rows], np.zeros(rows.size, int)
-            return self.compiled.integrate(rows, *stepping, mask, substeps, self.single)
-
-        return integrate_block
-
     def _trial_results(self, batch_indices, steps, extra_steps, single):
         """Results of batches by name, on all cores."""
-        known = self.known_inputs is not None
         count = batch_indices.size
-        if known and count > self.most_inputs:
-            found = [
-                self._trial_results(batch_indices[rows], steps[rows], extra_steps[rows], single)
-                for rows in np.array_split(np.arange(count), -(-count // self.most_inputs))
-            ]
-            return {name: np.concatenate([one[name] for one in found]) for name in found[0]}
-        if known:
-            inputs = self.known_inputs.of_batches(batch_indices, steps, extra_steps)
-            calls = os.cpu_count() or 1
-        else:
-            # Two at least, side by side.
-            inputs, calls = None, max(2, -(-count // self.trial_batches))
-
-        def integrate(rows):
-            if inputs is None:
-                few = batch_indices[rows], steps[rows], extra_steps[rows]
-                return self.compiled.integrate_few(*few, single)
-            everyone = np.ones(rows.size, bool)
-            own = batch_indices[rows], everyone, inputs_of_rows(inputs, rows)
-            return self.known_inputs.integrate(*own)
-
-        parts = np.array_split(np.arange(count), min(calls, count))
-        results = list(self.pool.map(integrate, parts))
+        results = []
+        for rows in np.array_split(np.arange(count), -(-count // self.backend.most_at_once)):
+            given = batch_indices[rows], steps[rows], extra_steps[rows], single
+            integrate, calls = self.backend.of_parts(*given, self.trial_batches)
+            results += self.pool.map(integrate, np.array_split(np.arange(rows.size), calls))
         return {name: np.concatenate([one[name] for one in results]) for name in results[0]}
+
+
+def suits_numpy(case: Case, batches: Batches, schedule) -> bool:
+    """Whether a sweep is small enough for NumPy, and its controller runs there."""
+    paths, runs = batches.run_index.shape
+    if not in_sequence() or len(jax.local_devices()) > 1:
+        return False
+    if case.controller is not None and (runs_compiled(schedule) or case.controller.period is None):
+        return False
+    return paths <= MAX_PATHS and paths * runs <= MAX_RUNS
 
 
 def _round_up(count: int, unit: int) -> int:

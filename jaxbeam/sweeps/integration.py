@@ -7,8 +7,9 @@ values. All batches of a block of XLA have equal shapes; `mask` marks those whos
 import contextlib
 import dataclasses
 import functools
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from typing import NamedTuple
 
@@ -52,15 +53,11 @@ from jaxbeam.runtime.compiling import (
 )
 from jaxbeam.runtime.vectorised import NotVectorisedError, vectorised
 from jaxbeam.simulation.closed_loop import closed_loop
-from jaxbeam.simulation.integration_plan import runs_compiled
 from jaxbeam.sweeps.batches import Batches
 from jaxbeam.sweeps.step_size import PathEvents
 
 # Rows of what the sensors measure, and their static correction.
 Outputs = tuple[OutputRows, StaticCorrection | None]
-# Paths and runs up to which NumPy gives the first answer sooner than a compiler: each path takes
-# some hundredths of a second, programs some seconds.
-MAX_PATHS, MAX_RUNS = 8, 1024
 
 
 class Stepping(NamedTuple):
@@ -312,7 +309,35 @@ def _with_model(discrete, model):
     return eqx.tree_at(lambda d: d.model, discrete, model, is_leaf=lambda leaf: leaf is None)
 
 
-class CompiledBatches:
+class Batchwise:
+    """Batches that are integrated in calls of a few, or of a block of them (see `integrate`)."""
+
+    most_at_once = sys.maxsize  # of which calls are made together
+
+    def of_parts(self, batch_indices, steps, extra_steps, single: bool, per_call: int):
+        """Function of some rows of the batches: their results by name; and number of calls."""
+
+        def integrate(rows):
+            return self.integrate_few(batch_indices[rows], steps[rows], extra_steps[rows], single)
+
+        count = batch_indices.size
+        return integrate, min(count, max(2, -(-count // per_call)))  # two at least, side by side
+
+    def block_integrator(self, batches_of: Callable, steps, substeps: int | None, single: bool):
+        """Function of a block's number and a mask of its batches: results of those in the mask.
+
+        `batches_of` a block are its batches, `steps` (s) those of all.
+        """
+
+        def integrate_block(block, mask):
+            rows = batches_of(block)
+            stepping = steps[rows], np.zeros(rows.size, int)
+            return self.integrate(rows, *stepping, mask, substeps, single)
+
+        return integrate_block
+
+
+class CompiledBatches(Batchwise):
     """Batches whose runs compiled programs integrate.
 
     `program` is the data of those of peaks; histories are at the events of the `schedule`. Batches
@@ -474,17 +499,7 @@ def _to_single_precision(leaf):
     return np.asarray(leaf, np.float32 if np.issubdtype(leaf.dtype, np.floating) else np.int32)
 
 
-def suits_numpy(case: Case, batches: Batches, schedule) -> bool:
-    """Whether a sweep is small enough for NumPy, and its controller runs there."""
-    paths, runs = batches.run_index.shape
-    if not in_sequence() or len(jax.local_devices()) > 1:
-        return False
-    if case.controller is not None and (runs_compiled(schedule) or case.controller.period is None):
-        return False
-    return paths <= MAX_PATHS and paths * runs <= MAX_RUNS
-
-
-class KnownBatches:
+class NumpyBatches(Batchwise):
     """Batches whose runs NumPy integrates, one batch after the other; see `CompiledBatches`."""
 
     def __init__(

@@ -9,6 +9,7 @@ compiled code.
 import dataclasses
 import functools
 import itertools
+import os
 import threading
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -190,7 +191,7 @@ class NativeLoops:
     def of_batches(
         self, batch_indices, max_steps, extra_steps, events, loads
     ) -> dict[str, np.ndarray | None]:
-        """Those of the `NativeInputs` that differ between batches; see `KnownInputs.of_batches`.
+        """Those of the `NativeInputs` that differ between batches; see `NativeBatches.of_batches`.
 
         From the times of the load events, and from cubics and wheels of the loads.
         """
@@ -286,10 +287,11 @@ def _model_of(structure: Case) -> KnownModel:
     return jax.tree.map(np.asarray, found)
 
 
-class KnownInputs:
-    """Inputs of the C integrator of batches of known numbers that share a model and outputs.
+class NativeBatches:
+    """Batches of known numbers that share a model and outputs, integrated in C.
 
-    `events` are those of all paths. Raises NotVectorisedError where loads cannot be vectorised.
+    `events` are those of all paths. Inputs are made for at most `most_at_once` batches, unless a
+    block has more. Raises NotVectorisedError where loads cannot be vectorised.
     """
 
     def __init__(
@@ -298,8 +300,11 @@ class KnownInputs:
         known: KnownModel,
         events: PathEvents,
         batches: Batches,
+        block_size: int,
+        most_at_once: int,
     ):
         self.program, self.batches = program, batches
+        self.block_size, self.most_at_once = block_size, most_at_once
         self.known, self.loops = known, None
         self.events = events, values_at(program.case, batches, "run.duration")
         with np.errstate(all="ignore"):  # as in compiled code
@@ -357,18 +362,28 @@ class KnownInputs:
         swept = any(name.startswith("profile.") for name in self.batches.shared_addresses)
         return native_peaks.inputs_over_time(batches, *panels, one_profile=not swept)
 
-    def of_blocks(
-        self, max_steps: Float[np.ndarray, " path"], batches_per_block: int, most_batches: int
-    ) -> Callable[[int], native_peaks.NativeInputs]:
-        """Function of a block's number: its inputs, which are made for several blocks at once.
+    def of_parts(self, batch_indices, steps, extra_steps, single: bool, per_call: int):
+        """Function of some rows of the batches: their results by name; and number of calls."""
+        del single, per_call
+        inputs = self.of_batches(batch_indices, steps, extra_steps)
 
-        `max_steps` (s) are those of all batches, of which inputs of `most_batches` are made at once
-        if a block has no more.
+        def integrate(rows):
+            everyone = np.ones(rows.size, bool)
+            return self.integrate(batch_indices[rows], everyone, inputs_of_rows(inputs, rows))
+
+        return integrate, min(batch_indices.size, os.cpu_count() or 1)
+
+    def block_integrator(self, batches_of: Callable, steps, substeps: int | None, single: bool):
+        """Function of a block's number and a mask of its batches: results of those in the mask.
+
+        `batches_of` a block are its batches, `steps` (s) those of all. Inputs are made for several
+        blocks at once.
         """
+        del substeps, single
         count, runs = self.batches.run_index.shape
-        most = max(1, min(GROUP_RUNS // runs, most_batches) // batches_per_block)
-        blocks = min(-(-count // batches_per_block), most)
-        group_size = blocks * batches_per_block
+        most = max(1, min(GROUP_RUNS // runs, self.most_at_once) // self.block_size)
+        blocks = min(-(-count // self.block_size), most)
+        group_size = blocks * self.block_size
 
         lock = threading.Lock()  # threads that ask for the same group wait for it
 
@@ -376,16 +391,16 @@ class KnownInputs:
         def of_group(group: int) -> native_peaks.NativeInputs:
             batch_indices = np.arange(group * group_size, (group + 1) * group_size) % count
             no_more = np.zeros(batch_indices.size, int)
-            return self.of_batches(batch_indices, max_steps[batch_indices], no_more)
+            return self.of_batches(batch_indices, steps[batch_indices], no_more)
 
-        def of_block(block: int) -> native_peaks.NativeInputs:
+        def integrate_block(block, mask):
             group, place = divmod(block, blocks)
-            rows = slice(place * batches_per_block, (place + 1) * batches_per_block)
+            rows = slice(place * self.block_size, (place + 1) * self.block_size)
             with lock:
                 inputs = of_group(group)
-            return inputs_of_rows(inputs, rows)
+            return self.integrate(batches_of(block), mask, inputs_of_rows(inputs, rows))
 
-        return of_block
+        return integrate_block
 
     def integrate(self, batch_indices, mask, inputs: native_peaks.NativeInputs):
         """Results (path, batch, ...) by name of batches with these inputs."""
