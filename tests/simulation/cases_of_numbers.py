@@ -301,16 +301,22 @@ OF_PROFILES = {
     for kind, profile in PROFILES.items()
 }
 
+LATER = 0.0031  # s
 DESIGN = DesignModel(
     force_per_volt=4.0, stiffness=1500.0, damping=4.0, mass=0.3, speed=2.9, entry_time=0.0231
 )
 
 
-def law(name: str, **changes) -> jb.Case:
-    """An example of a controller with other numbers of the law, and readings that do not jump."""
+def law(name: str, later: float = 0.0, **changes) -> jb.Case:
+    """An example of a controller with other numbers of the law, and readings that do not jump.
+
+    Loads may enter `later` (s), at no time at which something is sampled.
+    """
     case = CONTROLLED[name]
+    loads = (dataclasses.replace(one, entry_time=one.entry_time + later) for one in case.loads)
     return dataclasses.replace(
         case,
+        loads=tuple(loads),
         run=dataclasses.replace(case.run, sample_rate=np.float64(217.3)),
         sensors=tuple(dataclasses.replace(one, resolution=None) for one in case.sensors),
         controller=dataclasses.replace(case.controller, resolution=None, **changes),
@@ -340,22 +346,24 @@ OF_CONTROLLERS = {
         "mpc",
         "gpc",
         "mpc-dual-mode",
-        "lqr-step",
     )
 } | {
+    "lqr-step": law("lqr-step", LATER),
     # Nothing that moves with a period is at one time with what does not.
     "output-feedback": dataclasses.replace(
-        law("output-feedback", delay=np.float64(0.9 * PERIOD)),
+        law("output-feedback", LATER, delay=np.float64(0.9 * PERIOD)),
         sensors=[
-            dataclasses.replace(sensor, sampling_period=2.1 * PERIOD if i == 1 else None)
+            dataclasses.replace(sensor, sampling_period=2.137 * PERIOD if i == 1 else None)
             for i, sensor in enumerate(LATE)
         ],
     ),
     "lqr-inversion": law("lqr-inversion", delay=np.float64(1.9 * PERIOD)),
     "lqr-scheduled": law("lqr-scheduled", speeds=array(2.03, 3.07)),
-    "lqr-integral": law("lqr-integral", state_weight=array(1e4, 1e2, 1.0, 0.1, 0.01)),
+    "lqr-integral": law("lqr-integral", LATER, state_weight=array(1e4, 1e2, 1.0, 0.1, 0.01)),
     "lqr-augmented": law(
-        "lqr-augmented", estimator=jb.MovingHorizon(0.02, 1e-5, weight_deviation=1.0, window=2)
+        "lqr-augmented",
+        LATER,
+        estimator=jb.MovingHorizon(0.02, 1e-5, weight_deviation=1.0, window=2),
     ),
     "lqr-observer": law(
         "lqr-observer",
