@@ -437,7 +437,9 @@ def ravel_pytree(tree) -> tuple[Any, Callable]:
     def unpack(vector):
         parts = zip(leaves, ends, strict=True)
         return structure.unflatten(
-            vector[end - leaf.size : end].reshape(*leaf.shape, *vector.shape[1:]).astype(leaf.dtype)
+            vector[end - leaf.size : end]
+            .reshape((*leaf.shape, *vector.shape[1:]))
+            .astype(leaf.dtype)
             for leaf, end in parts
         )
 
