@@ -18,7 +18,7 @@ FOLDER = Path(problems.__file__).parent
 DIGITS = 12
 
 
-def main() -> None:
+def write_bounds() -> None:
     """Compute and write the bounds and scores of the problems named, or of all."""
     options = parser(__doc__)
     options.add_argument("names", nargs="*", metavar="PROBLEM", help=", ".join(problems.names()))
@@ -69,4 +69,4 @@ def _write(file: str, name: str, content: dict) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    write_bounds()
