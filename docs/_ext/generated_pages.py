@@ -33,6 +33,7 @@ GROUPS = {
         "jaxbeam.sweeps",
     ),
     "analysis": ("Analysis of runs", "jaxbeam.analysis"),
+    "benchmark": ("The benchmark of controllers", "jaxbeam.benchmark"),
     "applications": ("Parts of applications: jaxbeam.api", "jaxbeam.api"),
     "logs": ("Logs and their modes", "tuning.logs", "tuning.modal"),
     "fits": ("Fits, their uncertainty, and weighing", "tuning"),

@@ -238,6 +238,7 @@ def test_descriptions():
 BY_THEMSELVES = (
     "jaxbeam.runtime.",
     "jaxbeam.library.",
+    "jaxbeam.benchmark.",  # of the package
     "jaxbeam.c_code.source",
     "jaxbeam.analysis.assessment.assessment",
     "jaxbeam.app.server",  # of the package
