@@ -95,6 +95,7 @@ def test_parts_of_a_case_follow_from_its_fields():
         "vehicle_sensors": "VehicleSensor",
         "profile": "AbstractProfile",
         "controller": "AbstractController",
+        "contact": "AbstractContact",
         "run": "Run",
     }
     assert {*classes, "title"} == set(Case.__dataclass_fields__)
