@@ -58,8 +58,10 @@ def test_printed_laws(kind):
     case, most = STRIPS[kind]
     case = case_from_dict(case_to_dict(case) | LAWS[kind])
     assert peak_share(case) < most
-    if kind in ("h-infinity", "internal-model-scheduled"):  # linear, the same at all times
-        assert stability_margin(case, verdict_only=True).verdict == "stable"
+    if kind != "lqr":  # whose filter varies with its estimates
+        verdict = stability_margin(case, verdict_only=True).verdict
+        # Nonlinear laws may be unstable about no reading, under a mass that stays.
+        assert verdict == "stable" or kind in ("feedback", "sliding-mode")
 
 
 def test_positive_position_feedback_damps_and_softens():
