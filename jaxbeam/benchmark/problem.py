@@ -63,7 +63,7 @@ class BenchmarkProblem:
 
     def test_load(self, seed: int) -> Float[np.ndarray, " number"]:
         """Numbers of the load of a seed, equally distributed over their ranges."""
-        return self.numbers(uniform_samples(seed, (LOAD_STREAM,), len(self.vary)))
+        return np.asarray(self.numbers(uniform_samples(seed, (LOAD_STREAM,), len(self.vary))))
 
     def with_load(self, case: Case, numbers: Float[Array, " number"]) -> Case:
         """A case with the numbers of a load."""
