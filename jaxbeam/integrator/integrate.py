@@ -332,10 +332,12 @@ def peaks_of_halves(
         pairs = []
         for i, last in enumerate(np.swapaxes(state, 1, 2)):
             own = np.s_[2 * i : 2 * i + 2]
-            path_steps = jax.tree.map(lambda part, own=own: part[own], (path, steps))
-            pairs.append(_end_forces(loads, *path_steps, before[own], last, forces[own]))
+            of_pair = jax.tree.map(lambda part, own=own: part[own], (path, steps))
+            motion = before[own], last, forces[own]
+            pairs.append(_end_forces(loads, of_pair[0], of_pair[1], *motion))
         ends = np.concatenate(pairs)
-    first = initial_peaks(discrete.position_count, *loads.inertia.shape, discrete.magnitude)
+    load_count, batch_size = loads.inertia.shape
+    first = initial_peaks(discrete.position_count, load_count, batch_size, discrete.magnitude)
     inputs = before, forces, ends, None if commands is None else columns[:, count:]
     return update_peaks(first, steps.matrices, path, inputs)
 
