@@ -19,9 +19,8 @@ from jaxbeam.model.state_space import Plant
 from jaxbeam.numerics.discretisation import balance
 from jaxbeam.runtime.arrays import Array, Number, set_at, xp
 
-DIFFERENCE_STEP = (
-    1e-4  # of length, speed and mass of the design; over these derivatives are differences
-)
+# Of length, speed and mass of the design; over these derivatives are differences.
+DIFFERENCE_STEP = 1e-4
 
 
 class ExtendedKalman(AbstractKalmanEstimator):
