@@ -50,19 +50,16 @@ def plot_tuning(
         raise ValueError("there is nothing to draw: give at least one panel")
     max_runs = max(len(panel.labels) for panel in panels)
     figure = drawing_area(ax, (max(7.0, 4.2 * len(panels)), 3.4 + 0.26 * max_runs))
-    grid = figure.subplots(
-        2, len(panels), squeeze=False, height_ratios=[1.2 + 0.22 * max_runs, 1.2]
-    )
-    for axes, panel in zip(grid[0], panels, strict=True):
+    grid = figure.add_gridspec(2, len(panels), height_ratios=[1.2 + 0.22 * max_runs, 1.2])
+    above = [figure.add_subplot(grid[0, i]) for i in range(len(panels))]
+    for axes, panel in zip(above, panels, strict=True):
         _draw(axes, panel)
-    handles, labels = grid[0, 0].get_legend_handles_labels()
+    handles, labels = above[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower right", ncols=3, handlelength=1.2)
-    left, right = min(a.get_xlim()[0] for a in grid[0]), max(a.get_xlim()[1] for a in grid[0])
-    for axes in grid[0]:
+    left, right = min(a.get_xlim()[0] for a in above), max(a.get_xlim()[1] for a in above)
+    for axes in above:
         axes.set_xlim(left, right)
-    for axes in grid[1, 1:]:
-        axes.axis("off")
-    below = grid[1, 0]
+    below = figure.add_subplot(grid[1, :])
     below.plot(history, color=GREY, linewidth=0.7)
     below.plot(np.fmin.accumulate(np.nanmin(history, axis=1)), color=INK, linewidth=1.4)
     below.set(xlabel="step", ylabel="objective", title="search: every start, and the best so far")

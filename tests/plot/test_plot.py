@@ -19,12 +19,14 @@ import jaxbeam.plot
 from jaxbeam.model.frequency_responses import frequency_response
 from jaxbeam.plot import (
     FitPanel,
+    TuningPanel,
     animate,
     plot_envelope,
     plot_fit,
     plot_frequency_response,
     plot_modes,
     plot_record,
+    plot_tuning,
 )
 from jaxbeam.plot.style import INK, format_number, separate_labels, unit_scale
 from tests.plot.figures import CASE, MANY, data, lines_of, words
@@ -351,3 +353,29 @@ def test_envelope_and_modes_on_axes(record):
     assert len(lines_of(left, record.envelope("moment").positions.size)) == 2
     plot_modes(CASE, ax=right, title="shapes")
     assert right.get_title(loc="left") == "shapes" and len(lines_of(right, 401)) == 2
+
+
+def test_tuning():
+    """A panel for each kind of runs, in per cent of no control; the search below all of them."""
+    labels, uncontrolled = ["light", "heavy"], np.array([2.0, 4.0])
+    panels = [
+        TuningPanel(
+            title, labels, uncontrolled, *(share * uncontrolled for share in (0.9, 0.5, 0.2))
+        )
+        for title in ("training runs", "held out runs")
+    ]
+    history = np.array([[0.9, 1.0], [0.95, 0.6], [0.7, np.nan]])
+    figure = plot_tuning(panels, history, "two loads")
+    *above, below = figure.axes
+    assert [axes.get_title("left") or axes.get_title() for axes in above] == [
+        "training runs",
+        "held out runs",
+    ]
+    before, after = (line for line in above[0].lines if line.get_label() in ("before", "after"))
+    assert_allclose(data(before)[0], [90, 90])
+    assert_allclose(data(after)[0], [50, 50])
+    assert_allclose(data(below.lines[-1])[1], [0.9, 0.6, 0.6])  # the best so far
+    figure.draw_without_rendering()
+    assert below.get_position().width > 1.5 * above[0].get_position().width
+    with pytest.raises(ValueError, match="at least one panel"):
+        plot_tuning([], history)
