@@ -59,7 +59,7 @@ export function createModes(store, names) {
     const { names: labels, positions } = result.channels;
     const known = positions.every((/** @type {number | null} */ one) => one !== null);
     const places = known ? positions : labels.map((/** @type {string} */ _, /** @type {number} */ i) => i);
-    const order = [...places.keys()].filter((i) => labels.length > 1).sort((a, b) => places[a] - places[b]);
+    const order = labels.length > 1 ? [...places.keys()].sort((a, b) => places[a] - places[b]) : [];
     if (!order.length) return [];
     const [low, high] = [places[order[0]], places[order[order.length - 1]]];
     const at = (/** @type {number} */ i) => 10 + (160 * (places[i] - low)) / (high - low || 1);
