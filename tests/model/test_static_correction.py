@@ -16,7 +16,9 @@ from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.output_rows import LoadInfluence, sensor_rows, static_correction
 from jaxbeam.model.static_correction import (
+    Motion,
     bending_moment,
+    corrected_history,
     residual_actuator_gain,
     residual_flexibility,
     shear_force,
@@ -236,20 +238,24 @@ def test_wheels_on_the_ground_do_not_bend_the_beam():
 
 
 @pytest.mark.parametrize("quantity", ["moment", "shear", "curvature"])
-@pytest.mark.parametrize("part", ["support", "spring"])
-def test_dampers_in_corrected_rows_by_a_long_series(part, quantity):
-    """What a damper at a presses on the modes left out: -c w'(a) by the series of a pinned beam.
+@pytest.mark.parametrize("part", ["support", "spring", "mass"])
+def test_dampers_and_masses_in_corrected_rows_by_a_long_series(part, quantity):
+    """What a damper or a mass at a presses on the modes left out, by the series of a pinned beam.
 
-    A moment row of the modes left out is row_i(x) phi_i(a) / k_i, summed over 200 000 modes; the
-    spring is so weak that the modes are those of the beam.
+    -c w'(a) and -m w''(a) times row_i(x) phi_i(a) / k_i, summed over 200 000 modes, in rows and in
+    histories; the springs are so weak that the modes are those of the beam.
     """
     length, stiffness, mass, modes = 1.3, 2.0, 0.7, 3
-    at, x, damping = 0.52, 0.33, 0.8
+    at, x, size, derivative = 0.52, 0.33, 0.8, 3 if quantity == "shear" else 2
     sensor = jb.Sensor(x, quantity)
+    devices = {
+        "spring": jb.SpringDamper(at, damping=size),
+        "mass": jb.Electrodynamic(at, 1.0, 1e-3, 1e-9, mass=size),
+    }
     case = jb.Case(
         jb.Beam(length, stiffness, mass, modes=modes),
-        supports=[jb.Support(at, stiffness=1e-9, damping=damping)] if part == "support" else [],
-        actuators=[jb.SpringDamper(at, damping=damping)] if part == "spring" else [],
+        supports=[jb.Support(at, stiffness=1e-9, damping=size)] if part == "support" else [],
+        actuators=[devices[part]] if part in devices else [],
         sensors=[sensor],
         loads=[jb.MovingForce(force=1.0, speed=1.0)],
         run=jb.Run(1.0),
@@ -257,29 +263,36 @@ def test_dampers_in_corrected_rows_by_a_long_series(part, quantity):
     model = modal_model(case, mesh_layout(case), True)
     outputs = sensor_rows(model, case, (sensor,))
     correction = static_correction(model, case, (sensor,), outputs)
-    found, place = correction.rows.rates[0], np.array(at)
-    influence = correction.influence.of_forces_at(place, place)[0]
+    rates, accelerations = correction.rows.rates, correction.rows.accelerations
+    found, other = (accelerations, rates) if part == "mass" else (rates, accelerations)
+    assert other is None or np.abs(other).max() < 1e-15
+    influence = correction.influence.of_forces_at(np.array(at), np.array(at))[0]
     order = np.arange(1, 200_001) * np.pi / length
 
-    def shape(i, place):
-        return np.sqrt(2 / (mass * length)) * np.sin(order[i] * place)
+    def shapes(place):
+        return np.sqrt(2 / (mass * length)) * np.sin(order * place)
 
-    every, kept = np.arange(200_000), np.arange(modes)
-    bend = np.sqrt(2 / (mass * length)) * (
-        order**3 * np.cos(order * x) if quantity == "shear" else order**2 * np.sin(order * x)
-    )
-    factor = outputs.rows[0, 0] / bend[0]  # sign and E I of the quantity
-    k = stiffness / mass * order**4
-    left_out = every[modes:]
-    residual = np.sum((factor * bend * shape(every, at) / k)[left_out])
-    signs = np.sign(np.asarray(model.shapes(np.array(at), (0,))[0]) * shape(kept, at))
-    expected = -damping * residual * shape(kept, at) * signs
-    scale = np.abs(expected).max()
+    waves = order**3 * np.cos(order * x) if derivative == 3 else order**2 * np.sin(order * x)
+    terms = -np.sqrt(2 / (mass * length)) * waves * shapes(at) / (stiffness / mass * order**4)
+    residual = np.sum(terms[modes:])  # of the derivative of w, in 1/(N m) or 1/(N m^2)
+    factor = 1.0 if quantity == "curvature" else stiffness
+    scale = np.abs(factor * residual * size)
     assert scale > 1e-3
-    # That of a load there, per newton upwards, is the same series.
-    assert_allclose(influence, residual * signs[0], rtol=1e-4)
     # The third derivative converges with the square of the number of modes.
-    assert_allclose(found, expected * signs[0], rtol=0, atol=1e-4 * scale)
+    # That of a load there, per newton upwards, is the same series.
+    assert_allclose(influence, factor * residual, rtol=1e-4)
+    at_place = np.asarray(model.shapes(np.array(at), (0,))[0])
+    assert_allclose(found[0], -factor * residual * size * at_place, rtol=0, atol=1e-4 * scale)
+
+    none = np.zeros((2, modes))
+    pushed = np.array([[1.0, 2.0, -3.0], [0.3, 0.0, 0.4]])
+    moving = (none, none, pushed) if part == "mass" else (none, pushed, none)
+    no_load, no_command = np.full((2, 1), np.nan), np.zeros((2, len(case.actuators)))
+    motion = Motion(*moving, no_load, np.zeros((2, 1)), no_command)
+    speed = pushed @ np.asarray(model.modes.shapes(np.array(at)))
+    history = corrected_history(case, model.modes, motion, x, derivative)
+    tolerance = 1e-4 * np.abs(residual * size * speed).max()
+    assert_allclose(history, -residual * size * speed, rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize(("near", "expected"), [(0.0, 1.0), (0.5 - 1e-9, 1.0), (1.0, 2.0)])
