@@ -18,7 +18,7 @@ from docs.draw_rooms import PICTURE, listing, package_imports
 from tests.layers.selection import layers, matches
 from tests.layers.touched import nearest_tests
 from tests.modules import ROOT, module_files, parse
-from tests.mutants.__main__ import left_ones, targets
+from tests.mutants.__main__ import first_fit, left_ones, patterns, targets
 
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 SPANS = re.findall(r"`([^`]+)`", TEXT)
@@ -192,11 +192,16 @@ def test_matrices_are_computed_by_one_thread():
 # Data of the test of the tests: tests that should notice changes, and what may go unnoticed.
 
 
-def test_targets_name_tests_that_exist():
-    files = targets()
-    packages = {name.split("/")[1] for name in files}
-    assert packages == {"model", "case", "integrator", "estimation", "analysis"}
-    for test in sorted({test for own in files.values() for test in own}):
+def test_targets_name_files_and_tests_that_exist():
+    """Each pattern is the first that fits some file, each file of the packages has a pattern."""
+    no_numbers, tests = patterns()
+    files = [path.relative_to(ROOT).as_posix() for path in (ROOT / "jaxbeam").rglob("*.py")]
+    fits = {name: first_fit(name) for name in files}
+    assert {*no_numbers, *tests} == {*fits.values()} - {None}
+    mutated = {name.split("/")[1] for name in targets()}
+    assert mutated == {"model", "case", "integrator", "estimation", "analysis", "simulation"}
+    assert not [n for n in files if fits[n] is None and n.split("/")[1] in mutated]
+    for test in sorted({test for own in tests.values() for test in own}):
         path, _, name = test.partition("::")
         assert (ROOT / path).exists(), test
         assert not name or re.search(rf"^def {name}\(", (ROOT / path).read_text(), re.M), test

@@ -4,7 +4,7 @@
 
 needs the group `mutants` (cosmic-ray). Mutants are drawn with the seed from the files of
 `targets.toml`, in a copy of the repository; each is told to its own tests, the quick ones of a file
-and those named one by one. A file whose tests fail without a change, or take too long, is an error.
+and those named one by one. A test that fails without the change, too, is an error.
 Mutants in `left.toml` may survive, with the reason given there; the exit status is 1 if more than
 LARGEST_SHARE of the others do.
 """
@@ -13,6 +13,7 @@ import argparse
 import fnmatch
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -50,15 +51,29 @@ class Mutant(NamedTuple):
     code: str
 
 
+def patterns() -> tuple[list[str], dict[str, list[str]]]:
+    """Patterns of the files whose numbers no mutant changes, and those of others with their tests.
+
+    The first that fits a file counts, of the former first.
+    """
+    read = tomllib.loads((FOLDER / "targets.toml").read_text())
+    return read["no_numbers"], read["targets"]
+
+
+def first_fit(name: str) -> str | None:
+    """The pattern that counts for a file, or None."""
+    no_numbers, tests = patterns()
+    return next((p for p in (*no_numbers, *tests) if fnmatch.fnmatch(name, p)), None)
+
+
 def targets() -> dict[str, list[str]]:
     """Tests of each file of the library that has some, by its path."""
-    patterns = tomllib.loads((FOLDER / "targets.toml").read_text())["targets"]
-    found = {}
+    tests, found = patterns()[1], {}
     for path in sorted((ROOT / "jaxbeam").rglob("*.py")):
         name = path.relative_to(ROOT).as_posix()
-        pattern = next((p for p in patterns if fnmatch.fnmatch(name, p)), None)
-        if pattern is not None and path.name != "__init__.py":
-            found[name] = patterns[pattern]
+        pattern = first_fit(name)
+        if pattern in tests:
+            found[name] = tests[pattern]
     return found
 
 
@@ -72,23 +87,24 @@ def left_ones() -> list[dict[str, str]]:
     return entries
 
 
-def mutants_of(name: str) -> list[Mutant]:
-    """All mutants of a file, in order."""
+def drawn_mutant(name: str, draw: random.Random) -> Mutant | None:
+    """One of all mutants of a file, each with the same chance; None if there is none."""
     from cosmic_ray.ast import ast_nodes, get_ast  # pyright: ignore[reportMissingImports]
     from cosmic_ray.mutating import mutate_code  # pyright: ignore[reportMissingImports]
     from cosmic_ray.plugins import get_operator  # pyright: ignore[reportMissingImports]
 
-    code, found = (ROOT / name).read_text(), []
-    tree = get_ast(code)
+    code = (ROOT / name).read_text()
+    nodes, changes = list(ast_nodes(get_ast(code))), []
     for operator in (get_operator(each)() for each in OPERATORS):
-        count = sum(len(list(operator.mutation_positions(node))) for node in ast_nodes(tree))
-        for occurrence in range(count):
-            changed = mutate_code(code, operator, occurrence)
-            lines = zip(code.splitlines(), changed.splitlines(), strict=True)
-            pair = next(((a.strip(), b.strip()) for a, b in lines if a != b), None)
-            if pair is not None and _changes_numbers(*pair):
-                found.append(Mutant(name, *pair, changed))
-    return found
+        count = sum(len(list(operator.mutation_positions(node))) for node in nodes)
+        changes += [(operator, occurrence) for occurrence in range(count)]
+    for operator, occurrence in draw.sample(changes, len(changes)):
+        changed = mutate_code(code, operator, occurrence)
+        lines = zip(code.splitlines(), changed.splitlines(), strict=True)
+        pair = next(((a.strip(), b.strip()) for a, b in lines if a != b), None)
+        if pair is not None and _changes_numbers(*pair):
+            return Mutant(name, *pair, changed)
+    return None
 
 
 def _changes_numbers(line: str, after: str) -> bool:
@@ -114,16 +130,18 @@ class Copy:
             else:
                 shutil.copy(source, place)
 
-    def passes(self, tests: list[str], limit: float) -> bool:
-        """Whether all of some tests pass within a limit (s)."""
+    def failure(self, tests: list[str], limit: float) -> str | None:
+        """First of some tests that fails or outlasts a limit (s), or the file; None if all pass."""
         whole = [test for test in tests if "::" not in test]
         single = [test for test in tests if "::" in test]
         runs = [[*whole, "-m", "not slow"]] if whole else []
-        return all(self._run(run, limit) for run in (*runs, *([single] if single else [])))
+        runs += [single] if single else []
+        return next((found for run in runs if (found := self._failure(run, limit))), None)
 
-    def _run(self, arguments: list[str], limit: float) -> bool:
+    def _failure(self, arguments: list[str], limit: float) -> str | None:
         command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "0", "-p", "no:cacheprovider"]
-        environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
+        # What does not change is compiled once for all mutants.
+        environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(self.folder / "compiled")}
         try:
             done = subprocess.run(
                 [*command, *arguments],
@@ -131,10 +149,12 @@ class Copy:
                 env=environment,
                 timeout=limit,
                 capture_output=True,
+                text=True,
             )
         except subprocess.TimeoutExpired:
-            return False
-        return done.returncode == 0
+            return arguments[0]
+        failed = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
+        return None if done.returncode == 0 else failed[1] if failed else arguments[0]
 
 
 def main() -> int:
@@ -151,36 +171,33 @@ def main() -> int:
     drawn = random.Random(options.seed).choices(
         list(tests), [(ROOT / name).stat().st_size for name in tests], k=options.count
     )
-    end, tried, survived, healthy = time.monotonic() + options.seconds, 0, [], {}
+    end, tried, survived = time.monotonic() + options.seconds, 0, []
     tested: set[tuple[str, ...]] = set()
+    healthy: set[str] = set()
     with tempfile.TemporaryDirectory() as folder:
         copy = Copy(folder)
         for i, name in enumerate(drawn):
             if time.monotonic() > end:
                 break
-            some = mutants_of(name)
-            if not some:
-                continue
-            mutant = random.Random(f"{options.seed} {i}").choice(some)
-            if mutant[:3] in tested:
+            mutant = drawn_mutant(name, random.Random(f"{options.seed} {i}"))
+            if mutant is None or mutant[:3] in tested:
                 continue
             tested.add(mutant[:3])
-            key = tuple(tests[name])
-            if key not in healthy:
-                healthy[key] = copy.passes(tests[name], options.limit)
-            if not healthy[key]:
-                print(f"error: without a change the tests of {name} fail", flush=True)
-                return 2
             place = copy.folder / name
             place.write_text(mutant.code)
-            lives = copy.passes(tests[name], options.limit)
+            killer = copy.failure(tests[name], options.limit)
             place.write_text((ROOT / name).read_text())
+            if killer and killer not in healthy and copy.failure([killer], options.limit):
+                print(f"error: without a change {killer} fails", flush=True)
+                return 2
             allowed = mutant[:3] in left
             tried += not allowed
-            if lives and not allowed:
+            if killer is None and not allowed:
                 survived.append(mutant)
-            word = "survives" if lives else "killed"
-            print(f"{word:8s} {name}: {mutant.before}  ->  {mutant.after}", flush=True)
+            if killer:
+                healthy.add(killer)
+            word = f"killed by {killer}" if killer else "survives"
+            print(f"{name}: {mutant.before}  ->  {mutant.after}\n    {word}", flush=True)
     share = len(survived) / max(tried, 1)
     print(f"{len(survived)} of {tried} mutants survive ({share:.0%}); seed {options.seed}")
     return int(share > LARGEST_SHARE)
