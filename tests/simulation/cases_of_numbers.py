@@ -358,7 +358,7 @@ OF_CONTROLLERS = {
         ],
     ),
     "lqr-inversion": law("lqr-inversion", delay=np.float64(1.9 * PERIOD)),
-    "lqr-scheduled": law("lqr-scheduled", speeds=array(2.03, 3.07)),
+    "lqr-scheduled": law("lqr-scheduled", LATER, speeds=array(2.03, 3.07)),
     "lqr-integral": law("lqr-integral", LATER, state_weight=array(1e4, 1e2, 1.0, 0.1, 0.01)),
     "lqr-augmented": law(
         "lqr-augmented",
@@ -432,7 +432,7 @@ OF_CONTROLLERS = {
     ),
     "mpc-scenario": law("mpc-scenario", delays=array(0.0, 2e-3), loads="known"),
     "lqr-finite": law("lqr-finite", design=DESIGN, terminal_weight=array(1e3, 1e2, 1.0, 0.1, 0.0)),
-    "lqr-position": law("lqr-position", masses=array(0.3, 0.5), speeds=array(2.03, 3.07)),
+    "lqr-position": law("lqr-position", LATER, masses=array(0.3, 0.5), speeds=array(2.03, 3.07)),
     "kalman": rig(
         [MASS],
         actuators=CONTROLLED["kalman-known"].actuators,
