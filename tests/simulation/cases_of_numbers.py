@@ -405,6 +405,7 @@ OF_CONTROLLERS = {
     **{
         name: law(
             "moving-horizon",
+            later,
             estimator=jb.MovingHorizon(
                 0.02,
                 1e-5,
@@ -415,17 +416,22 @@ OF_CONTROLLERS = {
                 deflection_limit=3e-4,
             ),
         )
-        for name, low, high in (
-            ("moving-horizon", 0.5, 3.6),
-            ("moving-horizon of a heavy load", 4.5, 9.0),
+        for name, later, low, high in (
+            ("moving-horizon", 0.0, 0.5, 3.6),
+            ("moving-horizon of a heavy load", LATER, 4.5, 9.0),
         )
     },
     "design with a patch": law("compensation-kalman", design=DesignModel(correction=0.8)),
     "gpc-adaptive": law(
-        "gpc-adaptive", until=np.float64(0.1213), output_weight=array(2.0), reference=array(1e-4)
+        "gpc-adaptive",
+        LATER,
+        until=np.float64(0.1213),
+        output_weight=array(2.0),
+        reference=array(1e-4),
     ),
     "mpc-soft": law(
         "mpc-soft",
+        LATER,
         output_weight=array(1.0, 2.0),
         horizon_weight=array(1.0, 1.1, 1.2, 1.3, 1.4, 1.5),
         positions=array(0.2, 0.4),

@@ -60,16 +60,13 @@ NEVER_OF_EFFECT = {
 # Cases whose derivatives are still to be compared.
 OPEN = {
     "articulated vehicles",
-    "moving-horizon of a heavy load",
     "dlqr-kalman",
     "mpc-dual-mode",
-    "gpc-adaptive",
     "h-infinity",
     "kalman",
     "kalman-extended",
     "lqr-finite",
     "mpc-scenario",
-    "mpc-soft",
 }
 
 
