@@ -59,7 +59,6 @@ NEVER_OF_EFFECT = {
 }
 # Cases whose derivatives are still to be compared.
 OPEN = {
-    "articulated vehicles",
     "dlqr-kalman",
     "mpc-dual-mode",
     "h-infinity",
