@@ -1,6 +1,7 @@
 """Command `compare`: controllers on a case, beside the least achievable peak."""
 
 import itertools
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,6 +23,7 @@ def compare(
     controllers: Annotated[tuple[Path, ...], Parameter(consume_multiple=True)] = (),
     over: Over = (),
     cases: Path | None = None,
+    faults: Annotated[bool, Parameter(negative="")] = False,
     period: float | None = None,
     output: Output = None,
     pictures: DrawingOptions = DrawingOptions(),
@@ -41,6 +43,10 @@ def compare(
         plants, delays, errors of gates (`controller.gate_errors.0`) and sensors, listed or drawn.
         Laws do not know what differs of beam, supports, actuators and sensors; a law drawn by hand
         is added.
+    faults
+        Compare under faults of which the laws do not know: 1 and 5 % of the readings lost, each
+        sensor in turn stuck, readings and commands late by up to a fifth of the period, 12-bit
+        converters, 15 % less rigidity.
     period
         Time (s) for which commands are held in the least achievable peak; if left out, the
         shortest period of the controllers, or 0.01.
@@ -52,6 +58,8 @@ def compare(
     refuse_option(bool(output and over), "a picture shows one load case: leave out -o or --over")
     refuse_option(bool(cases and over), "--cases has runs of its own: leave out --over")
     refuse_option(bool(output and cases), "a picture shows one load case: leave out -o or --cases")
+    apart = faults and bool(output or over or cases)
+    refuse_option(apart, "--faults prints a table of its own: leave out -o, --over and --cases")
     options.check_outputs(output)
     if cases is not None:
         check_exists("file of load cases", cases)
@@ -66,6 +74,9 @@ def compare(
     laws = _read_controllers(case, parsed_case, controllers)
     if cases is not None:
         _report_runs(parsed_case, laws, cases, period, options)
+        return
+    if faults:
+        _report_faults(parsed_case, laws, period, options)
         return
     runs = [dict(zip(values, row, strict=True)) for row in itertools.product(*values.values())]
     load_cases = [jb.replace(parsed_case, run) for run in runs]
@@ -129,6 +140,49 @@ def _report_runs(case, laws, path: Path, period, options: CaseOptions) -> None:
     )
 
 
+def _report_faults(case, laws, period, options: CaseOptions) -> None:
+    """Report the worst peaks of the controllers under each fault."""
+    from jaxbeam.analysis.loop_faults import compare_under_faults
+    from jaxbeam.case.validation import check_case
+
+    check_case(case)
+    worst, least = compare_under_faults(case, laws, period)
+    cells = [
+        (
+            name,
+            *(
+                "-" if one is None else f"{round(one.share, 3) + 0.0:.1%}"
+                for one in of_faults.values()
+            ),
+        )
+        for name, of_faults in worst.items()
+    ]
+    lines = [
+        _bound_line(least),
+        "share of the attainable reduction, at worst, under faults that the laws do not know:",
+        *table(("controller", *next(iter(worst.values()))), cells),
+    ]
+    for name, of_faults in worst.items():
+        if None in of_faults.values():
+            lines.append(f"{name}: acts in continuous time, without samples to lose")
+        for fault, one in of_faults.items():
+            if one is not None and one.is_worse_than_none:
+                ratio = f"{one.peak / one.uncontrolled:.3g} times the peak without control"
+                how = "it diverges" if math.isnan(one.peak) else ratio
+                lines.append(f"{name}, {fault}{one.at and f' ({one.at})'}: {how}")
+    options.report(
+        _bound_to_dict(least)
+        | {
+            "faults": {
+                name: {fault: one and one._asdict() for fault, one in of_faults.items()}
+                for name, of_faults in worst.items()
+            }
+        },
+        lines,
+        None,
+    )
+
+
 def _read_controllers(path: Path, case: "jb.Case", files: tuple[Path, ...]) -> dict:
     """Controllers by name: that of the case, if any, and those of the files.
 
@@ -148,11 +202,7 @@ def _read_controllers(path: Path, case: "jb.Case", files: tuple[Path, ...]) -> d
 
 def _to_dict(comparison: "Comparison") -> dict:
     """Numbers of a comparison by their names in JSON (SI units)."""
-    bound = comparison.bound
-    return {
-        "uncontrolled_peak": bound.uncontrolled,
-        "least_peak": bound.peak,
-        "held_for": bound.period,
+    return _bound_to_dict(comparison.bound) | {
         "controllers": {
             name: _metrics_to_dict(metrics)
             | {
@@ -161,6 +211,14 @@ def _to_dict(comparison: "Comparison") -> dict:
             }
             for name, metrics in comparison.metrics.items()
         },
+    }
+
+
+def _bound_to_dict(bound: "jb.Bound") -> dict:
+    return {
+        "uncontrolled_peak": bound.uncontrolled,
+        "least_peak": bound.peak,
+        "held_for": bound.period,
     }
 
 
@@ -200,11 +258,7 @@ def _metrics_to_dict(metrics: "PerformanceMetrics") -> dict:
 
 
 def _lines(comparison: "Comparison") -> list[str]:
-    bound = comparison.bound
-    lines = [
-        f"no control: peak {bound.uncontrolled:.6g} m; no controller that holds its commands for "
-        f"{bound.period:g} s gets below {bound.peak:.6g} m, {bound.reduction:.1%} less"
-    ]
+    lines = [_bound_line(comparison.bound)]
     lines += table(
         (
             "controller",
@@ -242,6 +296,13 @@ def _lines(comparison: "Comparison") -> list[str]:
         verdicts = filter(None, (comparison.loop_summary(name), record.verdict))
         lines.append(f"{name}: {'; '.join(verdicts)}")
     return lines
+
+
+def _bound_line(bound: "jb.Bound") -> str:
+    return (
+        f"no control: peak {bound.uncontrolled:.6g} m; no controller that holds its commands for "
+        f"{bound.period:g} s gets below {bound.peak:.6g} m, {bound.reduction:.1%} less"
+    )
 
 
 def _margin_text(metrics: "PerformanceMetrics", number: float) -> str:

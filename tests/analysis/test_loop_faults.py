@@ -1,0 +1,145 @@
+"""Laws under faults of their loops: what a fault is, who knows of it, and the command's table."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.analysis.loop_faults import FAULTS, FaultedPeak, compare_under_faults
+from jaxbeam.cli import main
+
+FORCE = 4.0  # N
+
+
+def strip(**changes) -> jb.Case:
+    """A strip of one mode whose commands are held for 10 ms, so that its bound is found at once."""
+    parts = {
+        "beam": jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=1),
+        "actuators": [jb.PointForce(0.3, limits=[-FORCE, FORCE])],
+        "sensors": [jb.Sensor(0.3)],
+        "loads": [jb.MovingMass(mass=0.3, speed=1.5)],
+        "run": jb.Run(0.5, sample_rate=200.0),
+    }
+    return jb.Case(**(parts | changes))
+
+
+FEEDBACK = jb.Feedback(gains=[800.0], period=0.01)
+CASE = strip(controller=FEEDBACK)
+UNCONTROLLED = jb.simulate(strip())
+
+
+def of_fault(name: str, case: jb.Case = CASE) -> dict[str, jb.Case]:
+    return next(fault for fault in FAULTS if fault.name == name).variants(case, UNCONTROLLED)
+
+
+def peak_of(case: jb.Case) -> float:
+    return float(np.max(jb.simulate(case).peak_deflection))
+
+
+WRONG_SIGN = dataclasses.replace(FEEDBACK, gains=[-400.0])
+SOFT = tuple(fault for fault in FAULTS if fault.name == "E I -15 %")
+OF_ONE_RUN = tuple(fault for fault in FAULTS if fault.name in ("none", "stuck"))
+
+
+@pytest.fixture(scope="module")
+def compared():
+    laws = {"feedback": FEEDBACK, "wrong sign": WRONG_SIGN}
+    return compare_under_faults(strip(), laws, faults=OF_ONE_RUN)
+
+
+def test_a_stuck_sensor_leaves_feedback_without_effect(compared):
+    stuck = compared[0]["feedback"]["stuck"]
+    assert_allclose(stuck.peak, peak_of(strip()), rtol=1e-9)
+    assert_allclose(stuck.share, 0.0, atol=1e-8)
+    assert stuck.at == "sensor 0"
+
+
+def test_a_stuck_sensor_reads_what_it_did_before_the_load():
+    case = strip(controller=FEEDBACK, sensors=[jb.Sensor(0.3, offset=1e-4), jb.Sensor(0.2)])
+    free = jb.simulate(dataclasses.replace(case, controller=None))
+    stuck = next(fault for fault in FAULTS if fault.name == "stuck").variants(case, free)
+    assert list(stuck) == ["sensor 0", "sensor 1"]
+    readings = jb.simulate(dataclasses.replace(stuck["sensor 0"], controller=None)).measured
+    assert_allclose(readings[:, 0], 1e-4, rtol=1e-6)
+    assert np.ptp(readings[:, 1]) > 1e-4
+
+
+def test_less_rigidity_is_not_known_to_the_design():
+    law = jb.LQR(state_weight=[1e6, 1.0], command_weight=[1.0], period=0.01)
+    found, _ = compare_under_faults(strip(), {"lqr": law}, faults=SOFT)
+    soft = strip(beam=dataclasses.replace(CASE.beam, flexural_rigidity=0.85 * 11.68))
+    informed = peak_of(dataclasses.replace(soft, controller=law))
+    nominal = dataclasses.replace(law, nominal_plant=jb.state_space(strip()))
+    assert_allclose(
+        found["lqr"]["E I -15 %"].peak, peak_of(dataclasses.replace(soft, controller=nominal))
+    )
+    assert abs(found["lqr"]["E I -15 %"].peak / informed - 1) > 1e-4
+    assert_allclose(found["lqr"]["E I -15 %"].uncontrolled, peak_of(soft), rtol=1e-6)
+
+
+@pytest.mark.parametrize("fraction", [0.01, 0.05])
+def test_readings_are_lost_as_often_as_said(fraction):
+    cases = of_fault(f"{100 * fraction:g} % lost")
+    assert len({case.run.seed for case in cases.values()}) == 5
+    for case in cases.values():
+        assert [sensor.dropout for sensor in case.sensors] == [fraction]
+
+
+def test_readings_and_commands_are_late_by_a_fifth_of_the_period():
+    for case in of_fault("late").values():
+        assert_allclose([case.sensors[0].jitter, case.controller.jitter], 0.002)
+
+
+def test_converters_have_twelve_bits():
+    case = of_fault("12 bits")[""]
+    readings = np.abs(UNCONTROLLED.measured).max()
+    assert_allclose(case.sensors[0].resolution, 4 * readings / 4096)
+    assert_allclose(case.controller.resolution, 2 * FORCE / 4096)
+    ranged = strip(controller=FEEDBACK, sensors=[jb.Sensor(0.3, range=[-1e-3, 3e-3])])
+    assert_allclose(of_fault("12 bits", ranged)[""].sensors[0].resolution, 4e-3 / 4096)
+
+
+def test_what_is_worse_than_no_control_is_named(compared):
+    worst, least = compared
+    assert worst["wrong sign"]["none"].is_worse_than_none
+    assert not worst["feedback"]["none"].is_worse_than_none
+    assert FaultedPeak(np.nan, 1e-3, np.nan, "").is_worse_than_none
+    none = worst["feedback"]["none"]
+    expected = (least.uncontrolled - peak_of(CASE)) / (least.uncontrolled - least.peak)
+    assert_allclose(none.share, expected, rtol=1e-6)
+
+
+def test_laws_in_continuous_time_lose_no_samples():
+    law = jb.Feedback(gains=[500.0])
+    sampled = tuple(fault for fault in FAULTS if fault.sampled)
+    found, _ = compare_under_faults(strip(), {"continuous": law}, 0.01, sampled)
+    assert found["continuous"] == dict.fromkeys(fault.name for fault in sampled)
+
+
+def test_command(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("jaxbeam.analysis.loop_faults.compare_under_faults", _of_one_run)
+    jb.save_case(strip(controller=FEEDBACK), tmp_path / "case.toml")
+    law = "[controller]\nkind = 'feedback'\ngains = [-400.0]\nperiod = 0.01\n"
+    (tmp_path / "wrong.toml").write_text(law)
+    command = f"compare {tmp_path / 'case.toml'} --faults"
+    assert _code(f"{command} --controllers {tmp_path / 'wrong.toml'}") == 0
+    text = capsys.readouterr().out
+    assert "wrong, none: 1.18 times the peak without control" in text
+    assert _code(f"{command} --json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["faults"]["case"]["stuck"]["at"] == "sensor 0"
+    assert _code(f"{command} --over loads.0.mass=0.1,0.2") == 2
+    assert "leave out -o, --over and --cases" in capsys.readouterr().err
+
+
+def _code(line: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(line.split())
+    return ended.value.code
+
+
+def _of_one_run(case, laws, period):
+    return compare_under_faults(case, laws, period, OF_ONE_RUN)
