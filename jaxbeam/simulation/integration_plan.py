@@ -155,13 +155,21 @@ def check_origin(
 
 
 def check_same_events(planned: EventSchedule, own: EventSchedule) -> None:
-    """Raises ValueError unless a controlled run has the events of control that a plan has."""
+    """Raises ValueError unless a controlled run has the events of control that a plan has.
+
+    Those of a moving plan may be at other times, in the same order.
+    """
+    moving = planned.source is not None
+    if moving and len(own.times) == len(planned.times):
+        times = {name: getattr(planned, name) for name in ("times", "lengths", "merging")}
+        own = dataclasses.replace(own, **times)
     pairs = zip(jax.tree.leaves(planned), jax.tree.leaves(own), strict=False)
     if jax.tree.structure(planned) != jax.tree.structure(own) or not all(
         np.shape(a) == np.shape(b) and np.allclose(a, b, rtol=1e-12, atol=1e-12) for a, b in pairs
     ):
+        other = "in another order or number" if moving else "at other times"
         raise ValueError(
-            "the plan was made for control, readings or commands at other times (period, delays,"
+            f"the plan was made for control, readings or commands {other} (period, delays,"
             f" sampling periods): {INSTEAD}"
         )
 
@@ -244,8 +252,8 @@ def integration_plan(
     Default times are those of the run, which ends at its duration. `tolerance` is relative to the
     largest deflection. A `first_run` with the longest steps may take the place of the first trial
     run of a controlled case that is not compiled. A `moving` plan of a controlled case holds for
-    other periods, delays and times of samples too, as long as the order of events stays; so is
-    made, for derivatives, where these are traced. Raises ValueError for an invalid case,
+    other periods and delays too, as long as the number and order of events stay; so is made, for
+    derivatives, where these or times of samples are traced. Raises ValueError for an invalid case,
     RuntimeError if no time step meets the tolerance.
     """
     check_tolerance(tolerance)
@@ -307,17 +315,18 @@ def check_plan(case: Case, plan: IntegrationPlan, times) -> IntegrationPlan:
     if plan.origin is None:
         return plan
     lengths = np.diff(concrete(times)) if is_concrete(times) else np.array([np.inf])
-    if plan.schedule is not None:
-        lengths = np.asarray(plan.schedule.lengths)
+    schedule = own = plan.schedule
+    if schedule is not None and case.controller is not None:
+        with contextlib.suppress(jax.errors.ConcretizationTypeError):  # of traced events
+            end = float(concrete(case.run.duration)) if plan.to_duration else None
+            own = loop_schedule(case, concrete(times), end, schedule.source is not None)
+        lengths = np.asarray(own.lengths)
     steps_per_limit = float(lengths.max()) / plan.substeps / plan.origin.max_stable_step
     same = check_origin(plan.origin, plan.shapes, case, times, steps_per_limit, plan.error)
     if same and not any_jax(case, times):
         return plan
-    if plan.schedule is not None:
-        with contextlib.suppress(jax.errors.ConcretizationTypeError):  # of traced events
-            end = float(concrete(case.run.duration)) if plan.to_duration else None
-            moving = plan.schedule.source is not None
-            check_same_events(plan.schedule, loop_schedule(case, concrete(times), end, moving))
+    if schedule is not None:
+        check_same_events(schedule, own)
     if same:
         return plan
     return dataclasses.replace(

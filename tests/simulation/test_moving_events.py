@@ -107,6 +107,21 @@ def test_a_plan_for_fixed_times_refuses_their_derivatives(address):
         derivative_of_peak(LOOP, address, plan)
 
 
+@pytest.mark.parametrize(
+    ("address", "change"),
+    [("controller.period", -1e-4), ("controller.delay", -0.01), ("sensors.0.delay", 0.01)],
+)
+def test_a_moving_plan_holds_for_other_times_in_the_same_order(address, change):
+    plan, point = integration_plan(LOOP, moving=True), float(value_at(LOOP, address))
+    case = jb.replace(LOOP, {address: point * (1 + change)})
+    record, expected = (jb.simulate(case, plan=each) for each in (plan, None))
+    size = expected.peak_deflection[0]
+    assert_allclose(record.deflection, expected.deflection, rtol=0, atol=1e-7 * size)
+    assert np.isnan(record.error_estimate)
+    with pytest.raises(ValueError, match="in another order or number"):
+        jb.simulate(jb.replace(LOOP, {address: 2.1 * point}), plan=plan)
+
+
 @pytest.mark.parametrize("address", ["controller.resolution", "sensors.0.resolution"])
 def test_rounding_refuses_derivatives_by_the_resolution(address):
     rounded = dataclasses.replace(
