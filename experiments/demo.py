@@ -23,8 +23,9 @@ import xarray
 
 import jaxbeam as jb
 import tuning
-from jaxbeam.files.report import check_report_folder, text_table
+from jaxbeam.files.report import check_report_folder
 from jaxbeam.plot import plot_sweep
+from jaxbeam.runtime.printer import text_table
 
 FOLDER = "out/demo"
 LOGS = ("log_1.csv", "log_2.csv", "log_3.csv")

@@ -12,10 +12,10 @@ from plain_docstrings import as_text
 import jaxbeam
 import jaxbeam.plot
 import tuning
-from jaxbeam.case.display import TableViews
 from jaxbeam.case.fields import INCREASING, NOT_NEGATIVE, ON_BEAM, POSITIVE
 from jaxbeam.cli.app import COMMANDS, app as commands
 from jaxbeam.files.json_schema import Key, json_schema, table_classes, table_keys, tables
+from jaxbeam.runtime.printer import TableViews
 
 # Pages of the public names, by the packages in which they are defined; the first that fits.
 GROUPS = {

@@ -14,7 +14,8 @@ from experiments.thesis.verdicts import (
     Finding,
     FindingVerdicts,
 )
-from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable, text_table
+from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable
+from jaxbeam.runtime.printer import text_table
 
 TITLE = "The thesis, reproduced"
 ALL_VERDICTS = (*VERDICTS, *NOT_COUNTED)
@@ -39,7 +40,7 @@ def as_text(run: ExperimentRun) -> str:
     lines = [f"{run.experiment.name}: {run.experiment.covers}", f"  {run.experiment.claim}"]
     for finding, assigned in zip(run.outcome.findings, run.verdicts, strict=True):
         lines += ["", f"  {_finding_title(finding)}"]
-        lines += [f"    {line}" for line in text_table(COLUMNS, _finding_rows(finding, assigned))]
+        lines += text_table(COLUMNS, _finding_rows(finding, assigned), indent="    ")
         lines += [f"    {sentence}" for sentence in _finding_notes(finding, assigned)]
     lines += [f"  {remark}" for remark in run.outcome.remarks]
     counts = [f"{run.count(word)} {word}" for word in ALL_VERDICTS if run.count(word)]

@@ -18,6 +18,7 @@ from jaxbeam.analysis.margins import StabilityMargin, stability_margin
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.printer import TableViews
 from jaxbeam.simulation.commands import with_exact_compensation
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
@@ -44,7 +45,7 @@ class PerformanceMetrics(NamedTuple):
     limit_cycles: tuple[CommandOscillation, ...]
 
 
-class Comparison(Module):
+class Comparison(TableViews, Module):
     """Result of `compare`: records and metrics of the controllers by name, and the bound.
 
     `uncontrolled` is the run without controller, `optimal` the run with the commands of the bound.
@@ -56,6 +57,46 @@ class Comparison(Module):
     records: dict[str, Record]
     metrics: dict[str, PerformanceMetrics]
     bound: Bound
+
+    @property
+    def headline(self) -> str:
+        """Peaks without control and under the bound, in one sentence."""
+        return self.bound.verdict
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Name and metrics of each controller, by head, as `PerformanceMetrics` has them.
+
+        Efforts are (controller, actuator) in that class, columns here; margins are NaN where the
+        loop has none.
+        """
+        metrics = self.metrics.values()
+        efforts = np.array([one.effort for one in metrics]).T
+        limits = np.array([one.saturated for one in metrics]).T
+        return {
+            "controller": np.array(list(self.metrics)),
+            "peak (m)": np.array([one.peak for one in metrics]),
+            "share of attainable reduction": np.array([one.share for one in metrics]),
+            "RMS (m)": np.array([one.rms for one in metrics]),
+            "after exit (m)": np.array([one.after_exit for one in metrics]),
+            **{f"effort {i} (command^2 s)": effort for i, effort in enumerate(efforts)},
+            **{f"time at limit {i}": limit for i, limit in enumerate(limits)},
+            "gain margin": np.array([one.stability_margin.gain for one in metrics]),
+            "delay margin (s)": np.array([one.stability_margin.delay for one in metrics]),
+        }
+
+    @property
+    def remarks(self) -> list[str]:
+        """Sentences on margins that are missing, loops, and the verdicts of the records."""
+        obstacles = {name: one.stability_margin.obstacle for name, one in self.metrics.items()}
+        remarks = []
+        for obstacle in dict.fromkeys(filter(None, obstacles.values())):
+            names = [name for name, found in obstacles.items() if found == obstacle]
+            remarks.append(f"no margin of {', '.join(names)}: {obstacle}")
+        for name, record in self.records.items():
+            verdicts = filter(None, (self.loop_summary(name), record.verdict))
+            remarks.append(f"{name}: {'; '.join(verdicts)}")
+        return remarks
 
     def loop_summary(self, name: str) -> str:
         """Sentence on saturation, instability under stationary loads and oscillation of commands.

@@ -5,6 +5,7 @@ import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -27,6 +28,7 @@ from jaxbeam.model.statics import (
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.printer import TableViews
 from jaxbeam.simulation.derived_histories import corrected_deflection
 from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan, sample_times
 from jaxbeam.simulation.record import Record
@@ -45,10 +47,10 @@ __all__ = [
 AMPLIFIED = tuple(name for name, entry in QUANTITIES.items() if not entry.time_derivative)
 
 
-class Envelope(Module):
+class Envelope(TableViews, Module):
     """Lowest and highest value of a quantity at `positions` (m): at most zero, and at least zero.
 
-    In m for deflections. It unpacks as lowest and highest.
+    In the unit of the quantity, m for deflections. It unpacks as lowest and highest.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(jb.Beam(0.6, 12.0, 0.5), loads=[jb.MovingMass(mass=0.1, speed=1.0)])
@@ -60,6 +62,18 @@ class Envelope(Module):
     lowest: Float[Array, " position"]
     highest: Float[Array, " position"]
     positions: Float[Array, " position"]
+    quantity: str = eqx.field(static=True, default="deflection")
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Position (m), lowest and highest value, by head."""
+        unit = QUANTITIES[self.quantity].unit
+        head = self.quantity if unit == "1" else f"{self.quantity} ({unit})"
+        return {
+            "position (m)": np.asarray(self.positions),
+            f"lowest {head}": np.asarray(self.lowest),
+            f"highest {head}": np.asarray(self.highest),
+        }
 
     def __iter__(self) -> Iterator[Float[Array, " position"]]:
         return iter((self.lowest, self.highest))
@@ -106,7 +120,7 @@ def envelope(
         points = sections(case, x, quantity)
         sensors = tuple(Sensor(point, quantity, **parameters) for point in points.points)
         lowest, highest = calculate(case, plan, sample_times(case), sensors)
-        return Envelope(points.smallest(lowest), points.largest(highest), x)
+        return Envelope(points.smallest(lowest), points.largest(highest), x, quantity)
 
     def curves(found):
         values = xp.stack([-found.lowest, found.highest], axis=-1)

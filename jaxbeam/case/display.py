@@ -1,10 +1,7 @@
 """How parts of a case are shown: numbers with units, addresses in words, arguments explained."""
 
-import abc
 import dataclasses
 import re
-from collections.abc import Iterable, Sequence
-from html import escape
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -13,10 +10,7 @@ import numpy as np
 
 from jaxbeam.case.declared_checks import in_unit, suggestion
 from jaxbeam.runtime.module import Module
-
-if TYPE_CHECKING:
-    import pandas  # imported where it is used, as it takes half a second
-
+from jaxbeam.runtime.printer import html_table
 
 # Least largest value, factor and prefix.
 PREFIXES = (
@@ -149,19 +143,7 @@ def case_html(case: Any) -> str:
             rows.append((address, type(part).__name__, entries))
         else:
             rows.append((address, type(part).__name__, repr(part)))
-    return html_table(case.title or "Case", ("address", "part", "entries"), rows)
-
-
-def html_table(caption: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table in HTML, its texts escaped, flush left."""
-
-    def row(tag, cells):
-        texts = (f'<{tag} style="text-align: left">{escape(cell)}</{tag}>' for cell in cells)
-        return f"<tr>{''.join(texts)}</tr>"
-
-    body = "".join(row("td", cells) for cells in rows)
-    head = f'<caption style="text-align: left"><b>{escape(caption)}</b></caption>'
-    return f"<table>{head}<thead>{row('th', header)}</thead><tbody>{body}</tbody></table>"
+    return html_table(("address", "part", "entries"), rows, case.title or "Case")
 
 
 def _parts(case: Any) -> list[tuple[str, Any]]:
@@ -212,19 +194,3 @@ def _numbers(values) -> str:
         first = ", ".join(f"{one:.6g}" for one in values.ravel()[:3])
         return f"[{first}, ... {shape} values]"
     return f"[{', '.join(map(_numbers, values))}]"
-
-
-class TableViews:
-    """Base of results that have columns of equally many numbers by their heads."""
-
-    @property
-    @abc.abstractmethod
-    def columns(self) -> dict[str, np.ndarray]:
-        """Columns by head, with units, as "frequency (Hz)"."""
-
-    def to_dataframe(self) -> "pandas.DataFrame":
-        """Columns as a table of pandas, the first of them as its index."""
-        import pandas
-
-        first, *_ = columns = self.columns
-        return pandas.DataFrame(dict(columns)).set_index(first)

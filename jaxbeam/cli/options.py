@@ -25,8 +25,8 @@ from jaxbeam.cli.arguments import (
     parse_size,
     parse_value,
 )
-from jaxbeam.files.report import text_table
 from jaxbeam.runtime.output_file import whole_file
+from jaxbeam.runtime.printer import text_table
 
 if TYPE_CHECKING:
     from jaxbeam.model.plausibility.facts import Plausibility

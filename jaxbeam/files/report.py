@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxbeam.runtime.output_file import naming_file, whole_file
-
-Row = Sequence[str]
+from jaxbeam.runtime.printer import Row, html_table, markdown_table
 
 PAGE_STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
@@ -108,7 +107,7 @@ def markdown(title: str, sections: Sequence[ReportSection]) -> str:
             lines += [f"{'#' * section.level} {section.title}", ""]
         for part in section.parts:
             if isinstance(part, ReportTable):
-                lines += _markdown_table(part)
+                lines += markdown_table(part.header, part.rows)
             elif isinstance(part, ReportFigure):
                 lines += [f"![{part.name}]({part.source()})", ""]
             else:
@@ -125,46 +124,10 @@ def html(title: str, sections: Sequence[ReportSection], style: str = "") -> str:
             body.append(f"<h{section.level}>{safe(section.title)}</h{section.level}>")
         for part in section.parts:
             if isinstance(part, ReportTable):
-                body.append(_html_table(part))
+                body.append(html_table(part.header, part.rows, cell_class=part.cell_class))
             elif isinstance(part, ReportFigure):
                 body.append(f'<img src="{safe(part.source())}" alt="{safe(part.name)}">')
             else:
                 body.append(f"<p>{safe(part)}</p>")
     head = f'<meta charset="utf-8"><title>{safe(title)}</title><style>{PAGE_STYLE}{style}</style>'
     return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(body)}</body></html>'
-
-
-def text_table(header: Row, rows: Sequence[Row], alignment: str = "") -> list[str]:
-    """Lines of a table for the terminal, columns two spaces apart.
-
-    `alignment` has a letter for each column, "<" for flush left and ">" for flush right, as in
-    format strings; all are flush left if it is left out.
-    """
-    table = [header, *rows]
-    widths = [max(len(row[i]) for row in table) for i in range(len(header))]
-    marks = alignment or "<" * len(header)
-    return [
-        "  ".join(
-            f"{cell:{mark}{width}}" for cell, mark, width in zip(row, marks, widths, strict=True)
-        ).rstrip()
-        for row in table
-    ]
-
-
-def _markdown_table(table: ReportTable) -> list[str]:
-    lines = [table.header, ["---"] * len(table.header), *table.rows]
-    return [f"| {' | '.join(line)} |" for line in lines] + [""]
-
-
-def _html_table(table: ReportTable) -> str:
-    def line(tag: str, cells: Row, class_of: Callable[[str], str | None]) -> str:
-        inner = []
-        for cell in cells:
-            name = class_of(cell)
-            start = f"<{tag}>" if name is None else f'<{tag} class="{name}">'
-            inner.append(f"{start}{html_library.escape(cell)}</{tag}>")
-        return f"<tr>{''.join(inner)}</tr>"
-
-    header = line("th", table.header, lambda cell: None)
-    rows = "".join(line("td", row, table.cell_class) for row in table.rows)
-    return f"<table>{header}{rows}</table>"

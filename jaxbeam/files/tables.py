@@ -55,12 +55,13 @@ MAX_EXCEL_ROWS = 1_048_575  # below the heads
 
 
 def save(result: Any, path: str | os.PathLike, overwrite: bool = False) -> None:
-    """Write a result to a file: a record, modes, frequency responses, an envelope, a sweep.
+    """Write a result to a file: a record, modes, frequency responses, an envelope, a sweep, a fit.
 
     The ending decides: .nc and .zarr hold its dataset, with units and coordinates; .csv (UTF-8, all
     digits), .xlsx, .mat and .parquet its `columns`, with units in their heads (`write_table`); a
     text that a spreadsheet would run as a formula has an apostrophe before it in the first two. Of
-    a sweep, a row for each run (`sweep_columns`). Raises FileExistsError if the
+    a sweep, a row for each run (`sweep_columns`). What has no dataset, as a fit, is written as a
+    table alone. Raises FileExistsError if the
     file exists, without `overwrite`; ValueError for another ending; ImportError, with what to
     install, if a package is missing.
 
@@ -72,12 +73,13 @@ def save(result: Any, path: str | os.PathLike, overwrite: bool = False) -> None:
     mode,frequency (Hz),damping ratio
     """
     path = Path(path)
-    check_ending(path, "a result", RESULTS)
+    has_dataset = hasattr(result, "data_vars") or hasattr(result, "to_xarray")
+    check_ending(path, "a result", RESULTS if has_dataset else TABLES)
     if hasattr(result, "data_vars"):  # the dataset of a sweep
         columns = sweep_columns(result) if path.suffix in TABLES else {}
         write_result(path, lambda: columns, lambda: result, overwrite)
     else:
-        write_result(path, lambda: result.columns, result.to_xarray, overwrite)
+        write_result(path, lambda: result.columns, lambda: result.to_xarray(), overwrite)
 
 
 def write_result(

@@ -18,7 +18,6 @@ from jaxtyping import Complex, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
-from jaxbeam.case.display import TableViews
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.channels import ChannelPair, check_pairs, common_pairs, input_column, output_row
@@ -29,6 +28,7 @@ from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.module import Module
 from jaxbeam.runtime.output_file import whole_file
+from jaxbeam.runtime.printer import TableViews
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX

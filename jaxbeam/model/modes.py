@@ -20,7 +20,6 @@ from jaxtyping import Bool, Float
 from numpy.polynomial import legendre
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.display import TableViews
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.validation import check_plant
 from jaxbeam.model.layout import Layout, find_layout, is_uniform, longest_span, node_positions
@@ -46,6 +45,7 @@ from jaxbeam.numerics.polynomials import legendre_to_chebyshev, piecewise_chebys
 from jaxbeam.runtime.arrays import Array, add_at, set_at, stop_gradient, xp
 from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.printer import TableViews
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
@@ -95,7 +95,12 @@ class Modes(TableViews, Module):
         rows = [f"  {i}: {f:.5g} Hz, damping ratio {z:.3g}" for i, (f, z) in enumerate(numbers, 1)]
         if len(rows) > MAX_LISTED:
             rows[MAX_LISTED - 1 : -1] = ["  ..."]
-        return "\n".join([f"Modes: {self.stiffness.size} of the beam", *rows])
+        return "\n".join([self.headline, *rows])
+
+    @property
+    def headline(self) -> str:
+        """How many modes there are."""
+        return f"Modes: {self.stiffness.shape[-1]} of the beam"
 
     @property
     def columns(self) -> dict[str, np.ndarray]:

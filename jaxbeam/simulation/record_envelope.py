@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.display import TableViews
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.along_beam import refined, sections
 from jaxbeam.model.modes import Modes
@@ -15,6 +14,7 @@ from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, any_traced, known, take, xp
 from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.module import Module
+from jaxbeam.runtime.printer import TableViews
 from jaxbeam.simulation.section_forces import history
 
 if TYPE_CHECKING:

@@ -13,19 +13,19 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.display import TableViews, html_table, with_prefix
+from jaxbeam.case.display import with_prefix
 from jaxbeam.case.fields import is_concrete
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.files.endings import check_ending
 from jaxbeam.files.netcdf import write_netcdf
-from jaxbeam.files.report import text_table
 from jaxbeam.files.tables import write_result
 from jaxbeam.model.modes import Modes
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.module import Module
 from jaxbeam.runtime.output_file import whole_file
+from jaxbeam.runtime.printer import TableViews, html_table, text_table
 from jaxbeam.simulation.errors import Extremes
 from jaxbeam.simulation.labels import (
     ACTING_COMMAND,
@@ -143,14 +143,15 @@ MAX_SENSORS = 12  # with a row each
 def record_text(case: Case, times, verdict: str, extremes: Extremes) -> str:
     """Title, duration and loads of a run, its verdict, and a row of extremes for each sensor."""
     rows = _sensor_rows(case, extremes)
-    lines = text_table(HEADER, rows[:MAX_SENSORS], "<><>>>>") if rows else []
-    return "\n  ".join([_head(case, times), verdict, *lines, *_left_out(rows)])
+    lines = text_table(HEADER, rows[:MAX_SENSORS], "<><>>>>", "  ") if rows else []
+    others = (f"  {line}" for line in _left_out(rows))
+    return "\n".join([_head(case, times), f"  {verdict}", *lines, *others])
 
 
 def record_html(case: Case, times, verdict: str, extremes: Extremes) -> str:
     """What `record_text` tells, as a table in HTML and a paragraph below it."""
     rows = _sensor_rows(case, extremes)
-    table = html_table(_head(case, times), HEADER, rows[:MAX_SENSORS])
+    table = html_table(HEADER, rows[:MAX_SENSORS], _head(case, times))
     return f"{table}<p>{escape('; '.join([verdict, *_left_out(rows)]))}</p>"
 
 

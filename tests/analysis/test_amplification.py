@@ -114,6 +114,7 @@ def test_envelope_of_moments_against_the_record_and_amplification_of_a_slow_forc
     slow = envelope(case, positions, quantity="moment")
     static = FORCE * positions * (LENGTH - positions) / LENGTH
     assert_allclose(slow.highest, static, rtol=0.02)
+    assert list(slow.columns) == ["position (m)", "lowest moment (N m)", "highest moment (N m)"]
     found = amplification(case, positions, quantity="moment")
     assert_allclose(found, np.asarray(slow.highest) / static, rtol=1e-9)
     stress = amplification(case, positions, quantity="stress", section_modulus=-2.0)

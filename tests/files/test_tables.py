@@ -31,7 +31,6 @@ from jaxbeam.files.report import (
     check_report_folder,
     html,
     markdown,
-    text_table,
     write_report,
 )
 from jaxbeam.files.tables import as_text_cell, from_text_cell, sweep_columns, write_table
@@ -391,9 +390,3 @@ def test_a_folder_with_files_is_kept(tmp_path):
     assert len(list(tmp_path.iterdir())) == 1
     check_report_folder(tmp_path, overwrite=True)
     check_report_folder(tmp_path / "none", overwrite=False)
-
-
-def test_text_tables_are_aligned_column_by_column():
-    rows = [("a", "1.5"), ("longer", "10")]
-    assert text_table(("name", "m"), rows) == ["name    m", "a       1.5", "longer  10"]
-    assert text_table(("name", "m"), rows, "<>")[1:] == ["a       1.5", "longer   10"]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxbeam.case.case import Case
-from jaxbeam.files.report import text_table
+from jaxbeam.runtime.printer import text_table
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
 from tuning.control.tune import ParameterBounds, tune

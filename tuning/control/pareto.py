@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from jaxbeam.case.case import Case
-from jaxbeam.files.report import text_table
+from jaxbeam.runtime.printer import text_table
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import ALL_METRICS, Objective
 from tuning.control.penalised_objective import StabilityConstraint

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.control.optimal.lqr import LQR
-from jaxbeam.files.report import text_table
+from jaxbeam.runtime.printer import text_table
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import Objective
 from tuning.control.tune import ParameterBounds, tune

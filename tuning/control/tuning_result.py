@@ -18,8 +18,8 @@ from jaxbeam.case.case import Case, replace, value_at
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.validation import check_case
-from jaxbeam.files.report import text_table
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.runtime.printer import TableViews, text_table
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 from tuning.control.load_cases import PLANT_PREFIXES, AddressValues, run_case, value_columns
 from tuning.control.objective import Objective, with_fixed_design
@@ -62,7 +62,7 @@ class StartResult(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class TuningResult:
+class TuningResult(TableViews):
     """Result of a tuning: the tuned case, and its training and held-out runs.
 
     `history` is the true objective by step and start, NaN where the closed loop was unstable, which
@@ -147,6 +147,16 @@ class TuningResult:
         if last.name == "training":
             sentence += "; nothing was held out, so this proves nothing for other loads"
         return sentence
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Address, unit, and value before and after of each tuned parameter, by head."""
+        return {
+            "parameter": np.array([one.address for one in self.parameters]),
+            "unit": np.array(["" if one.unit == "1" else one.unit for one in self.parameters]),
+            "before": np.array([one.start for one in self.parameters]),
+            "after": np.asarray(self.values),
+        }
 
     def __str__(self) -> str:
         pairs = zip(self.parameters, self.values, strict=True)

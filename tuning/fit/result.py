@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
 from jaxbeam.case.quantities import unit_of
+from jaxbeam.runtime.printer import TableViews
 from tuning.fit import summary
 from tuning.fit.dataset import (
     ChannelResiduals,
@@ -24,7 +25,7 @@ from tuning.parameters.free import LOG_ADDRESS, FreeParameter, to_unbounded, wit
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(TableViews):
     """Result of an identification, in SI units and the order of `parameters`.
 
     `errors` are standard errors, infinite for parameters that are not identifiable from the data;
@@ -118,6 +119,23 @@ class Fit:
         """Addresses of the parameters that ended at one of their bounds."""
         pairs = zip(self.parameters, self.values, strict=True)
         return [parameter.address for parameter, value in pairs if parameter.at_bound(value)]
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Address, unit, start, value, standard error and 95 % interval of each parameter, by head.
+
+        Errors and intervals are infinite for parameters that are not identifiable.
+        """
+        units = ["" if one.unit == "1" else one.unit for one in self.parameters]
+        return {
+            "parameter": np.array(self.addresses),
+            "unit": np.array(units),
+            "start": self.start_values,
+            "fitted": np.asarray(self.values),
+            "standard error": np.asarray(self.errors),
+            "95 % from": self.intervals[:, 0],
+            "95 % to": self.intervals[:, 1],
+        }
 
     @property
     def remarks(self) -> list[str]:

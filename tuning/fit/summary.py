@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.files.report import Row, text_table
+from jaxbeam.runtime.printer import Row, text_table
 from tuning.fit.multi_start import LocalMinimum
 from tuning.logs.log import Log
 from tuning.logs.quality import find_faults

@@ -86,13 +86,9 @@ class ModalFit(ModalEstimates):
                 f"{one.frequency:.3f} Hz ({100 * one.share:.2g} %)" for one in self.lines
             )
             lines.append(f"  harmonic lines, no modes (share of the variance): {listed}")
-        if self.modes:
-            if high > MAX_BAND_RATIO * low:
-                lines.append("  energy: share of that in the three octaves around the mode")
-            lines.append("  frequency (Hz)  +- 95 %    damping ratio  +- 95 %     energy")
-        else:
-            lines.append("  no mode is well identified")
-        lines += [str(mode) for mode in self.modes]
+        if self.modes and high > MAX_BAND_RATIO * low:
+            lines.append("  energy: share of that in the three octaves around the mode")
+        lines += self._mode_lines()
         if self.rejected:
             lines.append("  not well identified:  [--choose FREQUENCY]")
         for mode, reason in self.rejected:

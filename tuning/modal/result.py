@@ -1,10 +1,12 @@
 """Modes identified from samples, their shapes, and the reasons for which some are rejected."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
+from jaxbeam.runtime.printer import TableViews, text_table
 from tuning.logs.log import Log
 
 
@@ -88,13 +90,6 @@ class IdentifiedMode(NamedTuple):
         measured = self.shape[np.isfinite(self.shape)]
         return float(phase_collinearity(measured[None])[0])
 
-    def __str__(self) -> str:
-        return (
-            f"  {self.frequency:14.4f}  {self.quantile * self.frequency_sd:7.4f}    "
-            f"{self.damping_ratio:13.5f}  {self.quantile * self.damping_sd:7.5f}    "
-            f"{100 * self.energy_share:5.1f} %"
-        )
-
     def to_dict(self) -> dict:
         """Plain numbers for JSON: frequency, damping ratio, deviations, 95 % intervals, shape."""
         half = self.quantile * self.frequency_sd, self.quantile * self.damping_sd
@@ -131,12 +126,42 @@ def channels_of(log: Log) -> Channels:
     return Channels(log.names, log.quantities, log.positions, log.sensors)
 
 
-class ModalEstimates:
+class ModalEstimates(TableViews):
     """Frequencies, damping ratios and shapes of modes, ascending, at the channels of a source."""
 
     modes: tuple[IdentifiedMode, ...]
     channels: Channels
     source: str
+
+    @property
+    def headline(self) -> str:
+        """What the modes are those of."""
+        return f"{len(self.modes)} mode{'s' * (len(self.modes) != 1)} of {self.source}"
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Frequency (Hz) and damping ratio with 95 % errors, share of energy of modes, by head."""
+        return {
+            "frequency (Hz)": self.frequencies,
+            "frequency +- 95 % (Hz)": np.diff(self.frequency_intervals).ravel() / 2,
+            "damping ratio": self.damping_ratios,
+            "damping ratio +- 95 %": np.diff(self.damping_intervals).ravel() / 2,
+            "energy share": np.array([mode.energy_share for mode in self.modes]),
+        }
+
+    def _mode_lines(self, head: str = "", last: Sequence[str] = ()) -> list[str]:
+        """Lines of a table of the modes, with a last column if it has a head."""
+        if not self.modes:
+            return ["  no mode is well identified"]
+        header = ["frequency (Hz)", "+- 95 %", "damping ratio", "+- 95 %", "energy"]
+        formats = "{:.4f}", "{:.4f}", "{:.5f}", "{:.5f}", "{:.1%}"
+        rows = [
+            [form.format(entry) for form, entry in zip(formats, row, strict=True)]
+            for row in zip(*self.columns.values(), strict=True)
+        ]
+        if head:
+            header, rows = [*header, head], [[*r, one] for r, one in zip(rows, last, strict=True)]
+        return text_table(header, rows, ">" * 5 + "<" * bool(head), "  ")
 
     @property
     def frequencies(self) -> Float[np.ndarray, " mode"]:

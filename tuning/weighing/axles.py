@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.loads.axles import Axles
-from jaxbeam.files.report import text_table
+from jaxbeam.runtime.printer import text_table
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
 from tuning.weighing.axle_fit import SHARES, AxleFit, fit_axles

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.files.report import ReportSection, ReportTable, markdown, text_table
+from jaxbeam.files.report import ReportSection, ReportTable, markdown
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.output_file import whole_file
+from jaxbeam.runtime.printer import TableViews, text_table
 
 
 class TrainCurve(NamedTuple):
@@ -176,7 +177,7 @@ class CodeCheck:
 
 
 @dataclasses.dataclass(frozen=True)
-class Assessment:
+class Assessment(TableViews):
     """Checks of a bridge by a code, its inputs, and what is not checked and not in the model.
 
     `sources` are the open sources of the numbers of the code by clause, `effects` those of the
@@ -233,6 +234,23 @@ class Assessment:
         effects = None if self.effects is None else self.effects.to_dict()
         return content | {"effects": effects, "verdict": self.verdict}
 
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Subject, value, limit, unit, outcome and clause of each check, by head.
+
+        Values and limits that a check lacks are NaN.
+        """
+        numbers = np.array([(c.value, c.limit) for c in self.checks], float).reshape(-1, 2)
+        units = ["" if check.unit == "1" else check.unit for check in self.checks]
+        outcomes, clauses = ([getattr(c, key) for c in self.checks] for key in HEADER[4:])
+        columns = [c.subject for c in self.checks], *numbers.T, units, outcomes, clauses
+        return dict(zip(HEADER, map(np.asarray, columns), strict=True))
+
+    @property
+    def remarks(self) -> list[str]:
+        """Remarks on checks, a sentence each with its subject."""
+        return [f"{check.subject}: {check.remark}" for check in self.checks if check.remark]
+
     def _rows(self) -> list[list[str]]:
         return [
             [
@@ -253,14 +271,13 @@ class Assessment:
     @property
     def lines(self) -> list[str]:
         """Lines of the report as text."""
-        remarks = [f"  {c.subject}: {c.remark}" for c in self.checks if c.remark]
         return [
             f"{self.title}, {self.code}",
             *(f"  {line}" for line in self._inputs),
             "",
             *text_table(HEADER, self._rows(), "<>><<<"),
             "",
-            *remarks,
+            *(f"  {remark}" for remark in self.remarks),
             "",
             *(["largest effects of each train:", *self.effects.lines, ""] if self.effects else []),
             "not checked:",
@@ -277,7 +294,6 @@ class Assessment:
     def to_markdown(self) -> str:
         """The report as Markdown, with the sources of the numbers of the code."""
         inputs = _listed(self._inputs)
-        remarks = _listed(f"{c.subject}: {c.remark}" for c in self.checks if c.remark)
         sections = [
             ReportSection(
                 "",
@@ -285,7 +301,7 @@ class Assessment:
                     f"Checks by {self.code}. {self.verdict}",
                     *inputs,
                     ReportTable(HEADER, self._rows()),
-                    *remarks,
+                    *_listed(self.remarks),
                 ],
             )
         ]

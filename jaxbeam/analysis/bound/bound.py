@@ -85,6 +85,14 @@ class Bound(Module):
         """Attainable reduction as a share of the uncontrolled peak, 0 to 1."""
         return 1 - self.peak / self.uncontrolled
 
+    @property
+    def verdict(self) -> str:
+        """Peaks without control and with the best commands, in one sentence."""
+        return (
+            f"no control: peak {self.uncontrolled:.6g} m; no controller that holds its commands"
+            f" for {self.period:g} s gets below {self.peak:.6g} m, {self.reduction:.1%} less"
+        )
+
     def share(self, record: Record) -> float:
         """Share of the attainable reduction that a run achieves: 0 without control, 1 at best.
 

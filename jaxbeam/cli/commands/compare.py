@@ -158,7 +158,7 @@ def _report_faults(case, laws, period, options: CaseOptions) -> None:
         for name, of_faults in worst.items()
     ]
     lines = [
-        _bound_line(least),
+        least.verdict,
         "share of the attainable reduction, at worst, under faults that the laws do not know:",
         *table(("controller", *next(iter(worst.values()))), cells),
     ]
@@ -258,8 +258,7 @@ def _metrics_to_dict(metrics: "PerformanceMetrics") -> dict:
 
 
 def _lines(comparison: "Comparison") -> list[str]:
-    lines = [_bound_line(comparison.bound)]
-    lines += table(
+    lines = table(
         (
             "controller",
             "peak (m)",
@@ -286,23 +285,7 @@ def _lines(comparison: "Comparison") -> list[str]:
             for name, metrics in comparison.metrics.items()
         ],
     )
-    obstacles = {
-        name: metrics.stability_margin.obstacle for name, metrics in comparison.metrics.items()
-    }
-    for obstacle in dict.fromkeys(filter(None, obstacles.values())):
-        names = [name for name, found in obstacles.items() if found == obstacle]
-        lines.append(f"no margin of {', '.join(names)}: {obstacle}")
-    for name, record in comparison.records.items():
-        verdicts = filter(None, (comparison.loop_summary(name), record.verdict))
-        lines.append(f"{name}: {'; '.join(verdicts)}")
-    return lines
-
-
-def _bound_line(bound: "jb.Bound") -> str:
-    return (
-        f"no control: peak {bound.uncontrolled:.6g} m; no controller that holds its commands for "
-        f"{bound.period:g} s gets below {bound.peak:.6g} m, {bound.reduction:.1%} less"
-    )
+    return [comparison.headline, *lines, *comparison.remarks]
 
 
 def _margin_text(metrics: "PerformanceMetrics", number: float) -> str:

@@ -13,7 +13,7 @@ from jaxbeam.cli.options import (
     enable_compile_cache,
     print_message,
 )
-from jaxbeam.files.report import text_table
+from jaxbeam.runtime.printer import text_table
 
 MAX_PROCESSES = 2  # experiments at once, each of which takes a core and up to 2 GB
 

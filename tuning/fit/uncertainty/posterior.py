@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.files.report import ReportTable, text_table
+from jaxbeam.files.report import ReportTable
 from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.printer import text_table
 from tuning.checkpoint import NO_CHECKPOINT, Checkpoint, checkpoint_path, fingerprint
 from tuning.fit.result import Fit
 from tuning.optional import import_extra

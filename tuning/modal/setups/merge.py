@@ -65,10 +65,8 @@ class MultiSetupFit(ModalEstimates):
             *(f"  {choice.text}  [{choice.option}]" for choice in self.choices),
             *(f"  {note}" for note in self.notes),
         ]
-        heading = "  frequency (Hz)  +- 95 %    damping ratio  +- 95 %     energy   setups"
-        lines.append(heading if self.modes else "  no mode is well identified")
-        for mode, pairs in zip(self.modes, self.pairs, strict=True):
-            lines.append(f"{mode}   {', '.join(str(k + 1) for k in sorted(pairs))}")
+        numbers = [", ".join(str(k + 1) for k in sorted(pairs)) for pairs in self.pairs]
+        lines += self._mode_lines("setups", numbers)
         if self.rejected:
             lines.append("  not well identified:")
         lines += [f"  {mode.frequency:14.4f}  {reason}" for mode, reason in self.rejected]

@@ -1,0 +1,192 @@
+"""Tables: as text at any width, in HTML and Markdown, and the views of results that have columns.
+
+Nothing heavy is imported at the top, so that the command line may use it.
+"""
+
+import abc
+import os
+import sys
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy
+    import pandas  # imported where it is used, as it takes half a second
+
+Row = Sequence[str]
+GAP = 2  # spaces between columns
+LEAST_WIDTH = 20  # of a terminal; in a narrower one lines are broken
+MAX_SHOWN = 20  # rows of a result in a notebook
+
+
+def terminal_width() -> int | None:
+    """Characters in a line: COLUMNS, or those of the terminal; None where output goes elsewhere."""
+    try:
+        asked = os.environ.get("COLUMNS", "")
+        if not asked.isdecimal() and not sys.stdout.isatty():
+            return None
+        width = int(asked) if asked.isdecimal() else os.get_terminal_size().columns
+    except (OSError, AttributeError):  # no terminal, no standard output
+        return None
+    return max(width, LEAST_WIDTH) if width else None
+
+
+def text_table(
+    header: Row,
+    rows: Iterable[Row],
+    alignment: str = "",
+    indent: str = "",
+    width: int | None = None,
+) -> list[str]:
+    """Lines of a table, columns two spaces apart, within a width (characters).
+
+    By default it is `terminal_width`. Where the table is wider its words are wrapped, then its
+    columns printed in several tables below each other, each beginning with the first. `alignment`
+    has a letter for each column, "<" for flush left and ">" for flush right, as in format strings;
+    all are flush left if it is left out.
+
+    >>> rows = [("loads.0.speed", "12.5", "at its upper bound")]
+    >>> print("\\n".join(text_table(("parameter", "value", ""), rows, "<><", width=30)))
+    parameter      value
+    loads.0.speed   12.5  at its
+                          upper
+                          bound
+    """
+    limit = (width or terminal_width() or sys.maxsize) - len(indent)
+    columns = list(zip(header, *rows, strict=True))
+    natural = [max(map(len, column)) for column in columns]
+    least = [max(len(w) for cell in column for w in [*cell.split(), ""]) for column in columns]
+    lines: list[str] = []
+    for group, widths in _groups(natural, least, limit):
+        marks = [(alignment or "<" * len(columns))[i] for i in group]
+        lines += [""] if lines else []
+        for number, row in enumerate(zip(*(columns[i] for i in group), strict=True)):
+            lines += [indent + line for line in _row_lines(row, marks, widths, number == 0)]
+    return [line.rstrip() for line in lines]
+
+
+def _groups(
+    natural: list[int], least: list[int], limit: int
+) -> Iterator[tuple[list[int], list[int]]]:
+    """Columns that fit beside each other, the first column in each group, and their widths."""
+    if sum(natural) + GAP * (len(natural) - 1) <= limit:
+        yield list(range(len(natural))), natural
+        return
+    key = min(least[0], max(limit // 2, limit - GAP - max(least[1:], default=-GAP)))
+    least = [key, *(min(one, limit - key - GAP) for one in least[1:])]
+    rest = list(range(1, len(natural)))
+    while True:
+        group = [0]
+        while rest and sum(least[i] + GAP for i in group) + least[rest[0]] <= limit:
+            group.append(rest.pop(0))
+        widths = {i: natural[i] for i in group}
+        while sum(widths.values()) + GAP * (len(group) - 1) > limit:
+            widest = max((i for i in group if widths[i] > least[i]), key=widths.__getitem__)
+            widths[widest] -= 1
+        yield group, list(widths.values())
+        if not rest:
+            return
+
+
+def _row_lines(row: Row, marks: Row, widths: list[int], is_header: bool) -> Iterator[str]:
+    """Lines of a row, words of its cells wrapped; those of a header end at its foot."""
+    cells = [
+        [cell] if len(cell) <= width else textwrap.wrap(cell, max(width, 1)) or [""]
+        for cell, width in zip(row, widths, strict=True)
+    ]
+    height = max(map(len, cells))
+    for i in range(height):
+        parts = []
+        for cell, mark, width in zip(cells, marks, widths, strict=True):
+            place = i - (height - len(cell)) * is_header
+            parts.append(f"{cell[place] if 0 <= place < len(cell) else '':{mark}{width}}")
+        yield (" " * GAP).join(parts)
+
+
+def markdown_table(header: Row, rows: Iterable[Row]) -> list[str]:
+    """Lines of a table in Markdown."""
+    lines = [header, ["---"] * len(header), *rows]
+    return [f"| {' | '.join(line)} |" for line in lines] + [""]
+
+
+def html_table(
+    header: Row,
+    rows: Iterable[Row],
+    caption: str = "",
+    cell_class: Callable[[str], str | None] = lambda cell: None,
+) -> str:
+    """A table in HTML, its texts escaped, flush left under the caption.
+
+    `cell_class` returns the CSS class of a cell's text, or None.
+    """
+    style = ' style="text-align: left"' if caption else ""
+
+    def line(tag: str, cells: Row) -> str:
+        named = [(cell, cell_class(cell) if tag == "td" else None) for cell in cells]
+        inner = (
+            f"<{tag}{style}>{escape(cell)}</{tag}>"
+            if name is None
+            else f'<{tag}{style} class="{name}">{escape(cell)}</{tag}>'
+            for cell, name in named
+        )
+        return f"<tr>{''.join(inner)}</tr>"
+
+    head = f"<caption{style}><b>{escape(caption)}</b></caption>" if caption else ""
+    body = "".join(line("td", row) for row in rows)
+    return f"<table>{head}<thead>{line('th', header)}</thead><tbody>{body}</tbody></table>"
+
+
+class TableViews:
+    """Base of results that have columns of equally many entries by their heads."""
+
+    @property
+    @abc.abstractmethod
+    def columns(self) -> "dict[str, numpy.ndarray]":
+        """Columns by head, with units, as "frequency (Hz)"."""
+
+    @property
+    def headline(self) -> str:
+        """Sentence above the table in a notebook: the verdict of a result that has one."""
+        return getattr(self, "verdict", type(self).__name__)
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """Columns as a table of pandas, the first of them as its index.
+
+        Raises ImportError, with what to install, without pandas.
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise ImportError(
+                "a dataframe needs pandas, which is not installed: pip install pandas; .columns has"
+                " the same arrays by their heads"
+            ) from None
+        first, *_ = columns = self.columns
+        return pandas.DataFrame(dict(columns)).set_index(first)
+
+    def _repr_html_(self) -> str | None:
+        """Table of the columns in a notebook; None leaves traced or several results to the text."""
+        import jax.errors
+
+        try:
+            columns = self.columns
+        except jax.errors.JAXTypeError:  # traced
+            return None
+        lengths = {column.shape for column in columns.values()}
+        if len(lengths) != 1 or len(next(iter(lengths))) != 1:
+            return None
+        rows = [[_cell(entry) for entry in row] for row in zip(*columns.values(), strict=True)]
+        if len(rows) > MAX_SHOWN:
+            more = f"... {len(rows) - MAX_SHOWN} more ..."
+            rows[MAX_SHOWN - 1 : -1] = [[more, *[""] * (len(columns) - 1)]]
+        remarks = "".join(f"<p>{escape(one)}</p>" for one in getattr(self, "remarks", ()))
+        return html_table(list(columns), rows, self.headline) + remarks
+
+
+def _cell(entry: Any) -> str:
+    """Text of an entry of a column: six digits of a number, nothing for what is not known."""
+    if isinstance(entry, str):
+        return entry
+    return "" if entry != entry else f"{entry:.6g}"
