@@ -94,6 +94,10 @@ for _title, _commands in COMMANDS.items():
     _group = Group.create_ordered(_title)
     for _command in _commands:
         app.command(_command, group=_group)
+app.register_install_completion_command(
+    help="Install completion of commands and options for bash, zsh, fish or PowerShell, also in"
+    " the file that the shell reads when it starts."
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
