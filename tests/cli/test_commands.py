@@ -138,7 +138,7 @@ def test_compare_over_the_runs_of_a_file(tmp_path, capsys):
     assert all(11 < one["values"]["beam.flexural_rigidity"] < 13 for one in found["cases"])
     shares = [one["controllers"]["weak"]["share"] for one in found["cases"]]
     assert found["over_all"]["weak"]["worst_share"] == min(shares)
-    with pytest.raises(SystemExit, match="1"):
+    with pytest.raises(SystemExit, match="2"):
         main(["compare", str(case), "--cases", str(runs), "--over", "loads.0.mass=1,2"])
     assert "--cases has runs of its own" in capsys.readouterr().err
 
