@@ -17,6 +17,7 @@ import contextlib
 import functools
 import hashlib
 import importlib.metadata
+import logging
 import os
 import pathlib
 import sys
@@ -31,6 +32,7 @@ from jaxbeam.runtime import cache_folder
 from jaxbeam.runtime.cache_folder import CacheError, machine_description
 from jaxbeam.runtime.trusted_code import PICKLING_ERRORS, loaded_program, pickled, unpickled
 
+LOGGER = logging.getLogger(__name__)
 OWN_PACKAGES = ("jaxbeam", "tuning")  # whose source is hashed
 # Packages whose functions may be compiled; a test compares them with the declared dependencies.
 DEPENDENCIES = (
@@ -125,6 +127,7 @@ def switch_on() -> None:
     except CacheError as error:
         _warn(error)
         return
+    LOGGER.info("compile cache in %s", folder.parent)
     jax.config.update("jax_compilation_cache_dir", str(folder))
     if MIN_COMPILE_TIME.upper() not in os.environ:
         jax.config.update(MIN_COMPILE_TIME, 0.3)
@@ -179,6 +182,7 @@ def read_program(name: str) -> tuple[bytes, Any] | None:
     except CacheError as error:
         _warn(error)
         return None
+    LOGGER.debug("program %s: %s", name, "cached" if stored else "to be compiled")
     if stored is not None:
         cache_folder.mark_used(name)
     return stored

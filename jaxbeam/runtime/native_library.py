@@ -7,6 +7,7 @@ without it.
 import contextlib
 import functools
 import hashlib
+import logging
 import os
 import pathlib
 import shutil
@@ -28,6 +29,7 @@ from jaxbeam.runtime.cache_folder import (
 )
 from jaxbeam.runtime.trusted_code import NativeCode, loaded_library
 
+LOGGER = logging.getLogger(__name__)
 C_FOLDER = pathlib.Path(__file__).parent / "native"
 # Functions that are called once are not made part of their callers: the compiler takes a third less
 # time, and the code runs as fast.
@@ -69,16 +71,23 @@ class Library(NamedTuple):
             with tempfile.TemporaryDirectory(dir=private_folder()) as folder:
                 compiled = pathlib.Path(folder) / "library.so"
                 _compile(self, compiled)
-                return write_file(self.file_name, compiled.read_bytes())
+                path = write_file(self.file_name, compiled.read_bytes())
+                LOGGER.info("C code compiled by %s: %s", find_compiler(), path)
+                return path
         except (CacheError, OSError) as error:
             raise RuntimeError(f"the C code cannot be stored: {error}") from None
 
     def can_be_built(self) -> bool:
         """Whether there is a compiler, and the library never was compiled here, nor removed."""
         try:
-            return not os.path.lexists(self.library_path()) and find_compiler() is not None
+            if os.path.lexists(self.library_path()):
+                return False
         except CacheError:
             return False
+        if find_compiler() is None:
+            LOGGER.info("C code not used: there is no C compiler")
+            return False
+        return True
 
     @contextlib.contextmanager
     def built_meanwhile(self) -> Iterator[None]:
@@ -92,8 +101,10 @@ class Library(NamedTuple):
         with ThreadPoolExecutor(1) as pool:
             build = pool.submit(self.build)
             yield
-            with contextlib.suppress(RuntimeError):
+            try:
                 build.result()
+            except RuntimeError as error:
+                LOGGER.info("C code not used: %s", error)
 
     def remove(self) -> pathlib.Path:
         """Remove the compiled library until `build`; its path, of an empty file in its place.

@@ -6,6 +6,7 @@ Sensors that are too many for one integration are integrated in groups, one afte
 import contextlib
 import dataclasses
 import functools
+import logging
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -47,6 +48,7 @@ from jaxbeam.sweeps.step_size import (
     stratified_sample,
 )
 
+LOGGER = logging.getLogger(__name__)
 MAX_BLOCK_RUNS = 512  # about; a block is one call of the compiled program and one write
 # The same where batches are integrated at once: an H100 takes 65536 runs in 0.33 s, in blocks of
 # all of them in 0.71 s. Histories are large, and have the blocks of a CPU.
@@ -110,6 +112,7 @@ class Runner:
         self.backend: NativeBatches | NumpyBatches | CompiledBatches = in_c or (
             self._numpy_batches() if small else self._compile()
         )
+        LOGGER.info("sweep in %d blocks by %s", self.block_count, type(self.backend).__name__)
         longest = None
         if self.schedule is not None and case.controller is not None:  # steps end at events
             longest = self.schedule.lengths.max()
