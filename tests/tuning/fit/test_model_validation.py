@@ -208,6 +208,19 @@ def test_verdicts_on_chains_that_do_not_mix():
     assert "100 divergent steps" in with_diagnostics(["a"], divergent, 100).verdict
 
 
+def test_draws_as_inference_data_and_as_a_table():
+    pytest.importorskip("blackjax")
+    draws = np.random.default_rng(0).normal(size=(2, 300, 2))
+    posterior = with_diagnostics(["beam.length", "loads.0.mass"], draws, 0)
+    tree = posterior.to_inference_data()
+    group = tree["posterior"]
+    assert list(tree.children) == ["posterior"] and dict(group.sizes) == {"chain": 2, "draw": 300}
+    np.testing.assert_array_equal(group["loads.0.mass"], draws[..., 1])
+    frame = posterior.to_dataframe()
+    np.testing.assert_allclose(frame["mean"], draws.mean(axis=(0, 1)))
+    assert f"{draws[..., 0].mean():.6g}</td>" in posterior._repr_html_()
+
+
 def test_the_posterior_of_a_fit_is_as_wide_as_its_intervals(plain):
     """The model is nearly linear within its errors, so that both agree."""
     pytest.importorskip("blackjax")

@@ -6,6 +6,7 @@ No-U-turn sampling (Hoffman and Gelman, 2014) by blackjax, the extra `bayes`.
 import dataclasses
 import os
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +15,13 @@ from jaxtyping import Float
 
 from jaxbeam.files.report import ReportTable
 from jaxbeam.runtime.arrays import Array
-from jaxbeam.runtime.printer import text_table
+from jaxbeam.runtime.printer import TableViews, text_table
 from tuning.checkpoint import NO_CHECKPOINT, Checkpoint, checkpoint_path, fingerprint
 from tuning.fit.result import Fit
 from tuning.optional import import_extra
+
+if TYPE_CHECKING:
+    import xarray  # imported where it is used, as it takes as long as all of JAX
 
 NOISE_MODELS = ("fixed", "estimated")
 DRAWS_PER_BLOCK = 100  # draws between two checkpoints
@@ -26,7 +30,7 @@ MIN_EFFECTIVE_DRAWS = 100  # below it intervals are not reliable
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Posterior:
+class Posterior(TableViews):
     """Draws (chain, draw, parameter) of the free parameters in SI units, with diagnostics.
 
     `r_hat` is the ratio of the spread between chains to that within (1 for chains that have mixed),
@@ -88,6 +92,35 @@ class Posterior:
             for address, mean, deviation, interval, r_hat, effective in rows
         }
         return {"numbers": numbers, "verdict": self.verdict}
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Address, mean, deviation, 95 % interval and diagnostics of each parameter, by head."""
+        return {
+            "parameter": np.array(self.addresses),
+            "mean": self.means,
+            "deviation": self.deviations,
+            "95 % from": self.intervals[:, 0],
+            "95 % to": self.intervals[:, 1],
+            "R-hat": np.asarray(self.r_hat),
+            "effective draws": np.asarray(self.effective_draws),
+        }
+
+    def to_inference_data(self) -> "xarray.DataTree":
+        """Draws as ArviZ reads them: group "posterior", a variable (chain, draw) per address.
+
+        ArviZ 1.0 and later take a DataTree of xarray for inference data, as `arviz.summary(tree)`.
+        """
+        import xarray
+
+        chains, draws, _ = self.draws.shape
+        variables = {
+            address: (("chain", "draw"), self.draws[..., i])
+            for i, address in enumerate(self.addresses)
+        }
+        coordinates = {"chain": np.arange(chains), "draw": np.arange(draws)}
+        group = xarray.Dataset(variables, coordinates, {"inference_library": "jaxbeam"})
+        return xarray.DataTree.from_dict({"posterior": group})
 
     @property
     def table(self) -> ReportTable:
