@@ -141,6 +141,20 @@ def temporary_file(folder: pathlib.Path, data: bytes):
             os.unlink(path)
 
 
+def link(own: str, target: pathlib.Path, content: bytes) -> None:
+    """Give a file of some content a second name, in one step on network file systems too.
+
+    A file system without links gets a copy. Raises FileExistsError if there is a file of this name.
+    """
+    try:
+        os.link(own, target)
+    except FileExistsError:
+        raise
+    except OSError:
+        with open(target, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
+            file.write(content)
+
+
 def machine_description() -> str:
     """Operating system, architecture, and model and instruction sets of the processor."""
     try:
@@ -200,8 +214,11 @@ def _key(folder: pathlib.Path) -> bytes:
     path = folder / KEY_FILE
     if not os.path.lexists(path):
         try:
-            with temporary_file(folder, secrets.token_bytes(KEY_BYTES)) as temporary:
-                os.link(temporary, path)  # not `replace`: the key of another process would be lost
+            key = secrets.token_bytes(KEY_BYTES)
+            with temporary_file(folder, key) as temporary:
+                link(
+                    temporary, path, key
+                )  # not `replace`: the key of another process would be lost
         except FileExistsError:
             pass
         except OSError as error:

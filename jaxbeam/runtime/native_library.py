@@ -12,6 +12,7 @@ import os
 import pathlib
 import shutil
 import subprocess
+import sys
 import tempfile
 import warnings
 from collections.abc import Iterator
@@ -35,7 +36,9 @@ C_FOLDER = pathlib.Path(__file__).parent / "native"
 # time, and the code runs as fast.
 COMPILER_FLAGS = (
     *("-O2", "-fno-inline-functions-called-once", "-march=native", "-fno-math-errno"),
-    "-fPIC",
+    *(
+        () if sys.platform == "win32" else ("-fPIC",)
+    ),  # there all code is so; clang refuses the word
 )
 
 

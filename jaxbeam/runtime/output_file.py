@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from jaxbeam.runtime.cache_folder import temporary_file
+from jaxbeam.runtime.cache_folder import link, temporary_file
 
 # Names of the files written in a context that asks for them, as a command that is interrupted.
 WRITTEN: contextvars.ContextVar[list[str] | None] = contextvars.ContextVar("written", default=None)
@@ -154,15 +154,9 @@ def _take_over(own: str, lock: Path, content: bytes, held: bytes) -> bool:
 def _link(own: str, target: Path, content: bytes) -> bool:
     """Give a file a second name; False if there is a file of this name."""
     try:
-        os.link(own, target)  # one step on network file systems too, content included
+        link(own, target, content)
     except FileExistsError:
         return False
-    except OSError:  # a file system without links
-        try:
-            with open(target, "xb") as file:
-                file.write(content)
-        except FileExistsError:
-            return False
     return True
 
 
