@@ -373,12 +373,14 @@ OF_CONTROLLERS = {
     "poles": law("lqr-observer", estimator=jb.Observer([[-30.0, 200.0], [-60.0, 800.0]])),
     "dlqr-kalman": law(
         "dlqr-kalman",
+        LATER,
         positions=array(0.2, 0.45),
         position_weight=array(1e5, 2e5),
         input_rate_weight=array(1e-6, 1e-5),
     ),
     "h-infinity": law(
         "h-infinity",
+        LATER,
         positions=array(0.15, 0.3, 0.4),
         corner=np.float64(40.0),
         attenuation=np.float64(190.0),
@@ -439,10 +441,13 @@ OF_CONTROLLERS = {
     "mpc-scenario": law("mpc-scenario", delays=array(0.0, 2e-3), loads="known"),
     "lqr-finite": law("lqr-finite", design=DESIGN, terminal_weight=array(1e3, 1e2, 1.0, 0.1, 0.0)),
     "lqr-position": law("lqr-position", LATER, masses=array(0.3, 0.5), speeds=array(2.03, 3.07)),
+    # A filter that knows the loads exactly has nothing to correct.
     "kalman": rig(
-        [MASS],
+        [dataclasses.replace(MASS, entry_time=np.float64(0.0231))],
         actuators=CONTROLLED["kalman-known"].actuators,
-        controller=jb.LQR(**WEIGHTS, estimator=CONTINUOUS),
+        controller=jb.LQR(
+            **WEIGHTS, estimator=CONTINUOUS, design=DesignModel(mass=0.3, entry_time=0.0231)
+        ),
     ),
 }
 JUMPING = {

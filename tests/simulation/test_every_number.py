@@ -36,6 +36,11 @@ JUMPS = {
 # Those of an internal model that is scheduled, which counts the commands on their way.
 COUNTS = "needs known delays: leave period and delays out of what is traced"
 STEP, TOLERANCE = 4e-6, 1e-4  # of numbers; of the largest derivative of an output
+# Where runs repeat less exactly, as numbers pass equations of Riccati. The disagreement falls as
+# the step grows, so that it is rounding of the differences: that by the attenuation is 113, 7.5
+# and 0.4 times the tolerance with 4e-6, 4e-5 and 4e-4. Not of times, which reorder events.
+LARGER_STEPS = {"h-infinity": 4e-4, "dlqr-kalman": 1e-4}
+TIMES = ("period", "delay")
 
 # Numbers that do not matter in these cases, or never.
 WITHOUT_EFFECT = {
@@ -59,10 +64,7 @@ NEVER_OF_EFFECT = {
 }
 # Cases whose derivatives are still to be compared.
 OPEN = {
-    "dlqr-kalman",
     "mpc-dual-mode",
-    "h-infinity",
-    "kalman",
     "kalman-extended",
     "lqr-finite",
     "mpc-scenario",
@@ -123,8 +125,11 @@ def test_derivatives_equal_differences(name):
         return outputs(moved(case, smooth, shares))
 
     found = np.asarray(jax.jacfwd(function)(np.zeros(len(smooth))))
-    rows = STEP * np.eye(len(smooth))
-    expected = np.stack([(function(row) - function(-row)) / (2 * STEP) for row in rows], -1)
+    steps = [
+        STEP if address.endswith(TIMES) else LARGER_STEPS.get(name, STEP) for address in smooth
+    ]
+    rows = zip(steps, np.diag(steps), strict=True)
+    expected = np.stack([(function(row) - function(-row)) / (2 * step) for step, row in rows], -1)
     sizes = np.maximum(np.abs(function(np.zeros(len(smooth)))), 1e-12)
     without_effect = set()
     for i, address in enumerate(smooth):
