@@ -124,14 +124,13 @@ class WheelSet(Module):
 class LoadSet(Module):
     """All loads of a run: trajectories, distances of wheels behind the first (m), wheels.
 
-    The runs of a batch share everything but the numbers of the wheels. Loads have one wheel each
-    unless `behind` lists the wheels of each. `profile` is that of the surface, if it has one. The
-    last wheels are those of `absorbers`, which are fixed to the beam.
+    The runs of a batch share everything but the numbers of the wheels. `profile` is that of the
+    surface, if it has one. The last wheels are those of `absorbers`, which are fixed to the beam.
     """
 
     trajectories: tuple[AbstractTrajectory, ...]
     wheels: WheelSet
-    behind: tuple[Float[Array, " _"], ...] | None = None
+    behind: tuple[Float[Array, " _"], ...]
     profile: Module | None = None
     absorbers: int = eqx.field(static=True, default=0)
 
@@ -183,8 +182,7 @@ class LoadSet(Module):
 
     def _paths(self):
         """Pairs of trajectory and distances behind it."""
-        behind = self.behind or (np.zeros(1),) * len(self.trajectories)
-        return zip(self.trajectories, behind, strict=True)
+        return zip(self.trajectories, self.behind, strict=True)
 
     def kinematics(self, times: Float[Array, "*time"]) -> tuple[Float[Array, "wheel *time"], ...]:
         """Positions (m), speeds (m/s) and accelerations (m/s^2) of the wheels at times (s)."""
