@@ -205,3 +205,21 @@ def test_peaks_under_every_kind(kind):
     fronts = np.sort(np.concatenate([fronts - 1e-9, fronts, fronts + 1e-9]))
     expected = np.abs(shear_line(fronts[:, None] - behind) @ weights).max()
     assert_allclose(peak(loaded(load), quantity="shear"), expected, rtol=1e-8)
+
+
+def test_a_traced_peak_under_several_wheels_and_its_derivative():
+    """By a weight the moment line where its wheel is at the largest moment; by the speed, zero."""
+    load, wheels = KINDS["axles"]
+    behind, weights = np.array(list(wheels)), np.array(list(wheels.values()))
+    layout = mesh_layout(BRIDGE)
+
+    def value(forces, speed):
+        case = jb.replace(loaded(load), {"loads.0.forces": forces, "loads.0.speed": speed})
+        return jb.statics.static_peak(case, X, layout, quantity="moment")
+
+    lines = moment_line((np.array([0.0, X, LENGTH])[:, None] + behind).reshape(-1, 1) - behind)
+    largest = np.argmax(np.abs(lines @ weights))
+    found, (by_weights, by_speed) = jax.jit(jax.value_and_grad(value, (0, 1)))(weights, V)
+    assert_allclose(found, lines[largest] @ weights, rtol=1e-9)
+    assert_allclose(by_weights, lines[largest], rtol=1e-9, atol=1e-12)
+    assert_allclose(by_speed, 0.0, atol=1e-9 * found)
