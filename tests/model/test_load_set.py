@@ -69,6 +69,24 @@ def test_motion_of_the_surface_is_that_of_its_height():
     assert accelerations[0, 1] == pytest.approx((high - 2 * middle + low) / step**2, rel=1e-4)
 
 
+def test_a_sine_profile_presses_by_springs_dampers_and_inertia():
+    """y = a sin(2 pi x / L + p) at x = 20 m - v (t - 0.1 s): k y + c y' of a tyre, m y'' of a mass.
+
+    A vehicle stands still where it begins until the run does.
+    """
+    mass = jb.MovingMass(5e3, speed=-15.0, entry_time=0.1)
+    times, wave = np.array([-0.2, 0.0, 0.13, 0.4]), 2 * np.pi / 7.0
+    angle, rate = wave * (20.0 - 15.0 * (np.maximum(times, 0.0) - 0.1)) + 0.4, -15.0 * wave
+    moves = times >= 0
+    height, speed = 5e-3 * np.sin(angle), 5e-3 * rate * np.cos(angle) * moves
+    loads = load_set(jb.Case(CASE.beam, loads=[mass, CAR], profile=PROFILE, run=jb.Run(1.0)))
+    weight, surface = contact.known_disturbance(loads, times)
+    tyre = 3e6 * height + 8e3 * speed
+    assert_allclose(surface, np.stack([0 * tyre, tyre], axis=-1), rtol=1e-9, atol=1e-9)
+    inertia = -5e3 * rate**2 * height * moves
+    assert_allclose(weight, np.stack([inertia, tyre], axis=-1), rtol=1e-9, atol=1e-9)
+
+
 def test_vehicles_at_rest_stay_so():
     """On surfaces of any heights: no rates, no accelerations, forces in equilibrium."""
     group = LOADS.wheels.vehicles[0]

@@ -176,6 +176,16 @@ def test_masses_on_the_beam_reduce_the_input_matrix_of_a_patch(system):
     assert_allclose(loaded[3:6, 1], inverse @ free[3:6, 1], rtol=1e-9, atol=1e-13)
 
 
+def test_static_responses_are_gains_of_python_control(system):
+    """-C A^-1 B + D is what a constant input ends at."""
+    unloaded = system.unloaded
+    found = unloaded.static_response(slice(None)) @ unloaded.B + unloaded.D
+    matrices = (np.asarray(getattr(unloaded, name)) for name in "ABCD")
+    expected = control.ss(*matrices).dcgain()
+    # Velocities and accelerations end at 0, of 1e-3 m times powers of 600 rad/s but for rounding.
+    assert_allclose(found, expected, rtol=1e-9, atol=1e-13)
+
+
 @pytest.mark.parametrize("period", [1e-4, 1e-3, 0.02])
 def test_discretisation_is_that_of_scipy(system, period):
     for continuous in (system.unloaded, system.augmented(0.1)):
