@@ -281,7 +281,15 @@ BASES = {
 }
 
 # The case, the entry that is wrong, its value, the address that is named, and the likely unit.
+STANDING = {"position": 12.5, "mass": 2e3, "damping": 500.0}
+TABLE = {"kind": "mass", "mass": 30e3, "positions": [0.0, 25.0]}
 MISTAKES = [
+    # Absorbers, foundations and forces; the absorber is tuned at 3.55 Hz by 1e6 N/m
+    ("bridge", "absorbers.0", STANDING | {"stiffness": 1e3}, ".stiffness", "not in kN/m"),
+    ("bridge", "absorbers.0", {**STANDING, "mass": 2e6, "frequency": 3.5}, ".mass", "in kg"),
+    ("bridge", "beam.foundation_stiffness", 20.0, "", "in N/m^2, not in kN/m^2"),
+    ("footbridge", "loads.1.frequencies", [800.0], "", "in Hz, not in rad/s"),
+    ("bridge", "loads.0", TABLE | {"times": [0.0, 1000.0]}, "", "loads.0.times in s, not in ms"),
     # Stiffness, mass and damping of the beam
     ("bridge", "beam.flexural_rigidity", 30e6, "", "in N m^2, not in kN m^2"),
     ("bridge", "beam.flexural_rigidity", 30e3, "", "in N m^2, not in kN m^2"),
@@ -498,6 +506,16 @@ def changed(case: jb.Case, entry: str, value) -> jb.Case:
     else:
         node[last] = value
     return case_from_dict(content)
+
+
+def test_absorbers_and_foundations_of_use_look_right():
+    absorber = jb.Absorber(12.5, mass=2e3, stiffness=1e6, damping=3e3)
+    free_of_ground = jb.Absorber(12.5, ground_inertance=2e3, stiffness=1e6, damping=3e3)
+    for case in (
+        bridge(absorbers=[absorber, free_of_ground]),
+        bridge(beam={"foundation_stiffness": 20e3}),
+    ):
+        assert jb.check(case).warnings == ()
 
 
 def test_soft_springs_beside_each_other_do_not_clamp():

@@ -223,6 +223,34 @@ BEAM = (
     ),
 )
 
+ABSORBERS = (
+    Range(
+        of_parts("absorbers", "mass", "inertance", over=values.mass),
+        0.0,
+        2.0,
+        "it is {value:.3g} times the mass of the beam",
+        above="is it in kg, and beam.mass_per_length in kg/m, not in t/m?",
+        unless=("weight",),
+    ),
+    Range(
+        values.absorber_over_first_frequency,
+        0.1,
+        INF,
+        "the absorber swings at {frequency:.3g} Hz, {value:.2g} times the first frequency of the"
+        " beam",
+        "is it in N/m, not in kN/m? Or give its frequency",
+        unless=("stiffness", "weight"),
+    ),
+    Range(
+        values.foundation_over_bending,
+        1e-4,
+        INF,
+        "it is {value:.2g} times the stiffness of the beam in bending, and changes nothing",
+        "is it in N/m^2, not in kN/m^2 or MN/m^2?",
+        unless=("stiffness",),
+    ),
+)
+
 ACTUATORS = (
     Range(
         values.influence_of_actuator,
@@ -456,7 +484,7 @@ LOADS = (
         -INF,
         1 + 1e-12,
         "it has not left the beam by the end of the run at {duration:.4g} s",
-        above="it leaves at t = {leave:.4g} s; lengthen run.duration, or peaks may be missed",
+        above="it leaves at t = {leave:.4g} s; {likely}",
         cause="travel",
         unless=("stiffness", "distance"),
     ),
@@ -590,6 +618,13 @@ OTHERS = (
         unless=("stiffness",),
     ),
     Range(
+        values.samples_of_force,
+        values.LEAST_SAMPLES,
+        INF,
+        "{rate:.4g} Hz make {value:.2g} samples in a period of the force at {frequency:.4g} Hz",
+        "is it in Hz, not in rad/s? Else give a run.sample_rate above {least:.3g} Hz",
+    ),
+    Range(
         values.duration_over_crossing,
         0.0,
         300.0,
@@ -609,4 +644,4 @@ ADVICE = (  # on what commands report
     ),
 )
 
-RANGES = (*MATERIAL, *WEIGHTS, *BEAM, *ACTUATORS, *LOADS, *OTHERS)
+RANGES = (*MATERIAL, *WEIGHTS, *BEAM, *ABSORBERS, *ACTUATORS, *LOADS, *OTHERS)

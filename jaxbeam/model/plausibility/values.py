@@ -23,6 +23,7 @@ CLAMPING_STIFFNESS = 10.0  # E I / L: of two springs that hold the rotation, too
 SUPPORTED = 1e-3  # of the largest influence on a mode: a place that moves as little is held
 LEAST_SAMPLES = 2.0  # in a period
 LARGEST_IN_KHZ = 10.0  # of a sample rate of 10 kHz
+LATE_BY_TABLE = 100.0  # times the run, until a load leaves
 SMALL_UNITS = {"m": "mm", "m/s": "mm/s", "m/s^2": "mm/s^2", "1": "1e-6", "Pa": "MPa"}
 
 
@@ -85,6 +86,11 @@ def rigidity(facts: Facts) -> float:
 def density(facts: Facts) -> float:
     """Mass per length of the beam (kg/m)."""
     return facts.density
+
+
+def mass(facts: Facts) -> float:
+    """Mass of the beam (kg)."""
+    return facts.density * facts.length
 
 
 # The beam: stiffness, mass, damping, supports
@@ -429,6 +435,28 @@ def largest_phase(facts):
             yield Value(name, abs(phase))
 
 
+# Absorbers and foundations
+
+
+def absorber_over_first_frequency(facts):
+    """Natural frequencies of absorbers that are given by springs, over that of the first mode."""
+    first = facts.numbers.first_frequency
+    for address, absorber in _parts(facts, "absorbers"):
+        if first is not None and absorber.stiffness is not None:
+            moved = absorber.mass + absorber.inertance + absorber.ground_inertance
+            own = math.sqrt(float(absorber.stiffness) / float(moved)) / (2 * math.pi)
+            words = {"frequency": own, "first": first}
+            yield Value(f"{address}.stiffness", own / first, words)
+
+
+def foundation_over_bending(facts):
+    """Stiffness of a foundation over that of the first half wave of the beam in bending."""
+    bending = facts.rigidity * (math.pi / facts.length) ** 4
+    for name, given in _numbers(facts.case.beam, "beam", "foundation_stiffness"):
+        if given > 0:
+            yield Value(name, float(given) / bending)
+
+
 # Loads: their travel
 
 
@@ -446,9 +474,13 @@ def entry_over_duration(facts):
 def exit_over_duration(facts):
     """Time at which a load leaves over the duration of the run."""
     duration = float(facts.case.run.duration)
-    for (address, _), (enter, leave) in zip(facts.loads(), facts.windows, strict=True):
+    for (address, load), (enter, leave) in zip(facts.loads(), facts.windows, strict=True):
         if enter < duration and leave < NEVER:
-            yield Value(address, leave / duration, {"leave": leave, "duration": duration})
+            likely = "lengthen run.duration, or peaks may be missed"
+            if load.times is not None and leave > LATE_BY_TABLE * duration:
+                likely += f"; are {address}.times in s, not in ms?"
+            words = {"leave": leave, "duration": duration, "likely": likely}
+            yield Value(address, leave / duration, words)
 
 
 def braking_to_stop(facts):
@@ -662,6 +694,16 @@ def samples_of_record(facts):
         likely += ", or is it in kHz?"
     words = {"rate": rate, "what": f"mode {mode}", "frequency": frequency, "likely": likely}
     yield Value("run.sample_rate", rate / frequency, words)
+
+
+def samples_of_force(facts):
+    """Samples of the record in a period of the highest frequency of each varying force."""
+    rate = float(facts.case.run.sample_rate)
+    for address, load in facts.loads("varying-force"):
+        highest = float(np.max(load.frequencies, initial=0.0))
+        if highest > 0:
+            words = {"rate": rate, "frequency": highest, "least": LEAST_SAMPLES * highest}
+            yield Value(f"{address}.frequencies", rate / highest, words)
 
 
 def gravity(facts):
