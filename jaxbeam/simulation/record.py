@@ -340,9 +340,21 @@ class Record(RecordViews):
                 found.append(f"the stroke of absorber {i} is {stroke:.4g} m, above {limit:.4g} m")
         return found
 
+    def _size_sentences(self) -> list[str]:
+        """How large a deflection is that no beam has; the loop may be unstable, but is bounded."""
+        largest = np.abs(np.asarray(concrete(self.deflection))).max(initial=0.0)
+        ratio = float(largest / concrete(self.case.beam.length))
+        if not ratio > 1:
+            return []
+        loop = "" if self.case.controller is None else ", and the stability of the loop"
+        return [
+            f"the deflection reaches {largest:.4g} m, {ratio:.3g} times the length of the beam, for"
+            f" which the model does not hold: check units{loop}"
+        ]
+
     @property
     def verdict(self) -> str:
-        """Sentence on divergence, contact, controller steps without a solution, and the error."""
+        """Sentence on divergence, size, contact, steps of the controller that failed, and error."""
         diverged = float(concrete(self.diverged_time))
         if np.isfinite(diverged):
             return (
@@ -355,7 +367,7 @@ class Record(RecordViews):
             parts = [contact_sentence(self.case, *contact)]
         else:
             parts = [flights_sentence(self.case, self.flights)]
-        parts += self._stroke_sentences()
+        parts += self._stroke_sentences() + self._size_sentences()
         failures = int(concrete(self.failures)[-1])
         if failures:
             parts.append(f"the controller found no solution in {failures} of its steps")

@@ -120,6 +120,10 @@ def test_a_loop_without_gain_is_the_beam_without_a_loop():
     scale = np.abs(free.deflection).max()
     assert_allclose(record.deflection, free.deflection, rtol=0, atol=1e-9 * scale)
     assert record.verdict.split(";")[0] == free.verdict.split(";")[0]
+    size = f"the deflection reaches {scale:.4g} m, {scale:.3g} times the length of the beam"
+    assert size in record.verdict and size in free.verdict
+    assert "stability of the loop" in record.verdict and "stability" not in free.verdict
+    assert "times the length" not in jb.simulate(Units().case(0.0, 0.05)).verdict
     warned = (
         jb.check(SOFT).warnings, jb.check(dataclasses.replace(SOFT, controller=None)).warnings
     )  # fmt: skip
