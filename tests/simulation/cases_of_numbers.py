@@ -439,7 +439,13 @@ OF_CONTROLLERS = {
         positions=array(0.2, 0.4),
     ),
     "mpc-scenario": law("mpc-scenario", delays=array(0.0, 2e-3), loads="known"),
-    "lqr-finite": law("lqr-finite", design=DESIGN, terminal_weight=array(1e3, 1e2, 1.0, 0.1, 0.0)),
+    "lqr-finite": law(
+        "lqr-finite",
+        LATER,
+        design=DESIGN,
+        entries="predicted",
+        terminal_weight=array(1e3, 1e2, 1.0, 0.1, 0.01),
+    ),
     "lqr-position": law("lqr-position", LATER, masses=array(0.3, 0.5), speeds=array(2.03, 3.07)),
     # A filter that knows the loads exactly has nothing to correct.
     "kalman": rig(

@@ -66,7 +66,6 @@ NEVER_OF_EFFECT = {
 OPEN = {
     "mpc-dual-mode",
     "kalman-extended",
-    "lqr-finite",
     "mpc-scenario",
 }
 
