@@ -18,6 +18,7 @@ from jaxbeam.case.fields import is_concrete
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.files.endings import check_ending
+from jaxbeam.files.interactive import interactive_page
 from jaxbeam.files.netcdf import write_netcdf
 from jaxbeam.files.tables import write_result
 from jaxbeam.model.modes import Modes
@@ -268,6 +269,17 @@ class RecordViews(TableViews, Module):
             self.to_netcdf(path, overwrite)
         else:
             write_result(path, lambda: self.columns, self.to_xarray, overwrite)
+
+    def to_html(self, path: str | os.PathLike, overwrite: bool = False) -> None:
+        """Write an interactive figure of the histories, a page in one file, for any browser.
+
+        Raises ValueError for another ending than .html, FileExistsError if the file exists,
+        without `overwrite`.
+        """
+        check_ending(path, "an interactive figure", (".html",))
+        page = interactive_page(_head(self.case, self.times), self.verdict, self.columns)
+        with whole_file(path, overwrite) as beside:
+            beside.write_text(page, encoding="utf-8")
 
     def to_netcdf(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write the labelled dataset to a netCDF file.
