@@ -32,15 +32,18 @@ def whole_file(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Pat
 
     A write that is stopped leaves what was there. Raises FileExistsError if something is there,
     without `overwrite`; OSError (a FileNotFoundError without its folder) with the name `path`,
-    whatever cannot be written.
+    whatever cannot be written, or is a device or a pipe, which a file would take the place of.
     """
     place = Path(os.path.realpath(path))  # a link stays a link
     _refuse_existing(place, path, overwrite)
-    beside = place.with_name(f".{place.stem}.{os.getpid()}{place.suffix}")
+    # The ending is that of the name, which decides the format, and not that of the file behind.
+    beside = place.with_name(f".{place.stem}.{os.getpid()}{Path(path).suffix}")
     try:
         with naming_file(path):
             if not place.parent.is_dir():
                 raise FileNotFoundError(None, f"there is no folder {Path(path).parent}")
+            if place.exists() and not (place.is_file() or place.is_dir()):
+                raise OSError(None, "it is a device or a pipe, not a regular file")
             yield beside
             _refuse_existing(place, path, overwrite)  # of another process meanwhile
             if place.is_dir():

@@ -2,6 +2,8 @@
 
 import ast
 import errno
+import os
+import re
 import resource
 import signal
 
@@ -10,6 +12,7 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.files.matrices import write_state_space
+from jaxbeam.files.tables import write_table
 from jaxbeam.runtime.output_file import whole_file
 from tests.modules import module_files, parse
 from tuning.checkpoint import save
@@ -44,6 +47,26 @@ def test_a_folder_takes_the_place_of_a_folder_and_links_stay(tmp_path):
         beside.mkdir()
         (beside / "new").touch()
     assert link.is_symlink() and [path.name for path in place.iterdir()] == ["new"]
+
+
+def test_a_link_to_a_file_without_an_ending_keeps_both(tmp_path):
+    place, link = tmp_path / "stored", tmp_path / "x.csv"
+    place.touch()
+    link.symlink_to(place)
+    write_table(link, {"x (m)": np.arange(2.0)}, overwrite=True)
+    assert link.is_symlink() and place.read_text().splitlines()[0] == "x (m)"
+    assert sorted(tmp_path.iterdir()) == [place, link]
+
+
+def test_no_file_takes_the_place_of_a_pipe_or_a_device(tmp_path):
+    place, link = tmp_path / "pipe", tmp_path / "x.csv"
+    os.mkfifo(place)
+    link.symlink_to(place)
+    for path in (link, place):
+        said = f"cannot write {re.escape(str(path))}: it is a device or a pipe"
+        with pytest.raises(OSError, match=said), whole_file(path, overwrite=True):
+            pytest.fail("nothing is computed")
+    assert place.is_fifo() and link.is_symlink()
 
 
 @pytest.mark.parametrize(
