@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxbeam.analysis.assessment.assessment import (
     INFORMATION,
@@ -16,12 +15,12 @@ from jaxbeam.analysis.assessment.assessment import (
     running_factor,
     static_dynamic_factor,
 )
+from jaxbeam.analysis.load_models import TabulatedLine, influence_at
 from jaxbeam.analysis.sections import spans
 from jaxbeam.case.beam import MATERIALS
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.model.along_beam import SETTLED, refined
-from jaxbeam.model.statics import held_positions, influence_line
 
 LINE_POINTS = 801  # along the beam, between which influence lines are linear
 FRONT_POSITIONS = 8001  # of the first axle of a train
@@ -40,26 +39,9 @@ class CheckedSection(NamedTuple):
     side: str = "right"
 
 
-class TabulatedLine(NamedTuple):
-    """Influence line (per newton) at load positions (m); zero off the beam."""
-
-    positions: Float[np.ndarray, " position"]
-    values: Float[np.ndarray, " position"]
-
-    def at(self, x: Float[np.ndarray, "*place"]) -> Float[np.ndarray, "*place"]:
-        """Values at positions x (m)."""
-        return np.interp(x, self.positions, self.values, left=0.0, right=0.0)
-
-
 def tabulated_line(case: Case, section: CheckedSection) -> TabulatedLine:
-    """Influence line of a section, with a point at its kink."""
-    length = float(concrete(case.beam.length))
-    places = np.linspace(0.0, length, LINE_POINTS)
-    # Shear forces jump at the section: a point on both sides of it.
-    beside = section.x + 1e-9 * length * np.array([-1.0, 0.0, 1.0])
-    places = np.unique(np.concatenate([places, np.clip(beside, 0, length), held_positions(case)]))
-    line = influence_line(case, section.x, places, quantity=section.quantity, side=section.side)
-    return TabulatedLine(places, np.asarray(line))
+    """Influence line of a section, with points at its kink."""
+    return influence_at(case, section.x, section.quantity, section.side, LINE_POINTS)
 
 
 def largest_moments(case: Case) -> list[CheckedSection]:
@@ -70,7 +52,7 @@ def largest_moments(case: Case) -> list[CheckedSection]:
 
     def at(x):
         lines = [tabulated_line(case, CheckedSection("", "moment", float(one))) for one in x]
-        positive = (TabulatedLine(line.positions, np.maximum(line.values, 0.0)) for line in lines)
+        positive = (line._replace(values=np.maximum(line.values, 0.0)) for line in lines)
         return np.array([largest_under_lm71(line) for line in positive])
 
     def curves(found):
@@ -112,7 +94,7 @@ def largest_under_lm71(line: TabulatedLine) -> float:
     first = np.concatenate([first, peak - axles])
     effect = []
     for sign in (1.0, -1.0):
-        signed = TabulatedLine(line.positions, sign * line.values)
+        signed = line._replace(values=sign * line.values)
         unfavourable = np.maximum(signed.values, 0.0)
         steps = np.diff(signed.positions) * (unfavourable[1:] + unfavourable[:-1]) / 2
         area = np.concatenate([[0.0], np.cumsum(steps)])

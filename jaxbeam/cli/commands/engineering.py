@@ -3,12 +3,15 @@
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from cyclopts import Parameter
 
 import jaxbeam as jb
 from jaxbeam.cli.arguments import check_suffix
 from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, print_warnings, table
 from jaxbeam.files.endings import TABLES
+
+ZERO = 1e-5  # share of the largest value of a quantity that is printed as 0
 
 
 def assess(
@@ -92,6 +95,94 @@ def _number_or_quantity(text: str | None) -> float | str | None:
         return None if text is None else float(text)
     except ValueError:
         return text
+
+
+def envelope(
+    case: Path,
+    /,
+    vehicle: str,
+    *,
+    quantity: tuple[str, ...] = ("moment", "shear"),
+    at: tuple[str, ...] = (),
+    lane: str | None = None,
+    impact: float | None = None,
+    speed: str | None = None,
+    output: Output = None,
+    options: CaseOptions = CaseOptions(),
+) -> None:
+    """Compute extremes under a load model of a code: a vehicle at its worst place and a lane load.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML, of which beam, supports and actuators at rest count, not its loads.
+    vehicle
+        HL-93, LM1, M1600, S1600, CL-625, HB45, or a train of the library, as HSLM-A1.
+    quantity
+        moment, shear, reaction, deflection, rotation, ...; repeat it for more.
+    at
+        Position of a section, as 12.5 (m) or "12.5 m"; repeat it for more. By default supports,
+        midspans and quarter points; reactions at supports.
+    lane
+        Lane load where it is unfavourable, as 9300 (N/m) or "9.3 kN/m"; by default that of the
+        load model.
+    impact
+        Allowance for dynamics, added to effects of axles, 0.33 for a third; by default that of the
+        load model.
+    speed
+        Speed, as 20 (m/s) or "80 km/h": print the dynamic extremes of its axles too.
+    output
+        Write the extremes to a table: OUT.csv, .xlsx, .mat or .parquet.
+    """
+    check_suffix(output, TABLES[0], "a table of extremes", TABLES[1:])
+    options.check_outputs(output)
+    parsed_case = options.read(case, judged="structure")
+
+    from jaxbeam.analysis.load_models import crossing_envelope, load_model_envelope
+    from jaxbeam.analysis.sections import characteristic_points
+    from jaxbeam.case.reading.units import number_in_si
+    from jaxbeam.model.statics import REACTION, held_positions
+
+    lane_load = None if lane is None else number_in_si(lane, "N/m", "--lane")
+    velocity = None if speed is None else number_in_si(speed, "m/s", "--speed")
+    places = {point.x: point.name for point in characteristic_points(parsed_case)}
+    sections = [number_in_si(text, "m", "--at") for text in at]
+    columns = {name: [] for name in ("quantity", "place", "x (m)", "lowest", "highest")}
+    dynamic = {"dynamic lowest": [], "dynamic highest": []}
+    rows = []
+    for name in quantity:
+        x = sections or (held_positions(parsed_case) if name == REACTION else list(places))
+        found = load_model_envelope(
+            parsed_case, vehicle, x, quantity=name, lane=lane_load, allowance=impact
+        )
+        of_crossing = [()] * len(x)
+        if velocity is not None and name != REACTION:
+            moving = crossing_envelope(parsed_case, vehicle, velocity, x, quantity=name)
+            of_crossing = list(zip(*map(np.asarray, moving), strict=True))
+        for i, place in enumerate(found.positions):
+            low, high = found.lowest[i], found.highest[i]
+            label = places.get(float(place), "")
+            entries = name, label, float(place), float(low), float(high)
+            for head, entry in zip(columns, entries, strict=True):
+                columns[head].append(entry)
+            for head, entry in zip(dynamic, of_crossing[i] or (np.nan, np.nan), strict=True):
+                dynamic[head].append(float(entry))
+            of_rounding = ZERO * max(-found.lowest.min(), found.highest.max())
+            low, high = (0.0 if abs(one) < of_rounding else one for one in (low, high))
+            extremes = [f"{low:.5g}", str(found.at_lowest[i]) if low else ""]
+            extremes += [f"{high:.5g}", str(found.at_highest[i]) if high else ""]
+            if velocity is not None:
+                extremes += [f"{one:.5g}" for one in of_crossing[i]] or ["", ""]
+            rows.append((f"{name} at {label or f'{place:g} m'}", *extremes))
+    if velocity is not None:
+        columns |= dynamic
+    if output:
+        from jaxbeam.files.tables import write_table
+
+        write_table(output, {k: np.array(v) for k, v in columns.items()}, options.overwrite)
+    heads = "section (SI units)", "lowest", "under", "highest", "under"
+    heads += ("dynamic lowest", "highest") if velocity is not None else ()
+    options.report(columns, table(heads, rows), output)
 
 
 def influence(

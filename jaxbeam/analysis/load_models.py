@@ -1,0 +1,308 @@
+"""Envelopes of the load models of road bridges: a vehicle at its worst place, and a lane load.
+
+Models are those of `jaxbeam/library/load_models.toml`; a new one is a table there.
+"""
+
+import dataclasses
+import functools
+import tomllib
+from importlib import resources
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxbeam.analysis.sections import Envelope, envelope
+from jaxbeam.case.case import Case
+from jaxbeam.case.declared_checks import check_on_beam, suggestion
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.loads.axles import Axles
+from jaxbeam.case.quantities import quantity_of
+from jaxbeam.library.published import trains
+from jaxbeam.model.along_beam import positions_along, sections
+from jaxbeam.model.modes import modes
+from jaxbeam.model.statics import REACTION, held_positions, influence_line
+
+POSITIONS = 41  # along the beam by default, beside the special ones
+LINE_POINTS = 2001  # along the beam, between which influence lines are linear
+SPACINGS = 25  # values of a varied spacing, searched again between the neighbours of the best
+COARSE = 20  # points of a line between those at which an axle is tried first
+
+
+class ModelVehicle(NamedTuple):
+    """Vehicle of a load model: distances (m) and forces (N) of its axles, and its lane load (N/m).
+
+    `spacings` are the distances (m) that the spacing number `varied` may have, None for one only.
+    """
+
+    name: str
+    axle_spacings: Float[np.ndarray, " spacing"]
+    axle_forces: Float[np.ndarray, " axle"]
+    lane: float
+    varied: int | None
+    between: tuple[float, float] | None
+    choices: tuple[float, ...]
+
+    def with_spacing(self, value: float | None) -> Float[np.ndarray, " axle"]:
+        """Offsets (m) of the axles behind the first, with a value of the varied spacing (m)."""
+        spacings = np.array(self.axle_spacings, float)
+        if value is not None:
+            spacings[self.varied] = value
+        return np.concatenate([[0.0], np.cumsum(spacings)])
+
+
+class LoadModel(NamedTuple):
+    """Load model of a code: its vehicles, and the `allowance` for dynamics of axles (1)."""
+
+    vehicles: tuple[ModelVehicle, ...]
+    allowance: float
+
+
+@functools.cache
+def load_models() -> dict[str, LoadModel]:
+    """All load models of the library by name.
+
+    >>> from jaxbeam.analysis.load_models import load_models
+    >>> print(", ".join(load_models()))
+    HL-93, LM1, M1600, S1600, CL-625, HB45
+    """
+    text = (resources.files("jaxbeam.library") / "load_models.toml").read_text(encoding="utf-8")
+    found = {}
+    for table in tomllib.loads(text)["models"]:
+        vehicles = tuple(
+            ModelVehicle(
+                one["name"],
+                np.array(one["axle_spacings"]),
+                np.array(one["axle_forces"]),
+                one["lane"],
+                one.get("varied"),
+                tuple(one["between"]) if "between" in one else None,
+                tuple(one.get("choices", ())),
+            )
+            for one in table["vehicles"]
+        )
+        found[table["name"]] = LoadModel(vehicles, table.get("allowance", 0.0))
+    return found
+
+
+def load_model(name: str) -> LoadModel:
+    """Load model of a name, or one of a train of the library without a lane load.
+
+    Raises ValueError for an unknown name, and for a train without forces.
+    """
+    if name in load_models():
+        return load_models()[name]
+    train = trains().get(name)
+    if train is None or train.forces is None:
+        known = [
+            *load_models(),
+            *(one for one, train in trains().items() if train.forces is not None),
+        ]
+        raise ValueError(f"there is no load model {name!r}; {suggestion(name, known)}")
+    spacings = np.diff(train.offsets)
+    return LoadModel((ModelVehicle(name, spacings, train.forces, 0.0, None, None, ()),), 0.0)
+
+
+class WorstPlace(NamedTuple):
+    """Place of a vehicle: name, offsets (m) of its axles behind the first, and that one's x (m).
+
+    Offsets are negative for a vehicle that goes to the left. Without a `vehicle` there is none.
+    """
+
+    vehicle: str
+    offsets: Float[np.ndarray, " axle"]
+    first_axle: float
+
+    def __str__(self) -> str:
+        if not self.vehicle:
+            return "unloaded"
+        last, first = sorted((self.first_axle, self.first_axle - self.offsets[-1]))
+        return f"{self.vehicle} at {last:.4g} to {first:.4g} m"
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadModelEnvelope:
+    """Lowest and highest static value of a quantity at `positions` (m), in SI units.
+
+    At most zero and at least zero. Axles count with the allowance, the lane load without.
+    `at_lowest` and `at_highest` are the places of the vehicles.
+    """
+
+    positions: Float[np.ndarray, " position"]
+    lowest: Float[np.ndarray, " position"]
+    highest: Float[np.ndarray, " position"]
+    at_lowest: tuple[WorstPlace, ...]
+    at_highest: tuple[WorstPlace, ...]
+
+
+def load_model_envelope(
+    case: Case,
+    model: str | LoadModel,
+    x=None,
+    *,
+    quantity: str = "moment",
+    lane: float | None = None,
+    allowance: float | None = None,
+) -> LoadModelEnvelope:
+    """Static envelope of a load model of a code at positions x (m), by default along the beam.
+
+    One vehicle of the `model`, a name of `load_models` or a train of the library, stands wherever
+    it is worst, in either direction, in part on the beam; its varied spacing has the worst of its
+    values. The `lane` load (N/m) lies on all parts where it is unfavourable. `allowance` is
+    added to effects of axles. Both are by default those of the model. Quantities are those of
+    `influence_line`; of what jumps at a position both sides count. The case's own loads do not.
+
+    Raises ValueError as `influence_line`, for an unknown model, and for a lane load or an allowance
+    below 0.
+
+    >>> import jaxbeam as jb
+    >>> from jaxbeam.analysis.load_models import load_model_envelope
+    >>> case = jb.Case(jb.Beam(length=20.0, flexural_rigidity=6e9, mass_per_length=9e3))
+    >>> found = load_model_envelope(case, "LM1", x=[10.0])  # 2 * 300 kN * 4.7 m + 27 kN/m L^2 / 8
+    >>> print(f"{found.highest[0]:.4g} N m")
+    4.17e+06 N m
+    """
+    chosen = load_model(model) if isinstance(model, str) else model
+    allowance = chosen.allowance if allowance is None else allowance
+    for name, value in (("lane", lane or 0.0), ("allowance", allowance)):
+        if not value >= 0:
+            raise ValueError(f"{name} must be 0 or more, not {value:g}")
+    if x is None:
+        x = held_positions(case) if quantity == REACTION else positions_along(case, POSITIONS)
+    x = np.atleast_1d(np.asarray(concrete(x), float))
+    check_on_beam("x", x, case.beam.length)
+    points, left_of = x, np.zeros(0, int)
+    if quantity != REACTION:
+        quantity_of(quantity)
+        points, left_of = map(np.asarray, sections(case, x, quantity))
+    found = [
+        _extremes(influence_at(case, float(point), quantity), chosen, lane, 1 + allowance)
+        for point in points
+    ]
+    lowest, highest = ([one[i] for one in found[: x.size]] for i in (0, 1))
+    for position, (low, high) in zip(left_of, found[x.size :], strict=True):
+        lowest[position] = min(lowest[position], low, key=lambda one: one[0])
+        highest[position] = max(highest[position], high, key=lambda one: one[0])
+    return LoadModelEnvelope(
+        x,
+        np.array([value for value, _ in lowest]),
+        np.array([value for value, _ in highest]),
+        tuple(place for _, place in lowest),
+        tuple(place for _, place in highest),
+    )
+
+
+def crossing_envelope(
+    case: Case, model: str | LoadModel, speed: float, x, *, quantity: str = "moment"
+) -> Envelope:
+    """Dynamic envelope at positions x (m) of the vehicles of a load model, one after another.
+
+    Each crosses from the left at a `speed` (m/s) with the least of its varied spacing, as moving
+    forces without allowance and lane load, and the run goes on for one period of the lowest mode.
+    Raises as `envelope`, and ValueError for an unknown model.
+    """
+    chosen = load_model(model) if isinstance(model, str) else model
+    free = dataclasses.replace(case, loads=(), controller=None)
+    length, period = float(concrete(case.beam.length)), 1 / float(modes(free).frequencies[0])
+    found = []
+    for vehicle in chosen.vehicles:
+        offsets = vehicle.with_spacing(None)
+        axles = Axles(offsets=offsets, forces=vehicle.axle_forces, speed=speed)
+        run = dataclasses.replace(case.run, duration=(length + offsets[-1]) / speed + period)
+        crossing = dataclasses.replace(free, loads=(axles,), run=run)
+        found.append(envelope(crossing, x, quantity=quantity))
+    lowest = np.min([one.lowest for one in found], axis=0)
+    return Envelope(lowest, np.max([one.highest for one in found], axis=0), found[0].positions)
+
+
+class TabulatedLine(NamedTuple):
+    """Influence line (per newton) at load positions (m); zero off the beam.
+
+    It is linear between positions, among which are its `kinks` (m).
+    """
+
+    positions: Float[np.ndarray, " position"]
+    values: Float[np.ndarray, " position"]
+    kinks: Float[np.ndarray, " kink"]
+
+    def at(self, x: Float[np.ndarray, "*place"]) -> Float[np.ndarray, "*place"]:
+        """Values at positions x (m)."""
+        return np.interp(x, self.positions, self.values, left=0.0, right=0.0)
+
+    @property
+    def positive_area(self) -> float:
+        """Integral of the positive values over the positions (m)."""
+        a, b = self.values[:-1], self.values[1:]
+        # Of an interval in which the line crosses zero a triangle counts.
+        highest, lowest = np.maximum(a, b), np.minimum(a, b)
+        crosses = (highest > 0) & (lowest < 0)
+        share = np.where(crosses, highest / np.where(crosses, highest - lowest, 1.0), 1.0)
+        heights = np.where(crosses, highest, np.maximum(a, 0.0) + np.maximum(b, 0.0))
+        return float(np.sum(np.diff(self.positions) * share * heights / 2))
+
+
+def influence_at(
+    case: Case, x: float, quantity: str, side: str = "right", points: int = LINE_POINTS
+) -> TabulatedLine:
+    """Influence line of a quantity at x (m), for loads at equally spaced `points` and its kinks."""
+    length = float(concrete(case.beam.length))
+    places = np.linspace(0.0, length, points)
+    # Shear forces jump at the section: a point on both sides of it.
+    beside = x + 1e-9 * length * np.array([-1.0, 0.0, 1.0])
+    kinks = np.concatenate([np.clip(beside, 0.0, length), held_positions(case)])
+    places = np.union1d(places, kinks)
+    line = influence_line(case, x, places, quantity=quantity, side=side)
+    return TabulatedLine(places, np.asarray(line), kinks)
+
+
+def _extremes(line: TabulatedLine, model: LoadModel, lane: float | None, factor: float):
+    """Lowest and highest value with the places of the vehicles, each at most and at least zero."""
+    found = []
+    for sign in (-1.0, 1.0):
+        signed = line._replace(values=sign * line.values)
+        area = signed.positive_area
+        best = 0.0, WorstPlace("", np.zeros(0), np.nan)
+        for vehicle in model.vehicles:
+            uniform = (vehicle.lane if lane is None else lane) * area
+            value, place = _worst_place(signed, vehicle)
+            if factor * value + uniform > best[0]:
+                best = factor * value + uniform, place
+        found.append((sign * best[0] + 0.0, best[1]))  # no -0.0
+    return found
+
+
+def _worst_place(line: TabulatedLine, vehicle: ModelVehicle) -> tuple[float, WorstPlace]:
+    """Largest sum of the axle forces times the line (N times its unit), and the vehicle's place."""
+    length, best = float(line.positions[-1]), (0.0, WorstPlace("", np.zeros(0), np.nan))
+    coarse = np.concatenate([line.positions[::COARSE], line.kinks])
+
+    def search(places, values):
+        """The best of values of the spacing with an axle at each of some places, and its value."""
+        found, chosen = best, None
+        for value in values:
+            offsets = vehicle.with_spacing(value)
+            for behind in (offsets, -offsets):
+                fronts = (places[:, None] + behind).ravel()
+                total = line.at(fronts[:, None] - behind) @ vehicle.axle_forces
+                i = int(np.argmax(total))
+                if total[i] > found[0]:
+                    place = WorstPlace(vehicle.name, behind, float(fronts[i]))
+                    found, chosen = (float(total[i]), place), value
+        return found, chosen
+
+    values = vehicle.choices or (None,)
+    if vehicle.between is not None:
+        low, high = vehicle.between[0], vehicle.between[1] or max(vehicle.between[0], length)
+        values = np.linspace(low, high, SPACINGS)
+    best, chosen = search(coarse, values)
+    if vehicle.between is not None and chosen is not None:
+        step = (high - low) / (SPACINGS - 1)
+        values = np.linspace(max(low, chosen - step), min(high, chosen + step), SPACINGS)
+        best, chosen = search(coarse, values)
+    if not best[1].vehicle:
+        return best
+    # The line is linear between its points, so that an axle is at one of them at the worst place.
+    near = best[1].first_axle - best[1].offsets
+    step = COARSE * length / line.positions.size
+    points = line.positions[np.min(np.abs(line.positions[:, None] - near), axis=1) <= 2 * step]
+    return search(points, (chosen,))[0]

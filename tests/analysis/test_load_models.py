@@ -1,0 +1,143 @@
+"""Envelopes of load models against PyCBA, closed forms, and the static peak of a crossing."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.analysis.load_models import (
+    LoadModel,
+    ModelVehicle,
+    crossing_envelope,
+    influence_at,
+    load_model,
+    load_model_envelope,
+    load_models,
+)
+from jaxbeam.cli import main
+from tests.modules import ROOT
+
+PYCBA = json.loads((ROOT / "tests" / "data" / "load_models.json").read_text())
+BEAM = jb.Beam(20.0, flexural_rigidity=6e9, mass_per_length=9e3, damping_ratio=0.01, modes=3)
+SPAN = jb.Case(BEAM)
+
+
+def two_spans(first: float, second: float) -> jb.Case:
+    beam = jb.Beam(first + second, flexural_rigidity=6e9, mass_per_length=9e3)
+    return jb.Case(beam, supports=[jb.Support(first)])
+
+
+def vehicle(spacings, forces, lane: float = 0.0, **spacing) -> LoadModel:
+    varied = {"varied": None, "between": None, "choices": ()} | spacing
+    one = ModelVehicle("lorry", np.array(spacings), np.array(forces), lane, **varied)
+    return LoadModel((one,), 0.0)
+
+
+@pytest.mark.parametrize("name", PYCBA["vehicles"])
+def test_extremes_of_two_spans_are_those_of_pycba(name):
+    """Six digits: that program moves the lorry in steps of 0.05 m, in both directions."""
+    case, numbers = two_spans(*map(float, PYCBA["spans"])), PYCBA["vehicles"][name]
+    lorry = vehicle(numbers["spacings"], 1e3 * np.array(numbers["forces"]))
+    moment = load_model_envelope(case, lorry, [25.0])
+    assert_allclose(moment.lowest, 1e3 * numbers["support moment"], rtol=2e-6)
+    reactions = load_model_envelope(case, lorry, quantity="reaction")
+    assert_allclose(reactions.highest, 1e3 * np.array(numbers["reactions"]), rtol=1e-6)
+
+
+def test_one_axle_and_the_lane_load_on_one_span():
+    """P L / 4 and q L^2 / 8 at midspan; P and q L / 2 at the supports; nothing the other way."""
+    lorry = vehicle([], [100e3], lane=5e3)
+    middle = load_model_envelope(SPAN, lorry, [10.0])
+    assert_allclose(middle.highest, 100e3 * 20 / 4 + 5e3 * 400 / 8, rtol=1e-6)
+    assert_allclose(middle.lowest, 0.0, atol=1.0)
+    ends = load_model_envelope(SPAN, lorry, [0.0, 20.0], quantity="shear")
+    assert_allclose(ends.highest[0], 150e3, rtol=1e-6)
+    assert_allclose(ends.lowest[1], -150e3, rtol=1e-4)
+    factored = load_model_envelope(SPAN, lorry, [10.0], lane=0.0, allowance=0.4)
+    assert_allclose(factored.highest, 1.4 * 100e3 * 20 / 4, rtol=1e-6)
+
+
+def test_the_lane_load_lies_where_it_is_unfavourable():
+    """Midspans of two equal spans l: 3 q l^2 / 32 by the own span, -q l^2 / 32 by the other."""
+    found = load_model_envelope(two_spans(20.0, 20.0), vehicle([], [0.0], lane=1e3), [10.0])
+    assert_allclose(found.highest, 3 * 1e3 * 400 / 32, rtol=1e-5)
+    assert_allclose(found.lowest, -1e3 * 400 / 32, rtol=1e-5)
+
+
+def test_extremes_are_static_peaks_of_the_crossing():
+    """The larger of both extremes, in both directions, along a beam of two spans."""
+    case, spacings, forces = two_spans(14.0, 9.0), [3.1, 1.2], np.array([60e3, 110e3, 90e3])
+    x = np.array([3.0, 7.0, 14.0, 19.0])
+    found = load_model_envelope(case, vehicle(spacings, forces), x)
+    peaks = []
+    for order in (1, -1):
+        offsets = np.concatenate([[0.0], np.cumsum(spacings[::order])])
+        lorry = jb.Axles(offsets=offsets, forces=forces[::order], speed=1.0)
+        loaded = dataclasses.replace(case, loads=(lorry,))
+        peaks.append(np.asarray(jb.statics.static_peak(loaded, x, quantity="moment")))
+    largest = np.maximum(found.highest, -found.lowest)
+    assert_allclose(largest, np.maximum(*peaks), rtol=5e-6)
+
+
+def test_the_named_place_gives_the_extreme():
+    found = load_model_envelope(two_spans(25.0, 35.0), "HL-93", [25.0], lane=0.0, allowance=0.0)
+    place = found.at_lowest[0]
+    line = influence_at(two_spans(25.0, 35.0), 25.0, "moment")
+    forces = next(one for one in load_models()["HL-93"].vehicles if one.name == place.vehicle)
+    value = line.at(place.first_axle - place.offsets) @ forces.axle_forces
+    assert_allclose(found.lowest[0], value, rtol=1e-9)
+
+
+def test_the_varied_spacing_is_the_worst():
+    """Moment over the inner support, against every spacing in steps of 1 cm."""
+    case, model = two_spans(25.0, 35.0), load_models()["HL-93"]
+    truck = model.vehicles[0]._replace(lane=0.0)
+    found = load_model_envelope(case, LoadModel((truck,), 0.0), [25.0])
+    line = influence_at(case, 25.0, "moment")
+    lowest = 0.0
+    for value in np.arange(4.3, 9.001, 0.01):
+        offsets = truck.with_spacing(value)
+        for behind in (offsets, -offsets):
+            fronts = np.linspace(-10.0, 70.0, 1601)[:, None]
+            lowest = min(lowest, float((line.at(fronts - behind) @ truck.axle_forces).min()))
+    assert_allclose(found.lowest[0], lowest, rtol=1e-4)
+    assert found.lowest[0] <= lowest * (1 - 1e-5)
+
+
+def test_choices_of_a_spacing():
+    lorry = vehicle([2.0], [50e3, 50e3], varied=0, choices=(2.0, 6.0))
+    assert_allclose(load_model_envelope(SPAN, lorry, [10.0]).highest, 100e3 * 4.5, rtol=1e-6)
+
+
+def test_a_slow_crossing_is_static():
+    """Within a per cent for forces at 1 m/s, of the beam's three modes."""
+    x = [5.0, 10.0]
+    moving = crossing_envelope(SPAN, "HL93-tandem", 1.0, x)
+    static = load_model_envelope(SPAN, "HL93-tandem", x)
+    assert_allclose(moving.highest, static.highest, rtol=0.01)
+
+
+def test_trains_of_the_library_are_load_models():
+    assert load_model("HSLM-A1").vehicles[0].axle_forces.size == 50
+    with pytest.raises(ValueError, match="there is no load model 'HL-39'; .*HL-93"):
+        load_model("HL-39")
+    with pytest.raises(ValueError, match="lane must be 0 or more, not -1"):
+        load_model_envelope(SPAN, "LM1", [10.0], lane=-1.0)
+
+
+def test_command(tmp_path, capsys):
+    jb.save_case(SPAN, tmp_path / "case.toml")
+    command = f"envelope {tmp_path / 'case.toml'} LM1 --at 10"
+    table = tmp_path / "out.csv"
+    for words in (f"--lane 27kN/m --quantity moment -o {table}", "--quantity reaction --json"):
+        with pytest.raises(SystemExit) as ended:
+            main(f"{command} {words}".replace("reaction --json", "deflection --json").split())
+        assert ended.value.code == 0
+    printed = capsys.readouterr().out
+    assert "moment at midspan 1" in printed
+    assert "4.17e+06" in printed
+    assert "tandem at " in printed
+    assert "4170000" in table.read_text()
