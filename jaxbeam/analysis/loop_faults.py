@@ -14,7 +14,7 @@ from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, Bound, bound
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete
-from jaxbeam.model.state_space import Plant, state_space
+from jaxbeam.model.state_space import state_space
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning, simulate
 
@@ -151,15 +151,14 @@ def compare_under_faults(
     >>> law = jb.Feedback(gains=[3000.0], period=0.002)
     >>> peaks, least = compare_under_faults(case, {"feedback": law})
     >>> stuck = peaks["feedback"]["stuck"]
-    >>> print(f"{stuck.share:.0%}", stuck.at)
-    0% sensor 0
+    >>> print(f"{stuck.peak / stuck.uncontrolled:.2f}", stuck.at)
+    1.00 sensor 0
     """
     if not controllers:
         raise ValueError("there is nothing to compare: give at least one controller")
     free = dataclasses.replace(case, controller=None)
     periods = [float(concrete(c.period)) for c in controllers.values() if c.period is not None]
     period = min(periods, default=DEFAULT_PERIOD) if period is None else period
-    nominal = state_space(free)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)
         uncontrolled = simulate(free)
@@ -174,7 +173,7 @@ def compare_under_faults(
 
         table = {}
         for name, law in controllers.items():
-            case_with_law = dataclasses.replace(case, controller=_designed_for(law, nominal))
+            case_with_law = _with_fixed_design(dataclasses.replace(case, controller=law))
             table[name] = {}
             for fault in faults:
                 if fault.sampled and law.period is None:
@@ -188,10 +187,12 @@ def compare_under_faults(
     return table, least_peak(free)
 
 
-def _designed_for(law: AbstractController, nominal: Plant) -> AbstractController:
-    if law.nominal_plant is not None:
-        return law
-    return dataclasses.replace(law, nominal_plant=nominal)
+def _with_fixed_design(case: Case) -> Case:
+    """The case with a law that is designed for it, whatever happens to its beam and sensors."""
+    if case.controller.nominal_plant is not None:
+        return case
+    law = dataclasses.replace(case.controller, nominal_plant=state_space(case))
+    return dataclasses.replace(case, controller=law)
 
 
 def _peak(name: str, case: Case, at: str, least_peak: Bound) -> FaultedPeak:

@@ -67,6 +67,16 @@ def test_a_stuck_sensor_reads_what_it_did_before_the_load():
     assert np.ptp(readings[:, 1]) > 1e-4
 
 
+def test_estimators_have_the_loops_they_are_made_for():
+    """A Kalman filter, which needs the period of its law, of a sensor that is stuck: no command."""
+    noisy = [jb.Sensor(0.3, noise=1e-9)]
+    estimator = jb.Kalman(process_noise=1e-3)
+    law = jb.LQR([1e6, 1.0], [1e-2], period=0.01, estimator=estimator)
+    found, _ = compare_under_faults(strip(sensors=noisy), {"lqr": law}, faults=OF_ONE_RUN)
+    assert found["lqr"]["none"].share > 0.01
+    assert_allclose(found["lqr"]["stuck"].share, 0.0, atol=1e-3)
+
+
 def test_less_rigidity_is_not_known_to_the_design():
     law = jb.LQR(state_weight=[1e6, 1.0], command_weight=[1.0], period=0.01)
     found, _ = compare_under_faults(strip(), {"lqr": law}, faults=SOFT)
