@@ -39,7 +39,8 @@ class Finding:
 
     `interpretations` maps a name to computed values (number,); the first takes the thesis at its
     word, the others are what it may have meant. `fitted` maps an interpretation to the labels of
-    the numbers that its parameters were fitted to, one label for each parameter. `impossible` is a
+    the numbers that its parameters were fitted to, one label for each parameter unless `parameters`
+    has their number, so that parameters of several findings count once. `impossible` is a
     computed proof that no value can be right for the stated rig, or empty, `remark` says why a
     number is not met where that is known.
 
@@ -52,6 +53,7 @@ class Finding:
     fitted: Mapping[str, str] = dataclasses.field(default_factory=dict)
     impossible: str = ""
     remark: str = ""
+    parameters: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         count = self.published.numbers.size
@@ -78,7 +80,8 @@ class Finding:
         values = self.null.values if by_null else self.interpretations[interpretation]
         off = np.abs(np.asarray(values) - self.published.numbers) / self.published.allowed_error
         off = np.minimum(np.where(np.isnan(off), FARTHEST, off), FARTHEST) / STANDARD_DEVIATION
-        parameters = 0 if by_null else len(self.fitted.get(interpretation, "").split())
+        labels = "" if by_null else self.fitted.get(interpretation, "")
+        parameters = self.parameters.get(interpretation, len(labels.split()))
         return float(np.sum(off[~self.published.repeated] ** 2)) + 2 * parameters
 
 
@@ -89,6 +92,7 @@ def make_finding(
     *,
     null: tuple[str, object],
     fitted: Mapping[str, str] | None = None,
+    parameters: Mapping[str, int] | None = None,
     impossible: str = "",
     remark: str = "",
 ) -> Finding:
@@ -103,7 +107,15 @@ def make_finding(
     null_array = np.asarray(null_values, float)
     if null_array.ndim == 0:
         null_array = np.full(published.numbers.size, null_array)
-    return Finding(published, arrays, NullModel(name, null_array), fitted or {}, impossible, remark)
+    return Finding(
+        published,
+        arrays,
+        NullModel(name, null_array),
+        fitted or {},
+        impossible,
+        remark,
+        parameters or {},
+    )
 
 
 def group_of(finding: Finding, findings: Sequence[Finding]) -> list[Finding]:

@@ -1,9 +1,11 @@
 """Frequency responses of the electrodynamic shaker on the beam of rig A: Figs 2.15 to 2.20."""
 
 import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
+import scipy.optimize
 from matplotlib.figure import Figure
 
 import jaxbeam as jb
@@ -26,65 +28,150 @@ RIGID = {"flexural_rigidity": 1.022e5, "mass_per_length": 11.016}  # Fig. 2.20
 TEXTBOOK = "aluminium of 70 GPa, 2700 kg/m^3, 3.3 mm high"  # chosen for a force drop
 UNDAMPED = f"{TEXTBOOK}, without damping"
 MASS_IN_IMPEDANCE = "the mass in eq. (2.26), but not in (2.33)"
+IDENTIFIED = f"{MASS_IN_IMPEDANCE}; rigidity and mass per length fitted to Fig. 2.15"
+UNKNOWN = ("flexural_rigidity", "mass_per_length")
+# Numbers of Fig. 2.15, and the standard deviations by rounding: half a unit of the last digit.
+OF_FREE_BEAM = published.FORCE_DROPS, published.SHAKER_GAIN, published.SHAKER_PEAK_FREQUENCY
+OF_MASS = (
+    published.STATIONARY_MASS_DROP,
+    published.STATIONARY_MASS_PEAK_FREQUENCY,
+    published.STATIONARY_MASS_PEAK,
+)
+
+
+class IdentifiedBeam(NamedTuple):
+    """Rigidity (N m^2) and mass per length (kg/m) of a beam, fitted to printed numbers.
+
+    `covariance` is that of both by rounding, `predicted` the numbers of Fig. 2.16 with a mass and
+    `deviations` their standard deviations.
+    """
+
+    values: np.ndarray
+    covariance: np.ndarray
+    predicted: np.ndarray
+    deviations: np.ndarray
+
+
+def identified_beam(printed: jb.Beam, jointly: bool = False) -> IdentifiedBeam:
+    """Beam whose rigidity and mass per length are fitted to Fig. 2.15, or to Fig. 2.16 `jointly`.
+
+    By least squares of all printed numbers over half a unit of their last digits. The damping is
+    the printed one, and the mass of Fig. 2.16 is in eq. (2.26) alone.
+    """
+    parts = OF_FREE_BEAM + (OF_MASS if jointly else ())
+    numbers = np.concatenate([one.numbers for one in parts])
+    scatter = np.concatenate([one.allowed_error for one in parts]) / 2
+    start = np.array([getattr(printed, name) for name in UNKNOWN], float)
+
+    def beam(scales) -> jb.Beam:
+        return dataclasses.replace(printed, **dict(zip(UNKNOWN, scales * start, strict=True)))
+
+    def predictions(scales):
+        return _of_mass(_features(_mass_in_impedance_only(beam(scales))))
+
+    def residuals(scales):
+        found = _of_free_beam(_features(_response(beam(scales))))
+        found = np.concatenate([found, predictions(scales)]) if jointly else found
+        return (found - numbers) / scatter
+
+    fit = scipy.optimize.least_squares(residuals, np.ones(2), diff_step=1e-3, x_scale=0.01)
+    covariance = np.linalg.inv(fit.jac.T @ fit.jac)
+    steps = 1e-3 * np.eye(2)
+    slopes = [(predictions(fit.x + one) - predictions(fit.x - one)) / 2e-3 for one in steps]
+    deviations = np.sqrt(np.einsum("in,ij,jn->n", slopes, covariance, slopes))
+    return IdentifiedBeam(
+        fit.x * start, covariance * np.outer(start, start), predictions(fit.x), deviations
+    )
+
+
+def _of_free_beam(features: dict) -> np.ndarray:
+    """Numbers of Fig. 2.15 in the order of OF_FREE_BEAM."""
+    drops = np.append(features["drops"], [np.nan] * 4)[:4]
+    frequency, height = features["peak"]
+    return np.concatenate([drops, [features["low"], height, frequency]])
+
+
+def _of_mass(features: dict) -> np.ndarray:
+    """Numbers of Fig. 2.16 in the order of OF_MASS."""
+    return np.array([features["drops"][0], *features["peak"]])
 
 
 def run(load_rig) -> ExperimentResult:
-    """Dips and peaks of the force per voltage, the beam bare or with 0.5 kg on it."""
+    """Dips and peaks of the force per voltage, the beam bare or with 0.5 kg on it.
+
+    All figures are of one rig, so that one reading serves for all.
+    """
     printed = dataclasses.replace(load_rig("A").beam, modes=4)
     aluminium_beam = jb.Beam(
         printed.length, damping_ratio=printed.damping_ratio, modes=4, **ALUMINIUM
     )
     undamped = dataclasses.replace(aluminium_beam, damping_ratio=0.0)
-    beams = {LITERAL: printed, TEXTBOOK: aluminium_beam, UNDAMPED: undamped}
-    free = {name: _features(_response(beam)) for name, beam in beams.items()}
-    with_mass = {name: _features(_response(beam, STATIONARY_MASS)) for name, beam in beams.items()}
-    with_mass[MASS_IN_IMPEDANCE] = _features(_mass_in_impedance_only(printed))
-    with_mass[f"{MASS_IN_IMPEDANCE}, beam of aluminium"] = _features(
-        _mass_in_impedance_only(aluminium_beam)
-    )
-    transmitted = max(_peaks(_response(printed), 2), key=lambda pair: pair[1])
+    found, joint = identified_beam(printed), identified_beam(printed, jointly=True)
+    identified = dataclasses.replace(printed, **dict(zip(UNKNOWN, found.values, strict=True)))
+    in_both = {LITERAL: printed, TEXTBOOK: aluminium_beam, UNDAMPED: undamped}
+    in_impedance = {
+        MASS_IN_IMPEDANCE: printed,
+        f"{MASS_IN_IMPEDANCE}, beam of aluminium": aluminium_beam,
+        IDENTIFIED: identified,
+    }
+    beams = in_both | in_impedance
+    free = {name: _response(beam) for name, beam in beams.items()}
+    with_mass = {name: _response(beam, STATIONARY_MASS) for name, beam in in_both.items()}
+    with_mass |= {name: _mass_in_impedance_only(beam) for name, beam in in_impedance.items()}
     one_mode = dataclasses.replace(printed, modes=1)
-    null, null_with_mass = (_features(_response(one_mode, mass)) for mass in ((), STATIONARY_MASS))
-    null_transmitted = max(_peaks(_response(one_mode), 2), key=lambda pair: pair[1])
+    free_null, null_with_mass = (_response(one_mode, mass) for mass in ((), STATIONARY_MASS))
 
-    def by_beam(published_numbers, features, null_features, select):
-        values = {name: select(one) for name, one in features.items()}
+    def by_reading(published_numbers, responses, null, select, remark=""):
+        values = {name: select(one) for name, one in responses.items()}
         first, drops_only = values.pop(LITERAL), published_numbers is published.FORCE_DROPS
+        by_section = dict.fromkeys((TEXTBOOK, UNDAMPED), "2") if drops_only else {}
+        to_figure = (
+            {IDENTIFIED: published_numbers.labels} if published_numbers in OF_FREE_BEAM else {}
+        )
         return make_finding(
             published_numbers,
             first,
             values,
-            null=("one mode", select(null_features)),
-            fitted=dict.fromkeys((TEXTBOOK, UNDAMPED), "2") if drops_only else None,
+            null=("one mode", select(null)),
+            fitted=by_section | to_figure,
+            parameters={IDENTIFIED: len(UNKNOWN) if drops_only else 0},
+            remark=remark,
         )
 
-    def drops(features):
-        return np.append(features["drops"], [np.nan] * 4)[:4]
+    def of_free(start, stop=None):
+        return lambda response: _of_free_beam(_features(response))[start:stop]
 
+    def of_mass(index):
+        return lambda response: _of_mass(_features(response))[index]
+
+    remark = (
+        f"Fig. 2.15 gives {found.predicted[2]:.1f} +- {2 * found.deviations[2]:.1f} for it; fitted"
+        f" to both figures, {joint.predicted[2]:.1f}"
+    )
     findings = (
-        by_beam(published.FORCE_DROPS, free, null, drops),
-        by_beam(published.SHAKER_GAIN, free, null, lambda one: [one["low"], one["peak"][1]]),
-        by_beam(published.SHAKER_PEAK_FREQUENCY, free, null, lambda one: one["peak"][0]),
-        make_finding(
+        by_reading(published.FORCE_DROPS, free, free_null, of_free(0, 4)),
+        by_reading(published.SHAKER_GAIN, free, free_null, of_free(4, 6)),
+        by_reading(published.SHAKER_PEAK_FREQUENCY, free, free_null, of_free(6)),
+        by_reading(
             published.TRANSMITTED_PEAK_FREQUENCY,
-            transmitted[0],
-            null=("one mode", null_transmitted[0]),
+            free,
+            free_null,
+            lambda response: max(_peaks(response, 2), key=lambda pair: pair[1])[0],
         ),
-        by_beam(
-            published.STATIONARY_MASS_DROP, with_mass, null_with_mass, lambda one: one["drops"][0]
-        ),
-        by_beam(
-            published.STATIONARY_MASS_PEAK_FREQUENCY,
-            with_mass,
-            null_with_mass,
-            lambda one: one["peak"][0],
-        ),
-        by_beam(
-            published.STATIONARY_MASS_PEAK, with_mass, null_with_mass, lambda one: one["peak"][1]
-        ),
+        by_reading(published.STATIONARY_MASS_DROP, with_mass, null_with_mass, of_mass(0)),
+        by_reading(published.STATIONARY_MASS_PEAK_FREQUENCY, with_mass, null_with_mass, of_mass(1)),
+        by_reading(published.STATIONARY_MASS_PEAK, with_mass, null_with_mass, of_mass(2), remark),
     )
     stiff = dataclasses.replace(printed, **{key: np.asarray(value) for key, value in RIGID.items()})
-    return ExperimentResult(findings, {"responses": _draw(printed, stiff)})
+    remarks = tuple(
+        f"{what}: rigidity {values[0]:.2f} +- {2 * deviation[0]:.2f} N m^2, mass per length"
+        f" {values[1]:.4f} +- {2 * deviation[1]:.4f} kg/m (95 %, by the rounding of the numbers)."
+        for what, values, deviation in (
+            ("Fitted to Fig. 2.15", found.values, np.sqrt(np.diag(found.covariance))),
+            ("Fitted to Figs 2.15 and 2.16", joint.values, np.sqrt(np.diag(joint.covariance))),
+        )
+    )
+    return ExperimentResult(findings, {"responses": _draw(printed, stiff)}, remarks)
 
 
 def _response(beam: jb.Beam, stationary_masses=()) -> FrequencyResponse:
