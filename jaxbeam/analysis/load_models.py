@@ -117,7 +117,7 @@ class WorstPlace(NamedTuple):
         if not self.vehicle:
             return "unloaded"
         last, first = sorted((self.first_axle, self.first_axle - self.offsets[-1]))
-        return f"{self.vehicle} at {last:.4g} to {first:.4g} m"
+        return f"{self.vehicle} {last:.4g}-{first:.4g} m"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -139,5 +139,5 @@ def test_command(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "moment at midspan 1" in printed
     assert "4.17e+06" in printed
-    assert "tandem at " in printed
+    assert "tandem 8.8-10 m" in printed
     assert "4170000" in table.read_text()

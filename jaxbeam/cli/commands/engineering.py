@@ -1,9 +1,9 @@
 """Commands about results that an engineer signs: checks by codes, influence lines."""
 
+import math
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 from cyclopts import Parameter
 
 import jaxbeam as jb
@@ -158,14 +158,14 @@ def envelope(
         of_crossing = [()] * len(x)
         if velocity is not None and name != REACTION:
             moving = crossing_envelope(parsed_case, vehicle, velocity, x, quantity=name)
-            of_crossing = list(zip(*map(np.asarray, moving), strict=True))
+            of_crossing = list(zip(*moving, strict=True))
         for i, place in enumerate(found.positions):
             low, high = found.lowest[i], found.highest[i]
             label = places.get(float(place), "")
             entries = name, label, float(place), float(low), float(high)
             for head, entry in zip(columns, entries, strict=True):
                 columns[head].append(entry)
-            for head, entry in zip(dynamic, of_crossing[i] or (np.nan, np.nan), strict=True):
+            for head, entry in zip(dynamic, of_crossing[i] or (math.nan, math.nan), strict=True):
                 dynamic[head].append(float(entry))
             of_rounding = ZERO * max(-found.lowest.min(), found.highest.max())
             low, high = (0.0 if abs(one) < of_rounding else one for one in (low, high))
@@ -177,12 +177,15 @@ def envelope(
     if velocity is not None:
         columns |= dynamic
     if output:
+        import numpy as np
+
         from jaxbeam.files.tables import write_table
 
         write_table(output, {k: np.array(v) for k, v in columns.items()}, options.overwrite)
-    heads = "section (SI units)", "lowest", "under", "highest", "under"
+    heads = "section", "lowest", "under", "highest", "under"
     heads += ("dynamic lowest", "highest") if velocity is not None else ()
-    options.report(columns, table(heads, rows), output)
+    lines = ["extremes in SI units, and the place of the vehicle:", *table(heads, rows)]
+    options.report(columns, lines, output)
 
 
 def influence(
