@@ -50,7 +50,9 @@ somebody who tries to refute it. The rules:
 In the lists the number of the thesis comes first, the computed one in brackets, then the reason.
 This page is written from the report of `jaxbeam reproduce --all`, by
 `python -m experiments.thesis.page`. [Verdicts that changed](thesis_changes.md) has each number
-whose verdict was another one before these rules.
+whose verdict was another one before these rules. Where numbers were computed with parameters that
+are not printed, these can be identified: [two of them from one
+figure](../tutorials/notebooks/13_read_a_thesis) predict another.
 """
 
 
