@@ -12,6 +12,8 @@ import tempfile
 
 # No window, with or without a screen; also in processes that a test starts.
 os.environ["MPLBACKEND"] = "Agg"
+# Tables are as wide as they need, whatever the terminal; test processes are told its width.
+os.environ.pop("COLUMNS", None)
 # Several test processes share a GPU: none may allocate most of its memory.
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 # Test processes share the cores: threads of small matrix products would wait for each other, on a

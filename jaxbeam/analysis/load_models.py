@@ -4,9 +4,6 @@ Models are those of `jaxbeam/library/load_models.toml`; a new one is a table the
 """
 
 import dataclasses
-import functools
-import tomllib
-from importlib import resources
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +15,7 @@ from jaxbeam.case.declared_checks import check_on_beam, suggestion
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.axles import Axles
 from jaxbeam.case.quantities import quantity_of
-from jaxbeam.library.published import trains
+from jaxbeam.library.published import LoadModel, ModelVehicle, load_models, trains
 from jaxbeam.model.along_beam import positions_along, sections
 from jaxbeam.model.modes import modes
 from jaxbeam.model.statics import REACTION, held_positions, influence_line
@@ -27,62 +24,6 @@ POSITIONS = 41  # along the beam by default, beside the special ones
 LINE_POINTS = 2001  # along the beam, between which influence lines are linear
 SPACINGS = 25  # values of a varied spacing, searched again between the neighbours of the best
 COARSE = 20  # points of a line between those at which an axle is tried first
-
-
-class ModelVehicle(NamedTuple):
-    """Vehicle of a load model: distances (m) and forces (N) of its axles, and its lane load (N/m).
-
-    `spacings` are the distances (m) that the spacing number `varied` may have, None for one only.
-    """
-
-    name: str
-    axle_spacings: Float[np.ndarray, " spacing"]
-    axle_forces: Float[np.ndarray, " axle"]
-    lane: float
-    varied: int | None
-    between: tuple[float, float] | None
-    choices: tuple[float, ...]
-
-    def with_spacing(self, value: float | None) -> Float[np.ndarray, " axle"]:
-        """Offsets (m) of the axles behind the first, with a value of the varied spacing (m)."""
-        spacings = np.array(self.axle_spacings, float)
-        if value is not None:
-            spacings[self.varied] = value
-        return np.concatenate([[0.0], np.cumsum(spacings)])
-
-
-class LoadModel(NamedTuple):
-    """Load model of a code: its vehicles, and the `allowance` for dynamics of axles (1)."""
-
-    vehicles: tuple[ModelVehicle, ...]
-    allowance: float
-
-
-@functools.cache
-def load_models() -> dict[str, LoadModel]:
-    """All load models of the library by name.
-
-    >>> from jaxbeam.analysis.load_models import load_models
-    >>> print(", ".join(load_models()))
-    HL-93, LM1, M1600, S1600, CL-625, HB45
-    """
-    text = (resources.files("jaxbeam.library") / "load_models.toml").read_text(encoding="utf-8")
-    found = {}
-    for table in tomllib.loads(text)["models"]:
-        vehicles = tuple(
-            ModelVehicle(
-                one["name"],
-                np.array(one["axle_spacings"]),
-                np.array(one["axle_forces"]),
-                one["lane"],
-                one.get("varied"),
-                tuple(one["between"]) if "between" in one else None,
-                tuple(one.get("choices", ())),
-            )
-            for one in table["vehicles"]
-        )
-        found[table["name"]] = LoadModel(vehicles, table.get("allowance", 0.0))
-    return found
 
 
 def load_model(name: str) -> LoadModel:

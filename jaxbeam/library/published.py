@@ -1,4 +1,4 @@
-"""Trains and line loads of the library."""
+"""Trains, line loads and load models of the library."""
 
 import functools
 import tomllib
@@ -108,3 +108,59 @@ def line_loads() -> dict[str, CodeLineLoad]:
         )
         for table in content["loads"]
     }
+
+
+class ModelVehicle(NamedTuple):
+    """Vehicle of a load model: distances (m) and forces (N) of its axles, and its lane load (N/m).
+
+    `spacings` are the distances (m) that the spacing number `varied` may have, None for one only.
+    """
+
+    name: str
+    axle_spacings: Float[np.ndarray, " spacing"]
+    axle_forces: Float[np.ndarray, " axle"]
+    lane: float
+    varied: int | None
+    between: tuple[float, float] | None
+    choices: tuple[float, ...]
+
+    def with_spacing(self, value: float | None) -> Float[np.ndarray, " axle"]:
+        """Offsets (m) of the axles behind the first, with a value of the varied spacing (m)."""
+        spacings = np.array(self.axle_spacings, float)
+        if value is not None:
+            spacings[self.varied] = value
+        return np.concatenate([[0.0], np.cumsum(spacings)])
+
+
+class LoadModel(NamedTuple):
+    """Load model of a code: its vehicles, and the `allowance` for dynamics of axles (1)."""
+
+    vehicles: tuple[ModelVehicle, ...]
+    allowance: float
+
+
+@functools.cache
+def load_models() -> dict[str, LoadModel]:
+    """All load models of the library by name.
+
+    >>> from jaxbeam.library.published import load_models
+    >>> print(", ".join(load_models()))
+    HL-93, LM1, M1600, S1600, CL-625, HB45
+    """
+    text = (resources.files(__package__) / "load_models.toml").read_text(encoding="utf-8")
+    found = {}
+    for table in tomllib.loads(text)["models"]:
+        vehicles = tuple(
+            ModelVehicle(
+                one["name"],
+                np.array(one["axle_spacings"]),
+                np.array(one["axle_forces"]),
+                one["lane"],
+                one.get("varied"),
+                tuple(one["between"]) if "between" in one else None,
+                tuple(one.get("choices", ())),
+            )
+            for one in table["vehicles"]
+        )
+        found[table["name"]] = LoadModel(vehicles, table.get("allowance", 0.0))
+    return found

@@ -9,15 +9,13 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.analysis.load_models import (
-    LoadModel,
-    ModelVehicle,
     crossing_envelope,
     influence_at,
     load_model,
     load_model_envelope,
-    load_models,
 )
 from jaxbeam.cli import main
+from jaxbeam.library.published import LoadModel, ModelVehicle, load_models
 from tests.modules import ROOT
 
 PYCBA = json.loads((ROOT / "tests" / "data" / "load_models.json").read_text())

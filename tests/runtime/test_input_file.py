@@ -246,6 +246,7 @@ BY_THEMSELVES = (
     "jaxbeam.case.loads.vehicles.vehicle",
     "jaxbeam.cli.",
     "jaxbeam.files.export.files",
+    "jaxbeam.files.interactive",  # of the package
     "jaxbeam.files.netcdf",
     "tuning.logs.readers.table",
     "tuning.logs.readers.tdms",
