@@ -81,7 +81,8 @@ class Finding:
         off = np.abs(np.asarray(values) - self.published.numbers) / self.published.allowed_error
         off = np.minimum(np.where(np.isnan(off), FARTHEST, off), FARTHEST) / STANDARD_DEVIATION
         labels = "" if by_null else self.fitted.get(interpretation, "")
-        parameters = self.parameters.get(interpretation, len(labels.split()))
+        by_labels = len(labels.split())
+        parameters = 0 if by_null else self.parameters.get(interpretation, by_labels)
         return float(np.sum(off[~self.published.repeated] ** 2)) + 2 * parameters
 
 
