@@ -34,7 +34,9 @@ def load_model(name: str) -> LoadModel:
     if name in load_models():
         return load_models()[name]
     train = trains().get(name)
-    if train is None or train.forces is None:
+    if train is not None and train.forces is None:
+        raise ValueError(f"{name} is known by masses of its axles, not forces; take another train")
+    if train is None:
         known = [
             *load_models(),
             *(one for one, train in trains().items() if train.forces is not None),
@@ -106,7 +108,7 @@ def load_model_envelope(
     chosen = load_model(model) if isinstance(model, str) else model
     allowance = chosen.allowance if allowance is None else allowance
     for name, value in (("lane", lane or 0.0), ("allowance", allowance)):
-        if not value >= 0:
+        if not 0 <= value < np.inf:
             raise ValueError(f"{name} must be 0 or more, not {value:g}")
     if x is None:
         x = held_positions(case) if quantity == REACTION else positions_along(case, POSITIONS)
@@ -140,8 +142,10 @@ def crossing_envelope(
 
     Each crosses from the left at a `speed` (m/s) with the least of its varied spacing, as moving
     forces without allowance and lane load, and the run goes on for one period of the lowest mode.
-    Raises as `envelope`, and ValueError for an unknown model.
+    Raises as `envelope`, and ValueError for an unknown model or a speed that is not above 0.
     """
+    if not 0 < speed < np.inf:
+        raise ValueError(f"the speed of a crossing must be above 0 m/s, not {speed:g}")
     chosen = load_model(model) if isinstance(model, str) else model
     free = dataclasses.replace(case, loads=(), controller=None)
     length, period = float(concrete(case.beam.length)), 1 / float(modes(free).frequencies[0])

@@ -124,6 +124,12 @@ def test_trains_of_the_library_are_load_models():
         load_model("HL-39")
     with pytest.raises(ValueError, match="lane must be 0 or more, not -1"):
         load_model_envelope(SPAN, "LM1", [10.0], lane=-1.0)
+    with pytest.raises(ValueError, match="allowance must be 0 or more, not inf"):
+        load_model_envelope(SPAN, "LM1", [10.0], allowance=np.inf)
+    with pytest.raises(ValueError, match="a crossing must be above 0 m/s, not 0"):
+        crossing_envelope(SPAN, "LM1", 0.0, [10.0])
+    with pytest.raises(ValueError, match="EN15528-D2 is known by masses of its axles"):
+        load_model("EN15528-D2")
 
 
 def test_command(tmp_path, capsys):
