@@ -6,7 +6,7 @@ A new fault is an entry of `FAULTS`.
 import dataclasses
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -54,9 +54,15 @@ class LoopFault(NamedTuple):
     sampled: bool = False
 
 
-def _of_sensors(case: Case, **changes) -> Case:
-    sensors = [dataclasses.replace(sensor, **changes) for sensor in case.sensors]
-    return dataclasses.replace(case, sensors=tuple(sensors))
+def _with_at_least(part: Any, **least: float) -> Any:
+    """A sensor or controller with some numbers, where its own are not larger."""
+    own = {name: float(concrete(getattr(part, name) or 0.0)) for name in least}
+    return dataclasses.replace(part, **{name: max(own[name], least[name]) for name in least})
+
+
+def _of_sensors(case: Case, **least: float) -> Case:
+    sensors = tuple(_with_at_least(sensor, **least) for sensor in case.sensors)
+    return dataclasses.replace(case, sensors=sensors)
 
 
 def _of_seeds(case: Case) -> dict[str, Case]:
@@ -72,7 +78,7 @@ def _lost(fraction: float) -> Callable[[Case, Record], dict[str, Case]]:
 def _late(case: Case, uncontrolled: Record) -> dict[str, Case]:
     """Readings and commands up to a fifth of the period later."""
     late = float(concrete(case.controller.period)) / 5
-    law = dataclasses.replace(case.controller, jitter=late)
+    law = _with_at_least(case.controller, jitter=late)
     return _of_seeds(dataclasses.replace(_of_sensors(case, jitter=late), controller=law))
 
 

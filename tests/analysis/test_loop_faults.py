@@ -103,6 +103,13 @@ def test_readings_and_commands_are_late_by_a_fifth_of_the_period():
         assert_allclose([case.sensors[0].jitter, case.controller.jitter], 0.002)
 
 
+def test_faults_of_the_case_itself_stay_where_they_are_larger():
+    worse = strip(controller=FEEDBACK, sensors=[jb.Sensor(0.3, dropout=0.2, jitter=0.005)])
+    for case in (*of_fault("1 % lost", worse).values(), *of_fault("late", worse).values()):
+        sensor = case.sensors[0]
+        assert_allclose([sensor.dropout, sensor.jitter], [0.2, 0.005])
+
+
 def test_converters_have_twelve_bits():
     case = of_fault("12 bits")[""]
     readings = np.abs(UNCONTROLLED.measured).max()
