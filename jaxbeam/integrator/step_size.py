@@ -153,7 +153,7 @@ def choose_step_size(
             for grid in _grids(case, model, events, step, schedule, substeps)
         )
         trial = StepTrial(times, coarse, fine[::2], substeps=substeps)
-        change = UNSAMPLED * _largest_deflection_change(case, model, trial, least)
+        change = UNSAMPLED * largest_change(case, model, coarse, trial.fine, least)
         error, share = change, shrink**CONVERGENCE_ORDER
         if not substeps:
             error, trial = max(change, share * former_error), trial._replace(former=former)
@@ -265,25 +265,28 @@ def trial_positions(case: Case) -> Float[Array, " position"]:
     return case.beam.length * (np.arange(count) + 0.5) / count
 
 
-def trial_deflections(case: Case, model: ModalModel, states):
-    """Deflections (m) at the trial positions from states (boundary, state, batch)."""
-    rows = model.shapes(trial_positions(case), (0,))[0]
-    deflections = rows @ states[:, 0 : 2 * case.beam.modes : 2]
-    return deflections.reshape(-1, deflections.shape[-1])
-
-
-def _largest_deflection_change(
-    case: Case, model: ModalModel, trial: StepTrial, least: float
+def largest_change(
+    case: Case,
+    model: ModalModel,
+    coarse: Float[np.ndarray, "time state batch"],
+    fine: Float[np.ndarray, "time state batch"],
+    least: float,
 ) -> float:
-    """`largest_change` of the deflections of a trial, of some times after others."""
+    """Largest change of deflections at the trial positions from one run to another, by states.
+
+    Relative to the largest deflection of each run of the batch in the `fine` one, or to `least` (m)
+    where that is larger; of some times after others.
+    """
     rows, own = model.shapes(trial_positions(case), (0,))[0], np.s_[:, 0 : 2 * case.beam.modes : 2]
-    coarse, fine = trial.coarse[own], trial.fine[own]
+    coarse, fine = coarse[own], fine[own]
     change = largest = np.zeros(coarse.shape[2])
     for i in range(0, len(coarse), TRIAL_CHUNK):
         deflections, exact = (rows @ part[i : i + TRIAL_CHUNK] for part in (coarse, fine))
         change = np.maximum(change, np.max(np.abs(deflections - exact), axis=(0, 1)))
         largest = np.maximum(largest, np.max(np.abs(exact), axis=(0, 1)))
-    return _relative(change, largest, least)
+    if not np.any(largest):
+        return 0.0
+    return float(np.max(change / np.maximum(largest, least), initial=0.0))
 
 
 def rounding_deflection(case: Case, model: ModalModel, loads: LoadSet) -> float:
@@ -296,22 +299,3 @@ def rounding_deflection(case: Case, model: ModalModel, loads: LoadSet) -> float:
     rows = model.shapes(trial_positions(case), (0,))[0]
     stiffness = np.where(model.modes.stiffness > 0, model.modes.stiffness, np.inf)
     return ROUNDING * float(weight * np.max(np.sum(rows**2 / stiffness, axis=1)))
-
-
-def largest_change(coarse: np.ndarray, fine: np.ndarray, least: float = 0.0) -> float:
-    """Largest change of responses (value, batch), relative to the largest value of each run.
-
-    Relative to `least` where no value is larger.
-    """
-    with np.errstate(invalid="ignore"):
-        return _relative(np.max(np.abs(coarse - fine), axis=0), np.max(np.abs(fine), axis=0), least)
-
-
-def _relative(
-    change: Float[np.ndarray, " batch"], largest: Float[np.ndarray, " batch"], least: float
-) -> float:
-    """Largest of changes relative to the largest values, or to `least` where that is larger."""
-    if not np.any(largest):
-        return 0.0
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return float(np.max(change / np.maximum(largest, least), initial=0.0))

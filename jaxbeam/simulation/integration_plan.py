@@ -40,7 +40,6 @@ from jaxbeam.integrator.step_size import (
     longest_trial_step,
     rounding_deflection,
     steps_per_interval,
-    trial_deflections,
 )
 from jaxbeam.integrator.time_grid import EventSchedule, grid_by_schedule, sample_schedule
 from jaxbeam.model.load_set import load_set
@@ -477,8 +476,9 @@ def _choose_substeps(
     def trial(coarse, fine):
         return StepTrial(schedule.times[own], coarse[own], fine[own])
 
-    def deflections(states):
-        return np.asarray(trial_deflections(case, model, states))
+    @np.errstate(all="ignore")  # of runs that diverge
+    def change(coarse, fine):
+        return UNSAMPLED * largest_change(case, model, coarse, fine, least)
 
     first_states = None
     if first_run is not None and policy is not None:
@@ -486,8 +486,7 @@ def _choose_substeps(
         if policy.holds_commands:
             held = HeldCommands(policy.model, commands, policy.load_amplitude)
             fine = np.asarray(trial_run(case, shapes, schedule, np.asarray(2 * min_substeps), held))
-            change = largest_change(deflections(first_states), deflections(fine), least)
-            error = AMPLIFICATION * UNSAMPLED * change
+            error = AMPLIFICATION * change(first_states, fine)
             if error <= tolerance:
                 amplified = trial(first_states, fine)._replace(amplification=AMPLIFICATION)
                 return min_substeps, error, amplified
@@ -499,15 +498,12 @@ def _choose_substeps(
         substeps = xp.asarray(min_substeps * 2**halvings)
         return np.asarray(trial_run(case, shapes, schedule, substeps, policy))
 
-    def response(halvings):
-        return deflections(states(halvings))
-
     # A loop that diverges does so with any step, so its error is not defined. A stiff law in
     # continuous time may also overflow because the steps are too long.
     confirming_halvings = 6 if case.controller.period is None else 1
-    if np.isnan(response(1)).any() and np.isnan(response(confirming_halvings)).any():
+    if np.isnan(states(1)).any() and np.isnan(states(confirming_halvings)).any():
         return 2 * min_substeps, np.nan, None
-    halvings, error = _halve_until_converged(response, tolerance, 8, least)
+    halvings, error = _halve_until_converged(states, change, tolerance, 8)
     return min_substeps * 2**halvings, error, trial(states(halvings), states(halvings + 1))
 
 
@@ -558,17 +554,20 @@ _compiled_trial_run = compiled(_closed_loop_trial_run)
 
 
 def _halve_until_converged(
-    response: Callable[[int], np.ndarray], tolerance: float, max_halvings: int, least: float
+    states: Callable[[int], np.ndarray],
+    change: Callable[[np.ndarray, np.ndarray], float],
+    tolerance: float,
+    max_halvings: int,
 ) -> tuple[int, float]:
-    """Number of halvings of a step until one more changes the response within half the tolerance.
+    """Number of halvings of a step until the error by one more is within a tolerance, and it.
 
-    Returns it with twice that change (see `UNSAMPLED`), relative to the largest response, or to
-    `least` where that is larger. Raises RuntimeError if no number up to `max_halvings` suffices.
+    By the `states` after so many halvings, and the error by their `change`. Raises RuntimeError if
+    no number up to `max_halvings` suffices.
     """
-    coarse, floor = response(0), ErrorFloor(tolerance)
+    coarse, floor = states(0), ErrorFloor(tolerance)
     for halvings in range(max_halvings):
-        fine = response(halvings + 1)
-        error = UNSAMPLED * largest_change(coarse, fine, least)
+        fine = states(halvings + 1)
+        error = change(coarse, fine)
         if error <= tolerance:
             return halvings, error
         floor.check(error, 0.5**halvings)

@@ -9,6 +9,7 @@ import jaxbeam as jb
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.integrator.step_size import UNSAMPLED, trial_positions
 from jaxbeam.model.modal_model import modal_model
+from jaxbeam.simulation.integration_plan import AMPLIFICATION
 
 TIGHT = 1e-9
 
@@ -150,6 +151,25 @@ def test_a_change_that_is_small_by_chance_is_not_the_stated_error(name):
     # As each of these is that of the steps of the run itself, it is no wider than it must be.
     assert error_along(record, exact) <= record.error_estimate <= 1e-7
     assert record.error_estimate <= 4 * error_along(record, exact)
+
+
+@pytest.mark.parametrize(
+    ("name", "tolerance", "amplification"),
+    [
+        ("one step for both", 1e-3, AMPLIFICATION),  # one trial, of the commands of the loop
+        ("one step for both", 1e-5, 1.0),
+        ("samples that are far apart", 1e-7, 1.0),
+        ("span", 1e-7, 1.0),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+def test_the_stated_error_of_a_run_under_commands(name, tolerance, amplification):
+    """That of its own steps, at most twice as wide again, and what a law may make of it."""
+    command = jb.Prescribed([3.0], period=0.02)
+    case = dataclasses.replace(SHARP[name], actuators=(jb.PointForce(0.4),), controller=command)
+    record, exact = (jb.simulate(case, tolerance=t) for t in (tolerance, 1e-10))
+    stated = record.error_estimate / amplification
+    assert error_along(record, exact) <= stated <= 2.5 * error_along(record, exact)
 
 
 @pytest.mark.parametrize("ends", ["pinned-pinned", "free-free", "clamped-free"])
