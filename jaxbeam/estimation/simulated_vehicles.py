@@ -1,7 +1,8 @@
 """States of vehicles, simulated beside a filter that does not estimate them.
 
-The vehicles, their trajectories and the profile are known; they are driven by the estimated motion
-of the beam, so that no sensor in a vehicle is needed.
+The vehicles, their weights, trajectories and the profile are known; they are driven by the
+estimated motion of the beam, so that no sensor in a vehicle is needed. (Filters that estimate
+weights estimate vehicles, too.)
 """
 
 import dataclasses
@@ -67,7 +68,8 @@ class SampledWithVehicles(AbstractSampledFilter):
     def update(self, state: VehicleMemory, measurement, t):
         plant = self.plant
         estimate, filter_state = self.filter.update(state.filter_state, measurement, t)
-        beam, constants = plant.modal_model.state_count, _constants(plant, estimate)
+        beam = plant.modal_model.state_count
+        constants = plant.augmented_start[plant.vehicle_states :]
         x = xp.concatenate([state.state, constants])
         predicted = self.transition_at(t).predict(x, state.command, measurement.command)
         vehicles = predicted[beam : beam + plant.vehicle_states]
@@ -100,18 +102,11 @@ class ContinuousWithVehicles(AbstractContinuousFilter):
     def rates(self, state, measurement, command, t):
         estimate, own = self.estimate(state, measurement, t), self.filter.state_count
         system, beam = self.plant.augmented(t), self.plant.modal_model.state_count
-        x = xp.concatenate([estimate.state, estimate.vehicles, _constants(self.plant, estimate)])
+        constants = self.plant.augmented_start[self.plant.vehicle_states :]
+        x = xp.concatenate([estimate.state, estimate.vehicles, constants])
         rates = system.A @ x + system.B @ command
         of_filter = self.filter.rates(state[:own], measurement, command, t)
         return xp.concatenate([of_filter, rates[beam : beam + self.plant.vehicle_states]])
-
-
-def _constants(plant: Plant, estimate: Estimate):
-    """Constant states of the augmented plant, with estimated weights where there are any."""
-    constants = plant.augmented_start[plant.vehicle_states :]
-    if estimate.weights is None:
-        return constants
-    return xp.concatenate([estimate.weights, constants[estimate.weights.shape[0] :]])
 
 
 def with_loads(plant: Plant, state, added, t, with_weights: bool) -> Estimate:

@@ -217,8 +217,6 @@ def _(filter: SampledWithVehicles, code: CSource) -> EstimateCode:
     start = np.concatenate([np.zeros(beam), np.asarray(plant.augmented_start)])
     x = code.state("coupled", start, "states of beam and vehicles, weights of the loads")
     code.add("/* States of the vehicles, driven by the estimated motion of the beam */")
-    if inner.weights is not None:
-        code.add(f"copy({x} + {beam + vehicles}, {inner.weights}, {inner.wheels});")
     matrices = [np.array(part) for part in at_samples(model, code)]
     # A run starts at rest: there is no period before it.
     matrices[0][0] = np.eye(vehicles, size, k=beam)
