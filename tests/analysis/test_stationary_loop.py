@@ -6,6 +6,7 @@ import json
 import control
 import numpy as np
 import pytest
+import scipy.optimize
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
@@ -82,6 +83,47 @@ def test_a_cubic_law_has_no_gain_at_rest_and_is_unstable_under_the_load():
     case = cubic_case()
     assert margins_at_rest(case) == np.inf and np.max(growth(case, 20).factor) < 1.1
     assert stability_margin(case).verdict == "unstable"
+
+
+def test_a_cubic_law_under_a_vehicle_is_linear_about_their_equilibrium():
+    """In continuous time, with the states of a quarter car; matrices assembled here."""
+    body, axle, suspension, damper, tyre, wall = 0.2, 0.1, 300.0, 2.0, 4000.0, 1.5
+    car = jb.QuarterCar(
+        body_mass=body,
+        axle_mass=axle,
+        suspension_stiffness=suspension,
+        suspension_damping=damper,
+        tyre_stiffness=tyre,
+        tyre_damping=wall,
+        times=[0.0, 3.0],
+        positions=[POSITION, POSITION],
+    )
+    case = dataclasses.replace(cubic_case(), loads=(car,), controller=jb.Feedback([CUBIC], power=3))
+    span = span_of(case)
+    (at_load,), (at_sensor,) = span.shapes(POSITION), span.shapes(0.3)
+    (stiffness,), damping = span.frequencies**2, span.damping[0, 0]
+    weight = (body + axle) * 9.81 * at_load
+
+    def force_left(y):
+        return stiffness * y / at_sensor + at_sensor * CUBIC * y**3 + weight
+
+    y = scipy.optimize.brentq(force_left, -0.1, 0.0)
+    gain = 3 * CUBIC * y**2 * at_sensor**2
+    K = [
+        [stiffness + gain + tyre * at_load**2, 0.0, -tyre * at_load],
+        [0.0, suspension, -suspension],
+        [-tyre * at_load, -suspension, suspension + tyre],
+    ]
+    C = [
+        [damping + wall * at_load**2, 0.0, -wall * at_load],
+        [0.0, damper, -damper],
+        [-wall * at_load, -damper, damper + wall],
+    ]
+    inertia = np.array([1.0, body, axle])[:, None]
+    A = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.array(K) / inertia, -np.array(C) / inertia]])
+    found = np.sort_complex(linearised_loop(case, 0.5).poles())
+    assert_allclose(found, np.sort_complex(np.linalg.eigvals(A)), rtol=1e-8)
+    assert gain > stiffness  # the equilibrium matters
 
 
 def margins_at_rest(case) -> float:
@@ -220,6 +262,8 @@ def test_sampled_loop_has_its_period_and_poles():
     unloaded = jb.to_control(case)
     assert unloaded.plant.input_labels == ["command_0"]
     assert np.abs(unloaded.closed.poles() - systems.closed.poles()).max() > 1e-3
+    without = jb.to_control(dataclasses.replace(case, loads=()))
+    assert_allclose(without.closed.poles(), unloaded.closed.poles())
 
 
 def test_errors():
