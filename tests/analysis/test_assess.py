@@ -183,6 +183,18 @@ def test_effects_of_a_train_are_those_of_its_runs():
         assert_allclose(line.at(np.array([7.0]))[0], exact, rtol=1e-3)
 
 
+def test_reactions_of_a_critically_damped_beam():
+    """Its poles are double; the reaction at an end is the shear force there, and no other."""
+    case = jb.Case(jb.Beam(10.0, 3e9, 8000.0, damping_ratio=1.0, modes=3))
+    sensors, train = (jb.Sensor(0.0, "shear"), jb.Sensor(0.6, "shear")), trains()["HL93-tandem"]
+    load = jb.Axles(speed=30.0, offsets=train.offsets, forces=train.forces)
+    loaded = dataclasses.replace(case, loads=(load,), run=jb.Run(0.6, sample_rate=2000.0))
+    assert reaction_peaks(loaded, (0.0,), ("loads.0.speed",), np.array([[30.0]])) is None
+    found = train_response(case, "HL93-tandem", sensors, 30.0, 30.01, reactions=(0.0,))
+    sampled = np.abs(jb.simulate(loaded).reactions[:, 0]).max()
+    assert_allclose(found.peaks[found.speeds == 30.0, -1], sampled, rtol=5e-3)
+
+
 def test_trains_that_govern_are_a_finding():
     """HSLM-A10 in resonance on 15 m: above LM71, and named, but only the acceleration fails."""
     bridge = jb.Case(jb.Beam(15.0, 10.5e9, 12000.0, damping_ratio=0.01125))

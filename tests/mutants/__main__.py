@@ -4,8 +4,8 @@
 
 needs the group `mutants` (cosmic-ray). Mutants are drawn with the seed from the files of
 `targets.toml`, in a copy of the repository; each is told to its own tests: the quick ones of a
-file, those named one by one, and the slow ones where no quick one notices. A test that fails
-without the change, too, is an error.
+file, those named one by one, and where no quick one notices the slow ones, those of the nightly
+run too. A test that fails without the change, too, is an error.
 Mutants in `left.toml` may survive, with the reason given there; the exit status is 1 if more than
 LARGEST_SHARE of the others do.
 """
@@ -137,7 +137,7 @@ class Copy:
         single = [test for test in tests if "::" in test]
         runs = [single] if single else []
         if whole:
-            runs = [[*whole, "-m", "not slow"], *runs, [*whole, "-m", "slow"]]
+            runs = [[*whole, "-m", "not slow"], *runs, [*whole, "-m", "slow", "--nightly"]]
         return next((found for run in runs if (found := self._failure(run, limit))), None)
 
     def _failure(self, arguments: list[str], limit: float) -> str | None:

@@ -189,11 +189,13 @@ def case_of(load, **parts) -> jb.Case:
 
 
 @pytest.mark.parametrize("name", LOADS)
-def test_the_uncontrolled_peak_is_that_of_the_simulation(name):
+def test_both_peaks_are_those_of_the_simulation(name):
     case = case_of(LOADS[name])
     found = jb.bound(case, period=0.05, spacing=0.005)
     assert_allclose(found.uncontrolled, jb.simulate(case).peak_deflection[0], rtol=1e-6)
     assert 0.0 < found.peak < 0.9 * found.uncontrolled
+    controlled = jb.simulate(dataclasses.replace(case, controller=found.controller()))
+    assert_allclose(controlled.peak_deflection[0], found.peak, rtol=2e-3)
 
 
 def test_its_commands_attain_it_on_a_rough_surface():
