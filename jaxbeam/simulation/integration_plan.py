@@ -287,7 +287,7 @@ def integration_plan(
     equally_spaced = bool(
         np.all(np.abs(intervals - intervals.mean()) < SPACING_TOLERANCE * intervals.mean())
     )
-    lead_samples = max(0, int(np.ceil(samples[0] / intervals.mean() - SPACING_TOLERANCE)))
+    lead_samples = int(np.ceil(samples[0] / intervals.mean() - SPACING_TOLERANCE))
     schedule = run_schedule(case, samples, equally_spaced, lead_samples, to_duration)
     step, error, trial = choose_step_size(case, shapes, tolerance, schedule)
     substeps, share = trial.substeps, 1.0

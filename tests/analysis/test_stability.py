@@ -205,6 +205,15 @@ def test_growth_of_a_sampled_loop_needs_no_finer_steps(monkeypatch):
     np.testing.assert_allclose(found, finer, atol=1e-6 * finer.max())
 
 
+def test_a_cubic_term_does_not_change_growth_about_rest():
+    """The linear loop is multiplied in NumPy, the other differentiated from sample to sample."""
+    laws = [jb.Feedback([900.0], 1, more, period=0.004, delay=0.006) for more in (None, [[1e9]])]
+    cases = [jb.replace(shaker_case(law), {"loads.0.speed": 4.0}) for law in laws]
+    linear, cubic = (growth(case) for case in cases)
+    np.testing.assert_array_equal(cubic.times, linear.times)
+    np.testing.assert_allclose(cubic.factor, linear.factor, rtol=1e-7)
+
+
 def test_sampled_poles_match_simulated_decay():
     """The loop has a delay of one and a half periods, a delayed sensor and a digital filter."""
     filter = jb.Filter(cutoff=60.0, order=2)

@@ -12,7 +12,7 @@ from scipy.interpolate import CubicSpline
 import jaxbeam as jb
 from jaxbeam.case.case import part_classes
 from jaxbeam.case.limits import MAX_COUNTS, MAX_ENTRIES, MAX_WHEELS
-from jaxbeam.case.trajectory import BrakingTrajectory, TabulatedTrajectory
+from jaxbeam.case.trajectory import NEVER, BrakingTrajectory, TabulatedTrajectory
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.files.json_schema import table_classes, table_keys, tables
@@ -148,6 +148,17 @@ def test_cubics_of_a_table_are_those_of_a_spline(points):
     expected = [spline(times, d) for d in range(3)]
     assert_allclose(kinematics_of_cubics(trajectory, times), expected, atol=1e-11)
     assert_cubics_agree(trajectory, np.array([breakpoints[-1] + 0.5]))  # where the load stays
+
+
+@pytest.mark.parametrize("left", [False, True])
+def test_a_table_that_ends_at_the_end_of_the_beam_leaves_it_then(left):
+    """A wheel behind the first is on the beam still, and stays there."""
+    positions = 2.0 * np.array([0.1, 0.4, 1.0])
+    positions = 2.0 - positions if left else positions
+    path = TabulatedTrajectory(np.array([0.2, 0.5, 1.1]), positions, LENGTH)
+    entry, leave = path.entry_exit_times(np.array([0.0, 0.1]))
+    assert_allclose(entry, 0.2)
+    assert_allclose(leave, [1.1, NEVER])
 
 
 def test_cubics_of_a_load_set_are_padded_to_the_same_number():

@@ -115,6 +115,7 @@ def test_decay_of_the_error():
         (Observer(poles=POLES, speed=2.0), "poles or speed must be given, and not both"),
         (Observer(poles=POLES[:1]), "poles must list a pair for each of 2 modes, not 1"),
         (Observer(poles=[[1.0, 2.0], [-1.0, 3.0]]), "poles must have negative real parts"),
+        (Observer(poles=[[0.0, 2.0], [-1.0, 3.0]]), "poles must have negative real parts"),
         (Observer(speed=0.5), "speed must be above 1"),
     ],
 )

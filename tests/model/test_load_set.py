@@ -6,6 +6,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
+from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model import contact
 from jaxbeam.model.contact import _pressing_forces, contact_at, forces_of_wheels, split_states
 from jaxbeam.model.load_set import load_set
@@ -46,6 +47,15 @@ def test_wheels_follow_behind_the_first():
     entry, leave = LOADS.entry_exit_times().T
     assert_allclose(entry, [0.4, *behind / 30.0, 0.1])
     assert_allclose(leave - entry, [2.0, *[2 / 3] * 8, 4 / 3])
+
+
+def test_each_wheel_passes_each_position():
+    places = np.array([3.0, 11.0])
+    behind = np.concatenate([OFFSETS, OFFSETS + 25.0])
+    expected = [(places + 4.0) / 10.0, *(places + behind[:, None]) / 30.0]
+    found = LOADS.passages(places)
+    assert_allclose(found, [*expected, 0.1 + (20.0 - places) / 15.0], rtol=1e-12)
+    assert_array_equal(LOADS.rest_times(), 10 * [NEVER])
 
 
 def test_cubics_are_the_positions():

@@ -332,6 +332,7 @@ MISTAKES = [
     ("bridge", "loads.0.entry_time", 500.0, "loads.0", "loads.0.entry_time in s, not in ms"),
     ("bridge", "loads.0.start_position", -30e3, "", "in m, not in mm"),
     ("bridge", "loads.0.deceleration", 15.0, "", "in m/s^2"),
+    ("bridge", "loads.0.deceleration", 16.0, "", "less than 12.5 m/s^2 let it leave"),
     ("bridge", "run.duration", 0.5, "loads.0", "lengthen run.duration"),
     ("bridge", "run.duration", 2000.0, "", "in s, not in ms"),
     ("bridge", "run.gravity", 9810.0, "", "in m/s^2, 9.81 on earth, not in mm/s^2"),

@@ -66,6 +66,14 @@ def test_rail_spectra_by_hand():
     assert_allclose(american, 15.53e-8 * np.array([0.0233**2 / 1e-16, 0.131**2 / 1e8]), rtol=3e-5)
 
 
+def test_wavelengths_of_rail_spectra():
+    """In m, as in the options of TTB-2D (`A04_Options.m`)."""
+    published = {"fra-3": (1.524, 304.8), "german-low": (3.0, 150.0), "sncf-poor": (2.0, 40.0)}
+    for name, wavelengths in published.items():
+        lowest, highest = jb.profiles.RailProfile(name).wavenumber_range()
+        assert_allclose((1 / highest, 1 / lowest), wavelengths, rtol=1e-12)
+
+
 @pytest.mark.parametrize("name", ["german-low", "german-high"])
 def test_density_by_wavenumber_has_the_variance_of_that_by_radians(name):
     """Integral of S(Omega), in closed form, over all wavelengths."""
