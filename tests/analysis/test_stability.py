@@ -4,6 +4,8 @@ import dataclasses
 import json
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
@@ -13,7 +15,12 @@ import scipy.optimize
 import jaxbeam as jb
 from jaxbeam.analysis import stability
 from jaxbeam.analysis.frozen_loop import loop_dynamics
-from jaxbeam.analysis.linearised_loop import affine_linearisations, linearised_loop, loop_timing
+from jaxbeam.analysis.linearised_loop import (
+    LinearisedLoop,
+    affine_linearisations,
+    linearised_loop,
+    loop_timing,
+)
 from jaxbeam.analysis.margins import margins
 from jaxbeam.analysis.stability import (
     _assignment,
@@ -28,6 +35,7 @@ from jaxbeam.control.design_model import DesignModel
 from jaxbeam.control.optimal.crossing_gains import GainSchedule
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.gain_table import GainTable
+from tests.differences import central
 from tests.modules import DATA
 
 REFERENCE = json.loads((DATA / "optimal_control.json").read_text())
@@ -149,6 +157,24 @@ def test_pole_of_published_loop_with_filter():
     assert rightmost.real == pytest.approx(0.6891684603605122, rel=1e-6)
     assert abs(rightmost.imag) == pytest.approx(62.83126204745206, rel=1e-8)
     assert loop.growth_rate() == pytest.approx(rightmost.real, rel=1e-9)
+
+
+@pytest.mark.parametrize("period", [None, 0.01])
+def test_derivatives_of_the_growth_rate_by_gains(period):
+    """Against differences of the eigenvalues by NumPy."""
+    rng = np.random.default_rng(6)
+    A, B, gains = rng.normal(size=(5, 5)), rng.normal(size=(5, 2)), rng.normal(size=10)
+
+    def rate(gains):
+        return LinearisedLoop(A, B, gains.reshape(2, 5), period, 4).growth_rate()
+
+    def by_numpy(gains):
+        values = np.linalg.eigvals(A + B @ gains.reshape(2, 5))
+        return max(values.real) if period is None else np.log(max(abs(values))) / period
+
+    assert rate(gains) == pytest.approx(by_numpy(gains), rel=1e-12)
+    found = jax.grad(rate)(jnp.asarray(gains))
+    np.testing.assert_allclose(found, central(by_numpy, gains, 1e-5), rtol=1e-6)
 
 
 def test_crossing_branches_are_tracked():
