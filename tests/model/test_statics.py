@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.integrate import quad
 
 import jaxbeam as jb
 from jaxbeam.analysis.sections import influence_table
@@ -66,6 +67,26 @@ def test_two_spans_have_the_textbook_deflections():
     assert_allclose(found, np.array([-23.0, 9.0]) / 1536 / 3.0, rtol=1e-13)
     loaded = replace_loads(case, [MovingForce(force=3.0, speed=2.0)])
     assert_allclose(static_peak(loaded, 0.5), 0.015012, atol=5e-7)
+
+
+def test_a_haunched_span_by_the_unit_load_method():
+    """Integral of the product of both bending moments over a rigidity of third degree."""
+    length, powers = 4.0, [8.0, -9.0, 5.0, 6.0]
+    case = Case(Beam(length, mass_per_length=1.0, segments=[jb.Segment(flexural_rigidity=powers)]))
+
+    def moment(s, a):
+        return min(s, a) * (length - max(s, a)) / length
+
+    def flexibility(x, a):
+        def product(s):
+            rigidity = np.polynomial.polynomial.polyval(s / length, powers)
+            return moment(s, x) * moment(s, a) / rigidity
+
+        return quad(product, 0.0, length, points=[x, a], epsabs=0.0, epsrel=1e-12)[0]
+
+    x, a = np.array([0.7, 2.3]), np.array([1.1, 3.2])
+    expected = [[-flexibility(*pair) for pair in zip(x, [y, y], strict=True)] for y in a]
+    assert_allclose(influence_line(case, x, a), expected, rtol=1e-9)
 
 
 def test_supports_springs_and_patches_together_against_finite_elements():

@@ -33,7 +33,7 @@ from jaxbeam.model.theory.elements import (
     nodal_unknowns,
     sections,
 )
-from jaxbeam.numerics.polynomials import piecewise_chebyshev
+from jaxbeam.numerics.polynomials import chebyshev_polynomials, piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, add_at, solve, take, xp
 from jaxbeam.runtime.module import Module
 
@@ -131,7 +131,7 @@ def transfer(sections: Sections, layout: Layout) -> Transfer:
     first, last = sections.nodes[elements], sections.nodes[elements + 1]
     x = nodes[:-1, None] + half_lengths[:, None] * (points + 1)
     local = 2 * (x - first[:, None]) / (last - first)[:, None] - 1
-    table = _chebyshev_table(local, sections.series.shape[1])
+    table = chebyshev_polynomials(local, sections.series.shape[1])
     at_points = xp.einsum("pjd,pdk->pjk", table, sections.series[elements])
     A = _matrices(sections, at_points)
     operator = half_lengths[:, None, None, None, None] * xp.einsum("ij,pjab->piajb", values, A)
@@ -144,14 +144,6 @@ def transfer(sections: Sections, layout: Layout) -> Transfer:
     unit = np.zeros((POINTS + 1, 4, 4))
     unit[0] = np.eye(4)
     return Transfer(sections, nodes, (series + unit).reshape(-1, POINTS + 1, 16))
-
-
-def _chebyshev_table(local, terms: int):
-    """Chebyshev polynomials below a degree at local positions, along a new last axis."""
-    table = [xp.ones_like(local), local]
-    while len(table) < terms:
-        table.append(2 * local * table[-1] - table[-2])
-    return xp.stack(table[:terms], axis=-1)
 
 
 def _matrices(sections: Sections, values) -> Float[Array, "part point 4 4"]:
