@@ -31,6 +31,7 @@ from .case.loads.point import (
 from .case.loads.vehicles.cars import Oscillator as Oscillator, QuarterCar as QuarterCar
 from .case.loads.walking import Crowd as Crowd, Pedestrian as Pedestrian
 from .case.sensors import Sensor as Sensor
+from .case.track import Track as Track
 from .control import receptance_method as receptance_method
 from .control.compensators import PD as PD, PositivePositionFeedback as PositivePositionFeedback
 from .control.feedback import (

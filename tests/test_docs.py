@@ -29,6 +29,7 @@ from jaxbeam.case.loads.vehicles.vehicle import load_vehicle
 from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSensor
 from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.track import Track
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.files.json_schema import tables
 from tests.modules import ROOT
@@ -279,6 +280,7 @@ PARTS = {
     "sensors": Sensor,
     "vehicle_sensors": VehicleSensor,
     "loads": AbstractLoad,
+    "track": Track,
     "profile": AbstractProfile,
     "contact": AbstractContact,
     "controller": AbstractController,

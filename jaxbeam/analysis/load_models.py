@@ -15,6 +15,7 @@ from jaxbeam.case.declared_checks import check_on_beam, suggestion
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.axles import Axles
 from jaxbeam.case.quantities import quantity_of
+from jaxbeam.case.track import Kernel
 from jaxbeam.library.published import LoadModel, ModelVehicle, load_models, trains
 from jaxbeam.model.along_beam import positions_along, sections
 from jaxbeam.model.modes import modes
@@ -173,6 +174,24 @@ class TabulatedLine(NamedTuple):
     def at(self, x: Float[np.ndarray, "*place"]) -> Float[np.ndarray, "*place"]:
         """Values at positions x (m)."""
         return np.interp(x, self.positions, self.values, left=0.0, right=0.0)
+
+    def spread(self, kernel: Kernel) -> "TabulatedLine":
+        """Line of axles that a track spreads; beyond the ends of the beam by their shares on it.
+
+        Between positions, of which an even spread has a curve, it is linear.
+        """
+        places = np.unique((self.positions[:, None] - concrete(kernel.offsets)).reshape(-1))
+        values = self.values
+        steps = np.diff(self.positions) * (values[1:] + values[:-1]) / 2
+        integral = np.append(0.0, np.cumsum(steps))
+        total = np.zeros(places.size)
+        for offset, weight in zip(*map(concrete, kernel[:2]), strict=True):
+            x = places + offset
+            total += weight * (
+                np.interp(x, self.positions, integral) if kernel.integrated else self.at(x)
+            )
+        kinks = (self.kinks[:, None] - concrete(kernel.offsets)).reshape(-1)
+        return TabulatedLine(places, total, kinks)
 
     @property
     def positive_area(self) -> float:

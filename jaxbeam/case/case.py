@@ -27,12 +27,14 @@ from jaxbeam.case.fields import (
     number,
 )
 from jaxbeam.case.former_words import attribute_address, present_address
-from jaxbeam.case.loads.base import AbstractLoad, trajectory, wheel_distances
+from jaxbeam.case.loads.base import AbstractLoad, wheel_distances
 from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSensor
 from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.quantities import OF_QUANTITY
 from jaxbeam.case.reading.units import in_si
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.case.track import Track, windows
+from jaxbeam.case.trajectory import AbstractPiecewiseTrajectory
 from jaxbeam.runtime.arrays import Array, Number, set_at, xp
 from jaxbeam.runtime.module import Module
 
@@ -94,7 +96,7 @@ class Run(ReprWithUnits):
 
 
 class Case(Module):
-    """Beam, supports, absorbers, actuators, sensors, loads, profile, contact, controller, run.
+    """Beam, supports, absorbers, actuators, sensors, loads, track, profile, controller, run.
 
     Sensors are on the beam; `vehicle_sensors` are on bodies and axles of the loads.
 
@@ -114,6 +116,7 @@ class Case(Module):
     sensors: tuple[Sensor, ...] = ()
     loads: tuple[AbstractLoad, ...] = ()
     vehicle_sensors: tuple[VehicleSensor, ...] = ()
+    track: Track | None = None
     profile: AbstractProfile | None = None
     contact: AbstractContact | None = None
     controller: AbstractController | None = None
@@ -134,6 +137,7 @@ class Case(Module):
         vehicle_sensors: Iterable = (),
         absorbers: Iterable = (),
         contact=None,
+        track: Track | None = None,
     ):
         self.beam = beam
         self.supports = tuple(supports)
@@ -142,6 +146,7 @@ class Case(Module):
         self.sensors = tuple(sensors)
         self.loads = tuple(loads)
         self.vehicle_sensors = tuple(vehicle_sensors)
+        self.track = track
         self.profile = profile
         self.contact = contact
         self.controller = controller
@@ -168,6 +173,14 @@ class Case(Module):
     def carried(self) -> tuple[AbstractLoad | Absorber, ...]:
         """What presses on the beam, in the order of its wheels: loads, then absorbers."""
         return (*self.loads, *self.absorbers)
+
+    def trajectory(self, load: AbstractLoad | Absorber) -> AbstractPiecewiseTrajectory:
+        """Trajectory of the first wheel of a load of the case."""
+        travels = isinstance(load, AbstractLoad) and load.speed is not None
+        if self.track is not None and travels and load.start_position is None:
+            start = self.track.start(load.speed, self.beam.length)
+            load = dataclasses.replace(load, start_position=start)
+        return load.trajectory(self.beam.length)
 
     @property
     def lifts(self) -> bool:
@@ -423,8 +436,9 @@ def concrete_case(case: Case) -> Case:
 
 
 def structure_of(case: Case) -> Case:
-    """Beam, supports, absorbers, actuators and sensors of a case, as a case without loads."""
-    return Case(case.beam, case.supports, case.actuators, case.sensors, absorbers=case.absorbers)
+    """All of a case but its loads, profile, contact, controller and run."""
+    parts = case.beam, case.supports, case.actuators, case.sensors
+    return Case(*parts, absorbers=case.absorbers, track=case.track)
 
 
 def stack_cases(cases: Sequence[Case]) -> Case:
@@ -439,12 +453,12 @@ def crossing_times(case: Case) -> Float[np.ndarray, "load 2"]:
 
     Raises `jax.errors.ConcretizationTypeError` if the case is traced.
     """
-    windows = []
+    found = []
     for load in case.loads:
         behind = wheel_distances(load, load.vehicle(case.run.gravity))
-        entry, leave = trajectory(load, case.beam.length).entry_exit_times(behind)
-        windows.append((np.min(concrete(entry)), np.max(concrete(leave))))
-    return np.array(windows).reshape(-1, 2)
+        entry, leave = windows(case.track, case.trajectory(load), behind)
+        found.append((np.min(concrete(entry)), np.max(concrete(leave))))
+    return np.array(found).reshape(-1, 2)
 
 
 SINGULARS = {"bodies": "body", "masses": "mass"}

@@ -30,18 +30,25 @@ from jaxbeam.case.loads.base import (
     AbstractLoad,
     VehicleModel,
     known_numbers,
-    trajectory,
     wheel_distances,
 )
 from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSensor
 from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.sensors import Sensor, sensor_labels
+from jaxbeam.case.track import Track
 from jaxbeam.runtime.arrays import Array
 
 # Parts with a method `validate(address)`.
 SELF_VALIDATING = (
-    Beam | Absorber | AbstractActuator | Sensor | AbstractLoad | AbstractProfile | AbstractContact
+    Beam
+    | Absorber
+    | AbstractActuator
+    | Sensor
+    | AbstractLoad
+    | Track
+    | AbstractProfile
+    | AbstractContact
 )
 
 
@@ -82,6 +89,7 @@ def check_plant(case: Case) -> None:
             raise ValueError(error)
     _check_supports(case.supports, case.beam.length)
     _check_wheels(case)
+    _check_track(case)
     _check_kinks(case)
     _check_profile(case)
     _check_labels(case.sensors)
@@ -137,6 +145,53 @@ def _check_wheels(case: Case) -> None:
         )
 
 
+def _check_track(case: Case) -> None:
+    """Validate that the track spreads forces that enter the beam, and shorter than it is."""
+    if case.track is None:
+        return
+    if case.absorbers:
+        raise ValueError(
+            "track and absorbers cannot be together: the track would spread what hangs on the beam;"
+            " leave one of them out"
+        )
+    if case.controller is not None:
+        raise ValueError(
+            "track and controller cannot be together: laws are designed for loads at points; leave"
+            " one of them out"
+        )
+    lowest, highest = case.track.ends()
+    length = case.beam.length
+    if all(map(is_concrete, (lowest, highest, length))):
+        width = float(concrete(highest) - concrete(lowest))
+        if not width < float(concrete(length)):
+            raise ValueError(
+                f"track spreads an axle over {width:g} m, which must be less than the length of the"
+                f" beam, {float(concrete(length)):g} m"
+            )
+    for i, load in enumerate(case.loads):
+        vehicle = load.vehicle(case.run.gravity)
+        masses = vehicle.wheel_masses
+        if vehicle.names or not is_concrete(masses) or np.any(concrete(masses)):
+            raise ValueError(
+                f"track spreads forces, and loads.{i} has mass, which follows the beam at a point:"
+                " take the weights of its axles as forces, or leave the track out"
+            )
+        _check_start(f"loads.{i}", load, case)
+
+
+def _check_start(address: str, load: AbstractLoad, case: Case) -> None:
+    """Validate that no share of a load is on the beam before the run."""
+    start, speed = load.start_position, load.speed
+    if start is None or speed is None or not all(map(known_numbers, (case.track, load))):
+        return
+    first = float(concrete(case.track.start(speed, case.beam.length)))
+    if (concrete(start) - first) * concrete(speed) > POSITION_TOLERANCE * abs(concrete(speed)):
+        raise ValueError(
+            f"{address}.start_position is {concrete(start):g} m, where a share of the axle is on"
+            f" the beam already; the first one enters at {first:g} m"
+        )
+
+
 def _wheel_count(load: AbstractLoad) -> int:
     """About how many wheels a load has, without its vehicles, which may take long to make."""
     lists = (getattr(load, name, None) for name in ("axles", "offsets", "coaches"))
@@ -188,7 +243,7 @@ def _travel(load: AbstractLoad, vehicle: VehicleModel, case: Case) -> tuple[floa
     """Lowest and highest position (m) of any wheel, from the start until all have left the beam."""
     length = float(concrete(case.beam.length))
     behind = float(np.max(concrete(wheel_distances(load, vehicle))))
-    path = trajectory(load, case.beam.length)
+    path = case.trajectory(load)
     places = path.kinematics(concrete(case.run.duration) * np.array([0.0, 1.0]))[0]
     if load.positions is not None:
         places = np.append(places, concrete(load.positions))

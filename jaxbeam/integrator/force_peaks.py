@@ -104,7 +104,10 @@ def force_paths(
             return np.broadcast_to(default if given is None else concrete(given), runs)
 
         speed, entry = of_load("speed"), of_load("entry_time")
-        start = of_load("start_position", np.where(speed < 0, length, 0.0))
+        start = np.where(speed < 0, length, 0.0)
+        if case.track is not None:
+            start = case.track.start(speed, case.beam.length)
+        start = of_load("start_position", start)
         behind = wheels.behind[i]
         if {f"loads.{i}.spacing", f"loads.{ALL}.spacing"} & set(addresses):
             spacings, index = np.unique(of_load("spacing"), return_inverse=True)

@@ -34,6 +34,7 @@ MAX_CONDITION = 1e6  # of the eigenvectors; beyond, poles are nearly repeated
 TABLE_POINTS = 600  # of the beam, at least; peaks are searched on lines between them
 POINTS_PER_MODE = 40
 TABLE_PHASE = 0.3  # rad of the fastest pole, at most, between two points under the slowest force
+SHORTEST = 1e-12  # of the length: shorter segments are left out
 CURVATURE_MARGIN = 1.2  # of the curvature over second differences of the table
 
 
@@ -95,9 +96,12 @@ def force_system(
     if model.mode_map is not None:
         into = into @ model.mode_map.T
     on_outputs = outputs.rows @ vectors[:, own] * np.where(poles[own].imag > 0, 2.0, 1.0)
-    nodes = np.asarray(model.modes.nodes)
-    breaks = np.unique(np.concatenate([nodes, np.clip(places, nodes[0], nodes[-1])]))
-    series = np.asarray(model.modes.series) @ into.T
+    nodes, series = np.asarray(model.load_nodes), np.asarray(model.load_series) @ into.T
+    if model.spread is not None:  # shares of an axle may pass nodes at one time
+        long = np.diff(nodes) > SHORTEST * (nodes[-1] - nodes[0])
+        nodes, series = np.append(nodes[:-1][long], nodes[-1]), series[long]
+    places = np.clip(model.load_places(places), nodes[0], nodes[-1])
+    breaks = np.unique(np.concatenate([nodes, places]))
     return ForceSystem(poles[own], series, on_outputs, nodes, breaks, outputs)
 
 

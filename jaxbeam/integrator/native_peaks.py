@@ -207,12 +207,12 @@ def model_inputs(
     model: ModalModel, outputs: OutputRows, correction: StaticCorrection | None
 ) -> dict[str, Any]:
     """Those of the `NativeInputs` that a model determines, and outputs with their correction."""
-    series = model.modes.series
+    series = model.load_series
     linear = linear_outputs(model, outputs, correction)
     influence = linear.influence
     return {
         "state_matrix": model.state_matrix,
-        "shape_nodes": model.modes.nodes,
+        "shape_nodes": model.load_nodes,
         "shape_series": series if model.mode_map is None else series @ model.mode_map,
         "output_rows": linear.rows,
         "output_bounds": bounds_by_energy(

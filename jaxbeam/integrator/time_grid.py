@@ -420,8 +420,8 @@ def event_places(
     model: ModalModel, places: Float[Array, " place"] | None
 ) -> Float[Array, " event_place"]:
     """Places (m) at which a passing wheel is a load event: those of the model, and some more."""
-    own = model.modes.nodes[1:-1]
-    return own if places is None else xp.concatenate([own, places])
+    own = model.load_nodes[1:-1]
+    return own if places is None else xp.concatenate([own, model.load_places(places)])
 
 
 def _events_between(case: Case, model: ModalModel, places, start, end, known=None):

@@ -47,6 +47,8 @@ def special_positions(case: Case) -> Float[Array, " place"]:
     enter, leave = loads.entry_exit_times().T
     stands = (enter < NEVER) & (leave >= NEVER)
     standing = xp.where(stands, loads.kinematics(xp.full((), NEVER))[0], 0.0)
+    if case.track is not None:
+        standing = (standing[:, None] + case.track.kernel().offsets).reshape(-1)
     return xp.clip(xp.concatenate([xp.stack(places), standing]), 0.0, length)
 
 

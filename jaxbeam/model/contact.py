@@ -74,10 +74,10 @@ def surface_rows(
     blocks, modes_per_block = model.state_matrix.shape[0], model.modes_per_block
     block_shape = (*position.shape, blocks, modes_per_block)
     if not (inertia or springs):
-        shape = xp.where(active[..., None], model.shapes(position_on_beam, (0,))[0], 0.0)
+        shape = xp.where(active[..., None], model.load_shapes(position_on_beam, (0,))[0], 0.0)
         return SurfaceRows(shape.reshape(block_shape), None, None, None)
     shape, slope, curvature = xp.where(
-        active[..., None], model.shapes(position_on_beam, (0, 1, 2)), 0.0
+        active[..., None], model.load_shapes(position_on_beam, (0, 1, 2)), 0.0
     )
     speed, acceleration = speed[..., None], acceleration[..., None]
     side = model.state_matrix.shape[1]

@@ -165,7 +165,10 @@ def peak_under_loads(
     `breaks` (m). Between events the sum is a polynomial in time, of degree POINTS - 1 at most;
     under waves it is interpolated in `wave_intervals` more (see `intervals_of_waves`).
     """
-    loads, length = load_set(case), case.beam.length
+    loads, low, high = load_set(case), 0.0, case.beam.length
+    if case.track is not None:
+        first, last = case.track.ends()
+        low, high = low - last, high - first
     windows, times = _intervals(case, loads, breaks, wave_intervals)
     starts, ends = times[:-1], times[1:]
     count = line(xp.zeros(0)).shape[-1]
@@ -175,7 +178,7 @@ def peak_under_loads(
         middle = (starts[part] + ends[part]) / 2
         # At a break, where the line of a shear force jumps, the side on which the wheel is.
         within = middle + (ends[part] - starts[part]) * WITHIN[:, None]
-        position = xp.clip(loads.kinematics(within)[0], 0.0, length)
+        position = xp.clip(loads.kinematics(within)[0], low, high)
         forces = loads.varying_weight(within)[..., 0]
         active = (windows[:, :1] < middle) & (middle < windows[:, 1:])
         active = active & (ends[part] - starts[part] > SHORTEST * (times[-1] - times[0]))

@@ -17,6 +17,7 @@ from jaxbeam.case.loads.base import (
     VehicleModel,
     wheel_distances,
 )
+from jaxbeam.case.track import Track, windows
 from jaxbeam.case.trajectory import AbstractTrajectory
 from jaxbeam.model.layout import Layout
 from jaxbeam.model.settlement import surface
@@ -133,6 +134,7 @@ class LoadSet(Module):
     behind: tuple[Float[Array, " _"], ...]
     profile: Module | None = None
     absorbers: int = eqx.field(static=True, default=0)
+    track: Track | None = None
 
     @property
     def inertia(self) -> Float[Array, "wheel batch"]:
@@ -241,8 +243,8 @@ class LoadSet(Module):
 
     def entry_exit_times(self) -> Float[Array, "wheel 2"]:
         """Times (s) at which wheels enter and leave the beam; `NEVER` for what does not happen."""
-        windows = [xp.stack(path.entry_exit_times(behind), -1) for path, behind in self._paths()]
-        return xp.concatenate(windows) if windows else xp.zeros((0, 2))
+        found = [xp.stack(windows(self.track, *each), -1) for each in self._paths()]
+        return xp.concatenate(found) if found else xp.zeros((0, 2))
 
     def events(
         self, places: Float[Array, " place"]
@@ -253,8 +255,8 @@ class LoadSet(Module):
         """
         if self.profile is not None:
             places = xp.concatenate([places, self.profile.kinks()])
-        windows = self.entry_exit_times()
-        return windows, xp.concatenate([windows.reshape(-1), self.passage_times(places)])
+        ends = self.entry_exit_times()
+        return ends, xp.concatenate([ends.reshape(-1), self.passage_times(places)])
 
     def passages(
         self, positions: Float[Array, " position"]
@@ -293,7 +295,7 @@ def load_set(case: Case, layout: Layout | None = None) -> LoadSet:
 
     This needs a `layout` (from `mesh_layout`) where the numbers of the case are traced.
     """
-    trajectories = tuple(one.trajectory(case.beam.length) for one in case.carried)
+    trajectories = tuple(map(case.trajectory, case.carried))
     vehicles = [load.vehicle(case.run.gravity) for load in case.carried]
     return LoadSet(
         trajectories,
@@ -301,6 +303,7 @@ def load_set(case: Case, layout: Layout | None = None) -> LoadSet:
         tuple(map(wheel_distances, case.carried, vehicles)),
         surface(case, layout),
         len(case.absorbers),
+        case.track,
     )
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Layout, Modes, mesh_layout, modes
+from jaxbeam.model.spread import SpreadShapes, spread_series
 from jaxbeam.runtime.arrays import Array, block_diag, set_at, solve_triangular, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.module import Module
@@ -24,7 +25,8 @@ class ModalModel(Module):
 
     The coordinates q have the unit mass matrix. Where the moving mass of an actuator couples the
     `modes`, `mode_map` maps q to their amplitudes; else it is None. `displacement_map` maps q to
-    the displacement (m, or rotation in rad) at each actuator.
+    the displacement (m, or rotation in rad) at each actuator. `spread` are the mode shapes under
+    axles that a track spreads, None without one.
     """
 
     modes: Modes
@@ -32,6 +34,7 @@ class ModalModel(Module):
     state_matrix: Float[Array, "block side side"]
     command_matrix: Float[Array, "state actuator"]
     displacement_map: Float[Array, "actuator mode"]
+    spread: SpreadShapes | None = None
 
     @property
     def state_count(self) -> int:
@@ -70,6 +73,32 @@ class ModalModel(Module):
         """
         rows = self.modes.shape_derivatives(x, derivatives)
         return rows if self.mode_map is None else rows @ self.mode_map
+
+    def load_shapes(self, x, derivatives: tuple[int, ...]) -> Float[Array, "order *position mode"]:
+        """Rows from q to the deflection (m) under wheels at x (m), or its x-derivatives.
+
+        Transposed, they map the force of a wheel to generalised forces on q.
+        """
+        if self.spread is None:
+            return self.shapes(x, derivatives)
+        rows = self.spread.derivatives(x, derivatives)
+        return rows if self.mode_map is None else rows @ self.mode_map
+
+    @property
+    def load_nodes(self) -> Float[Array, " node"]:
+        """Positions of a wheel (m) between which its mode shapes are polynomials."""
+        return self.modes.nodes if self.spread is None else self.spread.nodes
+
+    @property
+    def load_series(self) -> Float[Array, "segment degree mode"]:
+        """Chebyshev series of the modes under a wheel between the `load_nodes`."""
+        return self.modes.series if self.spread is None else self.spread.series
+
+    def load_places(self, places: Float[Array, " place"]) -> Float[Array, " wheel_place"]:
+        """Positions of a wheel (m) at which its force, or a share of it, is at places (m)."""
+        if self.spread is None:
+            return places
+        return (places[:, None] - self.spread.offsets).reshape(-1)
 
     def fields(self, x, orders: tuple[int, ...]) -> Float[Array, "order *position mode"]:
         """Rows from q to fields of the beam at positions x (m): see `Modes.fields`."""
@@ -122,7 +151,8 @@ def assemble_modal_model(case: Case, modes: Modes, coupled: bool = True) -> Moda
         zero, one = xp.zeros(count), xp.ones(count)
         blocks = xp.stack([zero, one, -modes.stiffness, -modes.damping], axis=-1)
         no_actuators = xp.zeros((2 * count, 0)), xp.zeros((0, count))
-        return ModalModel(modes, None, blocks.reshape(count, 2, 2), *no_actuators)
+        blocks = blocks.reshape(count, 2, 2)
+        return ModalModel(modes, None, blocks, *no_actuators, _spread_shapes(case, modes))
     stiffness = xp.diag(modes.stiffness) + modes.coupling
     damping = xp.diag(modes.damping) + modes.damping_coupling
     for support in case.supports:
@@ -153,7 +183,15 @@ def assemble_modal_model(case: Case, modes: Modes, coupled: bool = True) -> Moda
         )
         displacement_map = displacement_map @ transformation
     matrix, command = _state_space_matrices(stiffness, damping, displacement_map, attachments)
-    return ModalModel(modes, transformation, matrix[None], command, displacement_map)
+    parts = transformation, matrix[None], command, displacement_map
+    return ModalModel(modes, *parts, _spread_shapes(case, modes))
+
+
+def _spread_shapes(case: Case, modes: Modes) -> SpreadShapes | None:
+    if case.track is None:
+        return None
+    kernel = case.track.kernel()
+    return SpreadShapes(*spread_series(kernel, modes.nodes, modes.series), kernel.offsets)
 
 
 def _state_space_matrices(stiffness, damping, displacement_map, attachments):

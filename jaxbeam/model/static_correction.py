@@ -20,6 +20,7 @@ from jaxbeam.model.deflection_lines import (
     validated_layout,
 )
 from jaxbeam.model.flexibility import check_supported
+from jaxbeam.model.load_influence import residual_influence
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import Layout, Modes, mesh_layout
 from jaxbeam.model.theory.elements import rigidity_at
@@ -136,17 +137,31 @@ def _loads_history(case: Case, motion: Motion, x, derivative: int, layout: Layou
     on_beam = xp.isfinite(motion.load_position)  # wheels of vehicles press on the ground, too
     if not all(map(is_known, jax.tree.leaves((case, motion, x)))):
         positions = xp.where(on_beam, motion.load_position, 0.0)
-        residual = _residual_flexibility(case, x, positions, derivative, layout)
+        residual = _under_loads(case, x, positions, derivative, layout)
         return xp.einsum("tl,tl...->t...", xp.where(on_beam, motion.contact_force, 0.0), residual)
     time, load = np.nonzero(on_beam)
     positions, forces = motion.load_position[time, load], motion.contact_force[time, load]
-    residual = _residual_flexibility(case, x, positions, derivative, layout)
+    residual = _under_loads(case, x, positions, derivative, layout)
     history = xp.zeros((on_beam.shape[0], *x.shape))
     if not time.size:
         return history
     starts = np.flatnonzero(np.diff(time, prepend=-1))
     values = forces.reshape(-1, *(1,) * x.ndim) * residual
     return set_at(history, time[starts], np.add.reduceat(values, starts, axis=0))
+
+
+def _under_loads(case: Case, x, positions, derivative: int, layout: Layout):
+    """Residual flexibility for the forces of loads at positions (m), as the track spreads them."""
+    if case.track is None:
+        return _residual_flexibility(case, x, positions, derivative, layout)
+    return _spread_residual(case, layout, x, positions, derivative)
+
+
+@compiled_if_traced
+def _spread_residual(case: Case, layout: Layout, x, positions, derivative: int):
+    influence = residual_influence(case, modal_model(case, layout), x, derivative)
+    found = -influence.of_forces_at(positions, positions)
+    return found.reshape((*positions.shape, *x.shape))
 
 
 def port_forces(

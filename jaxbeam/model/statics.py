@@ -23,6 +23,7 @@ from jaxbeam.model.deflection_lines import (
 )
 from jaxbeam.model.flexibility import flexibility
 from jaxbeam.model.layout import Layout, is_uniform
+from jaxbeam.model.load_influence import spread_line
 from jaxbeam.model.sensing.output_rows import SIDE_SHARE, beside, quantity_factor
 from jaxbeam.model.settlement import settlement_response
 from jaxbeam.model.static_correction import section_stiffness
@@ -175,6 +176,7 @@ def _static_peak(
     wave_intervals: int,
 ):
     line, breaks = _line(case, layout, x.reshape(-1), kind, fibre_distance, section_modulus)
+    line, breaks = spread_line(case, line, breaks)
     return peak_under_loads(case, line, breaks, wave_intervals).reshape(x.shape)
 
 

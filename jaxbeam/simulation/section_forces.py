@@ -4,6 +4,8 @@ Shear forces jump at the positions of loads, supports and point actuators, so th
 value on either side; reactions are jumps of the shear force, less the other forces there.
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -95,13 +97,14 @@ def reactions(case: Case, modes: Modes, motion: Motion) -> Float[Array, "time su
     first, last = nodes == 0, nodes == modes.nodes.shape[0] - 1
     right, left = (_vertical_force(case, modes, motion, x, side) for side in ("right", "left"))
     reaction = xp.where(last, 0.0, right) - xp.where(first, 0.0, left)
-    # Loads between the sections on both sides; none are beyond the ends.
+    # Loads between the sections on both sides.
     low, high = xp.where(first, -xp.inf, x - step), xp.where(last, xp.inf, x + step)
-    position = motion.load_position[..., None]
-    stands_there = (position > low) & (position <= high)
-    reaction = reaction + xp.sum(
-        xp.where(stands_there, motion.contact_force[..., None], 0.0), axis=1
-    )
+    for offset, share in _shares(case):
+        position = motion.load_position[..., None] + offset
+        on_beam = (position >= -step) & (position <= case.beam.length + step)
+        stands_there = on_beam & (position > low) & (position <= high)
+        force = xp.where(stands_there, share * motion.contact_force[..., None], 0.0)
+        reaction = reaction + xp.sum(force, axis=1)
     for actuator, force in zip(case.actuators, port_forces(case, modes, motion, True), strict=True):
         for place, order, factor in actuator.displacement_map():
             if order == 0:
@@ -114,6 +117,14 @@ def reactions(case: Case, modes: Modes, motion: Motion) -> Float[Array, "time su
             inertia = xp.where(there, support.mass * acceleration[:, None], 0.0)
             reaction = reaction + inertia
     return reaction
+
+
+def _shares(case: Case) -> list[tuple[Any, Any]]:
+    """Offsets (m) and shares of the point forces in which a load acts."""
+    if case.track is None:
+        return [(0.0, 1.0)]
+    kernel = case.track.kernel()
+    return [] if kernel.integrated else list(zip(kernel.offsets, kernel.weights, strict=True))
 
 
 def _vertical_force(case: Case, modes: Modes, motion: Motion, x, side: str):

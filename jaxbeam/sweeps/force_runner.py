@@ -51,7 +51,7 @@ MIN_WHEELS = 8  # of a row; below, integration in batches takes less time
 LEAST_TOLERANCE = 1e-8  # above the error of the eigenvectors
 # Numbers on which the model does not depend, and with which forces keep constant speeds.
 ADDRESS = re.compile(r"loads\.(\d+|\*)\.(speed|entry_time|start_position|spacing)|run\.duration")
-OF_BEAM = "beam", "supports", "actuators", "sensors"  # the keys on which the model depends
+OF_BEAM = "beam", "supports", "actuators", "sensors", "track"  # the keys on which the model depends
 # Runs of a block at most, and pairs of its wheels at most. Twice as many runs as before took 12 %
 # less time for ten trains at 101 speeds: threads wait for each other between NumPy's short calls.
 FORCE_BLOCK_RUNS, BLOCK_PAIRS = 64, 4e6

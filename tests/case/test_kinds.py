@@ -93,6 +93,7 @@ def test_parts_of_a_case_follow_from_its_fields():
         "sensors": "Sensor",
         "loads": "AbstractLoad",
         "vehicle_sensors": "VehicleSensor",
+        "track": "Track",
         "profile": "AbstractProfile",
         "controller": "AbstractController",
         "contact": "AbstractContact",

@@ -302,6 +302,9 @@ def test_assess_cites_clauses(run, refused, folder):
     found = run(f"{line} --json")
     assert "not required" in {check["outcome"] for check in found["checks"]}
     assert "track cannot be 'gravel'" in refused(f"{line} --track gravel")
+    assert "spread cannot be 'wide'" in refused(f"{line} --spread wide")
+    inputs = run(f"{line} --spread 2.4m --json")["inputs"]
+    assert inputs["spread of axles"] == "Track(spread_length=2.4 m)"
     assert "ask for the dynamic analysis" in refused(f"{line} --track maintained --plot")
     assert "line_speed takes a number in m/s" in refused("assess case.toml --line-speed fast")
 

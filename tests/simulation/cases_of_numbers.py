@@ -225,6 +225,14 @@ JUMPS_OF_ALL = rig(
         [2e3], period=0.0052, delay=1e-3, resolution=0.01, dropout=0.1, jitter=1e-3
     ),
 )
+SPREAD = [jb.MovingForce(force=3.0, speed=2.4)]
+OF_TRACKS = {
+    "sleepers": rig(SPREAD, track=jb.Track(spread="3 sleepers", sleeper_spacing=0.03)),
+    "even": rig(SPREAD, track=jb.Track(spread_length=0.07)),
+    "uneven": rig(
+        SPREAD, track=jb.Track(spread_offsets=[-0.03, 0.01, 0.05], spread_shares=[0.5, 1.0, 0.7])
+    ),
+}
 OF_LOADS = {
     "forces": rig(
         [
@@ -467,6 +475,7 @@ CASES: dict[str, tuple[jb.Case, str | tuple[str, ...]]] = {
     **{name: (case, "actuators.") for name, case in ACTUATORS.items()},
     "sensors": (SENSORS, "sensors."),
     **{name: (case, ("loads.", "vehicle_sensors.")) for name, case in OF_LOADS.items()},
+    **{f"{name} track": (case, "track.") for name, case in OF_TRACKS.items()},
     **{f"{name} profile": (case, "profile.") for name, case in OF_PROFILES.items()},
     "run": (rig(controller=None), "run."),
     **{name: (case, "controller.") for name, case in OF_CONTROLLERS.items()},

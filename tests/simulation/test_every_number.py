@@ -53,6 +53,8 @@ WITHOUT_EFFECT = {
     "moving-horizon of a heavy load": {"controller.estimator.max_weight"},
     "mpc": {"controller.soft_weight"},
     "run": {"run.duration"},
+    "even track": {"track.sleeper_spacing"},
+    "uneven track": {"track.sleeper_spacing"},
 }
 NEVER_OF_EFFECT = {
     ("SpringDamper", "limits"),  # it takes no commands

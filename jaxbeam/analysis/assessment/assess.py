@@ -18,6 +18,7 @@ from jaxbeam.case.case import Case, Run
 from jaxbeam.case.declared_checks import suggestion
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.reading.units import number_in_si
+from jaxbeam.case.track import Track, track_of
 from jaxbeam.case.validation import check_case
 from jaxbeam.library.published import trains as library
 from jaxbeam.model.modes import modes
@@ -39,6 +40,7 @@ def assess(
     code: str = "en1991-2",
     deck: str = "ballasted",
     track: str = "standard",
+    spread: str | Track | None = None,
     classification: float = 1.0,
     determinant_length=None,
     added_damping: float = 0.0,
@@ -48,11 +50,13 @@ def assess(
 ) -> Assessment:
     """Checks of a railway bridge by EN 1991-2, section 6.4, and EN 1990, annex A2.
 
-    Beam and supports are those of the case; its loads, sensors and run are not used. `line_speed`
-    is the maximum line speed at the site, in m/s or with a unit ("250 km/h"). Limits of the deck
-    acceleration are those of a "ballasted" or "slab" `deck`. The state of the `track`, "standard"
-    or carefully "maintained", chooses Phi_3 or Phi_2 of LM71, and 1 + phi'' or 1 + phi''/2, by
-    which all calculated effects of the trains are multiplied (as commonly stated).
+    Beam, supports and track are those of the case; its loads, sensors and run are not used.
+    `line_speed` is the maximum line speed at the site, in m/s or with a unit ("250 km/h"). Limits
+    of the deck acceleration are those of a "ballasted" or "slab" `deck`. The state of the `track`,
+    "standard" or carefully "maintained", chooses Phi_3 or Phi_2 of LM71, and 1 + phi'' or
+    1 + phi''/2, by which all calculated effects of the trains are multiplied (as commonly stated).
+    The axles of the trains are spread by the track of the case, or by a `spread` in its place: a
+    `Track`, "3 sleepers", or a length ("2.4 m"); LM71 is not.
     `classification` is the factor alpha of LM71. The `determinant_length` L_phi (m, table 6.2) is
     the span of a single span, and must be given for others. `added_damping` (6.4.6.4) is added to
     the modal damping ratios.
@@ -100,6 +104,9 @@ def assess(
         )
     if not 0 <= added_damping < 1:
         raise ValueError(f"added_damping is a ratio, as 0.005; it is {added_damping:g}")
+    if spread is not None:
+        given = spread if isinstance(spread, Track) else track_of(spread)
+        case = dataclasses.replace(case, track=given)
     bridge = _bridge(case)
     warn_if_implausible(bridge)
     length = _determinant_length(bridge, determinant_length)
@@ -130,6 +137,7 @@ def assess(
         "determinant length": f"{length:g} m",
         "deck": deck,
         "track": track,
+        "spread of axles": "none" if bridge.track is None else repr(bridge.track),
         "classification factor": f"{classification:g}",
         "added damping": f"{added_damping:g}",
     }

@@ -70,8 +70,8 @@ def largest_moments(case: Case) -> list[CheckedSection]:
 
 def largest_under_train(line: TabulatedLine, offsets, forces) -> float:
     """Largest absolute static effect of axles (N) at offsets (m) behind the first."""
-    length = line.positions[-1]
-    fronts = np.linspace(0.0, length + offsets[-1], FRONT_POSITIONS)
+    start, end = line.positions[[0, -1]]
+    fronts = np.linspace(start, end + offsets[-1], FRONT_POSITIONS)
     kinks = line.positions[np.argmax(np.abs(line.values))] + offsets  # an axle at the peak
     fronts = np.concatenate([fronts, kinks])
     total = np.zeros(fronts.size)

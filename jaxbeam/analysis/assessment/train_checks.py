@@ -84,6 +84,7 @@ def train_checks(
     )
     checks = [_acceleration_check(case, effects, len(decks), responses, deck, speeds, state)]
     for i, (section, line) in enumerate(zip(sections, lines, strict=True)):
+        line = line if case.track is None else line.spread(case.track.kernel())
         checks.append(_section_check(effects, len(decks) + i, section, line, responses, state))
     return checks, effects
 

@@ -22,6 +22,7 @@ def assess(
     code: str = "en1991-2",
     deck: str = "ballasted",
     track: str = "standard",
+    spread: str | None = None,
     classification: float = 1.0,
     determinant_length: str | None = None,
     added_damping: float = 0.0,
@@ -51,6 +52,9 @@ def assess(
     track
         State of the track: standard, or maintained with care. Calculated effects of trains are
         multiplied by 1 + phi'' or 1 + phi''/2.
+    spread
+        How the track spreads the axles of trains, in place of the case's: "3 sleepers", or a length
+        as "2.4 m".
     classification
         Factor alpha of LM71.
     determinant_length
@@ -75,6 +79,7 @@ def assess(
         code=code,
         deck=deck,
         track=track,
+        spread=spread,
         classification=classification,
         determinant_length=_number_or_quantity(determinant_length),
         added_damping=added_damping,

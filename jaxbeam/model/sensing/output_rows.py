@@ -22,14 +22,13 @@ from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int
-from numpy.polynomial import chebyshev
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.quantities import QUANTITIES, Quantity, quantity_of
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.model.flexibility import Flexibility, flexibility
-from jaxbeam.model.layout import is_uniform
+from jaxbeam.model.flexibility import flexibility
+from jaxbeam.model.load_influence import LoadInfluence, load_influence
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.static_correction import (
@@ -41,9 +40,7 @@ from jaxbeam.model.static_correction import (
     residual_port_flexibility,
     section_stiffness,
 )
-from jaxbeam.model.theory.statics import SectionFlexibility
-from jaxbeam.numerics.polynomials import chebyshev_polynomials, piecewise_chebyshev
-from jaxbeam.runtime.arrays import Array, set_at, solve, take, xp
+from jaxbeam.runtime.arrays import Array, set_at, solve, xp
 from jaxbeam.runtime.module import Module
 
 LEAST_FREQUENCY = 30.0  # Hz
@@ -272,11 +269,6 @@ def beside(case: Case, x, side: str = "right") -> Float[Array, "*position"]:
     return xp.clip(shifted, step, case.beam.length - step)
 
 
-SIDE_SHIFT = 0.01  # towards a position nearby, by which the side of a break is found,
-LARGEST_SHIFT = 0.1  # over the length of the beam and the root of the rounding error, at most
-PARTS, PART_TERMS = 8, 24  # in which influence functions that are no cubics are interpolated
-
-
 class CorrectionRows(Module):
     """Rows of the static correction of outputs; zero for those that are not corrected.
 
@@ -287,91 +279,6 @@ class CorrectionRows(Module):
     rates: Float[Array, "output mode"] | None
     accelerations: Float[Array, "output mode"] | None
     commands: Float[Array, "output actuator"]
-
-
-class LoadInfluence(Module):
-    """Static influence of a force on outputs, less that of the modes, over its position.
-
-    Chebyshev `series` of the outputs per newton upwards between the `breaks` (m): nodes of the
-    beam, and the outputs, at which moments have kinks and shear forces jump. `mirrored` outputs are
-    those, then their negatives.
-    """
-
-    breaks: Float[Array, " break"]
-    series: Float[Array, "piece term output"]
-    mirrored: bool = eqx.field(static=True, default=False)
-
-    def of_forces_at(
-        self,
-        x: Float[Array, "*position"],
-        near: Float[Array, "*position"],
-        output: Int[Array, "*position"] | None = None,
-    ) -> Float[Array, "..."]:
-        """Outputs (*position, output) per newton upwards at positions x (m).
-
-        Off the beam as at its nearer end. At a break the limit on the side of it on which `near`
-        (m) is. Only one `output` at each position, if its number is given: (*position,).
-        """
-        # Further breaks may lie between a position and one nearby.
-        largest = LARGEST_SHIFT * np.finfo(x.dtype).eps ** 0.5 * self.breaks[-1]
-        toward = x + xp.clip(SIDE_SHIFT * (near - x), -largest, largest)
-        piece = xp.sum(toward[..., None] >= self.breaks[1:-1], axis=-1)
-        left, right = take(self.breaks, piece), take(self.breaks, piece + 1)
-        width = xp.where(right > left, right - left, 1.0)
-        local = xp.clip((2 * x - left - right) / width, -1.0, 1.0)
-        table = chebyshev_polynomials(local, self.series.shape[1])
-        if output is not None:
-            return xp.sum(table * self.series[piece, :, output], axis=-1)
-        influence = xp.einsum("...k,...ko->...o", table, take(self.series, piece))
-        return xp.concatenate([influence, -influence], -1) if self.mirrored else influence
-
-    def plus(self, other: "LoadInfluence") -> "LoadInfluence":
-        """Sum with another, whose breaks are among those of this one."""
-
-        def values(x):
-            return other.of_forces_at(x, x)
-
-        added = _to_series(self.breaks, self.series.shape[1], values)
-        return eqx.tree_at(lambda one: one.series, self, self.series + added)
-
-
-def _to_series(breaks, terms: int, function: Callable) -> Float[Array, "piece term output"]:
-    """Chebyshev series between breaks (m) through the values (..., output) of a function."""
-    points = chebyshev.chebpts1(terms)
-    middle, half = (breaks[1:] + breaks[:-1]) / 2, xp.diff(breaks) / 2
-    values = function(middle[:, None] + half[:, None] * points)
-    scale = np.where(np.arange(terms) == 0, 1.0, 2.0)[:, None] / terms
-    to_series = scale * chebyshev.chebvander(points, terms - 1).T
-    return xp.einsum("kp,spo->sko", to_series, values)
-
-
-def load_influence(
-    case: Case,
-    modes: Modes,
-    on_modes: Float[Array, "mode output"],
-    greens: Sequence[tuple[Flexibility | SectionFlexibility, Float[Array, " _"], Sequence[int]]],
-) -> LoadInfluence:
-    """Influence of forces on outputs, from influence functions less that of the modes.
-
-    `greens` are influence functions, factors from them to the quantities, and the indices of their
-    outputs; the amplitudes of the modes have the influence `on_modes`. Between the breaks both are
-    polynomials on a uniform beam; on others, smooth functions, interpolated in parts.
-    """
-    uniform, terms = is_uniform(case), max(4, modes.series.shape[1])
-    breakpoints = [modes.nodes / case.beam.length, *(one.breakpoints for one, _, _ in greens)]
-    if not uniform:
-        breakpoints.append(np.linspace(0.0, 1.0, PARTS + 1))
-    breaks = case.beam.length * xp.sort(xp.clip(xp.concatenate(breakpoints), 0.0, 1.0))
-    terms = terms if uniform else max(terms, PART_TERMS)
-
-    def influence(x):
-        values = -piecewise_chebyshev(modes.nodes, modes.series @ on_modes, x, (0,))[0]
-        for one, factor, index in greens:
-            at = np.s_[..., np.array(index, int)]
-            values = set_at(values, at, values[at] + factor * one(x / case.beam.length))
-        return values
-
-    return LoadInfluence(breaks, _to_series(breaks, terms, influence))
 
 
 class StaticCorrection(Module):
@@ -438,6 +345,8 @@ def static_correction(
     )
     greens = list(zip(all_greens, factors, groups.values(), strict=True))
     influence = load_influence(case, model.modes, of_modes, greens)
+    if case.track is not None:
+        influence = influence.spread(case.track.kernel())
     return StaticCorrection(rows, influence)
 
 
@@ -504,7 +413,7 @@ def linear_outputs(
         on_modes = model.mode_map @ on_modes
     influence = None
     if correction is not None or outputs.has_feedthrough.any():
-        influence = LoadInfluence(model.modes.nodes, model.modes.series @ on_modes)
+        influence = LoadInfluence(model.load_nodes, model.load_series @ on_modes)
     if correction is not None:
         influence = correction.influence.plus(influence)
     return LinearOutputs(xp.array(rows).reshape(count, model.state_count), influence)
