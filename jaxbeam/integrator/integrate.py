@@ -357,6 +357,7 @@ def integrate_history(
     max_loads: int,
     steps: int,
     policy: AbstractInputPolicy | None = None,
+    in_chunks: bool = False,
 ):
     """Integrate from rest over a grid: running peaks, states, commands, observations, final memory.
 
@@ -364,9 +365,11 @@ def integrate_history(
     command, batch) at the nodes, observations of each step, and the final memory of the `policy`
     are None without one. Running peaks are those at the monitored positions, None without any.
     `max_loads` is the largest number of loads on the beam at once. Of a run whose matrices
-    do not fit into memory, the reverse pass saves one state for each chunk.
+    do not fit into memory, or that is to be integrated `in_chunks`, the reverse pass saves one
+    state for each chunk.
     """
-    chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy, steps)
+    at_once = None if in_chunks else steps
+    chunk, chunk_steps = _chunk_function(discrete, loads, max_loads, policy, at_once)
     load_count, batch_size = loads.inertia.shape
 
     def one_chunk(carry, first):
