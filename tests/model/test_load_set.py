@@ -49,6 +49,17 @@ def test_wheels_follow_behind_the_first():
     assert_allclose(leave - entry, [2.0, *[2 / 3] * 8, 4 / 3])
 
 
+def test_scaled_wheels_are_those_of_scaled_vehicles():
+    numbers = np.array([14e3, 1100.0, 9e5, 3e4, 3e6, 8e3])
+    wheels, expected = (
+        load_set(jb.Case(CASE.beam, loads=[jb.QuarterCar(*own, speed=-15.0)])).wheels
+        for own in (numbers, 1.7 * numbers)
+    )
+    pairs = zip(*map(jax.tree.leaves, (wheels.scaled(np.array(1.7)), expected)), strict=True)
+    for found, own in pairs:
+        assert_allclose(found, own, rtol=1e-12)
+
+
 def test_each_wheel_passes_each_position():
     places = np.array([3.0, 11.0])
     behind = np.concatenate([OFFSETS, OFFSETS + 25.0])

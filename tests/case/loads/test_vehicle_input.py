@@ -47,6 +47,8 @@ TABLES = {
     "axles": {"offsets": [0.0, 3.0], "forces": [1e5, 2e5]},
 }
 
+AXLES = [name for name, values in TABLES["half-car"].items() if isinstance(values, list)]
+
 
 def case_with(kind, changes=None, without=()):
     """Case whose only load is the table of a kind, changed."""
@@ -85,6 +87,11 @@ def test_case_files_keep_every_number(kind, tmp_path):
             "half-car",
             {"axle_positions": [-2.0, 2.0]},
             "axle_positions.1 must be below.*front first",
+        ),
+        (
+            "half-car",
+            {name: [2.0, -2.0, -1.0] if name == "axle_positions" else 3 * [1e4] for name in AXLES},
+            "axle_positions.2 must be below the entry before it, -2 m; it is -1 m",
         ),
         ("half-car", {"axle_positions": [2.0, 0.5]}, r"axle 1 of loads.0 would carry a negative"),
         ("half-car", {"axle_positions": [2.0]}, "needs two axles or more.*quarter-car"),

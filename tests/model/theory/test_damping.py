@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 import jaxbeam as jb
 from jaxbeam.case.beam import rayleigh_coefficients
 from jaxbeam.model.modes import mesh_layout, modes
+from jaxbeam.model.theory.damping import safe_sqrt
 from tests.differences import central
 
 BRIDGE = {"flexural_rigidity": 1e10, "mass_per_length": 1e4, "modes": 4}
@@ -168,3 +169,9 @@ def test_rigid_motion(beam):
 def test_bad_settlements():
     with pytest.raises(ValueError, match="one for each of the 1 supports"):
         jb.statics.settlement_response(TWO_SPANS, [0.1, 0.2], 1.0)
+
+
+def test_a_rigid_mode_has_derivatives():
+    """The square root of a frequency of zero had none."""
+    slopes = jax.vmap(jax.grad(safe_sqrt))(jnp.array([-1e-9, 0.0, 4.0]))
+    assert_allclose(slopes, [0.0, 0.0, 0.25], rtol=1e-15)
