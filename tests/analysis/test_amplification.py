@@ -139,6 +139,16 @@ def test_amplification_of_the_shear_force_under_a_slow_force():
     assert_allclose(found, np.maximum(high, -low) / static, rtol=1e-6)  # both sides of x
 
 
+def test_an_envelope_without_positions_holds_the_largest_values():
+    """Under a slow force F L / 4 at midspan; moments at the ends are none."""
+    found = envelope(crossing(0.1, modes=3), quantity="moment")
+    best = int(np.argmax(found.highest))
+    assert_allclose(found.positions[best], LENGTH / 2, rtol=0.05)  # 0.25 % less moment there
+    assert_allclose(found.highest[best], FORCE * LENGTH / 4, rtol=0.02)
+    assert_allclose(found.positions[[0, -1]], [0.0, LENGTH], atol=1e-9)
+    assert_allclose(found.highest[[0, -1]], 0.0, atol=1e-3 * FORCE * LENGTH)
+
+
 # Resonance and cancellation speeds, against coach lengths and simulated free vibration.
 
 BEAM = jb.Beam(25.0, 3.0e10, 15000.0, damping_ratio=0.0, modes=2)
