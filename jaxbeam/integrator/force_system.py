@@ -131,11 +131,11 @@ def particular_solutions(
     for s, half in enumerate(np.diff(system.nodes) / 2):
         rates = (speeds / half)[:, None]
         far = np.abs(system.poles / rates) >= terms
-        p = np.zeros((size + 1, speeds.size, poles), complex)
+        p = np.zeros((size, speeds.size, poles), complex)
         for k in range(terms, 0, -1):  # from the highest coefficient down
             known = 2 * k * rates * p[k] + system.poles * p[k + 1] - right[s, k]
             p[k - 1] = np.where(far, known / (system.poles * c[k - 1]), 0.0)
-        result[:, s] = np.moveaxis(p[:size], 0, 1)
+        result[:, s] = np.moveaxis(p, 0, 1)
         at_speed, near = np.nonzero(~far)
         if near.size:
             matrix = np.zeros((near.size, size, size), complex)

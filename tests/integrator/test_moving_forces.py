@@ -93,6 +93,15 @@ def test_particular_solutions_satisfy_their_equation():
         assert np.abs(residual).max() < 1e-9 * np.abs(b).max()
 
 
+def test_the_bound_on_the_second_derivative_of_a_response():
+    """Of a slow force the largest is that of the first and third mode as it passes midspan."""
+    case = jb.Case(BEAM, sensors=[jb.Sensor(6.0)], loads=[ROW])
+    speeds = np.array([0.05, 0.2])
+    found = force_responses(system_of(case), speeds).curvature.max(axis=(1, 2))
+    expected = speeds**2 * 2 * 12.0 / (np.pi**2 * 4e8) * (1 + 1 / 9)
+    assert np.all(expected <= found) and np.all(found <= 1.6 * expected), found / expected
+
+
 def test_no_peak_is_missed_among_random_forces():
     """Against dense samples of the same motion: they are below the peaks, and close to them."""
     rng, runs, wheels = np.random.default_rng(5), 12, 9
