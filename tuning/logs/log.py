@@ -15,7 +15,14 @@ MAX_SIZE = 1e30  # of a sample in its SI unit; bytes in the wrong order are larg
 PLAUSIBLE_STEPS = (1.5e-5, 0.11)
 MIN_SAMPLES = 8  # of a log whose steps tell something
 USUAL_STEPS = (2e-4, 0.02)  # that a likely unit would give
-SCALES = {"ms": 1e-3, "us": 1e-6, "s": 1.0, "min": 60.0}
+SCALES = {"ms": 1e-3, "us": 1e-6, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+# Times in minutes that are read as seconds look like those of fast loggers. These have rates (Hz)
+# of series: powers of two, and some numbers times powers of two or of ten.
+FAST_RATE = 2500.0  # Hz, from which on times are compared with these series
+DOUBLED = (1.0, 25.0, 75.0)  # 12 800, 25 600, 51 200 and 1200, 2400, 4800 Hz, say
+DECIMAL = (1.0, 2.0, 2.5, 4.0, 5.0, 8.0)
+OTHERS = (22050.0, 44100.0, 96000.0, 192000.0)  # of sound cards
+RATE_TOLERANCE = 1e-3  # of a rate: times are rounded
 
 
 class LogWarning(UserWarning):
@@ -152,10 +159,12 @@ def doubts(
     values: Float[np.ndarray, "time channel"],
     lines: Sequence[int] | np.ndarray | None = None,
     time_unit: str = "s",
+    time_unit_is_sure: bool = False,
 ) -> Iterator[str]:
     """Sentences on what looks wrong with a log: jumps and scale of its times, equal channels.
 
-    `lines` are the line numbers of the samples in the file, `time_unit` what it says of times.
+    `lines` are the line numbers of the samples in the file, `time_unit` what it says of times; that
+    is sure where its format defines it or the user has given it.
     """
     steps = np.diff(times)
     usual = float(np.median(steps))
@@ -177,8 +186,23 @@ def doubts(
         ]
         guess = f": are they in {likely[0]}, not in {time_unit}?" if likely else ""
         yield f"times are {usual:.4g} s apart, {1 / usual:.4g} samples a second{guess}"
+    elif times.size >= MIN_SAMPLES and not time_unit_is_sure and not jumps.size:
+        rate = (times.size - 1) / float(times[-1] - times[0])
+        if rate > FAST_RATE and not _is_of_series(rate) and _is_of_series(rate / SCALES["min"]):
+            yield (
+                f"times are {1 / rate:.4g} s apart, {rate:.4g} samples a second: are they in min,"
+                f" not in {time_unit}? (no doubt if you give the unit, by units= or beside the log)"
+            )
     first_of: dict[bytes, str] = {}
     for name, column in zip(names, values.T, strict=True):
         other = first_of.setdefault(column.tobytes(), name)
         if other != name and np.ptp(column) > 0:
             yield f"{name} equals {other} in every sample: is one of them a copy?"
+
+
+def _is_of_series(rate: float) -> bool:
+    """Whether a rate (Hz) is one that loggers have."""
+    doubled = np.outer(DOUBLED, 2.0 ** np.arange(21))
+    decimal = np.outer(DECIMAL, 10.0 ** np.arange(7))
+    series = np.concatenate([doubled.ravel(), decimal.ravel(), OTHERS])
+    return bool(np.any(np.abs(series / rate - 1) < RATE_TOLERANCE))

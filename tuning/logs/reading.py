@@ -204,9 +204,11 @@ def _make_log(
     source = f"{path}:{run}" if run else str(path)
     check_samples(source, (time_column, *channels), values, table.lines)
     unit_of_times = column_units[0][0]
+    given = declared.get(time_column) or description.unit(time_column)
+    sure = table.time is not None or bool(given)
     said = [
         *table.warnings,
-        *doubts(channels, values[:, 0], values[:, 1:], table.lines, unit_of_times),
+        *doubts(channels, values[:, 0], values[:, 1:], table.lines, unit_of_times, sure),
     ]
     log = Log(
         times=values[:, 0],

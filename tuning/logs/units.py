@@ -27,6 +27,8 @@ UNITS = {
     "ms": Unit("s", 1e-3, "time"),
     "us": Unit("s", 1e-6, "time"),
     "min": Unit("s", 60.0, "time"),
+    "h": Unit("s", 3600.0, "time"),
+    "d": Unit("s", 86400.0, "time"),
     "m": Unit("m", 1.0, "deflection"),
     "cm": Unit("m", 1e-2, "deflection"),
     "mm": Unit("m", 1e-3, "deflection"),
@@ -56,9 +58,12 @@ for _name, _quantity in QUANTITIES.items():
 
 # Other spellings of units in the table.
 _SPELLINGS = {
-    "sec": "s",
-    "seconds": "s",
-    "Sekunden": "s",
+    **dict.fromkeys(("sec", "seconds", "second", "Sekunden", "Sek"), "s"),
+    **dict.fromkeys(("msec", "milliseconds", "Millisekunden"), "ms"),
+    **dict.fromkeys(("usec", "microseconds", "Mikrosekunden"), "us"),
+    **dict.fromkeys(("mins", "minutes", "minute", "Minuten"), "min"),
+    **dict.fromkeys(("hr", "hrs", "hours", "hour", "Stunden"), "h"),
+    **dict.fromkeys(("days", "day", "Tage"), "d"),
     "inch": "in",
     "g_n": "g",
     "°": "deg",

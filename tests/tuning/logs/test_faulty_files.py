@@ -11,7 +11,7 @@ import pytest
 import scipy.io
 
 from tuning import read_log, read_logs
-from tuning.logs.log import Log, LogWarning
+from tuning.logs.log import Log, LogWarning, doubts
 from tuning.logs.readers.stamps import seconds_of
 
 STEP = 0.005
@@ -181,10 +181,58 @@ def test_a_jump_of_times_is_told_with_its_line(tmp_path):
         ("time [s]", 1e6, "5000 s apart, 0.0002 samples a second: are they in us, not in s?"),
         ("time [ms]", 1.0, "5e-06 s apart, 2e.05 samples a second: are they in s, not in ms?"),
         ("time [min]", 1.0, "0.3 s apart, 3.333 samples a second: are they in s, not in min?"),
+        ("t/s", 1 / 60, "8.333e-05 s apart, 1.2e.04 samples a second: are they in min, not in s?"),
     ],
 )
 def test_times_in_another_unit_than_the_file_says(tmp_path, name, scale, said):
     read_warned(csv(tmp_path / "run.csv", scale * TIMES, name), said.replace("?", r"\?"))
+
+
+@pytest.mark.parametrize("rate", [50.0, 100.0, 200.0, 256.0, 500.0, 512.0, 1000.0, 1024.0])
+def test_minutes_are_told_from_the_rates_of_fast_loggers(rate):
+    """Unless the unit is given."""
+    minutes, columns = np.arange(900) / rate / 60, (("w",), np.zeros((900, 1)))
+
+    def said(times, sure=False):
+        return list(doubts(columns[0], times, columns[1], time_unit_is_sure=sure))
+
+    assert ["are they in min" in sentence for sentence in said(minutes)] == [True]
+    assert ["are they in min" in sentence for sentence in said(np.round(minutes, 6))] == [True]
+    assert "are they in h, not in s" in said(np.arange(900) / 200 / 3600)[0]
+    assert not said(minutes, sure=True) and not said(np.arange(900) / rate)
+    for fast in (3200.0, 4096.0, 5000.0, 9600.0, 12800.0, 44100.0, 51200.0):
+        assert not said(np.arange(900) / fast)
+
+
+@pytest.mark.parametrize("suffix", [".mat", ".h5", ".parquet", ".xlsx"])
+def test_minutes_are_told_in_every_format(tmp_path, suffix):
+    path, columns = tmp_path / f"run{suffix}", {"t": TIMES / 60, "w": signal(TIMES)}
+    if suffix == ".mat":
+        scipy.io.savemat(path, columns)
+    elif suffix == ".h5":
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "w") as file:
+            for name, values in columns.items():
+                file[name] = values
+    elif suffix == ".parquet":
+        arrow = pytest.importorskip("pyarrow")
+        pytest.importorskip("pyarrow.parquet").write_table(arrow.table(columns), path)
+    else:
+        book = pytest.importorskip("openpyxl").Workbook()
+        for row in [["t/s", "w/mm"], *zip(*columns.values(), strict=True)]:
+            book.active.append(list(map(str, row) if row[0] == "t/s" else map(float, row)))
+        book.save(path)
+    with pytest.warns(LogWarning, match=r"are they in min, not in s\?"):
+        log = read_log(path, units={"w": "mm"})
+    np.testing.assert_allclose(60 * log.times, TIMES, atol=1e-9)
+    seconds = read_log(path, units={"w": "mm", "t": "min"})
+    np.testing.assert_allclose(seconds.times, TIMES, atol=1e-9)
+
+
+def test_units_as_quotients_and_in_words(tmp_path):
+    for name in ("t/ms", "t / ms", "Zeit in ms", "time [msec]"):
+        log = read_log(csv(tmp_path / "run.csv", 1e3 * TIMES, name))
+        np.testing.assert_allclose(log.times, TIMES, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,10 @@ from jaxtyping import Float, Int
 
 from jaxbeam.runtime.input_file import check_input, describe_content, read_input
 from tuning.logs.clocks import Clock, join_channels
+from tuning.logs.units import is_unit
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
+_QUOTIENT = re.compile(r"^(?P<name>[^/]*?\S)(\s*/\s*|\s+in\s+)(?P<unit>\S+)$")
 MAX_SHOWN = 40  # characters of a cell in a message
 MIN_CHANNEL_SHARE = 0.1  # of the samples: shorter arrays are no channels, and may be left out
 CHECKED_ROWS = 200  # at the end of a file, with which its last one is compared
@@ -58,9 +60,20 @@ class LogFormat(NamedTuple):
 
 
 def parse_heading(text: str) -> tuple[str, str | None]:
-    """Name and unit in the heading of a column, such as `d1 [mm]`; None without a unit."""
-    found = _HEADING.match(text.strip())
-    return (found["name"], found["unit"]) if found else (text.strip(), None)
+    """Name and unit in the heading of a column, such as `d1 [mm]`; None without a unit.
+
+    Also as quotients (ISO 80000-1) and in words, `d1/mm` and `d1 in mm`, of a known unit.
+
+    >>> from tuning.logs.readers import parse_heading
+    >>> [parse_heading(text) for text in ("t/ms", "a1 / m/s^2", "d1/d2", "m/s")]
+    [('t', 'ms'), ('a1', 'm/s^2'), ('d1/d2', None), ('m/s', None)]
+    """
+    text = text.strip()
+    found = _HEADING.match(text)
+    if found is None and not is_unit(text):
+        found = _QUOTIENT.match(text)
+        found = found if found and is_unit(found["unit"]) else None
+    return (found["name"], found["unit"]) if found else (text, None)
 
 
 def table_of(
