@@ -12,6 +12,7 @@ from .modes import (
     plot_modes as plot_modes,
     plot_poles as plot_poles,
 )
+from .realisations import plot_realisations as plot_realisations
 from .record import plot_record as plot_record
 from .sweep import plot_sweep as plot_sweep
 from .tuning import (

@@ -433,6 +433,12 @@ def test_fractiles_of_a_sweep_over_seeds(run, folder):
     for name, largest in (("50 %", np.sort(peaks, axis=0)[1].max()), ("100 %", peaks.max())):
         assert any(name in row and f"{largest:.6g}" in row for row in said.splitlines())
     assert (folder / "out.png").exists()
+    median = next(row for row in said.splitlines() if "50 %" in row)
+    assert "-inf to inf" in median and median.split()[-1] == "3"  # six are the least
+    (folder / "out.png").unlink()
+    found = run(f"{line} --overwrite --fractile profile.seed=0.5 --plot --json")
+    assert np.shape(found["statistics"][0]["peak_deflection"]) == (8, 2)
+    assert (folder / "out.png").exists()  # a histogram
 
 
 def test_paired_sweep(run):

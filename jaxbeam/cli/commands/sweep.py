@@ -61,7 +61,9 @@ def sweep(
         Pair the values of all parameters one by one instead of computing all combinations.
     fractile
         ADDRESS=0.5,0.95: print and draw these fractiles of the peaks over the values of a
-        parameter, as of `profile.seed`; the results are written whole.
+        parameter, as of `profile.seed`, with intervals, means, dynamic amplification and how many
+        values are still needed; a histogram where nothing else has several. The results are
+        written whole.
     resume
         Continue an interrupted sweep in the same store.
     scheduler
@@ -89,7 +91,7 @@ def sweep(
     fractiles = _fractile_levels(fractile, values)
     picture = pictures.path(output, case.with_stem(f"{case.stem}_sweep"))
     refuse_option(
-        bool(picture) and not 0 < len(_several(values) - set(fractiles)) < 3,
+        bool(picture) and not bool(not fractiles) <= len(_several(values) - set(fractiles)) < 3,
         "--plot draws peaks over one or two parameters with several values; leave it out",
     )
     if not resume:
@@ -116,16 +118,20 @@ def sweep(
     if output and not store:
         jb.save(results, output, options.overwrite)
     if picture:
-        from jaxbeam.plot import plot_sweep
+        from jaxbeam.plot import plot_realisations, plot_sweep
 
-        look = {"title": pictures.title, "labels": labels}
-        drawn = _fractiles(results, fractiles) if fractiles else results
-        figure = plot_sweep(drawn, ax=pictures.page(), **look)
+        look = {"ax": pictures.page(), "title": pictures.title, "labels": labels}
+        if fractiles and not _several(values) - set(fractiles):
+            ((address, levels),) = fractiles.items()
+            figure = plot_realisations(results, address, levels[-1], **look)
+        else:
+            drawn = _fractiles(results, fractiles) if fractiles else results
+            figure = plot_sweep(drawn, **look)
         pictures.save(figure, picture)
     options.report(
-        jb.api.content(results) | {"plausibility": plausibility},
+        jb.api.content(results) | {"plausibility": plausibility} | _statistics(results, fractiles),
         _lines(parsed_case, results, list(values))
-        + (_fractile_lines(parsed_case, results, fractiles) if fractiles else []),
+        + (_fractile_lines(parsed_case, results, fractiles, values) if fractiles else []),
         output,
         picture,
     )
@@ -164,20 +170,60 @@ def _fractiles(results: "xarray.Dataset", fractiles: dict[str, list[float]]) -> 
         return results[peaks].quantile(levels, address, keep_attrs=True)
 
 
+def _statistics(results: "xarray.Dataset", fractiles: dict[str, list[float]]) -> dict:
+    """Statistics over one address for each level, as content; empty without any."""
+    from jaxbeam.sweeps.realisations import realisations
+
+    found = []
+    for address, levels in fractiles.items():
+        for level in levels:
+            one = realisations(results, address, level)
+            peaks = {str(name): one[name].values for name in one}
+            heads = {**one.attrs, "statistic": one.statistic.values}
+            found.append(jb.api.plain(heads | peaks))
+    return {"statistics": found} if found else {}
+
+
 def _fractile_lines(
-    case: "jb.Case", results: "xarray.Dataset", fractiles: dict[str, list[float]]
+    case: "jb.Case", results: "xarray.Dataset", fractiles: dict[str, list[float]], over
 ) -> list[str]:
-    """Fractiles of the peak of each sensor, the largest over the other values."""
-    found, rows = _fractiles(results, fractiles), []
-    for i, sensor in enumerate(case.sensors):
-        unit = f" ({sensor.unit})" if sensor.unit != "1" else ""
-        for level in found["quantile"].values:
-            peaks = found[f"peak_{sensor.quantity}"].sel(quantile=level)[..., i]
-            row = sensor.name or i, f"{sensor.quantity}{unit}"
-            rows.append((*row, f"{100 * level:g} %", f"{peaks.max().item():.6g}"))
-    ((address, _),) = fractiles.items()
-    head = f"fractiles over {_head(results[address])}, the largest of the other values:"
-    return [head, *table(("sensor", "quantity", "fractile", "peak"), rows)]
+    """Statistics of the peak of each sensor, of the other values with the largest fractile."""
+    import numpy as np
+
+    from jaxbeam.sweeps.realisations import CONFIDENCE, realisations, static_peaks
+
+    ((address, levels),) = fractiles.items()
+    static, rows = static_peaks(case, set(over)), []
+    for level in levels:
+        found = realisations(results, address, level)
+        for i, sensor in enumerate(case.sensors):
+            of_sensor = found[f"peak_{sensor.quantity}"].isel(sensor=i)
+            run = np.unravel_index(
+                np.nanargmax(of_sensor.sel(statistic="fractile")), of_sensor.shape[1:]
+            )
+            values = (part[run] for part in of_sensor.values)
+            one = dict(zip(found.statistic.values, values, strict=True))
+            unit = f" ({sensor.unit})" if sensor.unit != "1" else ""
+            amplified = one["fractile"] / static[i]
+            rows.append(
+                (
+                    sensor.name or i,
+                    f"{sensor.quantity}{unit}",
+                    f"{100 * level:g} %",
+                    f"{one['fractile']:.6g}",
+                    f"{one['low']:.4g} to {one['high']:.4g}",
+                    f"{one['mean']:.4g}",
+                    f"{one['mean_low']:.4g} to {one['mean_high']:.4g}",
+                    "" if np.isnan(amplified) else f"{amplified:.4g}",
+                    f"{one['needed']:.0f}",
+                )
+            )
+    head = (
+        f"over {_head(results[address])}, of the largest other values, with intervals of"
+        f" {100 * CONFIDENCE:g} %; amplification is the fractile over the static peak:"
+    )
+    columns = ("sensor", "quantity", "fractile", "peak", "interval", "mean", "interval")
+    return [head, *table((*columns, "amplification", "still needed"), rows)]
 
 
 def _print_plausibility(case: "jb.Case", values, options: CaseOptions) -> dict:
