@@ -141,9 +141,10 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         sys.exit(WRONG_USAGE)
     except (ValueError, OSError, RuntimeError, ImportError, CycloptsError) as error:
         message = " ".join(str(error).split())
-        if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
+        names_no_file = isinstance(error, OSError) and not error.filename and message[:1] == "["
+        if names_no_file and error.errno == errno.ENOSPC:
             _close_output()  # what is printed goes to a file on a full disk
-            message = f"no space left on device{'' if message[:1] == '[' else f': {message}'}"
+            message = "no space left on device"
         print_message(message)
         sys.exit(WRONG_USAGE if isinstance(error, UsageError | CycloptsError) else 1)
     sys.exit(0)
@@ -170,10 +171,19 @@ def _missing(error: MissingArgumentError) -> str:
 
 
 def refuse_former_words(arguments: Sequence[str]) -> None:
-    """Check a command line. Raises UsageError for a command or option that is called otherwise."""
-    former = RENAMED_COMMANDS
+    """Check a command line. Raises UsageError for a command or option that is called otherwise.
+
+    Also for an empty word, as of a variable of the shell without a value: as the name of a file it
+    would be that of the folder. Only a title may be empty.
+    """
+    former, before = RENAMED_COMMANDS, ""
     for word in arguments:
-        name = word.partition("=")[0]
+        name, equals, value = word.partition("=")
+        of_option = bool(equals) and name.startswith("--")
+        if not (value if of_option else word) and (name if of_option else before) != "--title":
+            where = f"{name}=" if of_option else f"after {before}" if before else "of the command"
+            raise UsageError(f"a word of the command line is empty ({where}); give a name or value")
+        before = word
         if name in former:
             raise UsageError(f"{name} is called {former[name]} now")
         if former is RENAMED_COMMANDS:

@@ -7,6 +7,8 @@ import importlib.util
 import os
 from pathlib import Path
 
+from jaxbeam.runtime.output_file import check_named
+
 TABLES = (".csv", ".xlsx", ".mat", ".parquet")  # columns of numbers with heads
 DATASETS = (".nc", ".zarr")  # everything, with units and coordinates
 RESULTS = (*DATASETS, *TABLES)
@@ -16,9 +18,10 @@ PACKAGES = {".xlsx": "openpyxl", ".parquet": "pyarrow"}
 def check_ending(path: str | os.PathLike, content: str, allowed: tuple[str, ...] = RESULTS) -> None:
     """Check that a result can be written to a file by its ending.
 
-    Raises ValueError for another ending than those allowed, ImportError, with what to install, if
-    the package that writes it is missing.
+    Raises ValueError for no name, or another ending than those allowed; ImportError, with what to
+    install, if the package that writes it is missing.
     """
+    check_named(path)
     ending = Path(path).suffix
     if ending not in allowed:
         first = Path(path).with_suffix(allowed[0])

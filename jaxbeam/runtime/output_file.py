@@ -32,8 +32,10 @@ def whole_file(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Pat
 
     A write that is stopped leaves what was there. Raises FileExistsError if something is there,
     without `overwrite`; OSError (a FileNotFoundError without its folder) with the name `path`,
-    whatever cannot be written, or is a device or a pipe, which a file would take the place of.
+    whatever cannot be written, or is a device or a pipe, which a file would take the place of;
+    ValueError for an empty name, which is that of the folder.
     """
+    check_named(path)
     place = Path(os.path.realpath(path))  # a link stays a link
     _refuse_existing(place, path, overwrite)
     # The ending is that of the name, which decides the format, and not that of the file behind.
@@ -56,6 +58,12 @@ def whole_file(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Pat
             beside.unlink(missing_ok=True)
     if (written := WRITTEN.get()) is not None:
         written.append(os.fspath(path))
+
+
+def check_named(path: str | os.PathLike) -> None:
+    """Raises ValueError for the name of a file to write that is empty, or a folder's."""
+    if not Path(path).name:
+        raise ValueError(f"{os.fspath(path)!r} is no name of a file to write; give it one")
 
 
 @contextlib.contextmanager

@@ -1,5 +1,6 @@
 """Ctrl-C at any moment ends a command in one line, which says what is kept, with status 130."""
 
+import errno
 import json
 import subprocess
 import sys
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxbeam.cli import main
+from jaxbeam.cli.app import refuse_former_words
 from jaxbeam.cli.commands import simulate
 from jaxbeam.runtime.interrupts import interruptible, keeping
 from jaxbeam.runtime.output_file import whole_file
@@ -140,3 +142,32 @@ def test_a_full_disk_below_the_output_is_told(folder):
         command = [sys.executable, "-m", "jaxbeam", "--help"]
         ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
     assert (ended.returncode, ended.stderr) == (1, "jaxbeam: no space left on device\n")
+
+
+def test_a_full_disk_under_a_file_is_told_once(folder, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("jaxbeam.runtime.output_file.os.replace", full)
+    with pytest.raises(SystemExit):
+        main(["simulate", "case.toml", "-o", "run.csv"])
+    said = "jaxbeam: cannot write run.csv: no space left on device"
+    assert capsys.readouterr().err.splitlines()[-1] == said
+
+
+@pytest.mark.parametrize(
+    ("words", "where"),
+    [
+        (["simulate", ""], "after simulate"),
+        (["simulate", "case.toml", "-o", ""], "after -o"),
+        (["simulate", "case.toml", "--output="], "--output="),
+        ([""], "of the command"),
+    ],
+)
+def test_an_empty_word_is_no_file(capsys, words, where):
+    """As of a variable of the shell without a value; only a title may be empty."""
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    said = f"jaxbeam: a word of the command line is empty ({where}); give a name or value\n"
+    assert (ended.value.code, capsys.readouterr().err) == (2, said)
+    refuse_former_words(["simulate", "--title", "", "--title="])

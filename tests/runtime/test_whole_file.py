@@ -87,6 +87,14 @@ def test_an_error_names_the_file_that_the_user_gave(tmp_path, monkeypatch, error
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("name", ["", "/", "."])
+def test_a_file_without_a_name_is_refused(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    for write in (WRITERS["record.csv"], WRITERS["case.toml"]):
+        with pytest.raises(ValueError, match="is no name of a file to write"):
+            write(name)
+
+
 WRITERS = {
     "record.csv": lambda path: jb.save(RECORD, path),
     "record.xlsx": lambda path: jb.save(RECORD, path),
