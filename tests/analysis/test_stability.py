@@ -14,7 +14,7 @@ import scipy.optimize
 
 import jaxbeam as jb
 from jaxbeam.analysis import stability
-from jaxbeam.analysis.frozen_loop import loop_dynamics
+from jaxbeam.analysis.frozen_loop import affine_jacobian, loop_dynamics
 from jaxbeam.analysis.linearised_loop import (
     LinearisedLoop,
     affine_linearisations,
@@ -175,6 +175,15 @@ def test_derivatives_of_the_growth_rate_by_gains(period):
     assert rate(gains) == pytest.approx(by_numpy(gains), rel=1e-12)
     found = jax.grad(rate)(jnp.asarray(gains))
     np.testing.assert_allclose(found, central(by_numpy, gains, 1e-5), rtol=1e-6)
+
+
+def test_a_jacobian_at_a_known_point_has_derivatives_by_traced_numbers():
+    matrix = np.random.default_rng(7).normal(size=(2, 3))
+
+    def jacobian(factor):
+        return affine_jacobian(lambda x: factor**2 * (matrix @ x), np.zeros(3))
+
+    np.testing.assert_allclose(jax.jacfwd(jacobian)(3.0), 6.0 * matrix, rtol=1e-12)
 
 
 def test_crossing_branches_are_tracked():

@@ -89,6 +89,16 @@ def test_a_haunched_span_by_the_unit_load_method():
     assert_allclose(influence_line(case, x, a), expected, rtol=1e-9)
 
 
+def test_a_long_beam_on_a_foundation_deflects_as_an_endless_one():
+    """Hetenyi: beta / (2 k) exp(-beta r) (cos beta r + sin beta r), with beta^4 = k / (4 E I)."""
+    rigidity, foundation = 1e10, 1e7
+    beam = Beam(200.0, rigidity, 1e4, foundation_stiffness=foundation)
+    beta, r = (foundation / (4 * rigidity)) ** 0.25, np.array([0.0, 6.0, 20.0])
+    shape = np.exp(-beta * r) * (np.cos(beta * r) + np.sin(beta * r))
+    found = influence_line(Case(beam), 100.0 + r, 100.0)
+    assert_allclose(found, -beta / (2 * foundation) * shape, rtol=0, atol=1e-9 * beta / foundation)
+
+
 def test_supports_springs_and_patches_together_against_finite_elements():
     # No load so close to another node that the short element spoils the oracle.
     y = np.array([0.02, 0.11, 0.3, 0.47, 0.7, 0.95, 1.15])

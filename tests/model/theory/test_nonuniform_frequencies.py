@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
+import scipy.optimize
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
@@ -171,6 +173,23 @@ def test_hinge_of_two_cantilevers():
     propped = np.array([3.926602312047919, 7.068582745628732])
     expected = np.sort(np.concatenate([cantilever, propped])) ** 2 / 0.25
     assert_allclose(found, expected, rtol=1e-11)
+
+
+def test_a_stiff_and_a_soft_half():
+    """Eight modes, most in the soft half: roots of the exact transfer matrix of both."""
+    halves = jb.Segment(0.5, 1.0, 1.0), jb.Segment(0.5, 1e-2, 1.0)
+    found = frequencies(length=1.0, segments=halves, modes=8)
+
+    def at_the_end(omega):
+        transfer = np.eye(4)  # of deflection, slope, moment, shear force
+        for rigidity in (1.0, 1e-2):
+            rates = np.diag([1.0, 1 / rigidity, 1.0], 1)
+            rates[3, 0] = omega**2
+            transfer = scipy.linalg.expm(0.5 * rates) @ transfer
+        return np.linalg.det(transfer[np.ix_([0, 2], [1, 3])])
+
+    roots = [scipy.optimize.brentq(at_the_end, 0.99 * omega, 1.01 * omega) for omega in found]
+    assert_allclose(found, roots, rtol=1e-6)  # of the determinant, which loses ten digits
 
 
 @pytest.mark.parametrize("ends", ["clamped-pinned", "free-guided", "clamped-free"])
