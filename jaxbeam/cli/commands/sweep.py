@@ -38,6 +38,7 @@ def sweep(
     output: Output = None,
     paired: bool = False,
     fractile: str | None = None,
+    run_up: bool = False,
     resume: bool = False,
     scheduler: str | None = None,
     precision: str = "double",
@@ -64,6 +65,9 @@ def sweep(
         parameter, as of `profile.seed`, with intervals, means, dynamic amplification and how many
         values are still needed; a histogram where nothing else has several. The results are
         written whole.
+    run_up
+        Begin so far before the bridge that vehicles have forgotten their start on a rough track: at
+        the fastest of the speeds, 1 % of their free motion is left at the bridge.
     resume
         Continue an interrupted sweep in the same store.
     scheduler
@@ -97,6 +101,8 @@ def sweep(
     if not resume:
         options.check_outputs(output, picture)
     parsed_case = options.read(case, judged="")
+    if run_up:
+        parsed_case = _with_run_up(parsed_case, values)
     labels = pictures.sensor_labels(parsed_case)
     plausibility = _print_plausibility(parsed_case, values, options)
 
@@ -135,6 +141,15 @@ def sweep(
         output,
         picture,
     )
+
+
+def _with_run_up(case: "jb.Case", values: dict) -> "jb.Case":
+    """The case with its vehicles far enough before the bridge for all swept speeds."""
+    from jaxbeam.analysis.run_up import with_run_up
+    from jaxbeam.case.reading.units import number_in_si
+
+    given = [one for name, own in values.items() if name.endswith(".speed") for one in own]
+    return with_run_up(case, speeds=[number_in_si(one, "m/s", "speed") for one in given])
 
 
 def _several(values: dict) -> set[str]:
