@@ -282,11 +282,16 @@ BASES = {
 
 # The case, the entry that is wrong, its value, the address that is named, and the likely unit.
 STANDING = {"position": 12.5, "mass": 2e3, "damping": 500.0}
+TUNED = {"position": 12.5, "mass": 2e3, "stiffness": 1e6}
 TABLE = {"kind": "mass", "mass": 30e3, "positions": [0.0, 25.0]}
 MISTAKES = [
     # Absorbers, foundations and forces; the absorber is tuned at 3.55 Hz by 1e6 N/m
     ("bridge", "absorbers.0", STANDING | {"stiffness": 1e3}, ".stiffness", "not in kN/m"),
     ("bridge", "absorbers.0", {**STANDING, "mass": 2e6, "frequency": 3.5}, ".mass", "in kg"),
+    ("bridge", "absorbers.0", STANDING | {"mass": 2.0, "frequency": 3.5}, ".mass", "kg, not in t"),
+    ("bridge", "absorbers.0", TUNED | {"damping": 9.0}, ".damping", "in N s/m, not in kN s/m"),
+    ("bridge", "absorbers.0", TUNED | {"damping_ratio": 10.0}, ".damping_ratio", "a fraction of"),
+    ("bridge", "supports", [{"position": 12.5, "stiffness": 500.0}], ".0.stiffness", "N/m, not in"),
     ("bridge", "beam.foundation_stiffness", 20.0, "", "in N/m^2, not in kN/m^2"),
     ("footbridge", "loads.1.frequencies", [800.0], "", "in Hz, not in rad/s"),
     ("bridge", "loads.0", TABLE | {"times": [0.0, 1000.0]}, "", "loads.0.times in s, not in ms"),
@@ -348,6 +353,7 @@ MISTAKES = [
     ("cars", "loads.0.suspension_stiffness", 1.75e7, "", "swapped with loads.0.tyre_stiffness"),
     ("cars", "loads.0.tyre_damping", 1e5, "loads.0.suspension_damping", "loads.0.tyre_damping"),
     ("cars", "loads.0.axle_mass", 18e3, "", "swapped with loads.0.body_mass"),
+    ("cars", "loads.0.axle_mass", 0.6, "", "in kg, not in t"),
     ("cars", "loads.0.body_mass", 17e3 * 9.81, "", "in kg, not its weight in N"),
     ("cars", "loads.1.suspension_stiffness.1", 1000.0, "", "in N/m, not in kN/m"),
     ("cars", "loads.1.tyre_stiffness.0", 1750.0, "", "in N/m, not in kN/m"),

@@ -233,13 +233,39 @@ ABSORBERS = (
         unless=("weight",),
     ),
     Range(
+        values.mass_of_absorber,
+        1e-4,
+        INF,
+        "it is {value:.2g} times the mass of the beam, and changes nothing",
+        "is it in kg, not in t?",
+        unless=("weight",),
+    ),
+    Range(
         values.absorber_over_first_frequency,
         0.1,
         INF,
         "the absorber swings at {frequency:.3g} Hz, {value:.2g} times the first frequency of the"
         " beam",
         "is it in N/m, not in kN/m? Or give its frequency",
+        cause="absorber",
         unless=("stiffness", "weight"),
+    ),
+    Range(
+        values.damping_of_absorber,
+        1e-3,
+        2.0,
+        "the damping ratio of the absorber is {value:.2g}",
+        "is it {unit}?",
+        "is it {unit}?",
+        unless=("weight", "absorber"),
+    ),
+    Range(
+        values.support_over_bending,
+        1e-4,
+        INF,
+        "it is {value:.2g} times the stiffness of the beam in bending, and changes nothing",
+        "is it in N/m, not in kN/m or MN/m?",
+        unless=("stiffness",),
     ),
     Range(
         values.foundation_over_bending,
@@ -399,9 +425,10 @@ LOADS = (
     ),
     Range(
         values.unsprung_over_sprung,
-        0.0,
+        2e-3,
         1.0,
         "what is below the suspension has {value:.3g} times the mass of the body",
+        "are both in kg, not in t?",
         above="is it swapped with {upper}, and are both in kg?",
     ),
     Range(

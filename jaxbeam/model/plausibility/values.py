@@ -345,7 +345,8 @@ def unsprung_over_sprung(facts):
         for address, load in facts.loads(*ROAD_KINDS, "wagon"):
             if hasattr(load, name):
                 ratio = np.sum(getattr(load, name)) / load.body_mass
-                yield Value(f"{address}.{name}", ratio, {"upper": f"{address}.body_mass"})
+                if ratio > 0:
+                    yield Value(f"{address}.{name}", ratio, {"upper": f"{address}.body_mass"})
 
 
 def gyration_over_wheelbase(facts):
@@ -447,6 +448,37 @@ def absorber_over_first_frequency(facts):
             own = math.sqrt(float(absorber.stiffness) / float(moved)) / (2 * math.pi)
             words = {"frequency": own, "first": first}
             yield Value(f"{address}.stiffness", own / first, words)
+
+
+def mass_of_absorber(facts):
+    """Masses of absorbers without inerters over that of the beam."""
+    for address, absorber in _parts(facts, "absorbers"):
+        if absorber.mass > 0 and not absorber.inertance and not absorber.ground_inertance:
+            yield Value(f"{address}.mass", float(absorber.mass) / mass(facts))
+
+
+def damping_of_absorber(facts):
+    """Damping ratios of absorbers that have a damper and a spring."""
+    for address, absorber in _parts(facts, "absorbers"):
+        critical = 2 * math.sqrt(float(absorber.spring) * float(absorber.moving_mass))
+        if absorber.damper > 0 and critical > 0:
+            given = absorber.damping_ratio is None
+            name, unit = ("damping", "in N s/m, not in kN s/m") if given else (
+                "damping_ratio", "a fraction of critical damping, 0.1 for ten per cent"
+            )  # fmt: skip
+            yield Value(f"{address}.{name}", float(absorber.damper) / critical, {"unit": unit})
+
+
+def support_over_bending(facts):
+    """Stiffness of springs under a beam that has other supports, over that in bending at midspan.
+
+    Soft springs may hold a beam with free ends, so that it moves as if nothing did.
+    """
+    bending = facts.rigidity * math.pi**4 / (2 * facts.length**3)
+    for address, support in _parts(facts, "supports"):
+        for name, given in _numbers(support, address, "stiffness"):
+            if given > 0 and "free" not in facts.case.beam.ends:
+                yield Value(name, float(given) / bending)
 
 
 def foundation_over_bending(facts):
