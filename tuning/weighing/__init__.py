@@ -1,9 +1,9 @@
 """Weighing in motion: loads found in a log of a beam that is known."""
 
 from tuning.weighing.axles import AxleWeighing, weigh_axles
+from tuning.weighing.calibration import calibrate_influence_lines
 from tuning.weighing.influence_lines import (
     InfluenceLines,
-    calibrate_influence_lines,
     model_influence_lines,
 )
 

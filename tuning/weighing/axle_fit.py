@@ -6,27 +6,43 @@ crossing are
     y_s(t) = sum_a P_a u_s(t; v, t_0, x_a) + c_s + e_s(t),   cov e = S + d^2 B B' + E E'.
 
 S is the white noise of the sensors; the columns of B are readings of dynamic wheel forces
-(`dynamic_forces`), d their share of the static ones, and those of E are what the errors of
+(`dynamic_forces`), d their share of the static ones, and those of E are what the deviations of
 calibrated influence lines make of the axle forces. The share d has the greatest restricted
 likelihood (Patterson and Thompson 1971, DOI 10.1093/biomet/58.3.545). The covariance of all
 parameters is that of the weighted problem, times what the residuals exceed this noise by.
+
+What readings tell little of is known before: axles of a group share its load and are about 1.35 m
+apart.
 """
 
 import dataclasses
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 import scipy.optimize
 from jaxtyping import Float
 
 from tuning.fit.uncertainty.covariance import t_quantile
-from tuning.weighing.dynamic_forces import dynamic_readings, white_noise
+from tuning.weighing.dynamic_forces import SHARES, dynamic_waves, white_noise
 from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines
-from tuning.weighing.search import MAX_GAP, MIN_AXLE_SHARE, MIN_GAP
 
-ROUNDS = 3  # of weights and parameters in turn
-SHARES = 1e-4, 0.3  # of dynamic wheel forces in the static ones; worst roads have 0.3
 STEPS = 1e-4  # of lengths and times in differences, of the bridge and its crossing
+ITERATIONS = 12  # of Gauss and Newton
+MAX_ROWS, RATE = 900, 100.0  # samples of all sensors, and in a second; of more, means are taken
+LOADED = 0.12  # share of the largest reading, above which there is something on the bridge
+MARGIN = 5.0  # m, by which axles may enter earlier, or leave later, than readings tell so
+MARGIN_SHARE, MARGIN_TIME = 0.15, 0.25  # of the loaded time, and s, that are used before and after
+CORRELATION = 0.05  # s, of dynamic wheel forces: their share follows from so many of these times
+SHARE_SPREAD = 0.3  # of the logarithm of the share of dynamic wheel forces
+SPEED_SPREAD = 0.03  # of the speed of the start, relative
+MIN_GAP = 0.6  # m, between axles: less than any tandem's
+MIN_AXLE_SHARE = 0.04  # of the gross weight, in an axle: less stands for something else
+GROUP_GAP = 2.2  # m, of axles of one group (COST 323)
+# Standard deviations of what is known before: differences of loads of neighbours in a group, in
+# their mean; gaps (m) in a group about their mean.
+EQUAL, GROUP_MEAN, GROUP_SPREAD = 0.12, 1.35, 0.1
+LOAD_SPREAD = 0.35  # of logarithms of the loads of a vehicle
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -34,7 +50,8 @@ class AxleFit:
     """Axles on a bridge with the covariance of their forces (N), speed, entry time and offsets.
 
     `covariance` is that of forces, speed (m/s), entry time (s) and offsets (m) behind the first
-    axle, in this order; `dynamic_share` is d. `deviance` is minus twice the log-likelihood but for
+    axle, in this order; `dynamic_share` is d. Residuals have `excess` times the variance that noise
+    and usual dynamic wheel forces give them. `deviance` is minus twice the log-likelihood but for
     a constant of the readings, at the best parameters.
     """
 
@@ -44,7 +61,10 @@ class AxleFit:
     dynamic_share: float
     degrees_of_freedom: float
     deviance: float
-    fitted: Float[np.ndarray, "time sensor"]
+    excess: float
+    rows: int
+    weights: "Weights"
+    lines: InfluenceLines
 
     @property
     def is_plausible(self) -> bool:
@@ -68,6 +88,20 @@ class AxleFit:
         return t_quantile(self.degrees_of_freedom) * self.errors
 
     @property
+    def groups(self) -> list[list[int]]:
+        """Axles (from 0) of groups, each less than 2.2 m behind the one before."""
+        return axle_groups(self.geometry.offsets)
+
+    @property
+    def criterion(self) -> float:
+        """The lower, the more likely the number of axles (Schwarz 1978), in units of the deviance.
+
+        An axle adds a load and a place, of which little is new in a group. Axles of one vehicle
+        have loads within a factor of two or so: more stands for several.
+        """
+        return self.deviance + unlikeliness(self.rows, self.geometry.offsets, self.forces)
+
+    @property
     def gross_weight(self) -> tuple[float, float]:
         """Sum of the axle forces and its standard error (N)."""
         return self.group_weight(range(self.forces.size))
@@ -79,207 +113,335 @@ class AxleFit:
         return float(self.forces[own].sum()), float(np.sqrt(variance))
 
 
-class _Weights(NamedTuple):
-    """Square roots of inverse covariances: r - U shrink U' r of rows in units of the noise."""
+def axle_groups(offsets: Float[np.ndarray, " axle"]) -> list[list[int]]:
+    """Axles (from 0) at offsets (m) of groups, each less than 2.2 m behind the one before."""
+    apart = np.flatnonzero(np.diff(offsets) >= GROUP_GAP) + 1
+    return [part.tolist() for part in np.split(np.arange(offsets.size), apart)]
 
-    basis: Float[np.ndarray, "row wave"]
-    shrink: Float[np.ndarray, " wave"]
-    logarithm: float  # of the determinant of the covariance
+
+def unlikeliness(rows: int, offsets, forces) -> float:
+    """What a number of axles adds to the deviance of so many rows in `AxleFit.criterion`."""
+    axles, groups = forces.size, len(axle_groups(offsets))
+    logs = np.log(np.maximum(forces, 1e-3 * forces.sum()))
+    unlike = np.sum(((logs - logs.mean()) / LOAD_SPREAD) ** 2)
+    return float((groups + axles) * np.log(rows) + unlike)
+
+
+class Weights(NamedTuple):
+    """Inverse of the lower factor of a covariance of rows in units of the noise."""
+
+    factor: Float[np.ndarray, "row row"]
+    unlikely: float = 0.0  # deviance of the share of dynamic wheel forces
 
     def __call__(self, rows):
-        inside = self.basis.T @ rows
-        scaled = self.shrink[:, None] * inside if rows.ndim > 1 else self.shrink * inside
-        return rows - self.basis @ scaled
+        """Rows in units of the noise, weighted."""
+        return scipy.linalg.solve_triangular(self.factor, rows, lower=True, check_finite=False)
+
+    @property
+    def logarithm(self) -> float:
+        """Logarithm of the determinant of the covariance."""
+        return 2 * float(np.sum(np.log(np.diag(self.factor))))
+
+
+class CrossingLog:
+    """Readings (SI units) of a crossing, in units of the white noise of each sensor.
+
+    `speed` (m/s) is what is known of it before the fit, within some per cent.
+    """
+
+    speed: float | None = None
+
+    def __init__(
+        self,
+        times: Float[np.ndarray, " time"],
+        readings: Float[np.ndarray, "time sensor"],
+        valid: np.ndarray,
+    ):
+        first, last = loaded_times(times, readings)
+        margin = MARGIN_SHARE * (last - first) + MARGIN_TIME
+        near = (times > first - margin) & (times < last + margin)
+        times, readings, valid = times[near], readings[near], valid[near]
+        rate = (times.size - 1) / (times[-1] - times[0])
+        block = max(times.size * readings.shape[1] // MAX_ROWS, int(rate / RATE))
+        if block > 1:  # means of so many samples
+            whole = times.size // block * block
+            counted = np.where(valid, 1.0, 0.0)[:whole].reshape(-1, block, readings.shape[1])
+            sums = np.where(valid, readings, 0.0)[:whole].reshape(counted.shape).sum(axis=1)
+            times = times[:whole].reshape(-1, block).mean(axis=1)
+            readings = sums / np.maximum(counted.sum(axis=1), 1.0)
+            valid = counted.sum(axis=1) > block / 2
+        self.times, self.readings, self.valid = times, readings, valid
+        self.scale = (valid / white_noise(readings, valid)).T.ravel()
+        self.used = self.scale > 0
+        self.target = (readings.T.ravel() * self.scale)[self.used]
+        self.loaded = first, last
+        self.freedom = max((last - first) / CORRELATION, 3.0)
+        sensors = readings.shape[1]
+        self.shifts = self.rows(np.broadcast_to(np.eye(sensors), (times.size, sensors, sensors)))
+
+    def places(self, speed: float, length: float) -> tuple[float, float]:
+        """How far axles may have come (m) at time 0, less the speed times it, least and most."""
+        first, last = self.loaded
+        return abs(speed) * first - MARGIN, max(
+            abs(speed) * last - length, abs(speed) * first
+        ) + MARGIN
+
+    def rows(self, table: Float[np.ndarray, "time number sensor"]):
+        """Rows (sensor by sensor) of the samples that count, in units of the noise."""
+        flat = table.transpose(2, 0, 1).reshape(self.scale.size, -1)
+        return (flat * self.scale[:, None])[self.used]
+
+    def linear(self, lines: InfluenceLines, geometry: AxleGeometry, weights: Weights):
+        """Weighted sum of squares of the best forces at a geometry, and these forces (N)."""
+        columns = np.hstack([self.rows(lines.crossing(geometry, self.times)), self.shifts])
+        columns, target = weights(columns), weights(self.target)
+        sizes = _sizes(columns, geometry.offsets.size)
+        found = np.linalg.lstsq(columns / sizes, target, rcond=None)[0]
+        count = geometry.offsets.size
+        if np.any(found[:count] < 0):
+            low = np.concatenate([np.zeros(count), np.full(self.shifts.shape[1], -np.inf)])
+            found = scipy.optimize.lsq_linear(columns / sizes, target, (low, np.inf)).x
+        left = target - columns @ (found / sizes)
+        return float(left @ left), (found / sizes)[:count]
+
+
+def loaded_times(times, readings) -> tuple[float, float]:
+    """First and last time (s) with something on the bridge; all of them if there is nothing."""
+    level = np.abs(readings - np.median(readings[: max(times.size // 20, 3)], axis=0))
+    on = np.flatnonzero(np.any(level > LOADED * level.max(axis=0), axis=1))
+    ends = (on[0], on[-1]) if on.size > 2 else (0, -1)
+    return float(times[ends[0]]), float(times[ends[1]])
+
+
+class _Model:
+    """Readings and slopes at numbers: forces, speed, entry time, offsets, shifts."""
+
+    def __init__(self, lines: InfluenceLines, log: CrossingLog, start: AxleGeometry):
+        self.lines, self.log, self.start = lines, log, start
+        self.count = start.offsets.size
+
+    def first(self, forces, shifts):
+        """Numbers of the start."""
+        self.least = 0.01 * max(float(forces.sum()), 1e-12)
+        at = self.start
+        entry = [at.speed, at.entry_time, *at.offsets[1:]]
+        return np.concatenate([forces, entry, shifts])
+
+    def parts(self, x):
+        """Geometry, forces, shifts."""
+        n = self.count
+        geometry = AxleGeometry(
+            x[n], x[n + 1], np.append(0.0, x[n + 2 : 2 * n + 1]), self.start.length
+        )
+        return geometry, x[:n], x[2 * n + 1 :]
+
+    def residual(self, x):
+        """What a model of numbers leaves of the readings, and its columns by forces."""
+        geometry, forces, shifts = self.parts(x)
+        columns = self.log.rows(self.lines.crossing(geometry, self.log.times))
+        return self.log.target - columns @ forces - self.log.shifts @ shifts, columns
+
+    def jacobian(self, x, columns):
+        """Slopes of the readings by all numbers."""
+        geometry, forces, _ = self.parts(x)
+        times = self.log.times
+        step = STEPS * geometry.length / abs(geometry.speed)  # in time
+
+        def slopes(moved, size):
+            return (self.log.rows(self.lines.crossing(moved, times)) - columns) / size * forces
+
+        later = dataclasses.replace(geometry, entry_time=geometry.entry_time + step)
+        speed = STEPS * geometry.speed
+        faster = dataclasses.replace(geometry, speed=geometry.speed + speed)
+        by_entry = slopes(later, step)
+        parts = [columns, slopes(faster, speed).sum(axis=1, keepdims=True)]
+        # An axle that is further behind enters later.
+        parts += [by_entry.sum(axis=1, keepdims=True), by_entry[:, 1:] / abs(geometry.speed)]
+        return np.hstack([*parts, self.log.shifts])
+
+    def known(self, x):
+        """Residuals of what is known before, in standard deviations, and their slopes."""
+        n = self.count
+        forces, offsets = x[:n], np.append(0.0, x[n + 2 : 2 * n + 1])
+        close = np.flatnonzero(np.diff(offsets) < GROUP_GAP)
+        rows, left = [], []
+        for i in close:
+            size = EQUAL * max(float(forces[i : i + 2].mean()), self.least)
+            row = np.zeros(x.size)
+            row[i], row[i + 1] = 1 / size, -1 / size
+            rows.append(row)
+            left.append(-(forces[i] - forces[i + 1]) / size)
+            row = np.zeros(x.size)
+            row[n + 2 + i] = 1 / GROUP_SPREAD
+            if i:
+                row[n + 1 + i] = -1 / GROUP_SPREAD
+            rows.append(row)
+            left.append(-(offsets[i + 1] - offsets[i] - GROUP_MEAN) / GROUP_SPREAD)
+        if self.log.speed is not None:
+            row, spread = np.zeros(x.size), SPEED_SPREAD * self.log.speed
+            row[n] = np.sign(x[n]) / spread
+            rows.append(row)
+            left.append((self.log.speed - abs(x[n])) / spread)
+        return np.array(left), np.array(rows).reshape(-1, x.size)
+
+    def allowed(self, x):
+        """Numbers within what is possible: forces that press, axles in order."""
+        n, x = self.count, x.copy()
+        x[:n] = np.maximum(x[:n], 0.0)
+        gaps = np.maximum(np.diff(np.append(0.0, x[n + 2 : 2 * n + 1])), MIN_GAP)
+        x[n + 2 : 2 * n + 1] = np.cumsum(gaps)
+        speed = abs(self.start.speed)
+        x[n] = np.sign(self.start.speed) * np.clip(abs(x[n]), 0.85 * speed, 1.15 * speed)
+        low, high = self.log.places(x[n], self.start.length)
+        first = np.clip(abs(x[n]) * x[n + 1], low, high)
+        x[n + 1] = first / abs(x[n])
+        room = max(high - first, (n - 1) * MIN_GAP)
+        offsets = x[n + 2 : 2 * n + 1]
+        if n > 1 and offsets[-1] > room:
+            x[n + 2 : 2 * n + 1] = offsets * room / offsets[-1]
+        return x
 
 
 def fit_axles(
     lines: InfluenceLines,
     start: AxleGeometry,
     forces: Float[np.ndarray, " axle"],
-    times: Float[np.ndarray, " time"],
-    readings: Float[np.ndarray, "time sensor"],
-    valid: np.ndarray,
+    log: CrossingLog,
+    weights: Weights | None = None,
 ) -> AxleFit:
-    """Axles fitted to the readings (SI units) of a crossing, from a geometry and forces (N)."""
-    unit_readings = lines.crossing
-    noise = white_noise(readings, valid)
-    scale = (valid / noise).T.ravel()
-    used = scale > 0
-
-    def rows(table):
-        """Rows in units of the noise, sensor by sensor, of a table (time, column, sensor)."""
-        flat = table.transpose(2, 0, 1).reshape(scale.size, -1)
-        return (flat * scale[:, None])[used]
-
-    target = (readings.T.ravel() * scale)[used]
-    sensors = readings.shape[1]
-    shifts = rows(np.broadcast_to(np.eye(sensors), (times.size, sensors, sensors)))
-    geometry, count = start, start.offsets.size
-    share = 0.05
-    for _ in range(ROUNDS):
-        weights, share, level, freedom = _weights(
-            geometry, forces, times, lines, rows, shifts, target
-        )
-        geometry, forces, shift = _weighted(
-            weights, geometry, times, unit_readings, rows, shifts, target
-        )
-    columns = rows(unit_readings(geometry, times))
-    slopes = _slopes(unit_readings, geometry, times, rows) @ _per_force(forces, count)
-    jacobian = weights(np.hstack([columns, slopes, shifts]))
+    """Axles fitted to the readings of a crossing, from a geometry and forces (N)."""
+    model = _Model(lines, log, start)
+    n = model.count
+    x = model.first(forces, np.zeros(log.shifts.shape[1]))
+    if weights is None:
+        weights = _weights(model, x, first_time=True)[0]
+    for _ in range(2):
+        x, _ = _gauss_newton(model, x, weights)
+        weights, share, excess = _weights(model, x)
+    left, columns = model.residual(x)
+    jacobian = weights(model.jacobian(x, columns))
+    before, slopes = model.known(x)
+    jacobian = np.vstack([jacobian, slopes])
     sizes = np.linalg.norm(jacobian, axis=0)
     unseen = sizes < 1e-12 * sizes.max()
     sizes = np.where(unseen, 1.0, sizes)
     inverse = np.linalg.pinv(jacobian / sizes)
-    covariance = level * (inverse @ inverse.T) / np.outer(sizes, sizes)
+    covariance = (inverse @ inverse.T) / np.outer(sizes, sizes)
     # Readings tell nothing of the place of an axle without a force, nor of one off the bridge.
-    most = np.where(np.arange(sizes.size) < count, max(float(forces.sum()), 1e-300), MAX_GAP)
+    most = np.where(np.arange(sizes.size) < n, max(float(x[:n].sum()), 1e-300), start.length)
     covariance[unseen, unseen] = most[unseen] ** 2
-    own = covariance[: 2 * count + 1, : 2 * count + 1]
-    fitted = np.einsum("tas,a->ts", unit_readings(geometry, times), forces) + shift
-    left = weights(target - columns @ forces - shifts @ shift)
-    deviance = weights.logarithm + left @ left
-    return AxleFit(geometry, forces, own, share, freedom, float(deviance), fitted)
+    weighted = weights(left)
+    deviance = weights.logarithm + weights.unlikely + weighted @ weighted + before @ before
+    geometry, forces, _ = model.parts(x)
+    own = covariance[: 2 * n + 1, : 2 * n + 1]
+    return AxleFit(
+        geometry,
+        forces,
+        own,
+        share,
+        log.freedom,
+        float(deviance),
+        excess,
+        left.size,
+        weights,
+        lines,
+    )
 
 
-def _per_force(forces, count):
-    """Slopes by speed, entry time and offsets from those of each axle's readings by its own."""
-    matrix = np.zeros((3 * count, count + 1))
-    for a in range(count):
-        matrix[3 * a, 0] = matrix[3 * a + 1, 1] = forces[a]
-        if a:
-            matrix[3 * a + 2, 1 + a] = forces[a]
-    return matrix
+def refined(fit: AxleFit, start: AxleGeometry, forces, log: CrossingLog):
+    """Deviance, geometry and forces at the weights of a fit, of other axles from a start."""
+    model = _Model(fit.lines, log, start)
+    x, squares = _gauss_newton(
+        model, model.first(forces, np.zeros(log.shifts.shape[1])), fit.weights
+    )
+    return fit.weights.logarithm + fit.weights.unlikely + squares, *model.parts(x)[:2]
 
 
-def _slopes(unit_readings, geometry: AxleGeometry, times, rows):
-    """Rows of the slopes of each axle's unit readings by speed, entry time and its own offset."""
-    crossing = geometry.length / abs(geometry.speed)
-    found = []
-    for field, step in (
-        ("speed", STEPS * abs(geometry.speed)),
-        ("entry_time", STEPS * crossing),
-        ("offsets", STEPS * geometry.length),
-    ):
-        ends = [
-            unit_readings(
-                dataclasses.replace(geometry, **{field: getattr(geometry, field) + sign * step}),
-                times,
-            )
-            for sign in (1, -1)
-        ]
-        found.append((ends[0] - ends[1]) / (2 * step))
-    table = np.stack(found, axis=2)  # time, axle, number, sensor
-    return rows(table.reshape(times.size, -1, table.shape[3]))
+def _gauss_newton(model: _Model, x, weights: Weights):
+    """Numbers of least weighted squares, in damped steps, and these squares."""
+
+    def cost(x):
+        left, columns = model.residual(x)
+        before = model.known(x)
+        weighted = weights(left)
+        return float(weighted @ weighted + before[0] @ before[0]), weighted, columns, before
+
+    value, left, columns, before = cost(x)
+    damping = 1e-3
+    for _ in range(ITERATIONS):
+        jacobian = np.vstack([weights(model.jacobian(x, columns)), before[1]])
+        sizes = _sizes(jacobian, model.count)
+        scaled = jacobian / sizes
+        normal, right = scaled.T @ scaled, scaled.T @ np.concatenate([left, before[0]])
+        gained = 0.0
+        for _ in range(5):
+            step = np.linalg.solve(normal + damping * np.eye(x.size), right) / sizes
+            trial = model.allowed(x + step)
+            new = cost(trial)
+            if new[0] < value:
+                gained = value - new[0]
+                x, (value, left, columns, before) = trial, new
+                damping = max(damping / 5, 1e-9)
+                break
+            damping *= 10
+        if gained < 0.01:
+            break
+    return x, value
 
 
-def _weights(geometry, forces, times, lines, rows, shifts, target):
-    """Weights for dynamic wheel forces at a geometry, their share, the level, their freedom."""
-    unit_readings = lines.crossing
-    columns = unit_readings(geometry, times)
-    first = _Weights(np.zeros((target.size, 0)), np.zeros(0), 0.0)
-    if lines.covariance is not None:
-        first = _inverse_root(rows(_line_errors(lines, geometry, forces, times)), 1.0)
-    waves = first(rows(dynamic_readings(lines, geometry, forces, times)))
-    slopes = _slopes(unit_readings, geometry, times, rows) @ _per_force(forces, forces.size)
-    jacobian = first(np.hstack([rows(columns), slopes, shifts]))
-    basis = np.linalg.qr(jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300))[0]
-    outside = waves - basis @ (basis.T @ waves)
-    left = first(target)
-    left = left - basis @ (basis.T @ left)
-    vectors, sizes, _ = np.linalg.svd(outside, full_matrices=False)
-    power = sizes**2
-    inside = (vectors.T @ left) ** 2
-    rest = max(float(left @ left - inside.sum()), 0.0)
-    number = target.size - basis.shape[1]
+def _weights(model: _Model, x, first_time=False) -> tuple[Weights, float, float]:
+    """Weights for dynamic wheel forces at numbers, their share, and the excess of residuals."""
+    geometry, forces, _ = model.parts(x)
+    lines, log = model.lines, model.log
+    fixed = np.eye(log.target.size)
+    if lines.deviations is not None:
+        fixed += _square(log.rows(_line_errors(lines, geometry, forces, log.times)))
+    dynamic = _square(log.rows(dynamic_waves(lines, geometry, forces, log.times)))
+    left, columns = model.residual(x)
+    jacobian = model.jacobian(x, columns)
+    jacobian = np.column_stack([jacobian / _sizes(jacobian, model.count), left])
+    number = log.target.size - jacobian.shape[1] + 1
+    usual = np.log(lines.dynamic_share)
 
-    def squares(log_share):
-        return rest + np.sum(inside / (1 + np.exp(2 * log_share) * power))
+    def at(log_share):
+        """Deviance (Patterson and Thompson 1971), factor and level of the covariance."""
+        factor = np.linalg.cholesky(fixed + np.exp(2 * log_share) * dynamic)
+        triangle = np.linalg.qr(Weights(factor)(jacobian), mode="r")
+        sizes = np.abs(np.diag(triangle))
+        squares, determinant = sizes[-1] ** 2, Weights(factor).logarithm
+        level = max(float(squares) / number, 1.0)
+        unlikely = ((log_share + np.log(level) / 2 - usual) / SHARE_SPREAD) ** 2
+        reduced = 2 * np.sum(np.log(np.maximum(sizes[:-1], 1e-12)))
+        deviance = determinant + reduced + number * np.log(level) + squares / level + unlikely
+        return deviance, factor, level, unlikely
 
-    def deviance(log_share):
-        return np.sum(np.log1p(np.exp(2 * log_share) * power)) + squares(log_share)
+    best = usual
+    if not first_time:
+        best = scipy.optimize.minimize_scalar(
+            lambda log_share: at(log_share)[0], bounds=tuple(np.log(SHARES)), method="bounded",
+            options={"xatol": 0.1},
+        ).x  # fmt: skip
+    _, factor, level, unlikely = at(best)
+    share = float(np.exp(best) * np.sqrt(level))
+    return Weights(factor * np.sqrt(level), float(unlikely)), share, level
 
-    best = scipy.optimize.minimize_scalar(
-        deviance, bounds=tuple(np.log(SHARES)), method="bounded", options={"xatol": 1e-3}
-    ).x
-    share = float(np.exp(best))
-    second = _inverse_root(waves, share)
-    told = share**2 * power / (1 + share**2 * power)  # of each wave, of which readings tell
-    freedom = max(float(told.sum()), 3.0)
-    combined = _Chained(first, second)
-    return combined, share, max(float(squares(best)) / number, 1.0), freedom
+
+def _sizes(columns, count):
+    """Norms of columns; those of axles that are hardly on the bridge are not small."""
+    sizes = np.linalg.norm(columns, axis=0)
+    sizes[:count] = np.maximum(sizes[:count], 1e-3 * sizes[:count].max())
+    return np.maximum(sizes, 1e-300)
+
+
+def _square(table):
+    return table @ table.T
 
 
 def _line_errors(lines: InfluenceLines, geometry: AxleGeometry, forces, times):
-    """Readings (time, number, sensor) of independent errors of the lines, of unit variance."""
-    x = geometry.positions(times)
-    hats = np.eye(lines.positions.size)
-    loads = sum(
-        force * np.stack([np.interp(own, lines.positions, hat, 0.0, 0.0) for hat in hats], axis=1)
-        for force, own in zip(forces, x.T, strict=True)
-    )
-    assert lines.covariance is not None
-    sensors = len(lines.covariance)
-    found = np.zeros((times.size, sensors * hats.shape[0], sensors))
-    for s, covariance in enumerate(lines.covariance):
-        sizes, vectors = np.linalg.eigh(covariance)
-        part = slice(s * hats.shape[0], (s + 1) * hats.shape[0])
-        found[:, part, s] = loads @ (vectors * np.sqrt(np.maximum(sizes, 0.0)))
-    return found
-
-
-class _Chained(NamedTuple):
-    """One weighting after another."""
-
-    first: _Weights
-    second: _Weights
-
-    def __call__(self, rows):
-        return self.second(self.first(rows))
-
-    @property
-    def logarithm(self) -> float:
-        return self.first.logarithm + self.second.logarithm
-
-
-def _inverse_root(columns, size) -> _Weights:
-    """Weights for the covariance 1 + size^2 C C' of columns C."""
-    vectors, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    variance = 1 + (size * sizes) ** 2
-    return _Weights(vectors, 1 - variance**-0.5, float(np.sum(np.log(variance))))
-
-
-def _weighted(weights, start: AxleGeometry, times, unit_readings, rows, shifts, target):
-    """Geometry, forces and shifts of least weighted squares, forces by variable projection."""
-    sign, count = np.sign(start.speed), start.offsets.size
-    weighted_shifts, weighted_target = weights(shifts), weights(target)
-    sensors = shifts.shape[1]
-
-    def geometry_at(x):
-        offsets = np.append(0.0, np.cumsum(np.exp(x[2:])))
-        return AxleGeometry(sign * np.exp(x[0]), x[1], offsets, start.length)
-
-    def solution(x):
-        columns = np.hstack([weights(rows(unit_readings(geometry_at(x), times))), weighted_shifts])
-        sizes = np.linalg.norm(columns, axis=0)
-        sizes = np.maximum(sizes, 1e-9 * sizes.max())  # of axles that are not on the bridge
-        low = np.concatenate([np.zeros(count), np.full(sensors, -np.inf)])
-        found = np.linalg.lstsq(columns / sizes, weighted_target, rcond=None)[0]
-        if np.any(found < low):
-            found = scipy.optimize.lsq_linear(columns / sizes, weighted_target, (low, np.inf)).x
-        return columns, found / sizes
-
-    def residual(x):
-        columns, found = solution(x)
-        return columns @ found - weighted_target
-
-    gaps = np.clip(np.diff(start.offsets), 1.001 * MIN_GAP, 0.999 * MAX_GAP)
-    first = np.concatenate([[np.log(abs(start.speed)), start.entry_time], np.log(gaps)])
-    crossing = start.length / abs(start.speed)
-    low = [first[0] - 0.3, first[1] - crossing, *np.full(count - 1, np.log(MIN_GAP))]
-    high = [first[0] + 0.3, first[1] + crossing, *np.full(count - 1, np.log(MAX_GAP))]
-    found = scipy.optimize.least_squares(
-        residual, first, bounds=(low, high), diff_step=1e-5, max_nfev=30,
-        x_scale=np.array([0.1, 0.1 * crossing, *np.full(count - 1, 0.3)]),
-    )  # fmt: skip
-    numbers = solution(found.x)[1]
-    return geometry_at(found.x), numbers[:count], numbers[count:]
+    """Readings (time, number, sensor) of the deviations of the lines."""
+    assert lines.deviations is not None
+    number, points, sensors = lines.deviations.shape
+    table = lines.deviations.transpose(1, 0, 2).reshape(points, -1)
+    still = InfluenceLines(lines.positions, table)
+    readings = np.einsum("tak,a->tk", still.crossing(geometry, times), forces)
+    return readings.reshape(times.size, number, sensors)

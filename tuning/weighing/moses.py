@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from tuning.fit.uncertainty.covariance import t_quantile
-from tuning.weighing.dynamic_forces import dynamic_errors, dynamic_readings, white_noise
+from tuning.weighing.dynamic_forces import dynamic_errors, dynamic_waves, white_noise
 from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines
 
 
@@ -81,7 +81,7 @@ def moses(
         share = 1 - (axles + sensors) / valid.sum()
         squares = np.sum(valid * residuals**2, axis=0) / np.maximum(valid.sum(axis=0), 1) / share
         noise = np.sqrt(np.maximum(squares, 1e-18 * noise**2))
-    waves = dynamic_readings(lines, geometry, solution[:axles], times)
+    waves = dynamic_waves(lines, geometry, solution[:axles], times)
     parts = [columns]
     if found:
         parts.append(_geometry_slopes(lines, geometry, times, solution[:axles]))

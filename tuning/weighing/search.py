@@ -1,177 +1,240 @@
 """Speed, entry time and distances of axles in readings, without a guess of any of them.
 
-For each of many speeds the readings are explained by non-negative forces that enter at many times
-(a comb). Groups of neighbouring forces are axles, or several: starts divide the heaviest groups
-until there are as many axles as wanted. From each start all numbers are refined by least squares,
-with the forces of each point by non-negative least squares (variable projection).
+Readings of two sensors are y_1 = u_1 * F and y_2 = u_2 * F, with the readings u of one force that
+crosses at a speed, and the train of axles F: at the right speed y_1 * u_2 = y_2 * u_1, whatever the
+axles (the cross relation of blind identification, Xu, Liu, Tong and Kailath 1995,
+DOI 10.1109/78.476442). A single sensor has the speed at which non-negative forces that enter at
+many times (a comb) leave least. Neighbouring forces of a comb at this speed are one axle. All axles
+are then fitted (`axle_fit`), the comb is repeated with the weights of the fit, which see the kinks
+of the lines through vibration, and axles are one by one split or left out, as long as the number
+becomes more likely.
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
+from tuning.weighing.axle_fit import (
+    GROUP_MEAN,
+    AxleFit,
+    CrossingLog,
+    axle_groups,
+    fit_axles,
+    refined,
+    unlikeliness,
+)
 from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines
 
-SPEED_COUNT = 24  # candidates
-ENTRY_COUNT = 160  # candidates of each speed
-STARTS = 6  # speeds from which the geometry is refined
-KEPT, SAME_SPEED = 4, 0.02  # geometries of a search, of speeds that differ by more (relative)
-MAX_ROWS = 600  # samples of all sensors
-# Of the gross weight, in an axle: fewer are what the lines lack. Steering axles of loaded lorries
-# and axles of their groups have a tenth or more.
-MIN_AXLE_SHARE = 0.04
-MIN_GROUP_SHARE = 0.02  # likewise, of a group of forces of a comb
-LIGHT_GROUPS = 0.3, 0.1  # of the heaviest group, below which groups are no starts: tried in turn
-PAIR = 1.3  # m, of axles for which a group is taken: that of a tandem
-FREQUENCY_STEP = 0.015  # by which the frequency of the bridge is refined, relative
+SPEED_STEP, SINGLE_STEP = 0.01, 0.04  # of the speeds tried, relative; with a single sensor
+NEAR = 0.97, 0.985, 1.0, 1.015, 1.03  # times this speed, tried by combs
+SPACING = 0.35  # m, between the forces of combs
+MOST_AXLES = 9  # of a comb: the heaviest
+JOINED = 0.75  # m, between forces of one axle
+LEAST_SHARE = 0.1  # of the heaviest axle of a comb, in the others
+ROUNDS = 2  # of fewer and of more axles
+LEAST_GAIN = 1.0  # of the criterion, by another number of axles
+TRIED = 2  # changes that are fitted, of all
+COMBS = 3  # one after the other
 FREQUENCY_SHARES = np.linspace(0.85, 1.15, 121)  # of that of the lines, tried in free vibration
 MIN_CYCLES = 3.0  # of free vibration that tell its frequency
 MIN_EXPLAINED = 0.5  # share of its energy that one decaying mode explains
 AT_EXIT = 0.1  # of the largest mean over two cycles, below which nothing is on the bridge
-MIN_GAP, MAX_GAP = 0.6, 60.0  # m, between axles: less than any tandem's, more than any vehicle's
+MAX_ROWS = 600  # samples of all sensors in a comb
 
 
-class Found(NamedTuple):
-    """Axles of a search: geometry, forces (N), and what they leave of the variance of readings.
+class _Comb(NamedTuple):
+    """Misfit of a comb (share of the variance), its speed, and places (m) of its forces (N)."""
 
-    `lines` are those of the search, with the frequency of the bridge that explains the log best.
+    misfit: float
+    speed: float
+    places: Float[np.ndarray, " force"]
+    forces: Float[np.ndarray, " force"]
+
+
+def find_axles(
+    lines: InfluenceLines,
+    log: CrossingLog,
+    speeds: tuple[float, float],
+    both_ways: bool = False,
+    number: int | None = None,
+) -> tuple[dict[int, AxleFit], dict[int, float]]:
+    """The best fits of some numbers of axles, a number among them if it is given.
+
+    With them the criteria of all numbers that were tried. `speeds` (m/s) are the lowest and highest
+    possible ones, from the left or, with `both_ways`, in both directions. Empty if nothing crosses.
     """
+    comb = _best_comb(lines, log, speeds, both_ways)
+    fit, fits, tried = None, {}, {}
+    for _ in range(COMBS):  # at the weights of the fit before
+        places, forces = _axles_of(comb)
+        if places.size == 0:
+            return {}, {}
+        speed = abs(comb.speed)
+        log.speed = speed
+        start = AxleGeometry(comb.speed, places[0] / speed, places - places[0], lines.length)
+        own = fit_axles(lines, start, forces, log, fit and fit.weights)
+        if fit is None or own.criterion < fit.criterion:
+            fit = own
+        known = fits.get(own.forces.size)
+        if known is None or own.criterion < known.criterion:
+            fits[own.forces.size] = own
+        comb = _weighted_comb(fit, log)
+    assert fit is not None
+    log.speed = abs(fit.geometry.speed)
+    while number and fit.forces.size != number:
+        change = _with_one_more if fit.forces.size < number else _with_one_less
+        best = _changed(_Trial.of(fit), change, fit, log)
+        fit = fits[best.forces.size] = fit_axles(lines, *best[1:], log, fit.weights)
+    changes = (_with_one_less, _with_one_more), (_with_one_more, _with_one_less)
+    for change, back in ROUNDS * changes:
+        while change is _with_one_more or fit.forces.size > 1:
+            trial = _changed(_Trial.of(fit), change, fit, log)
+            if number:  # the number is that again after the opposite change
+                trial = _changed(trial, back, fit, log)
+            count = trial.forces.size
+            tried[count] = min(trial.criterion, tried.get(count, np.inf))
+            if count > MOST_AXLES or trial.criterion > fit.criterion - LEAST_GAIN:
+                break
+            own = fit_axles(lines, *trial[1:], log, fit.weights)
+            if count not in fits or own.criterion < fits[count].criterion:
+                fits[count] = own
+            if most_likely({0: fit, 1: own}) is fit:
+                break
+            fit = own
+    return fits, tried | {count: own.criterion for count, own in fits.items()}
 
-    lines: InfluenceLines
+
+def most_likely(fits: dict[int, AxleFit]) -> AxleFit:
+    """The fit of the most likely number of axles."""
+    return min(fits.values(), key=lambda fit: (not fit.is_plausible, fit.criterion))
+
+
+class _Trial(NamedTuple):
+    """Axles tried with the weights of a fit, and their criterion."""
+
+    criterion: float
     geometry: AxleGeometry
     forces: Float[np.ndarray, " axle"]
-    misfit: float
 
-    @property
-    def is_plausible(self) -> bool:
-        """Whether no axle is so light that it stands for something else."""
-        return bool(self.forces.min() > MIN_AXLE_SHARE * self.forces.sum())
+    @classmethod
+    def of(cls, fit: AxleFit) -> "_Trial":
+        return cls(fit.criterion, fit.geometry, fit.forces)
 
 
-class AxleSearch:
-    """AxleSearch for axles in the readings (SI units) of one crossing, by influence lines.
+def _changed(trial: _Trial, change, fit: AxleFit, log: CrossingLog) -> _Trial:
+    """The best of what a change makes of axles, with the weights of a fit."""
+    speed, ranked = trial.geometry.speed, []
+    for places in change(trial.geometry.offsets, trial.forces):
+        entry = trial.geometry.entry_time + places[0] / abs(speed)
+        geometry = AxleGeometry(speed, entry, places - places[0], fit.lines.length)
+        ranked.append((*log.linear(fit.lines, geometry, fit.weights), geometry))
+    ranked.sort(key=lambda one: one[0])
+    trials = []
+    for _, forces, start in ranked[:TRIED]:
+        deviance, geometry, forces = refined(fit, start, forces, log)
+        new = unlikeliness(fit.rows, geometry.offsets, forces)
+        trials.append(_Trial(deviance + new, geometry, forces))
+    return min(trials, key=lambda one: one.criterion)
 
-    `speeds` (m/s) are the lowest and highest possible ones, from the left or, with `both_ways`, in
-    both directions.
-    """
 
-    def __init__(
-        self,
-        lines: InfluenceLines,
-        times: Float[np.ndarray, " time"],
-        readings: Float[np.ndarray, "time sensor"],
-        speeds: tuple[float, float],
-        both_ways: bool = False,
-    ):
-        stride = max(times.size * readings.shape[1] // MAX_ROWS, 1)
-        self.lines, self.speeds = lines, speeds
-        self.times, readings = times[::stride], readings[::stride]
-        self.scale = np.maximum(readings.std(axis=0), 1e-300)
-        self.target = ((readings - readings.mean(axis=0)) / self.scale).T.ravel()
-        directions = (1.0, -1.0) if both_ways else (1.0,)
-        tried = [sign * v for v in np.geomspace(*speeds, SPEED_COUNT) for sign in directions]
-        if lines.covariance is not None and lines.frequency is not None:
-            # Slow runs, by which lines are calibrated, tell little of it, the log itself much.
-            self.lines = lines._replace(frequency=free_frequency(lines, self.times, readings))
-        self.combs = sorted((self._comb(speed) for speed in tried), key=lambda comb: comb[0])[
-            :STARTS
-        ]
+def _with_one_less(places, forces) -> list[np.ndarray]:
+    """Places of axles of which one is left out, or joined with the next."""
+    trials = []
+    for i in range(places.size):
+        trials.append(np.delete(places, i))
+        if i + 1 < places.size:
+            share = forces[i + 1] / max(float(forces[i : i + 2].sum()), 1e-300)
+            joined = np.delete(places, i + 1)
+            joined[i] += share * (places[i + 1] - places[i])
+            trials.append(joined)
+    return trials
 
-    def axles(self, count: int, before: Found | None = None) -> list[Found]:
-        """The best of `count` axles at different speeds, the best first, KEPT at most.
 
-        Starts are those of the combs, and of one axle less `before`. Where none is plausible, the
-        best are returned nevertheless.
-        """
-        starts = [
-            AxleGeometry(speed, places[0] / abs(speed), places - places[0], self.length)
-            for _, speed, groups in self.combs
-            for least in LIGHT_GROUPS
-            if (places := _places(groups, count, least)) is not None
-        ]
-        if before is not None:
-            starts += _with_one_taken_for_two(before.geometry)
-        found = sorted(map(self._refined, starts), key=lambda one: one.misfit)
-        plausible = [one for one in found if one.is_plausible] or found
-        kept: list[Found] = []
-        for one in plausible:
-            speed = one.geometry.speed
-            if all(abs(speed / other.geometry.speed - 1) > SAME_SPEED for other in kept):
-                kept.append(one)
-        return kept[:KEPT]
+def _with_one_more(places, forces) -> list[np.ndarray]:
+    """Places of axles of which one, or a group, is a group of one more."""
+    trials = []
+    for group in axle_groups(places):
+        for own in [group] if len(group) == 1 else [group, *([i] for i in group)]:
+            middle = np.average(places[own], weights=np.maximum(forces[own], 1e-300))
+            new = middle + GROUP_MEAN * (np.arange(len(own) + 1) - len(own) / 2)
+            trials.append(np.sort(np.concatenate([np.delete(places, own), new])))
+    return trials
 
-    def with_one_more(self, before: Found) -> list[Found]:
-        """Axles of which one has been taken for two, where they are, with the best forces."""
-        found = []
-        for geometry in _with_one_taken_for_two(before.geometry):
-            table = self._columns(geometry, before.lines)
-            forces, misfit = scipy.optimize.nnls(table, self.target)
-            found.append(Found(before.lines, geometry, forces, misfit**2 / self.target.size))
-        return found
 
-    @property
-    def length(self) -> float:
-        """Length (m) of the beam."""
-        return self.lines.length
+def _best_comb(lines: InfluenceLines, log: CrossingLog, speeds, both_ways: bool) -> _Comb:
+    """The comb of the best speed."""
+    stride = max(log.times.size * log.readings.shape[1] // MAX_ROWS, 1)
+    times, readings = log.times[::stride], log.readings[::stride]
+    scale = np.maximum(readings.std(axis=0), 1e-300)
+    target = ((readings - readings.mean(axis=0)) / scale).T.ravel()
 
-    def _columns(self, geometry: AxleGeometry, lines: InfluenceLines | None = None):
-        table = (lines or self.lines).crossing(geometry, self.times) / self.scale
-        return (table - table.mean(axis=0)).transpose(2, 0, 1).reshape(self.target.size, -1)
+    def comb(speed) -> _Comb:
+        low, high = log.places(speed, lines.length)
+        places = np.arange(low, high + SPACING, SPACING)
+        table = lines.crossing(AxleGeometry(speed, 0.0, places, lines.length), times) / scale
+        rows = (table - table.mean(axis=0)).transpose(2, 0, 1).reshape(target.size, -1)
+        forces, misfit = scipy.optimize.nnls(rows, target)
+        used = forces > 1e-6 * forces.max(initial=0.0)
+        return _Comb(float(misfit**2 / target.size), speed, places[used], forces[used])
 
-    def _comb(self, speed):
-        """Misfit of a comb, its speed, and the groups (place, weight) of its forces."""
-        half = self.length / abs(speed) / 2
-        entries = np.linspace(self.times[0] - half, self.times[-1] - half, ENTRY_COUNT)
-        places = abs(speed) * entries
-        comb = AxleGeometry(speed, 0.0, places, self.length)
-        weights, misfit = scipy.optimize.nnls(self._columns(comb), self.target)
-        used = np.flatnonzero(weights > 1e-6 * weights.max(initial=0.0))
-        groups = []
-        for group in np.split(used, np.flatnonzero(np.diff(used) > 2) + 1) if used.size else []:
-            weight = weights[group]
-            if weight.sum() > MIN_GROUP_SHARE * weights.sum():
-                groups.append((float(np.average(places[group], weights=weight)), weight.sum()))
-        return float(misfit), speed, groups
+    single = readings.shape[1] == 1
+    step = SINGLE_STEP if single else SPEED_STEP
+    count = int(np.ceil(np.log(speeds[1] / speeds[0]) / step)) + 1
+    directions = (1.0, -1.0) if both_ways else (1.0,)
+    tried = [sign * float(v) for v in np.geomspace(*speeds, count) for sign in directions]
+    if single:
+        best = min((comb(speed) for speed in tried), key=lambda one: one.misfit).speed
+    else:
+        even = np.linspace(times[0], times[-1], times.size)
+        table = np.stack([np.interp(even, times, own) for own in readings.T], axis=1)
+        best = min(tried, key=lambda speed: _cross_relation(lines, even, table, speed))
+    return min((comb(best * near) for near in NEAR), key=lambda one: one.misfit)
 
-    def _refined(self, start: AxleGeometry) -> Found:
-        sign, count = np.sign(start.speed), start.offsets.size
 
-        free = self.lines.covariance is not None and self.lines.frequency is not None
-        frequency = self.lines.frequency or 1.0
+def _weighted_comb(fit: AxleFit, log: CrossingLog) -> _Comb:
+    """The comb of the best speed near that of a fit, with its weights."""
+    shifts, target = fit.weights(log.shifts), fit.weights(log.target)
+    basis = np.linalg.qr(shifts)[0]
 
-        def geometry_at(x):
-            offsets = np.append(0.0, np.cumsum(np.exp(x[2 : count + 1])))
-            return AxleGeometry(sign * np.exp(x[0]), x[1], offsets, start.length)
+    def comb(speed) -> _Comb:
+        low, high = log.places(speed, fit.lines.length)
+        places = np.arange(low, high + SPACING, SPACING)
+        at = AxleGeometry(speed, 0.0, places, fit.lines.length)
+        rows = fit.weights(log.rows(fit.lines.crossing(at, log.times)))
+        rows, own = rows - basis @ (basis.T @ rows), target - basis @ (basis.T @ target)
+        forces, misfit = scipy.optimize.nnls(rows, own)
+        used = forces > 1e-6 * forces.max(initial=0.0)
+        return _Comb(float(misfit**2), speed, places[used], forces[used])
 
-        def lines_at(x):
-            return self.lines._replace(frequency=frequency * np.exp(x[-1])) if free else self.lines
+    return min((comb(fit.geometry.speed * near) for near in NEAR), key=lambda one: one.misfit)
 
-        def residual(x):
-            table = self._columns(geometry_at(x), lines_at(x))
-            return table @ scipy.optimize.nnls(table, self.target)[0] - self.target
 
-        gaps = np.log(np.clip(np.diff(start.offsets), 1.001 * MIN_GAP, 0.999 * MAX_GAP))
-        first = np.array([np.log(abs(start.speed)), start.entry_time, *gaps, *[0.0] * free])
-        low, high = np.log(np.array(self.speeds) * [0.9, 1.1])
-        least = np.array(
-            [low, -np.inf, *np.full(count - 1, np.log(MIN_GAP)), *[-FREQUENCY_STEP] * free]
-        )
-        most = np.array(
-            [high, np.inf, *np.full(count - 1, np.log(MAX_GAP)), *[FREQUENCY_STEP] * free]
-        )
-        passage = start.length / abs(start.speed)
-        found = scipy.optimize.least_squares(
-            residual, np.clip(first, least + 1e-9, most - 1e-9), bounds=(least, most),
-            x_scale=np.array([0.1, 0.1 * passage, *np.full(count - 1, 0.3), *[0.01] * free]),
-            diff_step=1e-5, max_nfev=30,
-        )  # fmt: skip
-        geometry = geometry_at(found.x)
-        lines = lines_at(found.x)
-        forces = scipy.optimize.nnls(self._columns(geometry, lines), self.target)[0]
-        return Found(lines, geometry, forces, float(2 * found.cost / self.target.size))
+def _cross_relation(lines: InfluenceLines, times, readings, speed: float) -> float:
+    """Share of y_1 * u_2 - y_2 * u_1 of all pairs of sensors in the squares of its terms."""
+    still = AxleGeometry(speed, float(times[0]), np.zeros(1), lines.length)
+    unit = lines.crossing(still, times)[:, 0]
+    size = 2 * times.size
+    level = np.median(readings[: max(times.size // 20, 3)], axis=0)
+    Y, U = np.fft.rfft(readings - level, size, axis=0), np.fft.rfft(unit, size, axis=0)
+    products = Y[:, :, None] * U[:, None, :]
+    unlike = products - products.transpose(0, 2, 1)
+    terms = np.sum(np.abs(products) ** 2) - np.sum(np.abs(Y * U) ** 2)
+    return float(np.sum(np.abs(unlike) ** 2) / max(2 * terms, 1e-300))
+
+
+def _axles_of(comb: _Comb) -> tuple[np.ndarray, np.ndarray]:
+    """Places and forces of the axles of a comb: of neighbours the centre, the heaviest of all."""
+    if comb.places.size == 0:
+        return comb.places, comb.forces
+    parts = np.flatnonzero(np.diff(comb.places) > JOINED) + 1
+    groups = np.split(np.arange(comb.places.size), parts)
+    forces = np.array([comb.forces[own].sum() for own in groups])
+    places = np.array([np.average(comb.places[own], weights=comb.forces[own]) for own in groups])
+    order = np.argsort(-forces)[:MOST_AXLES]
+    order = np.sort(order[forces[order] > LEAST_SHARE * forces.max()])
+    return places[order], forces[order]
 
 
 def free_frequency(
@@ -205,34 +268,3 @@ def free_frequency(
 
     best = max((first * FREQUENCY_SHARES).tolist(), key=explained)
     return best if explained(best) > MIN_EXPLAINED else first
-
-
-def _places(groups, count, least) -> np.ndarray | None:
-    """Places (m) of `count` axles: the heaviest groups, of which the heaviest are several axles.
-
-    Groups lighter than a share `least` of the heaviest do not count.
-    """
-    if not groups:
-        return None
-    heavy = sorted(groups, key=lambda group: -group[1])[:count]
-    heavy = [group for group in heavy if group[1] >= least * heavy[0][1]]
-    pieces = np.ones(len(heavy), int)
-    while pieces.sum() < count:
-        pieces[np.argmax([group[1] / n for group, n in zip(heavy, pieces, strict=True)])] += 1
-    places = [
-        place + PAIR * (k - (n - 1) / 2)
-        for (place, _), n in zip(heavy, pieces.tolist(), strict=True)
-        for k in range(n)
-    ]
-    return np.sort(places)
-
-
-def _with_one_taken_for_two(geometry: AxleGeometry) -> list[AxleGeometry]:
-    """Geometries with two axles in the place of one of those of a geometry."""
-    found = []
-    for i, at in enumerate(geometry.offsets):
-        offsets = np.sort([*np.delete(geometry.offsets, i), at - PAIR / 2, at + PAIR / 2])
-        entry = geometry.entry_time + offsets[0] / abs(geometry.speed)
-        moved = dataclasses.replace(geometry, entry_time=entry, offsets=offsets - offsets[0])
-        found.append(moved)
-    return found

@@ -113,13 +113,20 @@ def _signal(sensor: Sensor) -> Sensor:
 
 
 def driven(poles, inputs, step):
-    """States z' = pole z + input from rest, exact for inputs that are linear within each step."""
+    """States z' = pole z + input from rest, exact for inputs that are linear within each step.
+
+    Each input has its own pole, or all have one.
+    """
     exponent = poles * step
     growth = np.exp(exponent)
     small = np.abs(exponent) < 1e-6
     safe = np.where(small, 1.0, exponent)
     first = np.where(small, 1 + exponent / 2, (growth - 1) / safe)
     second = np.where(small, 0.5 + exponent / 6, (first - 1) / safe)
+    if np.ndim(poles) == 0:
+        return scipy.signal.lfilter(
+            [step * second, step * (first - second)], [1.0, -growth], inputs, axis=0
+        )
     states = [
         scipy.signal.lfilter([step * b, step * (a - b)], [1.0, -factor], column)
         for a, b, factor, column in zip(first, second, growth, inputs.T, strict=True)

@@ -47,7 +47,7 @@ def test_weighing(call, tmp_path, monkeypatch):
 def test_influence_lines_of_several_logs_are_kept(call, tmp_path, monkeypatch):
     """Those found from two logs weigh a third at once, and a fourth from the file."""
     found = tuning.weighing.InfluenceLines(
-        np.array([0.0, 0.3, 0.6]), np.array([[0.0], [-2e-6], [0.0]]), np.eye(3)[None], 20.0,
+        np.array([0.0, 0.3, 0.6]), np.array([[0.0], [-2e-6], [0.0]]), np.eye(3)[:, :, None], 20.0,
         np.array([[0.0], [1.0], [0.0]]), np.array([1.0]), np.array([0.02]),
     )  # fmt: skip
     calibrated, used = [], []

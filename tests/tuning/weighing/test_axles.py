@@ -12,11 +12,11 @@ import jaxbeam as jb
 from tests.oracles import finite_elements, vehicle_elements
 from tuning import Log
 from tuning.weighing import calibrate_influence_lines, model_influence_lines, weigh_axles
-from tuning.weighing.axle_fit import fit_axles
+from tuning.weighing.axle_fit import CrossingLog
 from tuning.weighing.axles import AxleWeighing
 from tuning.weighing.influence_lines import AxleGeometry, lines_from_dict
 from tuning.weighing.moses import moses
-from tuning.weighing.search import AxleSearch
+from tuning.weighing.search import find_axles
 
 LENGTH, RIGIDITY, DENSITY, DAMPING, FIBRE = 20.0, 1e10, 10000.0, 0.02, -0.5
 PLACES, DURATION, SPEED, LEAD = [LENGTH / 2, LENGTH / 4], 2.4, 18.0, 9.0
@@ -68,7 +68,8 @@ def crossings():
 
 def search(log, count, speeds=SPEEDS, lines=None, both_ways=False):
     lines = model_influence_lines(case()) if lines is None else lines
-    return AxleSearch(lines, log.times, log.values, speeds, both_ways).axles(count)[0]
+    crossing = CrossingLog(log.times, log.values, log.valid)
+    return find_axles(lines, crossing, speeds, both_ways, count)[0][count]
 
 
 @pytest.fixture(scope="module")
@@ -134,10 +135,7 @@ def test_intervals_of_moses_cover_on_rough_roads(found):
 
 def test_the_fit_is_closer_than_moses_and_its_intervals_cover(crossings, found):
     truth = np.array([*TRUCK.static_loads, SPEED, LEAD / SPEED, SPACING])
-    fits = [
-        fit_axles(one.lines, one.geometry, one.forces, log.times, log.values, log.valid)
-        for one, log in zip(found[0], crossings, strict=True)
-    ]
+    fits = found[0]
     errors = np.array([fit.values - truth for fit in fits])
     half_widths = np.array([fit.half_widths for fit in fits])
     covered = np.abs(errors) < half_widths
@@ -155,7 +153,7 @@ def test_axles_of_a_log_are_weighed_and_reported(crossings):
     forces = np.asarray(weighed.load.forces)
     np.testing.assert_allclose(forces, TRUCK.static_loads, rtol=0.1)
     assert str(weighed).startswith("2 axles found, at ")
-    assert "BIC by number of axles" in str(weighed)
+    assert "criterion by number of axles" in str(weighed)
     content = weighed.to_dict()
     assert {"1", "2", "3"} <= content["bic"].keys()
     assert content["axles"][0]["value"] == forces[0]
@@ -165,7 +163,7 @@ def test_axles_of_a_log_are_weighed_and_reported(crossings):
 
 
 def test_a_wrong_number_of_axles_is_told(crossings):
-    said = "no road gives so large dynamic wheel forces"
+    said = "times the variance that noise and dynamic wheel forces give them"
     assert said in str(weigh_axles(case(), crossings[0], SPEEDS, 1))
     assert said not in str(weigh_axles(case(), crossings[0], SPEEDS, 2))
 
@@ -240,5 +238,3 @@ def test_what_cannot_be_weighed(crossings):
         weigh_axles(felt, log, SPEEDS, 2)
     with pytest.raises(ValueError, match="no load is known; calibration needs a vehicle of known"):
         calibrate_influence_lines(case(), log)
-    with pytest.raises(ValueError, match="at least 5 points, not 3"):
-        calibrate_influence_lines(case(), log, points=3)
