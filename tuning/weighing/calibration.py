@@ -165,11 +165,11 @@ class _Run:
 
     def static(self, lines: InfluenceLines, basis) -> Float[np.ndarray, "time number"]:
         """Readings of a sensor whose influence line is each column of a basis."""
-        basis_lines = lines._replace(values=basis)
-        return sum(
-            np.einsum("tak,a->tk", basis_lines.crossing(at, self.times), forces)
+        parts = [
+            np.einsum("tak,a->tk", lines._replace(values=basis).crossing(at, self.times), forces)
             for at, forces in self.vehicles
-        )
+        ]
+        return np.sum(parts, axis=0)
 
     def repeats(self, other: "_Run") -> bool:
         """Whether the same vehicles crossed at nearly the same speeds."""
@@ -231,7 +231,8 @@ class _Problem:
             targets = [run.rows(run.readings[:, [s]], s) for s in range(self.sensors)]
             block, ones = scipy.linalg.block_diag, np.ones((run.times.size, 1))
             shifts = [run.rows(ones, s) for s in range(self.sensors)]
-            rows = np.hstack([block(*tables), block(*shifts), np.vstack(targets)])
+            parts = [block(*tables), block(*shifts), np.vstack(targets)]
+            rows = np.concatenate([np.asarray(part) for part in parts], axis=1)
             waves = np.concatenate(
                 [dynamic_waves(start, *one, run.times) for one in run.vehicles], axis=1
             )
@@ -282,12 +283,12 @@ class _Problem:
     def best_shares(self) -> Float[np.ndarray, "2"]:
         """Logarithms of the greatest restricted likelihood."""
         limits = np.log([SHARES, STIFFNESSES])
-        stiffnesses = np.linspace(*limits[1], 7)
+        stiffnesses = np.linspace(limits[1, 0], limits[1, 1], 7)
 
         def best(log_share):
             return min((self.solved([log_share, one]).deviance, one) for one in stiffnesses)
 
-        trials = np.linspace(*limits[0], 9)
+        trials = np.linspace(limits[0, 0], limits[0, 1], 9)
         first = min(trials, key=lambda one: best(one)[0])
         apart = trials[1] - trials[0]
         share = scipy.optimize.minimize_scalar(

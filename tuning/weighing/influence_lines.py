@@ -153,7 +153,8 @@ def lines_from_dict(content: dict) -> InfluenceLines:
     tables = [None if content[name] is None else np.array(content[name]) for name in names]
     return InfluenceLines(
         np.array(content["positions_m"]), np.array(content["ordinates"]).T, tables[0],
-        content["frequency_hz"], *tables[1:], content["dynamic_share"],
+        content["frequency_hz"], *tables[1:],
+        dynamic_share=content["dynamic_share"],
     )  # fmt: skip
 
 

@@ -183,7 +183,9 @@ def _best_comb(lines: InfluenceLines, log: CrossingLog, speeds, both_ways: bool)
     step = SINGLE_STEP if single else SPEED_STEP
     count = int(np.ceil(np.log(speeds[1] / speeds[0]) / step)) + 1
     directions = (1.0, -1.0) if both_ways else (1.0,)
-    tried = [sign * float(v) for v in np.geomspace(*speeds, count) for sign in directions]
+    tried = [
+        sign * float(v) for v in np.geomspace(speeds[0], speeds[1], count) for sign in directions
+    ]
     if single:
         best = min((comb(speed) for speed in tried), key=lambda one: one.misfit).speed
     else:
