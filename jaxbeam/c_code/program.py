@@ -1,39 +1,59 @@
 """Program in C of the controller of a case: source, header, recorded samples, loop that checks."""
 
 import dataclasses
+import math
 import os
+from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
-from jaxbeam.c_code.compensation import Compensation
-from jaxbeam.c_code.recorded_loop import (
-    RecordedLoop,
-    filters_in_program,
-    recorded_loop,
+from jaxbeam.c_code.recorded_loop import recorded_loop
+from jaxbeam.c_code.sampled_program import (
+    gate_times_of,
+    sampled_program,
 )
-from jaxbeam.c_code.source import CSource
-from jaxbeam.c_code.texts import check_text, header_text, samples_text, source_text
-from jaxbeam.c_code.writers import NoCCodeError, write_law
+from jaxbeam.c_code.texts import (
+    Member,
+    ProgramText,
+    check_text,
+    header_text,
+    samples_text,
+    source_text,
+    uses,
+)
+from jaxbeam.c_code.translation import (
+    ProgramWriter,
+    Word,
+    functions_of,
+    in_single_type,
+    last_word,
+    named_arrays,
+    operations,
+    with_numbers,
+    without_unused,
+)
 from jaxbeam.case.case import Case
-from jaxbeam.case.controller import AbstractController, LawOfCommanded
-from jaxbeam.case.fields import concrete, import_modules, kind_of
+from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.fields import concrete, kind_of
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.state_controller import AbstractStateController, SampledStateLaw, TrueState
+from jaxbeam.control.state_controller import AbstractStateController
 from jaxbeam.model.modes import mesh_layout
-from jaxbeam.model.sensing.sensor_signals import (
-    initial_filter_state,
-    possible_readings,
-    to_reading,
-)
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import known
+from jaxbeam.runtime.c_translation import _renew
+from jaxbeam.runtime.c_writer import (
+    CArray,
+    UntranslatedError,
+    kind_of as kind_of_array,
+    used_variables,
+)
 from jaxbeam.runtime.compiling import compiled_if_traced
+from jaxbeam.runtime.module import Module
 from jaxbeam.runtime.output_file import whole_file
-from jaxbeam.simulation.closed_loop import command_lag
-from jaxbeam.simulation.commands import command_ranges
 
 MAX_SAMPLES = 2000  # recorded ones, of the start of the run
 
@@ -70,26 +90,30 @@ def export_c(case: Case, name: str) -> CProgram:
         raise ValueError("controller is missing: there is nothing to export; add one to the case")
     if controller.period is None:
         raise ValueError("controller.period is missing: a real controller samples; give its period")
-    import_modules("jaxbeam.c_code.laws")
     law = known(_designed(case, mesh_layout(case)))
-    code = _source(case)
-    try:
-        write_law(law, code)
-    except NoCCodeError as error:
-        kind = kind_of(type(controller)) or type(controller).__name__
-        raise ValueError(f"controller.kind {kind!r} cannot be exported as C: {error}") from None
-    received = _write_limits(case, code)
     loop = recorded_loop(case, law, MAX_SAMPLES)
-    given = _given_states(law, loop, code)
-    gate_events = _gate_events(code, float(loop.times[-1]))
+    period, duration = (float(concrete(x)) for x in (controller.period, case.run.duration))
+    samples = math.floor(duration / period * (1 + 1e-12)) + 1
+    try:
+        text = _translated(case, law, samples, loop.states.shape[1])
+    except (UntranslatedError, jax.errors.JAXTypeError) as error:
+        kind = kind_of(type(controller)) or type(controller).__name__
+        reason = (
+            f"there is no C for {error}"
+            if isinstance(error, UntranslatedError)
+            else "take jaxbeam.runtime.arrays.xp in its step, not numpy"
+        )
+        raise ValueError(f"controller.kind {kind!r} cannot be exported as C: {reason}") from None
+    given = loop.states if text.given_states else np.zeros((len(loop.times), 0))
+    gate_events = _gate_events(gate_times_of(law), float(loop.times[-1]))
     title = _title(case, controller)
     files = {
-        f"{name}.h": header_text(name, title, code),
-        f"{name}.c": source_text(name, title, code),
+        f"{name}.h": header_text(name, title, text),
+        f"{name}.c": source_text(name, title, text),
         f"{name}_samples.h": samples_text(name, loop, given, gate_events),
-        f"{name}_check.c": check_text(name, code, received),
+        f"{name}_check.c": check_text(name, text),
     }
-    return CProgram(files, code.operations, code.state_bytes, code.constant_bytes, len(loop.times))
+    return CProgram(files, text.operations, text.state_bytes, text.constant_bytes, len(loop.times))
 
 
 def write_c(program: CProgram, folder: str | os.PathLike, overwrite: bool = False) -> list[Path]:
@@ -113,132 +137,75 @@ def _designed(case: Case, layout):
     return case.controller.law(state_space(case, layout=layout))
 
 
-def _source(case: Case) -> CSource:
-    """Code that begins with the readings, behind the digital filters of their sensors.
-
-    One that is missing leaves the last in its place, and the filter as it is.
-    """
-    period, duration = (float(concrete(x)) for x in (case.controller.period, case.run.duration))
-    samples = int(np.floor(duration / period * (1 + 1e-12))) + 1
-    code = CSource(len(case.sensors), len(case.actuators), period, samples)
-    at_rest = [to_reading(sensor, 0.0) for sensor in case.sensors]
-    code.state("reading", at_rest, "last readings, behind the digital filters")
-    code.work("present", len(case.sensors), "which of them are new: 1, or 0 for a missing one")
-    commands = len(case.actuators)
-    code.state("acting", np.zeros(commands), "commands that act at the sample", restarts=False)
-    code.work("wanted", commands, "commands of the law, before the limits")
-    filters = filters_in_program(case)
-    if case.sensors:
-        # A reading that comes filtered may be beyond the range of its samples.
-        ranges = [
-            possible_readings(
-                dataclasses.replace(sensor, range=None)
-                if sensor.has_digital_filter and sections is None
-                else sensor
-            )
-            for sensor, sections in zip(case.sensors, filters, strict=True)
-        ]
-        lowest, highest = (
-            code.constant(f"{name}_reading", ends)
-            for name, ends in zip(("lowest", "highest"), np.transpose(ranges), strict=True)
-        )
-        arguments = f"{code.readings}, {code.present}, measurements, {lowest}, {highest}"
-        code.add(f"receive({arguments}, {code.sensors});", 3 * code.sensors)
-    for i, sections in enumerate(filters):
-        if sections is None:
-            continue
-        count = len(sections)
-        start = initial_filter_state(case.sensors[i], sections, 0.0)
-        states = code.state(f"filter_{i}", start, f"states of the filter of sensor {i}")
-        filter, reading = code.constant(f"filter_{i}", sections), f"{code.readings}[{i}]"
-        code.add(
-            f"if ({code.present}[{i}] > 0)\n"
-            f"    {reading} = filter_sample({filter}, {count}, {states}, {reading});",
-            9 * count + 1,
-        )
-    return code
-
-
-def _write_limits(case: Case, code: CSource) -> tuple[str, ...]:
-    """Resolution, limits and rate limits of the commands, and the delay until they act.
-
-    The members of the state that are the last commands as the actuators received them; none where
-    hysteresis or creep of the actuators is compensated, whose states follow from them. Where a
-    number of the law is not finite, it starts again, and the last command of it stays.
-    """
-    actuators, lag = code.actuators, command_lag(case)
-    low, high, rate = (np.asarray(part) for part in command_ranges(case))
-    last = code.state("last_wanted", np.zeros(actuators), "last of these", restarts=False)
-    numbers = sum(member.size for member in code.members.values() if member.restarts)
-    code.add(
-        f"""
-/* A law with a number that is not finite starts again, and its last command stays */
-if (!is_finite(s) || !all_finite({code.output}, {actuators})) {{
-    restart(s);
-    copy({code.output}, {last}, {actuators});
-}}
-copy({last}, {code.output}, {actuators});""",
-        2 * (numbers + actuators),
+def _translated(case: Case, law, samples: int, states: int) -> ProgramText:
+    """Step of a program in C, and what its texts say of it."""
+    program = sampled_program(case, law, samples)
+    start = jax.tree.map(np.asarray, program.start())
+    sensors, actuators = len(program.ranges), len(start.wanted)
+    arguments = start, np.zeros(sensors), np.zeros(states), np.float64(0)
+    closed = without_unused(jax.make_jaxpr(program.step)(*arguments))
+    with_paths, _ = jax.tree_util.tree_flatten_with_path(start)
+    names = with_numbers({path: last_word(path) for path, _ in with_paths})
+    writer = ProgramWriter(named_arrays(jax.tree_util.tree_leaves_with_path(program)))
+    members, given = {}, []
+    for path, leaf in with_paths:
+        kind, place = kind_of_array(leaf), jax.tree_util.keystr(path, simple=True, separator=".")
+        given.append(CArray(kind, leaf.shape, f"s->{names[path]}", False))
+        if leaf.size:
+            members[names[path]] = Member(kind, np.ravel(leaf), place)
+    kept = list(given)
+    given.append(CArray("d", (sensors,), "measurements", False))
+    given.append(CArray("d", (states,), f"(measurements + {sensors})", False))
+    given.append(Word("d", (), "t", False))
+    sent, *after = writer.run(closed, given)
+    writer.line("/* State for the next sample */")
+    _renew(writer, kept, after, None)
+    writer.line("/* Commands */")
+    writer.copy(CArray("d", (actuators,), "commands", False), sent)
+    body = in_single_type("\n".join(writer.lines))
+    notes = []
+    if jax.tree.structure(program.law.law) != jax.tree.structure(law):
+        notes = [f"Tables over time end after {samples} samples; then their last entries hold."]
+    # The last commands as the actuators received them; with compensations the states of these
+    # follow from them.
+    queue, acting = (
+        next(names[path] for path, leaf in with_paths if leaf is part)
+        for part in (start.commands.queue, start.commands.command)
     )
-    zeros, meaning = np.zeros(actuators * lag), "last commands, the latest first"
-    latest = code.state("sent", zeros, meaning, restarts=False)
-    compensation = Compensation(case, code)
-    compensation.write_inverse()
-    code.add("/* Commands as the actuators receive them */")
-    if case.controller.resolution is not None:
-        step = f"(real){float(concrete(case.controller.resolution))!r}"
-        code.add(
-            f"for (i = 0; i < {actuators}; i++)\n"
-            f"    {code.output}[i] = {step} * rint({code.output}[i] / {step});",
-            3 * actuators,
-        )
-    for i in range(actuators):
-        bounds = []
-        if np.isfinite(low[i]):
-            bounds.append((f"(real){float(low[i])!r}", f"(real){float(high[i])!r}", 2))
-        if np.isfinite(rate[i]):
-            change = f"(real){float(rate[i]) * code.period!r}"
-            bounds.append((f"{latest}[{i}] - {change}", f"{latest}[{i}] + {change}", 4))
-        for lower, upper, operations in bounds:
-            code.add(
-                f"{code.output}[{i}] = clamp({code.output}[{i}], {lower}, {upper});", operations
-            )
-    code.add(f"copy(commands, {code.output}, {actuators});")
-    queues, known_queue = [(latest, code.output)], latest
-    if compensation.operators:
-        meaning = "what acts of them, the latest first"
-        known_queue = code.state("known", zeros, meaning, restarts=False)
-        acting = code.work("acts", actuators, "what acts of the commands")
-        compensation.write_model(acting)
-        queues.append((known_queue, acting))
-    for queue, newest in queues:
-        if lag > 1:
-            code.add(
-                f"for (i = {actuators * lag - 1}; i >= {actuators}; i--)"
-                f" {queue}[i] = {queue}[i - {actuators}];"
-            )
-        code.add(f"copy({queue}, {newest}, {actuators});")
-    code.add(f"copy({code.command}, {known_queue} + {actuators * (lag - 1)}, {actuators});")
-    if compensation.operators:
-        return ()
-    return ("sent",) if lag > 1 else ("sent", "acting")
+    received = [queue] if program.begun else [queue, acting]
+    received = [] if start.commands.assumed is not None else received
+    return ProgramText(
+        body,
+        functions_of(body),
+        members,
+        {key: part for key, part in writer.constants.items() if uses(body, key)},
+        sensors,
+        actuators,
+        float(concrete(case.controller.period)),
+        states if closed.jaxpr.invars[-2] in used_variables(closed.jaxpr) else 0,
+        len(gate_times_of(law)),
+        received,
+        operations(closed.jaxpr),
+        writer.stack_bytes,
+        notes,
+        [part.without_reading for part in _parts(law) if hasattr(part, "without_reading")],
+        min(getattr(part, "difference_step", 1.0) for part in _parts(law)),
+    )
 
 
-def _given_states(law, loop: RecordedLoop, code: CSource) -> np.ndarray:
-    """States that the program is given at each sample, none for a law with an estimator."""
-    if not code.given_states:
-        return np.zeros((len(loop.times), 0))
-    law = law.law if isinstance(law, LawOfCommanded) else law
-    assert isinstance(law, SampledStateLaw)
-    filter = law.filter
-    while not isinstance(filter, TrueState):
-        filter = filter.filter
-    return loop.states @ np.asarray(filter.state_map).T
+def _parts(law: Any) -> Iterator[Module]:
+    """A law with all parts of it: filters, sources of the load, laws within."""
+    if isinstance(law, Module):
+        yield law
+        law = [getattr(law, field.name) for field in dataclasses.fields(law)]
+    if isinstance(law, list | tuple):
+        for part in law:
+            yield from _parts(part)
 
 
-def _gate_events(code: CSource, end: float) -> list[tuple[float, int]]:
+def _gate_events(gate_times: np.ndarray, end: float) -> list[tuple[float, int]]:
     """Times (s) up to the end of the run at which gates 0 and 1 are passed, in their order."""
-    events = [(float(t), gate) for gate in (0, 1) for t in code.gate_times[:, gate]]
+    events = [(float(t), gate) for gate in (0, 1) for t in gate_times[:, gate]]
     return sorted(event for event in events if event[0] < min(NEVER, end))
 
 

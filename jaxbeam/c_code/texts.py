@@ -2,45 +2,92 @@
 
 import re
 import textwrap
-from collections.abc import Callable, Sequence
 from importlib.metadata import version
+from typing import NamedTuple
 
-import jax
 import numpy as np
+from jaxtyping import Bool, Num
 
 from jaxbeam.c_code.recorded_loop import RecordedLoop
-from jaxbeam.c_code.source import CSource, array_text
+from jaxbeam.runtime.c_writer import number_text
 
-MIN_COMPILED = 300  # samples from which compilation pays
+REAL_BYTES, INT_BYTES = 8, 4  # in double precision
 
 
-def at_samples(function: Callable, code: CSource, varies: bool = True) -> tuple[np.ndarray, ...]:
-    """Arrays that a function gives at each sample time (s), stacked along a first axis.
+class Member(NamedTuple):
+    """Member of the state: kind of its numbers as in `CArray`, values after a reset, address."""
 
-    A function that does not vary is evaluated once.
+    kind: str
+    start: np.ndarray
+    address: str
+
+
+class ProgramText(NamedTuple):
+    """Step of a program in C with its functions, state and constants, and what is said of it.
+
+    `given_states` is the number of states of the plant that follow the readings among the
+    measurements; `received` are members of the state that have the last commands. Commands by
+    derivatives that are differences agree to rounding over the `difference_step`.
     """
-    times = code.period * np.arange(code.samples if varies else 1)
-    if len(times) >= MIN_COMPILED:
-        return tuple(np.asarray(part) for part in jax.jit(jax.vmap(function))(times))
-    rows = [function(t) for t in times]
-    return tuple(
-        np.stack([np.asarray(part) for part in column]) for column in zip(*rows, strict=True)
-    )
 
+    body: str
+    functions: list[str]
+    members: dict[str, Member]
+    constants: dict[str, np.ndarray]
+    sensors: int
+    actuators: int
+    period: float
+    given_states: int
+    gate_loads: int
+    received: list[str]
+    operations: int
+    stack_bytes: int
+    notes: list[str]
+    missing: list[str]
+    difference_step: float
+
+    @property
+    def state_bytes(self) -> int:
+        """Bytes of the state in double precision."""
+        reals, ints = self._sizes([part.start for part in self.members.values()])
+        ints += 2 * (self.gate_loads > 0)
+        size = REAL_BYTES * reals + INT_BYTES * ints
+        return -(-size // REAL_BYTES) * REAL_BYTES if reals else size
+
+    @property
+    def constant_bytes(self) -> int:
+        """Bytes of the constants in double precision."""
+        reals, ints = self._sizes(self.constants.values())
+        return REAL_BYTES * reals + INT_BYTES * ints
+
+    @staticmethod
+    def _sizes(arrays) -> tuple[int, int]:
+        """Numbers of real and of whole entries."""
+        sizes = [(array.size, array.dtype.kind == "f") for array in arrays]
+        return sum(n for n, real in sizes if real), sum(n for n, real in sizes if not real)
+
+
+BY_PRECISION = """
+#define BY_PRECISION(single, twice) (sizeof(real) < 8 ? (real)(single) : (real)(twice))
+"""
 
 # Of commands, relative to the largest, in double and single precision. Rounding makes ROUNDING and
 # less; filters that invert their sensors and programs with many limits may magnify it.
 ROUNDING, TOLERANCE, FLOAT_TOLERANCE = 1e-12, 1e-10, 1e-2
 
 
-def header_text(name: str, title: list[str], code: CSource) -> str:
+def header_text(name: str, title: list[str], code: ProgramText) -> str:
     """Header: sizes, state, functions, cost."""
     big = name.upper()
     members = [
-        f"    {name}_real {member}[{max(part.size, 1)}]; /* {part.comment} */"
+        f"    {f'{name}_real' if part.kind == 'd' else 'int'} {member}[{part.start.size}];"
+        f" /* {_meaning(part)} */"
+        for part_kind in (True, False)
         for member, part in code.members.items()
+        if (part.kind == "d") == part_kind
     ]
-    members += [f"    int {counter}; /* {comment} */" for counter, comment in code.counters.items()]
+    if code.gate_loads:
+        members.append("    int passages[2]; /* loads that have passed each gate */")
     return f"""{_comment([*title, *_cost_lines(code), *code.notes])}
 #ifndef {big}_H
 #define {big}_H
@@ -77,44 +124,39 @@ void {name}_step({name}_state *s, const {name}_real *measurements, {name}_real t
 """
 
 
-def source_text(name: str, title: list[str], code: CSource) -> str:
+def source_text(name: str, title: list[str], code: ProgramText) -> str:
     """Source: constants, helpers, reset, gate and step."""
-    constants = []
-    for constant, values in code.constants.items():
-        kind = "int" if values.dtype.kind == "i" else "real"
-        constants.append(
-            _wrapped(f"static const {kind} {constant}[] = {{{array_text(values) or '0'}}};")
-        )
-    body = "\n".join(code.lines)
-    indices = [i for i in ("i", "j", "sample") if _uses(body, i)]
-    declared = [f"    int {', '.join(indices)};"] if indices else []
-    declared += [f"    {variable};" for variable in code.variables]
-    unused = [f"    (void){word};" for word in ("measurements", "t") if not _uses(body, word)]
+    constants = [
+        _wrapped(f"static const {_type(values)} {constant}[] = {{{array_text(values)}}};")
+        for constant, values in code.constants.items()
+    ]
+    unused = [f"    (void){word};" for word in ("measurements", "t") if not uses(code.body, word)]
     return f"""{_comment(title)}
 #include "{name}.h"
 
+#include <limits.h>
 #include <math.h>
+#include <stdlib.h>
+#include <string.h>
 
 #ifdef __FAST_MATH__
 #error "missing readings are NaN, which -ffast-math takes for numbers: compile without it"
 #endif
 
 typedef {name}_real real;
-
+{BY_PRECISION if uses(code.body, "BY_PRECISION") else ""}
 {_lines(constants)}
 
-{(chr(10) * 2).join(code.helper_texts())}
+{(chr(10) * 2).join(code.functions)}
 
-{_restart_functions(name, code)}
 void {name}_reset({name}_state *s)
 {{
-{_lines(_reset_lines(code, False))}
-    restart(s);
+{_lines(_reset_lines(code))}
 }}
 {_gate_function(name, code)}
 void {name}_step({name}_state *s, const real *measurements, real t, real *commands)
 {{
-{_lines([*declared, *unused, body])}
+{_lines([*unused, code.body])}
 }}
 """
 
@@ -141,17 +183,16 @@ enum {{ SAMPLES = {len(loop.times)}, GATE_EVENTS = {len(gate_events)} }};
 """
 
 
-def check_text(name: str, code: CSource, received: Sequence[str]) -> str:
+def check_text(name: str, code: ProgramText) -> str:
     """Loop over the recorded samples, which compares the commands with those expected.
 
-    Members `received` of the state have the commands that the actuators received last. They become
-    the recorded ones: a law may be unstable by itself, where only the loop is stable, and would
-    multiply the rounding of its own commands from sample to sample.
+    Those that the state has last become the recorded ones: a law may be unstable by itself, where
+    only the loop is stable, and would multiply the rounding of its own commands.
     """
     big = name.upper()
     receive = "".join(
         f"\n            state.{member}[i] += ({name}_real)(expected - (double)commands[i]);"
-        for member in received
+        for member in code.received
     )
     if receive:
         receive = (
@@ -206,17 +247,18 @@ int main(void)
 """
 
 
-def _cost_lines(code: CSource) -> list[str]:
+def _cost_lines(code: ProgramText) -> list[str]:
     return [
         f"Written by jaxbeam {version('jaxbeam')}; C99, fixed memory, no library but math.h.",
         f"Cost of a step at worst: {code.operations} additions, multiplications, divisions,",
         "comparisons and functions of math.h.",
         f"Memory in double precision: {code.state_bytes} bytes of state,"
-        f" {code.constant_bytes} bytes of constants.",
+        f" {code.constant_bytes} bytes of constants,",
+        f"{code.stack_bytes} bytes of intermediate results on the stack at most.",
     ]
 
 
-def _measurements(code: CSource) -> str:
+def _measurements(code: ProgramText) -> str:
     """What the measurements are, as a sentence."""
     text = f"Measurements are the readings of the sensors ({code.sensors}), in SI units"
     if code.given_states:
@@ -226,7 +268,7 @@ def _measurements(code: CSource) -> str:
     return text + "."
 
 
-def _gate_prototype(name: str, code: CSource) -> str:
+def _gate_prototype(name: str, code: ProgramText) -> str:
     if not code.gate_loads:
         return ""
     return f"""
@@ -235,7 +277,7 @@ void {name}_gate({name}_state *s, int gate, {name}_real t);
 """
 
 
-def _gate_function(name: str, code: CSource) -> str:
+def _gate_function(name: str, code: ProgramText) -> str:
     """Function that notes the passage of a gate; the oldest load makes room for a new one."""
     if not code.gate_loads:
         return ""
@@ -243,37 +285,15 @@ def _gate_function(name: str, code: CSource) -> str:
 void {name}_gate({name}_state *s, int gate, real t)
 {{
     int load;
-    if (!all_finite(&t, 1)) return;
-    load = (gate ? s->passages_2++ : s->passages_1++) % {code.gate_loads};
+    if (!(t - t == 0)) return;
+    load = s->passages[gate]++ % {code.gate_loads};
     s->gate_times[2 * load + gate] = t;
-    if (gate) return;
-    {" ".join(["s->gate_times[2 * load + 1] = (real)1e30;", *code.first_gate_lines])}
+    if (!gate) s->gate_times[2 * load + 1] = (real)1e30;
 }}
 """
 
 
-def _restart_functions(name: str, code: CSource) -> str:
-    """Functions that set the law to its start, and say whether all its numbers are finite."""
-    restarting = [
-        f"all_finite(s->{key}, {part.size})"
-        for key, part in code.members.items()
-        if part.restarts and part.size
-    ]
-    separator, unused = "\n        && ", [] if restarting else ["    (void)s;"]
-    return f"""/* Start of the law: what is set from outside, and commands on their way, stay. */
-static void restart({name}_state *s)
-{{
-{_lines([*unused, *_reset_lines(code, True)])}
-}}
-
-static int is_finite(const {name}_state *s)
-{{
-{_lines([*unused, f"    return {separator.join(restarting or ['1'])};"])}
-}}
-"""
-
-
-def _missing_lines(code: CSource) -> str:
+def _missing_lines(code: ProgramText) -> str:
     """What a step does where a reading is missing, as lines of a comment."""
     sentences = [
         "A reading that is no number, or outside the range of its sensor, is missing: give NAN for"
@@ -286,22 +306,36 @@ def _missing_lines(code: CSource) -> str:
     return textwrap.fill(" ".join(sentences), 97, initial_indent="   ", subsequent_indent="   ")
 
 
-def _reset_lines(code: CSource, restarts: bool) -> list[str]:
-    """Statements that set the state to its start: what restarts, or all else."""
+def _reset_lines(code: ProgramText) -> list[str]:
+    """Statements that set the state to its start."""
     lines, loops = [], False
-    members = {key: part for key, part in code.members.items() if part.restarts == restarts}
-    for name, part in members.items():
-        start = np.zeros(part.size) if part.start is None else part.start
-        if part.size and np.all(start == start[0]) and part.size > 2:
+    for name, part in code.members.items():
+        values = array_text(part.start).split(", ")
+        if len(values) > 2 and len(set(values)) == 1:
             loops = True
-            value = array_text(start[:1])
-            lines.append(f"    for (i = 0; i < {part.size}; i++) s->{name}[i] = {value};")
+            lines.append(f"    for (i = 0; i < {len(values)}; i++) s->{name}[i] = {values[0]};")
         else:
-            lines += [
-                f"    s->{name}[{i}] = {array_text(start[i : i + 1])};" for i in range(part.size)
-            ]
-    lines += [] if restarts else [f"    s->{name} = 0;" for name in code.counters]
-    return ["    int i;", *lines] if loops else lines
+            lines += [f"    s->{name}[{i}] = {value};" for i, value in enumerate(values)]
+    if code.gate_loads:
+        lines.append("    s->passages[0] = s->passages[1] = 0;")
+    return ["    int i;", *lines] if loops else lines or ["    (void)s;"]
+
+
+def _type(values: np.ndarray) -> str:
+    return "real" if values.dtype.kind == "f" else "int"
+
+
+def _meaning(part: Member) -> str:
+    """What a member of the state is, by its address in the state of the program."""
+    if part.address.startswith("settings."):
+        return f"{part.address.removeprefix('settings.')}; settable"
+    return part.address
+
+
+def array_text(values: Num[np.ndarray, "*entry"] | Bool[np.ndarray, "*entry"]) -> str:
+    """Numbers of an array in C, separated by commas; exact in double precision."""
+    kind = int if values.dtype.kind in "iub" else float
+    return ", ".join(map(number_text, np.ravel(values).astype(kind).tolist()))
 
 
 def _comment(lines: list[str]) -> str:
@@ -313,7 +347,7 @@ def _lines(lines) -> str:
     return "\n".join(lines)
 
 
-def _uses(body: str, word: str) -> bool:
+def uses(body: str, word: str) -> bool:
     """Whether statements use a variable."""
     return re.search(rf"\b{word}\b", body) is not None
 

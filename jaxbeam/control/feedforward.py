@@ -53,6 +53,8 @@ class Prescribed(AbstractStaticController):
     1.131 mm
     """
 
+    without_reading: ClassVar[str] = "No reading is used."
+
     kind: ClassVar[str] = "prescribed"
     open_loop: ClassVar[bool] = True
 
@@ -210,6 +212,8 @@ class Feedforward(AbstractController):
 class FeedforwardLaw(AbstractSampledLaw):
     """Table of commands and the times (s) at which each load passes the two gates."""
 
+    without_reading: ClassVar[str] = "No reading is used."
+
     gates: Float[Array, "2"]
     shares: Float[Array, " breakpoint"]
     values: Float[Array, "actuator breakpoint"]
@@ -244,6 +248,8 @@ class ConfirmedFeedforwardLaw(FeedforwardLaw):
     since its second gate, within the first CONFIRMATION_SHARE of its crossing; a missing reading
     shows nothing.
     """
+
+    without_reading: ClassVar[str] = "It shows no load."
 
     confirmation: Float[Array, ""]
     sensors: tuple[int, ...] = eqx.field(static=True)

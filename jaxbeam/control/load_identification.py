@@ -8,7 +8,7 @@ In a simulation the gate times are computed from the trajectory of the load.
 """
 
 import abc
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -90,6 +90,10 @@ class AbstractLoadIdentifier(AbstractLoadSource):
     samples are used. Samples at which a deflection is missing are left out.
     """
 
+    without_reading: ClassVar[str] = (
+        "Samples at which a deflection is missing do not identify the load."
+    )
+
     length: Float[Array, ""]
     gravity: Float[Array, ""]
     influence_lines: Float[Array, "sensor position"]
@@ -134,6 +138,10 @@ class GateIdentifier(AbstractLoadIdentifier):
 
     def initial_state(self):
         return xp.zeros(2)
+
+    def update(self, state, measurement, t):
+        # Each load that passes the first gate begins new sums.
+        return super().update(xp.where(t < self.gate_times[1], 0.0, state), measurement, t)
 
     @property
     def speed(self) -> Float[Array, ""]:

@@ -1,7 +1,7 @@
 """Filters of plants that vary while loads cross, of known loads and of loads that they follow."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from jaxbeam.model.contact import mass_contact_rows
 from jaxbeam.model.linear_system import Signal, StateSpace
 from jaxbeam.model.sensing.output_rows import OutputRows
 from jaxbeam.numerics.matrices import symmetric_part
-from jaxbeam.runtime.arrays import Array, add_at, take, xp
+from jaxbeam.runtime.arrays import Array, add_at, scan, take, xp
 
 Square = Float[Array, "state state"]
 
@@ -55,8 +55,13 @@ class CrossingFilter(AbstractSampledFilter):
     The first `plant_states` states x are those of the plant; those of analogue filters follow, of
     the vehicles, the weights of the loads, and those of the sensors (see `sensor_chain`). `scale`
     is the size of the states before those of the sensors, `noise_intensity` that of the white noise
-    in their rates. A `table` has what `model_at` returns at all samples.
+    in their rates. A `table` has what `model_at` returns at all samples, `gains` those at all
+    samples, with which the covariance of a state stays what it was.
     """
+
+    without_reading: ClassVar[str] = (
+        "The estimate is predicted by the model, and not corrected by it."
+    )
 
     filtered: FilteredPlant
     sensor_chain: SensorChain
@@ -67,12 +72,26 @@ class CrossingFilter(AbstractSampledFilter):
     plant_states: int = eqx.field(static=True)
     estimates_weights: bool = eqx.field(static=True)
     table: SampleModel | None = None
+    gains: Float[Array, "sample state sensor"] | None = None
 
     def initial_state(self):
         commands = self.filtered.plant.commands
         return FilterState(self.initial, self.initial_covariance, xp.zeros(commands))
 
     def tabulated(self, times):
+        filter, noise = self.with_models(times), self.sensor_chain.noise_covariance
+
+        def step(covariance, model):
+            transition, C, _ = model
+            gain, after = corrected(transition.predict_covariance(covariance), C, noise)
+            return after, gain
+
+        gains = scan(step, self.initial_covariance, filter.table)[1]
+        return dataclasses.replace(filter, gains=gains)
+
+    def with_models(self, times: Float[Array, " sample"]) -> "CrossingFilter":
+        """The filter with a table of its models at all samples (s)."""
+
         def block(first, number):
             return self.model_at(times[first : first + number])
 
@@ -107,8 +126,11 @@ class CrossingFilter(AbstractSampledFilter):
 
     def update(self, state, measurement, t):
         prediction = self.predict(state, measurement.command, t)
-        noise = self.sensor_chain.noise_covariance
-        gain, covariance = corrected(prediction.covariance, prediction.C, noise)
+        noise, covariance = self.sensor_chain.noise_covariance, state.covariance
+        if self.gains is None:
+            gain, covariance = corrected(prediction.covariance, prediction.C, noise)
+        else:
+            gain = take(self.gains, self.sensor_chain.timing.sample_at(t))
         x = prediction.x + gain @ measurement.innovation(prediction.readings)
         return self.estimate(x, t), FilterState(x, covariance, measurement.command)
 
@@ -158,6 +180,11 @@ class LoadFollowingFilter(AbstractSampledFilter):
     the beam: 1, or 0 for a force. `scale` and `noise_intensity` are those of the states before the
     sensors.
     """
+
+    without_reading: ClassVar[str] = (
+        "The estimate is predicted by the model, and not corrected by it."
+    )
+    difference_step: ClassVar[float] = 1e-4  # of its derivatives, relative
 
     filtered: FilteredPlant
     output_rows: OutputRows

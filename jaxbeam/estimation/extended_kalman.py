@@ -20,7 +20,7 @@ from jaxbeam.numerics.discretisation import balance
 from jaxbeam.runtime.arrays import Array, Number, set_at, xp
 
 # Of length, speed and mass of the design; over these derivatives are differences.
-DIFFERENCE_STEP = 1e-4
+DIFFERENCE_STEP = LoadFollowingFilter.difference_step
 
 
 class ExtendedKalman(AbstractKalmanEstimator):

@@ -127,6 +127,8 @@ class InversionFilter(AbstractSampledFilter):
     period, None if there are none.
     """
 
+    without_reading: ClassVar[str] = "The estimate stays while a deflection is missing."
+
     mode_shape_inverse: Float[Array, "mode sensor"]
     difference_gain: Float[Array, ""]
     period: Float[Array, ""]

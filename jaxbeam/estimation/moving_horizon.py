@@ -14,6 +14,7 @@ import dataclasses
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -26,7 +27,7 @@ from jaxbeam.estimation.sampled_plant import Transition
 from jaxbeam.model.sensing.output_rows import modal_row
 from jaxbeam.numerics.matrices import symmetric_part
 from jaxbeam.numerics.qp import solve_qp
-from jaxbeam.runtime.arrays import Array, Number, cholesky, solve_triangular, xp
+from jaxbeam.runtime.arrays import Array, Number, cholesky, scan, solve_triangular, take, xp
 
 RIDGE = 1e-10  # added to correlations, which the deflections of a window make singular
 
@@ -60,8 +61,13 @@ class WindowFilter(AbstractSampledFilter):
 
     `rows` give the bounded deflections (m) from the states; they are bounded by `deflection_limit`
     in the last `window` samples, the present one included. `weight_rows` give the weights (N).
-    Missing readings are those of the `filter`.
+    Missing readings are those of the `filter`. A `table` has gains and factors at all samples, with
+    which the covariance of a state stays what it was.
     """
+
+    without_reading: ClassVar[str] = (
+        "The estimate is predicted by the model, and not corrected by it."
+    )
 
     filter: CrossingFilter
     rows: Float[Array, "deflection state"]
@@ -70,6 +76,7 @@ class WindowFilter(AbstractSampledFilter):
     min_weight: Float[Array, ""]
     max_weight: Float[Array, ""]
     window: int = eqx.field(static=True)
+    table: tuple[Float[Array, "sample joint sensor"], BoundFactor | None] | None = None
 
     @property
     def earlier(self) -> int:
@@ -84,7 +91,21 @@ class WindowFilter(AbstractSampledFilter):
         )
 
     def tabulated(self, times):
-        return dataclasses.replace(self, filter=self.filter.tabulated(times))
+        filter, noise = self.filter.with_models(times), self.filter.sensor_chain.noise_covariance
+
+        def step(covariance, model):
+            matrix, own, rows = self.joint(model[0], model[1])
+            covariance = symmetric_part(matrix @ covariance @ matrix.T + own)
+            gain, covariance = corrected(covariance, rows, noise)
+            factor = self.factor(covariance) if self._bounded else None
+            return covariance, (gain, factor)
+
+        start = self.initial_state().covariance
+        return dataclasses.replace(self, filter=filter, table=scan(step, start, filter.table)[1])
+
+    @property
+    def _bounded(self) -> bool:
+        return bool(self.rows.shape[0] or self.weight_rows.shape[0])
 
     def update(self, state, measurement, t):
         command = measurement.command
@@ -92,11 +113,18 @@ class WindowFilter(AbstractSampledFilter):
         matrix, noise, rows = self.joint(transition, C)
         x = transition.predict(state.mean[: C.shape[-1]], state.command, command)
         mean = xp.concatenate([x, matrix[C.shape[-1] :] @ state.mean])
-        covariance = symmetric_part(matrix @ state.covariance @ matrix.T + noise)
         readings = C @ x + D @ command + sensor_offsets(self.filter.filtered.plant)
-        gain, covariance = corrected(covariance, rows, self.filter.sensor_chain.noise_covariance)
+        covariance = state.covariance
+        if self.table is None:
+            own = self.filter.sensor_chain.noise_covariance
+            covariance = symmetric_part(matrix @ covariance @ matrix.T + noise)
+            gain, covariance = corrected(covariance, rows, own)
+            factor = self.factor(covariance) if self._bounded else None
+        else:
+            sample = self.filter.sensor_chain.timing.sample_at(t)
+            gain, factor = jax.tree.map(lambda part: take(part, sample), self.table)
         mean = mean + gain @ measurement.innovation(readings)
-        within = self._within_bounds(mean, covariance)[: C.shape[-1]]
+        within = self._within_bounds(mean, factor)[: C.shape[-1]]
         return self.filter.estimate(within, t), WindowState(mean, covariance, command)
 
     def joint(
@@ -143,13 +171,12 @@ class WindowFilter(AbstractSampledFilter):
         )
         return BoundFactor(size, root, columns.T, certain)
 
-    def _within_bounds(self, mean: Float[Array, " joint"], covariance: Joint):
+    def _within_bounds(self, mean: Float[Array, " joint"], factor: BoundFactor | None):
         """Most probable point within the bounds; the mean where none is found."""
         rows, lowest, highest = self.bounds()
-        count = rows.shape[0]
-        if not count:
+        count, numbers = rows.shape[0], rows @ mean
+        if factor is None:
             return mean
-        factor, numbers = self.factor(covariance), rows @ mean
         M = xp.concatenate([factor.root, -factor.root])
         sides = xp.concatenate(
             [(highest - numbers) / factor.size, (numbers - lowest) / factor.size]

@@ -27,6 +27,10 @@ class ConstantGainFilter(AbstractSampledFilter):
     state of the filter is x and the command of the last sample.
     """
 
+    without_reading: ClassVar[str] = (
+        "The estimate is predicted by the model, and not corrected by it."
+    )
+
     transition: Transition
     C: Float[Array, "sensor state"]
     D: Float[Array, "sensor actuator"]

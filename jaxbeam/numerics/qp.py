@@ -47,7 +47,14 @@ SMOOTHING = 1e-18
 MAX_STEPS = 100  # of the interior-point method
 STEPS_BEFORE_CENTRING = 20  # after these every other step is a pure centring step
 MAX_SWEEPS = 20000  # of Hildreth's procedure
-DUAL_REGULARISATION = 1e-12  # of the multipliers in a step, for linearly dependent rows
+DUAL_REGULARISATION = 2e-12  # of the multipliers in a step, for linearly dependent rows
+SINGLE_PRECISION = {  # what takes the place of these in programs of single precision
+    TOLERANCE: 2e-5,
+    HILDRETH_TOLERANCE: 1e-6,
+    LIMIT_ROUNDING: 1e-6,
+    MAX_DISTANCE: 1e4,
+    DUAL_REGULARISATION: 1e-7,
+}
 
 Rows = Float[Array, "row variable"]
 

@@ -404,8 +404,6 @@ def _cholesky(writer: Writer, params, values, outs):
 
 def _triangular(writer: Writer, params, values, outs):
     (matrix, right), (_, shape) = values, outs[0]
-    if params["unit_diagonal"]:
-        raise UntranslatedError("triangular_solve of unit diagonals")
     varying = matrix.varying or right.varying
     found, size = writer.declare("d", shape, varying), matrix.shape[-1]
     writer.copy(found, right)
@@ -416,12 +414,31 @@ def _triangular(writer: Writer, params, values, outs):
     name = "eliminates" if varying else "eliminate"
     # X A = B is A' X' = B'.
     transposed, lower = transposed != (not left), params["lower"]
+    unit = params["unit_diagonal"]
     steps = (columns, 1, columns) if left else (1, columns, rows)
     for batch in range(found.size // (rows * columns)):
         arguments = f"{found.name} + {batch * rows * columns}, {steps[0]}, {steps[1]}, {steps[2]}"
         own = f"{matrix.name} + {batch * size * size}, {size}"
-        writer.line(f"{name}({arguments}, {own}, {int(lower)}, {int(transposed)});")
+        writer.line(f"{name}({arguments}, {own}, {int(lower)}, {int(transposed)}, {int(unit)});")
     return found
+
+
+def _lu(writer: Writer, params, values, outs):
+    """Triangular factors, rows that were swapped, and the order of the rows, run by run."""
+    value, size = values[0], outs[0][1][-1]
+    found = writer.declare("d", outs[0][1], value.varying)
+    swapped, order = (writer.declare("i", shape, value.varying) for _, shape in outs[1:])
+    writer.copy(found, value)
+    with writer.lanes(value.varying) as (lane,):
+        for matrix in range(found.size // size**2):
+            parts = (found, "Lane", size**2), (order, "Place", size), (swapped, "Place", size)
+            rows = [f"{one.name} + {matrix * step}" for one, _, step in parts]
+            if value.varying:
+                kinds = [kind for _, kind, _ in parts]
+                rows = [f"({k} *)({r}) + {lane}" for k, r in zip(kinds, rows, strict=True)]
+            step = "REGISTER_WIDTH" if value.varying else "1"
+            writer.line(f"decompose({', '.join(rows)}, {size}, {step});")
+    return [found, swapped, order]
 
 
 def _platform(writer: Writer, params, values, outs):
@@ -464,6 +481,7 @@ ARRAY_RULES: dict[str, Callable] = {
     "sort": _sort,
     "cholesky": _cholesky,
     "triangular_solve": _triangular,
+    "lu": _lu,
     "platform_index": _platform,
 }
 
@@ -541,7 +559,9 @@ def _scan(writer: Writer, params, values, outs):
     ]
     i, at = writer.new_name("i"), writer.new_name("a")
     with writer.block(f"for (int64_t {i} = 0; {i} < {length}; {i}++)"):
-        writer.line(f"const int64_t {at} = {f'{length} - 1 - {i}' if params['reverse'] else i};")
+        if inputs or stacked:
+            place = f"{length} - 1 - {i}" if params["reverse"] else i
+            writer.line(f"const int64_t {at} = {place};")
         here = [row._replace(name=f"({row.name} + {at} * {row.size})") for row in rows]
         found = writer.run(body, [*fixed, *carry, *here])
         for to, value in zip(stacked, found[carried:], strict=True):

@@ -81,7 +81,16 @@ class Writer:
 
     @contextmanager
     def loops(self, shape: Sequence[Any]) -> Iterator[list[str]]:
-        """Loops over all indices of a shape, whose names are given; 0 along an axis of length 1."""
+        """Loops over all indices of a shape, whose names are given; 0 along an axis of length 1.
+
+        Nothing is written where there are no indices.
+        """
+        lines = self.lines
+        if 0 in shape:
+            self.lines = []
+            yield ["0"] * len(shape)
+            self.lines = lines
+            return
         names = [self.new_name("i") if size != 1 else "0" for size in shape]
         used = [(name, size) for name, size in zip(names, shape, strict=True) if name != "0"]
         for name, size in used:
@@ -95,7 +104,8 @@ class Writer:
     def declare(self, kind: str, shape: Sequence[int], varying: bool) -> CArray:
         """A new array."""
         value = CArray(kind, tuple(shape), self.new_name(), varying)
-        self.line(f"{value.type} {value.name}[{max(value.size, 1)}];")
+        if value.size:
+            self.line(f"{value.type} {value.name}[{value.size}];")
         return value
 
     def copy(self, to: CArray, source: CArray) -> None:

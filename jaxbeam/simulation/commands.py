@@ -8,7 +8,7 @@ from jaxtyping import Float
 from jaxbeam.case.actuators.hysteresis import Creep, Hysteresis
 from jaxbeam.case.case import Case
 from jaxbeam.model.sensing.sensor_signals import ROUNDED
-from jaxbeam.runtime.arrays import Array, not_differentiated, stop_gradient, take, xp
+from jaxbeam.runtime.arrays import Array, is_jax, not_differentiated, stop_gradient, take, xp
 from jaxbeam.runtime.module import Module
 
 CommandRanges = tuple[Float[Array, " actuator"], ...]
@@ -246,6 +246,8 @@ class CommandPath(Module):
         """Memory after the command of an age in the queue begins; none where it is negative."""
 
         def present(queue, last):
+            if not is_jax(age):
+                return queue[age] if age >= 0 else last
             return xp.where(age >= 0, take(queue, xp.maximum(age, 0)), last)
 
         command, assumed = present(memory.queue, memory.command), memory.assumed

@@ -56,7 +56,7 @@ void process_event(const void *const *inputs, int64_t event, double time, Regist
 """
 
 MAX_DESIGNS = 64  # laws of more batches are sooner designed by one program
-LOOP_HEADERS = "registers.h", "translated.h"
+LOOP_HEADERS = "registers.h", "translated.h", "algebra.h", "decompose.h"
 GROUP_RUNS = 4096  # whose inputs are made at once; those of 512 take as long
 
 

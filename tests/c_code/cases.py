@@ -296,14 +296,12 @@ CASES = {
 GATES = LoadIdentification(gates=[-0.05, 0.05])
 CASES["table"] = rig(GivenTables(period=PERIOD))
 CASES["family"] = rig(GivenTables(family=True, identification=GATES, period=3 * PERIOD))
-CASES["position"] = rig(GivenTables(family=True, period=3 * PERIOD), loads=TWO_LOADS)
-CASES["position-followed"] = rig(
-    FollowedPositions(period=3 * PERIOD),
-    loads=[
-        jb.MovingMass(mass=0.4, speed=2.4, entry_time=0.021),
-        jb.MovingMass(mass=0.2, speed=2.9, entry_time=0.1),
-    ],
-)
+BETWEEN_SAMPLES = [  # loads that enter and leave between samples, where rounding decides nothing
+    jb.MovingMass(mass=0.4, speed=2.4, entry_time=0.021),
+    jb.MovingMass(mass=0.2, speed=2.9, entry_time=0.1),
+]
+CASES["position"] = rig(GivenTables(family=True, period=3 * PERIOD), loads=BETWEEN_SAMPLES)
+CASES["position-followed"] = rig(FollowedPositions(period=3 * PERIOD), loads=BETWEEN_SAMPLES)
 CASES["nearest"] = rig(
     GivenTables(family=True, nearest=True, identification=GATES, period=3 * PERIOD)
 )
@@ -315,7 +313,7 @@ CASES["mpc-varying"] = rig(
 )
 CASES["mpc-estimated"] = rig(
     VaryingMPC(settings=jb.MPC(3, 1, 1e-10, estimator=ESTIMATED, period=PERIOD), period=PERIOD),
-    **SHORT,
+    **SHORT | {"loads": [jb.MovingMass(mass=0.4, speed=14.5)]},  # leaves between samples
 )
 
 # Their designs compile for seconds.

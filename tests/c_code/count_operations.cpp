@@ -16,10 +16,13 @@ struct counted {
 #define BINARY(result, symbol) \
     friend result operator symbol(counted x, counted y) { return operations++, x.value symbol y.value; }
     BINARY(counted, +) BINARY(counted, -) BINARY(counted, *) BINARY(counted, /)
-    BINARY(bool, <) BINARY(bool, >) BINARY(bool, <=) BINARY(bool, >=)
+    BINARY(bool, <) BINARY(bool, >) BINARY(bool, <=) BINARY(bool, >=) BINARY(bool, ==) BINARY(bool, !=)
 #define UNARY(name) \
     friend counted name(counted x) { return operations++, std::name(x.value); }
-    UNARY(fabs) UNARY(sqrt) UNARY(exp) UNARY(sin) UNARY(rint)
+    UNARY(fabs) UNARY(sqrt) UNARY(exp) UNARY(sin) UNARY(cos) UNARY(tan) UNARY(log) UNARY(sinh)
+    UNARY(cosh) UNARY(tanh) UNARY(expm1) UNARY(log1p) UNARY(floor) UNARY(ceil) UNARY(rint)
+    friend counted pow(counted x, counted y) { return operations++, std::pow(x.value, y.value); }
+    friend counted fmod(counted x, counted y) { return operations++, std::fmod(x.value, y.value); }
 };
 long counted::operations = 0;
 

@@ -11,6 +11,16 @@ static const double lowest[] = LOWEST, highest[] = HIGHEST;
 
 enum { INPUTS = LAW_SENSORS + LAW_GIVEN_STATES, FIRST = SAMPLES / 8, LAST = SAMPLES / 4 };
 
+/* The numbers of the law come first in its state, its whole numbers after them. */
+static int is_finite(const law_state *s, const real *commands)
+{
+    const real *numbers = (const real *)s;
+    int i, finite = 1;
+    for (i = 0; i < NUMBERS; i++) finite = finite && numbers[i] - numbers[i] == 0;
+    for (i = 0; i < LAW_COMMANDS; i++) finite = finite && commands[i] - commands[i] == 0;
+    return finite;
+}
+
 static void step(law_state *s, int k, int faulty, real *commands)
 {
     const real faults[] = {NAN, INFINITY, (real)-1e35, (real)WILD};
@@ -43,7 +53,7 @@ int main(void)
         for (k = round ? SAMPLES - 1 : 0; k < SAMPLES; k++) {
             step(&right, k, 0, expected);
             step(&wrong, k, round == 0 && k >= FIRST && k < LAST, commands);
-            if (!is_finite(&wrong) || !all_finite(commands, LAW_COMMANDS)) {
+            if (!is_finite(&wrong, commands)) {
                 printf("sample %d: not finite\n", k);
                 return 1;
             }

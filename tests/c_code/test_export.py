@@ -12,11 +12,11 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.c_code import export_c, write_c
-from jaxbeam.c_code.writers import write_law
 from jaxbeam.case.controller import AbstractController, AbstractSampledLaw, ControlStep
 from jaxbeam.cli import main
 from jaxbeam.cli.commands.export import PROGRAM_FILES
 from jaxbeam.control.feedback import Feedback
+from jaxbeam.runtime.arrays import while_loop, xp
 from tests.c_code.cases import CASES, PERIOD, rig
 
 COMPILER = shutil.which("cc") or shutil.which("gcc")
@@ -72,11 +72,19 @@ def test_files_are_not_overwritten(program, tmp_path):
     assert not (tmp_path / "gates.c").exists()
 
 
-class Unknown(AbstractController):
-    """Controller whose law has no C code."""
+class Endless(AbstractController):
+    """Controller whose law may turn for ever."""
 
     def design_law(self, plant):
-        return self
+        return EndlessLaw()
+
+
+class EndlessLaw(AbstractSampledLaw):
+    """Halves the reading until it is small."""
+
+    def step(self, state, measurement, t):
+        halved = while_loop(lambda y: y > 1e-9, lambda y: y / 2, measurement.readings[0])
+        return ControlStep(xp.stack([halved, halved]), state)
 
 
 class LagLaw(AbstractSampledLaw):
@@ -90,7 +98,7 @@ class LagLaw(AbstractSampledLaw):
     def step(self, state, measurement, t):
         reading = measurement.readings[0]
         wanted = -1e4 * (self.share * reading + (1 - self.share) * state)
-        return ControlStep(np.stack([wanted, 0 * wanted]), reading)
+        return ControlStep(xp.stack([wanted, 0 * wanted]), reading)
 
 
 class Lag(AbstractController):
@@ -100,20 +108,8 @@ class Lag(AbstractController):
         return LagLaw(np.asarray(0.75))
 
 
-@write_law.register
-def _(law: LagLaw, code) -> None:
-    share, before = code.constant("share", law.share), code.state("before", 0.0, "last reading")
-    code.constant("unused", []), code.constant("ends", [-np.inf, np.inf])
-    code.add(
-        f"{code.output}[0] = -1e4 * ({share} * {code.readings}[0] + (1 - {share}) * {before});\n"
-        f"{code.output}[1] = 0 * unused[0];\n"
-        f"if (ends[0] < ends[1]) {before} = {code.readings}[0];",
-        8,
-    )
-
-
 @pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
-def test_constants_and_states_of_one_number_and_of_none(tmp_path):
+def test_a_law_of_ones_own_needs_no_code_in_c(tmp_path):
     write_c(export_c(rig(Lag(period=PERIOD)), "law"), tmp_path)
     assert COMPILER is not None
     build = [COMPILER, "-std=c99", "-Wall", "-Werror", "-o", "check", "law.c", "law_check.c", "-lm"]
@@ -145,11 +141,8 @@ def test_header_says_what_happens_without_a_reading():
 REFUSED = {
     "controller is missing": dataclasses.replace(FEEDFORWARD, controller=None),
     "controller.period is missing": rig(Feedback([1.0, 1.0])),
-    "controller.kind 'Unknown' cannot be exported as C: there is no code for its Unknown": rig(
-        Unknown(period=PERIOD)
-    ),
-    "no code for 'kalman-extended' with delays or digital filters of sensors": rig(
-        CASES["kalman-extended"].controller, sensors=[jb.Sensor(0.2), jb.Sensor(0.4, delay=1e-3)]
+    "kind 'Endless' cannot be exported as C: there is no C for a loop without a largest": rig(
+        Endless(period=PERIOD)
     ),
     "the closed loop diverges": rig(jb.OutputFeedback([[0, 0, 1e6], [0, 0, 1e6]], period=PERIOD)),
 }

@@ -105,7 +105,8 @@ def replayed(kind: str, program: CProgram, folder: Path, *options) -> tuple[floa
         for i, sign in enumerate("-+")
     )
     gated = ["-DGATED"] * ("law_gate(" in program.files["law.h"])
-    ends = f"-DLOWEST={{{lowest}}}", f"-DHIGHEST={{{highest}}}"
+    sizes = re.findall(r"^    law_real \w+\[(\d+)\];", program.files["law.h"], re.M)
+    ends = f"-DLOWEST={{{lowest}}}", f"-DHIGHEST={{{highest}}}", f"-DNUMBERS={sum(map(int, sizes))}"
     difference, largest = map(
         float, built(program, folder, *options, *gated, *ends, FAULTS).split()
     )

@@ -239,7 +239,7 @@ BY_THEMSELVES = (
     "jaxbeam.runtime.",
     "jaxbeam.library.",
     "jaxbeam.benchmark.",  # of the package
-    "jaxbeam.c_code.source",
+    "jaxbeam.c_code.translation",
     "jaxbeam.analysis.assessment.assessment",
     "jaxbeam.app.server",  # of the package
     "jaxbeam.app.take_away",  # what it wrote into a temporary folder

@@ -124,7 +124,8 @@ def test_the_file_name_depends_on_all_headers_of_the_integrator(monkeypatch):
     monkeypatch.undo()
     folder, library = native_library.C_FOLDER, native_peaks.LIBRARY
     files = sorted(path.name for path in folder.iterdir())
-    files.remove("translated.h")  # of translated programs
+    for name in ("translated.h", "algebra.h", "decompose.h"):  # of translated programs
+        files.remove(name)
     assert files == sorted(library.sources + library.headers)
     texts = [(folder / name).read_text() for name in files]
     assert set(re.findall(r'#include "(\w+\.h)"', "".join(texts))) == set(library.headers)

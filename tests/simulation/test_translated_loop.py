@@ -23,7 +23,7 @@ pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler h
 
 SANITIZED = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 EVENTS = 40
-REFUSED = {"kalman-extended": "accelerations", "mpc-unconstrained": "lu"}
+REFUSED = {"kalman-extended": "accelerations"}
 
 
 def loop_of(case):

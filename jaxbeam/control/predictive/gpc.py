@@ -381,6 +381,10 @@ class AdaptiveState(NamedTuple):
 class AdaptiveGPCLaw(AbstractSampledLaw):
     """Self-tuning law: the gains are those of the model identified so far."""
 
+    without_reading: ClassVar[str] = (
+        "Identification pauses while one is missing or among the past readings."
+    )
+
     start: Float[Array, " parameter"]
     start_root: Square
     forgetting: Float[Array, ""]

@@ -1,0 +1,384 @@
+"""C99 of a program of JAX for one run: constants by name, no vectors, the cost at worst.
+
+`jaxbeam.runtime.c_translation` has the rules; here is what a program for a real-time system needs
+beyond them.
+"""
+
+import math
+import re
+import textwrap
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jax.interpreters.partial_eval import dce_jaxpr
+
+from jaxbeam.numerics.qp import SINGLE_PRECISION
+from jaxbeam.runtime.c_translation import Translation
+from jaxbeam.runtime.c_writer import (
+    CArray,
+    UntranslatedError,
+    elementwise,
+    kind_of,
+    number_text,
+)
+from jaxbeam.runtime.interpreter import OPENED
+from jaxbeam.runtime.native_library import C_FOLDER
+
+WIDTH = 100  # of the lines of C
+INDEX = "#"  # stands for the index in the form of an expression
+QUADRATIC_PROGRAMS = "numerics/qp"  # whose tolerances depend on the precision
+PACKAGE = str(Path(__file__).parents[1])
+MACHINERY = str(Path(__file__).parents[1] / "runtime")
+BY_POINTER = {"cholesky", "triangular_solve", "lu", "scan"}  # rules that take addresses of inputs
+BY_PLACE = {"gather", "dynamic_slice"}  # that read their first input at places that are computed
+ELEMENTWISE_FREE = {  # that only move numbers, or are of truths and whole numbers
+    *("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "slice", "rev"),
+    *("concatenate", "stack", "tile", "pad", "split", "iota", "gather", "dynamic_slice"),
+    *("dynamic_update_slice", "scatter", "convert_element_type", "copy", "stop_gradient"),
+    *("platform_index", "select_n", "and", "or", "not", "xor", "reduce_or", "reduce_and"),
+}
+
+
+TAKEN = re.compile(r"[a-z]\d*|real|int|float|double|state|commands|measurements|restart|gamma")
+
+
+class Word(CArray):
+    """A number by the text of it, at all places of an array."""
+
+    def at(self, index: Any, varying: bool | None = None) -> str:
+        """Its text."""
+        return self.name
+
+
+class Number(Word):
+    """A number that is known."""
+
+
+class Expression(CArray):
+    """Entries of an array that are computed where they are used, which is once."""
+
+    def at(self, index: Any, varying: bool | None = None) -> str:
+        """Its text, of which the name is the form."""
+        return self.name.replace(INDEX, str(index))
+
+
+class ProgramWriter(Translation):
+    """Lines of C of a program whose constants are beside them.
+
+    What acts on each entry and is used once, by what acts on each entry too, becomes one line.
+    """
+
+    def __init__(self, names: dict[tuple, str]):
+        super().__init__()
+        self.names = names
+        self.constants: dict[str, np.ndarray] = {}
+        self.told: str | None = None
+        self.used_once: set = set()
+        self.stack_bytes = 0
+
+    def line(self, text: str) -> None:
+        """Write a line, or several of at most WIDTH characters."""
+        indent = "    " * self.depth
+        self.lines += textwrap.wrap(
+            text,
+            WIDTH,
+            initial_indent=indent,
+            subsequent_indent=f"{indent}    ",
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+
+    def declare(self, kind: str, shape: Sequence[int], varying: bool) -> CArray:
+        """A new array, on the stack."""
+        self.stack_bytes += math.prod(shape) * (8 if kind == "d" else 4)
+        return super().declare(kind, shape, varying)
+
+    def constant(self, array: np.ndarray) -> CArray:
+        """An array of known numbers, the same one for the same numbers."""
+        kind = kind_of(array)
+        if array.size == 1:
+            text = number_text(array.ravel().tolist()[0])
+            return Number(kind, array.shape, f"({text})" if text.startswith("-") else text, False)
+        if array.size == 0:
+            return CArray(kind, array.shape, "none", False)
+        key = fingerprint(array)
+        name = self.names.setdefault(key, f"constant_{len(self.constants) + 1}")
+        self.constants[name] = array
+        return CArray(kind, array.shape, name, False)
+
+    def run(self, closed, inputs: Sequence[CArray]) -> list[CArray]:
+        """Write the equations of a jaxpr; its outputs are arrays."""
+        jaxpr = getattr(closed, "jaxpr", closed)
+        uses = Counter(atom for atom in jaxpr.outvars if not hasattr(atom, "val"))
+        single = {}
+        for equation in jaxpr.eqns:
+            for atom in equation.invars:
+                if not hasattr(atom, "val"):
+                    uses[atom] += 1
+                    single[atom] = _joins(atom, equation)
+        uses.update(atom for atom in jaxpr.outvars if not hasattr(atom, "val"))
+        self.used_once |= {atom for atom, n in uses.items() if n == 1 and single.get(atom)}
+        return [self._stored(value) for value in super().run(closed, inputs)]
+
+    def equation(self, equation, values: list[CArray]) -> list[CArray]:
+        """Write an equation under the name of the function that it is of."""
+        name = equation.primitive.name
+        if name in OPENED:
+            return super().equation(equation, values)
+        place = _place(equation)
+        if self.depth == 1 and place not in (None, self.told):
+            self.told = place
+            self.line(f"/* {place} */")
+        if place is not None and place.startswith(QUADRATIC_PROGRAMS):
+            values = [_by_precision(value) for value in values]
+        out = equation.outvars[0].aval
+        if name == "broadcast_in_dim" and isinstance(values[0], Word):
+            return [values[0]._replace(shape=out.shape)]
+        text = _form(equation, values)
+        if text is not None and out.size == 1 and all(isinstance(one, Number) for one in values):
+            found = equation.primitive.bind(*map(_array, values), **equation.params)
+            return [self.constant(np.asarray(found, out.dtype))]
+        if text is None or any(text.count(f"{{{i}}}") > 1 for i in range(len(values))):
+            values = [
+                self._stored(value, name in BY_POINTER or (name in BY_PLACE and i == 0))
+                for i, value in enumerate(values)
+            ]
+        if text is None or equation.outvars[0] not in self.used_once:
+            return super().equation(equation, values)
+        entries = [value.at("0" if value.size == 1 else INDEX) for value in values]
+        return [Expression(kind_of(out), out.shape, f"({text.format(*entries)})", False)]
+
+    def varies(self, closed, inputs: Sequence[CArray]) -> list[bool]:
+        """Nothing differs between runs, as there is one."""
+        return [False] * len(getattr(closed, "jaxpr", closed).outvars)
+
+    def converted(self, value: CArray, kind: str) -> CArray:
+        """An array of another kind; of numbers beyond the whole ones the nearest."""
+        if value.kind + kind == "di":
+            return self.each("whole({})", "i", value.shape, [value], False)
+        return super().converted(value, kind)
+
+    def _stored(self, value: CArray, also_words: bool = False) -> CArray:
+        """An array in memory for one that is written where it is used."""
+        if isinstance(value, Expression) or (also_words and isinstance(value, Word)):
+            return self.each("{}", value.kind, value.shape, [value], False)
+        return value
+
+
+def _array(number: Number) -> np.ndarray:
+    """Array of a number."""
+    words = {"NAN": math.nan, "INFINITY": math.inf, "-INFINITY": -math.inf}
+    text = number.name.strip("()")
+    kinds = {"d": float, "i": int, "b": lambda text: bool(int(text))}
+    return np.full(number.shape, words[text] if text in words else kinds[number.kind](text))
+
+
+def _by_precision(value: CArray) -> CArray:
+    """A tolerance of quadratic programs, by the precision of the program."""
+    if isinstance(value, Number) and value.kind == "d":
+        number = float(_array(value).flat[0])
+        if number in SINGLE_PRECISION:
+            text = f"BY_PRECISION({SINGLE_PRECISION[number]!r}, {value.name})"
+            return Word("d", value.shape, text, False)
+    return value
+
+
+def _form(equation, values: list[CArray]) -> str | None:
+    """Form of what acts on each entry of arrays of one size, or numbers; None of another."""
+    name = equation.primitive.name
+    rule = None if name in Translation.rules else elementwise(name, equation.params)
+    size = equation.outvars[0].aval.size
+    if rule is None or name == "pow" or any(value.size not in (1, size) for value in values):
+        return None
+    form = rule(values[-1].kind if name == "select_n" else values[0].kind, False)
+    for i in range(form.count("{}")):
+        form = form.replace("{}", f"{{{i}}}", 1)
+    return form
+
+
+def _joins(atom, equation) -> bool:
+    """Whether an equation acts on each entry of what is read, and has as many."""
+    return (
+        equation.primitive.name not in Translation.rules
+        and elementwise(equation.primitive.name, equation.params) is not None
+        and equation.outvars[0].aval.size == atom.aval.size
+    )
+
+
+def without_unused(closed):
+    """A program of JAX without what no output makes use of, also within its loops."""
+    jaxpr, _ = dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), instantiate=True)
+    return closed.replace(jaxpr=jaxpr)
+
+
+def fingerprint(array) -> tuple:
+    """What tells arrays of other numbers apart."""
+    array = np.asarray(array)
+    return array.dtype.kind, array.size, array.tobytes()
+
+
+def _place(equation) -> str | None:
+    """Function of jaxbeam, or of a user, that an equation was written in, None if not known."""
+    frames = getattr(getattr(equation.source_info, "traceback", None), "frames", ())
+    for frame in frames:
+        file = frame.file_name
+        if file.startswith(PACKAGE) and not file.startswith(MACHINERY):
+            module = file.removeprefix(PACKAGE).strip("/\\").removesuffix(".py")
+            return f"{module.replace(chr(92), '/')}: {_plain(frame.function_name)}"
+        if "site-packages" not in file and not file.startswith(PACKAGE):
+            return _plain(frame.function_name)
+    return None
+
+
+def _plain(function: str) -> str:
+    """Name of a function without those within it that have none."""
+    return function.split(".<locals>")[0]
+
+
+def in_single_type(text: str) -> str:
+    """Text of translated lines with the types of a program: `real` and `int`."""
+    for word, own in (("double", "real"), ("int64_t", "int"), ("INT64_", "INT_")):
+        text = re.sub(rf"\b{word}\b" if word != "INT64_" else word, own, text)
+    return text
+
+
+def functions_of(text: str) -> list[str]:
+    """Texts of the functions that a text calls, each after those that it calls itself."""
+    known = {re.search(r"(\w+)\(", one)[1]: one for one in _functions()}  # type: ignore[index]
+    found: dict[str, str] = {}
+
+    def add(part: str) -> None:
+        for name, own in known.items():
+            if name not in found and re.search(rf"\b{name}\(", part):
+                add(own.split("{", 1)[1])
+                found[name] = own
+
+    add(text)
+    return list(found.values())
+
+
+def _functions() -> list[str]:
+    """Texts of the functions of translated programs, for numbers of type `real`."""
+    texts = [(C_FOLDER / name).read_text(encoding="utf-8") for name in ("algebra.h", "decompose.h")]
+    text = "\n".join(texts)
+    words = {"NUMBER": "real", "SQUARE_ROOT": "sqrt", "ZERO": "0", "ONE": "1"}
+    words |= {"Lane": "real", "Place": "int", "static inline": "static"}
+    text = re.sub(r"NAMED\((\w+)\)", r"\1", text)
+    for word, own in words.items():
+        text = re.sub(rf"\b{word}\b", own, text)
+    starts = [match.start() for match in re.finditer(r"^static", text, re.M)]
+    parts = [text[a:b] for a, b in zip(starts, [*starts[1:], len(text)], strict=True)]
+    return [*SMALL, *(part[: part.rindex("\n}") + 2] for part in parts)]
+
+
+SMALL = [
+    "static real larger(real a, real b)\n{\n    return a > b || !(a == a) ? a : b;\n}",
+    "static real smaller(real a, real b)\n{\n    return a < b || !(a == a) ? a : b;\n}",
+    "static int within(int index, int most)\n{\n"
+    "    return index < 0 ? 0 : index > most ? most : index;\n}",
+    "static int whole(real x)\n{\n"
+    "    return x >= 2e9 ? 2000000000 : x > -2e9 ? (int)x : -2000000000;\n}",
+]
+
+
+def operations(jaxpr) -> int:
+    """Operations of a program at worst: arithmetic and comparisons of numbers, functions of math.h.
+
+    Raises UntranslatedError for a loop without a largest number of turns.
+    """
+    return sum(map(_operations, jaxpr.eqns))
+
+
+def _operations(equation) -> int:
+    name, params = equation.primitive.name, equation.params
+    if name in OPENED:
+        return operations(_open(params[OPENED[name]]))
+    if name == "custom_linear_solve":
+        return operations(_open(params["jaxprs"].solve))
+    if name == "scan":
+        return params["length"] * operations(_open(params["jaxpr"]))
+    if name == "cond":
+        return max(operations(_open(branch)) for branch in params["branches"])
+    if name == "while":
+        condition, body = _open(params["cond_jaxpr"]), _open(params["body_jaxpr"])
+        turns = _most_turns(condition)
+        return turns * operations(body) + (turns + 1) * operations(condition)
+    if name == "convert_element_type" and equation.invars[0].aval.dtype.kind == "f":
+        return 2 * equation.outvars[0].aval.size  # comparisons with the ends of whole numbers
+    read, made = equation.invars[0].aval if equation.invars else None, equation.outvars[0].aval
+    if read is None or name in ELEMENTWISE_FREE:
+        return 0
+    if name == "lu":
+        size = read.shape[-1]
+        return read.size // size**2 * size**3
+    if read.dtype.kind != "f":
+        return 0
+    if name == "dot_general":
+        (contracted, _), _ = params["dimension_numbers"]
+        return 2 * made.size * int(np.prod([read.shape[axis] for axis in contracted], dtype=int))
+    if name.startswith(("reduce", "arg", "cum")):
+        return read.size
+    if name == "scatter-add":
+        return equation.invars[2].aval.size
+    if name == "sort":
+        size = read.shape[params["dimension"]]
+        return 3 * read.size * size // 2
+    if name == "cholesky":
+        return read.size // read.shape[-1] ** 2 * (read.shape[-1] ** 3 // 3 + read.shape[-1] ** 2)
+    if name == "triangular_solve":
+        return made.size * read.shape[-1]
+    if name == "integer_pow":
+        return made.size * (2 * abs(params["y"]).bit_length() + 1)
+    return made.size * {
+        "max": 2,
+        "min": 2,
+        "clamp": 4,
+        "sign": 4,
+        "is_finite": 2,
+        "lt_to": 3,
+        "le_to": 2,
+    }.get(name, 1)
+
+
+def _open(closed):
+    return getattr(closed, "jaxpr", closed)
+
+
+def _most_turns(condition) -> int:
+    """Number with which the condition of a loop compares its counter."""
+    for equation in condition.eqns:
+        if equation.primitive.name == "lt" and hasattr(most := equation.invars[1], "val"):
+            return int(most.val)
+    raise UntranslatedError("a loop without a largest number of turns")
+
+
+def named_arrays(leaves: Sequence[tuple[Any, Any]]) -> dict[tuple, str]:
+    """Names of arrays by what tells them apart, from their addresses in a tree."""
+    found: dict[tuple, str] = {}
+    for path, leaf in leaves:
+        if hasattr(leaf, "dtype") and np.asarray(leaf).dtype.kind in "fiub":
+            found.setdefault(fingerprint(leaf), last_word(path))
+    return with_numbers(found)
+
+
+def last_word(path) -> str:
+    """Last name in the address of a leaf, with the numbers behind it."""
+    words = [
+        str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", "")))) for key in path
+    ]
+    place = max((i for i, word in enumerate(words) if not word.isdecimal()), default=0)
+    word = re.sub(r"\W", "", "_".join(words[place:])).strip("_") or "value"
+    return f"{word}_" if TAKEN.fullmatch(word) else word
+
+
+def with_numbers(names: dict[Any, str]) -> dict[Any, str]:
+    """The same names, each but the first of several equal ones with a number."""
+    taken: dict[str, int] = {}
+    found = {}
+    for key, name in names.items():
+        taken[name] = taken.get(name, 0) + 1
+        found[key] = name if taken[name] == 1 else f"{name}_{taken[name]}"
+    return found
