@@ -53,6 +53,14 @@ class RecordedLoop(NamedTuple):
     commands: Float[np.ndarray, "sample actuator"]
 
 
+class FilteredState(NamedTuple):
+    """States of a law and of the digital filters before it, and its last readings."""
+
+    law: Any
+    filters: list
+    readings: Float[Array, " sensor"]
+
+
 class FilteredLaw(AbstractSampledLaw):
     """A law behind the digital filters of its sensors, which start from rest.
 
@@ -67,7 +75,7 @@ class FilteredLaw(AbstractSampledLaw):
         pairs = zip(self.sensors, self.sections, strict=True)
         filter_states = [initial_filter_state(*pair, 0.0) for pair in pairs]
         at_rest = [to_reading(sensor, 0.0) for sensor in self.sensors]
-        return self.law.initial_state(), filter_states, xp.array(at_rest)
+        return FilteredState(self.law.initial_state(), filter_states, xp.array(at_rest))
 
     def tabulated(self, times):
         return dataclasses.replace(self, law=self.law.tabulated(times))
@@ -90,7 +98,8 @@ class FilteredLaw(AbstractSampledLaw):
         step = self.law.step(law_state, measurement, t)
         if not any_jax(measurement):  # also of laws that use JAX for known numbers
             step = known(step)
-        return ControlStep(step.command, (step.state, after, measurement.readings), step.solved)
+        state = FilteredState(step.state, after, measurement.readings)
+        return ControlStep(step.command, state, step.solved)
 
 
 class _Recorder(SampledLoop):

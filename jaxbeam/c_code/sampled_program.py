@@ -80,7 +80,7 @@ class SampledProgram(Module):
         """
         low, high = self.ranges.T
         present = (measurements >= low) & (measurements <= high)
-        last = state.law[2]
+        last = state.law.readings
         readings = xp.where(present, measurements, last) if low.size else last
         known_command = self.path.known_to_law(state.commands)[:, 0]
         measurement = Measurement(readings, plant_state, known_command, present)

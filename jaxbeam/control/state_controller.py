@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -94,6 +94,13 @@ class TrueState(AbstractSampledFilter, AbstractContinuousFilter):
         return state
 
 
+class StateLawState(NamedTuple):
+    """States of a law and of the filter before it."""
+
+    law: Any
+    filter: Any
+
+
 class SampledStateLaw(AbstractSampledLaw):
     """State law behind a filter at samples; the state holds those of the law and of the filter."""
 
@@ -101,7 +108,7 @@ class SampledStateLaw(AbstractSampledLaw):
     filter: AbstractSampledFilter
 
     def initial_state(self):
-        return self.law.initial_state(), self.filter.initial_state()
+        return StateLawState(self.law.initial_state(), self.filter.initial_state())
 
     def tabulated(self, times):
         return SampledStateLaw(self.law.tabulated(times), self.filter.tabulated(times))
@@ -110,7 +117,7 @@ class SampledStateLaw(AbstractSampledLaw):
         law_state, filter_state = state
         estimate, filter_state = self.filter.update(filter_state, measurement, t)
         command, law_state, solved = self.law.step(law_state, estimate, measurement, t)
-        return ControlStep(command, (law_state, filter_state), solved)
+        return ControlStep(command, StateLawState(law_state, filter_state), solved)
 
 
 class ContinuousStateLaw(AbstractContinuousLaw):

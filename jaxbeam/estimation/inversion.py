@@ -1,7 +1,7 @@
 """Modal coordinates from deflections by inverting the mode shapes, rates by differences."""
 
 import warnings
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -116,11 +116,16 @@ class Inversion(AbstractEstimator):
         return None
 
 
+class InversionState(NamedTuple):
+    """Estimate x, last command, and periods to the next sample since the readings that x has."""
+
+    x: Float[Array, " state"]
+    command: Float[Array, " actuator"]
+    periods: Float[Array, ""]
+
+
 class InversionFilter(AbstractSampledFilter):
     """Inverse of the mode shapes, and lagged differences.
-
-    Its state is x, the last command, and the periods to the next sample since the readings that x
-    has.
 
     `difference_gain` (1/s) is the weight of a difference of coordinates in the rates, `period` (s)
     the time between samples; `actuator_transition` is that of the states of actuators over a
@@ -139,7 +144,7 @@ class InversionFilter(AbstractSampledFilter):
     sensors: tuple[int, ...] = eqx.field(static=True)
 
     def initial_state(self):
-        return xp.zeros(self.plant_states), xp.zeros(self.commands), xp.ones(())
+        return InversionState(xp.zeros(self.plant_states), xp.zeros(self.commands), xp.ones(()))
 
     def update(self, state, measurement, t):
         x, previous_command, periods = state
@@ -162,4 +167,4 @@ class InversionFilter(AbstractSampledFilter):
             inputs = (xp.concatenate([beam, each]) for each in (previous_command, command))
             parts.append(self.actuator_transition.predict(actuator_states, *inputs))
         x = xp.concatenate(parts)
-        return Estimate(x), (x, command, periods)
+        return Estimate(x), InversionState(x, command, periods)
