@@ -134,9 +134,18 @@ def systems(x):
     return factor, *solved, *alone, SQUARE @ x, jnp.einsum("ij,ik,kl->jl", matrix, matrix, SQUARE)
 
 
+def general_systems(x):
+    """Matrices without symmetry, whose rows change places; some are the same in all runs."""
+    matrix, table = MATRIX + jnp.outer(x, Y), jnp.asarray(MATRIX)
+    several = jnp.stack([matrix, matrix.T @ SQUARE, table])
+    solved = jnp.linalg.solve(matrix, x), jnp.linalg.solve(matrix.T, SQUARE)
+    factors, _, order = lax.linalg.lu(matrix)
+    return *solved, jnp.linalg.solve(table, x), jnp.linalg.inv(several), factors, order
+
+
 @pytest.mark.parametrize(
     "function",
-    [elementary, shapes, reductions, systems, places, branches, loops, searched],
+    [general_systems, elementary, shapes, reductions, systems, places, branches, loops, searched],
 )
 def test_programs_give_the_numbers_of_jax(function, tmp_path):
     def flat(x):
