@@ -356,11 +356,15 @@ def _most_turns(condition) -> int:
 
 
 def named_arrays(leaves: Sequence[tuple[Any, Any]]) -> dict[tuple, str]:
-    """Names of arrays by what tells them apart, from their addresses in a tree."""
+    """Names of arrays, and of their rows, by what tells them apart, from their addresses."""
     found: dict[tuple, str] = {}
     for path, leaf in leaves:
-        if hasattr(leaf, "dtype") and np.asarray(leaf).dtype.kind in "fiub":
-            found.setdefault(fingerprint(leaf), last_word(path))
+        if not hasattr(leaf, "dtype") or np.asarray(leaf).dtype.kind not in "fiub":
+            continue
+        array, name = np.asarray(leaf), last_word(path)
+        found.setdefault(fingerprint(array), name)
+        for i, row in enumerate(array if array.ndim > 1 else ()):
+            found.setdefault(fingerprint(row), f"{name}_{i}")
     return with_numbers(found)
 
 
