@@ -16,6 +16,7 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.analysis.bound.bound import run_peaks
+from jaxbeam.analysis.stability import frozen_poles, growth, stream
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.filters import Filter
 from jaxbeam.case.quantities import QUANTITIES
@@ -347,3 +348,37 @@ def test_plain_calls_compile_nothing(tmp_path):
     assert ended.returncode == 0, ended.stderr
     printed = [line for line in ended.stderr.splitlines() if line in NO_PROGRAM or "ompil" in line]
     assert printed == list(NO_PROGRAM), "no program between the names of the calls"
+
+
+LOOP = jb.Case(
+    jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.02, modes=2),
+    sensors=[jb.Sensor(0.3)],
+    actuators=[jb.PointForce(0.3)],
+    loads=[jb.MovingMass(mass=0.4, speed=2.0)],
+    controller=jb.Feedback([200.0]),
+    run=jb.Run(0.3),
+)
+SPEEDS = {"loads.0.speed": [2.0, 3.0]}
+# Their derivatives had been zero, or an error of JAX.
+REFUSED = {
+    "a sweep": lambda case, _: jb.sweep(case, SPEEDS, progress=False).peak_deflection.values.sum(),
+    "a sweep over values": lambda _, mass: jb.sweep(
+        LOOP, {"loads.0.mass": [0.3, mass]}, progress=False
+    ).peak_deflection.values.sum(),
+    "an assessment": lambda case, _: jb.assess(case, 30.0).checks[0].value,
+    "a check": lambda case, _: jb.check(case).speed_ratio,
+    "the stability of a loop": lambda case, _: frozen_poles(case).largest_real_part.max(),
+    "the stability of a loop over a crossing": lambda case, _: growth(case).factor.max(),
+    "the stability of a loop in a stream": lambda case, _: stream(case, 0.4).largest_multiplier,
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+@pytest.mark.parametrize("transform", [jax.grad, jax.jit])
+def test_what_has_no_derivative_is_refused_in_a_sentence(what, transform):
+    def function(mass):
+        return REFUSED[what](jb.replace(LOOP, {"loads.0.mass": mass}), mass)
+
+    named = " ".join(what.split()[:2])
+    with pytest.raises(ValueError, match=f"{named}.* neither differentiated nor compiled: call it"):
+        transform(function)(0.4)

@@ -25,7 +25,7 @@ from jaxbeam.analysis.linearised_loop import (
     sampled_matrices,
 )
 from jaxbeam.case.case import Case, concrete_case, crossing_times, replace
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, refuse_traced
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.discretisation import propagate
@@ -33,6 +33,7 @@ from jaxbeam.runtime.arrays import known, ravel_pytree, scan, xp
 from jaxbeam.runtime.compiling import compiled
 
 MAX_PHASE_PER_STEP = 0.4  # rad: phase of the fastest mode per step of the transition matrix
+UNTRACED = "the stability of a loop", "call it outside jit and grad"
 SAMPLES_AT_ONCE = 2048  # of which the plant is propagated together
 
 
@@ -89,6 +90,7 @@ def frozen_poles(case: Case, times: Float[np.ndarray, " time"] | None = None) ->
 
     Default: 100 times of the crossing. Raises ValueError as `linearised_loop`.
     """
+    refuse_traced(*UNTRACED, case)
     timing = loop_timing(case)
     if times is None:
         times = np.linspace(*_crossing_interval(case), 101)[:-1] if case.loads else np.zeros(1)
@@ -104,6 +106,7 @@ def growth(case: Case, points: int = 100) -> Growth:
     The loop is linearised about rest, where a cubic law has no gain. Raises ValueError as
     `linearised_loop`, and for a case without loads.
     """
+    refuse_traced(*UNTRACED, case)
     timing = loop_timing(case)
     start, end = _crossing_interval(case)
     loop = loop_dynamics(case, mesh_layout(concrete_case(case)))
@@ -129,6 +132,7 @@ def stream(case: Case, spacing: float) -> Stream:
     time. Raises ValueError for a case without exactly one load, one that stays on the beam, or a
     spacing that is not a multiple of the sampling period, and as `linearised_loop`.
     """
+    refuse_traced(*UNTRACED, case)
     timing = loop_timing(case)
     if len(case.loads) != 1:
         raise ValueError(f"a stream repeats the one load of a case; this has {len(case.loads)}")

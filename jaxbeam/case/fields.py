@@ -15,7 +15,7 @@ import jax.extend
 import numpy as np
 
 from jaxbeam.case.reading.units import in_si
-from jaxbeam.runtime.arrays import not_differentiated, xp
+from jaxbeam.runtime.arrays import any_traced, not_differentiated, xp
 
 
 def _as_array(unit: str, meaning: str):
@@ -142,6 +142,15 @@ class TracedNumberError(jax.errors.ConcretizationTypeError):
             f" number: {why}"
         )
         TypeError.__init__(self, sentence)
+
+
+def refuse_traced(what: str, instead: str, *trees) -> None:
+    """Raises ValueError, in one sentence, if numbers of some trees are traced by JAX.
+
+    `what` computes with NumPy, so that its derivatives would be zero; said is what to do `instead`.
+    """
+    if any_traced(trees):
+        raise ValueError(f"{what} can be neither differentiated nor compiled: {instead}")
 
 
 def concrete(

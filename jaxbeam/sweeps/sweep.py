@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxbeam.case.case import Case, unit_at
+from jaxbeam.case.fields import refuse_traced
 from jaxbeam.case.reading.units import in_si
 from jaxbeam.files.case_file import with_settings
 from jaxbeam.model.plausibility.check import warn_if_implausible
@@ -21,6 +22,8 @@ from jaxbeam.sweeps.words import compute_word_sweep, split_words, word_sweep
 
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
+
+SINGLE_RUNS = "call it outside jit, vmap and grad, or differentiate jaxbeam.simulate of each run"
 
 
 def first_and_last(case: Case, over: dict[str, Any]) -> list[Case]:
@@ -93,10 +96,10 @@ def sweep(
     old one, which it replaces when it is complete; interrupted, it continues there when repeated.
 
     Raises ValueError for an unknown address, invalid values, a case without sensors, a controller
-    in single precision, or a client without a store; FileExistsError if the store exists, without
-    `resume` or `overwrite`; OSError if it cannot be written, or another process writes it (an
-    `InUseError`, which says which); RuntimeError if no time step meets the tolerance or workers
-    keep dying.
+    in single precision, a client without a store, or numbers that are traced by JAX;
+    FileExistsError if the store exists, without `resume` or `overwrite`; OSError if it cannot be
+    written, or another process writes it (an `InUseError`, which says which); RuntimeError if no
+    time step meets the tolerance or workers keep dying.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
@@ -107,6 +110,7 @@ def sweep(
     >>> print(dict(runs.peak_deflection.sizes))
     {'loads.0.speed': 2, 'sensor': 1}
     """
+    refuse_traced("a sweep", SINGLE_RUNS, case, over)
     if client is not None and store is None:
         raise ValueError("workers write their blocks to a store; name one")
     words, numbers = split_words(case, over)

@@ -16,7 +16,7 @@ from jaxbeam.analysis.assessment.train_checks import TrackState, train_checks
 from jaxbeam.analysis.sections import spans
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.declared_checks import suggestion
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, refuse_traced
 from jaxbeam.case.reading.units import number_in_si
 from jaxbeam.case.track import Track, track_of
 from jaxbeam.case.validation import check_case
@@ -71,8 +71,8 @@ def assess(
     open source is left out and named in the report.
 
     Raises ValueError for an unknown code, deck, track or train, a controlled case, several
-    spans without a determinant length, a beam that can move as a rigid body, or numbers out of
-    range.
+    spans without a determinant length, a beam that can move as a rigid body, or numbers that are
+    out of range or traced by JAX.
 
     >>> import jaxbeam as jb
     >>> bridge = jb.Case(jb.Beam(25.0, 3e10, 15000.0, damping_ratio=0.01))
@@ -80,6 +80,8 @@ def assess(
     >>> print(found.checks[1].subject, found.checks[1].outcome)
     dynamic analysis not required
     """
+    instead = "call it outside jit and grad, or differentiate jaxbeam.simulate under a train"
+    refuse_traced("an assessment", instead, case, line_speed, lowest_speed)
     if track in DECKS:
         raise ValueError(f"track is its state, {' or '.join(TRACKS)}; {track!r} is the deck")
     given = dict(deck=deck, track=track, code=code)

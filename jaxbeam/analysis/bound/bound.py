@@ -13,7 +13,6 @@ smaller peak, whatever it measures, estimates or predicts.
 import dataclasses
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -27,6 +26,7 @@ from jaxbeam.analysis.bound.linear_program import least_peak
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import commanded
 from jaxbeam.case.declared_checks import check_on_beam
+from jaxbeam.case.fields import refuse_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedforward import Prescribed
 from jaxbeam.integrator.discrete_model import discrete_model
@@ -185,10 +185,7 @@ def checked_influence(
 
     Raises ValueError as `bound`.
     """
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(case)):
-        raise ValueError(
-            "a bound can be neither differentiated nor compiled: call it outside jit and grad"
-        )
+    refuse_traced("a bound", "call it outside jit and grad", case)
     check_case(case)
     own_period = None if case.controller is None else case.controller.period
     period = (

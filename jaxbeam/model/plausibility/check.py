@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from jaxbeam.case.case import Case, concrete_case
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, refuse_traced
 from jaxbeam.case.loads.base import known_numbers
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import Modes, modes
@@ -45,8 +45,8 @@ def check(case: Case) -> Plausibility:
     """Numbers by which the plausibility of a case is seen, with warnings of what looks wrong.
 
     Each warning names an address, what follows from the number there, and the likely mistake.
-    Nothing is simulated; it takes a few milliseconds. Raises ValueError for an invalid case,
-    `jax.errors.ConcretizationTypeError` if it is traced by `jit` or `vmap`.
+    Nothing is simulated; it takes a few milliseconds. Raises ValueError for an invalid case, and
+    for one that is traced by JAX.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -61,6 +61,7 @@ def check(case: Case) -> Plausibility:
     >>> print(found.warnings[0].split(" under")[0])
     beam.flexural_rigidity: the beam sags by 3.186 m
     """
+    refuse_traced("a check", "call it outside jit and grad", case)
     check_case(case)
     return _checked(concrete_case(case), rows=(*RANGES, *ADVICE))
 
