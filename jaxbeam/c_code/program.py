@@ -44,7 +44,7 @@ from jaxbeam.control.state_controller import AbstractStateController
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.state_space import state_space
 from jaxbeam.runtime.arrays import known
-from jaxbeam.runtime.c_translation import _renew
+from jaxbeam.runtime.c_translation import renew
 from jaxbeam.runtime.c_writer import (
     CArray,
     UntranslatedError,
@@ -159,7 +159,7 @@ def _translated(case: Case, law, samples: int, states: int) -> ProgramText:
     given.append(Word("d", (), "t", False))
     sent, *after = writer.run(closed, given)
     writer.line("/* State for the next sample */")
-    _renew(writer, kept, after, None)
+    renew(writer, kept, after, None)
     writer.line("/* Commands */")
     writer.copy(CArray("d", (actuators,), "commands", False), sent)
     body = in_single_type("\n".join(writer.lines))

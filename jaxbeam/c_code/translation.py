@@ -6,6 +6,7 @@ beyond them.
 
 import math
 import re
+import sysconfig
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
@@ -34,15 +35,22 @@ PACKAGE = str(Path(__file__).parents[1])
 MACHINERY = str(Path(__file__).parents[1] / "runtime")
 BY_POINTER = {"cholesky", "triangular_solve", "lu", "scan"}  # rules that take addresses of inputs
 BY_PLACE = {"gather", "dynamic_slice"}  # that read their first input at places that are computed
-ELEMENTWISE_FREE = {  # that only move numbers, or are of truths and whole numbers
+FREE = {  # that only move numbers, or are of truths and whole numbers
     *("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "slice", "rev"),
     *("concatenate", "stack", "tile", "pad", "split", "iota", "gather", "dynamic_slice"),
     *("dynamic_update_slice", "scatter", "convert_element_type", "copy", "stop_gradient"),
     *("platform_index", "select_n", "and", "or", "not", "xor", "reduce_or", "reduce_and"),
 }
-
-
-TAKEN = re.compile(r"[a-z]\d*|real|int|float|double|state|commands|measurements|restart|gamma")
+STANDARD_LIBRARY = sysconfig.get_path("stdlib")
+TAKEN = re.compile(  # names of the writer, words of C, of math.h, and of the program itself
+    r"[a-z]\d*"
+    "|auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for|goto|if"
+    "|inline|int|long|register|restrict|return|short|signed|sizeof|static|struct|switch|typedef"
+    "|union|unsigned|void|volatile|while"
+    "|sqrt|cbrt|exp|expm1|log|log1p|sin|cos|tan|sinh|cosh|tanh|asin|acos|atan|atan2|pow|fmod"
+    "|floor|ceil|rint|round|fabs|gamma|abs|labs|llabs"
+    "|real|commands|measurements|larger|smaller|within|whole|power|factor|eliminate|decompose"
+)
 
 
 class Word(CArray):
@@ -228,7 +236,7 @@ def _place(equation) -> str | None:
         if file.startswith(PACKAGE) and not file.startswith(MACHINERY):
             module = file.removeprefix(PACKAGE).strip("/\\").removesuffix(".py")
             return f"{module.replace(chr(92), '/')}: {_plain(frame.function_name)}"
-        if "site-packages" not in file and not file.startswith(PACKAGE):
+        if not file.startswith((PACKAGE, STANDARD_LIBRARY)) and "site-packages" not in file:
             return _plain(frame.function_name)
     return None
 
@@ -309,7 +317,7 @@ def _operations(equation) -> int:
     if name == "convert_element_type" and equation.invars[0].aval.dtype.kind == "f":
         return 2 * equation.outvars[0].aval.size  # comparisons with the ends of whole numbers
     read, made = equation.invars[0].aval if equation.invars else None, equation.outvars[0].aval
-    if read is None or name in ELEMENTWISE_FREE:
+    if read is None or name in FREE:
         return 0
     if name == "lu":
         size = read.shape[-1]

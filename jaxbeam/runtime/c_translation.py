@@ -567,11 +567,11 @@ def _scan(writer: Writer, params, values, outs):
         for to, value in zip(stacked, found[carried:], strict=True):
             row = to._replace(shape=value.shape, name=f"({to.name} + {at} * {value.size})")
             writer.copy(row, value)
-        _renew(writer, carry, found[:carried], None)
+        renew(writer, carry, found[:carried], None)
     return carry + stacked
 
 
-def _renew(writer: Writer, carry: list[CArray], found: list[CArray], mask: str | None) -> None:
+def renew(writer: Writer, carry: list[CArray], found: list[CArray], mask: str | None) -> None:
     """Copy what a turn of a loop has found to what the loop carries, in runs that go on."""
     kept = {value.name for value in carry}
     # One that is only handed on may be overwritten before it is copied.
@@ -605,7 +605,7 @@ def _while(writer: Writer, params, values, outs):
         (goes_on,) = writer.run(condition, [*asked, *copies])
         writer.line(f"if (!{f'any({goes_on.at(0)})' if parted else goes_on.at(0)}) break;")
         mask = goes_on.at(0) if parted else None
-        _renew(writer, copies, writer.run(body, [*fixed, *copies]), mask)
+        renew(writer, copies, writer.run(body, [*fixed, *copies]), mask)
     return copies
 
 

@@ -15,6 +15,7 @@ from jaxbeam.c_code.translation import (
     ProgramWriter,
     functions_of,
     in_single_type,
+    named_arrays,
     operations,
     without_unused,
 )
@@ -133,6 +134,13 @@ def test_quadratic_programs(method, problems, tmp_path):
     assert (found[:, 0] == status).all()
     x = np.array([solution.x for solution in known])
     assert_allclose(found[status == 0, 1:], x[status == 0], atol=1e-11)
+
+
+@pytest.mark.parametrize("word", ["factor", "const", "gamma", "x", "v12", "commands"])
+def test_names_are_none_of_c(word):
+    """Neither its words nor those of the program; several of one name get numbers."""
+    leaves = [((jax.tree_util.GetAttrKey(word),), np.arange(3.0) + i) for i in range(2)]
+    assert list(named_arrays(leaves).values()) == [f"{word}_", f"{word}__2"]
 
 
 def test_cost_at_worst():
