@@ -43,6 +43,8 @@ from jaxbeam.control.predictive.prediction import sampled_plant
 from jaxbeam.model.state_space import Plant
 from jaxbeam.runtime.arrays import Array, Number, add_at, solve, take, xp
 
+SAME_SAMPLE = 1e-9  # of a period: a time that is nearer to a sample is at it
+
 
 class PolynomialModel(NamedTuple):
     """Plant y(k) + a_1 y(k - 1) + ... = B_1 u(k - 1) + B_2 u(k - 2) + ..., all outputs with one a.
@@ -427,7 +429,9 @@ class AdaptiveGPCLaw(AbstractSampledLaw):
         now_complete = measurement.complete(range(self.outputs))
         past = self.powers + 1
         complete = xp.where(now_complete, xp.minimum(state.complete + 1.0, past + 1.0), 0.0)
-        active = (t <= self.until) & (sample > 0) & (complete > past)
+        # By numbers of samples, as rounding of a time may decide otherwise where it is `until`.
+        last = self.until / self.period
+        active = (sample <= last + SAME_SAMPLE) & (sample > 0) & (complete > past)
         coefficients, root = (
             xp.where(active, new, old) for new, old in zip(identified, state[:2], strict=True)
         )
@@ -442,7 +446,9 @@ class AdaptiveGPCLaw(AbstractSampledLaw):
         wanted = wanted - xp.einsum("pab,pb->a", gains.command_gains, commands[:powers])
         if self.probes:
             signs = probe_signs()
-            wanted = xp.where(t < self.until, self.probe * take(signs, sample % len(signs)), wanted)
+            wanted = xp.where(
+                sample < last - SAME_SAMPLE, self.probe * take(signs, sample % len(signs)), wanted
+            )
         return ControlStep(wanted, state)
 
     def identified(
