@@ -35,7 +35,7 @@ from experiments.benchmarks.common import (
     without_native,
 )
 from experiments.benchmarks.rivals import baselines
-from experiments.benchmarks.rivals.pinned_beam import MOMENT, PATCH, SPAN, PinnedBeam
+from experiments.benchmarks.rivals.baselines import MOMENT, PATCH, SPAN, PinnedBeam
 from experiments.benchmarks.sweep import TOLERANCE
 
 LOOPS = {"open": None, "sampled": 0.01, "instant": None}  # s between two commands

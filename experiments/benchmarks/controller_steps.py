@@ -8,7 +8,7 @@ design excluded. The steps are those of the crossing, on one core, compiled (see
 the median and the worst of them, and the time for each of 256 at once.
 """
 
-from experiments.benchmarks.cores import use_one_core
+from experiments.benchmarks import use_one_core
 
 if __name__ == "__main__":
     use_one_core()  # before JAX starts its threads

@@ -10,7 +10,7 @@ and the time of a call from Python. jaxbeam starts anew each time: on one core, 
 the other in a loop and 256 at once. Without OSQP the benchmark ends with a message.
 """
 
-from experiments.benchmarks.cores import use_one_core
+from experiments.benchmarks import use_one_core
 
 if __name__ == "__main__":
     use_one_core()  # before JAX starts its threads

@@ -37,7 +37,7 @@ from experiments.benchmarks.common import (
     without_native,
 )
 from experiments.benchmarks.rivals import baselines, numba_peaks
-from experiments.benchmarks.rivals.pinned_beam import PinnedBeam
+from experiments.benchmarks.rivals.baselines import PinnedBeam
 from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime import native_library
 from jaxbeam.runtime.compiling import compiled

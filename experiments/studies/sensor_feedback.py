@@ -24,13 +24,15 @@ from experiments.studies.held_out import (
     CUBIC_FEEDBACK,
     EXTRA_DELAY,
     EXTRA_DELAY_LAW,
+    PERIOD,
     RIGIDITY,
     RIGIDITY_ERRORS,
     HeldOutStudy,
     draw,
+    held_out_loads,
     peaks,
+    with_held_out_duration,
 )
-from experiments.studies.loads import PERIOD, held_out_loads, with_held_out_duration
 from experiments.studies.tune_feedforward import MODES
 from experiments.studies.tune_sensor_feedback import (
     CUTOFF,

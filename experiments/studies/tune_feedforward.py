@@ -16,7 +16,7 @@ import numpy as np
 
 import jaxbeam as jb
 import tuning
-from experiments.studies.loads import PERIOD, training_loads
+from experiments.studies.held_out import PERIOD, training_loads
 from experiments.thesis.cases import with_modes
 from jaxbeam import rigs
 

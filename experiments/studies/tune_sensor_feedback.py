@@ -21,8 +21,7 @@ import numpy as np
 
 import jaxbeam as jb
 import tuning
-from experiments.studies.held_out import EXTRA_DELAY, RIGIDITY
-from experiments.studies.loads import MASSES, PERIOD, training_loads
+from experiments.studies.held_out import EXTRA_DELAY, MASSES, PERIOD, RIGIDITY, training_loads
 from experiments.studies.tune_feedforward import COMMAND_LIMITS, COMMAND_RESOLUTION, MODES
 from experiments.thesis.cases import with_modes
 from jaxbeam import rigs

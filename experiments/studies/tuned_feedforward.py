@@ -31,9 +31,10 @@ from experiments.studies.held_out import (
     RIGIDITY_ERRORS,
     HeldOutStudy,
     draw,
+    held_out_loads,
     peaks,
+    with_held_out_duration,
 )
-from experiments.studies.loads import held_out_loads, with_held_out_duration
 from experiments.studies.tune_feedforward import FOLDER
 from experiments.thesis.chapter6.patch_rigs import with_feedback
 from experiments.thesis.verdicts import Experiment, ExperimentResult

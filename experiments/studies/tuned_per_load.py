@@ -17,10 +17,10 @@ import numpy as np
 import jaxbeam as jb
 import tuning
 from experiments.studies import tune_feedforward, tune_sensor_feedback
-from experiments.studies.held_out import load_label
-from experiments.studies.loads import (
+from experiments.studies.held_out import (
     HELD_OUT_SPEEDS,
     held_out_loads,
+    load_label,
     with_held_out_duration,
 )
 from experiments.studies.tune_feedforward import COMMAND_LIMITS, MODES

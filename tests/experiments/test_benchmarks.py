@@ -17,8 +17,10 @@ from experiments.benchmarks import (
     __main__,
     cases,
     controller_steps,
+    first_answer,
     growth,
     quadratic_programs,
+    trains,
 )
 from experiments.benchmarks.common import import_optional
 from experiments.benchmarks.computing_time import (
@@ -28,9 +30,7 @@ from experiments.benchmarks.computing_time import (
     time_steps,
 )
 from experiments.benchmarks.controller_steps import patch_case
-from experiments.benchmarks.first_answer import __main__ as first_answer
-from experiments.benchmarks.first_answer.rows import AXLES, ROWS, Row, train
-from experiments.benchmarks.trains import __main__ as trains
+from experiments.benchmarks.first_answer import AXLES, ROWS, Row, train
 from jaxbeam.case.controller import AbstractSampledLaw, ControlStep
 
 

@@ -16,12 +16,18 @@ from experiments.studies import (
     tune_sensor_feedback,
     tuned_feedforward,
 )
-from experiments.studies.creep import CreepFit, fitted_creep, lags_of
-from experiments.studies.held_out import RIGIDITY
-from experiments.studies.loads import held_out_loads, training_loads
+from experiments.studies.held_out import RIGIDITY, held_out_loads, training_loads
 from experiments.studies.one_law import plants, tune
 from experiments.studies.one_law.per_plant import TABLE_FILE
-from experiments.studies.patch_drift import CREEP, HYSTERESIS, log_of_patch, what_is_left
+from experiments.studies.patch_drift import (
+    CREEP,
+    HYSTERESIS,
+    CreepFit,
+    fitted_creep,
+    lags_of,
+    log_of_patch,
+    what_is_left,
+)
 from experiments.studies.shaker_drives import LOOPS, drive
 from experiments.studies.tune_feedforward import COMMAND_LIMITS
 from experiments.thesis.cases import data_physics_v4

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from experiments.validation.check import Check
+from experiments.validation.__main__ import check_groups
 from experiments.validation.expected_gain import expected_gain
 from experiments.validation.least_errors import (
     TELLING_GAIN,
@@ -19,7 +19,7 @@ from experiments.validation.least_errors import (
 )
 from experiments.validation.modal_methods import PYOMA, ours, pyoma, table
 from experiments.validation.modal_setups import HEADER, REFERENCES, assess, planted_setups
-from experiments.validation.page import check_groups, validation_page
+from experiments.validation.page import Check, validation_page
 from experiments.validation.random_cases import __main__ as random_cases
 from experiments.validation.random_cases.checks import (
     Errors,
@@ -28,8 +28,8 @@ from experiments.validation.random_cases.checks import (
     at_most,
     beside_scipy,
     contact_faults,
+    draw,
 )
-from experiments.validation.random_cases.drawing import draw
 from tests.oracles.planted_structures import (
     Planted,
     Structure,

@@ -5,8 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from experiments.benchmarks.rivals.baselines import reference_peaks
-from experiments.benchmarks.rivals.pinned_beam import PinnedBeam
+from experiments.benchmarks.rivals.baselines import PinnedBeam, reference_peaks
 from jaxbeam.model.statics import static_peak
 from jaxbeam.simulation.simulate import ContactLossWarning
 

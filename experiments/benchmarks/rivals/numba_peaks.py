@@ -12,8 +12,7 @@ from types import ModuleType
 import diffrax
 import numpy as np
 
-from experiments.benchmarks.rivals.baselines import FREE_VIBRATION
-from experiments.benchmarks.rivals.pinned_beam import GRAVITY, free_times
+from experiments.benchmarks.rivals.baselines import FREE_VIBRATION, GRAVITY, free_times
 
 TOLERANCE = 1e-8  # errors of the peaks of the benchmark's grid stay below 1e-6
 SOLVER, ORDER = diffrax.Dopri5, 5  # faster here than Tsit5 and Dopri8, with 3 modes and with 12

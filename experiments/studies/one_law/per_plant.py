@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from experiments.studies.loads import held_out_loads, training_loads
+from experiments.studies.held_out import held_out_loads, training_loads
 from experiments.studies.one_law.plants import ONE_LAW, Shares, cell, plant_case
 from experiments.studies.one_law.tune import (
     CUTOFF,

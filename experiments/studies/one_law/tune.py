@@ -17,7 +17,7 @@ import sys
 import numpy as np
 
 import jaxbeam as jb
-from experiments.studies.loads import training_loads
+from experiments.studies.held_out import training_loads
 from experiments.studies.one_law.plants import ONE_LAW, Shares, plant_case
 from jaxbeam.control.internal_model import ORDER, REFERENCE, SHARES, VALUES
 

@@ -1,7 +1,6 @@
 """Chapter 2: modes, critical speeds, moving force and mass, shaker, patches."""
 
-from experiments.thesis.published_numbers import PublishedNumbers
-from experiments.thesis.tolerances import DIGITS, FORMULA, HZ
+from experiments.thesis.published_numbers import DIGITS, FORMULA, HZ, PublishedNumbers
 
 MODE_LABELS = "1 2 3 4 5 6 7 8"
 

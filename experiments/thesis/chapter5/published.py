@@ -1,11 +1,11 @@
 """Chapter 5: optimal control of one span with a shaker."""
 
-from experiments.thesis.published_numbers import PublishedNumbers
-from experiments.thesis.tolerances import (
+from experiments.thesis.published_numbers import (
     DIGITS,
     MEASURED_RATIO,
     SAME_CURVE,
     YES_OR_NO,
+    PublishedNumbers,
 )
 
 # Optimal control of one span with a shaker, peaks at 0.25 m in percent of no control.

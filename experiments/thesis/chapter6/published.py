@@ -1,7 +1,6 @@
 """Chapter 6: displacement feedback of one and two spans with patches."""
 
-from experiments.thesis.published_numbers import PublishedNumbers
-from experiments.thesis.tolerances import (
+from experiments.thesis.published_numbers import (
     APPROXIMATE_FREQUENCY,
     DIGITS,
     FORMULA,
@@ -10,6 +9,7 @@ from experiments.thesis.tolerances import (
     MEASURED_REDUCTION,
     MEASURED_VOLTAGE,
     YES_OR_NO,
+    PublishedNumbers,
 )
 
 # Displacement feedback, masses m1 to m4.

@@ -1,10 +1,10 @@
 """Chapter 7: model predictive control of one and two spans with patches."""
 
-from experiments.thesis.published_numbers import PublishedNumbers
-from experiments.thesis.tolerances import (
+from experiments.thesis.published_numbers import (
     DIGITS,
     SAMPLE_INSTANT,
     YES_OR_NO,
+    PublishedNumbers,
 )
 
 # Model predictive control, 0.509 kg at 1 m/s.

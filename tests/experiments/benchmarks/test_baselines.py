@@ -11,16 +11,14 @@ from experiments.benchmarks import cases
 from experiments.benchmarks.common import Timing, time_call
 from experiments.benchmarks.rivals import baselines, numba_peaks
 from experiments.benchmarks.rivals.baselines import (
+    PinnedBeam,
+    crossing_rate,
     diffrax_peaks,
+    free_times,
+    hermite_peaks,
     reference_peaks,
     scipy_peaks,
     scipy_time,
-)
-from experiments.benchmarks.rivals.pinned_beam import (
-    PinnedBeam,
-    crossing_rate,
-    free_times,
-    hermite_peaks,
 )
 from tests.oracles.closed_loop import Actuator, Clock, Sensor, respond
 from tests.oracles.loads import Load

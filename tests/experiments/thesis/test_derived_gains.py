@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from experiments.thesis.cases import with_duration
-from experiments.thesis.chapter5 import observer, observer_loop
+from experiments.thesis.chapter5 import observer
 from experiments.thesis.chapter5.fed_back_states import (
     BUT_FOR_THE_END,
     COMBINATIONS,
@@ -24,7 +24,7 @@ from experiments.thesis.chapter5.regulator_limits import (
     with_other_shaker,
 )
 from experiments.thesis.chapter5.regulators import STATE_WEIGHTS
-from experiments.thesis.chapter6.derived_gains import (
+from experiments.thesis.chapter6.gain_scheduling import (
     BestGain,
     best_gains,
     equivalent_gains,
@@ -144,14 +144,12 @@ PERIOD = 5e-3
 @pytest.fixture(scope="module")
 def runs():
     """A run without control and one under the observed regulator."""
-    gains = observer_loop.design(RIG, PERIOD, STATE_WEIGHTS, COMMAND_WEIGHT)
-    return [
-        observer_loop.simulate_observed(RIG, PERIOD, each, after_exit=0.1) for each in (None, gains)
-    ]
+    gains = observer.design(RIG, PERIOD, STATE_WEIGHTS, COMMAND_WEIGHT)
+    return [observer.simulate_observed(RIG, PERIOD, each, after_exit=0.1) for each in (None, gains)]
 
 
 def test_gain_is_that_of_the_sampled_regulator():
-    gains = observer_loop.design(RIG, PERIOD, STATE_WEIGHTS, COMMAND_WEIGHT)
+    gains = observer.design(RIG, PERIOD, STATE_WEIGHTS, COMMAND_WEIGHT)
     expected = np.asarray(optimal_gain(RIG, PERIOD, STATE_WEIGHTS)[0])[0]
     np.testing.assert_allclose(gains.regulator, expected, rtol=1e-5)
 
@@ -167,7 +165,7 @@ def test_beam_without_control_is_that_of_the_integrator(runs):
 def test_at_5_ms_the_regulator_worsens_the_deflection_though_the_observer_is_right(runs):
     """As the thesis finds: not the observer is to blame, but the sampled gain (Figs 5.6, 5.7)."""
     uncontrolled, controlled = runs
-    peaks = [np.abs(one.deflection[:, observer_loop.SENSOR]).max() for one in runs]
+    peaks = [np.abs(one.deflection[:, observer.SENSOR]).max() for one in runs]
     assert peaks[1] > 1.1 * peaks[0]
     off = np.abs(controlled.states[:, 0] - controlled.estimates[:, 0]).max()
     assert off < 0.05 * np.abs(controlled.states[:, 0]).max()

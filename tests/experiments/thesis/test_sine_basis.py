@@ -5,7 +5,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 from scipy.linalg import eigh
 
-from experiments.thesis.chapter2.sine_basis import sine_basis_modes
+from experiments.thesis.chapter2.frequencies import sine_basis_modes
 from jaxbeam.case.beam import Beam, Support
 from jaxbeam.case.case import Case, replace
 from jaxbeam.model.modes import modes

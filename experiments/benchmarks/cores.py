@@ -1,9 +1,0 @@
-"""Restriction of a benchmark to one core, before JAX starts its threads."""
-
-import os
-
-
-def use_one_core() -> None:
-    """Run this process, XLA's threads included, on one core; to be called before importing JAX."""
-    os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false"
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})

@@ -1,1 +1,0 @@
-"""Time and memory of single runs as each of their dimensions grows."""

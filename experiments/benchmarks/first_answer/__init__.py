@@ -1,1 +1,0 @@
-"""Time to the first answer: rows of the benchmark, and how each is measured."""

@@ -1,1 +1,0 @@
-"""Time, memory and place on disk of sweeps into a store, as they grow."""

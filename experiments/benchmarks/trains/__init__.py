@@ -1,1 +1,0 @@
-"""Sweeps of high-speed trains over their speeds."""

@@ -1,1 +1,0 @@
-"""Sweeps of vehicles beside those of masses, and beside a script with scipy."""
