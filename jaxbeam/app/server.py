@@ -204,6 +204,7 @@ def application(workspace: Workspace, opened: str | None, token: str, port: int)
         "envelopes": lambda q: views.envelopes(workspace.record(q["text"])),
         "take": take,
         "sweep": lambda q: {"job": workspace.start_sweep(q["text"], q["axes"])},
+        "read-log": lambda q: workspace.read_log(q["name"], q["columns"], q["rate"], q["missing"]),
         "fit": lambda q: {"job": workspace.start_fit(q["text"], q["logs"], q["free"])},
         "modes": lambda q: {
             "job": workspace.start_modes(q["logs"], q.get("band"), q.get("choose", ()))

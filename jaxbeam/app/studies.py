@@ -13,6 +13,7 @@ from jaxbeam.case.case import Case, own_addresses, unit_at
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.reading.units import number_in_si
 from jaxbeam.files.tables import sweep_columns
+from jaxbeam.runtime.progress import following
 
 MAX_SWEPT = 10_000  # runs of a map on the screen
 MAX_SHOWN = 1500  # samples of a log or a fit on the screen
@@ -77,8 +78,8 @@ class Sweep:
             }
             self.found.append(peaks)
 
-    def state(self, known: int) -> dict[str, Any]:
-        """Axes, and rows beyond those that are known."""
+    def state(self, known: int, name: str) -> dict[str, Any]:
+        """Axes, rows beyond those that are known, and words to compute it again for a file."""
         unit = {
             a: "" if isinstance(v[0], str) else unit_at(self.case, a)
             for a, v in self.values.items()
@@ -89,6 +90,7 @@ class Sweep:
             "values": self.values,
             "units": unit,
             "found": self.found[known:],
+            "words": self.words(name),
         }
 
     def words(self, name: str) -> dict[str, str]:
@@ -122,15 +124,15 @@ def keep_log(folder: Path, name: str, content: bytes) -> Path:
     return path
 
 
-def read_logs(path: Path) -> list[Any]:
-    """Logs of a file. Raises ValueError as `tuning.read_logs`."""
+def read_logs(path: Path, options: Mapping[str, Any]) -> list[Any]:
+    """Logs of a file, read with options of `tuning.read_logs`. Raises ValueError as that does."""
     import warnings
 
     import tuning
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the notes and faults of the log tell it
-        logs = tuning.read_logs(path)
+        logs = tuning.read_logs(path, **options)
     folder = f"{path.parent}/"  # of the server: no one's who drops a log on the page
     return [dataclasses.replace(log, source=log.source.removeprefix(folder)) for log in logs]
 
@@ -160,46 +162,75 @@ def _spread(count: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, MAX_SHOWN)).round().astype(int))
 
 
-def fit(case: Case, logs: Sequence[Any], free: Mapping[str, Any]) -> dict[str, Any]:
-    """Fit free numbers of a case, each with bounds (also with units) or None, to logs.
+class Fit:
+    """A fit of free numbers of a case, each with bounds (also with units) or None, to logs.
 
-    Values with intervals, remarks on what the data cannot see, and measured and fitted readings.
+    Each point that its search tries is seen: its numbers, its misfit, and the readings that it
+    predicts beside those that were measured.
     """
-    import tuning
-    from jaxbeam.case.sensors import sensor_labels
 
-    loaded = case if logs[0].loads is None else dataclasses.replace(case, loads=logs[0].loads)
-    bounds = {}
-    for address, pair in free.items():
-        if pair is not None:
-            unit = unit_at(loaded, re.sub(r"^logs\.[^.]+\.", "", address))
-            pair = tuple(number_in_si(end, unit, address) for end in pair)
-        bounds[address] = pair
-    found = tuning.identify(case, logs, bounds)
-    data, runs = found.dataset, []
-    for i, log in enumerate(data.logs):
-        chosen = _spread(log.times.size)
-        mask = data.mask[i][chosen] > 0
-        runs.append(
-            {
-                "source": log.source,
-                "times": log.times[chosen],
-                "measured": np.where(mask, data.measured[i][chosen], np.nan).T,
-                "fitted": np.where(mask, found.fitted[i][chosen], np.nan).T,
-            }
-        )
-    sensors = case.all_sensors
-    labels = sensor_labels(case.sensors)
-    labels = [*labels, *(f"vehicle {one.quantity}" for one in case.vehicle_sensors)]
-    return found.to_dict() | {
-        "remarks": found.remarks,
-        "noise": np.asarray(found.noise),
-        "runs": runs,
-        "channels": [
+    def __init__(self, case: Case, logs: Sequence[Any], free: Mapping[str, Any]):
+        self.case, self.logs, self.misfits, self.point = case, logs, [], None
+        loaded = case if logs[0].loads is None else dataclasses.replace(case, loads=logs[0].loads)
+        self.bounds: dict[str, Any] = {}
+        for address, pair in free.items():
+            if pair is not None:
+                unit = unit_at(loaded, re.sub(r"^logs\.[^.]+\.", "", address))
+                pair = tuple(number_in_si(end, unit, address) for end in pair)
+            self.bounds[address] = pair
+
+    def run(self) -> dict[str, Any]:
+        """Values with intervals, remarks on what the data cannot see, and fitted readings."""
+        import tuning
+
+        with following(self._see):
+            found = tuning.identify(self.case, self.logs, self.bounds, progress=False)
+        return found.to_dict() | {
+            "remarks": found.remarks,
+            "noise": np.asarray(found.noise),
+            **self._readings(found.dataset, found.fitted),
+        }
+
+    def _see(self, point: Any) -> None:
+        self.misfits.append(point.misfit)
+        self.point = point
+
+    def state(self, known: int, name: str) -> dict[str, Any]:
+        """The misfit of each point so far, and numbers and readings of the last, unless known."""
+        point = self.point
+        if point is None or len(self.misfits) == known:
+            return {"misfits": self.misfits}
+        addresses = [parameter.address for parameter in point.problem.parameters]
+        return {
+            "misfits": self.misfits,
+            "numbers": dict(zip(addresses, point.values, strict=True)),
+            **self._readings(point.problem.data, point.predicted),
+        }
+
+    def _readings(self, data: Any, predicted: np.ndarray) -> dict[str, Any]:
+        """Measured and predicted readings of each log, and what their channels are."""
+        from jaxbeam.case.sensors import sensor_labels
+
+        runs = []
+        for i, log in enumerate(data.logs):
+            chosen = _spread(log.times.size)
+            mask = data.mask[i][chosen] > 0
+            runs.append(
+                {
+                    "source": log.source,
+                    "times": log.times[chosen],
+                    "measured": np.where(mask, data.measured[i][chosen], np.nan).T,
+                    "fitted": np.where(mask, predicted[i][chosen], np.nan).T,
+                }
+            )
+        case = self.case
+        labels = sensor_labels(case.sensors)
+        labels = [*labels, *(f"vehicle {one.quantity}" for one in case.vehicle_sensors)]
+        channels = [
             {"name": label, "quantity": one.quantity, "unit": one.unit}
-            for label, one in zip(labels, sensors, strict=True)
-        ],
-    }
+            for label, one in zip(labels, case.all_sensors, strict=True)
+        ]
+        return {"runs": runs, "channels": channels}
 
 
 def modes(
@@ -280,25 +311,43 @@ def compare(case: Case, controllers: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def tune(
-    case: Case, free: Mapping[str, Any], vary: str, spread: float, steps: int
-) -> dict[str, Any]:
-    """Tune numbers of a controller on three runs in which one number varies, judged on two.
+class Tuning:
+    """A tuning of numbers of a controller or an absorber, each with bounds or None.
 
     The number at `vary` is a share `spread` smaller, as it is, and as much larger in training, half
-    as much in the runs held out.
+    as much in the runs held out. Objective and numbers are seen after each step.
     """
-    import tuning
 
-    middle = float(concrete(jb.addresses(case)[vary]))
-    at = [{vary: middle * (1 + share * spread)} for share in (-1.0, 0.0, 1.0, -0.5, 0.5)]
-    runs = tuning.LoadCases(tuple(at[:3]), tuple(at[3:]))
-    bounds = {
-        address: None if pair is None else tuple(map(float, pair)) for address, pair in free.items()
-    }
-    found = tuning.tune(case, bounds, runs, steps=steps, progress=False)
-    return found.to_dict() | {
-        "history": found.history[:, 0],
-        "verdict": found.verdict,
-        "settings": dict(zip(free, map(float, found.values), strict=True)),
-    }
+    def __init__(self, case: Case, free: Mapping[str, Any], vary: str, spread: float, steps: int):
+        middle = float(concrete(jb.addresses(case)[vary]))
+        at = [{vary: middle * (1 + share * spread)} for share in (-1.0, 0.0, 1.0, -0.5, 0.5)]
+        self.case, self.training, self.held_out, self.steps = case, at[:3], at[3:], steps
+        self.bounds = {
+            address: None if pair is None else tuple(map(float, pair))
+            for address, pair in free.items()
+        }
+        self._seen: dict[str, Any] = {}
+
+    def run(self) -> dict[str, Any]:
+        """Objective by step, best numbers, and their verdict on the runs held out."""
+        import tuning
+
+        runs = tuning.LoadCases(tuple(self.training), tuple(self.held_out))
+        with following(self._see):
+            found = tuning.tune(self.case, self.bounds, runs, steps=self.steps, progress=False)
+        return found.to_dict() | {
+            "history": found.history[:, 0],
+            "verdict": found.verdict,
+            "settings": self._settings(found.values),
+        }
+
+    def _see(self, found: Any) -> None:
+        history, values = found
+        self._seen = {"history": history[:, 0], "settings": self._settings(values)}
+
+    def _settings(self, values: np.ndarray) -> dict[str, float]:
+        return dict(zip(self.bounds, map(float, values), strict=True))
+
+    def state(self, known: int, name: str) -> dict[str, Any]:
+        """The objective of each step so far, and the best numbers."""
+        return self._seen

@@ -25,6 +25,7 @@ from jaxbeam.app import document, studies, views
 from jaxbeam.case.case import Case, address_words, addresses, leaves_by_address, unit_at
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.reading.toml_file import parse_toml
+from jaxbeam.case.reading.units import number_in_si
 from jaxbeam.files.case_file import load_controller
 from jaxbeam.rigs import RIG_NAMES
 from jaxbeam.runtime.input_file import read_input, read_text_input
@@ -64,6 +65,7 @@ class Workspace:
         self._cases, self._records, self._simulators = Remembered(), Remembered(), Remembered()
         self._library = Remembered(100)
         self._jobs: dict[str, Any] = {}
+        self._log_options: dict[str, dict[str, Any]] = {}
         self._uploads = tempfile.TemporaryDirectory(prefix="jaxbeam-")
         self._numbers = itertools.count(1)
         self._computing = threading.RLock()
@@ -238,8 +240,7 @@ class Workspace:
 
     def start_sweep(self, text: str, axes: Iterable[Mapping[str, Any]]) -> str:
         """Begin a sweep; returns its number for `job`."""
-        sweep = studies.Sweep(self.case(text), list(axes))
-        return self._start(jb.api.Job(sweep.run), sweep)
+        return self._start_study(studies.Sweep(self.case(text), list(axes)))
 
     def start_fit(self, text: str, names: Iterable[str], free: Mapping[str, Any]) -> str:
         """Begin a fit of free numbers to logs that were given; returns its number for `job`.
@@ -249,7 +250,7 @@ class Workspace:
         logs = [log for name in names for log in self.log(name)]
         if not logs or not free:
             raise ValueError("a fit needs a log and a free number at least")
-        return self._start(jb.api.Job(studies.fit, self.case(text), logs, dict(free)))
+        return self._start_study(studies.Fit(self.case(text), logs, dict(free)))
 
     def start_modes(
         self, names: Iterable[str], band: Sequence[float] | None, choose: Sequence[float]
@@ -275,7 +276,7 @@ class Workspace:
     def start_tuning(self, text: str, free: Mapping[str, Any], vary: str, spread, steps) -> str:
         """Begin a tuning of numbers of a controller; returns its number for `job`."""
         parts = self.case(text), dict(free), vary, float(spread), int(steps)
-        return self._start(jb.api.Job(studies.tune, *parts))
+        return self._start_study(studies.Tuning(*parts))
 
     def controllers(self) -> list[str]:
         """Names of the files of the folder that have a controller."""
@@ -295,21 +296,48 @@ class Workspace:
         Raises ValueError for what is no log.
         """
         studies.keep_log(Path(self._uploads.name), name, content)
+        self._log_options.pop(name, None)
         if name.lower().endswith(".toml"):
-            return {"name": name, "logs": []}
-        return {"name": name, "logs": [studies.describe_log(log) for log in self.log(name)]}
+            return {"name": name, "logs": [], "problem": None}
+        return self.read_log(name)
+
+    def read_log(
+        self, name: str, columns: str = "", rate: str = "", missing: str = "refuse"
+    ) -> dict[str, Any]:
+        """Read a log that was dropped, now with these columns and their units, rate and gaps.
+
+        They are as of `tuning.read_logs`, "" for what the file itself tells; later fits read it in
+        the same way. Returns what is read, or the `problem` for which it cannot be.
+        """
+        if name in self._log_options or columns.strip() or rate.strip() or missing != "refuse":
+            self._log_options[name] = {
+                "columns": columns.strip() or None,
+                "rate": number_in_si(rate, "Hz", "rate") if rate.strip() else None,
+                "missing": missing,
+            }
+        try:
+            logs = [studies.describe_log(log) for log in self.log(name)]
+        except (ValueError, ImportError) as error:
+            problem = jb.api.problem(error)._asdict()
+            problem["message"] = problem["message"].replace(f"{self._uploads.name}/", "")
+            return {"name": name, "logs": [], "problem": problem}
+        return {"name": name, "logs": logs, "problem": None}
 
     def log(self, name: str) -> list[Any]:
         """Logs of a file that was dropped on the page. Raises ValueError if there was none."""
         path = Path(self._uploads.name) / Path(name).name
         if not path.is_file():
             raise ValueError(f"there is no log {name!r}: drop it on the page again")
-        return studies.read_logs(path)
+        return studies.read_logs(path, self._log_options.get(name, {}))
 
-    def _start(self, job: "jb.api.Job", sweep: studies.Sweep | None = None) -> str:
+    def _start_study(self, study: Any) -> str:
+        """Begin work whose results are seen as it goes on."""
+        return self._start(jb.api.Job(study.run), study)
+
+    def _start(self, job: "jb.api.Job", study: Any = None) -> str:
         """Keep work that goes on, of the last few; returns its number."""
         number = str(next(self._numbers))
-        self._jobs[number] = job, sweep
+        self._jobs[number] = job, study
         for old in list(self._jobs)[:-KEPT]:
             self._jobs.pop(old)[0].cancel()
         return number
@@ -317,14 +345,15 @@ class Workspace:
     def job(self, number: str, known: int = 0, name: str = "case.toml") -> dict[str, Any]:
         """State of work: its progress, whether it is done, and its result or what was wrong.
 
-        Of a sweep, the rows beyond those that are `known`, and the words to compute it again.
+        `seen` is what a sweep, a fit or a tuning has found so far, beyond the rows or points that
+        are `known`; a case in a file of the `name` is what words to compute it again speak of.
         Raises ValueError for a number that is not known.
         """
-        job, sweep = self._known_job(number)
+        job, study = self._known_job(number)
         state: dict[str, Any] = {"done": job.done, "progress": list(job.progress), "problem": None}
-        if sweep is not None:
-            state |= {"sweep": sweep.state(known), "words": sweep.words(name)}
-        if job.done:
+        if study is not None:
+            state["seen"] = study.state(known, name)
+        if state["done"]:
             try:
                 state["result"] = job.result()
             except jb.api.Cancelled:

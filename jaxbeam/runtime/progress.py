@@ -1,4 +1,4 @@
-"""Progress of work that takes long: a bar on standard error, or a function called at each step."""
+"""Progress of work that takes long: a bar on standard error, or functions called at each step."""
 
 import contextlib
 import contextvars
@@ -11,12 +11,19 @@ from tqdm import tqdm
 # Called with the steps done, those of the whole, and what a step is; what it raises ends the work.
 OnStep = Callable[[int, int, str], None]
 _ON_STEP: contextvars.ContextVar[OnStep | None] = contextvars.ContextVar("on_step", default=None)
+# Called with what a search has found so far.
+OnFound = Callable[[Any], None]
+_ON_FOUND: contextvars.ContextVar[OnFound | None] = contextvars.ContextVar("on_found", default=None)
+BAR_DELAY = 2.0  # s, after which the bar of work of unknown length is shown
 
 
 class ProgressBar(tqdm):
-    """Bar of `total` steps, shown on request; the function of `watching` is called at each."""
+    """Bar of `total` steps, shown on request; the function of `watching` is called at each.
 
-    def __init__(self, total: int, unit: str, *, shown: bool, **options: Any):
+    A `total` of None is one that nobody knows, of which `watching` is told 0.
+    """
+
+    def __init__(self, total: int | None, unit: str, *, shown: bool, **options: Any):
         super().__init__(total=total, unit=unit, disable=not shown, file=sys.stderr, **options)
         self._done = options.get("initial", 0)
         self._words = unit
@@ -41,7 +48,7 @@ class ProgressBar(tqdm):
     def _tell(self) -> None:
         on_step = _ON_STEP.get()
         if on_step is not None:
-            on_step(self._done, int(self.total), self._words)
+            on_step(self._done, int(self.total or 0), self._words)
 
 
 @contextlib.contextmanager
@@ -52,3 +59,30 @@ def watching(on_step: OnStep) -> Iterator[None]:
         yield
     finally:
         _ON_STEP.reset(token)
+
+
+def found_so_far(found: Any) -> None:
+    """Give what a search has found so far to the function of `following`, if there is one."""
+    on_found = _ON_FOUND.get()
+    if on_found is not None:
+        on_found(found)
+
+
+@contextlib.contextmanager
+def following(on_found: OnFound) -> Iterator[None]:
+    """Call a function with what fits and tunings find, at each step within this context.
+
+    The functions of contexts around it are called, too.
+    """
+    outer = _ON_FOUND.get()
+
+    def both(found):
+        on_found(found)
+        if outer is not None:
+            outer(found)
+
+    token = _ON_FOUND.set(both)
+    try:
+        yield
+    finally:
+        _ON_FOUND.reset(token)

@@ -303,6 +303,27 @@ def test_a_log_is_dropped_and_shown_as_read(page, server):
         {"name": "log.exe", "mimeType": "text/plain", "buffer": b"no"}
     )
     wait_for(lambda: "is no log" in page.locator("#status").inner_text())
+    bare = {"name": "bare.csv", "mimeType": "text/csv", "buffer": b"0,1\n0.01,2\n0.02,4\n"}
+    page.locator("#log-files").set_input_files(bare)
+    card = page.locator('.log[data-name="bare.csv"]')
+    assert "the file has no headings" in card.get_by_role("alert").inner_text()
+    card.get_by_label("Columns with units, - for one to leave out").fill("time [s], a1 [g]")
+    card.get_by_role("button", name="Read again").click()
+    wait_for(lambda: card.locator("td").all_inner_texts() == ["a1", "acceleration", "g"])
+
+
+def test_a_fit_converges_before_the_eyes(page):
+    demo = ROOT / "jaxbeam/demo"
+    write(page, (demo / "rig.toml").read_text())
+    page.get_by_role("tab", name="Identify").click()
+    page.locator("#log-files").set_input_files([demo / "log_1.toml", demo / "log_1.csv"])
+    page.wait_for_selector(".log")
+    page.get_by_role("button", name="Fit", exact=True).click()
+    trial = page.get_by_role("heading", name="Trial point")
+    trial.wait_for(timeout=120_000)
+    first = int(trial.inner_text().split()[-1])
+    page.get_by_role("heading", name="Fitted numbers").wait_for(timeout=300_000)
+    assert first < 15 and page.locator(".identify .plot").count() > 3
 
 
 def test_modes_are_found_and_one_is_left_out_by_a_click(page, server):

@@ -26,30 +26,30 @@ def finished(workspace, number, seconds=300):
 
 def test_a_map_is_the_sweep_of_the_library(workspace):
     state = finished(workspace, workspace.start_sweep(RIG, [SPEED, MASS]))
-    found = np.array([row[PEAK] for row in state["sweep"]["found"]])
+    found = np.array([row[PEAK] for row in state["seen"]["found"]])
     over = {"loads.0.speed": np.linspace(0.5, 1.5, 4), "loads.0.mass": np.linspace(0.1, 0.4, 3)}
     runs = jb.sweep(jb.api.load_case(RIG), over, progress=False)
     expected = runs.peak_deflection.isel(sensor=0).transpose("loads.0.mass", "loads.0.speed")
     np.testing.assert_allclose(found, expected.values, rtol=2e-3)
-    assert workspace.job("1", known=2)["sweep"]["found"] == state["sweep"]["found"][2:]
+    assert workspace.job("1", known=2)["seen"]["found"] == state["seen"]["found"][2:]
 
 
 def test_the_words_of_a_sweep_compute_it_again(workspace, rig, monkeypatch):
     state = finished(workspace, workspace.start_sweep(RIG, [SPEED]))
-    words = workspace.job("1", name="rig.toml")["words"]
+    words = workspace.job("1", name="rig.toml")["seen"]["words"]
     assert words["command"] == "jaxbeam sweep rig.toml --over loads.0.speed=0.5:1.5:4 --plot"
     monkeypatch.chdir(rig.parent)
     names: dict = {}
     exec(words["python"], names)
     peaks = names["runs"].peak_deflection.values[:, 0]
-    np.testing.assert_allclose(state["sweep"]["found"][0][PEAK], peaks, rtol=1e-9)
+    np.testing.assert_allclose(state["seen"]["found"][0][PEAK], peaks, rtol=1e-9)
 
 
 def test_words_are_swept_row_by_row(workspace):
     text = workspace.library_text("railway-bridge")
     trains = {"address": "loads.0.train", "words": "HSLM-A1, HSLM-A2"}
     speeds = {"address": "loads.0.speed", "from": "100 km/h", "to": "120 km/h", "count": 2}
-    sweep = finished(workspace, workspace.start_sweep(text, [trains, speeds]))["sweep"]
+    sweep = finished(workspace, workspace.start_sweep(text, [trains, speeds]))["seen"]
     assert (sweep["rows"], sweep["columns"]) == ("loads.0.train", "loads.0.speed")
     assert [len(row["midspan peak deflection (m)"]) for row in sweep["found"]] == [2, 2]
 
@@ -57,12 +57,12 @@ def test_words_are_swept_row_by_row(workspace):
 def test_a_sweep_is_stopped_and_keeps_the_rows_that_are_known(workspace):
     many = MASS | {"count": 2000}
     number = workspace.start_sweep(RIG, [SPEED, many])
-    while not workspace.job(number)["sweep"]["found"]:
+    while not workspace.job(number)["seen"]["found"]:
         time.sleep(0.02)
     workspace.cancel(number)
     state = finished(workspace, number)
     assert state["problem"]["message"] == "stopped"
-    assert 0 < len(state["sweep"]["found"]) < 2000
+    assert 0 < len(state["seen"]["found"]) < 2000
 
 
 @pytest.mark.parametrize(
@@ -110,6 +110,7 @@ def test_a_tuning_lowers_its_objective(workspace):
     result = state["result"]
     assert len(result["history"]) == 4 and state["progress"][:2] == [4, 4]
     assert result["history"][-1] < result["history"][0]
+    assert state["seen"] == {key: result[key] for key in ("history", "settings")}
     masses = [run["loads.0.mass"] for run in result["runs"]["training"]["cases"]]
     assert masses == pytest.approx([0.32, 0.4, 0.48])
 
@@ -129,8 +130,12 @@ def test_a_dropped_log_is_shown_as_read_and_fitted(workspace):
         "logs.*.loads.0.entry_time": None,
     }
     number = workspace.start_fit((demo / "rig.toml").read_text(), ["log_1.csv"], free)
-    result = finished(workspace, number)["result"]
+    state = finished(workspace, number)
+    result, seen = state["result"], state["seen"]
     own = result["numbers"]["beam.flexural_rigidity"]
+    assert seen["misfits"][-1] < 1e-2 * seen["misfits"][0]
+    assert seen["numbers"]["beam.flexural_rigidity"] == pytest.approx(own["value"], rel=1e-6)
+    assert "runs" not in workspace.job(number, len(seen["misfits"]))["seen"]
     truth = tomllib.loads((demo / "truth.toml").read_text())["beam.flexural_rigidity"]
     assert abs(own["value"] - truth) < abs(own["start"] - truth)
     assert len(result["runs"][0]["fitted"]) == 3
@@ -151,6 +156,35 @@ def test_modes_of_a_log_are_found_and_chosen(workspace, tmp_path):
     assert only["frequency_hz"] == pytest.approx(11, rel=2e-3)
     with pytest.raises(ValueError, match="drop a log"):
         workspace.start_modes([], None, [])
+
+
+def test_columns_and_units_of_a_log_are_told_by_hand(workspace):
+    rows = "\n".join(f"{i / 100},{i % 7},{i % 5}" for i in range(50))
+    found = workspace.take_log("bare.csv", rows.encode())
+    assert found["logs"] == [] and found["problem"]["message"].startswith("bare.csv, line 1")
+    (log,) = workspace.read_log("bare.csv", "time [s], a1 [g], -")["logs"]
+    assert log["channels"] == [{"name": "a1", "quantity": "acceleration", "unit": "g"}]
+    assert workspace.log("bare.csv")[0].values[1, 0] == pytest.approx(9.80665)
+    (log,) = workspace.read_log("bare.csv", "-, w [mm], s [mm]", "0.2 kHz")["logs"]
+    assert log["rate"] == pytest.approx(200.0) and len(log["channels"]) == 2
+    assert (
+        "rate takes a number"
+        in pytest.raises(ValueError, workspace.read_log, "bare.csv", "", "fast").value.args[0]
+    )
+    again = workspace.take_log("bare.csv", rows.encode())
+    assert again["problem"] is not None
+
+
+def test_a_fit_is_stopped(workspace):
+    demo = ROOT / "jaxbeam/demo"
+    for name in ("log_1.toml", "log_1.csv"):
+        workspace.take_log(name, (demo / name).read_bytes())
+    free = {"beam.flexural_rigidity": None, "beam.damping_ratio": None}
+    number = workspace.start_fit((demo / "rig.toml").read_text(), ["log_1.csv"], free)
+    while not workspace.job(number)["seen"]["misfits"]:
+        time.sleep(0.02)
+    workspace.cancel(number)
+    assert finished(workspace, number)["problem"]["message"] == "stopped"
 
 
 @pytest.mark.parametrize("name", ["../log.csv", "a/b.csv", ".csv", "log.exe", "", "a\0.csv"])

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled
-from jaxbeam.runtime.progress import ProgressBar
+from jaxbeam.runtime.progress import ProgressBar, found_so_far
 from tuning.checkpoint import NO_CHECKPOINT, Checkpoint
 from tuning.control.objective import Objective, WeightsAndLimits
 from tuning.control.penalised_objective import (
@@ -348,6 +348,7 @@ class Optimisation:
         with bar:
             while state.step < total:
                 state = self._step(state, target, seed)
+                found_so_far((state.history, self.best_values(state)))
                 bar.update()
                 bar.set_postfix_str(f"objective {state.best_value.min():.4g}")
                 if state.step % CHECKPOINT_STEPS == 0 or state.step == total:

@@ -1,8 +1,9 @@
 """Identification: parameters of a case from logs of runs with known loads, by least squares."""
 
+import contextlib
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import jax
 import numpy as np
@@ -11,9 +12,10 @@ from jaxtyping import Bool
 from jaxbeam.case.case import Case, structure_of
 from jaxbeam.case.fields import concrete
 from jaxbeam.model.plausibility.check import warn_if_implausible
+from jaxbeam.runtime.progress import BAR_DELAY, ProgressBar, following
 from tuning.checkpoint import Checkpoint, checkpoint_path, fingerprint
 from tuning.fit.dataset import Dataset, make_dataset
-from tuning.fit.least_squares import LeastSquares, check_loss
+from tuning.fit.least_squares import LeastSquares, SearchPoint, check_loss
 from tuning.fit.multi_start import multi_start
 from tuning.fit.result import Fit, fit_result
 from tuning.logs.log import Log
@@ -32,6 +34,7 @@ def identify(
     seed: int = 0,
     checkpoint: str | os.PathLike | None = None,
     resume: bool = False,
+    progress: bool = True,
 ) -> Fit:
     """Fit parameters of a case to logs of runs with known loads.
 
@@ -47,7 +50,8 @@ def identify(
     `loss` "soft-l1" or "huber" reduces the weight of outliers. `stages` are lists of addresses that
     are fitted first, one list after the other, the rest held. With several `starts`, drawn by the
     `seed` but for the first, the lowest minimum is taken. With a `checkpoint` file that search can
-    be stopped at any time; with `resume` it goes on, to the same result.
+    be stopped at any time; with `resume` it goes on, to the same result. Of a fit that takes longer
+    than two seconds the trial points and their misfit are shown, unless `progress` is False.
 
     Raises ValueError for faulty input or a checkpoint of another search, FileExistsError if the
     checkpoint exists and `resume` is not set, RuntimeError if the simulation fails.
@@ -86,14 +90,28 @@ def identify(
     stage_masks = [_stage_mask(parameters, stage) for stage in stages]
     least_squares = LeastSquares(dataset, parameters, loss)
     minima, start = (), None
-    if starts > 1:
-        kept = Checkpoint(path, _search_digest(dataset, parameters, loss, starts, seed))
-        minima = tuple(multi_start(least_squares, dataset.measured, starts, seed, kept))
-        start = minima[0].unbounded
-    for mask in stage_masks:
-        start = least_squares.solve(dataset.measured, start=start, free=mask).unbounded
-    solution = least_squares.solve(dataset.measured, start=start)
+    with _bar(progress):
+        if starts > 1:
+            kept = Checkpoint(path, _search_digest(dataset, parameters, loss, starts, seed))
+            minima = tuple(multi_start(least_squares, dataset.measured, starts, seed, kept))
+            start = minima[0].unbounded
+        for mask in stage_masks:
+            start = least_squares.solve(dataset.measured, start=start, free=mask).unbounded
+        solution = least_squares.solve(dataset.measured, start=start)
     return fit_result(case, least_squares, solution, minima)
+
+
+@contextlib.contextmanager
+def _bar(shown: bool) -> Iterator[None]:
+    """A bar of the points that searches try within this context."""
+    with ProgressBar(None, "point", shown=shown, desc="fit", delay=BAR_DELAY) as bar:
+
+        def on_point(point: SearchPoint) -> None:
+            bar.set_postfix_str(f"misfit {point.misfit:.4g}", refresh=False)
+            bar.update()
+
+        with following(on_point):
+            yield
 
 
 def _stage_mask(

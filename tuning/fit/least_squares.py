@@ -6,12 +6,13 @@ r is a residual over the standard deviation of the noise.
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.progress import found_so_far
 from tuning.fit.uncertainty.covariance import Uncertainty, autocorrelation_factor, uncertainty
 from tuning.parameters.free import FreeParameter, to_unbounded
 from tuning.parameters.prediction import SamplePrediction
@@ -195,10 +196,24 @@ class LeastSquaresSolution:
     converged: bool
 
 
+class SearchPoint(NamedTuple):
+    """A point that a search has tried: values of its parameters, samples that they predict.
+
+    `problem` is the `LeastSquares` that is searched in; `misfit` is half the sum of squared
+    residuals over their noise (or their loss), of measured samples alone.
+    """
+
+    problem: Any
+    values: Float[np.ndarray, " parameter"]
+    predicted: Float[np.ndarray, "log time channel"]
+    misfit: float
+
+
 class LeastSquares:
     """Least-squares problem in the free parameters of a dataset, compiled once for any samples.
 
-    Priors of the parameters count as further residuals. `loss` is one of the losses above.
+    Priors of the parameters count as further residuals. `loss` is one of the losses above. Who is
+    `following` (jaxbeam.runtime.progress) is given each `SearchPoint`.
 
     Raises ValueError if there are more parameters than samples, or for an unknown loss.
     """
@@ -372,7 +387,9 @@ class LeastSquares:
             # A weak Gaussian prior around the start (in the second fit, around the result of the
             # first) keeps unidentifiable directions bounded; it is left out of standard errors.
             weak_prior_residuals = (z * scale - point) / self.weak_prior_widths
-            parts = robust_residual(self.loss, residuals).ravel(), self.prior_residuals(values)
+            of_samples = robust_residual(self.loss, residuals).ravel()
+            found_so_far(SearchPoint(self, values, samples, float(np.sum(of_samples**2) / 2)))
+            parts = of_samples, self.prior_residuals(values)
             return np.concatenate([*parts, weak_prior_residuals]), np.vstack(
                 [
                     rows.reshape(-1, len(slopes)) * slopes,

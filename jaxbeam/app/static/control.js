@@ -2,7 +2,7 @@
 
 import { ask } from "./api.js";
 import { html, number, scaled } from "./dom.js";
-import { addressChoice, createJob, labelled } from "./job.js";
+import { addressChoice, createJob, freeChoice, labelled } from "./job.js";
 import { Plot } from "./plot.js";
 
 /** @param {import("./store.js").Store} store */
@@ -39,7 +39,7 @@ export function createControl(store) {
     commands.show({ x, series: driven });
   }
 
-  const free = addressChoice(store, "Tune");
+  const free = freeChoice(store, "Tune");
   const vary = addressChoice(store, "for runs that differ in");
   const spread = html("input", { value: 20, size: 3, inputmode: "decimal", autocomplete: "off" });
   const steps = html("input", { value: 30, size: 3, inputmode: "numeric", autocomplete: "off" });
@@ -47,20 +47,21 @@ export function createControl(store) {
   const history = new Plot({ title: "Objective by step", unit: "", axis: "step" });
   history.element.hidden = true;
   const tune = createJob(store, "Tune", async () => {
-    if (!free.select.value || !vary.select.value) {
-      store.say("choose a number to tune, and one in which the runs differ", true);
+    if (!free.free.size || !vary.select.value) {
+      store.say("choose numbers to tune, and one in which the runs differ", true);
       return null;
     }
-    return { name: "tune", question: { text: store.text, free: { [free.select.value]: null }, vary: vary.select.value, spread: Number(spread.value) / 100, steps: Number(steps.value) } };
+    return { name: "tune", question: { text: store.text, free: Object.fromEntries([...free.free].map((one) => [one, null])), vary: vary.select.value, spread: Number(spread.value) / 100, steps: Number(steps.value) } };
   }, (state) => {
-    const { result } = state;
-    if (!result) return 0;
-    const keep = html("button", { type: "button", onclick: () => store.change(...Object.entries(result.settings).map(([address, to]) => ({ set: address, to: Number(/** @type {number} */ (to).toPrecision(6)) }))) }, "Put it into the case");
-    const words = Object.entries(result.settings).map(([address, value]) => `${address} = ${number(/** @type {number} */ (value), 5)}`).join(", ");
-    verdict.replaceChildren(html("h3", {}, words, keep), html("p", {}, result.verdict));
+    const { result, seen } = state;
+    const last = result ?? seen;
+    if (!last.history) return 0;
+    const keep = html("button", { type: "button", onclick: () => store.change(...Object.entries(last.settings).map(([address, to]) => ({ set: address, to: Number(/** @type {number} */ (to).toPrecision(6)) }))) }, "Put it into the case");
+    const words = Object.entries(last.settings).map(([address, value]) => `${address} = ${number(/** @type {number} */ (value), 5)}`).join(", ");
+    verdict.replaceChildren(html("h3", {}, words, keep), html("p", {}, result ? result.verdict : `after step ${last.history.length}`));
     history.element.hidden = false;
-    const seen = result.history.map((/** @type {number | null} */ one) => one ?? NaN);
-    history.show({ zero: false, x: seen.map((/** @type {number} */ _, /** @type {number} */ i) => i), series: [{ name: "objective", tint: 0, y: seen }] });
+    const objective = last.history.map((/** @type {number | null} */ one) => one ?? NaN);
+    history.show({ zero: false, x: objective.map((/** @type {number} */ _, /** @type {number} */ i) => i), series: [{ name: "objective", tint: 0, y: objective }] });
     return 0;
   });
 
@@ -73,6 +74,6 @@ export function createControl(store) {
 
   const element = html("div.control", {},
     html("h3", {}, "Compare this controller with those of the folder"), html("div.form", {}, files, compare.element), table, pair,
-    html("h3", {}, "Tune by gradient steps"), html("div.form", {}, free.element, vary.element, labelled("by ± %", spread), labelled("steps", steps), tune.element), verdict, html("div.plots", {}, history.element));
+    html("h3", {}, "Tune by gradient steps"), html("div.form", {}, free.element, free.chips, vary.element, labelled("by ± %", spread), labelled("steps", steps), tune.element), verdict, html("div.plots", {}, history.element));
   return { element, show };
 }

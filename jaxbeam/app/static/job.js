@@ -32,7 +32,7 @@ export function createJob(store, words, begin, seen) {
         const state = await ask("job", { job: number, known, name: store.name });
         known = seen(state);
         const [done, total] = state.progress;
-        if (state.sweep) bar.value = known / Math.max(1, state.sweep.values[state.sweep.rows]?.length ?? 1);
+        if (state.seen?.rows !== undefined) bar.value = known / Math.max(1, state.seen.values[state.seen.rows]?.length ?? 1);
         else if (total > 0) bar.value = done / total;
         if (state.done) {
           if (state.problem) store.say(state.problem.message, state.problem.message !== "stopped");
@@ -74,4 +74,27 @@ export function addressChoice(store, words, others = []) {
   store.on("model", fill);
   fill();
   return { element: labelled(words, select), select };
+}
+
+/**
+ * A choice of free numbers: each is a chip that a press removes.
+ * @param {import("./store.js").Store} store @param {string} words @param {string[]} [others]
+ */
+export function freeChoice(store, words, others = []) {
+  /** @type {Set<string>} */ const free = new Set();
+  const choice = addressChoice(store, words, others);
+  const chips = html("div.chips", { role: "group", "aria-label": `${words}: chosen` });
+  const show = () => chips.replaceChildren(...[...free].map((one) => html("button.chip", { type: "button", "aria-label": `${one}: no longer free`, "data-address": one, onclick: () => {
+    free.delete(one);
+    show();
+  } }, `${one} ×`)));
+  const add = (/** @type {string} */ address) => {
+    free.add(address);
+    show();
+  };
+  choice.select.addEventListener("change", () => {
+    if (choice.select.value) add(choice.select.value);
+    choice.select.value = "";
+  });
+  return { element: choice.element, chips, free, add };
 }

@@ -37,9 +37,9 @@ export function createSweep(store) {
     rows = [];
     return { name: "sweep", question: { text: store.text, axes: chosen } };
   }, (state) => {
-    sweep = state.sweep;
+    sweep = state.seen;
     rows.push(...sweep.found);
-    words.textContent = `${state.words.python}\n\n# ${state.words.command}`;
+    words.textContent = `${sweep.words.python}\n\n# ${sweep.words.command}`;
     words.hidden = false;
     fillChoice();
     if (sweep.found.length || state.done) draw();

@@ -120,6 +120,7 @@ def identify(
                 stages=[text.split(",") for text in stage],
                 checkpoint=searched if starts > 1 else None,
                 resume=resume,
+                progress=not options.json_,
             )
             assessment = _assess(
                 fit, profile, draws, {"seed": seed, "noise": noise}, validate, output, resume
