@@ -162,7 +162,7 @@ def _spread(count: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, MAX_SHOWN)).round().astype(int))
 
 
-class Fit:
+class PageFit:
     """A fit of free numbers of a case, each with bounds (also with units) or None, to logs.
 
     Each point that its search tries is seen: its numbers, its misfit, and the readings that it
@@ -311,7 +311,7 @@ def compare(case: Case, controllers: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-class Tuning:
+class PageTuning:
     """A tuning of numbers of a controller or an absorber, each with bounds or None.
 
     The number at `vary` is a share `spread` smaller, as it is, and as much larger in training, half

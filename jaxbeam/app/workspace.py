@@ -250,7 +250,7 @@ class Workspace:
         logs = [log for name in names for log in self.log(name)]
         if not logs or not free:
             raise ValueError("a fit needs a log and a free number at least")
-        return self._start_study(studies.Fit(self.case(text), logs, dict(free)))
+        return self._start_study(studies.PageFit(self.case(text), logs, dict(free)))
 
     def start_modes(
         self, names: Iterable[str], band: Sequence[float] | None, choose: Sequence[float]
@@ -276,7 +276,7 @@ class Workspace:
     def start_tuning(self, text: str, free: Mapping[str, Any], vary: str, spread, steps) -> str:
         """Begin a tuning of numbers of a controller; returns its number for `job`."""
         parts = self.case(text), dict(free), vary, float(spread), int(steps)
-        return self._start_study(studies.Tuning(*parts))
+        return self._start_study(studies.PageTuning(*parts))
 
     def controllers(self) -> list[str]:
         """Names of the files of the folder that have a controller."""
