@@ -278,13 +278,174 @@ BASES = {
         [run]
         duration = 1.2
         """,
+    "rail": """
+        [beam]
+        length = 60.0
+        flexural_rigidity = 6.4e6
+        mass_per_length = 60.0
+        foundation_stiffness = 40e6
+        damping_ratio = 0.1
+        modes = 40
+        [[sensors]]
+        position = 30.0
+        [[loads]]
+        kind = "force"
+        force = 100e3
+        speed = 50.0
+        [run]
+        duration = 1.3
+        """,
+    "damped": """
+        [beam]
+        length = 25.0
+        flexural_rigidity = 30e9
+        mass_per_length = 15e3
+        damping_ratio = 0.015
+        axial_force = -5e6
+        [[supports]]
+        position = 10.0
+        stiffness = 2e9
+        rotational_stiffness = 1e8
+        damping = 1e6
+        mass = 2e3
+        [[absorbers]]
+        position = 18.0
+        mass = 3000.0
+        frequency = 11.5
+        damping_ratio = 0.08
+        max_stroke = 0.02
+        [[actuators]]
+        kind = "point"
+        position = 5.0
+        limits = [-2e4, 2e4]
+        [[sensors]]
+        position = 5.0
+        quantity = "velocity"
+        [[loads]]
+        kind = "mass"
+        mass = 30e3
+        speed = 25.0
+        [controller]
+        kind = "feedback"
+        gains = [2e5]
+        period = 0.01
+        resolution = 20.0
+        [run]
+        duration = 2.0
+        """,
+    "coil": """
+        [beam]
+        length = 1.5
+        flexural_rigidity = 60.0
+        mass_per_length = 1.2
+        damping_ratio = 0.01
+        [[actuators]]
+        kind = "electrodynamic"
+        position = 0.6
+        resistance = 3.0
+        inductance = 1e-3
+        force_constant = 8.0
+        mass = 0.05
+        stiffness = 200.0
+        damping = 1.0
+        back_emf = 8.0
+        limits = [-5.0, 5.0]
+        [[actuators]]
+        kind = "patch"
+        start = 0.8
+        end = 0.9
+        moment_per_volt = 2e-3
+        amplifier_gain = 100.0
+        limits = [-4.0, 12.0]
+        rate_limit = 2e3
+        [[actuators]]
+        kind = "spring"
+        position = 1.0
+        stiffness = 300.0
+        damping = 0.5
+        [[sensors]]
+        position = 0.6
+        [[sensors]]
+        position = 0.85
+        [[loads]]
+        kind = "mass"
+        mass = 0.3
+        speed = 1.5
+        [controller]
+        kind = "pd"
+        gains = [100.0, 80.0]
+        rate_gains = [5.0, 5.0]
+        lag = 0.002
+        period = 0.002
+        resolution = 0.005
+        [run]
+        duration = 1.5
+        """,
 }
 
 # The case, the entry that is wrong, its value, the address that is named, and the likely unit.
 STANDING = {"position": 12.5, "mass": 2e3, "damping": 500.0}
 TUNED = {"position": 12.5, "mass": 2e3, "stiffness": 1e6}
 TABLE = {"kind": "mass", "mass": 30e3, "positions": [0.0, 25.0]}
+ROLLED = [[2e3, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+PPF = {"kind": "ppf", "gains": [-300.0, -300.0], "damping_ratio": 0.5, "period": 0.002}
+BUMP = {"kind": "bump", "start": 1e3, "end": 2e3, "height": 0.03}
 MISTAKES = [
+    # Frequencies in rad/s, stroke, foundation, waves
+    ("damped", "absorbers.0.frequency", 11.5 * 2 * math.pi, "", "11.5 Hz"),
+    ("bridge", "absorbers.0", STANDING | {"frequency": 21.9}, ".frequency", "3.49 Hz"),
+    ("coil", "controller", PPF | {"frequency": 4.9 * 2 * math.pi}, ".frequency", "not in rad/s"),
+    ("damped", "absorbers.0.max_stroke", 20.0, "", "in m, not in mm"),
+    ("rail", "beam.foundation_stiffness", 40e3, "", "in N/m^2, not in kN/m^2"),
+    ("bridge", "beam.foundation_stiffness", 20e3, "", "in N/m^2, not in kN/m^2"),
+    ("cars", "profile.wavelength", 4000.0, "", "in m, not in mm"),
+    (
+        "cars",
+        "profile",
+        {"kind": "sine", "wavelength": 50.0, "amplitude": 5e-5},
+        ".wavelength",
+        "m",
+    ),
+    ("cars", "profile", BUMP, ".start", "in m, not in mm"),
+    # Dampers, masses and springs on supports and actuators
+    ("damped", "beam.axial_force", -5e3, "", "in N, not in kN"),
+    ("damped", "supports.0.rotational_stiffness", 1e5, "", "in N m/rad"),
+    ("damped", "supports.0.damping", 1e10, "", "in N s/m"),
+    ("damped", "supports.0.mass", 2e6, "", "in kg"),
+    ("rig", "actuators.1.force_per_volt", 4.6e-3, "", "in N/V"),
+    ("rig", "actuators.1.stiffness", 3.5, "", "not in kN/m or N/mm"),
+    ("rig", "actuators.1.damping", 80e3, "", "in N s/m"),
+    ("rig", "actuators.0.amplifier_gain", 46.0, "", "46 dB are a factor of 200"),
+    ("rig", "actuators.2.limits", [-5e-3, 5e-3], "", "in N"),
+    ("coil", "actuators.0.force_constant", 8e-3, "", "in N/A"),
+    ("coil", "actuators.0.inductance", 1.0, "", "in H, not in mH"),
+    ("coil", "actuators.0.back_emf", 8e3, "", "in V s/m"),
+    ("coil", "actuators.0.mass", 50.0, "", "in kg, not in g"),
+    ("coil", "actuators.1.amplifier_gain", 40.0, "", "40 dB are a factor of 100"),
+    ("coil", "actuators.1.rate_limit", 2.0, "", "in V/s, not in V/ms"),
+    ("coil", "actuators.2.stiffness", 0.3, "", "in N/m, not in kN/m"),
+    # Controllers: effect of gains, rounding, lags
+    ("rig", "controller.gains", (1e-3 * np.array(ROLLED)).tolist(), "", "not in mm"),
+    ("rig", "controller.gains", (1e6 * np.array(ROLLED)).tolist(), "", "command in its unit"),
+    ("damped", "controller.gains", [200.0], "", "command in its unit"),
+    ("damped", "controller.gains", [2e11], "", "command in its unit"),
+    ("coil", "controller.gains", [0.1, 0.08], "", "command in its unit"),
+    ("coil", "controller.rate_gains", [5e-3, 5e-3], "", "command in its unit"),
+    ("coil", "controller.rate_gains", [5e4, 5e4], "", "command in its unit"),
+    ("coil", "controller.lag", 2.0, "", "in s, not in ms"),
+    ("coil", "controller.resolution", 5.0, "", "in V, not in mV"),
+    ("damped", "controller.resolution", 2e4, "", "in N"),
+    ("coil", "controller", PPF | {"frequency": 5.6, "damping_ratio": 50.0}, ".damping_ratio", "50"),
+    ("coil", "controller.jitter", 1.2, "", "in s, not in ms"),
+    ("coil", "controller.period", 2e-6, "", "in s"),
+    # Vehicles, forces, travel
+    ("railway", "loads.2.bodies.0.inertia", 1e3, "", "in kg m^2, not in t m^2"),
+    ("railway", "loads.2.axles.0.mass", 0.9, "", "in kg, not in t"),
+    ("railway", "loads.1.forces", 170e3 / 9.81, "loads.1.masses", "forces in N"),
+    ("cars", "loads.0.entry_time", -5e3, "", "in s, not in ms"),
+    ("footbridge", "loads.1.amplitudes", [0.3], "", "in N, not in kN"),
+    ("bridge", "run.sample_rate", 1e6, "", "in Hz"),
+    ("rig", "sensors.2.section_modulus", 7.5e-11, "", "in m^3"),
     # Absorbers, foundations and forces; the absorber is tuned at 3.55 Hz by 1e6 N/m
     ("bridge", "absorbers.0", STANDING | {"stiffness": 1e3}, ".stiffness", "not in kN/m"),
     ("bridge", "absorbers.0", {**STANDING, "mass": 2e6, "frequency": 3.5}, ".mass", "in kg"),
@@ -520,7 +681,8 @@ def test_absorbers_and_foundations_of_use_look_right():
     free_of_ground = jb.Absorber(12.5, ground_inertance=2e3, stiffness=1e6, damping=3e3)
     for case in (
         bridge(absorbers=[absorber, free_of_ground]),
-        bridge(beam={"foundation_stiffness": 20e3}),
+        bridge(beam={"foundation_stiffness": 5e6}),
+        bridge(beam={"foundation_stiffness": 5e7}),
     ):
         assert jb.check(case).warnings == ()
 

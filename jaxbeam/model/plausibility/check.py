@@ -129,10 +129,10 @@ def _sentences(rows: tuple[Range, ...], *judged) -> Iterator[str]:
     facts = Facts(*judged)
     explained: dict[str, set[str]] = {}  # parts of the case by the cause that has spoken of them
     for row in rows:
-        said = set()
+        said, fields = set(), set()
         for address, value, words in row.values(facts):
-            part = _part(address)
-            if row.low <= value <= row.high or math.isnan(value):
+            part, field = _part(address), address.rstrip(".0123456789")
+            if row.low <= value <= row.high or math.isnan(value) or field in fields:
                 continue
             if explained.get(row.cause, set()) & {part, ""}:
                 continue
@@ -140,6 +140,8 @@ def _sentences(rows: tuple[Range, ...], *judged) -> Iterator[str]:
             if spoken & {part, ""} or (spoken and not part):
                 continue
             said.add(part)
+            if field != address:  # of a list the first entry stands for all
+                fields.add(field)
             yield _sentence(row, address, float(value), words)
         if row.cause:
             explained.setdefault(row.cause, set()).update(said)

@@ -361,14 +361,19 @@ class Facts:
         ]
         return np.sum(parts, axis=0)
 
+    def sag_per_command(self, actuator: Any) -> float:
+        """Largest static deflection (m) by a steady command of 1, of its unit."""
+        bend = self.shapes @ (compliance(self.modes) * self.influence(actuator.displacement_map()))
+        return abs(float(actuator.attachment().static_gain)) * float(np.max(np.abs(bend)))
+
     def sag_of_command(self, actuator: Any) -> float | None:
         """Largest static deflection (m) by the largest command; None without limits."""
         limits = actuator.command_limits()
-        if limits is None:
-            return None
-        command = np.max(np.abs(limits)) * abs(float(actuator.attachment().static_gain))
-        bend = self.shapes @ (compliance(self.modes) * self.influence(actuator.displacement_map()))
-        return float(command * np.max(np.abs(bend)))
+        return (
+            None
+            if limits is None
+            else float(np.max(np.abs(limits)) * self.sag_per_command(actuator))
+        )
 
     def reading(self, sensor: Any) -> float | None:
         """Size of the readings of a sensor by the static deflection and the first frequency.

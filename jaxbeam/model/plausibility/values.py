@@ -12,7 +12,7 @@ from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.layout import NODE_TOLERANCE
 from jaxbeam.model.linear_system import poles
-from jaxbeam.model.plausibility.facts import GRAVITY, Facts
+from jaxbeam.model.plausibility.facts import GRAVITY, Facts, compliance
 
 INF = math.inf
 SOUND_SPEED = 5000.0  # m/s, of waves in steel, aluminium, timber along the grain; concrete 3500
@@ -197,6 +197,13 @@ def step_of_segments(facts):
                     yield Value(f"beam.segments.{i + 1}.{name}", max(ends) / min(ends))
 
 
+def axial_over_buckling(facts):
+    """Axial force over that at which a pinned beam buckles."""
+    for name, force in _numbers(facts.case.beam, "beam", "axial_force"):
+        if force:
+            yield Value(name, abs(float(force)) * facts.length**2 / (math.pi**2 * facts.rigidity))
+
+
 def rigid_motions(facts):
     """Motions that nothing resists, of a beam that has hinges or on which something presses."""
     beam = facts.case.beam
@@ -252,6 +259,7 @@ def least_command(facts):
             yield Value(f"{address}.{name}", max(low, -high, 0.0), words)
 
 
+FEEDBACK = ("feedback", "output-feedback", "feedback-scheduled", "pd", "ppf")
 COMMAND_FIELDS = {
     "moment_per_volt": "N m/V",
     "d33": "m/V, not in pm/V",
@@ -271,13 +279,82 @@ def sag_of_command(facts):
             yield Value(f"{address}.{name}", sag / facts.length, words)
 
 
+def reach_of_command(facts):
+    """Deflection by the largest command of an actuator over that under the loads."""
+    for address, sag, words in sag_of_command(facts):
+        if facts.numbers.deflection:
+            yield Value(address, sag * facts.length / facts.numbers.deflection, words)
+
+
+def gain_in_decibels(facts):
+    """Share of what a patch bears that is used, where the gain of its amplifier fits as dB only."""
+    for address, patch in _parts(facts, "actuators"):
+        if patch.kind == "patch" and patch.limits is not None:
+            gain = float(patch.amplifier_gain)
+            used = float(np.max(np.asarray(patch.limits) / np.asarray(patch.depolarisation)))
+            fits = used * gain < 0.5 < used * 10 ** (min(gain, 200.0) / 20) < 1.1
+            words = {"gain": gain, "factor": 10 ** (min(gain, 200.0) / 20)}
+            yield Value(f"{address}.amplifier_gain", used * gain if fits else 1.0, words)
+
+
+def spring_of_actuator(facts):
+    """Stiffness of an actuator over that of the beam at its place, of rigs.
+
+    Shakers with a moving mass, and those on bridges, may hang softly.
+    """
+    for address, actuator in _parts(facts, "actuators"):
+        given = float(getattr(actuator, "stiffness", 0.0))
+        if given > 0 and not facts.is_bridge and not float(getattr(actuator, "mass", 0.0)):
+            moved = facts.influence(actuator.displacement_map())
+            ratio = given * float(np.sum(compliance(facts.modes) * moved**2))
+            yield Value(f"{address}.stiffness", ratio)
+
+
+def damping_at_places(facts):
+    """Largest damping ratio that a damper of an actuator or support adds to a mode.
+
+    The back-EMF of a coil that is shorted is one, K_f K_v / R.
+    """
+    found = []
+    for address, one in _parts(facts, "actuators"):
+        terms = one.displacement_map()
+        found += [(name, c, terms, "N s/m") for name, c in _numbers(one, address, "damping")]
+        if one.kind == "electrodynamic" and one.back_emf is not None:
+            c = float(one.force_constant * one.back_emf / one.resistance)
+            found.append((f"{address}.back_emf", c, terms, "V s/m, not in mV s/m"))
+    for address, one in _parts(facts, "supports"):
+        terms = ((one.position, 0, 1.0),)
+        found += [(name, c, terms, "N s/m") for name, c in _numbers(one, address, "damping")]
+    for name, c, terms, unit in found:
+        added = abs(float(c)) * facts.influence(terms) ** 2 * np.sqrt(compliance(facts.modes)) / 2
+        yield Value(name, float(np.max(added)), {"unit": unit})
+
+
+def rate_of_commands(facts):
+    """Rate limit of an actuator over its range and the rate of the first mode."""
+    for address, actuator in _parts(facts, "actuators"):
+        limits = actuator.command_limits()
+        for name, rate in _numbers(actuator, address, "rate_limit"):
+            if limits is not None and facts.numbers.first_frequency is not None:
+                needed = 2 * math.pi * facts.numbers.first_frequency * float(np.ptp(limits))
+                yield Value(name, float(rate) / needed, {"unit": actuator.command_unit})
+
+
 def lag_of_actuator(facts):
-    """Bandwidth of an actuator over the first natural frequency."""
+    """Bandwidth of an actuator, of a coil R / L, over the first natural frequency."""
     first = facts.numbers.first_frequency
     for address, actuator in _parts(facts, "actuators"):
-        for name, bandwidth in _numbers(actuator, address, "bandwidth"):
+        rates = list(_numbers(actuator, address, "bandwidth"))
+        unit = "1/s, 2 pi times the frequency in Hz, not in kHz"
+        if actuator.kind == "electrodynamic" and actuator.inner_loop is None:
+            rate = float(actuator.resistance) / float(actuator.inductance)
+            rates, unit = (
+                [(f"{address}.inductance", rate)],
+                "H, not in mH, and the resistance in ohm",
+            )
+        for name, bandwidth in rates:
             if first is not None:
-                yield Value(name, bandwidth / (2 * math.pi * first))
+                yield Value(name, bandwidth / (2 * math.pi * first), {"unit": unit})
 
 
 def growth_of_inner_loops(facts):
@@ -347,6 +424,12 @@ def unsprung_over_sprung(facts):
                 ratio = np.sum(getattr(load, name)) / load.body_mass
                 if ratio > 0:
                     yield Value(f"{address}.{name}", ratio, {"upper": f"{address}.body_mass"})
+    for address, load in facts.loads("vehicle"):
+        bodies = sum(float(body.mass) for body in load.bodies)
+        for i, axle in enumerate(load.axles):
+            if axle.mass > 0 and bodies > 0:
+                share = float(axle.mass) * len(load.axles) / bodies
+                yield Value(f"{address}.axles.{i}.mass", share, {"upper": f"{address}.bodies"})
 
 
 def gyration_over_wheelbase(facts):
@@ -360,6 +443,13 @@ def gyration_over_wheelbase(facts):
             inertia, mass = (getattr(load, f"{name}_{what}") for what in ("inertia", "mass"))
             radius = math.sqrt(float(inertia) / float(mass))
             yield Value(f"{address}.{name}_inertia", 2 * radius / float(distance))
+    for address, load in facts.loads("vehicle"):
+        for i, body in enumerate(load.bodies):
+            joints = [s.position for s in load.springs if body.name in (s.first, s.second)]
+            joints += [axle.position for axle in load.axles if axle.body == body.name]
+            if body.inertia is not None and body.mass > 0 and np.ptp(joints or [0.0]) > 0:
+                radius = math.sqrt(float(body.inertia) / float(body.mass))
+                yield Value(f"{address}.bodies.{i}.inertia", 2 * radius / float(np.ptp(joints)))
 
 
 PLACES = {"axles": "offsets", "half-car": "axle_positions", "wagon": "bogie_distance"}
@@ -417,9 +507,16 @@ def weight_over_force(facts):
     """Weight of the masses of axles over the forces with which they press."""
     for address, load in facts.loads("axles"):
         if load.masses is not None and load.forces is not None and float(facts.case.run.gravity):
-            masses, forces = np.max(load.masses), np.max(load.forces)
-            if masses > 0 and forces > 0:
-                yield Value(f"{address}.masses", masses * GRAVITY / forces)
+            shares = np.asarray(load.masses) * GRAVITY / np.where(load.forces > 0, load.forces, INF)
+            yield Value(f"{address}.masses", float(np.max(shares)))
+
+
+def amplitude_of_forces(facts):
+    """Largest amplitude of a varying force, without a steady part, over the weight of the beam."""
+    for address, load in facts.loads("varying-force"):
+        largest = float(np.max(np.abs(load.amplitudes), initial=0.0))
+        if largest > 0 and not float(load.force):
+            yield Value(f"{address}.amplitudes", largest / GRAVITY / mass(facts))
 
 
 def mass_ratio(facts):
@@ -439,15 +536,62 @@ def largest_phase(facts):
 # Absorbers and foundations
 
 
-def absorber_over_first_frequency(facts):
-    """Natural frequencies of absorbers that are given by springs, over that of the first mode."""
-    first = facts.numbers.first_frequency
+def _frequencies_of_absorbers(facts):
+    """Absorbers with addresses of their frequency or spring, its unit, and the frequency (Hz)."""
     for address, absorber in _parts(facts, "absorbers"):
-        if first is not None and absorber.stiffness is not None:
-            moved = absorber.mass + absorber.inertance + absorber.ground_inertance
-            own = math.sqrt(float(absorber.stiffness) / float(moved)) / (2 * math.pi)
-            words = {"frequency": own, "first": first}
-            yield Value(f"{address}.stiffness", own / first, words)
+        own = math.sqrt(float(absorber.spring) / float(absorber.moving_mass)) / (2 * math.pi)
+        by_spring = absorber.stiffness is not None
+        name = "stiffness" if by_spring else "frequency"
+        unit = "N/m, not in kN/m, and the mass in kg" if by_spring else "Hz"
+        yield absorber, f"{address}.{name}", own, unit
+
+
+def absorber_over_first_frequency(facts):
+    """Natural frequencies of absorbers over that of the first mode."""
+    first = facts.numbers.first_frequency
+    for _, address, own, unit in _frequencies_of_absorbers(facts):
+        if first is not None:
+            yield Value(address, own / first, {"frequency": own, "unit": unit})
+
+
+def frequency_off_modes(facts):
+    """Ratio of frequencies to the nearest that they may be tuned to, of absorbers and laws.
+
+    Those of absorbers, above that of the first mode, to that of a mode, f_m / (1 + mu) by Den
+    Hartog with the mass ratio mu of the mode, or of a force: they may miss it by 40 %. One that
+    fits better as rad/s may miss by 5 %, that of positive position feedback, too: these are 1.
+    """
+    elastic = facts.modes.stiffness > 1e-9 * facts.modes.stiffness_unit
+    forced = [float(f) for _, load in facts.loads("varying-force") for f in load.frequencies]
+    forced += [float(load.pace) for _, load in facts.loads("pedestrian", "crowd")]
+    found = []
+    for absorber, address, own, unit in _frequencies_of_absorbers(facts):
+        shapes = np.asarray(facts.modes.shapes(np.asarray(float(absorber.position))))
+        ratios = float(absorber.moving_mass) * shapes[elastic] ** 2
+        tuned = np.append(facts.frequencies / (1 + ratios), forced)
+        found.append((address, own, unit, tuned, True))
+    if getattr(facts.case.controller, "kind", "") == "ppf":
+        frequencies = _numbers(facts.case.controller, "controller", "frequency")
+        found += [(name, float(f), "Hz", facts.frequencies, False) for name, f in frequencies]
+    for address, own, unit, tuned, is_absorber in found:
+        if not facts.frequencies.size or own < facts.frequencies[0]:
+            continue
+        miss, in_radians = (
+            float(np.min(np.abs(np.log(f / tuned)))) for f in (own, own / (2 * math.pi))
+        )
+        likely = in_radians < min(miss, 0.1)
+        off_all = is_absorber and own < 1.4 * tuned.max()  # higher modes may be left out
+        if off_all or likely:
+            words = {"frequency": own, "hertz": own / (2 * math.pi), "ratio": math.exp(miss)}
+            words["unit"] = f"{unit}, not in rad/s" if unit == "Hz" else unit
+            yield Value(address, miss / math.log(1.05 if likely else 1.4), words)
+
+
+def lag_of_controller(facts):
+    """Time constants of lags of a controller times the rate of the first mode."""
+    if facts.numbers.first_frequency is not None:
+        for name, lag in _numbers(facts.case.controller, "controller", "lag"):
+            yield Value(name, float(lag) * 2 * math.pi * facts.numbers.first_frequency)
 
 
 def mass_of_absorber(facts):
@@ -478,7 +622,11 @@ def support_over_bending(facts):
     for address, support in _parts(facts, "supports"):
         for name, given in _numbers(support, address, "stiffness"):
             if given > 0 and "free" not in facts.case.beam.ends:
-                yield Value(name, float(given) / bending)
+                yield Value(name, float(given) / bending, {"unit": "N/m, not in kN/m or MN/m"})
+        for name, given in _numbers(support, address, "rotational_stiffness"):
+            if given > 0:
+                ratio = float(given) * facts.length / facts.rigidity
+                yield Value(name, ratio, {"unit": "N m/rad, not in kN m/rad"})
 
 
 def foundation_over_bending(facts):
@@ -487,6 +635,21 @@ def foundation_over_bending(facts):
     for name, given in _numbers(facts.case.beam, "beam", "foundation_stiffness"):
         if given > 0:
             yield Value(name, float(given) / bending)
+
+
+def sag_on_foundation(facts):
+    """Deflection of a long beam on a foundation k under its heaviest wheel over the length of it.
+
+    Under P it is P lambda / (2 k), with lambda^4 = k / (4 E I): Hetenyi (1946), Beams on elastic
+    foundation, chapter 2. Only where the foundation carries more than bending does.
+    """
+    heaviest = max((float(loads.max(initial=0.0)) for loads in facts.static_loads), default=0.0)
+    for name, ratio, _ in foundation_over_bending(facts):
+        k = ratio * facts.rigidity * (math.pi / facts.length) ** 4
+        decay = (k / (4 * facts.rigidity)) ** 0.25
+        if decay * facts.length > math.pi:
+            sag = heaviest * decay / (2 * k)
+            yield Value(name, sag * decay, {"sag": sag, "wave": 1 / decay})
 
 
 # Loads: their travel
@@ -501,6 +664,14 @@ def entry_over_duration(facts):
         likely = f"is {address}.entry_time in s, not in ms?" if late else "lengthen run.duration"
         words = {"when": when, "duration": duration, "likely": likely}
         yield Value(address, enter / duration, words)
+
+
+def exit_before_run(facts):
+    """Times (s) by which loads have left the beam before the run begins."""
+    for (address, load), (_, leave) in zip(facts.loads(), facts.windows, strict=True):
+        if leave <= 0:
+            name = "entry_time" if load.times is None else "times"
+            yield Value(f"{address}.{name}", -float(leave))
 
 
 def exit_over_duration(facts):
@@ -609,6 +780,34 @@ def _profile_unit(name: str) -> str:
     return "it is a factor of the heights" if name == ".scale" else "is it in m, not in mm?"
 
 
+def length_of_waves(facts):
+    """Wavelengths, and distances of the points of a table, over the length of the beam."""
+    yield from of_parts("profile", "wavelength", over=length)(facts)
+    for address, profile in _parts(facts, "profile"):
+        if profile.kind == "table":
+            apart = float(np.min(np.diff(profile.positions), initial=INF))
+            yield Value(f"{address}.positions", apart / facts.length)
+
+
+def acceleration_of_waves(facts):
+    """Largest vertical acceleration of wheels on a sine longer than the beam, over gravity."""
+    speed = facts.numbers.speed
+    for address, profile in _parts(facts, "profile"):
+        if profile.kind == "sine" and speed and float(profile.wavelength) > facts.length:
+            rate = 2 * math.pi * speed / float(profile.wavelength)
+            share = abs(float(profile.amplitude)) * rate**2 / GRAVITY
+            yield Value(f"{address}.wavelength", share or 1.0)
+
+
+def bump_under_loads(facts):
+    """1 for a bump or table that no load meets on the beam or as far before and behind it."""
+    for address, profile in _parts(facts, "profile"):
+        if profile.kind in ("bump", "table") and np.ptp(facts.profile[1]) == 0:
+            name = "start" if profile.kind == "bump" else "positions"
+            heights = profile.height if profile.kind == "bump" else np.ptp(profile.point_heights)
+            yield Value(f"{address}.{name}", float(abs(heights) > 0))
+
+
 def cutoff_over_crossing(facts):
     """Cutoffs of filters of sensors times the time at which the last load has left."""
     for address, sensor in _parts(facts, "sensors"):
@@ -668,7 +867,7 @@ def sides_of_jumps(facts):
 
 def _delays(facts):
     for address, part in (*_parts(facts, "sensors"), *_parts(facts, "controller")):
-        yield from _numbers(part, address, "delay")
+        yield from _numbers(part, address, "delay", "jitter")
 
 
 def delay_over_duration(facts):
@@ -695,6 +894,43 @@ def samples_in_period(facts):
         frequency, period = float(facts.frequencies[mode - 1]), float(controller.period)
         words = {"mode": mode, "frequency": frequency, "longest": 0.5 / frequency}
         yield Value("controller.period", 1 / (period * frequency), words)
+
+
+def effect_of_gains(facts):
+    """Deflection that feedback of the sizes of readings commands, over that under the loads."""
+    controller, driven = facts.case.controller, facts.case.driven
+    deflection, first = facts.numbers.deflection, facts.numbers.first_frequency
+    if not deflection or first is None or getattr(controller, "kind", "") not in FEEDBACK:
+        return
+    power = getattr(controller, "power", 1)
+    sizes = np.array([facts.reading(sensor) or 0.0 for sensor in facts.case.sensors]) ** power
+    all_read = controller.kind == "output-feedback"
+    columns = sizes if all_read else sizes[: len(driven), None]
+    sags = np.array([facts.sag_per_command(actuator) for actuator in driven])
+    for name, rate in (("gains", 1.0), ("rate_gains", 2 * math.pi * first)):
+        if hasattr(controller, name):
+            gains = np.abs(np.broadcast_to(getattr(controller, name), np.shape(controller.gains)))
+            commands = np.max(np.reshape(gains, (len(driven), -1)) * columns, axis=1)
+            effect = float(np.max(commands * sags)) * rate / deflection
+            if effect > 0:
+                yield Value(f"controller.{name}", effect)
+
+
+def step_of_commands(facts):
+    """Resolution of commands over their range, without limits over commands of some effect.
+
+    That is a command by which the beam bends as under the loads.
+    """
+    shares, step = [], getattr(facts.case.controller, "resolution", None)
+    for actuator in () if step is None else facts.case.driven:
+        limits, sag = actuator.command_limits(), facts.sag_per_command(actuator)
+        reach = (facts.numbers.deflection or 0.0) / sag if sag else 0.0
+        if limits is not None or reach:
+            reach = reach if limits is None else float(np.ptp(limits))
+            shares.append((float(step) / reach, actuator.command_unit))
+    if shares:
+        share, unit = max(shares)
+        yield Value("controller.resolution", share, {"unit": unit, "step": float(step)})
 
 
 def _controlled_modes(facts) -> int:
