@@ -123,7 +123,8 @@ def _padded_times(times: Float[np.ndarray, " time"], count: int) -> Float[np.nda
 
 LJUNG_BOX_LAGS = 20  # lags of the autocorrelation in the whiteness test
 WHITENESS_SIGNIFICANCE = 0.01  # probability of calling white residuals of a fit autocorrelated
-MIN_TIME_SHIFT_SD = 4.0  # standard errors beyond which a time shift is reported
+MIN_TIME_SHIFT_SD = 4.0  # standard errors beyond which a time shift or an offset is reported
+REST, LEAST_AT_REST = 0.01, 20  # of the largest reading, at most; samples
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +133,8 @@ class ChannelResiduals:
 
     `noise` is their standard deviation in the SI unit of the sensor; `p_value` that of
     `whiteness_p_value`; `autocorrelation_factor` the factor by which autocorrelation raises
-    variances; `time_shift` (s) the delay of the log against the model, with its standard error.
+    variances; `time_shift` (s) the delay of the log against the model, with its standard error;
+    `offset` what the sensor reads where the model is at rest, by its unit, with its own.
     """
 
     log: int
@@ -142,6 +144,8 @@ class ChannelResiduals:
     autocorrelation_factor: float
     time_shift: float
     time_shift_sd: float
+    offset: float
+    offset_sd: float
 
 
 def whiteness_p_value(residual: Float[np.ndarray, " time"]) -> float:
@@ -182,6 +186,11 @@ def channel_residuals(
             strength = max(float(rate @ rate), 1e-300)
             shift = float(residual @ rate) / strength
             remaining = residual - shift * rate
+            reading = np.abs(fitted[i, has, j])
+            at_rest = residual[reading <= REST * reading.max()]
+            if at_rest.size < LEAST_AT_REST:
+                at_rest = np.zeros(2)
+            spread = float(at_rest.std() * np.sqrt(autocorrelation_factor(at_rest) / at_rest.size))
             found.append(
                 ChannelResiduals(
                     log=i,
@@ -193,6 +202,8 @@ def channel_residuals(
                     time_shift_sd=float(
                         remaining.std() * np.sqrt(autocorrelation_factor(remaining) / strength)
                     ),
+                    offset=float(at_rest.mean()),
+                    offset_sd=spread,
                 )
             )
     return found
@@ -235,6 +246,12 @@ def residual_remarks(
                 f"{factors}), but not for bias"
             )
         for c in own:
+            if abs(c.offset) > max(MIN_TIME_SHIFT_SD * c.offset_sd, c.noise / 2):
+                size = f"{c.offset:.3g} (+- {2 * c.offset_sd:.2g}, in SI units)"
+                remarks.append(
+                    f"{source}: {names[c.sensor]} reads {size} at rest, which biases the fit: free"
+                    " its offset"
+                )
             if abs(c.time_shift) > MIN_TIME_SHIFT_SD * c.time_shift_sd:
                 what = "late" if c.time_shift > 0 else "early"
                 remarks.append(

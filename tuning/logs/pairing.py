@@ -13,6 +13,7 @@ from jaxbeam.case.quantities import unit_of
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.control.feedforward import Prescribed
 from tuning.logs.log import Log
+from tuning.logs.logger import samples_held
 
 MAX_START_DURATIONS = 10.0  # first time of a log, in its durations, that is simulated from 0 on
 COMMAND_UNITS = {"voltage": "V", "force": "N"}
@@ -21,9 +22,11 @@ COMMAND_UNITS = {"voltage": "V", "force": "N"}
 def case_of_log(case: Case, log: Log, times: Float[np.ndarray, " time"]) -> Case:
     """The case with the loads and commands of a log, until its end.
 
-    Commands are linear from sample to sample; `times` (s) are those of the log and of its padding,
-    in which the last commands stay. Raises ValueError, naming the log, for a command that no
-    actuator of the case accepts.
+    Commands are linear from sample to sample. One that stays for two samples or more is held by its
+    converter, and the mean of it and the one before is taken, so that its steps are where they are
+    in the log: half a sample early, they would take k dt / 2 from the damping beside a spring k.
+    `times` (s) are those of the log and of its padding, in which the last commands stay. Raises
+    ValueError, naming the log, for a command that no actuator of the case accepts.
     """
     if log.loads is not None:
         case = dataclasses.replace(case, loads=tuple(log.loads))
@@ -33,9 +36,16 @@ def case_of_log(case: Case, log: Log, times: Float[np.ndarray, " time"]) -> Case
             if actuator is not None:
                 _check_command(case, log, channel, actuator)
                 more = times.size - log.times.size
-                commands[actuator] = np.pad(log.values[:, channel], (0, more), mode="edge")
+                commands[actuator] = np.pad(_acting(log.values[:, channel]), (0, more), mode="edge")
         case = _prescribing(case, times, commands)
     return replace(case, {"run.duration": float(log.times[-1])})
+
+
+def _acting(command: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
+    """The command, or its means over neighbours if it is held over several samples."""
+    if samples_held(command) == 1.0:
+        return command
+    return np.append(command[0], (command[1:] + command[:-1]) / 2)
 
 
 def pad_cases(cases: list[Case], times: list[Float[np.ndarray, " time"]]) -> list[Case]:

@@ -138,7 +138,8 @@ def _held(log: Log):
     for i, name in enumerate(log.names):
         held = samples_held(log.values[:, i])
         if held > 1:
-            message = f"{log.source}: {name} holds each reading for {held:.3g} samples"
+            what = "reading" if log.actuators[i] is None else "command"
+            message = f"{log.source}: {name} holds each {what} for {held:.3g} samples"
             yield Fault("held", name, np.ones(log.times.size, bool), message)
 
 

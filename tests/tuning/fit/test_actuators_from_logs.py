@@ -118,6 +118,50 @@ def test_a_patch_alone_from_a_file(tmp_path):
     assert fit.cases[0].controller.values.shape == (2, 1001)
 
 
+def test_a_spring_beside_a_patch_whose_commands_are_held():
+    """Steps of a converter every 2 ms, exactly: read as ramps they are damping less by k dt / 2."""
+    stiffness, damping, period = 3500.0, 6.0, 2
+    frequencies = (np.arange(1, MODES + 1) * np.pi / LENGTH) ** 2 * np.sqrt(RIGIDITY / DENSITY)
+    at, n = shapes(0.5), MODES
+    moment = (shapes(PATCH["start"], 1) - shapes(PATCH["end"], 1)) * GAIN
+    moment = moment * PATCH["moment_per_volt"] * PATCH["correction"]
+    A = np.block(
+        [
+            [np.zeros((n, n)), np.eye(n)],
+            [
+                -np.diag(frequencies**2) - stiffness * np.outer(at, at),
+                -np.diag(2 * DAMPING * frequencies) - damping * np.outer(at, at),
+            ],
+        ]
+    )
+    B = np.append(np.zeros(n), moment)[:, None]
+    C = np.hstack([[shapes(x) for x in POSITIONS], np.zeros((2, n))])
+    walk = np.cumsum(np.random.default_rng(3).normal(size=501))
+    levels = np.clip(0.4 * (walk - np.linspace(0.0, walk[-1], 501)), -2.4, 7.4)
+    volts = np.repeat(levels, period)[:1001]
+    exact = scipy.signal.cont2discrete((A, B, C, np.zeros((2, 1))), 1e-3, "zoh")[:4]
+    readings = scipy.signal.dlsim((*exact, 1e-3), volts)[1]
+    readings = readings + 2e-6 * np.random.default_rng(4).normal(size=readings.shape)
+    table = np.column_stack([readings, volts])
+    held = Log(
+        TIMES,
+        table,
+        ("d1", "d2", "v"),
+        ("deflection", "deflection", "voltage"),
+        ("m", "m", "V"),
+        actuators=(None, None, 0),
+    )
+    rig = case()
+    spring = jb.SpringDamper(0.5, stiffness=4300.0, damping=9.0)
+    rig = dataclasses.replace(rig, actuators=(rig.actuators[1], spring))
+    free = ["actuators.0.correction", "actuators.1.stiffness", "actuators.1.damping"]
+    fit = identify(rig, [held], free)
+    np.testing.assert_array_less(
+        np.abs(fit.values - [PATCH["correction"], stiffness, damping]), 4 * fit.errors
+    )
+    assert fit.errors[2] < 0.15  # of a bias of 1.75 N s/m
+
+
 def test_faulty_commands_are_refused():
     good = log(SWEPT, STEPS)
 

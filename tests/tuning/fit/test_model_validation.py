@@ -25,7 +25,7 @@ from tests.tuning.stand_in import (
 )
 from tuning.checkpoint import Checkpoint, save
 from tuning.fit import model_validation, storage
-from tuning.fit.dataset import residual_remarks, whiteness_p_value
+from tuning.fit.dataset import channel_residuals, residual_remarks, whiteness_p_value
 from tuning.fit.model_validation import compare_fits, cross_validate
 from tuning.fit.result import fit_result
 from tuning.fit.uncertainty.covariance import t_quantile
@@ -81,6 +81,22 @@ def test_remarks_on_a_delayed_channel_and_autocorrelated_residuals(plain):
         "run 1: residuals are no white noise, so the model misses something"
     )
     assert delay.startswith("run 1: sensor 0 seems ") and " ms late (+- " in delay
+
+
+def test_a_remark_on_an_offset_where_the_model_is_at_rest(plain):
+    """60 samples at rest before the formula begins, in which the reading is 0."""
+    rng = np.random.default_rng(5)
+    model = np.vstack([np.zeros((60, 1)), clean()[1]])[None]
+    times = (TIMES[1] - TIMES[0]) * np.arange(model.shape[1])[None]
+    noise = NOISE * rng.normal(size=model.shape)
+    for offset, remarks in ((0.0, 0), (2.0 * NOISE, 1)):
+        (channel,) = channel_residuals(
+            times, model, noise + offset, np.full((1, 1), NOISE), np.ones((1, 1))
+        )
+        assert abs(channel.offset - offset) < 4 * channel.offset_sd < NOISE
+        found = [one for one in residual_remarks([channel], ["run"], NAMES) if "at rest" in one]
+        assert len(found) == remarks
+        assert all(one.endswith("which biases the fit: free its offset") for one in found)
 
 
 def test_information_criteria(plain):
