@@ -12,9 +12,11 @@ from jaxbeam.plot.schematic import draw_schematic
 from jaxbeam.plot.style import (
     COLOURS,
     GREY,
+    LIMIT,
     annotate,
     axis_label,
     colour,
+    curve_style,
     drawing_area,
     format_number,
     set_title,
@@ -24,8 +26,6 @@ from jaxbeam.plot.style import (
 )
 from jaxbeam.simulation.record import Record
 
-LIMIT = "#b00020"
-STYLES = "-", ":", "-."  # of curves whose colours are used up
 HEADROOM = 1.3  # of the axes over the largest value, for the name of the limit
 WIDTH, HEIGHT, LEGEND = 9.0, 2.3, 1.3  # inches, of the figure, a row of axes, the legend
 
@@ -57,8 +57,7 @@ def plot_assessment(
         limit = limits[own].max() if kind == "acceleration" else 1.0
         for number, curve in enumerate(effects.curves):
             values = (curve.values[:, own] / scale).max(axis=1)
-            style = STYLES[number // len(COLOURS) % len(STYLES)]
-            one.plot(3.6 * curve.speeds, values, style, color=colour(number), label=curve.train)
+            one.plot(3.6 * curve.speeds, values, label=curve.train, **curve_style(number))
         text = f"limit {limit:g} m/s²" if kind == "acceleration" else "LM71 with factors"
         line = one.axhline(limit, color=LIMIT, linestyle="--", linewidth=1.0, label=text)
         words = "deck acceleration (m/s²)" if kind == "acceleration" else f"{kind} / LM71"

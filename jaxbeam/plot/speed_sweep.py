@@ -1,7 +1,8 @@
 """Figure of a sweep over speed: peaks of trains, their envelope, and speeds of resonance."""
 
 import json
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray
@@ -22,16 +23,17 @@ from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.model.load_set import load_set
 from jaxbeam.plot.style import (
-    COLOURS,
     FAINT,
     GREY,
     INK,
+    LIMIT,
     UnitScale,
     annotate,
     axis_label,
+    curve_style,
+    draw_limits,
     drawing_area,
     format_number,
-    margin_labels,
     set_title,
     unit_scale,
     use_style,
@@ -41,6 +43,7 @@ FAST = 20.0  # m/s: from here on speeds are in km/h
 MAX_ORDER = 4  # of marked resonances and cancellations; higher ones are weak
 HALO = [withStroke(linewidth=3, foreground="white")]
 ENVELOPE_STYLE = {"color": FAINT, "linewidth": 6.0, "zorder": 1}
+LINE = 92  # letters of a line of a title or the legend
 
 
 def is_speed_sweep(peaks: xarray.DataArray, case: Case) -> bool:
@@ -74,15 +77,16 @@ def plot_speed_sweep(
     *,
     ax: Axes | None = None,
     title: str | None = None,
+    limits: Mapping[str, float] | None = None,
 ) -> Figure | SubFigure:
     """Peaks (speed, word, sensor) over speed, in the units of the sensors, a curve for each word.
 
-    A panel for each sensor, under its name, and speeds in km/h from 72 km/h on. Behind the curves
-    of several words is their envelope; a black dot marks the largest peak of all. Triangles mark
-    resonance speeds d f_1 / i of a curve, dashed lines those of the curve with the largest peak;
-    dotted lines are cancellation speeds, where there is a closed form (see
-    `analysis.critical_speeds`). The figure takes the place of `ax`; its title is that of
-    the case if left out.
+    A panel for each sensor, under its name and its largest peak, which a black dot marks, and
+    speeds in km/h from 72 km/h on. Behind the curves of several words, named below, is their
+    envelope. Triangles mark resonance speeds d f_1 / i of a curve, dashed lines those of the curve
+    with the largest peak; dotted lines are cancellation speeds, where there is a closed form (see
+    `analysis.critical_speeds`), and limits by quantity. The figure takes the place of `ax`; its
+    title is that of the case if left out.
     """
     (address,) = (str(dim) for dim in peaks.dims if is_speed(str(dim)))
     others = [str(dim) for dim in peaks.dims if dim not in (address, "sensor")]
@@ -95,16 +99,29 @@ def plot_speed_sweep(
     speeds = np.abs(peaks[address].values)
     count = len(values)
     numbers = sensor_numbers(peaks, case)
-    figure = drawing_area(ax, (7.6, 0.6 + 3.9 * count))
+    columns = max(1, LINE // (max(12, *map(len, labels)) + 8))  # 12 letters: "cancellation"
+    lines = -(-(len(labels) + 3) // columns)
+    figure = drawing_area(ax, (7.6, 0.8 + 3.6 * count + 0.17 * lines))
     panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+    entries: dict[str, Line2D] = {}
     for i, (axes, curves) in enumerate(zip(panels, values, strict=True)):
         quantity = case.sensors[numbers[i]].quantity
         factor, unit = unit_scale(curves, QUANTITIES[quantity].unit)
         axes.set_ylabel(axis_label(f"peak {quantity}", unit))
-        _draw_panel(axes, speeds, curves / factor, labels, cases, _load_index(address), unit)
-        if count > 1:
-            axes.set_title(names[i])
+        largest, found = _draw_panel(
+            axes, speeds, curves / factor, labels, cases, _load_index(address), unit
+        )
+        entries |= found
+        name = f"{names[i]}: " if count > 1 else ""
+        axes.set_title("\n".join(textwrap.wrap(name + largest, LINE)))
+        if limits and quantity in limits:
+            draw_limits(axes, [limits[quantity] / factor], [LIMIT], unit)
     panels[-1].set_xlabel(axis_label(address_words(case, address), speed_scale(speeds).unit))
+    if len(labels) > 1:
+        curves = [Line2D([], [], label=one, **curve_style(k)) for k, one in enumerate(labels)]
+        entries = dict(zip(labels, curves, strict=True)) | entries
+    if entries:
+        figure.legend(handles=list(entries.values()), loc="outside lower left", ncols=columns)
     set_title(figure, title, case.title)
     return figure
 
@@ -136,60 +153,34 @@ def _cases(peaks, case: Case, count: int) -> list[Case]:
     return [case_from_dict(json.loads(str(text))) for text in np.atleast_1d(peaks["cases"].values)]
 
 
-def _colours(count: int) -> list:
-    """Distinct colours of some curves; of many in the order of a map, dark to light."""
-    if count <= len(COLOURS):
-        return list(COLOURS[:count])
-    from matplotlib import colormaps
-
-    return list(colormaps["viridis"](np.linspace(0.0, 0.9, count)))
-
-
 def _draw_panel(axes, speeds, curves, labels, cases, load, unit):
-    """Curves (word, speed) of one sensor, their envelope and the marks on them."""
+    """Curves (word, speed) of one sensor, their envelope and marks.
+
+    Returns the largest peak in words, and a legend of envelope, marks and lines.
+    """
     factor, speed_unit = 1 / speed_scale(speeds).factor, speed_scale(speeds).unit
     order = np.argsort(speeds)
     x, curves = factor * speeds[order], curves[:, order]
     finite = np.where(np.isfinite(curves), curves, -np.inf)
     worst, at = np.unravel_index(np.argmax(finite), curves.shape)
+    entries: dict[str, Line2D] = {}
     if len(labels) > 1:
         axes.plot(x, np.max(finite, axis=0), **ENVELOPE_STYLE)
-    tints = _colours(len(labels))
+        entries["envelope"] = Line2D([], [], label="envelope", **ENVELOPE_STYLE)
     limits = float(np.min(speeds)), float(np.max(speeds))
-    for i, (case, y, tint) in enumerate(zip(cases, curves, tints, strict=True)):
-        axes.plot(x, y, color=tint, zorder=3 if i == worst else 2)
+    for i, (case, y) in enumerate(zip(cases, curves, strict=True)):
+        look = curve_style(i)
+        axes.plot(x, y, zorder=3 if i == worst else 2, **look)
         marks = [factor * one.speed for one in _resonances(case, load, *limits)]
-        axes.plot(marks, np.interp(marks, x, y), "v", markersize=5, color=tint, linestyle="none",
+        axes.plot(marks, np.interp(marks, x, y), "v", markersize=5, color=look["color"],
                   markeredgecolor="white", markeredgewidth=0.6, zorder=4)  # fmt: skip
-    axes.set_ylim(0.0, 1.25 * float(np.max(finite)))
+    axes.set_ylim(0.0, 1.2 * float(np.max(finite)))
     axes.set_xlim(x[0], x[-1])
-    _draw_critical_speeds(axes, cases[worst], load, limits, factor)
-    peak = f"{format_number(curves[worst, at])} {unit} at {format_number(x[at])} {speed_unit}"
+    entries |= _draw_critical_speeds(axes, cases[worst], load, limits, factor)
     axes.plot(x[at], curves[worst, at], "o", markersize=6, markeredgecolor="white", color=INK,
               clip_on=False, zorder=6)  # fmt: skip
-    right = x[at] > (x[0] + x[-1]) / 2
-    text = f"{labels[worst]}: {peak}" if labels[worst] else peak
-    annotate(axes, text, (x[at], curves[worst, at]), (-8 if right else 8, 0), va="center",
-             ha="right" if right else "left", path_effects=HALO, zorder=7)  # fmt: skip
-    if len(labels) > 1:
-        ranks = np.argsort(np.argsort(curves[:, -1]))
-        lowest = 0.05 * axes.get_ylim()[1] * (ranks + 0.5)  # where labels stay above the axis
-        margin_labels(axes, np.maximum(curves[:, -1], lowest), labels, tints)
-    _draw_legend(axes, cases[worst], load, limits, len(labels) > 1)
-
-
-def _draw_legend(axes, case: Case, load: int, limits, has_envelope: bool) -> None:
-    """Meaning of envelope, triangles and lines, above the axes."""
-    entries = [Line2D([], [], label="envelope", **ENVELOPE_STYLE)] if has_envelope else []
-    if _resonances(case, load, *limits):
-        mark = {"marker": "v", "markersize": 5, "color": INK, "linestyle": "--", "linewidth": 0.8}
-        entries.append(Line2D([], [], label="resonance d f₁ / i", **mark))
-        if cancellation_speeds(case, *limits):
-            line = {"color": GREY, "linestyle": ":", "linewidth": 0.8}
-            label = "cancellation 2 L f₁ / (2 i + 1)"
-            entries.append(Line2D([], [], label=label, **line))
-    if entries:
-        axes.legend(handles=entries, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
+    peak = f"{format_number(curves[worst, at])} {unit} at {format_number(x[at])} {speed_unit}"
+    return f"largest {peak}" + (f", {labels[worst]}" if labels[worst] else ""), entries
 
 
 def _resonances(case: Case, load: int, lowest: float, highest: float) -> list[CriticalSpeed]:
@@ -201,8 +192,8 @@ def _resonances(case: Case, load: int, lowest: float, highest: float) -> list[Cr
     return [one for one in found if one.order <= MAX_ORDER]
 
 
-def _draw_critical_speeds(axes, case: Case, load: int, limits, factor: float) -> None:
-    """Lines at resonance speeds of a case, named above, and at those of cancellation."""
+def _draw_critical_speeds(axes, case: Case, load: int, limits, factor: float) -> dict[str, Line2D]:
+    """Lines at resonance speeds of a case, named above, and at those of cancellation; a legend."""
     resonances = _resonances(case, load, *limits)
     cancellations = [c for c in cancellation_speeds(case, *limits) if c.order <= 2 * MAX_ORDER + 1]
     named = [(one, "d f₁", "--", INK, 0.99) for one in resonances]
@@ -213,3 +204,11 @@ def _draw_critical_speeds(axes, case: Case, load: int, limits, factor: float) ->
         axes.axvline(factor * one.speed, color=tint, linestyle=style, linewidth=0.8, zorder=1)
         annotate(axes, words, (factor * one.speed, height), (3, 0), va="top", fontsize=8,
                  color=tint, path_effects=HALO, xycoords=axes.get_xaxis_transform())  # fmt: skip
+    if not resonances:
+        return {}
+    mark = {"marker": "v", "markersize": 5, "color": INK, "linestyle": "--", "linewidth": 0.8}
+    entries = {"resonance": Line2D([], [], label="resonance", **mark)}
+    if cancellations:
+        line = {"color": GREY, "linestyle": ":", "linewidth": 0.8}
+        entries["cancellation"] = Line2D([], [], label="cancellation", **line)
+    return entries

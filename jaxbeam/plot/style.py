@@ -14,6 +14,9 @@ INK, GREY, FAINT, SHADE = "#22282e", "#6b747c", "#dfe3e6", "#eef2f5"
 # Okabe and Ito's colours, distinct with any kind of colour vision.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 ALARM = COLOURS[1]
+LIMIT = "#b00020"
+LIMIT_STYLE = {"color": LIMIT, "linewidth": 1.2, "linestyle": ":"}
+STYLES = "-", "--", ":"  # of curves whose colours are used up
 LABEL_HEIGHT = 0.17  # inches, of a line of text
 LOAD_COLOURS = (INK, "#A6611A", "#7B3294", "#7A868F")  # distinct from COLOURS too
 
@@ -62,6 +65,11 @@ def axis_label(words: str, unit: str) -> str:
 def colour(index: int) -> str:
     """Colour of a sensor or channel by its number; colours repeat after six."""
     return COLOURS[index % len(COLOURS)]
+
+
+def curve_style(index: int) -> dict[str, str]:
+    """Colour and line style of a curve among many, distinct up to eighteen."""
+    return {"color": colour(index), "linestyle": STYLES[index // len(COLOURS) % len(STYLES)]}
 
 
 def load_colour(index: int) -> str:
@@ -202,23 +210,24 @@ def margin_labels(axes, heights, labels, colours) -> None:
         entries = [*entries[: room - 1], (low, others, GREY)]
     gap = LABEL_HEIGHT * (high - low) / inches
     label_heights = separate_labels([entry[0] for entry in entries], gap, (low, high))
-    for height, (_, label, tint) in zip(label_heights, entries, strict=True):
-        annotate(
-            axes,
-            label,
-            (1.0, height),
-            (5, 0),
-            xycoords=axes.get_yaxis_transform(),
-            va="center",
-            color=tint,
-            annotation_clip=False,
-        )
+    beside = axes.get_yaxis_transform()
+    for height, (own, label, tint) in zip(label_heights, entries, strict=True):
+        look = {"va": "center", "color": tint, "annotation_clip": False}
+        if abs(height - own) > gap / 2:  # a line from where it belongs
+            shift = 72 * inches * (height - own) / (high - low)
+            look["arrowprops"] = {"arrowstyle": "-", "color": tint, "linewidth": 0.6}
+            annotate(axes, label, (1.0, own), (18, shift), xycoords=beside, **look)
+        else:
+            annotate(axes, label, (1.0, height), (5, 0), xycoords=beside, **look)
+
+
+def limit_words(limit: float, unit: str) -> str:
+    """Name of a limit."""
+    return f"limit {format_number(limit)} {unit}".rstrip()
 
 
 def draw_limits(axes, limits, colours, unit: str = "") -> None:
     """Draw limits of commands as dotted lines, with their values in the right margin."""
     for limit, tint in zip(limits, colours, strict=True):
         axes.axhline(limit, color=tint, linewidth=0.9, linestyle=":")
-    margin_labels(
-        axes, limits, [f"limit {format_number(limit)} {unit}".rstrip() for limit in limits], colours
-    )
+    margin_labels(axes, limits, [limit_words(limit, unit) for limit in limits], colours)

@@ -2,7 +2,7 @@
 
 import functools
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,11 +28,14 @@ from jaxbeam.plot.style import (
     ALARM,
     FAINT,
     INK,
+    LIMIT,
+    LIMIT_STYLE,
     UnitScale,
     axis_label,
     colour,
     drawing_area,
     format_number,
+    limit_words,
     margin_labels,
     set_title,
     single_axes,
@@ -52,6 +55,7 @@ def plot_sweep(
     ax: Axes | None = None,
     title: str | None = None,
     labels: Sequence[str] | None = None,
+    limits: Mapping[str, float] | None = None,
 ) -> Figure | SubFigure:
     """Peaks at the sensors over the swept addresses: curves for one, a map per sensor for two.
 
@@ -60,6 +64,7 @@ def plot_sweep(
     over their number. A sweep over more addresses is drawn in slices:
     `plot_sweep(dataset.isel({"loads.0.mass": 0}))`. Fractiles over an address, as
     `dataset.quantile([0.5, 0.95], "profile.seed", keep_attrs=True)`, are drawn beside each other.
+    `limits` by quantity (SI units), as `{"acceleration": 3.5}`, are dotted lines.
 
     The figure takes the place of `ax`, curves of one quantity are drawn on it. The title is that of
     the case, with what was selected, if left out; `labels` name the sensors of the dataset. Raises
@@ -91,7 +96,7 @@ def plot_sweep(
             f"select a value of the others, as in dataset.isel({{{swept[0]!r}: 0}})"
         )
     if is_speed_sweep(peaks, case):
-        return plot_speed_sweep(peaks, case, names, ax=ax, title=title)
+        return plot_speed_sweep(peaks, case, names, ax=ax, title=title, limits=limits)
     words = [address for address in swept if is_word_axis(peaks, address)]
     if words and len(swept) > 1:
         raise ValueError(
@@ -104,7 +109,7 @@ def plot_sweep(
         [row for row, i in enumerate(numbers) if case.sensors[i].quantity == quantity]
         for quantity in dict.fromkeys(case.sensors[i].quantity for i in numbers)
     ]
-    groups = [_quantity_peaks(peaks, numbers, rows, case, names) for rows in by_quantity]
+    groups = [_quantity_peaks(peaks, numbers, rows, case, names, limits) for rows in by_quantity]
     draw = _bars if words else _curves if len(swept) == 1 else _maps
     figure = draw(groups, swept, case, ax)
     fixed_values = [
@@ -158,15 +163,20 @@ class QuantityPeaks(NamedTuple):
     peaks: xarray.DataArray
     names: list[str]
     numbers: list[int]
+    limits: list[float]  # of the quantity: none, or one
 
 
-def _quantity_peaks(peaks, numbers, rows, case: Case, names: list[str]) -> QuantityPeaks:
+def _quantity_peaks(
+    peaks, numbers, rows, case: Case, names: list[str], limits: Mapping[str, float] | None
+) -> QuantityPeaks:
     """Peaks of the sensors of a quantity, which are some rows of all peaks."""
     own = [numbers[row] for row in rows]
     quantity = case.sensors[own[0]].quantity
     factor, unit = unit_scale(peaks[rows], QUANTITIES[quantity].unit)
     label = axis_label(f"peak {quantity}", unit)
-    return QuantityPeaks(label, unit, peaks[rows] / factor, [names[row] for row in rows], own)
+    given = [limits[quantity] / factor] if limits and quantity in limits else []
+    names = [names[row] for row in rows]
+    return QuantityPeaks(label, unit, peaks[rows] / factor, names, own, given)
 
 
 def _sensor_names(peaks, case: Case, labels: Sequence[str] | None) -> list[str]:
@@ -209,9 +219,13 @@ def _curves(groups: list[QuantityPeaks], swept, case, ax):
             top = finite[np.argmax(values[finite])] if finite.size else []
             axes.plot(x[top], values[top], "o", markersize=7, markeredgecolor="white", color=tint)
         axes.set_ylabel(group.label)
-        axes.set_ylim(bottom=0)
         axes.margins(x=0.01)
-        margin_labels(axes, last_values, group.names, tints)
+        for limit in group.limits:
+            axes.axhline(limit, **LIMIT_STYLE)
+        axes.set_ylim(bottom=0)
+        texts = [limit_words(limit, group.unit) for limit in group.limits]
+        tints += [LIMIT] * len(texts)
+        margin_labels(axes, [*last_values, *group.limits], [*group.names, *texts], tints)
     rows[-1].set_xlabel(axis_label(words, scale.unit))
     return figure
 
@@ -229,6 +243,8 @@ def _bars(groups: list[QuantityPeaks], swept, case, ax):
         for i, (values, name, number) in enumerate(bars):
             places = np.arange(len(labels)) + (i - (count - 1) / 2) * 0.8 / count
             axes.barh(places, values, 0.7 / count, color=colour(number), label=name)
+        for limit in group.limits:
+            axes.axvline(limit, label=limit_words(limit, group.unit), **LIMIT_STYLE)
         axes.set_yticks(np.arange(len(labels)), labels)
         axes.invert_yaxis()
         axes.set(xlabel=group.label, ylabel=address_words(case, address))
@@ -269,6 +285,9 @@ def _draw_maps(figure, grid, group: QuantityPeaks, swept, scales):
         filled = axes.contourf(x, y, values, levels=fill_levels, cmap="YlGnBu")
         drawn = axes.contour(x, y, values, levels=contour_levels[1:-1], colors=INK, linewidths=0.5)
         texts = axes.clabel(drawn, inline=False, fontsize=7, fmt="%.4g")
+        for limit in group.limits:
+            if np.nanmin(values) < limit < np.nanmax(values):
+                axes.contour(x, y, values, levels=[limit], colors=LIMIT, linestyles=":")
         corner, size = np.array([x[0], y[0]]), np.array([np.ptp(x), np.ptp(y)])
         for text in texts:
             # A number cut off at an edge would read as another one.
@@ -281,5 +300,7 @@ def _draw_maps(figure, grid, group: QuantityPeaks, swept, scales):
             title = f"{title}, largest {format_number(values[row, column])} {group.unit}".rstrip()
         axes.set_title(title)
         axes.grid(False)
-    bar = figure.colorbar(filled, ax=grid, ticks=contour_levels, label=group.label, pad=0.02)
+    words = "".join(f", {limit_words(limit, group.unit)} dotted" for limit in group.limits)
+    label = group.label + words
+    bar = figure.colorbar(filled, ax=grid, ticks=contour_levels, label=label, pad=0.02)
     bar.outline.set_visible(False)

@@ -92,6 +92,10 @@ REFUSED = [
         "sweep case.toml --over loads.0.speed=1,2 --fractile loads.0.speed=95",
         "fractiles are numbers from 0 to 1, such as 0.95",
     ),
+    (
+        "sweep case.toml --over loads.0.speed=1,2 --limit strain=1",
+        "--limit takes QUANTITY=VALUE of a quantity that a sensor reads",
+    ),
     ("sweep case.toml --over loads.0.speed=1,2 -o out.txt", "a sweep is written to a .zarr file"),
     ("frf case.toml --from 0", "--from and --to must increase from above 0 Hz; they are 0, 1000"),
     ("frf case.toml --from 10 --to 1", "--from and --to must increase from above 0 Hz"),
@@ -443,8 +447,11 @@ def test_fractiles_of_a_sweep_over_seeds(run, folder):
 
 def test_paired_sweep(run):
     line = "sweep case.toml --over loads.0.mass=0.1,0.5 --over loads.0.speed=0.5,1 --paired"
-    assert np.shape(run(f"{line} --json")["peak_deflection"]) == (2, 2)
-    assert "2 runs" in run(line)
+    peaks = np.array(run(f"{line} --json")["peak_deflection"])
+    assert peaks.shape == (2, 2)
+    limit = np.sort(peaks.max(axis=1)).mean()  # between the largest peaks of the two runs
+    said = run(f"{line} --limit deflection={limit}")
+    assert "2 runs" in said and f"deflection is above {limit:g} m in 1 of 2 runs" in said
 
 
 def test_sweep_over_words(run, refused, folder):

@@ -180,7 +180,7 @@ def test_curves_envelope_and_largest_peak():
     text = words(figure)
     for word in ("speed of the train (km/h)", "peak deflection (mm)", "bridge", *TRAINS):
         assert word in text
-    assert f"HSLM-A9: 50 mm at {3.6 * SPEEDS[WORST]:.0f} km/h" in text.replace("50.0", "50")
+    assert f"largest 50.0 mm at {3.6 * SPEEDS[WORST]:.0f} km/h, HSLM-A9" in text
 
 
 def test_resonance_and_cancellation_speeds_are_marked():
@@ -197,7 +197,40 @@ def test_resonance_and_cancellation_speeds_are_marked():
 def test_one_train_is_named():
     figure = plot_sweep(dataset().isel({"loads.0.train": 1}))
     assert len(lines_of(figure.axes[0], SPEEDS.size)) == 1
-    assert "HSLM-A9: " in words(figure) and "envelope" not in words(figure)
+    assert "km/h, HSLM-A9" in words(figure) and "envelope" not in words(figure)
+
+
+def test_long_names_of_trains_overlap_nothing():
+    """Titles, legend and limits of many trains with long names keep apart and on the figure."""
+    names = [f"multiple unit in two parts, series {i} of the operator" for i in range(10)]
+    peaks = xarray.concat([dataset().isel({"loads.0.train": [1]})] * 10, "loads.0.train")
+    peaks = peaks.assign_coords({"loads.0.train": names})
+    sensors = [jb.Sensor(x, name=f"deflection of the girder {x:g} m from its end") for x in (1, 2)]
+    case = dataclasses.replace(TRAIN_CASE, sensors=sensors)
+    peaks = xarray.concat([peaks.assign_coords(sensor=[one.name]) for one in sensors], "sensor")
+    peaks.attrs["case"] = json.dumps(case_to_dict(case))
+    peaks["cases"] = "loads.0.train", [json.dumps(case_to_dict(TRAIN_CASE))] * 10
+    figure = plot_sweep(peaks, limits={"deflection": 0.02})
+    said = words(figure)
+    for text in (*names, "limit 20.0 mm", "girder 2 m from its end: largest 50.0 mm"):
+        assert text in said.replace("\n", " ")
+    texts = [axes.title for axes in figure.axes] + figure.legends[0].get_texts()
+    texts += [axes.xaxis.label for axes in figure.axes]
+    boxes = [text.get_window_extent() for text in texts if text.get_text()]
+    frame = figure.bbox
+    assert all(frame.x0 <= b.x0 < b.x1 <= frame.x1 and frame.y0 <= b.y0 for b in boxes)
+    pairs = [(one, other) for k, one in enumerate(boxes) for other in boxes[:k]]
+    assert not any(one.overlaps(other) for one, other in pairs)
+    assert not any(one.overlaps(axes.bbox) for one in boxes for axes in figure.axes)
+
+
+@pytest.mark.parametrize("addresses", [1, 2])
+def test_limits_of_a_quantity(addresses):
+    over = {"loads_0_mass": [0.1, 0.2, 0.3], "loads_0_speed": [1.0, 2.0]}
+    figure = plot_sweep(swept(**dict(list(over.items())[:addresses])), limits={"deflection": 4e-4})
+    assert "limit 0.400 mm" in words(figure)
+    lines = [data(line)[1] for line in figure.axes[0].lines]
+    assert addresses == 2 or any(np.allclose(line, 0.4) for line in lines)
 
 
 def test_low_speeds_are_in_metres_per_second():

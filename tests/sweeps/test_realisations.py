@@ -85,7 +85,7 @@ def test_sweep_over_seeds_and_figure():
     assert np.isnan(static_peaks(case, ["beam.length"])).all()
     assert np.isnan(static_peaks(dataclasses.replace(case, loads=()), over)).all()
     shown = plot_realisations(swept.isel({"loads.0.speed": [0]}), "profile.seed", 0.5)
-    assert shown.axes[0].get_xlabel().startswith("peak deflection midspan")
+    assert shown.axes[0].get_xlabel().startswith("peak deflection, midspan")
     with pytest.raises(ValueError, match="select a value of loads"):
         plot_realisations(swept, "profile.seed")
     with pytest.raises(ValueError, match="is not swept"):

@@ -38,6 +38,7 @@ def sweep(
     output: Output = None,
     paired: bool = False,
     fractile: str | None = None,
+    limit: tuple[str, ...] = (),
     run_up: bool = False,
     resume: bool = False,
     scheduler: str | None = None,
@@ -65,6 +66,9 @@ def sweep(
         parameter, as of `profile.seed`, with intervals, means, dynamic amplification and how many
         values are still needed; a histogram where nothing else has several. The results are
         written whole.
+    limit
+        QUANTITY=VALUE, as "acceleration=3.5 m/s^2": count the runs above it, and draw it; repeat
+        it for more.
     run_up
         Begin so far before the bridge that vehicles have forgotten their start on a rough track: at
         the fastest of the speeds, 1 % of their free motion is left at the bridge.
@@ -103,7 +107,7 @@ def sweep(
     parsed_case = options.read(case, judged="")
     if run_up:
         parsed_case = _with_run_up(parsed_case, values)
-    labels = pictures.sensor_labels(parsed_case)
+    labels, limits = pictures.sensor_labels(parsed_case), _limits(parsed_case, limit)
     plausibility = _print_plausibility(parsed_case, values, options)
 
     from jaxbeam.sweeps.cluster import connect
@@ -126,7 +130,7 @@ def sweep(
     if picture:
         from jaxbeam.plot import plot_realisations, plot_sweep
 
-        look = {"ax": pictures.page(), "title": pictures.title, "labels": labels}
+        look = {"ax": pictures.page(), "title": pictures.title, "labels": labels, "limits": limits}
         if fractiles and not _several(values) - set(fractiles):
             ((address, levels),) = fractiles.items()
             figure = plot_realisations(results, address, levels[-1], **look)
@@ -137,6 +141,7 @@ def sweep(
     options.report(
         jb.api.content(results) | {"plausibility": plausibility} | _statistics(results, fractiles),
         _lines(parsed_case, results, list(values))
+        + _limit_lines(results, limits)
         + (_fractile_lines(parsed_case, results, fractiles, values) if fractiles else []),
         output,
         picture,
@@ -155,6 +160,34 @@ def _with_run_up(case: "jb.Case", values: dict) -> "jb.Case":
 def _several(values: dict) -> set[str]:
     """Addresses with more than one value."""
     return {address for address, given in values.items() if len(given) > 1}
+
+
+def _limits(case: "jb.Case", given: Sequence[str]) -> dict[str, float]:
+    """Limits by quantity, in SI units, of QUANTITY=VALUE."""
+    from jaxbeam.case.reading.units import number_in_si
+
+    units, limits = {sensor.quantity: sensor.unit for sensor in case.sensors}, {}
+    for text in given:
+        quantity, _, value = text.partition("=")
+        refuse_option(
+            quantity not in units or not value,
+            f"--limit takes QUANTITY=VALUE of a quantity that a sensor reads, as"
+            f" {next(iter(units), 'acceleration')}=1.5, not {text!r}; sensors read"
+            f" {', '.join(units) or 'nothing'}",
+        )
+        limits[quantity] = number_in_si(value, units[quantity], f"--limit {quantity}")
+    return limits
+
+
+def _limit_lines(results: "xarray.Dataset", limits: dict[str, float]) -> list[str]:
+    """How many runs are above each limit."""
+    lines = []
+    for quantity, limit in limits.items():
+        peaks, unit = results[f"peak_{quantity}"], results[f"peak_{quantity}"].attrs["units"]
+        above = int((peaks > limit).any("sensor").sum())
+        words = f"{limit:g} {unit}" if unit != "1" else f"{limit:g}"
+        lines.append(f"{quantity} is above {words} in {above} of {results['failed'].size} runs")
+    return lines
 
 
 def _fractile_levels(given: str | None, values: dict) -> dict[str, list[float]]:
