@@ -25,7 +25,7 @@ from jaxbeam.cli.commands.app import app as app_command
 from jaxbeam.cli.commands.benchmark import benchmark
 from jaxbeam.cli.commands.compare import compare
 from jaxbeam.cli.commands.describe import describe
-from jaxbeam.cli.commands.engineering import assess, check, envelope, influence
+from jaxbeam.cli.commands.engineering import assess, check, combine, envelope, influence
 from jaxbeam.cli.commands.export import export
 from jaxbeam.cli.commands.frequency import frf, modes, state_space
 from jaxbeam.cli.commands.identify import identify
@@ -44,7 +44,7 @@ from jaxbeam.runtime.memory import RARELY
 
 COMMANDS = {
     "Simulation": (new, check, describe, modes, frf, simulate, sweep),
-    "Engineering": (assess, envelope, influence),
+    "Engineering": (assess, envelope, combine, influence),
     "Control": (compare, benchmark, stability, state_space, tune, export),
     "Identification": (
         identify,

@@ -7,7 +7,8 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import jaxbeam as jb
-from jaxbeam.cli.arguments import check_suffix
+from jaxbeam.case.reading.toml_file import read_toml
+from jaxbeam.cli.arguments import check_suffix, refuse_option
 from jaxbeam.cli.options import CaseOptions, Output, PictureOptions, print_warnings, table
 from jaxbeam.files.endings import TABLES
 
@@ -144,19 +145,16 @@ def envelope(
     parsed_case = options.read(case, judged="structure")
 
     from jaxbeam.analysis.load_models import crossing_envelope, load_model_envelope
-    from jaxbeam.analysis.sections import characteristic_points
     from jaxbeam.case.reading.units import number_in_si
-    from jaxbeam.model.statics import REACTION, held_positions
+    from jaxbeam.model.statics import REACTION
 
     lane_load = None if lane is None else number_in_si(lane, "N/m", "--lane")
     velocity = None if speed is None else number_in_si(speed, "m/s", "--speed")
-    places = {point.x: point.name for point in characteristic_points(parsed_case)}
-    sections = [number_in_si(text, "m", "--at") for text in at]
     columns = {name: [] for name in ("quantity", "place", "x (m)", "lowest", "highest")}
     dynamic = {"dynamic lowest": [], "dynamic highest": []}
     rows = []
     for name in quantity:
-        x = sections or (held_positions(parsed_case) if name == REACTION else list(places))
+        places, x = _sections(parsed_case, name, at)
         found = load_model_envelope(
             parsed_case, vehicle, x, quantity=name, lane=lane_load, allowance=impact
         )
@@ -191,6 +189,87 @@ def envelope(
     heads += ("dynamic lowest", "highest") if velocity is not None else ()
     lines = ["extremes in SI units, and the place of the vehicle:", *table(heads, rows)]
     options.report(columns, lines, output)
+
+
+def combine(
+    case: Path,
+    actions: Path,
+    /,
+    *,
+    quantity: tuple[str, ...] = ("moment", "shear"),
+    at: tuple[str, ...] = (),
+    output: Output = None,
+    options: CaseOptions = CaseOptions(),
+) -> None:
+    """Combine actions with factors: design values along a beam, and the combinations that govern.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML.
+    actions
+        TOML file: tables [actions.NAME], each with uniform = "12 kN/m" or "self-weight",
+        model = "LM1" (with speed, lane or impact), or loads = "case"; and tables
+        [combinations.NAME] of factors, ACTION = 1.35, or [1.35, 1.0] if it may be favourable.
+    quantity
+        moment, shear, reaction, deflection, rotation, ...; repeat it for more.
+    at
+        Position of a section, as 12.5 (m) or "12.5 m"; repeat it for more. By default supports,
+        midspans and quarter points; reactions at supports.
+    output
+        Write the design values to a table: OUT.csv, .xlsx, .mat or .parquet.
+    """
+    check_suffix(output, TABLES[0], "a table of design values", TABLES[1:])
+    options.check_outputs(output)
+    parsed_case = options.read(case, judged="structure")
+    tables = read_toml(actions, "table of actions")
+    refuse_option(
+        set(tables) != {"actions", "combinations"}
+        or not all(isinstance(one, dict) for part in tables.values() for one in part.values()),
+        f"{actions}: tables of actions are [actions.NAME] and [combinations.NAME], nothing else",
+    )
+
+    from jaxbeam.analysis.combinations import combine as combine_actions
+
+    columns: dict[str, list] = {}
+    rows = []
+    for name in quantity:
+        places, x = _sections(parsed_case, name, at)
+        found = combine_actions(parsed_case, **tables, x=x, quantity=name)
+        low, high = found.lowest, found.highest
+        for i, place in enumerate(found.positions):
+            label = places.get(float(place), "")
+            worst = int(low[:, i].argmin()), int(high[:, i].argmax())
+            entry = {"quantity": name, "place": label, "x (m)": float(place)}
+            for k, combination in enumerate(found.names):
+                entry[f"lowest {combination}"] = float(low[k, i])
+                entry[f"highest {combination}"] = float(high[k, i])
+            for head, value in entry.items():
+                columns.setdefault(head, []).append(value)
+            extremes = f"{low[worst[0], i]:.5g}", f"{high[worst[1], i]:.5g}"
+            by = (found.names[k] for k in worst)
+            pairs = (text for pair in zip(extremes, by, strict=True) for text in pair)
+            rows.append((f"{name} at {label or f'{place:g} m'}", *pairs))
+    if output:
+        import numpy as np
+
+        from jaxbeam.files.tables import write_table
+
+        write_table(output, {k: np.array(v) for k, v in columns.items()}, options.overwrite)
+    heads = "section", "lowest", "combination", "highest", "combination"
+    lines = ["design values in SI units, and the combination of each:", *table(heads, rows)]
+    options.report(columns, lines, output)
+
+
+def _sections(case: "jb.Case", quantity: str, at: tuple[str, ...]) -> tuple[dict, list[float]]:
+    """Names of characteristic points by position (m), and positions of sections of a quantity."""
+    from jaxbeam.analysis.sections import characteristic_points
+    from jaxbeam.case.reading.units import number_in_si
+    from jaxbeam.model.statics import REACTION, held_positions
+
+    places = {point.x: point.name for point in characteristic_points(case)}
+    given = [number_in_si(text, "m", "--at") for text in at]
+    return places, given or list(held_positions(case) if quantity == REACTION else places)
 
 
 def influence(
