@@ -135,7 +135,9 @@ def _say(kept, written) -> None:
     # A checkpoint is written many times, and named as what is kept.
     files = [one for one in dict.fromkeys(written) if not any(one in kept for kept in said)]
     said += [f"written: {', '.join(files)}"] if files else []
-    line = f"jaxbeam: interrupted; {'; '.join(said) or 'nothing is kept'}\n"
+    bars = getattr(getattr(sys.modules.get("tqdm"), "tqdm", None), "_instances", ())
+    begin = "\n" if len(bars) else ""  # the line of a bar of progress is not ended
+    line = f"{begin}jaxbeam: interrupted; {'; '.join(said) or 'nothing is kept'}\n"
     with contextlib.suppress(OSError, ValueError):
         sys.stderr.flush()
     os.write(2, line.encode())

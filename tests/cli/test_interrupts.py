@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+import tqdm
 
 from jaxbeam.cli import main
 from jaxbeam.cli.app import refuse_former_words
@@ -117,6 +118,15 @@ def test_status_and_sentence_within_a_process(folder, capfd, monkeypatch):
         main(["simulate", "case.toml"])
     assert ended.value.code == 130
     assert capfd.readouterr().err == "jaxbeam: interrupted; inner; written: a.csv\n"
+
+
+def test_the_line_is_not_behind_a_bar_of_progress(capfd):
+    with tqdm.tqdm(total=2) as bar:
+        bar.update()
+        with pytest.raises(SystemExit), interruptible(of_process=False):
+            raise KeyboardInterrupt
+    said = capfd.readouterr().err.replace("\r", "\n").split("\n")
+    assert "jaxbeam: interrupted; nothing is kept" in said
 
 
 def test_checkpoints_are_named(tmp_path, capfd):
