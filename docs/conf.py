@@ -22,6 +22,7 @@ extensions = [
     "sphinx_design",
     "copied_pages",
     "generated_pages",
+    "page_in_browser",
     "plain_docstrings",
     "run_code",
     "svg_math",

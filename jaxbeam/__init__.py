@@ -5,6 +5,7 @@ The public names are listed in `__init__.pyi`. Each is imported when it is first
 """
 
 import importlib
+import importlib.util
 import os
 import sys
 
@@ -45,6 +46,11 @@ if "JAX_ENABLE_X64" not in os.environ:
     os.environ["JAX_ENABLE_X64"] = "1"
     if "jax" in sys.modules:
         sys.modules["jax"].config.update("jax_enable_x64", True)
+
+if importlib.util.find_spec("jax") is None:  # in a browser: known numbers need NumPy alone
+    from jaxbeam.runtime import without_jax
+
+    without_jax.install()
 
 _import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 

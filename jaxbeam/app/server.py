@@ -1,17 +1,14 @@
 """Thin server of the page: loopback only, a token for each question, JSON or arrays out."""
 
 import hmac
-import json
 import secrets
 import socket
-import struct
 import webbrowser
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-import numpy as np
 import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -20,11 +17,8 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-import jaxbeam as jb
-from jaxbeam.app import take_away, views
+from jaxbeam.app.questions import Content, answer, as_json, problem_of, questions
 from jaxbeam.app.workspace import MAX_BYTES, Workspace
-from jaxbeam.case.loads.vehicles.vehicle import vehicle_names
-from jaxbeam.library.published import trains
 from jaxbeam.model.plausibility.check import leave_warnings_to_caller
 
 STATIC = Path(__file__).parent / "static"
@@ -114,39 +108,20 @@ def _most_bytes(request: Request) -> int:
     return MAX_LOG_BYTES if request.url.path == LOG_PATH else MAX_BYTES
 
 
-def packed(words: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Response:
-    """Words as JSON and arrays as 32-bit floats in one answer.
-
-    First the length of the JSON (32 bits, little-endian), then the JSON, padded to 4 bytes, with
-    the shapes of the arrays, then their numbers one after the other.
-    """
-    content = {name: np.ascontiguousarray(array, "<f4") for name, array in arrays.items()}
-    shapes = {name: list(array.shape) for name, array in content.items()}
-    head = json.dumps(jb.api.plain({**words, "arrays": shapes}), allow_nan=False).encode()
-    head += b" " * (-len(head) % 4)
-    body = struct.pack("<I", len(head)) + head + b"".join(map(bytes, content.values()))
-    return Response(body, media_type="application/octet-stream")
+def _response(answered: bool, content: Content) -> Response:
+    heads = {}
+    if content.name is not None:
+        heads["content-disposition"] = f'attachment; filename="{content.name}"'
+    return Response(content.body, 200 if answered else 422, heads, content.kind)
 
 
 def _asked(work: Callable[[dict[str, Any]], Any]) -> Callable[[Request], Any]:
     """Handler of a question: its JSON to the work, in a thread; errors as data."""
 
-    async def answer(request: Request) -> Response:
-        try:
-            question = json.loads(await request.body())
-            if not isinstance(question, dict):
-                raise ValueError("a question is a table")
-            if not isinstance(question.get("text", ""), str):
-                raise ValueError("the text of a question is text")
-            found = await run_in_threadpool(work, question)
-        except (ValueError, KeyError, OSError, RuntimeError, ImportError, TypeError) as error:
-            problem = jb.api.problem(error)._asdict()
-            if isinstance(error, KeyError):
-                problem["message"] = f"the question lacks {error}"
-            return JSONResponse({"problem": problem}, 422)
-        return found if isinstance(found, Response) else JSONResponse(jb.api.plain(found))
+    async def respond(request: Request) -> Response:
+        return _response(*await run_in_threadpool(answer, work, await request.body()))
 
-    return answer
+    return respond
 
 
 def application(workspace: Workspace, opened: str | None, token: str, port: int) -> Any:
@@ -155,85 +130,20 @@ def application(workspace: Workspace, opened: str | None, token: str, port: int)
     def index(_) -> Response:
         return Response((STATIC / "index.html").read_bytes(), media_type="text/html")
 
-    def hello(_) -> dict[str, Any]:
-        return {
-            "opened": opened,
-            "folder": workspace.folder.name,
-            "files": workspace.files(),
-            "library": workspace.library(),
-            "names": names,
-        }
-
-    offsets = [{"name": name, "offsets": train.offsets} for name, train in trains().items()]
-    names = {"model": vehicle_names(), "train": list(trains())}
-
-    def run(question) -> Response:
-        record = workspace.record(question["text"])
-        words, arrays = views.pictures(record)
-        return packed(words, arrays)
-
-    def preview(question) -> Any:
-        text, values, ranges = question["text"], question["values"], question["ranges"]
-        if question.get("prepare"):
-            workspace.simulator(workspace.case(text), values, ranges)
-            return {}
-        record = workspace.preview(text, values, ranges)
-        words, arrays = views.pictures(record)
-        return packed(words | {"scene": views.scene(record.case)}, arrays)
-
-    def schema(_) -> dict[str, Any]:
-        from jaxbeam.files.json_schema import json_schema
-
-        return json_schema()
-
-    def take(question) -> Response:
-        name, content, kind = take_away.take(workspace, question["text"], question["what"])
-        heads = {"content-disposition": f'attachment; filename="{name}"'}
-        return Response(content, media_type=kind, headers=heads)
-
-    questions = {
-        "hello": hello,
-        "schema": schema,
-        "open": lambda q: workspace.read(q["name"]),
-        "library": lambda q: {"text": workspace.library_text(q["name"])},
-        "save": lambda q: workspace.save(q["name"], q["text"], q.get("mark")),
-        "model": lambda q: workspace.model(q["text"]),
-        "change": lambda q: {"text": workspace.change(q["text"], q["changes"])},
-        "run": run,
-        "preview": preview,
-        "envelopes": lambda q: views.envelopes(workspace.record(q["text"])),
-        "take": take,
-        "sweep": lambda q: {"job": workspace.start_sweep(q["text"], q["axes"])},
-        "read-log": lambda q: workspace.read_log(q["name"], q["columns"], q["rate"], q["missing"]),
-        "fit": lambda q: {"job": workspace.start_fit(q["text"], q["logs"], q["free"])},
-        "modes": lambda q: {
-            "job": workspace.start_modes(q["logs"], q.get("band"), q.get("choose", ()))
-        },
-        "compare": lambda q: {"job": workspace.start_comparison(q["text"], q["names"])},
-        "tune": lambda q: {
-            "job": workspace.start_tuning(q["text"], q["free"], q["vary"], q["spread"], q["steps"])
-        },
-        "controllers": lambda _: {"names": workspace.controllers()},
-        "job": lambda q: workspace.job(q["job"], q.get("known", 0), q.get("name") or "case.toml"),
-        "cancel": lambda q: workspace.cancel(q["job"]) or {},
-        "vehicles": lambda _: {"vehicles": views.vehicles(), "trains": offsets},
-        "words": lambda q: take_away.words(workspace, q["text"], q.get("name")),
-    }
-
     async def log(request: Request) -> Response:
         name, content = unquote(request.headers.get("x-name", "")), await request.body()
         try:
             found = await run_in_threadpool(workspace.take_log, name, content)
         except (ValueError, OSError, ImportError) as error:
-            return JSONResponse({"problem": jb.api.problem(error)._asdict()}, 422)
-        return JSONResponse(jb.api.plain(found))
+            return _response(False, as_json({"problem": problem_of(error)}))
+        return _response(True, as_json(found))
 
     routes = [
         Route("/", index),
         Route(LOG_PATH, log, methods=["POST"]),
         *(
             Route(f"/api/{name}", _asked(work), methods=["POST"])
-            for name, work in questions.items()
+            for name, work in questions(workspace, opened).items()
         ),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]

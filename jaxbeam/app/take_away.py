@@ -101,9 +101,12 @@ PEAKS = ("smallest", "smallest_time", "largest", "largest_time", "dynamic_amplif
 
 
 def _version() -> str:
-    from importlib.metadata import version
+    from importlib.metadata import PackageNotFoundError, version
 
-    return version("jaxbeam")
+    try:
+        return version("jaxbeam")
+    except PackageNotFoundError:  # its files alone, as in a browser
+        return ""
 
 
 def _short(value: Any) -> str:

@@ -242,7 +242,7 @@ def leaves_by_address(case: Case) -> dict[str, Any]:
 def _addresses_of(structure) -> list[str]:
     """Addresses of the leaves of all cases of a structure."""
     numbered = jax.tree.unflatten(structure, range(structure.num_leaves))
-    paths, _ = jax.tree_util.tree_flatten_with_path(numbered)
+    paths = jax.tree_util.tree_leaves_with_path(numbered)
     return [".".join(map(_key_name, path)) for path, _ in paths]
 
 

@@ -12,6 +12,31 @@
 
 const token = new URLSearchParams(location.search).get("token") ?? "";
 
+/** The page without a server: a worker computes in the browser. */
+export const alone = globalThis.document?.querySelector('meta[name="jaxbeam-worker"]') ?? null;
+const worker = alone && new Worker(/** @type {HTMLMetaElement} */ (alone).content, { type: "module" });
+/** @type {Map<number, (answer: any) => void>} */ const waiting = new Map();
+let asked = 0;
+worker?.addEventListener("message", ({ data }) => {
+  if (data.say === undefined) return waiting.get(data.id)?.(data);
+  const status = document.getElementById("status");
+  if (status) status.textContent = data.say;
+});
+
+/**
+ * The answer of the worker, as a server would give it.
+ * @param {string} name @param {string} text
+ */
+async function fromWorker(name, text) {
+  const id = ++asked;
+  worker?.postMessage({ id, name, text });
+  const { answered, body, kind, file, problem } = await new Promise((take) => waiting.set(id, take));
+  waiting.delete(id);
+  if (problem) throw new Refusal({ message: problem, address: null, line: null });
+  const headers = { "content-type": kind, ...(file ? { "content-disposition": `attachment; filename="${file}"` } : {}) };
+  return new Response(body, { status: answered ? 200 : 422, headers });
+}
+
 export class Refusal extends Error {
   /** @param {Problem} problem */
   constructor(problem) {
@@ -28,8 +53,10 @@ export class Refusal extends Error {
 async function send(name, body, headers = {}) {
   let response;
   try {
-    response = await fetch(`api/${name}`, { method: "POST", body, headers: { "x-token": token, ...headers } });
-  } catch {
+    if (worker) response = await fromWorker(name, String(body));
+    else response = await fetch(`api/${name}`, { method: "POST", body, headers: { "x-token": token, ...headers } });
+  } catch (error) {
+    if (error instanceof Refusal) throw error;
     const message = "the server does not answer: start jaxbeam app again, and open the address that it prints";
     throw new Refusal({ message, address: null, line: null });
   }

@@ -1,6 +1,6 @@
 // The page: bar, model, stage and panels, put together.
 
-import { ask } from "./api.js";
+import { alone, ask, download } from "./api.js";
 import { createControl } from "./control.js";
 import { html, tabs } from "./dom.js";
 import { createFields } from "./fields.js";
@@ -44,9 +44,8 @@ place("sliders").append(sliders.element);
 const panels = {
   Histories: createHistories(store),
   Envelopes: createEnvelopes(store),
-  Sweep: createSweep(store),
-  Identify: createIdentify(store),
-  Control: createControl(store),
+  // What needs JAX and threads is not there without a server.
+  ...(alone ? {} : { Sweep: createSweep(store), Identify: createIdentify(store), Control: createControl(store) }),
   "Take away": createTake(store),
 };
 const results = tabs("results", Object.fromEntries(Object.entries(panels).map(([title, panel]) => [title, panel.element])), (title) => {
@@ -68,7 +67,7 @@ place("bar").append(
 
 function save() {
   const name = store.name ?? prompt("Name of the file in the folder", "case.toml");
-  if (name) return store.save(name);
+  if (name) return store.save(name).then(() => (alone && !store.unsaved ? download({ text: store.text, what: "toml" }) : null));
 }
 
 theme.addEventListener("click", () => {

@@ -1,6 +1,6 @@
 // Files, pictures and a report of the run, and the same run in Python and on the command line.
 
-import { ask, download } from "./api.js";
+import { alone, ask, download } from "./api.js";
 import { html } from "./dom.js";
 
 const FILES = {
@@ -8,9 +8,12 @@ const FILES = {
   png: "Picture (PNG)", svg: "Picture (SVG)", gif: "Animation (GIF)", html: "Report to print (HTML)",
 };
 
+// What needs packages that a page without a server does not load.
+const BEYOND = ["xlsx", "nc", "gif"];
+
 /** @param {import("./store.js").Store} store */
 export function createTake(store) {
-  const files = html("div.buttons", {}, ...Object.entries(FILES).map(([what, words]) => html("button", { type: "button", "data-what": what, onclick: () => take(what) }, words)));
+  const files = html("div.buttons", {}, ...Object.entries(FILES).filter(([what]) => !alone || !BEYOND.includes(what)).map(([what, words]) => html("button", { type: "button", "data-what": what, onclick: () => take(what) }, words)));
   const python = html("pre.code", { tabindex: 0, "aria-label": "Python" });
   const command = html("pre.code", { tabindex: 0, "aria-label": "command line" });
   const element = html("div.take", {}, html("h3", {}, "Files of this run"), files, ...code("Python", python), ...code("Command line", command));

@@ -1,0 +1,136 @@
+"""Questions of the page and their answers, whatever carries them: the server, or a worker.
+
+A question is a name and a table; an answer a table, or bytes with their media type.
+"""
+
+import json
+import struct
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import jaxbeam as jb
+from jaxbeam.app import take_away, views
+from jaxbeam.app.workspace import Workspace
+from jaxbeam.case.loads.vehicles.vehicle import vehicle_names
+from jaxbeam.library.published import trains
+
+
+class Content(NamedTuple):
+    """An answer in bytes, with its media type, and the name of a file that is taken away."""
+
+    body: bytes
+    kind: str
+    name: str | None = None
+
+
+def packed(words: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Content:
+    """Words as JSON and arrays as 32-bit floats in one answer.
+
+    First the length of the JSON (32 bits, little-endian), then the JSON, padded to 4 bytes, with
+    the shapes of the arrays, then their numbers one after the other.
+    """
+    content = {name: np.ascontiguousarray(array, "<f4") for name, array in arrays.items()}
+    shapes = {name: list(array.shape) for name, array in content.items()}
+    head = json.dumps(jb.api.plain({**words, "arrays": shapes}), allow_nan=False).encode()
+    head += b" " * (-len(head) % 4)
+    body = struct.pack("<I", len(head)) + head + b"".join(map(bytes, content.values()))
+    return Content(body, "application/octet-stream")
+
+
+def questions(
+    workspace: Workspace, opened: str | None = None
+) -> dict[str, Callable[[dict[str, Any]], Any]]:
+    """Functions that answer the questions about a workspace, with a file of it `opened` first."""
+
+    def hello(_) -> dict[str, Any]:
+        return {
+            "opened": opened,
+            "folder": workspace.folder.name,
+            "files": workspace.files(),
+            "library": workspace.library(),
+            "names": names,
+        }
+
+    offsets = [{"name": name, "offsets": train.offsets} for name, train in trains().items()]
+    names = {"model": vehicle_names(), "train": list(trains())}
+
+    def run(question) -> Content:
+        record = workspace.record(question["text"])
+        return packed(*views.pictures(record))
+
+    def preview(question) -> Any:
+        text, values, ranges = question["text"], question["values"], question["ranges"]
+        if question.get("prepare"):
+            workspace.simulator(workspace.case(text), values, ranges)
+            return {}
+        record = workspace.preview(text, values, ranges)
+        words, arrays = views.pictures(record)
+        return packed(words | {"scene": views.scene(record.case)}, arrays)
+
+    def schema(_) -> dict[str, Any]:
+        from jaxbeam.files.json_schema import json_schema
+
+        return json_schema()
+
+    def take(question) -> Content:
+        name, content, kind = take_away.take(workspace, question["text"], question["what"])
+        return Content(content, kind, name)
+
+    return {
+        "hello": hello,
+        "schema": schema,
+        "open": lambda q: workspace.read(q["name"]),
+        "library": lambda q: {"text": workspace.library_text(q["name"])},
+        "save": lambda q: workspace.save(q["name"], q["text"], q.get("mark")),
+        "model": lambda q: workspace.model(q["text"]),
+        "change": lambda q: {"text": workspace.change(q["text"], q["changes"])},
+        "run": run,
+        "preview": preview,
+        "envelopes": lambda q: views.envelopes(workspace.record(q["text"])),
+        "take": take,
+        "sweep": lambda q: {"job": workspace.start_sweep(q["text"], q["axes"])},
+        "read-log": lambda q: workspace.read_log(q["name"], q["columns"], q["rate"], q["missing"]),
+        "fit": lambda q: {"job": workspace.start_fit(q["text"], q["logs"], q["free"])},
+        "modes": lambda q: {
+            "job": workspace.start_modes(q["logs"], q.get("band"), q.get("choose", ()))
+        },
+        "compare": lambda q: {"job": workspace.start_comparison(q["text"], q["names"])},
+        "tune": lambda q: {
+            "job": workspace.start_tuning(q["text"], q["free"], q["vary"], q["spread"], q["steps"])
+        },
+        "controllers": lambda _: {"names": workspace.controllers()},
+        "job": lambda q: workspace.job(q["job"], q.get("known", 0), q.get("name") or "case.toml"),
+        "cancel": lambda q: workspace.cancel(q["job"]) or {},
+        "vehicles": lambda _: {"vehicles": views.vehicles(), "trains": offsets},
+        "words": lambda q: take_away.words(workspace, q["text"], q.get("name")),
+    }
+
+
+def answer(work: Callable[[dict[str, Any]], Any], text: str | bytes) -> tuple[bool, Content]:
+    """Whether a question in JSON could be answered, and its answer or the problem, as bytes."""
+    try:
+        question = json.loads(text)
+        if not isinstance(question, dict):
+            raise ValueError("a question is a table")
+        if not isinstance(question.get("text", ""), str):
+            raise ValueError("the text of a question is text")
+        found = work(question)
+    except (ValueError, KeyError, OSError, RuntimeError, ImportError, TypeError) as error:
+        return False, as_json({"problem": problem_of(error)})
+    return True, found if isinstance(found, Content) else as_json(found)
+
+
+def problem_of(error: Exception) -> dict[str, Any]:
+    """What went wrong, in words for the page."""
+    problem = jb.api.problem(error)._asdict()
+    if isinstance(error, KeyError):
+        problem["message"] = f"the question lacks {error}"
+    return problem
+
+
+def as_json(found: Any) -> Content:
+    """An answer of plain data."""
+    body = json.dumps(jb.api.plain(found), ensure_ascii=False, allow_nan=False)
+    return Content(body.encode(), "application/json")
