@@ -16,6 +16,7 @@ from PIL import Image
 from docs._ext.copied_pages import with_link
 from docs.check_prose import WORDS, Text, own_findings, prose, texts
 from experiments.benchmarks.__main__ import BENCHMARKS
+from jaxbeam.analysis.combinations import combine
 from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.actuators.base import AbstractActuator
 from jaxbeam.case.beam import Beam, Support
@@ -177,6 +178,10 @@ def test_blocks_are_read(tmp_path, text):
     if "training" in content:
         found = read_load_cases(path)
         assert found.training and bool(found.held_out) == ("held_out" in content)
+    elif "combinations" in content:
+        case = case_from_dict(ABOUT)
+        found = combine(case, content["actions"], content["combinations"], [0.5])
+        assert np.isfinite(found.highest).all()
     elif "bodies" in content:
         assert load_vehicle(path).axles
     else:
