@@ -55,11 +55,23 @@ if importlib.util.find_spec("jax") is None:  # in a browser: known numbers need 
 _import_name, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
+def _version() -> str:
+    """Version of the installed package; "unknown" for its files alone, as in a browser."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("jaxbeam")
+    except PackageNotFoundError:
+        return "unknown"
+
+
 def __getattr__(name: str):
     if name in NAMES and name not in __all__:
         raise AttributeError(f"jaxbeam.{name} is called jaxbeam.{NAMES[name]} now")
     if name in MOVED:
         raise AttributeError(f"jaxbeam.{name} is jaxbeam.{MOVED[name]}.{name} now")
+    if name == "__version__":
+        return _version()
     if name in MODULES:
         return importlib.import_module(f"{MODULES[name]}.{name}")
     return _import_name(name)

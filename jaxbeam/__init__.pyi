@@ -70,3 +70,5 @@ from .simulation.simulate import simulate as simulate
 from .simulation.simulator import Simulator as Simulator
 from .simulation.stored_record import read_record as read_record
 from .sweeps.sweep import sweep as sweep
+
+__version__: str

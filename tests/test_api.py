@@ -1,5 +1,6 @@
 """Parts of applications: cases from text, problems as data, plain results, jobs."""
 
+import importlib.metadata
 import json
 import threading
 
@@ -158,3 +159,7 @@ def test_a_cancelled_sweep_keeps_its_blocks(tmp_path):
     again = jb.sweep(case, over, resume=True, **options)
     whole = jb.sweep(case, over, progress=False)
     np.testing.assert_allclose(again.peak_deflection, whole.peak_deflection, rtol=1e-5)
+
+
+def test_the_version_is_that_of_the_package():
+    assert jb.__version__ == importlib.metadata.version("jaxbeam")

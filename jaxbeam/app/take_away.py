@@ -92,21 +92,12 @@ def report(record: "jb.Record") -> str:
             ReportSection("Sensors", [sensors, picture]),
             ReportSection("Wheels", [wheels]),
             ReportSection("Case (SI units)", [ReportTable(("part", "numbers"), entries)]),
-            ReportSection("", [f"jaxbeam {_version()}"]),
+            ReportSection("", [f"jaxbeam {jb.__version__}"]),
         ],
     )
 
 
 PEAKS = ("smallest", "smallest_time", "largest", "largest_time", "dynamic_amplification")
-
-
-def _version() -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("jaxbeam")
-    except PackageNotFoundError:  # its files alone, as in a browser
-        return ""
 
 
 def _short(value: Any) -> str:

@@ -83,7 +83,10 @@ def export_c(case: Case, name: str) -> CProgram:
     with one without a period, a law that has no C code, and a loop that diverges.
     """
     if not (name.isidentifier() and name.isascii()):
-        raise ValueError(f"{name!r} cannot be the name of functions in C: take letters, digits, _")
+        raise ValueError(
+            f"{name!r} cannot be the name of functions in C: take a letter, then"
+            " letters, digits or _"
+        )
     check_case(case)
     controller = case.controller
     if controller is None:
