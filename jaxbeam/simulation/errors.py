@@ -128,7 +128,8 @@ def peak_errors(
     Of the deflection, relative to its largest value along the beam, and of what each sensor
     measures, relative to its largest. `heights` are the refined peaks. Errors are the changes of
     these as the steps that hold them are taken as two halves: such a step has the errors of its
-    polynomials and of its contact forces. In traced runs they are `interpolation_errors` only.
+    polynomials and of its contact forces. They are `interpolation_errors` where there are none, in
+    traced runs whose plan has no errors of peaks, and in long controlled ones.
     """
     count, own = len(case.sensors), own_outputs(case.sensors)
     if not count:

@@ -216,7 +216,7 @@ class IntegrationPlan(Module):
     with the last sample, or `to_duration` at the duration of the case. With a controller the
     `schedule` holds its events, the samples and the end. The `origin` is what the plan was made
     for, with which a case is compared before it is run by the plan; None where the caller answers
-    for that.
+    for that. Errors `of_peaks` hold those of peaks between steps, else of the steps only.
     """
 
     shapes: StaticShapes = eqx.field(static=True)
@@ -228,6 +228,7 @@ class IntegrationPlan(Module):
     to_duration: bool = eqx.field(static=True, default=False)
     sensor_errors: tuple[float, ...] = eqx.field(static=True, default=())
     origin: PlanOrigin | None = eqx.field(static=True, default=None)
+    of_peaks: bool = eqx.field(static=True, default=False)
 
     def without_statements(self) -> "IntegrationPlan":
         """The plan without errors and origin: static data of programs that other runs share."""
@@ -404,6 +405,7 @@ def common_plan(plans: Sequence[IntegrationPlan], what: str = "cases") -> Integr
         lead_samples=max(plan.lead_samples for plan in plans),
         equally_spaced=all(plan.equally_spaced for plan in plans),
         error=max(plan.error for plan in plans),
+        of_peaks=all(plan.of_peaks for plan in plans),
         sensor_errors=tuple(map(max, zip(*(plan.sensor_errors for plan in plans), strict=True))),
         origin=common_origin([plan.origin for plan in plans]),
     )

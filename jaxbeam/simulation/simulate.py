@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxbeam.case.case import Case
+from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.contact import ONE_RUN
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.sensors import Sensor
@@ -41,7 +41,9 @@ from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import (
     closed_loop,
     known_loop,
+    loop_schedule,
     moved_schedule,
+    moves_events,
     with_fixed_events,
     with_fixed_losses,
 )
@@ -127,13 +129,13 @@ def simulate(
         plan = check_plan(case, plan, xp.asarray(samples, float))
     elif is_concrete_tree(case):
         warn_if_implausible(case if times is None else _until(case, times))
-        first = None if any_jax(case, times) else _FirstRun(case, times)
-        plan = integration_plan(case, times, tolerance, first)
-        if first is not None:
-            return _with_warning(_refined(case, plan, times, tolerance, first))
+        record, plan = _known_run(case, times, tolerance)
+        if record is not None and not any_jax(case, times):
+            return _with_warning(record)
     else:
         middle, ranges = traced_ranges(case)
-        plan, inside = varied_plan(middle, ranges, times, tolerance), within(case, ranges)
+        plan = varied_plan(middle, ranges, times, tolerance, plan_of_peaks)
+        inside = within(case, ranges)
     return simulate_planned(case, plan, times, tolerance, inside)
 
 
@@ -176,7 +178,8 @@ def _lifting_run(case: Case, held: Case, plan: IntegrationPlan, times) -> "Integ
     motion = motion_at_samples(held, model, loads, run, times, setup.sample_steps)
     peaks = peaks_of_run(held, model, loads, run, monitored)
     outputs, none, steps = Outputs(*motion, None, None), np.zeros(0), len(run.pieces)
-    return Integration(peaks, None, outputs, model, grid, none, none, None, steps, run.flights)
+    parts = peaks, None, outputs, model, grid, none, none, None, steps
+    return Integration(*parts, flights=run.flights)
 
 
 def is_concrete_tree(tree) -> bool:
@@ -191,11 +194,38 @@ def simulate_planned(case: Case, plan: IntegrationPlan, times, tolerance: float,
     return _with_warning(_run(case, plan, times, tolerance, inside))
 
 
+def plan_of_peaks(case: Case, times, tolerance: float) -> IntegrationPlan:
+    """Plan of a run of known numbers, of whose peaks it has the errors, too."""
+    return _known_run(case, times, tolerance)[1]
+
+
+def _known_run(case: Case, times, tolerance: float) -> tuple[Record | None, IntegrationPlan]:
+    """Record of the known numbers of a case, as `grad` has them, and a plan of as exact peaks.
+
+    Of a derivative of a run that is compiled there is no record: it would take another program.
+    """
+    moving = case.controller is not None and moves_events(case, times)
+    traced, case = any_jax(case, times), concrete_case(case)
+    times = None if times is None else concrete(times)
+    first, record = _FirstRun(case, times), None
+    plan = integration_plan(case, times, tolerance, first)
+    end = float(case.run.duration) if times is None else None
+    times = sample_times(case) if times is None else times
+    if not (traced and plan.schedule is not None and runs_compiled(plan.schedule)):
+        record, plan = _refined(case, plan, times, tolerance, first)
+    if moving:
+        plan = dataclasses.replace(plan, schedule=loop_schedule(case, times, end, True))
+    return record, plan
+
+
 def _refined(
     case: Case, plan: IntegrationPlan, times, tolerance: float, first: "_FirstRun"
-) -> Record:
-    """Record of known numbers, with steps that are shortened until its peaks are exact enough."""
-    times, inside = sample_times(case) if times is None else xp.asarray(times, float), np.True_
+) -> tuple[Record, IntegrationPlan]:
+    """Record of known numbers, with steps that are shortened until its peaks are exact enough.
+
+    The plan that is returned has these steps, and the errors of the record.
+    """
+    inside = np.True_
     if first.record is None or first.substeps != plan.substeps:
         record = _run(case, plan, times, tolerance, inside, first.policy)
     else:
@@ -206,7 +236,9 @@ def _refined(
             break
         plan = dataclasses.replace(plan, substeps=shorter)
         record = _run(case, plan, times, tolerance, inside, first.policy)
-    return record
+    errors = {"error": float(record.error_estimate), "of_peaks": True}
+    errors["sensor_errors"] = tuple(map(float, record.step_errors))
+    return record, dataclasses.replace(plan, **errors)
 
 
 def _errors_of(case: Case, plan: IntegrationPlan) -> Float[np.ndarray, " all"]:
@@ -332,8 +364,10 @@ def _record(case: Case, integration: "Integration", times) -> Record:
     # Each wheel at its own time.
     lost_positions = xp.diagonal(loads.kinematics(lost_times)[0])
     diverged = xp.any(xp.isnan(outputs.motion.coordinates))  # errors are not defined
-    both = integration.running_peaks, integration.of_halves
-    of_peaks = peak_errors(case, integration.model, *both, heights, outputs.motion)
+    of_peaks = np.zeros(()), np.zeros(len(case.sensors))
+    if not integration.plan_of_peaks:
+        both = integration.running_peaks, integration.of_halves
+        of_peaks = peak_errors(case, integration.model, *both, heights, outputs.motion)
     return Record(
         case=case,
         modes=integration.model.modes,
@@ -491,7 +525,8 @@ class Integration(NamedTuple):
     """Running peaks, outputs at the sample times, model, grid, states (boundary, state, batch).
 
     `sampled_states` (time, state) are those at the sample times, `commands` (step, command, batch)
-    those at the nodes of each step. `of_halves` are the `peaks_of_halves` of a known run.
+    those at the nodes of each step. `of_halves` are the `peaks_of_halves` of a known run; none are
+    needed where the errors of the plan hold those of peaks.
     """
 
     running_peaks: Any
@@ -503,6 +538,7 @@ class Integration(NamedTuple):
     sampled_states: Array
     commands: Array | None
     steps: int
+    plan_of_peaks: bool = False
     flights: Flights | None = None
 
 
@@ -527,7 +563,7 @@ def run_integration(
         discrete, loads, max_loads=max_loads, steps=steps, policy=policy, in_chunks=in_chunks
     )
     of_halves, in_steps = None, (running_peaks, all_states, node_commands)
-    if monitored and not any_jax(discrete, loads, in_steps):
+    if monitored and not (plan.of_peaks or any_jax(discrete, loads, in_steps)):
         of_halves = peaks_of_halves(on_grid, discrete.grid, loads, max_loads, *in_steps)
     states = all_states[sample_steps]
 
@@ -555,6 +591,7 @@ def run_integration(
         states[..., 0],
         node_commands,
         steps,
+        plan.of_peaks,
     )
 
 

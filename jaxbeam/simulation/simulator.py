@@ -13,7 +13,7 @@ from jaxbeam.runtime.arrays import Array, any_traced, xp
 from jaxbeam.runtime.module import Module
 from jaxbeam.simulation.integration_plan import TOLERANCE, IntegrationPlan
 from jaxbeam.simulation.record import Record
-from jaxbeam.simulation.simulate import simulate_planned
+from jaxbeam.simulation.simulate import plan_of_peaks, simulate_planned
 from jaxbeam.simulation.varied_plan import declared_ranges, varied_plan, within
 
 
@@ -21,11 +21,12 @@ class Simulator(Module):
     """Simulation of a case as a function of the numbers at some addresses.
 
     `vary` lists addresses, or maps each to its range (low, high) in SI units; without a range it is
-    from half to twice the number of the case. Time steps are chosen once, for the ends of the
-    ranges. Called with values, as a mapping or in the order of `vary`, it returns the record of
-    `jaxbeam.simulate`, under `jit`, `vmap`, `grad`, `jvp`, `hessian`, `lax.map` and inside `scan`
-    too. Whatever does not depend on traced values is computed in NumPy. `record.result` tells
-    what is wrong with a run (see `jaxbeam.simulation.record.Result`).
+    from half to twice the number of the case. Time steps are chosen once, for the middle and the
+    ends of the ranges; the error that a record states is the largest of those runs. Called with
+    values, as a mapping or in the order of `vary`, it returns the record of `jaxbeam.simulate`,
+    under `jit`, `vmap`, `grad`, `jvp`, `hessian`, `lax.map` and inside `scan` too. Whatever does
+    not depend on traced values is computed in NumPy. `record.result` tells what is wrong with a
+    run (see `jaxbeam.simulation.record.Result`).
 
     Raises ValueError for an invalid case, unknown addresses, ranges in which positions change their
     order, and when called outside of transformations with values beyond their ranges.
@@ -60,7 +61,7 @@ class Simulator(Module):
         ]
         if timing:
             raise ValueError(f"{timing[0]} fixes the number of samples: give times if it varies")
-        self.plan = varied_plan(case, self.ranges, self.times, self.tolerance)
+        self.plan = varied_plan(case, self.ranges, self.times, self.tolerance, plan_of_peaks)
 
     def __call__(self, values: Mapping[str, Any] | Any = ()) -> Record:
         """Record for some values in SI units, by address or in the order of the addresses."""

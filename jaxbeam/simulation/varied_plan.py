@@ -7,7 +7,7 @@ steps depend little, and must be declared for all others.
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -28,12 +28,17 @@ SPEED_MARGIN = 4.0  # a traced speed, over the slowest that crosses within the r
 
 
 def varied_plan(
-    case: Case, ranges: Mapping[str, Range], times, tolerance: float
+    case: Case,
+    ranges: Mapping[str, Range],
+    times,
+    tolerance: float,
+    plan_of: Callable[..., IntegrationPlan] = integration_plan,
 ) -> IntegrationPlan:
     """Plan for all cases whose numbers at some addresses are within ranges.
 
-    The error is the largest of those at the ends of the ranges. Raises ValueError as
-    `integration_plan` does, and if positions along the beam change their order within the ranges.
+    The error is the largest of those at the middle and the ends of the ranges, for which `plan_of`
+    gives plans. Raises ValueError as `integration_plan` does, and if positions along the beam
+    change their order within the ranges.
     """
     ends = [(address, end) for address, both in ranges.items() for end in both]
     tried = [{address: end} for address, end in ends]
@@ -41,7 +46,7 @@ def varied_plan(
         tried = [{address: both[i] for address, both in ranges.items()} for i in (0, 1)]
     middle = {address: (low + high) / 2 for address, (low, high) in ranges.items()}
     base = replace(case, middle)
-    plans = [integration_plan(replace(base, one), times, tolerance) for one in (middle, *tried)]
+    plans = [plan_of(replace(base, one), times, tolerance) for one in (middle, *tried)]
     plan = common_plan(plans, "cases at the ends of the ranges")
     factor = STEPS_OF_MANY if many else 1
     return dataclasses.replace(plan, substeps=factor * plan.substeps, origin=None)
