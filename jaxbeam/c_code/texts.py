@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Num
 
 from jaxbeam.c_code.recorded_loop import RecordedLoop
+from jaxbeam.case.trajectory import SAME_TIME
 from jaxbeam.runtime.c_writer import number_text
 
 REAL_BYTES, INT_BYTES = 8, 4  # in double precision
@@ -202,7 +203,8 @@ def check_text(name: str, code: ProgramText) -> str:
     gates, tolerance = "", max(TOLERANCE, ROUNDING / code.difference_step)
     if code.gate_loads:
         gates = f"""
-        while (event < GATE_EVENTS && gate_event[2 * event] <= sample_time[k]) {{
+        while (event < GATE_EVENTS
+               && gate_event[2 * event] * (1 - {SAME_TIME:g}) <= sample_time[k]) {{
             {name}_gate(&state, (int)gate_event[2 * event + 1], ({name}_real)gate_event[2 * event]);
             event++;
         }}"""

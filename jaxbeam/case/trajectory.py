@@ -19,6 +19,13 @@ from jaxbeam.runtime.arrays import (
 from jaxbeam.runtime.module import Module
 
 NEVER = 1e30  # s, beyond any run; finite, also in single precision, so that derivatives exist
+SAME_TIME = 1e-12  # of a time: a sample that is earlier by less is at it
+SAME_SHARE = 1e-9  # of a crossing, likewise
+
+
+def has_come(time, t):
+    """Whether a time (s) has come at t (s), which may be the same but for rounding."""
+    return t >= time - SAME_TIME * xp.abs(time)
 
 
 class AbstractTrajectory(Module):

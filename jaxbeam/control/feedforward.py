@@ -27,7 +27,7 @@ from jaxbeam.case.fields import (
     number,
 )
 from jaxbeam.case.loads.base import trajectory
-from jaxbeam.case.trajectory import NEVER
+from jaxbeam.case.trajectory import NEVER, SAME_SHARE, SAME_TIME, has_come
 from jaxbeam.runtime.arrays import Array, Number, xp
 
 
@@ -107,8 +107,7 @@ class Prescribed(AbstractStaticController):
             angle = angle if self.phases is None else angle + self.phases
             command = command + xp.sum(self.amplitudes * xp.sin(angle), axis=-1)
         if self.times is not None:
-            tabulated = [xp.interp(t, self.times, row, left=0.0, right=0.0) for row in self.values]
-            command = command + xp.stack(tabulated)
+            command = command + _tabulated(self.times, self.values, t, SAME_TIME * t)
         return command
 
     def breakpoints(self, case):
@@ -222,7 +221,7 @@ class FeedforwardLaw(AbstractSampledLaw):
     length: Float[Array, ""]
 
     def step(self, state, measurement, t):
-        passed = t >= self.gate_times[:, 1]
+        passed = has_come(self.gate_times[:, 1], t)
         return ControlStep(xp.sum(xp.where(passed, self.table_commands(t), 0.0), axis=1), state)
 
     def distances(self, t) -> Float[Array, " load"]:
@@ -234,11 +233,7 @@ class FeedforwardLaw(AbstractSampledLaw):
     def table_commands(self, t) -> Float[Array, "actuator load"]:
         """Commands of the table for each load at t (s), read ahead by the lead."""
         shares = self.distances(t + self.lead) / self.length
-
-        def interpolate(row):
-            return xp.interp(shares, self.shares, row, left=0.0, right=0.0)
-
-        return xp.stack([interpolate(row) for row in self.values])
+        return _tabulated(self.shares, self.values, shares, SAME_SHARE)
 
 
 class ConfirmedFeedforwardLaw(FeedforwardLaw):
@@ -263,8 +258,8 @@ class ConfirmedFeedforwardLaw(FeedforwardLaw):
         if measurement.present is not None:
             readings = xp.where(measurement.present[own], readings, 0.0)
         lowest = xp.min(readings)
-        passed = t >= self.gate_times[:, 1]
-        early = self.distances(t) <= CONFIRMATION_SHARE * self.length
+        passed = has_come(self.gate_times[:, 1], t)
+        early = self.distances(t) <= (CONFIRMATION_SHARE + SAME_SHARE) * self.length
         confirmed = state | (passed & early & (lowest <= -self.confirmation))
         commands = xp.where(confirmed, self.table_commands(t), 0.0)
         return ControlStep(xp.sum(commands, axis=1), confirmed)
@@ -273,6 +268,13 @@ class ConfirmedFeedforwardLaw(FeedforwardLaw):
 def _deflection_sensors(sensors) -> tuple[int, ...]:
     """Places of the sensors that read a deflection."""
     return tuple(i for i, sensor in enumerate(sensors) if sensor.quantity == "deflection")
+
+
+def _tabulated(breakpoints, rows, x, rounding) -> Float[Array, "row ..."]:
+    """Rows of a table at x, zero beyond its ends, past which x may be by rounding."""
+    inside = (x >= breakpoints[0] - rounding) & (x <= breakpoints[-1] + rounding)
+    values = xp.stack([xp.interp(x, breakpoints, row) for row in rows])
+    return xp.where(inside, values, 0.0)
 
 
 def _gate_times(gates, loads, length) -> Float[np.ndarray, "load 2"]:

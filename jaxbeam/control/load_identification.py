@@ -19,6 +19,7 @@ from jaxbeam.case.controller import Measurement, Time
 from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import POSITIVE, concrete, deciding, is_concrete, number
 from jaxbeam.case.loads.base import AbstractLoad
+from jaxbeam.case.trajectory import SAME_SHARE, has_come
 from jaxbeam.estimation.observability import deflection_outputs
 from jaxbeam.estimation.observer import sensor_offsets
 from jaxbeam.model.modes import mesh_layout
@@ -141,7 +142,7 @@ class GateIdentifier(AbstractLoadIdentifier):
 
     def update(self, state, measurement, t):
         # Each load that passes the first gate begins new sums.
-        return super().update(xp.where(t < self.gate_times[1], 0.0, state), measurement, t)
+        return super().update(xp.where(has_come(self.gate_times[1], t), state, 0.0), measurement, t)
 
     @property
     def speed(self) -> Float[Array, ""]:
@@ -159,8 +160,9 @@ class GateIdentifier(AbstractLoadIdentifier):
         return (t - self.entry_time) * xp.abs(self.speed) / self.length
 
     def estimate(self, sums, t):
-        speed_identified = t >= self.gate_times[1]
-        mass_identified = speed_identified & (self.crossing_share(t) >= self.until)
+        speed_identified = has_come(self.gate_times[1], t)
+        until = self.until - SAME_SHARE
+        mass_identified = speed_identified & (self.crossing_share(t) >= until)
         mass = self.fitted_mass(*sums)
         return LoadEstimate(mass, self.speed, self.entry_time, speed_identified, mass_identified)
 

@@ -18,7 +18,7 @@ from jaxbeam.case.loads.base import (
     wheel_distances,
 )
 from jaxbeam.case.track import Track, windows
-from jaxbeam.case.trajectory import AbstractTrajectory
+from jaxbeam.case.trajectory import AbstractTrajectory, has_come
 from jaxbeam.model.layout import Layout
 from jaxbeam.model.settlement import surface
 from jaxbeam.runtime.arrays import Array, add_at, is_jax, is_known, xp
@@ -287,7 +287,7 @@ class LoadSet(Module):
     def on_beam(self, times: Float[Array, "*time"]) -> Bool[Array, "wheel *time"]:
         """Whether each wheel is on the beam at given times (s), from entry until before exit."""
         entry, leave = self.entry_exit_times().T.reshape(2, -1, *(1,) * xp.ndim(times))
-        return (entry <= times) & (times < leave)
+        return has_come(entry, times) & ~has_come(leave, times)
 
 
 def load_set(case: Case, layout: Layout | None = None) -> LoadSet:

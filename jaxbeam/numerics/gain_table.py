@@ -33,8 +33,11 @@ class GainTable(Module):
     coefficients: Float[Array, "interval power input state"]
 
     def __call__(self, fraction: Float[Array, ""]) -> Float[Array, "input state"]:
-        """Gain at a fraction of the time span; held before 0 and after 1."""
-        i = xp.searchsorted(self.breakpoints, fraction, side="right") - 1
+        """Gain at a fraction of the time span; held before 0 and after 1.
+
+        At a breakpoint, where gains may jump, that after it, even if rounding is before it.
+        """
+        i = xp.searchsorted(self.breakpoints, fraction + END_OFFSET, side="right") - 1
         i = xp.clip(i, 0, self.coefficients.shape[0] - 1)
         start = take(self.breakpoints, i)
         length = take(self.breakpoints, i + 1) - start

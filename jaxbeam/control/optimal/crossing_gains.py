@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.controller import ControlStep
-from jaxbeam.case.trajectory import NEVER
+from jaxbeam.case.trajectory import NEVER, has_come
 from jaxbeam.control.state_controller import AbstractStateLaw
 from jaxbeam.model.contact import (
     contact_rows,
@@ -62,8 +62,8 @@ class GainSchedule(AbstractStateLaw):
         final_gain = self.final_gain
         if self.fade_time is not None:
             final_gain = final_gain * xp.exp(-xp.maximum(t - self.end, 0.0) / self.fade_time)
-        gain = xp.where(t < self.end, self.table(crossing_share), final_gain)
-        return xp.where(t < self.start, 0.0, gain)
+        gain = xp.where(has_come(self.end, t), final_gain, self.table(crossing_share))
+        return xp.where(has_come(self.start, t), gain, 0.0)
 
     def step(self, state, estimate, measurement, t):
         load_weights = self.load_weights

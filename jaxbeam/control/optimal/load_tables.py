@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.estimator import EstimatedLoads
 from jaxbeam.case.loads.point import MovingMass
+from jaxbeam.case.trajectory import has_come
 from jaxbeam.control.load_identification import AbstractLoadSource
 from jaxbeam.control.optimal.crossing_gains import GainSchedule
 from jaxbeam.control.state_controller import AbstractStateLaw
@@ -152,9 +153,10 @@ class PositionGainLaw(AbstractStateLaw):
         """The loads of the case at t (s)."""
         positions, speeds, _ = self.load_set.kinematics(t)
         entry, leave = self.load_set.entry_exit_times().T
-        clock = xp.where(t < leave, xp.clip(self._share(positions), 0.0, 1.0), 1.0 + t - leave)
-        clock = xp.where(t < entry, -1.0, clock)
-        on_beam = (entry <= t) & (t < leave)
+        entered, left = has_come(entry, t), has_come(leave, t)
+        share, since_exit = xp.clip(self._share(positions), 0.0, 1.0), xp.maximum(t - leave, 0.0)
+        clock = xp.where(entered, xp.where(left, 1.0 + since_exit, share), -1.0)
+        on_beam = entered & ~left
         return ReadLoads(clock, xp.abs(speeds), on_beam, self.load_masses, self.load_weights)
 
     def estimated_loads(self, loads: EstimatedLoads) -> ReadLoads:
