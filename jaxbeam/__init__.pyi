@@ -50,6 +50,7 @@ from .control.optimal.lqr import LQR as LQR
 from .control.predictive.gpc import GPC as GPC, AdaptiveGPC as AdaptiveGPC
 from .control.predictive.mpc import MPC as MPC
 from .control.predictive.scenario_mpc import ScenarioMPC as ScenarioMPC
+from .control.semi_active import SemiActive as SemiActive
 from .control.sliding_mode import SlidingMode as SlidingMode
 from .control.state_controller import StateFeedback as StateFeedback
 from .estimation.extended_kalman import ExtendedKalman as ExtendedKalman

@@ -195,6 +195,9 @@ def inner_tables(part_class: type, name: str, level: int) -> list[str]:
             continue
         inner = f"{name}.{key.name}"
         lines += ["#" * level + (f" `[[{inner}]]`" if key.listed else f" `[{inner}]`"), ""]
+        if issubclass(part_class, key.part_class):
+            lines += ["Any other kind of this page.", ""]
+            continue
         classes = table_classes(key.part_class)
         if "" not in classes:
             lines += [*prose(key.part_class), ""]

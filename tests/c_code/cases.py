@@ -144,6 +144,12 @@ CASES = {
             period=PERIOD,
         )
     ),
+    "semi-active": rig(
+        jb.SemiActive(
+            [0.5, 0.8], 20.0, OutputFeedback([[-6.0, -5.0], [-7.0, -4.0]]), period=PERIOD
+        ),
+        sensors=[jb.Sensor(0.2, "velocity"), jb.Sensor(0.45, "velocity")],
+    ),
     "sliding-mode": rig(
         jb.SlidingMode(
             [30.0, 20.0], 10.0, [0.1, 0.2], positions=[0.25, 0.45], estimator=KALMAN, period=PERIOD

@@ -349,6 +349,7 @@ OF_CONTROLLERS = {
         "internal-model",
         "internal-model-scheduled",
         "feedback-stepped",
+        "semi-active",
         "sliding-mode",
         "state",
         "mpc",
