@@ -1,0 +1,49 @@
+"""Pedestrian streams against the closed form of a pinned beam, and people who stand in step."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import jaxbeam as jb
+from jaxbeam.analysis.footbridges import comfort_class, stream_response
+
+LENGTH, MASS, DAMPING, WIDTH = 40.0, 2500.0, 0.02, 3.0
+BRIDGE = jb.Case(jb.Beam(LENGTH, 10.4e9, MASS, damping_ratio=DAMPING, modes=2))
+
+
+@pytest.mark.parametrize(
+    ("density", "people", "in_step"),
+    [("TC3", 60.0, 10.8 * np.sqrt(DAMPING * 60)), (1.5, 180.0, 1.85 * np.sqrt(180))],
+)
+def test_stream_on_a_pinned_beam(density, people, in_step):
+    """2 p / (pi m zeta) of any mode, as |sin| has the mean 2 / pi."""
+    found = stream_response(BRIDGE, density, WIDTH, reduction=[1.0, 0.25])
+    assert_allclose(found.equivalent, in_step, rtol=1e-9)
+    expected = 2 * 280 * in_step / LENGTH / (np.pi * MASS * DAMPING)
+    assert_allclose(found.accelerations, [expected, expected / 4], rtol=1e-5)
+    assert list(found.columns["comfort class"]) == [comfort_class(expected * s) for s in (1, 0.25)]
+
+
+def test_people_in_step_have_the_acceleration_of_the_stream():
+    """Thirty people of a share of the force each, in the direction of the second mode, in time."""
+    found = stream_response(BRIDGE, "TC2", WIDTH)
+    count = 30
+    amplitude, pace = 280 * found.equivalent[1] / count, [found.frequencies[1]]
+    people = [
+        jb.VaryingForce(frequencies=pace, amplitudes=[amplitude], phases=[phase], position=at)
+        for half, phase in ((0.0, 0.0), (LENGTH / 2, np.pi))
+        for at in half + (np.arange(count // 2) + 0.5) * LENGTH / count
+    ]
+    run = jb.Run(6.0, sample_rate=200.0)  # six time constants
+    case = jb.Case(BRIDGE.beam, loads=people, sensors=[jb.Sensor(10.0, "acceleration")], run=run)
+    record = jb.simulate(case)
+    last = np.asarray(record.sensor_values[record.times > 5.0, 0])
+    assert_allclose(np.abs(last).max(), found.accelerations[1], rtol=0.01)
+
+
+def test_comfort_classes_and_wrong_numbers():
+    assert [comfort_class(a) for a in (0.5, 0.51, 2.5, 2.6)] == ["CL1", "CL2", "CL3", ""]
+    with pytest.raises(ValueError, match="no traffic class 'TC9'"):
+        stream_response(BRIDGE, "TC9", WIDTH)
+    with pytest.raises(ValueError, match="width must be positive"):
+        stream_response(BRIDGE, "TC3", 0.0)
