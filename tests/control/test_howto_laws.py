@@ -33,11 +33,14 @@ def strip(modes=3, sensors=(0.3,), mass=0.3, speed=1.5, entry=0.0) -> jb.Case:
     )
 
 
+VELOCITY = [jb.Sensor(0.3), jb.Sensor(0.3, "velocity")]
+
 # The strip for the law of each block, and the largest peak in terms of that without the law.
 STRIPS = {
     "feedback": (strip(mass=0.5), 0.95),  # of a patch
     "internal-model-scheduled": (strip(), 0.8),
     "sliding-mode": (strip(2, (0.2, 0.4)), 0.5),
+    "semi-active": (dataclasses.replace(strip(), sensors=VELOCITY), 0.98),  # by damping alone
     "h-infinity": (strip(), 0.8),
     "lqr": (strip(2, (0.2, 0.4), mass=0.4, speed=2.0), 0.7),
 }

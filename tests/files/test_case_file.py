@@ -179,6 +179,11 @@ REFUSED = [
     ('"shaker"', '"shakr"', "actuators.0.kind cannot be 'shakr'; did you mean 'shaker'?"),
     ('"mass"', '"car"', "loads.0.kind cannot be 'car'; it may be axles, crowd, "),
     ('"mass"', "1", "loads.0.kind cannot be 1; it may be axles, crowd, "),
+    (
+        "length = 0.6",
+        "length = 0.6\nskew = 9.0",
+        "beam has no key 'skew'; a beam has no skew, tors",
+    ),
     ("speed = 0.55", "sped = 0.55", "loads.0 has no key 'sped'; did you mean 'speed'?"),
     ("[-2.5, 7.5]", "7.5", "actuators.1.limits must be a list of 2 numbers, not 7.5"),
     ("[-2.5, 7.5]", "[1, 2, 3]", "actuators.1.limits must be a list of 2 numbers, not [1, 2, 3]"),

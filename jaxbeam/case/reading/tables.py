@@ -18,6 +18,8 @@ from jaxbeam.case.limits import check_entries, check_length
 from jaxbeam.case.quantities import OF_QUANTITY, unit_of
 from jaxbeam.case.reading.units import in_si
 
+# Words of what is not in the model of a beam; the nearest key would be another thing.
+OUTSIDE = re.compile(r"skew|torsion|twist|eccentric|frame|grillage")
 MAX_NUMBER = 2.0**1023  # above, whole numbers do not fit into a float
 
 
@@ -89,9 +91,13 @@ def read_part(address: str, table: dict[str, Any], part_class: type) -> Any:
     default_quantity = fields["quantity"].default if "quantity" in fields else None
     for key, value in values.items():
         if key not in fields:
-            raise ValueError(
-                f"{address} has no key {describe_value(key)}; {suggestion(key, fields)}"
-            )
+            hint = suggestion(key, fields)
+            if OUTSIDE.search(str(key)):
+                hint = (
+                    "a beam has no skew, torsion or frame: give one girder its share of the loads,"
+                    " by the distribution factors of a code, or take a program for grillages"
+                )
+            raise ValueError(f"{address} has no key {describe_value(key)}; {hint}")
         inner_class = fields[key].metadata.get("part")
         if inner_class is not None and isinstance(value, dict):
             values[key] = read_part(f"{address}.{key}", value, inner_class)
