@@ -115,7 +115,9 @@ def plot_speed_sweep(
         name = f"{names[i]}: " if count > 1 else ""
         axes.set_title("\n".join(textwrap.wrap(name + largest, LINE)))
         if limits and quantity in limits:
-            draw_limits(axes, [limits[quantity] / factor], [LIMIT], unit)
+            limit = limits[quantity] / factor
+            axes.set_ylim(0.0, max(axes.get_ylim()[1], 1.05 * limit))
+            draw_limits(axes, [limit], [LIMIT], unit)
     panels[-1].set_xlabel(axis_label(address_words(case, address), speed_scale(speeds).unit))
     if len(labels) > 1:
         curves = [Line2D([], [], label=one, **curve_style(k)) for k, one in enumerate(labels)]

@@ -300,7 +300,7 @@ def _draw_maps(figure, grid, group: QuantityPeaks, swept, scales):
             title = f"{title}, largest {format_number(values[row, column])} {group.unit}".rstrip()
         axes.set_title(title)
         axes.grid(False)
-    words = "".join(f", {limit_words(limit, group.unit)} dotted" for limit in group.limits)
+    words = "".join(f"\n{limit_words(limit, group.unit)} dotted" for limit in group.limits)
     label = group.label + words
     bar = figure.colorbar(filled, ax=grid, ticks=contour_levels, label=label, pad=0.02)
     bar.outline.set_visible(False)

@@ -233,6 +233,12 @@ def test_limits_of_a_quantity(addresses):
     assert addresses == 2 or any(np.allclose(line, 0.4) for line in lines)
 
 
+def test_a_limit_above_all_peaks_is_on_the_axes():
+    (axes,) = plot_sweep(dataset(), limits={"deflection": 0.2}).axes
+    assert any(np.allclose(data(line)[1], 200.0) for line in axes.lines)
+    assert axes.get_ylim()[1] > 200.0
+
+
 def test_low_speeds_are_in_metres_per_second():
     slow = dataset().assign_coords({"loads.0.speed": SPEEDS / 100})
     assert "speed of the train (m/s)" in words(plot_sweep(slow))
