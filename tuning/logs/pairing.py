@@ -23,8 +23,8 @@ def case_of_log(case: Case, log: Log, times: Float[np.ndarray, " time"]) -> Case
     """The case with the loads and commands of a log, until its end.
 
     Commands are linear from sample to sample. One that stays for two samples or more is held by its
-    converter, and the mean of it and the one before is taken, so that its steps are where they are
-    in the log: half a sample early, they would take k dt / 2 from the damping beside a spring k.
+    converter, and is weighted with its neighbours so that its steps are where they are in the log:
+    half a sample early, they would take k dt / 2 from the damping beside a spring k.
     `times` (s) are those of the log and of its padding, in which the last commands stay. Raises
     ValueError, naming the log, for a command that no actuator of the case accepts.
     """
@@ -42,10 +42,15 @@ def case_of_log(case: Case, log: Log, times: Float[np.ndarray, " time"]) -> Case
 
 
 def _acting(command: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
-    """The command, or its means over neighbours if it is held over several samples."""
+    """The command, or values whose lines act as it does where it is held over several samples.
+
+    Held from sample to sample it is sinc(x) exp(-i x) of its samples, x = omega dt / 2, and lines
+    are sinc(x)^2: these weights make up for exp(-i x) / sinc(x) up to x^4.
+    """
     if samples_held(command) == 1.0:
         return command
-    return np.append(command[0], (command[1:] + command[:-1]) / 2)
+    at = np.pad(command, (2, 1), mode="edge")  # at[2:-1] is the command
+    return (7 * (at[2:-1] + at[1:-2]) - at[3:] - at[:-3]) / 12
 
 
 def pad_cases(cases: list[Case], times: list[Float[np.ndarray, " time"]]) -> list[Case]:
