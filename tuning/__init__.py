@@ -18,13 +18,13 @@ from tuning.fit.experiment_design import design_experiment
 from tuning.fit.frequency_responses import identify_responses
 from tuning.fit.identify import Fit, identify
 from tuning.fit.modal_parameters import identify_from_modes
-from tuning.fit.storage import load_fit, save_fit
+from tuning.fit.result import load_fit, save_fit
 from tuning.logs.log import Log
 from tuning.logs.reading import read_log, read_logs
 from tuning.modal.arguments import ModalSettings
 from tuning.modal.fit import ModalFit
 from tuning.modal.identify_modes import identify_modes
-from tuning.parameters.prior import Prior
+from tuning.parameters.free import Prior
 from tuning.weighing.weigh import weigh
 
 MOVED = {  # names of former versions, each with the module in which it is now

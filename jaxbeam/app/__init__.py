@@ -1,5 +1,5 @@
 """A page in the browser for a case: build it, see it move, sweep it, fit it to logs, take it away.
 
-`document` is the text of a case and its changes, `workspace` what is computed for it, without any
+`workspace` has the text of a case, its changes and what is computed for it, without any
 web; `server` hands both to the page in `static`.
 """

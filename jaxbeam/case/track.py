@@ -2,7 +2,7 @@
 
 An axle at x presses with shares w_k at x + o_k: on three sleepers, at any offsets, or evenly over a
 length. What is off the beam then rests on the ground. A force on the modes psi is thus that of the
-filtered shapes sum_k w_k psi(x + o_k) (see `jaxbeam.model.load_influence`).
+filtered shapes sum_k w_k psi(x + o_k) (see `jaxbeam.model.deflection_lines`).
 """
 
 from typing import NamedTuple

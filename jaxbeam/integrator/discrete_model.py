@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxbeam.integrator.inputs import AbstractInputPolicy
 from jaxbeam.integrator.propagators import NODE_COUNT, PEAK_NODES, Propagators, propagators
 from jaxbeam.integrator.time_grid import TimeGrid
-from jaxbeam.model.load_influence import LoadInfluence
+from jaxbeam.model.deflection_lines import LoadInfluence
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.output_rows import (
     CorrectionRows,

@@ -15,12 +15,12 @@ from jaxbeam.case.beam import has
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import is_concrete
 from jaxbeam.model.deflection_lines import (
+    residual_influence,
     static_deflection_per_port_force,
     unchecked_influence_line,
     validated_layout,
 )
 from jaxbeam.model.flexibility import check_supported
-from jaxbeam.model.load_influence import residual_influence
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import Layout, Modes, mesh_layout
 from jaxbeam.model.theory.elements import rigidity_at

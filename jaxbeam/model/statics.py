@@ -17,13 +17,13 @@ from jaxbeam.case.quantities import QUANTITIES, SIDES, quantity_of
 from jaxbeam.model.deflection_lines import (
     intervals_of_waves,
     peak_under_loads,
+    spread_line,
     static_deflection,
     unchecked_influence_line,
     validated_layout,
 )
 from jaxbeam.model.flexibility import flexibility
 from jaxbeam.model.layout import Layout, is_uniform
-from jaxbeam.model.load_influence import spread_line
 from jaxbeam.model.sensing.output_rows import SIDE_SHARE, beside, quantity_factor
 from jaxbeam.model.settlement import settlement_response
 from jaxbeam.model.static_correction import section_stiffness

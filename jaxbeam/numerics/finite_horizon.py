@@ -22,20 +22,18 @@ from jaxbeam.numerics.batched_linalg import (
     transpose,
     vmap_last_axis,
 )
-from jaxbeam.numerics.coupled_stages import (
-    ConstantPlant,
-    Coupling,
-    explicit_force_law,
-    stage_responses,
-    stages_of_length,
-)
 from jaxbeam.numerics.gain_table import GainTable, PlantMatrices, interpolate_gains
 from jaxbeam.numerics.matrices import InputWeight, Square
 from jaxbeam.numerics.stages import (
     GAUSS_NODES,
+    ConstantPlant,
+    Coupling,
     collocated_stages,
     command_cost_matrix,
+    explicit_force_law,
     riccati_recursion,
+    stage_responses,
+    stages_of_length,
 )
 from jaxbeam.runtime.arrays import Array
 

@@ -12,11 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.numerics.batched_linalg import hstack, matmul, transpose
-from jaxbeam.numerics.coupled_stages import ConstantPlant
 from jaxbeam.numerics.matrices import InputWeight, Square
 from jaxbeam.numerics.polynomials import powers
 from jaxbeam.numerics.riccati import lqr
-from jaxbeam.numerics.stages import GAUSS_NODES
+from jaxbeam.numerics.stages import GAUSS_NODES, ConstantPlant
 from jaxbeam.runtime.arrays import Array, take, xp
 from jaxbeam.runtime.module import Module
 

@@ -8,16 +8,32 @@ Optimal control minimises over U, one interval after the other, backward in time
 the end, that at the start is the minimum of W + (Phi, Gamma)' P (Phi, Gamma) over U.
 """
 
+import functools
+import math
+import operator
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from jaxbeam.numerics.batched_linalg import batch_size_of, matmul, solve_batch, transpose
+from jaxbeam.numerics.batched_linalg import (
+    batch_size_of,
+    matmul,
+    solve_batch,
+    solve_each,
+    solve_unpivoted,
+    transpose,
+)
 from jaxbeam.numerics.discretisation import balance
-from jaxbeam.numerics.matrices import InputWeight, Square, symmetric_part
-from jaxbeam.numerics.polynomials import gauss_nodes, gauss_weights, integration_matrix
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.numerics.matrices import InputMatrix, InputWeight, Square, symmetric_part
+from jaxbeam.numerics.polynomials import (
+    gauss_nodes,
+    gauss_weights,
+    integration_matrix,
+    lagrange_coefficients,
+)
+from jaxbeam.runtime.arrays import Array, add_at, any_jax, index_in_dim, scan, xp
 from jaxbeam.runtime.module import Module
 
 NODE_COUNT = 6  # Gauss nodes of an interval; order 12
@@ -125,3 +141,278 @@ def command_cost_matrix(
     # Over an interval of length zero the commands have no effect; a cost keeps W invertible.
     safe_length = jnp.where(length > 0, length, 1.0)
     return safe_length * jnp.kron(np.diag(gauss_weights(NODE_COUNT)), R)
+
+
+TAYLOR_TERMS = 12  # of the series for the shortest intervals
+
+
+class ConstantPlant(Module):
+    """Constant part A, B, E of a plant; see the module."""
+
+    A: Square
+    B: InputMatrix
+    E: Float[Array, "state direction"]
+
+
+class Coupling(Module):
+    """Time-varying part F, V, S, D of a plant; see the module."""
+
+    force_distribution: Float[Array, "*time direction force"]
+    force_state_rows: Float[Array, "*time force state"]
+    command_feedthrough: Float[Array, "*time force input"]
+    force_feedthrough: Float[Array, "*time force force"]
+
+
+class StageResponse(Module):
+    """Response and cost of the constant part over an interval.
+
+    `state_at_nodes` and `state_at_end` give the state at the Gauss nodes and at the end from
+    (x0, commands, E F f), and `cost` is the integral of x'Qx as a quadratic form of these.
+    Commands and forces are values at the nodes, ordered by node.
+    """
+
+    state_at_nodes: Float[Array, "*length node source state"]
+    state_at_end: Float[Array, "*length state source"]
+    cost: Float[Array, "*length source source"]
+
+
+def stage_responses(
+    plant: ConstantPlant, Q: Square, length: Float[Array, ""], halvings: int
+) -> StageResponse:
+    """Responses for intervals of a length (s), of half of it, and so on, the longest first.
+
+    By Taylor series for the shortest interval, and doubling. Inputs are first the polynomials
+    sum_p c_p s^p / p! of the fraction s of the interval, then those through values at the nodes.
+    """
+    inputs = xp.concatenate([plant.B, plant.E], axis=1)
+    states, count = inputs.shape
+    fractions = np.append(GAUSS_NODES, 1.0)
+    shortest_length = length / 2**halvings
+    transition, input_responses = _phi_functions(plant.A * shortest_length, inputs, fractions)
+    # States at the nodes of the shortest interval.
+    powers = fractions[:, None] ** np.arange(1, NODE_COUNT + 1)
+    state_at_nodes = (
+        shortest_length * powers[:NODE_COUNT, :, None, None] * input_responses[:NODE_COUNT]
+    )
+    state_at_nodes = xp.concatenate(
+        [transition[:NODE_COUNT], _flatten_node_columns(state_at_nodes)], axis=2
+    )
+    quadrature = gauss_weights(NODE_COUNT)[:, None, None]
+    cost = xp.tensordot(state_at_nodes.mT, quadrature * (Q @ state_at_nodes), ((0, 2), (0, 1)))
+
+    def double(carry, _):
+        transition, input_responses, cost, length = carry
+        doubled = _double_phi(transition, input_responses)
+        doubled_cost = _double_cost(transition[-1], length * input_responses[-1], cost, count)
+        return (*doubled, doubled_cost, 2 * length), carry
+
+    start = (transition, input_responses, shortest_length * cost, shortest_length)
+    longest, shorter = scan(double, start, length=halvings)
+    transition, input_responses, cost, lengths = jax.tree.map(
+        lambda some, last: xp.concatenate([some, last[None]])[::-1], shorter, longest
+    )
+    # From coefficients to values at the nodes, commands first.
+    factorials = np.array([math.factorial(p) for p in range(NODE_COUNT)])
+    lagrange = lagrange_coefficients(NODE_COUNT) * factorials  # node, power
+    local = lagrange * powers[:, None]  # fraction, node, power: over each fraction of the interval
+    node_input_response = (
+        xp.einsum("cqp,lcpik->lciqk", local, input_responses) * lengths[:, None, None, None, None]
+    )
+    state_response = xp.concatenate(
+        [transition, _commands_before_forces(node_input_response, plant)], axis=3
+    )
+    cross_cost = cost[:, :states, states:].reshape(-1, states, NODE_COUNT, count)
+    cross_cost = _commands_before_forces(xp.einsum("qp,lipk->liqk", lagrange, cross_cost), plant)
+    input_cost = cost[:, states:, states:].reshape(-1, NODE_COUNT, count, NODE_COUNT, count)
+    input_cost = xp.einsum("qp,lpkxj->lqkxj", lagrange, input_cost)
+    input_cost = _commands_before_forces(xp.einsum("qx,lpkxj->lpkqj", lagrange, input_cost), plant)
+    input_cost = _commands_before_forces(xp.moveaxis(input_cost, (1, 2), (-2, -1)), plant)
+    top = xp.concatenate([cost[:, :states, :states], cross_cost], axis=2)
+    below = xp.concatenate([cross_cost.mT, input_cost], axis=2)
+    return StageResponse(
+        state_response[:, :NODE_COUNT].mT,
+        state_response[:, -1],
+        xp.concatenate([top, below], axis=1),
+    )
+
+
+def node_forces(
+    plant: ConstantPlant, response: StageResponse, coupling: Coupling, explicit: bool = False
+) -> tuple[Float[Array, "interval node_force column"], Float[Array, "node direction force _"]]:
+    """Forces f at the nodes per unit of (x0, commands at the nodes), and F, intervals last.
+
+    For intervals of one length from the coupling (interval, node) at their nodes. Where no force
+    depends on another one, nor on the states that forces change, the law is `explicit`.
+    """
+    states, inputs = plant.B.shape
+    free_columns = states + NODE_COUNT * inputs  # the states at the start and the commands
+    interval_count, forces = coupling.force_state_rows.shape[0], coupling.force_state_rows.shape[2]
+    size = NODE_COUNT * forces
+    # Rows of V x + S u at the nodes, and of f itself. Intervals are the last axis: sums are short.
+    distribution = xp.moveaxis(coupling.force_distribution, 0, -1)
+    contact_rows = xp.einsum("cwi,scri->cwrs", response.state_at_nodes, coupling.force_state_rows)
+    # (node, input, force, interval)
+    direct = xp.moveaxis(coupling.command_feedthrough, 0, -1).swapaxes(1, 2)
+    direct_part = np.eye(NODE_COUNT)[:, :, None, None, None] * direct[:, None]
+    direct_part = direct_part.reshape(NODE_COUNT, -1, forces, interval_count)
+    right = add_at(contact_rows[:, :free_columns], np.s_[:, states:], direct_part)
+    right = right.swapaxes(1, 2).reshape(size, free_columns, interval_count)
+    if explicit:
+        return xp.moveaxis(right, -1, 0), distribution
+    force_on_force = contact_rows[:, free_columns:].reshape(
+        NODE_COUNT, NODE_COUNT, -1, forces, interval_count
+    )
+    force_on_force = _unrolled_sum(
+        force_on_force[:, :, :, :, None] * distribution[:, :, None], 2
+    ).swapaxes(1, 2)
+    force_feedthrough = np.eye(forces)[:, :, None] + xp.moveaxis(coupling.force_feedthrough, 0, -1)
+    force_system = (
+        np.eye(NODE_COUNT)[:, None, :, None, None] * force_feedthrough[:, :, None] - force_on_force
+    )
+    system = force_system.reshape(size, size, interval_count)
+    return solve_each(system, right), distribution
+
+
+def coupled_stages(
+    plant: ConstantPlant,
+    response: StageResponse,
+    coupling: Coupling,
+    R: InputWeight,
+    length: Float[Array, ""],
+) -> Stage:
+    """Stages of intervals of one length (s), from the coupling (interval, node) at their nodes."""
+    states, inputs = plant.B.shape
+    free_columns = states + NODE_COUNT * inputs
+    force, distribution = node_forces(plant, response, coupling)
+    interval_count, size, _ = force.shape
+    # Response of the end to the forces; their cost with x0 and u, and by themselves.
+    force_response = xp.concatenate([response.state_at_end, response.cost])[:, free_columns:]
+    force_response = force_response.reshape(-1, NODE_COUNT, distribution.shape[1])
+    force_response = xp.einsum("wqd,qdts->wqts", force_response, distribution).reshape(
+        -1, size, interval_count
+    )
+    directed = force_response[states + free_columns :].reshape(NODE_COUNT, -1, size, interval_count)
+    force_cost = _unrolled_sum(directed[:, :, None] * distribution[:, :, :, None], 1).reshape(
+        size, size, interval_count
+    )
+    force_to_end, cross_cost, force_cost = (
+        xp.moveaxis(part, -1, 0)
+        for part in (
+            force_response[:states],
+            force_response[states : states + free_columns],
+            force_cost,
+        )
+    )
+    end = response.state_at_end[:, :free_columns] + force_to_end @ force
+    command_cost = xp.pad(command_cost_matrix(R, length), (states, 0))
+    force_part = force.mT @ (cross_cost.mT + force_cost @ force / 2)
+    cost = response.cost[:free_columns, :free_columns] + command_cost + force_part + force_part.mT
+    return Stage(end[..., :states], end[..., states:], cost)
+
+
+def stages_of_length(
+    plant: ConstantPlant,
+    responses: StageResponse,
+    length_index: Int[Array, ""],
+    coupling: Coupling,
+    R: InputWeight,
+    length: Float[Array, ""],
+) -> Stage:
+    """`coupled_stages` for intervals of one of the lengths of `responses`."""
+    response = jax.tree.map(lambda part: index_in_dim(part, length_index, 0, False), responses)
+    return coupled_stages(plant, response, coupling, R, length)
+
+
+def explicit_force_law(coupling: Coupling) -> Float[Array, "interval node force state_and_input"]:
+    """Rows of the explicit law f = (1 + D)^-1 (V x + S u)."""
+    law = xp.eye(coupling.force_feedthrough.shape[-1]) + coupling.force_feedthrough
+    right_side = xp.concatenate([coupling.force_state_rows, coupling.command_feedthrough], axis=3)
+    return jax.vmap(jax.vmap(solve_unpivoted))(law, right_side)
+
+
+def _unrolled_sum(terms, axis):
+    """Sum over a short axis; where traced unrolled, which is shorter to run than a loop."""
+    if not any_jax(terms):
+        return np.sum(terms, axis=axis)
+    return functools.reduce(operator.add, jnp.unstack(terms, axis=axis))
+
+
+def _flatten_node_columns(input_responses):
+    """Responses (fraction, power, state, input) as columns (fraction, state, power and input)."""
+    ordered = xp.moveaxis(input_responses, 1, 2)
+    return ordered.reshape(*ordered.shape[:2], -1)
+
+
+def _commands_before_forces(columns, plant: ConstantPlant):
+    """Columns (..., node, input) as (..., column), commands of all nodes before the forces."""
+    inputs = plant.B.shape[1]
+    commands, forces = columns[..., :inputs], columns[..., inputs:]
+    shape = (*columns.shape[:-2], -1)
+    return xp.concatenate([commands.reshape(shape), forces.reshape(shape)], axis=-1)
+
+
+def _phi_functions(x, inputs, fractions):
+    """exp(c x), and phi_1, ... of c x times the inputs, for fractions c of a small matrix x."""
+    states = x.shape[0]
+    columns = xp.concatenate([xp.eye(states), inputs], axis=1)
+    rows = [columns]
+    for _ in range(TAYLOR_TERMS - 1):
+        rows.append(x @ rows[-1])
+    powers, terms = xp.stack(rows), np.arange(TAYLOR_TERMS)
+    fraction_powers = fractions[:, None] ** terms
+    orders = np.arange(NODE_COUNT + 1)[:, None] + terms
+    weights = fraction_powers[:, None] / np.vectorize(math.factorial)(orders).astype(float)
+    transition = xp.tensordot(weights[:, 0], powers[:, :, :states], axes=1)
+    return transition, xp.tensordot(weights[:, 1:], powers[:, :, states:], axes=1)
+
+
+def _double_phi(transition, input_responses):
+    """Exponentials and phi functions (fraction, phi, state, input) of the doubled argument."""
+    halves = 0.5 ** np.arange(1, NODE_COUNT + 1)
+    doubled = transition[:, None] @ input_responses + xp.einsum(
+        "pq,cqik->cpik", _second_half_matrix().T, input_responses
+    )
+    return transition @ transition, doubled * halves[:, None, None]
+
+
+def _double_cost(transition, input_responses, cost, count):
+    """Cost of two equal intervals together, for inputs with coefficients over both."""
+    states = transition.shape[0]
+    first = 0.5 ** np.arange(NODE_COUNT)
+    first_half_inputs = _flatten_columns(input_responses * first[:, None, None])
+    scale = np.append(np.ones(states), np.repeat(first, count))
+    # (coefficient over the second, coefficient over both)
+    second_half_weights = _second_half_matrix() * first
+
+    def to_second_half(columns):
+        """Columns for coefficients over the second interval, as columns for those over both."""
+        split = columns.reshape(-1, NODE_COUNT, count)
+        return xp.einsum("ipk,pq->iqk", split, second_half_weights).reshape(columns.shape)
+
+    cross_cost, input_cost = cost[:states, states:], cost[states:, states:]
+    cross_second_half = to_second_half(cross_cost)
+    cost_of_end_state = cost[:states, :states] @ xp.concatenate(
+        [transition, first_half_inputs], axis=1
+    )
+    state_cost = transition.T @ cost_of_end_state[:, :states]
+    new_cross_cost = transition.T @ (cost_of_end_state[:, states:] + cross_second_half)
+    end_state_cost = first_half_inputs.T @ (cost_of_end_state[:, states:] / 2 + cross_second_half)
+    new_input_cost = (
+        to_second_half(to_second_half(input_cost).T) + end_state_cost + end_state_cost.T
+    )
+    top = xp.concatenate([state_cost, new_cross_cost], axis=1)
+    return cost * scale * scale[:, None] + xp.concatenate(
+        [top, xp.concatenate([new_cross_cost.T, new_input_cost], axis=1)]
+    )
+
+
+def _flatten_columns(input_responses):
+    """Responses (power, state, input) as columns (state, power and input)."""
+    return xp.moveaxis(input_responses, 0, 1).reshape(input_responses.shape[1], -1)
+
+
+@functools.cache
+def _second_half_matrix() -> np.ndarray:
+    """Weights 1 / (q - p)!: coefficient q of (1 + s)^q / q! in s^p / p!."""
+    rows = range(NODE_COUNT)
+    return np.array([[1 / math.factorial(q - p) if q >= p else 0.0 for q in rows] for p in rows])

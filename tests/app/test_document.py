@@ -8,7 +8,7 @@ import pytest
 from hypothesis import strategies as st
 
 import jaxbeam as jb
-from jaxbeam.app.document import changed
+from jaxbeam.app.workspace import changed
 from tests.app.conftest import RIG
 from tests.modules import ROOT
 

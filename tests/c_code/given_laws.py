@@ -9,8 +9,7 @@ import numpy as np
 import jaxbeam as jb
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.load_identification import LoadIdentification
-from jaxbeam.control.optimal.crossing_gains import GainSchedule
-from jaxbeam.control.optimal.load_tables import PositionGainLaw, ScheduledGainLaw
+from jaxbeam.control.optimal.crossing_gains import GainSchedule, PositionGainLaw, ScheduledGainLaw
 from jaxbeam.control.predictive.prediction import Preview, SampledPlant
 from jaxbeam.control.state_controller import SampledStateLaw, TrueState
 from jaxbeam.estimation.sampled_plant import sample_timing

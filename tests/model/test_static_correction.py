@@ -11,8 +11,11 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.case.case import replace
-from jaxbeam.model.deflection_lines import influence_line, static_deflection_per_command
-from jaxbeam.model.load_influence import LoadInfluence
+from jaxbeam.model.deflection_lines import (
+    LoadInfluence,
+    influence_line,
+    static_deflection_per_command,
+)
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.output_rows import sensor_rows, static_correction

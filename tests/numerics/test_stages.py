@@ -9,8 +9,15 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import BarycentricInterpolator
 
 from jaxbeam.numerics.batched_linalg import batch_axis_last
-from jaxbeam.numerics.coupled_stages import ConstantPlant, Coupling, coupled_stages, stage_responses
-from jaxbeam.numerics.stages import GAUSS_NODES, collocated_stages, riccati_recursion
+from jaxbeam.numerics.stages import (
+    GAUSS_NODES,
+    ConstantPlant,
+    Coupling,
+    collocated_stages,
+    coupled_stages,
+    riccati_recursion,
+    stage_responses,
+)
 
 STATES, INPUTS, DIRECTIONS, FORCES, HALVINGS = 4, 2, 3, 2, 3
 START, LENGTH = 0.4, 0.1

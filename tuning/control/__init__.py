@@ -1,8 +1,6 @@
 """Controllers tuned by gradients through the closed loop."""
 
-from tuning.control.integer_choices import tune_integers
-from tuning.control.pareto import lexicographic
-from tuning.control.reduced_order import tune_reduced
+from tuning.control.pareto import lexicographic, tune_integers, tune_reduced
 from tuning.control.run_set import draw_plants, with_identified_plant
 
 __all__ = ["draw_plants", "lexicographic", "tune_integers", "tune_reduced", "with_identified_plant"]

@@ -1,16 +1,21 @@
 """Multi-objective tuning: Pareto front (epsilon-constraint method) and lexicographic order."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxbeam.case.case import Case
+from jaxbeam.control.optimal.lqr import LQR
 from jaxbeam.runtime.printer import text_table
 from tuning.control.load_cases import LoadCases
 from tuning.control.objective import ALL_METRICS, Objective
 from tuning.control.penalised_objective import StabilityConstraint
-from tuning.control.tune import ParameterBounds, TuningProblem, check_arguments
+from tuning.control.tune import ParameterBounds, TuningProblem, check_arguments, tune
 from tuning.control.tuning_result import TuningResult
 
 
@@ -179,3 +184,231 @@ def _with_limits(objective: Objective, limits: dict[str, float]) -> Objective:
     if unknown:
         raise ValueError(f"there is no metric {min(unknown)!r}; it may be {', '.join(ALL_METRICS)}")
     return dataclasses.replace(objective, limits=objective.limits | limits)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class IntegerSearchResult:
+    """Tuning results by choice of integers."""
+
+    choices: tuple[dict[str, int], ...]
+    tuned: tuple[TuningResult, ...]
+
+    @property
+    def best(self) -> TuningResult:
+        """The result with the lowest objective on training runs; stable ones come first."""
+        ranks = [
+            (found.stability_violation > 0, found.run_sets[0].objective[1]) for found in self.tuned
+        ]
+        return self.tuned[min(range(len(ranks)), key=ranks.__getitem__)]
+
+    def __str__(self) -> str:
+        names = list(self.choices[0])
+        header = [*names, *(run_set.name for run_set in self.tuned[0].run_sets), ""]
+        rows = []
+        for choice, found in zip(self.choices, self.tuned, strict=True):
+            objectives = [f"{run_set.objective[1]:.5g}" for run_set in found.run_sets]
+            mark = "(best)" if found is self.best else ""
+            rows.append([*(f"{choice[name]:d}" for name in names), *objectives, mark])
+        lines = text_table(header, rows, ">" * (len(header) - 1) + "<")
+        return "\n".join(["objective by choice", *lines, "", str(self.best)])
+
+
+def tune_integers(
+    case: Case,
+    choices: Mapping[str, Sequence[int]],
+    free: ParameterBounds,
+    cases: LoadCases,
+    objective: Objective | None = None,
+    **options: Any,
+) -> IntegerSearchResult:
+    """Tune a case with every combination of integers at some addresses.
+
+    `choices` are lists by address, such as {"controller.horizon": [4, 6, 8]}. Integers decide array
+    shapes and have no gradient, so that each combination is a search of its own; `options` are
+    those of `tune`.
+
+    Raises ValueError for an address without an integer, and as `tune` does.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3, limits=(-2.0, 2.0))],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
+    ...     controller=jb.MPC(horizon=4, moves=2, move_weight=1e-9, period=0.01),
+    ...     run=jb.Run(0.3),
+    ... )
+    >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
+    >>> options = {"steps": 1, "least_peaks": False, "progress": False}
+    >>> free = {"controller.move_weight": (1e-10, 1e-8)}
+    >>> found = tuning.control.tune_integers(
+    ...     case, {"controller.horizon": [2, 4]}, free, loads, **options
+    ... )
+    >>> print(found.choices)
+    ({'controller.horizon': 2}, {'controller.horizon': 4})
+    """
+    rows = [dict(zip(choices, row, strict=True)) for row in itertools.product(*choices.values())]
+    if not choices or not rows:
+        raise ValueError("name at least one integer, with at least one value to try")
+    chosen = [with_integers(case, row) for row in rows]
+    found = [tune(own, free, cases, objective, **options) for own in chosen]
+    return IntegerSearchResult(tuple(rows), tuple(found))
+
+
+def with_integers(case: Case, values: Mapping[str, int]) -> Case:
+    """The case with other integers at some addresses.
+
+    Raises ValueError for an address at which there is no integer.
+    """
+    for address, value in values.items():
+        case = _replace_integer(case, address.split("."), int(value), address)
+    return case
+
+
+def _replace_integer(part, path: list[str], value: int, address: str):
+    """A part of a case with the integer at the path within it replaced."""
+    step, *rest = path
+    if isinstance(part, tuple):
+        if not (step.isdigit() and int(step) < len(part)):
+            raise ValueError(f"the case has nothing at {address}")
+        entries = list(part)
+        entries[int(step)] = _replace_integer(entries[int(step)], rest, value, address)
+        return tuple(entries)
+    names = (
+        [field.name for field in dataclasses.fields(part)] if _is_dataclass_instance(part) else []
+    )
+    if step not in names:
+        hint = f"; there it has {', '.join(names)}" if names else ""
+        raise ValueError(f"the case has nothing at {address}{hint}")
+    old = getattr(part, step)
+    if rest:
+        return dataclasses.replace(part, **{step: _replace_integer(old, rest, value, address)})
+    if isinstance(old, bool) or not isinstance(old, (int, np.integer)):
+        raise ValueError(f"{address} is no integer: tune it as a free parameter")
+    return dataclasses.replace(part, **{step: value})
+
+
+def _is_dataclass_instance(part) -> bool:
+    return dataclasses.is_dataclass(part) and not isinstance(part, type)
+
+
+FEEDBACK_ADDRESS = "controller.feedback"
+SHARE_PENALTY = 10.0  # added to the objective if the sum of the shares is off by one
+CANDIDATE_COUNT = 3  # states tried as the last one to be fed back
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ReducedFeedback:
+    """Indices of the states that are fed back, and all `shares` of the relaxed search.
+
+    `relaxed` is the result with these shares, `tuned` that with the shares rounded and the other
+    parameters tuned again.
+    """
+
+    fed_back: tuple[int, ...]
+    shares: Float[np.ndarray, " state"]
+    relaxed: TuningResult
+    tuned: TuningResult
+
+    def __str__(self) -> str:
+        rows = [
+            (str(state), f"{share:.3f}", "yes" if state in self.fed_back else "no")
+            for state, share in enumerate(self.shares)
+        ]
+        lines = text_table(("state", "share", "fed back"), rows, "<><")
+        rounded, tuned = self.tuned.run_sets[0].objective
+        relaxed = self.relaxed.run_sets[0].objective[1]
+        lines += [
+            "",
+            f"objective on training: {relaxed:.5g} with these shares, {rounded:.5g} when they are"
+            f" rounded, {tuned:.5g} when the other parameters are tuned again",
+        ]
+        return "\n".join([*lines, "", str(self.tuned)])
+
+
+def tune_reduced(
+    case: Case,
+    keep: int,
+    free: ParameterBounds,
+    cases: LoadCases,
+    objective: Objective | None = None,
+    **options: Any,
+) -> ReducedFeedback:
+    """Tune a regulator that feeds back `keep` of its states only, and select these.
+
+    First the share of each state (the controller's `feedback`) is a free parameter from 0 to 1,
+    with a penalty that keeps their sum at `keep`. Then the largest shares become 1, the others 0,
+    and the parameters in `free` are tuned again from their last values; for the last state the next
+    largest shares are tried as well, and the best on training runs is the result. `options` are
+    those of `tune`, without a checkpoint.
+
+    Raises ValueError for a controller that is no regulator, for more states than it has, and as
+    `tune` does.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
+    ...     actuators=[jb.PointForce(0.3, limits=(-2.0, 2.0))],
+    ...     sensors=[jb.Sensor(0.3)],
+    ...     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
+    ...     controller=jb.LQR(state_weight=[1e6, 1.0], command_weight=[1e-2], period=0.01),
+    ...     run=jb.Run(0.3),
+    ... )
+    >>> loads = tuning.LoadCases(({"loads.0.mass": 0.2},), ({"loads.0.mass": 0.3},))
+    >>> free = {"controller.command_weight.0": (1e-4, 1.0)}
+    >>> options = {"steps": 2, "least_peaks": False, "progress": False}
+    >>> found = tuning.control.tune_reduced(case, 1, free, loads, **options)
+    >>> print(len(found.fed_back), "of", len(found.shares), "states")
+    1 of 2 states
+    """
+    controller = case.controller
+    if not isinstance(controller, LQR):
+        raise ValueError("only regulators, such as kind 'lqr', have states to leave out")
+    states = int(controller.state_weight.shape[0])
+    if not 1 <= keep < states:
+        raise ValueError(f"keep must be 1 to {states - 1} of the {states} states; it is {keep}")
+    if any(address.startswith(FEEDBACK_ADDRESS) for address in free) or "checkpoint" in options:
+        raise ValueError(f"leave {FEEDBACK_ADDRESS} out of what is free, and name no checkpoint")
+    names = [f"{FEEDBACK_ADDRESS}.{state}" for state in range(states)]
+    shared = dict.fromkeys(names, (0.0, 1.0))
+
+    def penalty(values):
+        # On both sides: weights can compensate shares that are all too small.
+        total = jnp.sum(jnp.stack([values[name] for name in names]))
+        return SHARE_PENALTY * (total - keep) ** 2
+
+    relaxed = tune(
+        _with_feedback(case, np.full(states, keep / states)),
+        dict(free) | shared,
+        cases,
+        objective,
+        penalty=penalty,
+        **options,
+    )
+    pairs = zip(relaxed.parameters, relaxed.values, strict=True)
+    found = {parameter.address: value for parameter, value in pairs}
+    shares = np.array([found[name] for name in names])
+    order = np.argsort(-shares, kind="stable")
+    # The best relaxed shares need not be the best when rounded.
+    candidates = [
+        np.append(order[: keep - 1], last) for last in order[keep - 1 :][:CANDIDATE_COUNT]
+    ]
+    results = []
+    for kept in candidates:
+        rounded = _with_feedback(relaxed.case, np.isin(np.arange(states), kept).astype(float))
+        results.append(tune(rounded, free, cases, objective, **options))
+    best = min(
+        range(len(candidates)),
+        key=lambda i: (results[i].stability_violation > 0, results[i].run_sets[0].objective[1]),
+    )
+    return ReducedFeedback(
+        tuple(sorted(map(int, candidates[best]))), shares, relaxed, results[best]
+    )
+
+
+def _with_feedback(case: Case, shares: Float[np.ndarray, " state"]) -> Case:
+    """The case with other shares of its controller's states fed back."""
+    controller = dataclasses.replace(case.controller, feedback=shares)
+    return dataclasses.replace(case, controller=controller)

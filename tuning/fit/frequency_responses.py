@@ -22,9 +22,8 @@ from tuning.fit.least_squares import MAX_STEPS, LeastSquares
 from tuning.fit.summary import parameter_table
 from tuning.fit.uncertainty.covariance import confidence_intervals
 from tuning.logs.log import Log
-from tuning.parameters.free import FreeParameter, free_parameters
+from tuning.parameters.free import FreeParameter, Prior, free_parameters
 from tuning.parameters.prediction import FunctionPrediction
-from tuning.parameters.prior import Prior
 
 MIN_RELATIVE_SD = 1e-3  # of a measured response; no sensor is better calibrated
 

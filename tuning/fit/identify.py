@@ -15,12 +15,10 @@ from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.runtime.progress import BAR_DELAY, ProgressBar, following
 from tuning.checkpoint import Checkpoint, checkpoint_path, fingerprint
 from tuning.fit.dataset import Dataset, make_dataset
-from tuning.fit.least_squares import LeastSquares, SearchPoint, check_loss
-from tuning.fit.multi_start import multi_start
+from tuning.fit.least_squares import LeastSquares, SearchPoint, check_loss, multi_start
 from tuning.fit.result import Fit, fit_result
 from tuning.logs.log import Log
-from tuning.parameters.free import LOG_ADDRESS, FreeParameter, free_parameters
-from tuning.parameters.prior import Prior
+from tuning.parameters.free import LOG_ADDRESS, FreeParameter, Prior, free_parameters
 
 
 def identify(

@@ -23,8 +23,7 @@ from tuning.fit.least_squares import WEAK_PRIOR_WIDTH
 from tuning.fit.summary import parameter_table
 from tuning.fit.uncertainty.covariance import t_quantile, uncertainty
 from tuning.modal.result import ModalEstimates, mac_matrix
-from tuning.parameters.free import FreeParameter, free_parameters, to_unbounded
-from tuning.parameters.prior import Prior
+from tuning.parameters.free import FreeParameter, Prior, free_parameters, to_unbounded
 
 MIN_RELATIVE_FREQUENCY_SD = 1e-4  # of a frequency; clocks and temperature allow no better
 MIN_RELATIVE_DAMPING_SD = 1e-2

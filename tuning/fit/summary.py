@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.runtime.printer import Row, text_table
-from tuning.fit.multi_start import LocalMinimum
+from tuning.fit.least_squares import LocalMinimum
 from tuning.logs.log import Log
 from tuning.logs.quality import find_faults
 from tuning.parameters.free import FreeParameter

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.signal import correlate, detrend
 
-from tuning.logs.log import Log
-from tuning.logs.records import even_records
+from tuning.logs.log import Log, even_records
 
 PARTS = 4  # parts of a log whose offsets show the error of a clock's rate
 # Largest correlation of two independent signals, over all offsets, in standard deviations.

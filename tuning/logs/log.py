@@ -1,12 +1,17 @@
 """Logs of measured runs: samples in SI units, with their sensors, commands and loads."""
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.loads.base import AbstractLoad
+from tuning.logs.readers import LogTable, is_time_name, parse_heading
+from tuning.logs.units import UNITS
 
 GAP_STEPS = 1.5  # usual steps between two samples, beyond which samples are missing
 MAX_GRID_DEVIATION_STEPS = 0.25  # steps between times and an even grid, for rounded times
@@ -206,3 +211,148 @@ def _is_of_series(rate: float) -> bool:
     decimal = np.outer(DECIMAL, 10.0 ** np.arange(7))
     series = np.concatenate([doubled.ravel(), decimal.ravel(), OTHERS])
     return bool(np.any(np.abs(series / rate - 1) < RATE_TOLERANCE))
+
+
+MIN_RECORD_SAMPLES = 64
+
+
+class EvenRecord(NamedTuple):
+    """Samples at even steps: the time of the first (s), and the values (time, channel)."""
+
+    start: float
+    values: Float[np.ndarray, "time channel"]
+
+
+def even_records(log: Log) -> tuple[float, tuple[EvenRecord, ...], tuple[str, ...]]:
+    """Sampling rate (Hz), the records of a log between its gaps, and notes on what was done.
+
+    All records have one rate, that of the usual step. Times off an even grid by more than rounding
+    are interpolated (cubic spline) to the grid.
+
+    Raises ValueError for a log whose records between gaps are all too short.
+    """
+    step, parts = between_gaps(log.times)
+    records, notes, resampled, dropped = [], [], 0.0, 0
+    for start, stop in parts:
+        if stop - start < MIN_RECORD_SAMPLES:
+            dropped += 1
+            continue
+        times, values = log.times[start:stop], log.values[start:stop]
+        grid = times[0] + step * np.arange(round((times[-1] - times[0]) / step) + 1)
+        count = min(grid.size, times.size)
+        deviation = np.max(np.abs(times[:count] - grid[:count])) / step
+        if grid.size != times.size or deviation > MAX_GRID_DEVIATION_STEPS:
+            from scipy.interpolate import CubicSpline
+
+            grid = grid[grid <= times[-1]]
+            values = CubicSpline(times, values, axis=0)(grid)
+            resampled = max(resampled, float(deviation))
+        records.append(EvenRecord(float(times[0]), values))
+    if not records:
+        raise ValueError(
+            f"{log.source}: after {len(parts) - 1} gaps no record has {MIN_RECORD_SAMPLES} samples"
+        )
+    if len(parts) > 1:
+        used = "1 record is used" if len(records) == 1 else f"{len(records)} records are used"
+        less = f", {dropped} of less than {MIN_RECORD_SAMPLES} samples left out" if dropped else ""
+        many = "1 gap" if len(parts) == 2 else f"{len(parts) - 1} gaps"
+        notes.append(f"{many}: {used}{less}")
+    if resampled:
+        notes.append(
+            f"times are up to {resampled:.2g} steps off an even grid of {step:.6g} s: interpolated"
+        )
+    return 1 / step, tuple(records), tuple(notes)
+
+
+def between_gaps(times: Float[np.ndarray, " time"]) -> tuple[float, list[tuple[int, int]]]:
+    """Step (s) of some times, and the first and last (exclusive) sample of each part without gap.
+
+    >>> import numpy as np
+    >>> from tuning.logs.log import between_gaps
+    >>> between_gaps(np.array([0.0, 1.0, 2.0, 7.0, 8.0]))
+    (1.0, [(0, 3), (3, 5)])
+    """
+    steps = np.diff(times)
+    usual = np.median(steps)
+    # The median of rounded steps is one of the rounded steps; their mean without gaps is not.
+    cuts = np.flatnonzero(steps > GAP_STEPS * usual) + 1
+    within = np.delete(steps, cuts - 1)
+    step = float(np.mean(within)) if within.size else float(usual)
+    edges = [0, *cuts.tolist(), times.size]
+    return step, list(zip(edges[:-1], edges[1:], strict=True))
+
+
+SKIPPED = "-"  # name of a column that is not needed
+
+
+def with_named_columns(
+    path: Path, table: LogTable, columns: Sequence[str] | str | None
+) -> tuple[LogTable, list[str] | None, dict[str, str]]:
+    """The table with names for columns that have none, the channels wanted, and units given.
+
+    `columns` are headings, such as `a1 [g]`, as a sequence or separated by commas.
+
+    Raises ValueError for a table without headings if no columns, or another number, are given.
+    """
+    headings = columns.split(",") if isinstance(columns, str) else list(columns or ())
+    parsed = [parse_heading(heading) for heading in headings]
+    if table.has_headings:
+        # A name with brackets may be one of the file; otherwise they hold the unit.
+        names = [h.strip() if h.strip() in table.names else n
+                 for h, (n, _) in zip(headings, parsed, strict=True)]  # fmt: skip
+        units = {n: u for n, (_, u) in zip(names, parsed, strict=True) if u}
+        return table, names or None, units
+    count = len(table.names)
+    line = "" if table.lines is None else f", line {table.lines[0]}"
+    example = ", ".join(["time [s]", *(f"a{i} [g]" for i in range(1, count))])
+    if not headings:
+        raise ValueError(
+            f"{path}{line}: the file has no headings; name its {count} columns, with units, e.g. "
+            f'columns="{example}" (--columns), or write them into its first line'
+        )
+    if len(headings) != count:
+        raise ValueError(
+            f"{path}{line}: {len(headings)} columns are named, but the file has {count}; name all, "
+            f'e.g. columns="{example}", or "{SKIPPED}" for one that is not needed'
+        )
+    kept = [i for i, (name, _) in enumerate(parsed) if name != SKIPPED]
+    table = dataclasses.replace(
+        table,
+        names=tuple(parsed[i][0] for i in kept),
+        units=tuple(parsed[i][1] for i in kept),
+        values=table.values[:, kept],
+        has_headings=True,
+    )
+    return table, None, {}
+
+
+def with_times(path: Path, table: LogTable, rate: float | None, time: str | None) -> LogTable:
+    """The table with times from a sampling rate (Hz); unchanged without one.
+
+    Raises ValueError for a rate that is not positive and for a table that has times.
+    """
+    if rate is None:
+        return table
+    if not 0 < rate < np.inf:
+        raise ValueError(f"{path}: the sampling rate must be positive, not {rate:g} Hz")
+    named = time or table.time or next(
+        (
+            name
+            for name, unit in zip(table.names, table.units, strict=True)
+            if is_time_name(name) or (unit in UNITS and UNITS[unit].quantity == "time")
+        ),
+        None,
+    )  # fmt: skip
+    if named is not None:
+        raise ValueError(
+            f"{path}: the log has a column of times, {named!r}; leave the sampling rate out, or "
+            "read the file without that column"
+        )
+    times = np.arange(len(table.values)) / rate
+    return dataclasses.replace(
+        table,
+        names=("time", *table.names),
+        units=("s", *table.units),
+        values=np.column_stack([times, table.values]),
+        time="time",
+    )

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.signal import resample_poly
 
-from tuning.logs.log import Log
-from tuning.logs.records import between_gaps
+from tuning.logs.log import Log, between_gaps
 
 UNREAD_SD = 12.0  # robust standard deviations of a channel from its median to zero
 MIN_CHANGE = 4.0  # of the resolution of a channel: smaller changes may be those of a coarse one

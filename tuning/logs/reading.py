@@ -33,9 +33,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.columns import with_named_columns, with_times
 from tuning.logs.description import LogDescription, read_description
-from tuning.logs.log import Log, LogWarning, check_samples, doubts
+from tuning.logs.log import Log, LogWarning, check_samples, doubts, with_named_columns, with_times
 from tuning.logs.logger import interpolate_invalid
 from tuning.logs.readers import LogTable, is_time_name, read_tables
 from tuning.logs.readers.table import shown

@@ -15,9 +15,8 @@ from scipy.signal.windows import dpss
 from scipy.stats import f as f_distribution
 
 from tuning.modal.ambient import Candidate
-from tuning.modal.preprocessing import energy_band, prepare
+from tuning.modal.preprocessing import Samples, energy_band, prepare
 from tuning.modal.result import IdentifiedMode
-from tuning.modal.samples import Samples
 
 TAPERS, TIME_BANDWIDTH = 7, 4.0  # of the F-test (Thomson 1982), of 2 * 4 - 1 good tapers
 FALSE_ALARM_PROBABILITY = 1e-3  # of a line in noise, in a whole spectrum

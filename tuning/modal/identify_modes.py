@@ -48,8 +48,15 @@ from tuning.modal.impacts.whole_log import (
     modes_of_decays,
 )
 from tuning.modal.plscf import plscf_modes
-from tuning.modal.preprocessing import energy_band, kinetic_band, prepare
-from tuning.modal.samples import Samples, samples_of, with_channels, without_constant
+from tuning.modal.preprocessing import (
+    Samples,
+    energy_band,
+    kinetic_band,
+    prepare,
+    samples_of,
+    with_channels,
+    without_constant,
+)
 from tuning.modal.stabilisation import Diagram
 
 FORCED = "measured force"

@@ -19,7 +19,7 @@ from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
 from tuning.weighing.axle_fit import AxleFit, CrossingLog
 from tuning.weighing.influence_lines import InfluenceLines, check_static, model_influence_lines
-from tuning.weighing.moses import MosesFit, moses
+from tuning.weighing.matching_pursuit import MosesFit, moses
 from tuning.weighing.search import find_axles, free_frequency, most_likely
 
 MOST_EXCESS = 1.5  # of the variance of residuals, above which axles or lines are unlikely

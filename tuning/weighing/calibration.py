@@ -29,8 +29,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.model.load_set import load_set
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
-from tuning.weighing.axle_fit import CrossingLog
-from tuning.weighing.dynamic_forces import SHARES, dynamic_waves, white_noise
+from tuning.weighing.axle_fit import SHARES, CrossingLog, dynamic_waves, white_noise
 from tuning.weighing.influence_lines import (
     AxleGeometry,
     InfluenceLines,

@@ -187,7 +187,7 @@ def _prior_arguments(free, prior, scale) -> tuple[dict, dict, dict]:
 
 def _priors(bounds, normals, scales) -> dict:
     """Priors by address. Raises ValueError, naming the address, for one that is impossible."""
-    from tuning.parameters.prior import Prior
+    from tuning.parameters.free import Prior
 
     priors = {}
     for address, pair in bounds.items():
@@ -223,7 +223,7 @@ def _write_and_print(
     """Write case, fit, picture and report, print the result, and remove the checkpoints."""
     from jaxbeam.files.case_file import save_case
     from tuning.fit.report import write_report
-    from tuning.fit.storage import save_fit
+    from tuning.fit.result import save_fit
 
     if output:
         save_case(fit.case, output, overwrite=True)  # checked before the work

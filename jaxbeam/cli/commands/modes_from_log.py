@@ -144,7 +144,7 @@ def modes_from_log(
         options.check_case(case)
 
     import tuning
-    from tuning.modal.setups.channels import logs_of_setups
+    from tuning.modal.setups.merge import logs_of_setups
 
     read = [tuning.read_log(path, columns=columns, rate=rate) for path in logs]
     if align:

@@ -31,14 +31,12 @@ from jaxbeam.case.loads.base import VehicleModel, trajectory
 from jaxbeam.control.load_identification import LoadIdentification, given_load, identification_error
 from jaxbeam.control.optimal.crossing_gains import (
     GainSchedule,
-    crossing_events,
-    finite_horizon_gains,
-    frozen_gains,
-)
-from jaxbeam.control.optimal.load_tables import (
     PositionGainLaw,
     ScheduledGainLaw,
+    crossing_events,
     designs_of,
+    finite_horizon_gains,
+    frozen_gains,
     with_single_mass,
 )
 from jaxbeam.control.optimal.sampled_lqr import IntegralLaw, sampled_gain, warn_slow_sampling

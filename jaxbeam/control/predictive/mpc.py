@@ -25,19 +25,17 @@ from jaxbeam.case.fields import (
 )
 from jaxbeam.control.predictive.mpc_law import MPCLaw, command_limits, output_weights
 from jaxbeam.control.predictive.prediction import (
-    move_basis,
-    move_maps,
-    predict,
-    preview,
-    repeat_plant,
-    sampled_plant,
-)
-from jaxbeam.control.predictive.terminal import (
     TerminalRegulator,
     dual_mode_terminal,
     incremental_terminal,
     limits_error,
+    move_basis,
+    move_maps,
     periods_needed,
+    predict,
+    preview,
+    repeat_plant,
+    sampled_plant,
     terminal_regulator,
     unseen_modes,
 )

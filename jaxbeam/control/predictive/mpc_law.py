@@ -10,8 +10,13 @@ from jaxtyping import Float
 
 from jaxbeam.case.controller import ControlStep
 from jaxbeam.case.estimator import Estimate
-from jaxbeam.control.predictive.prediction import Prediction, Preview, SampledPlant, predict
-from jaxbeam.control.predictive.terminal import Terminal
+from jaxbeam.control.predictive.prediction import (
+    Prediction,
+    Preview,
+    SampledPlant,
+    Terminal,
+    predict,
+)
 from jaxbeam.control.state_controller import AbstractStateLaw
 from jaxbeam.estimation.sampled_plant import in_blocks
 from jaxbeam.numerics.qp import QuadraticProgram, first_move

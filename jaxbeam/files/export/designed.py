@@ -11,8 +11,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete, kinds
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.optimal.crossing_gains import GainSchedule
-from jaxbeam.control.optimal.load_tables import ScheduledGainLaw
+from jaxbeam.control.optimal.crossing_gains import GainSchedule, ScheduledGainLaw
 from jaxbeam.control.optimal.lqr import LQR
 from jaxbeam.control.state_controller import AbstractStateLaw, GainLaw, StateFeedback
 from jaxbeam.estimation.observer import ConstantGainFilter, Observer

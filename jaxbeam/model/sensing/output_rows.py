@@ -27,8 +27,8 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.quantities import QUANTITIES, Quantity, quantity_of
 from jaxbeam.case.sensors import Sensor
+from jaxbeam.model.deflection_lines import LoadInfluence, load_influence
 from jaxbeam.model.flexibility import flexibility
-from jaxbeam.model.load_influence import LoadInfluence, load_influence
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.static_correction import (

@@ -18,8 +18,7 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.estimator import Estimate
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.optimal.crossing_gains import crossing_events
-from jaxbeam.control.optimal.load_tables import with_crossing_load
+from jaxbeam.control.optimal.crossing_gains import crossing_events, with_crossing_load
 from jaxbeam.control.state_controller import TrueState
 from jaxbeam.estimation.sampled_plant import SampleTiming
 from jaxbeam.estimation.simulated_vehicles import SampledWithVehicles

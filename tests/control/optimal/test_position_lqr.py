@@ -13,8 +13,7 @@ import jaxbeam as jb
 from jaxbeam.case.controller import Measurement
 from jaxbeam.case.estimator import Estimate
 from jaxbeam.case.validation import check_case
-from jaxbeam.control.optimal.crossing_gains import GainSchedule
-from jaxbeam.control.optimal.load_tables import PositionGainLaw
+from jaxbeam.control.optimal.crossing_gains import GainSchedule, PositionGainLaw
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.gain_table import GainTable

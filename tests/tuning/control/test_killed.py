@@ -13,7 +13,7 @@ from tests.tuning.small_rig import GAIN, rig
 from tests.tuning.stand_in import fit, least_squares
 from tuning import checkpoint
 from tuning.checkpoint import Checkpoint
-from tuning.fit.multi_start import multi_start
+from tuning.fit.least_squares import multi_start
 from tuning.fit.uncertainty.posterior import sample
 
 # Code of a process that is killed once it has written its first checkpoint.
@@ -24,7 +24,7 @@ from pathlib import Path
 from tests.tuning import stand_in
 from tests.tuning.control import test_killed
 from tuning.checkpoint import Checkpoint
-from tuning.fit.multi_start import multi_start
+from tuning.fit.least_squares import multi_start
 from tuning.fit.uncertainty.posterior import sample
 file = Path(sys.argv[1])
 save = tuning.checkpoint.save

@@ -10,8 +10,8 @@ import pytest
 import jaxbeam as jb
 import tuning
 from tests.tuning.small_rig import GAIN, rig
-from tuning.control.integer_choices import with_integers
 from tuning.control.objective import METRICS
+from tuning.control.pareto import with_integers
 from tuning.control.run_set import make_run_set
 from tuning.control.tuning_result import RunSetResult
 

@@ -8,11 +8,11 @@ import pytest
 
 import jaxbeam as jb
 import tuning
+import tuning.fit.result
 from jaxbeam.analysis import margins
 from jaxbeam.cli import main
 from tests.tuning.small_rig import GAIN, RIGIDITY, rig
 from tests.tuning.stand_in import dataset, fit, least_squares
-from tuning.fit import storage
 
 LOADS = '[training]\n"loads.0.mass" = [0.3, 0.5]\n[held_out]\n"loads.0.mass" = [0.4]\n'
 TUNE = f"tune case.toml --cases loads.toml --free {GAIN}=500:7500 --no-least-peaks --steps 2"
@@ -36,7 +36,7 @@ def call(tmp_path, monkeypatch, capsys):
 
 def test_from_a_fit_to_a_tuned_case(call, tmp_path, monkeypatch):
     """From the file written by identify to a tuned case that can be simulated."""
-    monkeypatch.setattr(storage, "make_dataset", lambda case, logs: dataset())
+    monkeypatch.setattr(tuning.fit.result, "make_dataset", lambda case, logs: dataset())
     identified = fit(least_squares(free={RIGIDITY: None, "beam.damping_ratio": None}))
     tuning.save_fit(identified, tmp_path / "fit.npz")
     code, out, err = call(f"{TUNE} --fit fit.toml --plants 2 --aggregate cvar -o tuned.toml --json")

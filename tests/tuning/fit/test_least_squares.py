@@ -25,14 +25,14 @@ from tuning.fit.least_squares import (
     HUBER_THRESHOLD,
     LOSSES,
     check_loss,
+    draw_start_points,
     levenberg_marquardt,
+    multi_start,
     robust_residual,
     robust_slope,
     variance_factor,
 )
-from tuning.fit.multi_start import draw_start_points, multi_start
-from tuning.parameters.free import FreeParameter, free_parameters
-from tuning.parameters.prior import Prior
+from tuning.parameters.free import FreeParameter, Prior, free_parameters
 
 ADDRESSES = list(TRUTH)
 VALUES = np.array(list(TRUTH.values()))

@@ -14,13 +14,12 @@ from jaxbeam.case.case import replace
 from tests.oracles import finite_elements
 from tests.tuning.finite_element_rigs import SAGGING, SHAKER, SimulatedIdentification, plant
 from tests.tuning.stand_in import NOISE, TRUTH, clean, fit, least_squares
+from tuning.fit.least_squares import LocalMinimum
 from tuning.fit.model_validation import compare_fits, cross_validate
-from tuning.fit.multi_start import LocalMinimum
 from tuning.fit.report import write_report
 from tuning.fit.uncertainty.posterior import with_diagnostics
 from tuning.fit.uncertainty.profile import Profile
-from tuning.parameters.free import to_unbounded
-from tuning.parameters.prior import Prior
+from tuning.parameters.free import Prior, to_unbounded
 
 DELAY = 4e-3  # s
 STIFF, PROMPT = 1e7, 1e4  # N/m and 1/s: without either effect

@@ -24,7 +24,7 @@ from tests.tuning.stand_in import (
     least_squares,
 )
 from tuning.checkpoint import Checkpoint, save
-from tuning.fit import model_validation, storage
+from tuning.fit import model_validation, result
 from tuning.fit.dataset import channel_residuals, residual_remarks, whiteness_p_value
 from tuning.fit.model_validation import compare_fits, cross_validate
 from tuning.fit.result import fit_result
@@ -295,9 +295,9 @@ def test_unidentifiable_directions_are_not_sampled(plain):
 
 def test_a_fit_is_stored_without_loss(plain, tmp_path, monkeypatch):
     # The stand-in is made again, as the dataset of real logs would be.
-    monkeypatch.setattr(storage, "make_dataset", lambda case, logs: dataset())
-    storage.save_fit(plain, tmp_path / "fit.npz")
-    again = storage.load_fit(tmp_path / "fit.npz")
+    monkeypatch.setattr(result, "make_dataset", lambda case, logs: dataset())
+    result.save_fit(plain, tmp_path / "fit.npz")
+    again = result.load_fit(tmp_path / "fit.npz")
     assert str(again) == str(plain)
     for name in ("values", "errors", "correlation", "fitted", "noise", "intervals"):
         np.testing.assert_array_equal(getattr(again, name), getattr(plain, name))
@@ -305,27 +305,27 @@ def test_a_fit_is_stored_without_loss(plain, tmp_path, monkeypatch):
         again.least_squares.solve(again.dataset.measured).values, plain.values, rtol=1e-12
     )
     with pytest.raises(FileExistsError, match="exists already"):
-        storage.save_fit(plain, tmp_path / "fit.npz")
+        result.save_fit(plain, tmp_path / "fit.npz")
     with pytest.raises(ValueError, match="there is no such fit"):
-        storage.load_fit(tmp_path / "other.npz")
+        result.load_fit(tmp_path / "other.npz")
     (tmp_path / "cut.npz").write_bytes((tmp_path / "fit.npz").read_bytes()[:900])
     with pytest.raises(ValueError, match="this NumPy archive is damaged or cut off"):
-        storage.load_fit(tmp_path / "cut.npz")
+        result.load_fit(tmp_path / "cut.npz")
 
 
 def test_fits_of_the_former_format_are_refused(plain, tmp_path):
     file = tmp_path / "fit.npz"
-    save(file, storage.FORMER_FORMAT, {"about": np.array("{}")})
+    save(file, result.FORMER_FORMAT, {"about": np.array("{}")})
     with pytest.raises(ValueError, match="written by jaxbeam 0.1: identify from the logs again"):
-        storage.load_fit(file)
+        result.load_fit(file)
 
 
 def test_logs_are_stored_with_their_loads():
     loads = (jb.MovingMass(mass=0.5, speed=-1.0, entry_time=0.1), jb.MovingForce(force=3, speed=2))
     log = dataclasses.replace(dataset().logs[0], loads=loads, notes=("half of it",), sensors=(0,))
-    about = json.loads(json.dumps(storage._log_header(log, CASE)))
+    about = json.loads(json.dumps(result._log_header(log, CASE)))
     arrays = {f"log0.{name}": getattr(log, name) for name in ("times", "values", "valid")}
-    again = storage._read_log(0, about, case_to_dict(CASE)["beam"], arrays)
+    again = result._read_log(0, about, case_to_dict(CASE)["beam"], arrays)
     assert eqx.tree_equal(again.loads, loads)
     for name in ("names", "units", "sensors", "notes", "source"):
         assert getattr(again, name) == getattr(log, name)

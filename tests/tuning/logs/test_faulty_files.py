@@ -12,7 +12,7 @@ import scipy.io
 
 from tuning import read_log, read_logs
 from tuning.logs.log import Log, LogWarning, doubts
-from tuning.logs.readers.stamps import seconds_of
+from tuning.logs.readers.headings import seconds_of
 
 STEP = 0.005
 TIMES = STEP * np.arange(400)

@@ -6,7 +6,7 @@ from scipy.signal import lfilter
 
 from tuning import Log, read_log
 from tuning.logs import align_logs, find_faults
-from tuning.logs.records import even_records
+from tuning.logs.log import even_records
 
 TIMES = np.arange(40) / 500
 D1, D2 = np.sin(20 * TIMES), np.cos(30 * TIMES) - 1  # mm

@@ -7,8 +7,8 @@ from scipy.signal import firwin, lfilter
 from tests.oracles.planted_structures import FINER, coloured_noise, response
 from tests.tuning.modal.test_subspace import small_structure
 from tuning import Log, ModalSettings, identify_modes
-from tuning.modal.forced.common_denominator import fit_common_denominator, products, transforms
 from tuning.modal.forced.likelihood import triangular_factor
+from tuning.modal.forced.measured_responses import fit_common_denominator, products, transforms
 from tuning.modal.result import mac_matrix
 
 RATE = 40.0

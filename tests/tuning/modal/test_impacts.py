@@ -24,8 +24,8 @@ from tuning.modal.impacts.impact_records import (
     with_missed_impacts,
 )
 from tuning.modal.impacts.whole_log import impacts_left_out
+from tuning.modal.preprocessing import Samples
 from tuning.modal.result import IdentifiedMode
-from tuning.modal.samples import Samples
 
 RATE, BAND, FINER = 40.0, (0.5, 8.0), 8
 FREQUENCIES, DAMPING = np.array([0.83, 1.46, 3.7, 6.3]), np.array([0.006, 0.0054, 0.003, 0.012])

@@ -12,9 +12,8 @@ import scipy.stats
 from scipy.signal import lfilter
 
 from tuning import Log, ModalSettings, identify_modes
-from tuning.modal.preprocessing import energy_band, kinetic_band
+from tuning.modal.preprocessing import energy_band, kinetic_band, samples_of
 from tuning.modal.result import IdentifiedMode, is_at_edge, rejection_reason
-from tuning.modal.samples import samples_of
 
 FREQUENCIES = np.array([5.0, 12.0, 13.0])
 DAMPING = np.array([0.01, 0.008, 0.012])

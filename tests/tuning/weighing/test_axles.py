@@ -15,7 +15,7 @@ from tuning.weighing import calibrate_influence_lines, model_influence_lines, we
 from tuning.weighing.axle_fit import CrossingLog
 from tuning.weighing.axles import AxleWeighing
 from tuning.weighing.influence_lines import AxleGeometry, lines_from_dict
-from tuning.weighing.moses import moses
+from tuning.weighing.matching_pursuit import moses
 from tuning.weighing.search import find_axles
 
 LENGTH, RIGIDITY, DENSITY, DAMPING, FIBRE = 20.0, 1e10, 10000.0, 0.02, -0.5

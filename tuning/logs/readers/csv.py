@@ -15,8 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from tuning.logs.readers.headings import MAX_HEADING_ROWS, Headings, find_headings
-from tuning.logs.readers.stamps import is_stamp, seconds_of
+from tuning.logs.readers.headings import (
+    MAX_HEADING_ROWS,
+    Headings,
+    find_headings,
+    is_stamp,
+    seconds_of,
+)
 from tuning.logs.readers.table import (
     CHECKED_ROWS,
     LogFormat,

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from tuning.logs.clocks import STARTS, clocks_by_numbers
-from tuning.logs.readers.stamps import epoch_seconds, is_stamp
+from tuning.logs.readers.headings import epoch_seconds, is_stamp
 from tuning.logs.readers.table import (
     LogFormat,
     LogTable,

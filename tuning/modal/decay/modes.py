@@ -34,8 +34,14 @@ from tuning.modal.decay.stretches import (
     stacked,
     until_soft_impact,
 )
-from tuning.modal.preprocessing import HALF_POWER, kinetic_band, prepare, strongest_frequency
-from tuning.modal.samples import MIN_SAMPLES, Samples
+from tuning.modal.preprocessing import (
+    HALF_POWER,
+    MIN_SAMPLES,
+    Samples,
+    kinetic_band,
+    prepare,
+    strongest_frequency,
+)
 from tuning.modal.stabilisation import Diagram
 
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain

@@ -13,9 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from tuning.logs.log import Log
-from tuning.logs.records import even_records
-from tuning.modal.samples import Samples, part_of_window, with_channels
+from tuning.logs.log import Log, even_records
+from tuning.modal.preprocessing import Samples, part_of_window, with_channels
 
 FORCE = "force"
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int, Shaped
 from scipy.ndimage import uniform_filter1d
 
-from tuning.modal.forced.common_denominator import Lines
+from tuning.modal.forced.measured_responses import Lines
 
 NEIGHBOURS = 5  # lines on either side whose errors tell the variance of a line
 BLOCKS = 48  # of lines, every 48th in one

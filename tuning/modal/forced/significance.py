@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.stats import f as fisher
 
-from tuning.modal.forced.common_denominator import Lines
 from tuning.modal.forced.likelihood import (
     NEIGHBOURS,
     FittedModel,
@@ -25,6 +24,7 @@ from tuning.modal.forced.likelihood import (
     times_signals,
     transients_of,
 )
+from tuning.modal.forced.measured_responses import Lines
 
 DAMPING_RATIOS = (0.004, 0.016, 0.064)  # of poles that are tried
 NEAR_LINES, NEAR_WIDTHS = 32, 16.0  # about a pole that is tried: lines, and decay rates

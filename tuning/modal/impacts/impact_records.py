@@ -30,7 +30,6 @@ from scipy.signal import detrend
 
 from tuning.modal.ambient import divided_band
 from tuning.modal.decay.poles import NEARBY_BINS, NONLINEARITY_SHARE
-from tuning.modal.forced.common_denominator import HIGHEST_LINE, Lines, transforms
 from tuning.modal.forced.likelihood import (
     FEWER_REST_POWERS,
     REST_POWERS,
@@ -42,8 +41,8 @@ from tuning.modal.forced.likelihood import (
     resonances_of,
     whitened,
 )
-from tuning.modal.forced.modal_model import modes_of_model, unexplained
-from tuning.modal.forced.modes import mode_reason, refined_model
+from tuning.modal.forced.measured_responses import HIGHEST_LINE, Lines, transforms
+from tuning.modal.forced.modes import mode_reason, modes_of_model, refined_model, unexplained
 from tuning.modal.forced.significance import criterion, criterion_with, promising_poles
 from tuning.modal.result import SAME_MAC, IdentifiedMode, mac_matrix
 

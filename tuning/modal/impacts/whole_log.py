@@ -28,9 +28,8 @@ from tuning.modal.impacts.impact_records import (
     impact_modes,
     marked_impacts,
 )
-from tuning.modal.preprocessing import HALF_POWER, kinetic_band, prepare
+from tuning.modal.preprocessing import HALF_POWER, Samples, kinetic_band, prepare
 from tuning.modal.result import is_at_edge
-from tuning.modal.samples import Samples
 from tuning.modal.stabilisation import Diagram
 
 AFTER_CYCLES = 2.0  # of the lowest frequency, in which an impact's energy is compared

@@ -10,15 +10,267 @@ more than their errors, these are widened by the ratio of both (Birge 1932).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import scipy.optimize
+from jaxtyping import Int
 from scipy.stats import chi2
 
+from tuning.logs.log import Log, even_records
 from tuning.modal.fit import Choice, ModalFit
-from tuning.modal.result import Channels, IdentifiedMode, ModalEstimates
-from tuning.modal.setups.channels import merged_channels
-from tuning.modal.setups.pairing import lone_modes, paired_modes, uncertain_modes
+from tuning.modal.forced.forces import without_forces
+from tuning.modal.preprocessing import MAX_RATE_CHANGE, same_channels, with_channels
+from tuning.modal.result import (
+    MIN_ENERGY_SHARE,
+    Channels,
+    IdentifiedMode,
+    ModalEstimates,
+    channels_of,
+    mac_matrix,
+)
 from tuning.modal.setups.shape import Part, whole_shape
+
+
+def merged_channels(
+    setups: Sequence[Channels], sources: Sequence[str], references: Sequence[str] | None
+) -> tuple[Channels, tuple[Int[np.ndarray, " channel"], ...]]:
+    """Channels of all setups, each place once, and where those of each setup are among them.
+
+    Channels of one name and quantity are one place, unless the logs tell positions (or sensors of
+    the case) that differ. With `references`, the channels of these names are, and no others.
+    `sources` are the names of the logs, for messages.
+
+    Raises ValueError for a reference that a setup lacks, and for setups that no common channel
+    connects with the others.
+    """
+    for setup, source in zip(setups, sources, strict=True):
+        lacking = set(references or ()) - set(setup.names)
+        if lacking:
+            raise ValueError(
+                f"{source}: no channel {sorted(lacking)[0]!r}, which is to be a reference; "
+                f"the channels are {', '.join(setup.names)}"
+            )
+    known = _known_places(setups)
+    places: dict[tuple, int] = {}
+    rows, indices = [], []
+    for number, setup in enumerate(setups):
+        of_setup = []
+        for row in zip(*setup, strict=True):
+            name, quantity, position, sensor = row
+            key: tuple = (name, quantity)
+            if references is not None:
+                key = key if name in references else (*key, number)
+            elif len(known[name]) > 1:
+                unknown = position is None and sensor is None
+                key = (*key, number) if unknown else (*key, position, sensor)
+            if key not in places:
+                places[key] = len(rows)
+                rows.append((row, sources[number]))
+            of_setup.append(places[key])
+        indices.append(np.array(of_setup))
+    _check_connected(setups, sources, indices)
+    names = [row[0] for row, _ in rows]
+    named = tuple(
+        row[0] if names.count(row[0]) == 1 else _full_name(row, source) for row, source in rows
+    )
+    _, quantities, positions, sensors = zip(*(row for row, _ in rows), strict=True)
+    return Channels(named, quantities, positions, sensors), tuple(indices)
+
+
+def _known_places(setups: Sequence[Channels]) -> dict[str, set]:
+    """Positions and sensors that the logs tell for each name of a channel."""
+    known: dict[str, set] = {}
+    for setup in setups:
+        for name, _, position, sensor in zip(*setup, strict=True):
+            told = known.setdefault(name, set())
+            if position is not None or sensor is not None:
+                told.add((position, sensor))
+    return known
+
+
+def _full_name(row: tuple, source: str) -> str:
+    """Name of a channel that moves: with its position if it is known, else with its log."""
+    name, _, position, _ = row
+    return f"{name} at {position:g} m" if position is not None else f"{name} of {Path(source).stem}"
+
+
+def _check_connected(setups: Sequence[Channels], sources: Sequence[str], indices) -> None:
+    """Check that common channels lead from the first setup to all others."""
+    joined, reached = {0}, set(indices[0].tolist())
+    while more := [k for k in range(len(setups)) if k not in joined and reached & {*indices[k]}]:
+        joined |= set(more)
+        reached |= {int(i) for k in more for i in indices[k]}
+    left = [k for k in range(len(setups)) if k not in joined]
+    if left:
+        raise ValueError(
+            f"{sources[left[0]]}: no channel is common with {sources[0]}, by which their shapes "
+            f"could be scaled (the channels are {', '.join(setups[left[0]].names)}; and "
+            f"{', '.join(setups[0].names)}); references have the same name, quantity and position "
+            "in both"
+        )
+
+
+def logs_of_setups(
+    logs: Sequence[Log],
+    references: Sequence[str] | None = None,
+    channels: Sequence[str] | None = None,
+) -> list[list[Log]]:
+    """The logs of each setup: those with the same channels, positions and sampling rate.
+
+    With `references`, channels of one name may be at different places in each log, and each is a
+    setup of its own. Measured forces tell no setup apart: a hammer may strike many places.
+    `channels` are the names of those that are to be used, by default all.
+
+    Raises ValueError for references beside one log only, or that a log lacks, for setups without
+    a common channel, a log with forces only, and samples that are not even.
+    """
+    if references is not None and len(logs) == 1:
+        raise ValueError(
+            f"{logs[0].source}: references connect several setups, and this is one log"
+        )
+    groups: list[list[Log]] = []
+    for log in logs:
+        own = next((group for group in groups if _same_setup(group[0], log)), None)
+        if own is None or references is not None:
+            groups.append([log])
+        else:
+            own.append(log)
+    if len(groups) > 1:
+        used = [_with_known(without_forces(group[0]), channels) for group in groups]
+        merged_channels(
+            [channels_of(log) for log in used], [log.source for log in used], references
+        )
+    return groups
+
+
+def _with_known(log: Log, names: Sequence[str] | None) -> Log:
+    """The log with those of some channels that it has; all of its own, if none."""
+    return with_channels(log, [name for name in names or () if name in log.names] or None)
+
+
+def _same_setup(a: Log, b: Log) -> bool:
+    """Whether the channels but for forces, and the sampling rates, of two logs are the same."""
+    if not same_channels(without_forces(a), without_forces(b)):
+        return False
+    rate, other = (even_records(log)[0] for log in (a, b))
+    return abs(rate / other - 1) < MAX_RATE_CHANGE
+
+
+MAX_FREQUENCY_CHANGE = 0.03  # between setups: temperature, traffic, the mass of moved sensors
+MAX_SDS = 3.0  # standard deviations of the difference of two frequencies that may be more
+MIN_MAC = 0.6  # at common channels, where errors of the shapes take nothing from it
+OTHER_ERROR = 0.05  # of a component over the largest, by modes close by, beside its stated error
+MIN_SHARE_ALONE = 0.05  # of the energy; a mode that one setup alone shows may else be noise
+FAR = 1e6  # cost of a pair that is no pair
+
+
+def paired_modes(setups: Sequence[ModalFit], indices: Sequence[np.ndarray]) -> list[dict[int, int]]:
+    """For each mode of the structure, the mode (index) of each setup (index) that shows it.
+
+    Modes of a setup are paired with those of the setups before by the least sum of distances, in
+    frequency and in modal assurance criterion at the channels that both setups have, where these
+    are two or more. `indices` say which of all channels those of each setup are.
+    """
+    groups: list[dict[int, int]] = []
+    for number, setup in enumerate(setups):
+        cost = np.full((len(groups), len(setup.modes)), FAR)
+        for row, group in enumerate(groups):
+            for column, mode in enumerate(setup.modes):
+                distances = [
+                    distance(setups[k].modes[i], mode, indices[k], indices[number])
+                    for k, i in group.items()
+                ]
+                cost[row, column] = min(np.mean(distances), FAR)
+        rows, columns = scipy.optimize.linear_sum_assignment(cost)
+        pairs = {int(c): int(r) for r, c in zip(rows, columns, strict=True) if cost[r, c] < FAR}
+        for column in range(len(setup.modes)):
+            if column in pairs:
+                groups[pairs[column]][number] = column
+            else:
+                groups.append({number: column})
+    return groups
+
+
+def lone_modes(
+    setups: Sequence[ModalFit],
+    indices: Sequence[np.ndarray],
+    groups: Sequence[tuple[dict[int, int], dict]],
+) -> dict[int, str]:
+    """Groups (index) of a mode that one setup alone shows and that may be none, with the reason.
+
+    `groups` are the pairs of each mode, and what `uncertain_modes` found for it. Such a mode may be
+    noise if it is weak, or another estimate of a mode that several setups show.
+    """
+    several = [pairs for pairs, _ in groups if len(pairs) > 1]
+    found = {}
+    for number, (pairs, uncertain) in enumerate(groups):
+        if len(pairs) + len(uncertain) > 1:
+            continue
+        ((own, index),) = pairs.items()
+        mode = setups[own].modes[index]
+        same = [
+            setups[k].modes[i].frequency
+            for group in several
+            for k, i in group.items()
+            if distance(setups[k].modes[i], mode, indices[k], indices[own], 0.0) < FAR
+        ]
+        if mode.energy_share < MIN_SHARE_ALONE:
+            found[number] = f"found in {setups[own].source} alone, and weak"
+        elif same:
+            found[number] = f"found in {setups[own].source} alone, where {same[0]:.4g} Hz may be it"
+    return found
+
+
+def uncertain_modes(
+    setups: Sequence[ModalFit], indices: Sequence[np.ndarray], pairs: dict[int, int]
+) -> dict[int, tuple[IdentifiedMode, str]]:
+    """The rejected mode, with the reason, of each setup where a mode is not well identified.
+
+    It has the frequency of those of all other setups within errors, and their shape at common
+    channels. Poles without energy, and those at harmonic lines, are no modes.
+    """
+    found = {}
+    for number, setup in enumerate(setups):
+        near = []
+        for mode, reason in setup.rejected if number not in pairs else ():
+            distances = [
+                distance(setups[k].modes[i], mode, indices[k], indices[number], 0.0)
+                for k, i in pairs.items()
+            ]
+            width = max(mode.damping_ratio * mode.frequency, mode.frequency_sd)
+            line = any(abs(one.frequency - mode.frequency) < width for one in setup.lines)
+            if mode.energy_share >= MIN_ENERGY_SHARE and not line and max(distances) < FAR:
+                near.append((max(distances), len(near), mode, reason))
+        if near:
+            found[number] = min(near)[2:]
+    return found
+
+
+def distance(a: IdentifiedMode, b: IdentifiedMode, of_a, of_b, change=MAX_FREQUENCY_CHANGE):
+    """Distance of two modes, of 2 at most; `FAR` if they are too unlike to be one.
+
+    `of_a` and `of_b` are the channels of their shapes; `change` is the share by which frequencies
+    may differ beside their errors.
+    """
+    errors = MAX_SDS * np.hypot(a.frequency_sd, b.frequency_sd)
+    limit = max(change * min(a.frequency, b.frequency), errors)
+    apart = abs(a.frequency - b.frequency) / limit
+    _, first, second = np.intersect1d(of_a, of_b, return_indices=True)
+    mac = 1.0
+    if first.size > 1:
+        one, other = a.shape[first], b.shape[second]
+        left = _left_by_errors(a, first) * _left_by_errors(b, second)
+        mac = min(float(mac_matrix(one[None], other[None])[0, 0]) + 1 - left, 1.0)
+    return FAR if not apart <= 1 or mac < MIN_MAC else float(apart + 1 - mac)
+
+
+def _left_by_errors(mode: IdentifiedMode, channels: np.ndarray) -> float:
+    """What errors of a shape leave of its modal assurance criterion with the true one, expected."""
+    variances = Part(mode.shape, mode.shape_covariance, channels).variances[channels]
+    error = np.sum(variances + OTHER_ERROR**2)
+    size = np.sum(np.abs(mode.shape[channels]) ** 2)
+    return float(max(size - error, 0.0) / max(size, 1e-300))
 
 
 @dataclass(frozen=True, eq=False)
