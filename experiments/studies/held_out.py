@@ -1,4 +1,9 @@
-"""Performance of control laws on held-out loads, beside the least achievable peak."""
+"""Performance of control laws on held-out loads, beside the least achievable peak.
+
+Loads on the patch rigs B and C: those that laws are tuned on, and those held out.
+
+Loads enter at sampling instants and between them.
+"""
 
 import dataclasses
 from collections.abc import Mapping, Sequence

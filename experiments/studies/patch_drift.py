@@ -4,6 +4,8 @@ The thesis sees the deflection lag behind a falling voltage (Fig. 2.33). Here th
 a hysteresis and a creep of 2 % a decade; both are identified from a log of commands that turn and
 are held, with the noise of a laser, and their inverses are applied to another course of commands:
 `python -m experiments.studies.patch_drift`.
+
+Hysteresis and creep of an actuator from a log of commands that turn, and then are held.
 """
 
 import dataclasses

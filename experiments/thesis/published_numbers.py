@@ -1,4 +1,11 @@
-"""Numbers that are printed in the thesis, with the tolerance of each."""
+"""Numbers that are printed in the thesis, with the tolerance of each.
+
+Tolerances by the kind of published number, and the unit of frequency.
+
+Computed numbers: a unit of the last printed digit, and the rounding of the printed parameters where
+the number follows from them. Measured numbers: the scatter that the thesis itself shows, between
+the two spans of one beam (Tables 6.1 and 6.2) and between two series of the same case.
+"""
 
 import dataclasses
 

@@ -1,4 +1,14 @@
-"""Checks of the validation page: crossings and loops against closed forms, scipy and oracles."""
+"""Checks of the validation page: crossings and loops against closed forms, scipy and oracles.
+
+Checks of control: sampled loops, gains of regulators and filters, and the least peak.
+
+The event-by-event loop of `tests/oracles`, scipy's equations and Clarabel's linear program share no
+code with jaxbeam.
+
+Checks of beams and crossings: frequencies, statics, deflections, energy and derivatives.
+
+The closed forms, finite elements and scipy solutions of `tests/oracles` share no code with jaxbeam.
+"""
 
 import dataclasses
 from collections.abc import Iterator
@@ -22,19 +32,19 @@ from jaxbeam.model.statics import static_peak
 from jaxbeam.simulation.integration_plan import integration_plan
 from tests import loop_as_oracle
 from tests.adaptive_reference import simulate_adaptive
-from tests.as_oracle import as_oracle
 from tests.differences import central
+from tests.loop_as_oracle import as_oracle
 from tests.oracles import crossing, modal_equations
 from tests.oracles.closed_forms import (
     CHARACTERISTIC,
     critical_speed,
+    exact_frequencies,
     influence_line,
     moving_force,
     single_span_parameters,
     two_span_parameters,
 )
-from tests.oracles.exact_frequencies import exact_frequencies
-from tests.oracles.loads import GRAVITY, Load
+from tests.oracles.crossing import GRAVITY, Load
 from tests.oracles.modal_equations import Span
 
 

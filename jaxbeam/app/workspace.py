@@ -2,6 +2,8 @@
 
 Texts come with each question, so that two pages, or one that was loaded again, do not disturb each
 other; what was computed for a text is remembered for a while.
+
+The text of a case file under changes: comments, order and units of what stays are kept.
 """
 
 import collections

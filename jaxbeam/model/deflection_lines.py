@@ -1,5 +1,7 @@
 """Exact static solutions without modes: deflections, influence lines, static gains of actuators,
 and peaks of a slow crossing (see `flexibility`).
+
+Static influence of forces over their position: Chebyshev series.
 """
 
 from collections.abc import Callable, Sequence

@@ -6,6 +6,17 @@ The commands are the polynomials through their values U at the Gauss nodes of th
 
 Optimal control minimises over U, one interval after the other, backward in time: for a cost P at
 the end, that at the start is the minimum of W + (Phi, Gamma)' P (Phi, Gamma) over U.
+
+Stages of a plant that varies in time only by a few forces: a beam under travelling masses.
+
+    x' = A x + B u + E F(t) f,      f = V(t) x + S(t) u - D(t) f
+
+A, B and E, the directions of the forces, are constant; f are a few numbers, such as contact forces.
+Over an interval F f and u are the polynomials through their values at the Gauss nodes. The exact
+response and cost of the constant part to them (`stage_responses`) depend on the length of the
+interval only; the law of f at the nodes then is one small linear system an interval. So the length
+of an interval is limited by how fast f and the optimal u vary, not by the constant part. Where a
+plant has much faster lags, u is no such polynomial, and `stages` is accurate with longer intervals.
 """
 
 import functools

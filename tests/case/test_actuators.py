@@ -1,6 +1,11 @@
 """Actuators: limits of commands, moment of a patch, electromechanics of a coil."""
 
+import dataclasses
+import itertools
+import re
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,8 +14,14 @@ from scipy.integrate import solve_ivp
 
 import jaxbeam as jb
 from jaxbeam.case.case import addresses, replace
+from jaxbeam.case.validation import check_case
+from jaxbeam.model.frequency_responses import frequency_response
+from jaxbeam.model.linear_system import poles
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
+from jaxbeam.runtime.arrays import xp
+from jaxbeam.simulation.derived_histories import coil_history
+from tests.differences import central
 
 # Smart Material M8557-P1 on rig B of the thesis: sections 2.4.1 and 2.4.2.
 MATERIAL = {
@@ -140,3 +151,254 @@ def test_static_gains():
     assert_allclose(V4.attachment().static_gain, 4.2 / 0.82, rtol=1e-15)
     assert_allclose(jb.Shaker(0.1, force_per_volt=4.6).attachment().static_gain, 4.6, rtol=1e-15)
     assert jnp.ndim(jb.PointForce(0.1).attachment().static_gain) == 0
+
+
+# Inner loops of a shaker against the equations of its coil, by scipy and in closed form.
+
+R, L, KF, KV, MASS, DAMPING, STIFFNESS = 0.82, 5e-3, 4.2, 3.9, 0.03, 0.55, 900.0
+PLACE, GAIN, PERIOD, SPEED, DURATION = 0.35, 300.0, 0.01, 6.0, 0.12
+BEAM = jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.03, modes=2)
+LOOPS = {
+    "current": jb.actuators.CurrentLoop(bandwidth=900.0),
+    "current, proportional": jb.actuators.CurrentLoop(proportional=3.0),
+    "force": jb.actuators.ForceLoop(proportional=0.4, integral=90.0),
+    "force, with the lag of its sensor": jb.actuators.ForceLoop(
+        bandwidth=150.0, sensor_bandwidth=2000.0
+    ),
+}
+
+
+def shaker(loop=None, **changes) -> jb.Electrodynamic:
+    numbers = {"mass": MASS, "stiffness": STIFFNESS, "damping": DAMPING}
+    return jb.Electrodynamic(PLACE, R, L, KF, KV, **(numbers | changes), inner_loop=loop)
+
+
+def crossing(*actuators, **changes) -> jb.Case:
+    parts = {
+        "sensors": [jb.Sensor(0.3)],
+        "loads": [jb.MovingMass(0.1, SPEED)],
+        "controller": jb.Feedback([GAIN], period=PERIOD),
+        "run": jb.Run(DURATION, 1 / PERIOD),
+    }
+    return jb.Case(BEAM, actuators=actuators, **(parts | changes))
+
+
+def by_its_equations(loop, times):
+    """Deflection at the sensor, current and voltage, by scipy from sine modes and the coil.
+
+    States: coordinates, rates, current, integral of the error, what the sensor shows of the force.
+    """
+    wave = np.arange(1, 3) * np.pi / 0.6
+    omega = wave**2 * np.sqrt(11.68 / 0.535)
+    size = np.sqrt(2 / (0.535 * 0.6))
+    at_coil, at_sensor = size * np.sin(wave * PLACE), size * np.sin(wave * 0.3)
+    of_force = isinstance(loop, jb.actuators.ForceLoop)
+    output = KF if of_force else 1.0
+    p = L * loop.bandwidth / output if loop.proportional is None else loop.proportional
+    q = R * loop.bandwidth / output if loop.bandwidth is not None else loop.integral or 0.0
+
+    lag = loop.sensor_bandwidth if of_force else None
+
+    def rates(t, y, command):
+        coordinates, velocity, current, integral, shown = y[:2], y[2:4], *y[4:]
+        mass = np.eye(2) + MASS * np.outer(at_coil, at_coil)
+        suspension = DAMPING * at_coil @ velocity + STIFFNESS * at_coil @ coordinates
+        force = -2 * 0.03 * omega * velocity - omega**2 * coordinates
+        force += at_coil * (KF * current - suspension)
+        if t <= 0.6 / SPEED:
+            shape = size * np.sin(wave * SPEED * t)
+            slope = size * wave * np.cos(wave * SPEED * t)
+            bending = SPEED**2 * -(wave**2) * shape @ coordinates
+            mass += 0.1 * np.outer(shape, shape)
+            force -= 0.1 * shape * (9.81 + 2 * SPEED * slope @ velocity + bending)
+        acceleration = np.linalg.solve(mass, force)
+        measured = current
+        if of_force:
+            measured = KF * current - suspension - MASS * at_coil @ acceleration
+        error = command - (measured if lag is None else shown)
+        volts = p * error + q * integral
+        rise = (volts - R * current - KV * at_coil @ velocity) / L
+        follow = 0.0 if lag is None else lag * (measured - shown)
+        return [*velocity, *acceleration, rise, error, follow]
+
+    options = {"method": "LSODA", "rtol": 1e-8, "atol": 1e-11}
+    history, volts = [np.zeros(7)], []
+    for start, end in itertools.pairwise(times):
+        command = -GAIN * at_sensor @ history[-1][:2]
+        span = np.linspace(start, end, 2)
+        # The voltage of the beginning period, from L I' = u - R I - K_v w'.
+        first = history[-1]
+        rise = rates(start, first, command)[4]
+        volts.append(L * rise + R * first[4] + KV * at_coil @ first[2:4])
+        found = solve_ivp(rates, span, first, args=(command,), **options)
+        history.append(found.y[:, -1])
+    history = np.array(history)
+    return history[:, :2] @ at_sensor, history[:, 4], np.array(volts)
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_crossing_under_outer_feedback(name):
+    case = crossing(shaker(LOOPS[name]))
+    record, coil = jb.simulate(case), coil_history(case)
+    expected, *of_coil = by_its_equations(LOOPS[name], np.asarray(record.times))
+    assert_allclose(record.deflection[:, 0], expected, atol=1e-6 * np.abs(expected).max())
+    for history, own in zip((coil.current, coil.voltage[:-1]), of_coil, strict=True):
+        assert_allclose(history, own, atol=1e-6 * np.abs(own).max())
+
+
+def test_poles_of_the_loop_with_the_coil_at_rest():
+    """L p^2 + (R + P) p + Q = 0; from a bandwidth -b and the cancelled pole of the coil, -R / L."""
+    given = shaker(jb.actuators.CurrentLoop(proportional=3.0, integral=700.0)).attachment()
+    found = np.linalg.eigvals(given.state_matrix)
+    assert_allclose(np.sort(found), np.sort(np.roots([L, R + 3.0, 700.0])), rtol=1e-12)
+    for loop in (
+        jb.actuators.CurrentLoop(bandwidth=900.0),
+        jb.actuators.ForceLoop(bandwidth=900.0),
+    ):
+        found = np.linalg.eigvals(shaker(loop).attachment().state_matrix)
+        assert_allclose(np.sort(found), [-900.0, -R / L], rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("loop", "gain", "stiffness"),
+    [
+        (jb.actuators.CurrentLoop(bandwidth=900.0), KF, STIFFNESS),
+        (jb.actuators.CurrentLoop(proportional=3.0), KF * 3.0 / (3.0 + R), STIFFNESS),
+        (jb.actuators.ForceLoop(bandwidth=900.0, sensor_bandwidth=50.0), 1.0, 0.0),
+        # F = K_f I - k s with I = P (u - F) / R.
+        (
+            jb.actuators.ForceLoop(proportional=3.0),
+            3.0 * KF / (R + 3.0 * KF),
+            STIFFNESS * R / (R + 3.0 * KF),
+        ),
+    ],
+)
+def test_steady_force(loop, gain, stiffness):
+    attachment = shaker(loop).attachment()
+    assert_allclose(attachment.static_gain, gain, rtol=1e-12)
+    assert_allclose(attachment.stiffness, stiffness, rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("loop_class", "suspension", "factor"),
+    [
+        (jb.actuators.CurrentLoop, (jb.SpringDamper(PLACE, STIFFNESS, DAMPING),), KF),
+        (jb.actuators.ForceLoop, (), 1.0),
+    ],
+)
+def test_ideal_source_in_the_limit_of_its_bandwidth(loop_class, suspension, factor):
+    """The distance of the receptances falls as 1 / bandwidth: no back-EMF and no lag is left."""
+    frequencies, pair = np.array([0.0, 4.0, 21.0, 90.0]), [("actuators.0", "deflection@0.3")]
+
+    def receptance(*actuators):
+        case = jb.Case(BEAM, actuators=actuators)
+        return np.asarray(frequency_response(case, frequencies, pair).values)[:, 0]
+
+    expected = factor * receptance(jb.PointForce(PLACE), *suspension)
+    distances = [
+        np.abs(receptance(shaker(loop_class(bandwidth=b), mass=0.0)) / expected - 1).max()
+        for b in (1e6, 1e7)
+    ]
+    assert distances[1] < 1e-3
+    assert_allclose(distances[0] / distances[1], 10.0, rtol=0.02)
+
+
+def test_damping_by_the_back_emf_vanishes_under_current_drive():
+    """A shorted coil adds K_f K_v / R to the damper; a current source adds nothing."""
+
+    def ratio(actuator):
+        found = poles(jb.Case(BEAM, actuators=[actuator], sensors=[jb.Sensor(0.3)]))
+        first = found[np.abs(found.imag) > 1][np.argmin(np.abs(found[np.abs(found.imag) > 1]))]
+        return -first.real / abs(first)
+
+    light = {"mass": 0.0, "stiffness": 0.0, "damping": 0.0}
+    damper = jb.SpringDamper(PLACE, damping=KF * KV / R)
+    quick = dataclasses.replace(shaker(**light), inductance=np.array(1e-6))
+    assert_allclose(ratio(quick), ratio(damper), rtol=1e-3)
+    assert ratio(quick) > 0.2
+    assert_allclose(
+        ratio(shaker(jb.actuators.CurrentLoop(bandwidth=1e6), **light)), 0.03, rtol=1e-3
+    )
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_voltage_over_current_is_the_impedance(name):
+    """Eq. (2.26) of the thesis holds whatever sets the voltage, and (2.33) for the forces."""
+    case = jb.Case(BEAM, actuators=[shaker(LOOPS[name])])
+    frequencies = np.array([3.0, 26.0, 90.0, 700.0])
+    outputs = ("current", "voltage", "active_force", "transmitted_force")
+    pairs = [("actuators.0", f"actuators.0.{output}") for output in outputs]
+    found = np.asarray(frequency_response(case, frequencies, pairs).values)
+    s = 2j * np.pi * frequencies
+    wave = np.arange(1, 3) * np.pi / 0.6
+    omega, shape = wave**2 * np.sqrt(11.68 / 0.535), np.sqrt(2 / 0.321) * np.sin(wave * PLACE)
+    beam = s * sum(a**2 / (s**2 + 0.06 * w * s + w**2) for a, w in zip(shape, omega, strict=True))
+    mechanical = MASS * s + DAMPING + STIFFNESS / s
+    impedance = R + s * L + KF * KV / (1 / beam + mechanical)
+    assert_allclose(found[:, 1] / found[:, 0], impedance, rtol=1e-9)
+    assert_allclose(found[:, 2], KF * found[:, 0], rtol=1e-12)
+    assert_allclose(found[:, 3] / found[:, 2], 1 / (1 + beam * mechanical), rtol=1e-9)
+
+
+def test_derivatives_of_the_model_by_the_numbers_of_a_loop():
+    names = ("proportional", "integral", "sensor_bandwidth")
+
+    def numbers(values):
+        changed = dict(zip(names, values[:3], strict=True))
+        coil = dict(zip(("inductance", "mass", "stiffness"), values[3:], strict=True))
+        actuator = dataclasses.replace(
+            shaker(), inner_loop=jb.actuators.ForceLoop(**changed), **coil
+        )
+        found = jax.tree.leaves(actuator.attachment())
+        return xp.concatenate([xp.ravel(leaf) for leaf in found]) / 1e3
+
+    point = np.array([0.4, 9.0, 20.0, 0.5, 0.3, 9.0])
+    found = jax.jit(jax.jacfwd(numbers))(jax.numpy.asarray(point))
+    assert_allclose(found, central(numbers, point), rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("actuator", "message"),
+    [
+        (
+            shaker(jb.actuators.CurrentLoop()),
+            "actuators.0.inner_loop.proportional is missing; give it, or",
+        ),
+        (
+            shaker(jb.actuators.CurrentLoop(bandwidth=1.0, integral=2.0)),
+            "actuators.0.inner_loop.integral contradicts bandwidth",
+        ),
+        (
+            shaker(jb.actuators.ForceLoop(bandwidth=1.0), limits=[-5.0, 5.0]),
+            "actuators.0.limits bound the voltage, which actuators.0.inner_loop sets beyond them",
+        ),
+        (
+            shaker(jb.actuators.ForceLoop(bandwidth=-1.0)),
+            "actuators.0.inner_loop.bandwidth must be positive",
+        ),
+    ],
+)
+def test_errors(actuator, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        check_case(crossing(actuator))
+
+
+def test_a_patch_has_no_coil():
+    with pytest.raises(ValueError, match="actuators.0 is no electrodynamic shaker"):
+        coil_history(crossing(jb.PointForce(PLACE)))
+
+
+def test_commands_stay_within_the_limits_of_the_loop():
+    limited = shaker(jb.actuators.CurrentLoop(bandwidth=900.0, limits=[-0.1, 0.2]))
+    law = jb.Feedback([8e3], period=PERIOD)
+    record = jb.simulate(crossing(limited, controller=law))
+    assert_allclose([np.min(record.command), np.max(record.command)], [-0.1, 0.2], rtol=1e-12)
+    assert limited.command_unit == "A"
+
+
+def test_a_loop_that_the_beam_makes_unstable_is_warned_of():
+    steady, wild = (
+        jb.actuators.ForceLoop(bandwidth=b, sensor_bandwidth=30.0) for b in (1.0, 1000.0)
+    )
+    assert not any("inner_loop" in line for line in jb.check(crossing(shaker(steady))).warnings)
+    assert any("inner_loop" in line for line in jb.check(crossing(shaker(wild))).warnings)

@@ -5,8 +5,10 @@ import json
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from jaxbeam.benchmark.problem import TEST_SEEDS
 from jaxbeam.cli import main
 from jaxbeam.cli.app import RENAMED_COMMANDS, RENAMED_OPTIONS, app, refuse_former_words
 from jaxbeam.cli.arguments import bounds_in_si, pair_in_si, parse_bounds, parse_prior
@@ -248,3 +250,172 @@ def test_a_file_is_not_overwritten(refused, run, folder):
     run("new footbridge -o mine.toml --overwrite")
     assert "Footbridge" in (folder / "mine.toml").read_text()
     assert "no case of kind 'bridge'" in refused("new bridge")
+
+
+# Keys of `--json`, which programs of users read: fields may be renamed, these may not.
+
+MARGIN = {"verdict": None, "gain": None, "delay": None, "obstacle": None, "unstable": None}
+MARGINS = [{"gain": None, "gain_down": None, "phase": None, "delay": None, "distance": None}]
+LIMIT_CYCLES = [{"extra": None, "frequency": None, "at_limits": None}]
+COMPARISON = {
+    "uncontrolled_peak": None,
+    "least_peak": None,
+    "held_for": None,
+    "controllers": {
+        "controlled": {
+            "peak": None,
+            "rms": None,
+            "after_exit": None,
+            "effort": None,
+            "saturated": None,
+            "share": None,
+            "stability_margin": MARGIN,
+            "reserve": MARGIN,
+            "limit_cycles": LIMIT_CYCLES,
+            "swings": LIMIT_CYCLES,
+            "loop": None,
+            "verdict": None,
+        }
+    },
+}
+METRICS = {"peak", "worst_share", "mean_share", "after_exit", "saturated"}
+
+PLAUSIBILITY = dict.fromkeys(
+    (
+        "first_frequency",
+        "span",
+        "deflection",
+        "own_deflection",
+        "mass_ratio",
+        "crossing_time",
+        "speed",
+        "critical_speed",
+        "warnings",
+        "span_over_deflection",
+        "speed_ratio",
+    )
+)
+
+KEYS = {
+    "check case.toml": PLAUSIBILITY,
+    "modes case.toml": {"frequencies_hz": None, "damping_ratios": None},
+    "frf case.toml --pair force@0.3:deflection@0.3 --points 3": {
+        "frequencies_hz": None,
+        "responses": [
+            {"input": None, "output": None, "unit": None, "magnitude": None, "phase_deg": None}
+        ],
+    },
+    "simulate controlled.toml": {
+        "sensors": [
+            {
+                "name": None,
+                "quantity": None,
+                "unit": None,
+                "position": None,
+                "smallest": None,
+                "smallest_time": None,
+                "largest": None,
+                "largest_time": None,
+                "dynamic_amplification": None,
+                "step_error": None,
+                "truncation_error": None,
+            }
+        ],
+        "peak_deflection": None,
+        "lowest_contact_force": None,
+        "largest_contact_force": None,
+        "wheel_unloading": None,
+        "contact_lost_time": None,
+        "error_estimate": None,
+        "steps": None,
+        "peak_command": None,
+        "effort": None,
+        "saturated": None,
+        "verdict": None,
+        "stability": None,
+        "plausibility": PLAUSIBILITY,
+    },
+    "describe case.toml": {
+        "case": PLAUSIBILITY | {"frequencies_hz": None},
+        "vehicles": [
+            {
+                "title": None,
+                "source": None,
+                "wheelbase": None,
+                "weight": None,
+                "mass": None,
+                "offsets": None,
+                "static_loads": None,
+                "unsprung_masses": None,
+                "degrees_of_freedom": None,
+                "frequencies_hz": None,
+            }
+        ],
+    },
+    "sweep case.toml --over loads.0.mass=0.3,0.5": {
+        "values": {"loads.0.mass": None},
+        "dimensions": None,
+        "failed_runs": None,
+        "error_estimate": None,
+        "peak_deflection": None,
+        "plausibility": PLAUSIBILITY,
+    },
+    "stability controlled.toml --limits --headway 0.5 --mass-at 0.2=0.3": {
+        "verdict": None,
+        "along_crossing": {"gain": None, "delay": None, "obstacle": None},
+        "stable_without_loads": None,
+        "margins": MARGINS,
+        "mass_at": [{"position": None, "mass": None, "verdict": None, "margins": MARGINS}],
+        "largest_real_part": None,
+        "at_time": None,
+        "largest_growth": None,
+        "largest_multiplier": None,
+        "unstable_from": {
+            "loads frozen": {"mass": None, "speed": None},
+            "a stream": {"mass": None, "speed": None},
+        },
+    },
+    "compare controlled.toml --period 0.05": COMPARISON,
+    "compare controlled.toml --period 0.05 --over loads.0.mass=0.5": {
+        "cases": [{"values": {"loads.0.mass": None}} | COMPARISON],
+        "over_all": {"controlled": dict.fromkeys(METRICS)},
+    },
+}
+
+
+def keys(content):
+    """Keys of decoded JSON, at every level; those of a list are the keys of its first entry."""
+    if isinstance(content, dict):
+        return {key: keys(value) for key, value in content.items()}
+    if isinstance(content, list) and content and isinstance(content[0], dict):
+        return [keys(content[0])]
+    return None
+
+
+@pytest.mark.parametrize("line", KEYS)
+def test_keys(run, line):
+    assert keys(run(f"{line} --json")) == KEYS[line]
+
+
+# Command `benchmark`: the stored tables, and scores of a controller.
+
+
+def test_the_command_prints_the_tables(run, refused):
+    printed = run("benchmark")
+    assert all(name in printed for name in jb.benchmark.names())
+    found = run("benchmark patch --json")
+    assert_allclose(found["score"], jb.benchmark.baselines()["patch"].mean)
+    assert [row["seed"] for row in found["runs"]] == list(TEST_SEEDS)
+    assert "has footbridge" in refused("benchmark rope")
+    assert "name it" in refused("benchmark --seed 3")
+
+
+def test_the_command_scores_a_controller(run, folder):
+    (folder / "law.toml").write_text(
+        '[controller]\nkind = "feedback"\ngains = [4000.0]\nperiod = 0.01\nresolution = 0.01\n'
+    )
+    found = run("benchmark unknown_mass --controller law.toml --seed 1 --json")
+    law = jb.Feedback(gains=[4000.0], period=0.01, resolution=0.01)
+    expected = jb.benchmark.score("unknown_mass", law, seed=1)
+    assert_allclose(found["score"], expected.mean, rtol=1e-9)
+    assert found["runs"][0]["seed"] == 1

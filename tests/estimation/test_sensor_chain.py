@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import chi2, norm
 
 import jaxbeam as jb
@@ -18,8 +18,17 @@ from jaxbeam.estimation.sampled_plant import sample_timing
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.simulation.closed_loop import loop_schedule
 from jaxbeam.simulation.integration_plan import IntegrationPlan, static_shapes
+from tests.estimation.test_kalman import (
+    CASE as STREAM_CASE,
+    FORCES as STREAM_FORCES,
+    NOISE as STREAM_NOISE,
+    OFFSET as STREAM_OFFSET,
+    PERIOD as STREAM_PERIOD,
+    filter_readings as stream_filter_readings,
+    signals,
+)
 from tests.loop_as_oracle import parts_of
-from tests.oracles.sampled_plant import SampledPlant
+from tests.oracles.sampled_plant import SampledPlant, conditioned
 
 PERIOD, DELAY = 5e-3, 2e-3
 FORCES, DEVIATION = np.array([1e-2, 2e-2]), 2.0
@@ -204,3 +213,201 @@ def test_delays_beyond_max_delay_periods_are_refused():
     message = "estimator.max_delay_periods must be at least 2, the periods of sensors.0.delay"
     with pytest.raises(ValueError, match=message):
         check_case(case)
+
+
+# Estimates where readings are missing, against filters of the other sensors and by hand.
+
+MISSING_PERIOD = 4e-3
+MISSING_SENSORS = [jb.Sensor(0.2), jb.Sensor(0.35), jb.Sensor(0.45, offset=1e-4)]
+
+
+def loop(sensors, estimator) -> jb.Case:
+    return jb.Case(
+        jb.Beam(0.6, 11.68, 0.535, 0.03, modes=2),
+        actuators=[jb.PointForce(0.4)],
+        sensors=sensors,
+        loads=[jb.MovingMass(mass=0.4, speed=4.0)],
+        controller=jb.StateFeedback([[0.0] * 4], period=MISSING_PERIOD, estimator=estimator),
+        run=jb.Run(0.12),
+    )
+
+
+def replayed(case, readings, present=None):
+    """Estimates of the state and the weights, and the last state of the filter."""
+    controller = case.controller
+    filter = controller.estimator.sampled_filter(jb.state_space(case), sample_timing(controller))
+    state, states, weights = filter.initial_state(), [], []
+    for k, reading in enumerate(readings):
+        known = None if present is None else present[k]
+        measurement = Measurement(reading, np.zeros(4), np.array([0.1 * k]), known)
+        estimate, state = filter.update(state, measurement, np.asarray(k * MISSING_PERIOD))
+        states.append(estimate.state)
+        weights.append(estimate.weights)
+    return np.array(states), weights, state
+
+
+def random_readings(samples=16):
+    return np.cumsum(np.random.default_rng(2).normal(size=(samples, 3)), axis=0) * 1e-5
+
+
+def test_extended_filter_without_a_sensor_is_that_of_the_others():
+    """A sensor whose readings are all missing changes neither estimate nor covariance.
+
+    With less process noise the covariance is so nearly singular that another order of the same
+    sensors changes the estimate by 1e-9, too.
+    """
+    estimator = jb.ExtendedKalman(1.0, 1e-5, mass_deviation=0.1, speed_deviation=0.2)
+    readings, present = random_readings(8), np.tile([True, False, True], (8, 1))
+    found = replayed(loop(MISSING_SENSORS, estimator), readings, present)
+    expected = replayed(loop(MISSING_SENSORS[::2], estimator), readings[:, ::2])
+    assert_allclose(found[0], expected[0], rtol=1e-9, atol=1e-12)
+    assert_allclose(found[2].covariance, expected[2].covariance, rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        jb.Observer(speed=2.0),
+        jb.Kalman(0.02, 1e-5),
+        jb.Kalman(0.02, 1e-5, loads="estimated", weight_deviation=1.0),
+        jb.MovingHorizon(0.02, 1e-5, weight_deviation=1.0),
+    ],
+    ids=["observer", "kalman", "kalman-estimated", "moving-horizon"],
+)
+def test_missing_readings_correct_nothing(estimator):
+    """As if they were what the filter expects, by which innovations are zero."""
+    case, readings = loop(MISSING_SENSORS, estimator), random_readings()
+    present = np.random.default_rng(3).uniform(size=readings.shape) < 0.6
+    found, weights, _ = replayed(case, readings, present)
+    changed = np.where(present, readings, np.nan_to_num(readings) + 1.0)
+    assert_array_equal(found, replayed(case, changed, present)[0])
+    complete = np.ones_like(present)
+    assert_allclose(replayed(case, readings, complete)[0], replayed(case, readings)[0], rtol=1e-12)
+    # One by one: the correction is linear in the innovations, to which a missing one adds nothing.
+    full = replayed(case, readings)[0]
+    first = np.flatnonzero(~present.all(axis=1))[0]
+    assert_allclose(found[:first], full[:first], rtol=1e-12)
+    assert np.any(found[first] != full[first]) and np.all(np.isfinite(found))
+
+
+def test_inversion_keeps_its_estimate_until_all_deflections_come():
+    """Then its rates are the difference over the whole time; without a lag, by hand."""
+    case, readings = loop(MISSING_SENSORS[:2], jb.Inversion()), random_readings(6)[:, :2]
+    present = np.ones((6, 2), bool)
+    present[2, 0] = present[3, 1] = False
+    found, _, _ = replayed(case, readings, present)
+    x = np.sin(np.pi * np.outer([0.2, 0.35], [1, 2]) / 0.6) * np.sqrt(2 / (0.535 * 0.6))
+    q = np.linalg.solve(x, readings.T).T
+    rates = np.diff(q, axis=0) / MISSING_PERIOD
+    assert_allclose(found[1], [*q[1], *rates[0]], rtol=1e-9)
+    assert_allclose(found[[2, 3]], np.tile(found[1], (2, 1)), rtol=1e-12)
+    assert_allclose(found[4], [*q[4], *(q[4] - q[1]) / (3 * MISSING_PERIOD)], rtol=1e-9)
+    assert_allclose(found[5], [*q[5], *rates[4]], rtol=1e-9)
+
+
+def test_samples_without_a_deflection_do_not_identify_a_load():
+    """The mass is that of the samples that are left, by least squares."""
+    settings = jb.LoadIdentification(gates=[-0.1, -0.05])
+    case = loop(MISSING_SENSORS[:2], None)
+    plant = jb.state_space(case)
+    identifier = settings.identifier(plant, plant)
+    readings = -1e-3 * np.random.default_rng(4).uniform(size=(20, 2))
+    present = np.random.default_rng(5).uniform(size=(20, 2)) < 0.7
+    no_state, command = np.zeros(4), np.zeros(1)
+
+    def sums(rows):
+        state = identifier.initial_state()
+        for k in rows:
+            measurement = Measurement(
+                readings[k], no_state, command, present[k] | (rows != all_rows)
+            )
+            _, state = identifier.update(state, measurement, np.asarray(k * MISSING_PERIOD))
+        return state
+
+    all_rows = list(range(20))
+    complete = [k for k in all_rows if present[k].all()]
+    assert 0 < len(complete) < 20
+    assert_allclose(sums(all_rows), sums(complete), rtol=1e-12)
+
+
+def test_identification_pauses_with_missing_readings():
+    """Adaptive predictive control: coefficients stay until the past readings are complete again."""
+    law = jb.AdaptiveGPC(4, 2, 1e-9, measurement_noise=1e-6, period=MISSING_PERIOD, more_delay=1)
+    case = dataclasses.replace(loop(MISSING_SENSORS[:1], None), controller=law)
+    law = law.law(jb.state_space(case))
+    random, state, before = np.random.default_rng(6), law.initial_state(), None
+    changed = []
+    for k in range(20):
+        measurement = Measurement(
+            1e-4 * random.normal(size=1), np.zeros(4), random.normal(size=1), np.array([k != 6])
+        )
+        before, state = state, law.step(state, measurement, np.asarray(k * MISSING_PERIOD)).state
+        changed.append(bool(np.any(before.coefficients != state.coefficients)))
+    assert changed == [k > 0 and not 6 <= k <= 6 + law.powers + 1 for k in range(20)]
+
+
+# Kalman filters under several overlapping loads, against Gaussian conditioning.
+
+STREAM_SAMPLES, MASSES, STREAM_DEVIATION = 8, np.array([0.4, 0.3, 0.2]), np.array([2.0, 1.0, 0.5])
+# Two on the beam from the start, and one that enters at the fifth sample.
+LOADS = [
+    jb.MovingMass(mass=MASSES[0], speed=0.5, entry_time=-0.8),
+    jb.MovingForce(mass=MASSES[1], speed=0.8, entry_time=-0.4),
+    jb.MovingMass(mass=MASSES[2], speed=0.5, entry_time=4 * STREAM_PERIOD),
+]
+STREAM = dataclasses.replace(STREAM_CASE, loads=tuple(LOADS))
+
+
+class StreamPlant(SampledPlant):
+    """Plant under several loads: a column for each weight, by the mass matrix."""
+
+    def matrices(self, t):
+        A, B, C, D = super().matrices(t)
+        span, n = self.plant.span, self.plant.span.modes
+        on = [x.entry_time <= t < x.time_at(span.length) for x in self.loads]
+        shapes = [span.shapes(x.motion(t, span.length, False)[0]) for x in self.loads]
+        massive = [
+            x.kind == "mass" and is_on_beam for x, is_on_beam in zip(self.loads, on, strict=True)
+        ]
+        masses = [x.mass * has_mass for x, has_mass in zip(self.loads, massive, strict=True)]
+        mass = np.eye(n) + sum(m * np.outer(s, s) for m, s in zip(masses, shapes, strict=True))
+        for i, (shape, is_on_beam) in enumerate(zip(shapes, on, strict=True), self.inner):
+            A[:, i], C[:, i] = 0.0, 0.0
+            A[n : 2 * n, i] = -np.linalg.solve(mass, shape) * is_on_beam
+            C[2, i] = self.plant.rows[2] @ A[n : 2 * n, i]  # the accelerometer
+        return A, B, C, D
+
+
+@pytest.mark.parametrize("loads", ["known", "estimated"])
+def test_estimates_by_gaussian_conditioning(loads):
+    """The weight of a load before its entry keeps its prior."""
+    deviation = STREAM_DEVIATION if loads == "estimated" else None
+    commands, readings = signals(STREAM_SAMPLES)
+    kalman = Kalman(STREAM_FORCES, loads=loads, weight_deviation=deviation)
+    filter_state, (estimate, _) = stream_filter_readings(kalman, STREAM, commands, readings)
+    span, oracle_loads, actuators, sensors = parts_of(STREAM)
+    plant = StreamPlant(span, oracle_loads, actuators, sensors)
+    intensity = np.diag([0.0, 0.0, *STREAM_FORCES, *[0.0] * 4])
+    times = STREAM_PERIOD * np.arange(STREAM_SAMPLES)
+    steps = [plant.step(t, STREAM_PERIOD, 0.0, intensity) for t in times]
+    rows = [plant.matrices(t)[2:] for t in times]
+    mean, covariance = np.zeros(8), np.zeros((8, 8))
+    mean[5:] = MASSES * 9.81
+    if loads == "estimated":
+        covariance[5:, 5:] = np.diag(STREAM_DEVIATION**2)
+    state, covariance = conditioned(
+        (mean, covariance),
+        steps,
+        rows,
+        np.diag(STREAM_NOISE**2),
+        commands,
+        readings - STREAM_OFFSET,
+    )
+    scale = np.sqrt(np.diag(covariance)) + 1e-6 * np.abs(state)
+    assert_allclose(filter_state.x / scale, state / scale, rtol=0, atol=1e-3)
+    if loads == "estimated":
+        outer = scale * scale[:, None]
+        assert_allclose(filter_state.covariance / outer, covariance / outer, rtol=0, atol=1e-3)
+        assert_allclose(estimate.weights[-1], state[5:], rtol=1e-3)
+        assert estimate.weights[3, 2] == 0  # off the beam
+        assert_allclose(filter_state.x[5:8], state[5:], rtol=1e-3)

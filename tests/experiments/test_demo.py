@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 import tuning
 from experiments import demo
+from tests.differences import well_compiled
 from tests.tuning import stand_in
-from tests.well_compiled import well_compiled
 
 WRITTEN = {
     "demo.json", "fit.png", "fit.toml", "map.nc", "map.png", "record.nc", "tuned.png", "tuned.toml",

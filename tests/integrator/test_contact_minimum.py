@@ -13,7 +13,7 @@ from jaxbeam.integrator.contact_forces import contact_minimum
 from jaxbeam.integrator.propagators import GAUSS_NODES
 from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.oracles import modal_equations
-from tests.oracles.loads import Load
+from tests.oracles.crossing import Load
 
 NODES = np.asarray(GAUSS_NODES)
 START, LENGTH = np.array([0.0, 2.0]), np.array([2.0, 1.0])

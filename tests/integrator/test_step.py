@@ -10,7 +10,7 @@ from jaxbeam.integrator.step import advance, advance_unforced
 from jaxbeam.integrator.step_matrices import StepMatrices
 from jaxbeam.integrator.vehicles import StepInput
 from jaxbeam.simulation.simulate import simulate_readings
-from tests.runs import plan_of
+from tests.differences import plan_of
 
 STEPS, BATCH_SIZE = 5, 1
 

@@ -22,8 +22,8 @@ from jaxbeam.model.linear_system import poles, zeros
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.static_correction import residual_actuator_gain
-from tests.as_oracle import as_oracle
 from tests.differences import central
+from tests.loop_as_oracle import as_oracle
 from tests.oracles import finite_elements
 
 V4 = jb.Electrodynamic(0.5, 0.82, 5e-5, 4.2, mass=0.02, stiffness=9700.0, damping=0.55)

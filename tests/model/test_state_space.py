@@ -17,7 +17,7 @@ import jaxbeam as jb
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.state_space import state_space
 from tests.differences import central
-from tests.oracles.loads import GRAVITY, Load
+from tests.oracles.crossing import GRAVITY, Load
 from tests.oracles.modal_equations import Span, _System
 
 SPAN = Span(0.6, 11.68, 0.535, 3, 0.03)

@@ -28,8 +28,8 @@ from jaxbeam.model.static_correction import (
     shear_force,
 )
 from jaxbeam.simulation.derived_histories import corrected_deflection
-from tests.as_oracle import as_oracle
 from tests.differences import central
+from tests.loop_as_oracle import as_oracle
 from tests.oracles import finite_elements
 
 PLAIN = jb.Case(jb.Beam(0.6, 13.211, 0.812), actuators=[jb.Patch(0.2, 0.35, 1e-3)])

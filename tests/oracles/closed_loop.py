@@ -15,7 +15,7 @@ import numpy as np
 import scipy.signal
 from scipy.integrate import solve_ivp
 
-from tests.oracles.loads import GRAVITY, Load
+from tests.oracles.crossing import GRAVITY, Load
 from tests.oracles.modal_equations import Span, under
 
 DIGITS = 12  # times that agree to so many decimals are one

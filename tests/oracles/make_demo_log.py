@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.oracles.crossing import respond
+from tests.oracles.crossing import Load, respond
 from tests.oracles.finite_elements import Beam, Suspension
-from tests.oracles.loads import Load
 
 DEMO = Path(__file__).parents[2] / "jaxbeam" / "demo"
 NOISE = 3e-6  # m, standard deviation of a reading

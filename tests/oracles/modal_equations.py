@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from tests.oracles.loads import GRAVITY, Load
+from tests.oracles.crossing import GRAVITY, Load
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from tests.oracles import finite_elements, vehicle_elements
-from tests.oracles.loads import GRAVITY
+from tests.oracles.crossing import GRAVITY
 
 ELEMENTS, FIBRE, NOISE, LEAD = 32, -0.6, 0.04, 6.0
 CLASSES = {"A": 16e-6, "B": 64e-6, "C": 256e-6}  # m^3 at 0.1 cycles per metre

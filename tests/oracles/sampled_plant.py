@@ -14,7 +14,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from tests.oracles.closed_loop import Actuator, Sensor, _Plant
-from tests.oracles.loads import GRAVITY, Load
+from tests.oracles.crossing import GRAVITY, Load
 from tests.oracles.modal_equations import Span
 
 

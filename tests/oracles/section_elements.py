@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 
-from tests.oracles.shooting import ShootingBeam
+from tests.oracles.closed_forms import ShootingBeam
 
 HELD = {"pinned": (0,), "clamped": (0, 1), "free": (), "guided": (1,)}
 

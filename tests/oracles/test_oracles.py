@@ -12,12 +12,14 @@ from tests.oracles import crossing, make_demo_log, modal_equations
 from tests.oracles.closed_forms import (
     cancellation_speed,
     critical_speed,
+    exact_frequencies,
     influence_line,
     moving_force,
     single_span_parameters,
     two_span_parameters,
+    wavenumbers,
 )
-from tests.oracles.exact_frequencies import exact_frequencies, wavenumbers
+from tests.oracles.crossing import Load
 from tests.oracles.finite_elements import (
     Beam,
     Patch,
@@ -27,7 +29,6 @@ from tests.oracles.finite_elements import (
     natural_frequencies,
     static_deflection,
 )
-from tests.oracles.loads import Load
 from tests.oracles.make_demo_log import DEMO, NOISE, SAMPLING, measure, truth
 from tests.oracles.modal_equations import Span
 

@@ -1,12 +1,18 @@
 """Compiled functions, alone and within others; options that XLA does not know."""
 
+import logging
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from jaxbeam.runtime import compiling
+import jaxbeam as jb
+from jaxbeam.runtime import compile_cache, compiling, native_library
 from jaxbeam.runtime.arrays import fori_loop, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 
@@ -115,3 +121,89 @@ def test_derivatives_are_computed_in_numpy_until_that_has_cost_a_compilation(mon
 )
 def test_transformations_in_numpy_are_those_of_xla(transformed, x):
     assert_allclose(transformed(x), jax.jit(transformed)(x), rtol=1e-12)
+
+
+# LAPACK has one thread, whether NumPy was imported before or after; a setting of users stays.
+
+COUNT = """
+import threadpoolctl
+print({library["num_threads"] for library in threadpoolctl.threadpool_info()})
+"""
+
+
+def available_cores() -> int:
+    """Number of cores that this process may use; a system that binds none to processes has all."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+@pytest.mark.parametrize(
+    ("lines", "setting", "threads"),
+    [
+        ("import numpy, jaxbeam", None, "{1}"),
+        ("import numpy, tuning", None, "{1}"),
+        ("import jaxbeam, numpy", None, "{1}"),
+        ("import numpy, jaxbeam", "2", "{2}"),
+    ],
+)
+def test_threads_of_lapack(lines, setting, threads):
+    environment = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+    if setting is not None:
+        environment["OPENBLAS_NUM_THREADS"] = setting
+    printed = subprocess.run(
+        [sys.executable, "-c", lines + COUNT], env=environment, capture_output=True, check=True
+    ).stdout
+    if printed == b"set()\n":
+        pytest.skip("NumPy was built without a library whose threads are known")
+    if available_cores() > 1 or setting is None:
+        assert printed.decode().strip() == threads
+
+
+# What the logger "jaxbeam" says of decisions: cache, compiler, and who takes the steps of a sweep.
+#
+# It is quiet unless a program asks for it.
+
+CASE = jb.Case(
+    jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, modes=1),
+    sensors=[jb.Sensor(0.3)],
+    loads=[jb.MovingForce(force=1.0, speed=2.0)],
+)
+
+
+def test_a_sweep_says_who_takes_its_steps(caplog):
+    with caplog.at_level(logging.INFO, "jaxbeam"):
+        jb.sweep(CASE, {"loads.0.speed": [1.0, 2.0]}, progress=False)
+    said = [record.getMessage() for record in caplog.records if record.name.startswith("jaxbeam.")]
+    assert [text for text in said if text.startswith("sweep in 1 blocks by ")]
+
+
+def test_a_missing_compiler_and_one_that_fails_are_told(caplog, monkeypatch):
+    library = native_library.Library((), (), (), "this is no C")
+    with caplog.at_level(logging.INFO, "jaxbeam"):
+        monkeypatch.setattr(native_library, "find_compiler", lambda: None)
+        assert not library.can_be_built()
+        monkeypatch.setattr(native_library, "find_compiler", lambda: "no-such-compiler")
+        with library.built_meanwhile():
+            pass
+    missing, failed = caplog.messages
+    assert missing == "C code not used: there is no C compiler"
+    assert failed.startswith("C code not used: the C compiler no-such-compiler cannot be run")
+
+
+def test_the_folder_of_the_cache_is_told(caplog, monkeypatch):
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setattr(compile_cache.jax.config, "update", lambda name, value: None)
+    monkeypatch.setenv(compile_cache.SIZE_VARIABLE, "8")
+    monkeypatch.setattr(compile_cache, "max_bytes", lambda: 8 << 20)
+    with caplog.at_level(logging.INFO, "jaxbeam"):
+        compile_cache.switch_on()
+    assert caplog.messages[0].startswith("compile cache in ")
+
+
+def test_nothing_is_logged_by_default():
+    program = (
+        "import jaxbeam as jb, logging; logging.getLogger('jaxbeam.sweeps').info('a decision')"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import pytest
 
 import jaxbeam as jb
-from tests.oracles.loads import Load
-from tests.runs import load_of, plan_of
+from tests.differences import load_of, plan_of
+from tests.oracles.crossing import Load
 from tests.simulation.pinned_span import SPAN, TIMES, case_of
 
 

@@ -3,9 +3,9 @@
 import numpy as np
 
 import jaxbeam as jb
-from tests.oracles.loads import GRAVITY, Load
+from tests.differences import load_of
+from tests.oracles.crossing import GRAVITY, Load
 from tests.oracles.modal_equations import Span
-from tests.runs import load_of
 
 SPAN = Span(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535, modes=4, damping_ratio=0.02)
 SENSORS = [0.15, 0.4]

@@ -8,6 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
+from tests.differences import assert_close, plan_of
 from tests.oracles import modal_equations
 from tests.oracles.closed_forms import (
     cancellation_speed,
@@ -15,8 +16,7 @@ from tests.oracles.closed_forms import (
     influence_line,
     moving_force,
 )
-from tests.oracles.loads import GRAVITY, Load
-from tests.runs import assert_close, plan_of
+from tests.oracles.crossing import GRAVITY, Load
 from tests.simulation.pinned_span import SENSORS, SPAN, TIMES, case_of
 
 pytestmark = pytest.mark.filterwarnings(

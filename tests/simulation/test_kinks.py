@@ -15,9 +15,8 @@ from jaxbeam.case.loads.vehicles.cars import Oscillator
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.simulation.simulate import simulate_readings
 from tests.adaptive_reference import simulate_adaptive
-from tests.differences import central
+from tests.differences import central, plan_of
 from tests.oracles.kinked_path import PiecewiseShapes, Wheel, crossing
-from tests.runs import plan_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 UNIT = {"length": 1.0, "flexural_rigidity": 1.0, "mass_per_length": 1.0}

@@ -21,8 +21,8 @@ from jaxbeam.simulation.derived_histories import corrected_deflection
 from jaxbeam.simulation.stored_record import record_from_xarray
 from tests.differences import central
 from tests.modules import ROOT
+from tests.oracles.closed_forms import ShootingBeam
 from tests.oracles.section_elements import crossing, modes
-from tests.oracles.shooting import ShootingBeam
 
 REFERENCES = {
     case["case"]: case["outputs"]

@@ -11,10 +11,10 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.files.case_file import case_from_dict
+from tests.differences import assert_close, load_of, plan_of
 from tests.modules import DATA
 from tests.oracles import crossing, finite_elements
-from tests.oracles.loads import GRAVITY, Load
-from tests.runs import assert_close, load_of, plan_of
+from tests.oracles.crossing import GRAVITY, Load
 
 pytestmark = pytest.mark.filterwarnings(  # the model is bilateral, the oracles too
     "ignore::jaxbeam.simulation.simulate.ContactLossWarning"

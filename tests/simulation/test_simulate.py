@@ -17,9 +17,9 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.simulation.integration_plan import static_shapes
 from jaxbeam.simulation.simulate import ContactLossWarning
+from tests.differences import assert_close, load_of, plan_of
 from tests.oracles import modal_equations
-from tests.oracles.loads import GRAVITY, Load
-from tests.runs import assert_close, load_of, plan_of
+from tests.oracles.crossing import GRAVITY, Load
 from tests.simulation.pinned_span import SENSORS, SPAN, TIMES, case_of, random_load
 
 pytestmark = pytest.mark.filterwarnings(

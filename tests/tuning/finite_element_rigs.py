@@ -12,7 +12,7 @@ import scipy.signal
 import jaxbeam as jb
 from jaxbeam.case.case import replace
 from tests.oracles import crossing, finite_elements
-from tests.oracles.loads import Load
+from tests.oracles.crossing import Load
 from tuning import Fit, Log
 from tuning.fit.dataset import make_dataset
 from tuning.fit.least_squares import LeastSquares

@@ -1,4 +1,9 @@
-"""Multi-objective tuning: Pareto front (epsilon-constraint method) and lexicographic order."""
+"""Multi-objective tuning: Pareto front (epsilon-constraint method) and lexicographic order.
+
+Integer parameters of a controller, such as horizons: the case is tuned with each choice.
+
+Reduced-order feedback: the states to feed back, selected by a search over relaxed shares.
+"""
 
 import dataclasses
 import itertools

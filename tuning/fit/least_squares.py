@@ -2,6 +2,8 @@
 
 Each loss is half the square of `robust_residual(r)`, so that least squares minimises any of them;
 r is a residual over the standard deviation of the noise.
+
+Multi-start search: a fit searched from several points, and the distinct minima found.
 """
 
 import dataclasses

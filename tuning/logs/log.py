@@ -1,4 +1,9 @@
-"""Logs of measured runs: samples in SI units, with their sensors, commands and loads."""
+"""Logs of measured runs: samples in SI units, with their sensors, commands and loads.
+
+Evenly sampled records of a log: split at gaps, resampled where the clock wanders.
+
+Columns of a table that the user names, and times from a sampling rate.
+"""
 
 import dataclasses
 from collections.abc import Iterator, Sequence

@@ -1,6 +1,10 @@
 """Pre-processing of logs for modal identification: offset and drift, band, decimation.
 
 Every step is visible in the notes of a result and can be set by the user.
+
+Samples of logs from which modes are identified: records in a window, with notes on faults.
+
+The start of a log is left out while sensors settle: AC-coupled ones saturate when switched on.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,7 @@
-"""Free parameters of a fit or tuning, and their map to search variables without bounds."""
+"""Free parameters of a fit or tuning, and their map to search variables without bounds.
+
+Bounds, scale and prior distribution of a free parameter.
+"""
 
 import dataclasses
 import re

@@ -6,13 +6,27 @@ crossing are
     y_s(t) = sum_a P_a u_s(t; v, t_0, x_a) + c_s + e_s(t),   cov e = S + d^2 B B' + E E'.
 
 S is the white noise of the sensors; the columns of B are readings of dynamic wheel forces
-(`dynamic_forces`), d their share of the static ones, and those of E are what the deviations of
+(see below), d their share of the static ones, and those of E are what the deviations of
 calibrated influence lines make of the axle forces. The share d has the greatest restricted
 likelihood (Patterson and Thompson 1971, DOI 10.1093/biomet/58.3.545). The covariance of all
 parameters is that of the weighted problem, times what the residuals exceed this noise by.
 
 What readings tell little of is known before: axles of a group share its load and are about 1.35 m
 apart.
+
+Errors of weighing by the dynamic wheel forces of an unknown road.
+
+Each axle force varies about its static value P_a as a random process of standard deviation d P_a,
+with the spectrum S of quarter cars on a rough road, which has peaks at body bounce and axle hop. It
+changes the readings by d B w, where the columns of B are readings of P_a sqrt(S df) cos(2 pi f t)
+and sin(2 pi f t) on the influence lines, with the vibration of the bridge, and w is white. With
+noise of standard deviation s, the readings have the covariance C = s^2 + d^2 B B', and parameters
+fitted by least squares with the Jacobian J have
+
+    (J'J)^-1 J' C J (J'J)^-1.
+
+The share d follows from the residuals r = (1 - H) e, H = J (J'J)^-1 J': their power is that of the
+noise, and d^2 |(1 - H) B|^2.
 """
 
 import dataclasses

@@ -3,6 +3,15 @@
 Loads are added, singly and in pairs, where they explain most of the residual, and all are then
 refined together. The dynamic part of the response stays in the residual, but for velocities and
 accelerations (see `unit_force`).
+
+Moses' method: axle forces from influence lines, by linear least squares (Moses 1979).
+
+With the positions x_a(t) of the axles and the influence lines I_s of the sensors,
+
+    y_s(t) = sum_a P_a I_s(x_a(t)) + c_s,
+
+with an offset c_s of each sensor. What the static forces P_a do not explain, such as the vibration
+of bridge and vehicle, is residual.
 """
 
 import dataclasses

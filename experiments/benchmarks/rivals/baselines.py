@@ -4,6 +4,18 @@ The results are the largest absolute deflections at the sensors, over the crossi
 vibration after it, to one part in a million; or deflections at given times. The rules are the same
 for every solver: integrate the crossing, take the free vibration from its closed form where no
 controller acts, and refine peaks between samples with the same cubic.
+
+The pinned beam of the speed benchmark, and the closed forms that all solvers share.
+
+A point mass m enters a pinned beam at t = 0 and crosses at constant speed v; the beam has one span,
+or two over a support in the middle. With mass-normalised modes phi_j and x = v t,
+
+    q_j'' + 2 zeta w_j q_j' + w_j^2 q_j = -phi_j(x) R + p_j,
+    R = m (g + w_tt + 2 v w_xt + v^2 w_xx)  at x,
+
+which is the moving mass with its full convective acceleration. w_tt contains the unknown q'', but
+only along phi, so R has a closed form (Sherman and Morrison 1950), that of `crossing_rate`. p are
+modal forces of patches under control.
 """
 
 from dataclasses import dataclass

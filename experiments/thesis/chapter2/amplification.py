@@ -3,6 +3,8 @@
 Amplification is the largest dynamic over the largest static deflection at a midspan, free vibration
 after the exit included. The maps mark where the contact force becomes negative: the mass would have
 to pull on the beam to stay on it.
+
+Figures of moving masses and forces: histories, amplification over speed, and maps.
 """
 
 import dataclasses

@@ -1,4 +1,10 @@
-"""Natural frequencies and critical speeds: Tables 2.1 and 2.2, Fig. 2.4, eqs (2.38) and (2.39)."""
+"""Natural frequencies and critical speeds: Tables 2.1 and 2.2, Fig. 2.4, eqs (2.38) and (2.39).
+
+Modes of supported beams by the approximation of the thesis: springs in sine modes.
+
+Kept to reproduce printed numbers and to compare with `jaxbeam.modes`, which is exact. A rigid
+support becomes a stiff spring, and each such spring adds one spurious mode, the last of the list.
+"""
 
 import dataclasses
 

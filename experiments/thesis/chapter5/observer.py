@@ -2,6 +2,15 @@
 
 For the rig of Fig. 5.5 at 0.2 ms, for 5 ms with the shaker where it is, and for 10 ms with two
 modes and the shaker at 0.25 m. The observer is given the true weight of the load.
+
+The sampled regulator with a real observer in its loop, eqs (5.3) to (5.6).
+
+    x(k+1) = A_m(k) x(k) + B_m(k) u(k) + B_f(k) u_f(k),   y(k) = C x(k) + v(k),   u = -K xh
+    xh(k+1) = (A - B K - L C) xh(k) + L y(k) + B_f u_f(k)
+
+The plant has the mass at one of 240 positions along the beam, the observer does not; both
+have its weight, the true one. K is the optimal gain of the sampled beam without a load, L that of
+the dual problem. States are amplitudes of sine modes (m), their rates, and the shaker's.
 """
 
 import dataclasses

@@ -1,4 +1,11 @@
-"""What a random case is checked for: finite numbers, true verdicts, stated errors that hold."""
+"""What a random case is checked for: finite numbers, true verdicts, stated errors that hold.
+
+Draws of random valid cases: heavy and fast loads, many modes, events that coincide.
+
+Masses are 1e-3 to 100 times that of the beam, speeds 0.05 to 10 times the critical one, modes 1 to
+60. Loads enter together, meet, leave at once, or stop on the beam and stay. Frequencies are those
+of a span on two pins, of two equal clamped spans (in pairs), or of a free beam (two are zero).
+"""
 
 import contextlib
 import dataclasses
@@ -20,7 +27,7 @@ from jaxbeam.simulation.integration_plan import TOLERANCE, integration_plan
 from jaxbeam.simulation.record import Record
 from jaxbeam.simulation.simulate import ContactLossWarning
 from tests.oracles import modal_equations
-from tests.oracles.loads import Load
+from tests.oracles.crossing import Load
 from tests.oracles.modal_equations import KnownModes, Span
 
 LENGTH, RIGIDITY, MASS_PER_LENGTH = 2.0, 50.0, 1.5  # m, N m^2, kg/m

@@ -6,6 +6,10 @@ varying speed: here the gains K of the state are averaged over the loads on the 
 masses as weights, and the commands for their weights W, fed forward by the gains K_f, are added:
 
     u = -(sum of m_i K(m_i, v_i, x_i) / sum of m_i) z - sum of K_f(m_i, v_i, x_i) W_i
+
+Gains that vary while loads cross: of a finite horizon, or of the plant frozen at each time.
+
+J = x(end)' F x(end) + integral of x'Qx + u'Ru,     u = -K(t) x     (thesis, eqs 3.3 to 3.11)
 """
 
 import dataclasses

@@ -9,6 +9,17 @@ divided into cells, in which the constant part is propagated exactly and the for
 through Gauss nodes (`coupled_stages`), as in the integration of runs. Samples are multiples of the
 period, so that a load event, at which forces have a kink, always divides the same cell: the maps of
 such cells are computed once.
+
+What predictive control assumes after its horizon: a cost, and a set of states.
+
+Dual-mode control (Rawlings, Mayne and Diehl, Model Predictive Control, 2nd edition, 2017, section
+2.4): from the end of the horizon on a regulator acts, whose cost is known, from a set of states in
+which it keeps all limits for ever. The set is the maximal output-admissible one (Gilbert and Tan,
+IEEE Trans. Automatic Control 36, 1991): the rows E of the limits, of the next periods,
+
+    E Phi^j z <= 1,  j = 0 ... T - 1,  Phi the closed loop,
+
+of which those of all later periods follow if those of period T do.
 """
 
 import math

@@ -1,7 +1,9 @@
 """Steps of pedestrians and crowds: published factors, half-sine pulses, resonance, bad input."""
 
 import dataclasses
+import itertools
 
+import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -10,8 +12,11 @@ from scipy.integrate import quad, solve_ivp
 import jaxbeam as jb
 from jaxbeam.case.loads.walking import contact_time, jogging_factors, walking_factors
 from jaxbeam.case.validation import check_case
-from jaxbeam.files.case_file import case_from_dict
+from jaxbeam.files.case_file import case_from_dict, case_to_dict
+from jaxbeam.library.published import line_loads
 from jaxbeam.model.load_set import load_set
+from jaxbeam.simulation.integration_plan import integration_plan
+from tests.differences import central
 
 BEAM = jb.Beam(
     length=30.0, flexural_rigidity=2.87e9, mass_per_length=1500.0, damping_ratio=0.005, modes=2
@@ -191,3 +196,216 @@ def test_paces_of_a_crowd_end_at_three_deviations(monkeypatch):
     crowd = jb.Crowd(people=6, length=9.0, pace=1.9, pace_deviation=0.1, speed=1.4)
     paces = [one.frequencies[0] for one in crowd.force_histories().values()]
     assert_allclose(paces, [1.6, 1.6, 1.8, 2.19, 2.2, 2.2], rtol=1e-12)
+
+
+# Line loads against closed forms and integrals of influence lines.
+
+LENGTH, RIGIDITY = 20.0, 1e10
+
+
+def line_case_of(load, damping=0.0, duration=30.0, length=LENGTH) -> jb.Case:
+    beam = jb.Beam(
+        length=length, flexural_rigidity=RIGIDITY, mass_per_length=8000.0, damping_ratio=damping,
+        modes=4,
+    )  # fmt: skip
+    run = jb.Run(duration=duration, sample_rate=20.0)
+    return jb.Case(beam, sensors=[jb.Sensor(length / 2)], loads=[load], run=run)
+
+
+def influence(x, length=LENGTH):
+    """Moment at midspan under a unit force at x on a simply supported span."""
+    return min(x, length - x) / 2 if 0 <= x <= length else 0.0
+
+
+def midspan_moment(load, front, length=LENGTH) -> float:
+    """Static moment at midspan under the point forces of a load whose front is at a position."""
+    wheels = load_set(line_case_of(load, length=length))
+    places = front - np.asarray(wheels.behind[0])
+    return sum(f * influence(x, length) for f, x in zip(wheels.weight[:, 0], places, strict=True))
+
+
+def test_a_load_all_over_the_span_is_the_uniform_load():
+    """The error falls as the square of the distance of the point forces."""
+    expected, errors = 5 * 1e4 * LENGTH**4 / (384 * RIGIDITY), []
+    for points in (50, 100, 200):
+        load = jb.LineLoad(force_per_length=1e4, lengths=3 * LENGTH, speed=1.0, points=points)
+        peak = float(jb.statics.static_peak(line_case_of(load), LENGTH / 2))
+        errors.append(peak / expected - 1)
+    assert 0 < errors[2] < 1e-4
+    assert 3.5 < errors[1] / errors[2] < 4.5 and 3.5 < errors[0] / errors[1] < 4.5
+
+
+def test_a_standing_load_bends_the_beam_to_its_static_deflection():
+    """Over a part of the span, from 4 m to 11 m; the rest of it is on the embankment."""
+    load = jb.LineLoad(force_per_length=[2e4, 1e4], lengths=[7.0, 9.0], gaps=[0.0, 2.0],
+                       position=11.0, points=20)  # fmt: skip
+    case = line_case_of(load, damping=0.3, duration=6.0)
+    record = jb.simulate(case)
+
+    def under(x):
+        return float(jb.statics.static_deflection(case, LENGTH / 2, [x], [1.0]))
+
+    expected = 2e4 * quad(under, 4.0, 11.0)[0] + 1e4 * quad(under, 0.0, 2.0)[0]
+    assert record.deflection[-1, 0] == pytest.approx(expected, rel=2e-3)  # and truncated modes
+    assert np.isnan(np.asarray(record.load_position)[-1, -1])  # of a force off the beam
+
+
+@pytest.mark.parametrize(
+    ("model", "length"), [("SW/0", 15.0), ("SW/2", 25.0), ("unloaded-train", 20.0)]
+)
+def test_moments_of_models_are_integrals(model, length):
+    """The first part covers the span, or the load covers it all."""
+    code = line_loads()[model]
+    load = jb.LineLoad(model=model, speed=10.0, points=200)
+    moment = midspan_moment(load, length, length)
+    assert moment == pytest.approx(code.force_per_length[0] * length**2 / 8, rel=1e-3)
+
+
+def test_lm71_has_its_axles_between_its_line_loads():
+    load = jb.LineLoad(model="LM71", speed=10.0, tail=60.0, points=600)
+    wheels = load_set(line_case_of(load))
+    total = float(np.sum(wheels.weight))
+    assert total == pytest.approx(2 * 60.0 * 80e3 + 4 * 250e3)
+    line = quad(influence, 0, 6.8)[0] + quad(influence, 13.2, LENGTH)[0]
+    axles = sum(influence(LENGTH / 2 + at) for at in (-2.4, -0.8, 0.8, 2.4))
+    # Symmetrical at midspan: the axles begin 0.8 m behind the first part.
+    moment = midspan_moment(load, 60.0 + 3.2 + LENGTH / 2)
+    assert moment == pytest.approx(80e3 * line + 250e3 * axles, rel=1e-3)
+
+
+def test_in_case_files_and_gradients():
+    table = {"kind": "line-load", "model": "SW/2", "speed": 20.0}
+    beam = {"length": 20.0, "flexural_rigidity": 1e10, "mass_per_length": 8000.0}
+    case = case_from_dict({"beam": beam, "loads": [table]})
+    check_case(case)
+    written = case_to_dict(case)["loads"][0]
+    assert written["model"] == "SW/2" and "lengths" not in written
+
+    def peak(numbers):
+        load = jb.LineLoad(force_per_length=numbers[0], lengths=numbers[1], speed=1.0, points=10)
+        return jb.statics.static_peak(line_case_of(load), LENGTH / 2)
+
+    point = np.array([1e4, 6.0])
+    found = jax.grad(peak)(jax.numpy.asarray(point))
+    expected = [
+        central(lambda x: peak([x[0], 6.0]), point[:1], 10.0)[0],
+        central(lambda x: peak([1e4, x[0]]), point[1:], 1e-4)[0],
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        ({"model": "SW/1"}, r"loads.0.model cannot be 'SW/1'; did you mean"),
+        ({"model": "SW/0", "lengths": 3.0}, "has both model and lengths; leave one out"),
+        ({"lengths": 3.0}, "has neither model nor force_per_length with lengths"),
+        ({"lengths": 3.0, "force_per_length": [1.0, 2.0]}, "lengths must be a list as force_per_"),
+        ({"lengths": [3.0], "force_per_length": [1.0, 2.0]}, "force_per_length has 2 entries and"),
+        ({"model": "SW/0", "position": 3.0}, "has both position and speed; leave one out"),
+    ],
+)
+def test_bad_input_of_line(numbers, words):
+    with pytest.raises(ValueError, match=words):
+        check_case(line_case_of(jb.LineLoad(**numbers, speed=1.0)))
+
+
+# Forces that vary in time against scipy: travelling and in place; bad input.
+
+VARYING_LENGTH, VARYING_RIGIDITY, MODES, DAMPING, SPEED = 2.0, 6.0, 3, 0.02, 0.8
+TABLE = [0.3, 0.9, 1.4], [0.0, 1.0, -0.5]
+VARYING_BEAM = jb.Beam(
+    length=VARYING_LENGTH,
+    flexural_rigidity=VARYING_RIGIDITY,
+    mass_per_length=1.0,
+    damping_ratio=DAMPING,
+    modes=MODES,
+)
+FORCE = jb.VaryingForce(
+    force=2.0,
+    frequencies=[1.3, 3.0],
+    amplitudes=[0.7, 0.2],
+    phases=[0.2, 1.0],
+    force_times=TABLE[0],
+    forces=TABLE[1],
+)
+PLACES = {"travelling": {"speed": np.asarray(SPEED)}, "in place": {"position": np.asarray(0.7)}}
+
+
+def case_with(**changes) -> jb.Case:
+    load = dataclasses.replace(FORCE, **changes)
+    return jb.Case(VARYING_BEAM, loads=[load], sensors=[jb.Sensor(1.0)], run=jb.Run(2.6, 100.0))
+
+
+def force(t):
+    waves = 0.7 * np.sin(2 * np.pi * 1.3 * t + 0.2) + 0.2 * np.sin(2 * np.pi * 3.0 * t + 1.0)
+    return 2.0 + waves + np.interp(t, *TABLE)
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_response_is_that_of_scipy(place):
+    record = jb.simulate(case_with(**PLACES[place]))
+    n = np.arange(1, MODES + 1)
+    frequencies = (n * np.pi / VARYING_LENGTH) ** 2 * np.sqrt(VARYING_RIGIDITY)
+
+    def rates(t, y, on_beam):
+        x = SPEED * t if place == "travelling" else 0.7
+        modal_force = (
+            -on_beam * force(t) * np.sin(n * np.pi * x / VARYING_LENGTH) * 2 / VARYING_LENGTH
+        )
+        q, u = y[:MODES], y[MODES:]
+        return np.append(u, modal_force - frequencies**2 * q - 2 * DAMPING * frequencies * u)
+
+    times, state = np.asarray(record.times), np.zeros(2 * MODES)
+    midspan = np.zeros(times.size)
+    leaves = VARYING_LENGTH / SPEED if place == "travelling" else np.inf
+    ends = [0.0, *TABLE[0], min(leaves, 2.55), times[-1]]
+    for start, end in itertools.pairwise(ends):
+        inside = (times >= start) & (times <= end)
+        solution = solve_ivp(
+            rates,
+            (start, end),
+            state,
+            "DOP853",
+            t_eval=times[inside],
+            args=(start < leaves,),
+            dense_output=True,
+            rtol=1e-12,
+            atol=1e-14,
+            max_step=0.02,
+        )
+        midspan[inside] = np.sin(n * np.pi / 2) @ solution.y[:MODES]
+        state = solution.sol(end)
+    assert_allclose(record.deflection[:, 0], midspan, atol=1e-9 * np.abs(midspan).max())
+    on_beam = times < leaves
+    assert_allclose(record.contact_force[on_beam, 0], force(times[on_beam]), rtol=1e-12)
+
+
+def test_sweeps_and_gradients_reach_its_numbers():
+    case, address = case_with(speed=np.asarray(SPEED)), "loads.0.amplitudes.0"
+    swept = jb.sweep(case, {address: [0.5, 1.0]}, progress=False).peak_deflection.values[:, 0]
+    records = [jb.simulate(jb.replace(case, {address: a})) for a in (0.5, 1.0)]
+    assert_allclose(swept, [float(record.peak_deflection[0]) for record in records], rtol=1e-7)
+    plan = integration_plan(case)
+
+    def last(amplitude):
+        changed = jb.replace(case, {address: amplitude.reshape(())})
+        return jb.simulate(changed, plan=plan).deflection[-1, 0]
+
+    point = np.array([0.7])
+    assert_allclose(jax.jit(jax.grad(last))(point), central(last, point), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"speed": 1.0, "amplitudes": [1.0]}, "loads.0.amplitudes"),
+        ({"speed": 1.0, "forces": None}, "loads.0.forces is missing"),
+        ({"speed": 1.0, "position": 0.5}, "both position and speed"),
+        ({"position": 3.0}, "loads.0.position must lie on the beam"),
+        ({}, "neither speed nor times"),
+    ],
+)
+def test_bad_input_is_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        check_case(case_with(**changes))

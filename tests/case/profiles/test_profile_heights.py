@@ -1,5 +1,7 @@
 """Heights of profiles: closed forms, derivatives, jumps, contact patch, known and traced."""
 
+import json
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -7,12 +9,15 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 from scipy.interpolate import CubicSpline
+from scipy.signal.windows import hann
 
 import jaxbeam as jb
 from jaxbeam.case.fields import kinds
 from jaxbeam.case.profiles.shapes import AbstractProfile
+from jaxbeam.case.profiles.spectra import DIRECT_SIZE, RAIL_SPECTRA, ROAD_CLASSES, sum_of_cosines
 from tests.case.profiles.examples import AVERAGED, HEIGHTS, PLAIN, POSITIONS, PROFILES
 from tests.differences import central
+from tests.modules import DATA
 
 X = np.linspace(-5.0, 9.0, 57) + 0.0123  # away from all jumps and edges of a patch
 EVERY = pytest.mark.parametrize("name", PROFILES)
@@ -221,3 +226,195 @@ def test_gradient_of_the_position_of_a_wheel():
             got = jax.jacfwd(lambda x, i=i, p=profile: p.heights(x)[i])(x)
             scale = np.abs(expected).max()
             assert_allclose(np.diag(got), expected, rtol=1e-9, atol=1e-12 * scale)
+
+
+# Random profiles: published densities, spectrum of a realisation, seeds, switching on.
+
+REFERENCE = json.loads((DATA / "profiles.json").read_text())
+EVERYWHERE = [-1e4, -0.9e4]  # switched on long before
+RANDOM = [jb.profiles.ISO8608Profile("B", 1, switch_on=EVERYWHERE)] + [
+    jb.profiles.RailProfile(name, 1, switch_on=EVERYWHERE) for name in RAIL_SPECTRA
+]
+REALISATIONS = pytest.mark.parametrize("profile", RANDOM, ids=["B", *RAIL_SPECTRA])
+
+
+@pytest.mark.parametrize("name", REFERENCE)
+def test_reference_profiles(name):
+    """The table of the reference has eight digits."""
+    given = REFERENCE[name]
+    start, length = given["switch_on"]["x0"], given["switch_on"]["length"]
+    profile = jb.profiles.SpectrumProfile(
+        given["n"], given["amp"], given["phase"], switch_on=[start, start + length]
+    )
+    table = np.array(given["table_r_every_5th"])
+    x = given["table_x0"] + given["table_dx"] * np.arange(table.size)
+    assert_allclose(profile.heights(x)[0], table, atol=6e-11)
+    assert_allclose(np.stack(profile.heights(np.array([-60.0, -40.0]))), 0.0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "profile"),
+    [("iso8608-A", jb.profiles.ISO8608Profile("A")), ("fra-6", jb.profiles.RailProfile("fra-6"))],
+)
+def test_densities_give_the_amplitudes_of_the_reference(name, profile):
+    given = REFERENCE[name]
+    n = np.array(given["n"])
+    assert_allclose(np.sqrt(2 * profile.density(n) * (n[1] - n[0])), given["amp"], rtol=1e-7)
+
+
+def test_classes_of_iso_8608():
+    """Geometric means of ISO 8608:2016, table C.1, at 0.1 cycles per metre, in 1e-6 m^3."""
+    means = [16, 64, 256, 1024, 4096, 16384, 65536, 262144]
+    for name, mean in zip(ROAD_CLASSES, means, strict=True):
+        assert_allclose(
+            jb.profiles.ISO8608Profile(name).density(np.array([0.1, 1.0])),
+            [mean * 1e-6] * 2 * np.array([1.0, 0.01]),
+        )
+
+
+def test_rail_spectra_by_hand():
+    """S(n) in m^3: at the corner of the French spectrum, far above and far below the others'."""
+    french = RAIL_SPECTRA["sncf-poor"].density(0.0489)
+    assert_allclose(french, 1.79 * 308e-6 / 8)
+    german = RAIL_SPECTRA["german-high"].density(0.8246 / (2 * np.pi))
+    assert_allclose(german, 2 * np.pi * 1.08e-6 / (2 * 0.8246**2), rtol=7e-4)
+    american = RAIL_SPECTRA["fra-1"].density(np.array([1e-4, 100.0]))
+    assert_allclose(american, 15.53e-8 * np.array([0.0233**2 / 1e-16, 0.131**2 / 1e8]), rtol=3e-5)
+
+
+def test_wavelengths_of_rail_spectra():
+    """In m, as in the options of TTB-2D (`A04_Options.m`)."""
+    published = {"fra-3": (1.524, 304.8), "german-low": (3.0, 150.0), "sncf-poor": (2.0, 40.0)}
+    for name, wavelengths in published.items():
+        lowest, highest = jb.profiles.RailProfile(name).wavenumber_range()
+        assert_allclose((1 / highest, 1 / lowest), wavelengths, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["german-low", "german-high"])
+def test_density_by_wavenumber_has_the_variance_of_that_by_radians(name):
+    """Integral of S(Omega), in closed form, over all wavelengths."""
+    a = {"german-low": 4.032e-7, "german-high": 1.080e-6}[name]
+    c, r = 0.8246, 0.0206
+    density = RAIL_SPECTRA[name].density
+    low, high = 0.01, 3.0  # rad/m
+    shape = (np.arctan(high / r) - np.arctan(low / r)) / r
+    shape -= (np.arctan(high / c) - np.arctan(low / c)) / c
+    exact = a * c**2 / (c**2 - r**2) * shape
+    assert_allclose(quad(density, low / (2 * np.pi), high / (2 * np.pi))[0], exact, rtol=1e-9)
+
+
+@REALISATIONS
+def test_variance_is_the_integral_of_the_density(profile):
+    lowest, highest = map(float, profile.wavenumber_range())
+    exact = quad(profile.density, lowest, highest, epsrel=1e-10, limit=200)[0]
+    _, amplitudes, _ = profile.lines()
+    assert_allclose(np.sum(amplitudes**2) / 2, exact, rtol=1e-3)
+
+
+def test_variance_of_a_road_is_exact():
+    """S ~ n^-2: its integral is S(n0) n0^2 (1 / lowest - 1 / highest), whatever the waves."""
+    for waves in (5, 200):
+        profile = jb.profiles.ISO8608Profile(
+            "A", 3, lowest_wavenumber=0.02, highest_wavenumber=2.0, waves=waves
+        )
+        _, amplitudes, _ = profile.lines()
+        assert_allclose(np.sum(amplitudes**2) / 2, 16e-6 * 0.01 * (1 / 0.02 - 1 / 2), rtol=1e-12)
+
+
+@REALISATIONS
+def test_periodogram_of_a_realisation(profile):
+    """Power of five bands of a road or track so long that its waves do not interfere."""
+    lowest, highest = map(float, profile.wavenumber_range())
+    step, size = 0.4 / highest, 200_000
+    x = step * np.arange(size)
+    height = np.concatenate([profile.heights(part)[0] for part in np.split(x, 20)])
+    window = hann(size, sym=False)
+    power = np.abs(np.fft.rfft(window * height)) ** 2 * 2 * step / np.sum(window**2)
+    n = np.fft.rfftfreq(size, step)
+    assert_allclose(
+        np.sum(power) * n[1], quad(profile.density, lowest, highest, limit=200)[0], rtol=0.02
+    )
+    edges = np.geomspace(lowest, highest, profile.waves + 1)[:: profile.waves // 5]
+    for low, high in zip(edges[:-1], edges[1:], strict=True):
+        band = np.sum(power[(n >= low) & (n < high)]) * n[1]
+        assert_allclose(band, quad(profile.density, low, high, limit=200)[0], rtol=0.05)
+
+
+def test_a_seed_is_a_profile():
+    x = np.linspace(0.0, 40.0, 60)
+    first, again = (jb.profiles.ISO8608Profile("A", seed=7).heights(x) for _ in range(2))
+    assert_array_equal(first, again)
+    assert_allclose(jb.profiles.ISO8608Profile("B", seed=7).heights(x)[0], 2 * first[0], atol=1e-15)
+    scaled = jb.profiles.ISO8608Profile("A", seed=7, scale=3.0).heights(x)[0]
+    assert_allclose(scaled, 3 * first[0], atol=1e-15)
+    other = jb.profiles.ISO8608Profile("A", seed=8).heights(x)[0]
+    assert abs(np.corrcoef(other, first[0])[0, 1]) < 0.9
+    phases = jb.profiles.RailProfile("fra-2", seed=7).lines()[2]
+    assert_array_equal(phases, np.random.default_rng(7).uniform(0, 2 * np.pi, 100))
+
+
+def test_heights_are_normally_distributed_over_seeds():
+    """Kurtosis 3, no correlation between seeds."""
+    x = np.array([12.0])
+    profiles = [jb.profiles.ISO8608Profile("A", seed) for seed in range(2000)]
+    heights = np.array([profile.heights(x)[0][0] for profile in profiles])
+    deviation = np.sqrt(16e-6 * 0.01 * (1 / 0.01 - 1 / 4.0))
+    assert_allclose(heights.std(), deviation, rtol=0.05)
+    assert abs(heights.mean()) < 0.07 * deviation
+    assert abs(np.mean(heights**4) / np.mean(heights**2) ** 2 - 3) < 0.3
+
+
+@pytest.mark.parametrize("switch_on", [[2.0, 8.0], [8.0, 2.0]])
+def test_switching_on(switch_on):
+    """Zero before, all there behind, half in the middle; also for loads that travel left."""
+    profile = jb.profiles.RailProfile("fra-6", 3, switch_on=switch_on)
+    full = jb.profiles.RailProfile("fra-6", 3, switch_on=EVERYWHERE)
+    before, behind = np.array([[-30.0, 1.9], [8.1, 40.0]])[:: 1 if switch_on[0] < 5 else -1]
+    assert_array_equal(np.stack(profile.heights(before)), 0.0)
+    assert_array_equal(np.stack(profile.heights(behind)), np.stack(full.heights(behind)))
+    middle = profile.heights(np.array([5.0]))[0]
+    assert_allclose(middle, full.heights(np.array([5.0]))[0] / 2)
+
+
+def test_many_waves_are_summed_by_blocks():
+    """Equal to the sum at once, derivatives too, for known and for traced numbers."""
+    rng = np.random.default_rng(1)
+    waves = rng.uniform(0.1, 2.0, 90), rng.normal(size=90), rng.uniform(0, 6, 90)
+    x = np.linspace(0.0, 50.0, 2 * DIRECT_SIZE // 90)
+    known = sum_of_cosines(x, *waves)
+    at_once = [sum_of_cosines(part, *waves) for part in np.array_split(x, 3)]
+    assert_allclose(known, np.concatenate(at_once, axis=1), rtol=1e-9, atol=1e-10)
+    traced = jax.jit(sum_of_cosines)(x, *waves)
+    assert_allclose(traced, known, rtol=1e-9, atol=1e-10)
+
+    def total(amplitudes):
+        return sum_of_cosines(x, waves[0], amplitudes, waves[2])[0].sum()
+
+    gradient = jax.jit(jax.grad(total))(waves[1])
+    angles = 2 * np.pi * np.outer(waves[0], x) + waves[2][:, None]
+    assert_allclose(gradient, np.cos(angles).sum(axis=1), rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("shape", [(3, 4000), (40, 50, 6)])
+def test_sums_at_close_positions_are_interpolated(shape):
+    """Equal to the plain sum to rounding, at both ends of the panels too, derivatives too."""
+    rng = np.random.default_rng(2)
+    n, amplitudes, phases = np.geomspace(0.01, 3.0, 80), rng.normal(size=80), rng.uniform(0, 6, 80)
+    x = rng.uniform(-30.0, 40.0, shape)
+    angles = 2 * np.pi * n * x[..., None] + phases
+    k = 2 * np.pi * n
+    parts = np.cos(angles), -k * np.sin(angles), -(k**2) * np.cos(angles)
+    for found, part in zip(sum_of_cosines(x, n, amplitudes, phases), parts, strict=True):
+        expected = part @ amplitudes
+        assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_profiles_are_batched():
+    """Over the roughness of a road, as a sweep does."""
+    profile, x = jb.profiles.ISO8608Profile("A", 5), np.linspace(0.0, 10.0, 7)
+
+    def heights(scale):
+        return eqx.tree_at(lambda p: p.scale, profile, scale).heights(x)[0]
+
+    batched = jax.jit(jax.vmap(heights))(np.array([1.0, 2.0]))
+    assert_allclose(batched, np.outer([1.0, 2.0], profile.heights(x)[0]), rtol=1e-12, atol=1e-15)

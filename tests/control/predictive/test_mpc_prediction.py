@@ -24,7 +24,7 @@ from jaxbeam.control.predictive.prediction import (
     sampled_plant,
 )
 from jaxbeam.simulation.integration_plan import integration_plan
-from tests.control.optimal import test_crossing_vehicles as crossing
+from tests.control.optimal import test_crossing_lqr as crossing
 from tests.control.predictive import test_mpc_exact as exact
 from tests.differences import central
 from tests.loop_as_oracle import span_of
@@ -129,10 +129,10 @@ def test_a_mass_that_enters_within_a_period_and_a_delayed_command(speed, traced)
 @pytest.mark.parametrize("traced", [False, True])
 def test_a_vehicle_on_a_rough_surface(traced):
     period, first = 0.02, 11
-    found = found_plants(crossing.beam_case(), period, None, first, traced)
+    found = found_plants(crossing.vehicle_beam_case(), period, None, first, traced)
     for i in range(COUNT):
         start = (first + i) * period
-        A, B = over_period(crossing.plant, start, start + period)
+        A, B = over_period(crossing.vehicle_plant, start, start + period)
         scale = np.abs(A[:8]).max(axis=0)
         assert_allclose(found.A[i] / scale[:8], A[:8, :8] / scale[:8], atol=1e-8)
         assert_allclose(found.B[i], B[:8], atol=1e-8 * np.abs(B).max())
@@ -141,7 +141,7 @@ def test_a_vehicle_on_a_rough_surface(traced):
 
 # Predictive control of a beam under a vehicle on a rough surface, against an explicit program.
 #
-# Plant by scipy's integration of the matrices in `test_crossing_vehicles`; moves by least squares.
+# Plant by scipy's integration of the matrices in `test_crossing_lqr`; moves by least squares.
 
 VEHICLE_PERIOD, HORIZON, MOVES, MOVE_WEIGHT = 0.02, 9, 4, 3e-7
 SETTINGS = {
@@ -157,14 +157,14 @@ STATES, SAMPLE = 8, 12
 def sampled(period):
     """A, B and known inputs over a period, counted from t = 0."""
     start = period * VEHICLE_PERIOD
-    A, B = over_period(crossing.plant, start, start + VEHICLE_PERIOD)
+    A, B = over_period(crossing.vehicle_plant, start, start + VEHICLE_PERIOD)
     return A[:STATES, :STATES], B[:STATES], A[:STATES, STATES:]
 
 
 def explicit_move(state, previous_state, previous_command):
     """First move of the minimum of the sum of w^2 at 1 m and of the weighted moves squared."""
     constants = crossing.START[STATES:]
-    row = np.pad(crossing.SPAN.shapes(1.0), (0, STATES - crossing.MODES))
+    row = np.pad(crossing.SPAN.shapes(1.0), (0, STATES - crossing.VEHICLE_MODES))
     A, B, E = sampled(SAMPLE - 1)
     unexplained = state - (A @ previous_state + B[:, 0] * previous_command + E @ constants)
 
@@ -184,7 +184,7 @@ def explicit_move(state, previous_state, previous_command):
 
 def test_moves_foresee_the_vehicle_and_the_profile():
     law = jb.MPC(**SETTINGS, loads="known", prediction="time-varying", solver="unconstrained")
-    plant = jb.state_space(crossing.beam_case(controller=law))
+    plant = jb.state_space(crossing.vehicle_beam_case(controller=law))
     design = law.design_state_law(plant, plant)
     draws = np.random.default_rng(4).normal(size=(2, STATES))
     scale = np.array([1e-2, 1e-3, 0.2, 0.1, 2e-3, 2e-3, 0.05, 0.05])
@@ -200,10 +200,10 @@ def test_foresight_of_the_vehicle_beats_that_of_its_weight():
     """On a rough surface the static load is a poor prediction of the contact force."""
     foresight = jb.MPC(**SETTINGS, loads="known", prediction="time-varying")
     force = jb.MovingForce(mass=0.4, speed=crossing.SPEED)
-    design = jb.state_space(crossing.beam_case(force, profile=None))
+    design = jb.state_space(crossing.vehicle_beam_case(force, profile=None))
     weight = jb.MPC(**SETTINGS, loads="known", prediction="time-varying", nominal_plant=design)
     peaks = [
-        float(jb.simulate(crossing.beam_case(controller=law)).peak_deflection[0])
+        float(jb.simulate(crossing.vehicle_beam_case(controller=law)).peak_deflection[0])
         for law in (foresight, weight)
     ]
     assert peaks[0] < 0.8 * peaks[1]

@@ -11,8 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.numerics.qp import INFEASIBLE, METHODS, SOLVED, UNFINISHED, solve_qp
-from tests.control.predictive.test_mpc import beam_case, mpc
-from tests.control.predictive.test_mpc_law import commands
+from tests.control.predictive.test_mpc import beam_case, commands, mpc
 from tests.differences import central
 from tests.oracles import qpax_solver
 

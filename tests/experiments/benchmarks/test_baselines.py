@@ -21,7 +21,7 @@ from experiments.benchmarks.rivals.baselines import (
     scipy_time,
 )
 from tests.oracles.closed_loop import Actuator, Clock, Sensor, respond
-from tests.oracles.loads import Load
+from tests.oracles.crossing import Load
 from tests.oracles.modal_equations import Span
 from tests.oracles.two_spans import TwoSpans
 

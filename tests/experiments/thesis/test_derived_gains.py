@@ -34,7 +34,7 @@ from experiments.thesis.verdicts import LITERAL, NOT_REPRODUCED, REPRODUCED, ass
 from jaxbeam import rigs
 from jaxbeam.case.validation import check_case
 from tests.analysis.test_compare import critical_gain
-from tests.control.test_scheduled_feedback import beam_case, gains_at, law
+from tests.control.test_feedback import beam_case, gains_at, law
 from tests.loop_as_oracle import expected
 
 

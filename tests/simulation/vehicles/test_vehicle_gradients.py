@@ -13,8 +13,7 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.simulation.integration_plan import integration_plan
-from tests.differences import central
-from tests.runs import assert_close, plan_of
+from tests.differences import assert_close, central, plan_of
 
 TIMES = np.linspace(0.0, 1.4, 57)
 CAR = {

@@ -7,9 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
-from tests.oracles import quarter_car
+from tests.differences import assert_close
+from tests.oracles import vehicle_elements
 from tests.oracles.modal_equations import Span
-from tests.runs import assert_close
 
 SPAN = Span(20.0, 2e10, 1.2e4, modes=3, damping_ratio=0.02)
 BEAM = jb.Beam(20.0, 2e10, 1.2e4, 0.02, modes=3)
@@ -49,7 +49,7 @@ PROFILES = {
 @pytest.mark.parametrize("name", PROFILES)
 def test_a_quarter_car_is_that_of_scipy(name):
     """Also braking, before and behind the beam, starting on a profile that is not level."""
-    profile, car = PROFILES[name], quarter_car.Car(**CAR)
+    profile, car = PROFILES[name], vehicle_elements.Car(**CAR)
     case = case_of(
         jb.QuarterCar(**CAR, speed=19.0, start_position=-5.0, deceleration=1.3), profile=profile
     )
@@ -62,7 +62,7 @@ def test_a_quarter_car_is_that_of_scipy(name):
 
     places = np.concatenate([[0.0, 20.0], [] if profile is None else profile.kinks()])
     events = (19.0 - np.sqrt(19.0**2 - 2.6 * (places + 5.0))) / 1.3
-    states, forces = quarter_car.cross(SPAN, car, motion, heights, events, TIMES)
+    states, forces = vehicle_elements.quarter_cross(SPAN, car, motion, heights, events, TIMES)
     record = jb.simulate(case, TIMES, tolerance=1e-10)
     deflection = states[:, :3] @ SPAN.shapes(np.array([7.0, 12.0])).T
     assert_close(record.deflection, deflection, 1e-8)

@@ -11,8 +11,8 @@ import pytest
 
 import jaxbeam as jb
 from jaxbeam.case.case import replace
+from tests.differences import well_compiled
 from tests.oracles import finite_elements, vehicle_elements
-from tests.well_compiled import well_compiled
 from tuning import Log, load_fit, save_fit
 from tuning.fit.dataset import make_dataset
 from tuning.fit.least_squares import LeastSquares

@@ -1,14 +1,16 @@
 """Logs in binary formats, written by other libraries: the same run is read from each."""
 
+import re
 import warnings
 
 import numpy as np
 import pytest
 import scipy.io
+from scipy.signal import lfilter
 
-from tuning import read_log, read_logs
-from tuning.logs import readers
-from tuning.logs.log import LogWarning
+from tuning import Log, read_log, read_logs
+from tuning.logs import align_logs, find_faults, readers
+from tuning.logs.log import LogWarning, even_records
 
 TIMES = np.arange(40) / 500
 D1, D2 = np.sin(20 * TIMES), np.cos(30 * TIMES) - 1  # mm
@@ -230,3 +232,307 @@ def test_formats_are_found_in_the_modules_of_the_readers():
         ".tdms", ".mat", ".h5", ".hdf5", ".nc", ".parquet", ".xlsx", ".uff", ".unv"
     }  # fmt: skip
     assert set(suffixes) - binary == {".csv", ".tsv", ".txt", ".dat", ".lvm"}
+
+
+# LabVIEW measurement files, written by the tests after the published format.
+
+HEAD = """LabVIEW Measurement
+Writer_Version{s}2
+Reader_Version{s}2
+Separator{s}{separator}
+Decimal_Separator{s}{decimal}
+Multi_Headings{s}{multi}
+X_Columns{s}{clocks}
+Time_Pref{s}Absolute
+Date{s}2024/03/01
+Time{s}23:59:59{decimal}5
+***End_of_Header***
+{s}
+"""
+SEGMENT = """Channels{s}2{s}{s}{s}
+Samples{s}3{s}3{s}
+Date{s}2024/03/01{s}2024/03/01{s}
+Time{s}{start}{s}{start}{s}
+Y_Unit_Label{s}g{s}mm{s}
+X_Dimension{s}Time{s}Time{s}
+X0{s}0{decimal}0{s}0{decimal}0{s}
+Delta_X{s}0{decimal}001{s}0{decimal}001{s}
+***End_of_Header***{s}{s}
+"""
+ROWS = {
+    "One": "X_Value{s}a{s}b{s}Comment\n0{decimal}0000{s}1{decimal}5{s}2\n"
+    "0{decimal}0012{s}2{decimal}5{s}3{s}a remark\n0{decimal}0024{s}3{decimal}5{s}4\n",
+    "Multi": "X_Value{s}a{s}X_Value{s}b{s}Comment\n0{s}1{decimal}5{s}0{s}2\n"
+    "0{decimal}0012{s}2{decimal}5{s}0{decimal}0012{s}3\n"
+    "0{decimal}0024{s}3{decimal}5{s}0{decimal}0024{s}4\n",
+    "No": "X_Value{s}a{s}b{s}Comment\n{s}1{decimal}5{s}2\n{s}2{decimal}5{s}3\n{s}3{decimal}5{s}4\n",
+}
+
+
+def lvm(clocks="One", separator="Comma", decimal=".", starts=("23:59:59.5",), multi="Yes"):
+    """Text of a file with one segment for each start time."""
+    fields = {
+        "s": "," if separator == "Comma" else "\t",
+        "separator": separator,
+        "decimal": decimal,
+        "clocks": clocks,
+        "multi": multi,
+    }
+    text = HEAD.format(**fields)
+    for start in starts:
+        date, _, clock = start.rpartition(" ")
+        segment = SEGMENT.format(start=clock.replace(".", decimal), **fields)
+        text += segment.replace("2024/03/01", date or "2024/03/01")
+        text += ROWS[clocks].format(**fields) + "\n"
+    return text
+
+
+def write(folder, text, name="run.lvm"):
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("clocks", ROWS)
+@pytest.mark.parametrize(("separator", "decimal"), [("Comma", "."), ("Tab", "."), ("Tab", ",")])
+@pytest.mark.parametrize("name", ["run.lvm", "run.txt"])
+def test_layouts(tmp_path, clocks, separator, decimal, name):
+    log = read_log(write(tmp_path, lvm(clocks, separator, decimal), name))
+    step = 0.001 if clocks == "No" else 0.0012  # the printed Delta_X is used only without times
+    assert (log.names, log.units) == (("a", "b"), ("g", "mm"))
+    np.testing.assert_allclose(log.times, [0, step, 2 * step], rtol=1e-14)
+    np.testing.assert_allclose(log.values[:, 0] / 9.80665, [1.5, 2.5, 3.5], rtol=1e-14)
+    np.testing.assert_allclose(log.values[:, 1], [2e-3, 3e-3, 4e-3], rtol=1e-14)
+
+
+def test_segments_follow_their_start_times(tmp_path):
+    """The second segment starts one second later, past midnight."""
+    text = lvm(starts=("23:59:59.5", "2024/03/02 00:00:00.5"))
+    with pytest.warns(LogWarning, match="times jump by 0.9976 s after t = 0.0024 s, line 37"):
+        log = read_log(write(tmp_path, text))
+    expected = [0, 0.0012, 0.0024, 1, 1.0012, 1.0024]
+    np.testing.assert_allclose(log.times, expected, rtol=1e-12)
+    with pytest.raises(ValueError, match="not sampled evenly"):
+        _ = log.sample_rate
+
+
+def test_segments_whose_times_continue(tmp_path):
+    text = lvm(starts=("23:59:59.5", "23:59:59.5"))
+    head, first, second = text.partition("Channels")[0], *text.split("Channels")[1:]
+    for old, new in (("0.0024", "0.0060"), ("0.0012", "0.0048"), ("0.0000", "0.0036")):
+        second = second.replace(old, new)
+    log = read_log(write(tmp_path, f"{head}Channels{first}Channels{second}"))
+    np.testing.assert_allclose(log.times, 0.0012 * np.arange(6), rtol=1e-12)
+
+
+def test_special_blocks_are_passed_over(tmp_path):
+    block = "***Start_Special***\nLimits,1,2\n***End_Special***\n"
+    text = lvm().replace("Channels,2", f"{block}Channels,2")
+    assert read_log(write(tmp_path, text)).values.shape == (3, 2)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("***End_of_Header***", "", "the header has no end"),
+        ("2.5", "2.5x", "line 24, column 'a': '2.5x' is no number"),
+        ("2.5", "", "line 24, column 'a': the cell is empty"),
+        ("0.0012", "0.0000", "line 24: time 0 s is repeated"),
+        ("0.0012", "-1", "line 24: time -1 s comes after 0 s"),
+        ("Y_Unit_Label,g,", "Y_Unit_Label,,", "column 'a': no unit found"),
+        ("Y_Unit_Label,g,", "Y_Unit_Label,lux,", "column 'a': unknown unit 'lux'"),
+        ("X_Value,a,b", "Zeit,a,b", "line 22: the column headings must be X_Value"),
+        ("LabVIEW Measurement", "Something", "line 1: a LabVIEW measurement file starts with"),
+    ],
+)
+def test_mistakes(tmp_path, old, new, message):
+    text = lvm()
+    assert old in text
+    with pytest.raises(ValueError, match=message):
+        read_log(write(tmp_path, text.replace(old, new)))
+
+
+def test_a_key_without_a_value_counts_as_empty(tmp_path):
+    text = lvm("No").replace("Separator,.", "Separator")
+    assert "Decimal_Separator\n" in text
+    assert len(read_log(write(tmp_path, text)).times) > 1
+    with pytest.raises(ValueError, match="nor a Delta_X"):
+        read_log(write(tmp_path, re.sub("Delta_X,.*", "Delta_X", text)))
+
+
+def test_mistakes_between_segments(tmp_path):
+    two = lvm(starts=("23:59:59.5", "23:59:59.5"))
+    with pytest.raises(ValueError, match="starts before the one of line 23 ends"):
+        read_log(write(tmp_path, two))
+    head, _, second = two.rpartition("X_Value,a,b")
+    with pytest.raises(ValueError, match="this segment has the channels a, c, the first one a, b"):
+        read_log(write(tmp_path, f"{head}X_Value,a,c{second}"))
+    with pytest.raises(ValueError, match="Time 'noon' do not tell when it started"):
+        read_log(write(tmp_path, lvm(starts=("23:59:59.5", "noon"))))
+    with pytest.raises(ValueError, match="the log is empty"):
+        read_log(write(tmp_path, lvm().partition("0.0000")[0]))
+
+
+def test_channels_with_their_own_times(tmp_path):
+    text = lvm("Multi").replace("0.0012,3", "0.0013,3")
+    with pytest.raises(ValueError, match="line 24: the channels have different times"):
+        read_log(write(tmp_path, text))
+
+
+# Logs of other loggers: headings of many kinds or none, universal files, several clocks, gaps.
+
+
+TEXTS = {
+    "preamble and units below": "Logger 7\nserial,1234,5\nt,a,b\ns,mm,[mm]\n0,1,2\n0.1,3,4\n",
+    "spaces": "# comment\n t  a  b \n  s   mm  mm\n 0.0 1.0 2.0\n 0.1  3.0 4.0\n",
+    "spaces, decimal comma": "t a b\ns mm mm\n0,0 1,0 2,0\n0,1 3,0 4,0\n",
+    "comments within": "t [s];a [mm];b [mm]\n0,0;1,0;2,0\n% paused\n// again\n0,1;3,0;4,0\n",
+    "several headings": "place;left;right\nt (s);a (mm);b (mm)\n0;1;2\n0,1;3;4\n",
+}
+
+
+@pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
+def test_headings_of_many_kinds(tmp_path, text):
+    (tmp_path / "run.txt").write_text(text)
+    log = read_log(tmp_path / "run.txt")
+    assert log.names == ("a", "b") and log.units == ("mm", "mm")
+    np.testing.assert_allclose(log.values, [[1e-3, 2e-3], [3e-3, 4e-3]])
+    np.testing.assert_allclose(log.times, [0, 0.1])
+
+
+def test_a_file_without_headings_is_read_with_named_columns(tmp_path):
+    path = tmp_path / "node.csv"
+    path.write_text("0.000,1.0,7\n0.001,2.0,7\n0.002,3.0,8\n")
+    log = read_log(path, columns="time [s], a1 [g], -")
+    assert log.names == ("a1",)
+    np.testing.assert_allclose(log.values[:, 0], 9.80665 * np.arange(1, 4))
+    with pytest.raises(ValueError, match="2 columns are named, but the file has 3; name all"):
+        read_log(path, columns="time [s], a1 [g]")
+    with pytest.raises(ValueError, match=r'columns="time \[s\], a1 \[g\], a2 \[g\]"'):
+        read_log(path)
+    path.write_text("1;2\n3;4\n5;6\n")
+    log = read_log(path, columns=["a [mm]", "b [mm]"], rate=50.0)
+    np.testing.assert_allclose(log.times, [0, 0.02, 0.04])
+    with pytest.raises(ValueError, match="the log has a column of times, 'a'; leave the sampling"):
+        read_log(path, columns="a [s], b [mm]", rate=50.0)
+    with pytest.raises(ValueError, match="must be positive, not 0 Hz"):
+        read_log(path, columns="a [mm], b [mm]", rate=0.0)
+
+
+def test_units_are_given_with_the_names_of_columns(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("t,a,b\n0,1,2\n1,3,4\n")
+    path.write_text("t [s],a,b\n0,1,2\n1,3,4\n")
+    assert read_log(path, columns="b [mm]").values[:, 0].tolist() == [2e-3, 4e-3]
+
+
+def write_uff(path, unit="mm", kind=1):
+    pyuff = pytest.importorskip("pyuff")
+    for node, values in ((1, D1), (2, D2)):
+        function = pyuff.prepare_58(
+            return_full_dict=True, binary=0, id1="run", id2="", id3="", id4="", id5="",
+            func_type=kind, ver_num=1, load_case_id=0, rsp_ent_name="", rsp_node=node, rsp_dir=3,
+            ref_ent_name="", ref_node=0, ref_dir=0, ord_data_type=4, num_pts=values.size,
+            abscissa_spacing=1, abscissa_min=0.0, abscissa_inc=TIMES[1], z_axis_value=0.0,
+            ordinate_spec_data_type=8, ordinate_axis_units_lab=unit, data=values, x=TIMES,
+            orddenom_spec_data_type=0,
+        )  # fmt: skip
+        function = {key: value for key, value in function.items() if value is not None}
+        pyuff.UFF(str(path)).write_sets(function, mode="add" if node > 1 else "overwrite")
+
+
+@pytest.mark.parametrize("unit", ["mm", "NONE"])
+def test_universal_file(tmp_path, unit):
+    write_uff(tmp_path / "run.uff", unit)
+    log = read_log(tmp_path / "run.uff")
+    scale = 1e-3 if unit == "mm" else 1.0
+    assert log.names == ("1z", "2z") and log.quantities == ("deflection",) * 2
+    np.testing.assert_allclose(log.times, TIMES, atol=1e-6)
+    np.testing.assert_allclose(log.values, scale * np.column_stack([D1, D2]), atol=1e-6 * scale)
+
+
+def test_universal_file_that_cannot_be_read(tmp_path):
+    path = tmp_path / "run.uff"
+    write_uff(path, kind=4)
+    with pytest.raises(ValueError, match="run.uff: the universal file has 2 functions, none of"):
+        read_log(path)
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(ValueError, match="^[^\n]*run.uff: the file is damaged|no functions"):
+        read_log(path)
+
+
+def test_workbook_that_is_damaged(tmp_path):
+    pytest.importorskip("openpyxl")
+    path = tmp_path / "run.xlsx"
+    path.write_bytes(b"PK\x03\x04 and nothing else")
+    with pytest.raises(ValueError, match="run.xlsx: the file is damaged or cut off"):
+        read_log(path)
+
+
+def node(times, seed, clock_offset=0.0, clock_rate=1.0, sign=1.0):
+    """Log of a node whose clock has an offset and a rate, of one broadband response and noise."""
+    random = np.random.default_rng(3)
+    fine = np.arange(0, 60, 1e-3)
+    response = sum(
+        lfilter([1.0], [1, -2 * r.real, abs(r) ** 2], random.normal(size=fine.size)) * size
+        for r, size in (
+            (np.exp(1e-3 * 2 * np.pi * f * (-0.01 + 1j)), s) for f, s in ((3.0, 1.0), (11.0, 9.0))
+        )
+    )
+    values = sign * np.interp(times, fine, response / response.std())
+    values = values + 0.1 * np.random.default_rng(seed).normal(size=times.size)
+    return Log(
+        (times - clock_offset) * clock_rate, values[:, None], ("a",), ("acceleration",), ("g",),
+        f"node{seed}.csv",
+    )  # fmt: skip
+
+
+def test_clocks_of_several_nodes_are_aligned():
+    first = node(np.arange(0, 50, 0.01), 1)
+    second = node(np.arange(2.003, 55, 0.01), 2, clock_offset=7.5, clock_rate=1 + 2e-4, sign=-1)
+    log = align_logs([first, second])
+    assert log.names == ("1.a", "2.a")
+    assert np.corrcoef(log.values.T)[0, 1] < -0.95
+    assert "clock aligned by correlation" in log.notes[-1]
+    offset = float(log.notes[-1].split("): ")[1].split(" s")[0])
+    rate = float(log.notes[-1].split("rate ")[1].split(" ppm")[0])
+    assert offset == pytest.approx(7.5, abs=0.02) and rate == pytest.approx(-200, abs=40)
+
+
+def test_logs_without_a_common_signal_are_not_aligned():
+    random = np.random.default_rng(0)
+    logs = [
+        Log(np.arange(4000) / 100, random.normal(size=(4000, 1)), ("a",), ("acceleration",), ("g",))
+        for _ in range(2)
+    ]
+    with pytest.raises(ValueError, match="no signal in common with the first log"):
+        align_logs(logs)
+    with pytest.raises(ValueError, match="needs two logs or more, not 1"):
+        align_logs(logs[:1])
+
+
+def test_records_between_gaps():
+    times = np.delete(np.arange(1000) / 100, slice(300, 400))
+    values = np.sin(5 * times)[:, None]
+    log = Log(times, values, ("a",), ("acceleration",), ("g",))
+    rate, records, notes = even_records(log)
+    assert rate == pytest.approx(100)
+    assert [len(record.values) for record in records] == [300, 600]
+    assert records[1].start == 4.0 and "1 gap: 2 records are used" in notes[0]
+    wandering = times[:300] + 0.005 * np.sin(times[:300])
+    log = Log(wandering, np.sin(5 * wandering)[:, None], ("a",), ("acceleration",), ("g",))
+    rate, (record,), notes = even_records(log)
+    grid = record.start + np.arange(len(record.values)) / rate
+    np.testing.assert_allclose(record.values[:, 0], np.sin(5 * grid), atol=1e-6)
+    assert "interpolated" in notes[0]
+    with pytest.raises(ValueError, match="no record has 64 samples"):
+        even_records(Log(times[:40], values[:40], ("a",), ("acceleration",), ("g",)))
+
+
+def test_gravity_and_offsets_are_reported():
+    times = np.arange(500) / 100
+    wave = 0.1 * np.sin(30 * times)
+    values = np.column_stack([wave + 9.81, wave, wave - 51 * 9.81])
+    log = Log(times, values, ("up", "level", "odd"), ("acceleration",) * 3, ("g",) * 3)
+    faults = {(fault.kind, fault.channel) for fault in find_faults(log)}
+    assert faults == {("gravity", "up"), ("offset", "odd")}

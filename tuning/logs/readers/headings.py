@@ -1,4 +1,9 @@
-"""Headings above the rows of a table: names and units of columns, other lines that are skipped."""
+"""Headings above the rows of a table: names and units of columns, other lines that are skipped.
+
+Columns of dates and times of day, as loggers write them, in seconds from the first.
+
+2024-05-14T09:30:00.010+02:00    14.05.2024 09:30:00,010    5/14/2024 9:30:00 AM    09:30:00.010
+"""
 
 import re
 from collections.abc import Sequence

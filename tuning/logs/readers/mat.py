@@ -1,4 +1,11 @@
-"""MATLAB files up to version 7; since 7.3 they are HDF5."""
+"""MATLAB files up to version 7; since 7.3 they are HDF5.
+
+Consistency of the elements of a MATLAB file, checked before scipy reads it.
+
+scipy trusts the types, sizes and counts in a file; a wrong one ends the process or takes minutes.
+The format is that of "MAT-File Format" (MathWorks), section 1: a tree of data elements, each a tag
+(type and size) and its data.
+"""
 
 import math
 import struct

@@ -1,4 +1,18 @@
-"""Frequency responses from measured forces: estimates H1, H2 and Hv with their coherence."""
+"""Frequency responses from measured forces: estimates H1, H2 and Hv with their coherence.
+
+p-LSCF where forces were measured: spectra of responses over those of forces, without windows.
+
+Transforms of whole records obey
+
+    a(z) Y_o(z) = sum_i b_oi(z) U_i(z) + t_o(z),   z = exp(i w T),
+
+with polynomials of one degree: a is the common denominator, b / a are the frequency responses, and
+t is what the states at the start and the end of a record leave (Pintelon and Schoukens 2012,
+section 6.3), so that there is no leakage however lightly the structure is damped. The polynomials
+are found by linear least squares over all lines (Guillaume et al. 2003), first unweighted, then
+weighted by 1 / |a|, which makes the error that of the outputs (Sanathanan and Koerner 1963). With a
+lowest coefficient of one, poles that stand for noise are unstable, and fall away.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

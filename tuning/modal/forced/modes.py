@@ -1,8 +1,10 @@
 """Modes from responses to measured forces, of a hammer or a shaker.
 
-Poles of p-LSCF (`common_denominator`) that are stable are refined by the likelihood of a modal
+Poles of p-LSCF (`measured_responses`) that are stable are refined by the likelihood of a modal
 model, to which poles are added where errors are more than noise. A wide band is divided into bands
 of three octaves.
+
+Modal model of responses to measured forces: modes with their uncertainties.
 """
 
 from collections.abc import Callable

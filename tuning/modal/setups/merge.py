@@ -6,6 +6,12 @@ Modes of the setups are paired, their frequencies and damping ratios averaged wi
 variances as weights, and their shapes scaled to each other at the references (PoSER: Reynders,
 Magalhaes, De Roeck and Cunha 2009; for all setups at once in `shape`). Where setups disagree by
 more than their errors, these are widened by the ratio of both (Birge 1932).
+
+Which channels of several setups are one place of the structure, and which are others.
+
+By these channels logs are of one setup or of several.
+
+Modes of several setups that are one mode of the structure.
 """
 
 from collections.abc import Sequence
