@@ -24,6 +24,7 @@ Range = tuple[Any, Any]  # lowest and highest value, arrays of the shape of the 
 MARGIN = 2.0  # a number without a range is within this factor of that of the case
 MOST_ENDS = 8  # of ranges that are tried one by one; of more, all lower and all upper ends
 STEPS_OF_MANY = 2  # times as many steps where ends are tried together
+UNTRIED = 2.0  # errors within ranges over those at the numbers that are tried
 SPEED_MARGIN = 4.0  # a traced speed, over the slowest that crosses within the run
 
 
@@ -36,9 +37,9 @@ def varied_plan(
 ) -> IntegrationPlan:
     """Plan for all cases whose numbers at some addresses are within ranges.
 
-    The error is the largest of those at the middle and the ends of the ranges, for which `plan_of`
-    gives plans. Raises ValueError as `integration_plan` does, and if positions along the beam
-    change their order within the ranges.
+    The error is twice the largest of those at the middle and the ends of the ranges, for which
+    `plan_of` gives plans: it is larger at other numbers. Raises ValueError as `integration_plan`
+    does, and if positions along the beam change their order within the ranges.
     """
     ends = [(address, end) for address, both in ranges.items() for end in both]
     tried = [{address: end} for address, end in ends]
@@ -46,10 +47,17 @@ def varied_plan(
         tried = [{address: both[i] for address, both in ranges.items()} for i in (0, 1)]
     middle = {address: (low + high) / 2 for address, (low, high) in ranges.items()}
     base = replace(case, middle)
-    plans = [plan_of(replace(base, one), times, tolerance) for one in (middle, *tried)]
+    several = any(np.any(low < high) for low, high in ranges.values())
+    margin, cases = UNTRIED if several else 1.0, (replace(base, one) for one in (middle, *tried))
+    plans = [plan_of(one, times, tolerance / margin) for one in cases]
     plan = common_plan(plans, "cases at the ends of the ranges")
-    factor = STEPS_OF_MANY if many else 1
-    return dataclasses.replace(plan, substeps=factor * plan.substeps, origin=None)
+    return dataclasses.replace(
+        plan,
+        substeps=(STEPS_OF_MANY if many else 1) * plan.substeps,
+        error=margin * plan.error,
+        sensor_errors=tuple(margin * error for error in plan.sensor_errors),
+        origin=None,
+    )
 
 
 def declared_ranges(case: Case, vary) -> dict[str, Range]:

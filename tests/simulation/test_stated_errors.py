@@ -163,6 +163,12 @@ def test_a_dozen_traced_runs(seed):
 
 
 @pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
+def test_a_traced_run_between_those_that_were_tried():
+    """Its error is twice that at the middle and the ends of its range."""
+    assert check_traced_run(133, TOLERANCES[1], True) < MAX_RATIO
+
+
+@pytest.mark.filterwarnings("ignore::jaxbeam.simulation.simulate.ContactLossWarning")
 @pytest.mark.parametrize("first", range(12, 312, 10))
 def test_three_hundred_random_cases(first):
     for seed in range(first, first + 10):
