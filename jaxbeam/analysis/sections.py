@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam, suggestion
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, refuse_traced
 from jaxbeam.case.quantities import QUANTITIES, quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.integrate import integrate_peaks
@@ -345,6 +345,7 @@ def record_amplification(record: Record) -> list[float | None]:
     not known (see `static_peak`).
     """
     case = record.case
+    refuse_traced("an amplification", "call it outside jit and grad", case)
     wheels = load_set(case).wheel_count
     if case.controller is not None or not 0 < wheels <= MAX_WHEELS:
         return [None] * len(case.sensors)

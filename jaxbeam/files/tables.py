@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxbeam.case.case import Case, address_words, unit_at
+from jaxbeam.case.fields import refuse_traced
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.files.endings import DATASETS, RESULTS, TABLES, check_ending
@@ -72,6 +73,7 @@ def save(result: Any, path: str | os.PathLike, overwrite: bool = False) -> None:
     >>> print(path.read_text().splitlines()[0])
     mode,frequency (Hz),damping ratio
     """
+    refuse_traced("a file", "call it outside jit and grad", result)
     path = Path(path)
     has_dataset = hasattr(result, "data_vars") or hasattr(result, "to_xarray")
     check_ending(path, "a result", RESULTS if has_dataset else TABLES)

@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.display import with_prefix
-from jaxbeam.case.fields import is_concrete
+from jaxbeam.case.fields import is_concrete, refuse_traced
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.files.endings import check_ending
@@ -235,6 +235,7 @@ class RecordViews(TableViews, Module):
 
     def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units; `record_from_xarray` restores the record exactly."""
+        refuse_traced("a dataset", "call it outside jit and grad", self)
         return labelled_dataset(*self._dataset_parts())
 
     def plot(self, quantity: str | None = None, **options: Any) -> "Figure | SubFigure":

@@ -1,0 +1,46 @@
+"""What is written, or handed to other packages, refuses traced numbers in one sentence."""
+
+import jax
+import numpy as np
+import pytest
+
+import jaxbeam as jb
+from jaxbeam.analysis.sections import record_amplification
+
+CASE = jb.Case(
+    jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.02, modes=2),
+    sensors=[jb.Sensor(0.3)],
+    actuators=[jb.PointForce(0.3)],
+    loads=[jb.MovingMass(mass=0.3, speed=2.0)],
+    run=jb.Run(0.1, 100.0),
+)
+MASS, RIGIDITY = "loads.0.mass", "beam.flexural_rigidity"
+REFUSED = {
+    "amplification of a record": lambda case, _: record_amplification(jb.simulate(case)),
+    "python-control, plant and loop": lambda case, path: jb.to_control(case),
+    "python-control": lambda case, path: jb.state_space(case).unloaded.to_control(),
+    "MATLAB": lambda case, path: jb.state_space(case).unloaded.to_mat(path / "plant.mat"),
+    "file": lambda case, path: jb.save(jb.simulate(case), path / "run.csv"),
+    "dataset": lambda case, path: jb.simulate(case).to_xarray(),
+}
+OF_PLANTS = "python-control, plant and loop", "python-control", "MATLAB"
+TRANSFORMED = {
+    "grad": lambda function: jax.jvp(function, (1.0,), (1.0,)),
+    "jit": lambda function: jax.jit(function)(1.0),
+    "vmap": lambda function: jax.vmap(function)(np.array([0.8, 1.0])),
+}
+
+
+@pytest.mark.parametrize("transformed", TRANSFORMED)
+@pytest.mark.parametrize("name", REFUSED)
+def test_traced_numbers_are_refused(name, transformed, tmp_path):
+    address = RIGIDITY if name in OF_PLANTS else MASS
+
+    def function(share):
+        value = share * float(jb.addresses(CASE)[address])
+        REFUSED[name](jb.replace(CASE, {address: value}), tmp_path)
+        return share
+
+    with pytest.raises(ValueError, match="can be neither differentiated nor compiled: call it"):
+        TRANSFORMED[transformed](function)
+    assert not list(tmp_path.iterdir())
