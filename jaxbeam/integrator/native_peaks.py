@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
+from jaxbeam.case.profiles.spectra import ProfilesOfRuns
 from jaxbeam.integrator.contact_forces import (
     END_FRACTIONS,
     FORCE_FRACTIONS,
@@ -164,7 +165,7 @@ class NativeInputs(NamedTuple):
     output_bounds: Float[Array, "task output block"]
     influence_breaks: Float[Array, "task break"] | None
     influence_series: Float[Array, "task piece term output"] | None
-    surface: Float[Array, "task step motion_node"] | None = None
+    surface: Float[Array, "task step motion_node run"] | None = None
     load_forces: Float[Array, "task step wheel_node run"] | None = None
     initial_vehicles: Float[Array, "task state run"] | None = None
     lengths_of_panels: Int[Array, "task panel"] | None = None
@@ -280,6 +281,15 @@ def batch_inputs(
     }
 
 
+def shared_vehicles(inputs: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Matrices of vehicles of some inputs, with one run where all runs of each batch share them."""
+    names = ("vehicle_state_matrix", "vehicle_input_matrix", "vehicle_output_matrix")
+    matrices = [inputs[name] for name in names]
+    if matrices[0] is None or any(np.any(part != part[..., :1]) for part in matrices):
+        return {}
+    return {name: part[..., :1] for name, part in zip(names, matrices, strict=True)}
+
+
 def inputs_over_time(
     batches: Sequence[LoadSet],
     starts: Float[np.ndarray, "batch boundary"],
@@ -305,21 +315,19 @@ def inputs_over_time(
         inputs["load_forces"] = forces.reshape(len(batches), steps, -1, runs)
     if first.profile is None or all(loads.massless for loads in batches):
         return inputs
-    surface = np.zeros((len(batches), steps, first.wheel_count, 3, PATH_NODES))
+    runs = len(first.profile.phases) if isinstance(first.profile, ProfilesOfRuns) else 1
+    surface = np.zeros((len(batches), steps, first.wheel_count, 3, PATH_NODES, runs))
     paths = [loads.kinematics(times) for loads, times in zip(batches, all_times, strict=True)]
     groups = [range(len(batches))] if one_profile else [[row] for row in range(len(batches))]
     for group in groups:
         flat = [np.concatenate([paths[row][i].ravel() for row in group]) for i in range(3)]
         heights: Any = batches[group[0]].surface_motion(*flat)
-        motion = np.stack(heights)
-        for row, part in zip(
-            group,
-            np.split(motion, np.cumsum([paths[row][0].size for row in group])[:-1], axis=1),
-            strict=True,
-        ):
-            by_wheel = part.reshape(3, *paths[row][0].shape)
-            surface[row, : len(all_times[row])] = np.moveaxis(by_wheel, 2, 0).swapaxes(1, 2)
-    inputs["surface"] = surface.reshape(len(batches), steps, -1)
+        ends = np.cumsum([paths[row][0].size for row in group])[:-1]
+        for i, motion in enumerate(heights):
+            for row, part in zip(group, np.split(motion, ends), strict=True):
+                by_wheel = part.reshape(*paths[row][0].shape, runs)
+                surface[row, : len(all_times[row]), :, i] = by_wheel.swapaxes(0, 1)
+    inputs["surface"] = surface.reshape(len(batches), steps, -1, runs)
     if first.wheels.vehicles:
         at_rest: list[Any] = [initial_vehicle_states(loads) for loads in batches]
         inputs["initial_vehicles"] = np.stack(at_rest)

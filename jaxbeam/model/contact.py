@@ -409,7 +409,7 @@ def initial_vehicle_states(loads: LoadSet) -> Float[Array, "state batch"] | None
     surface = xp.zeros_like(wheels.stiffness)
     motion = loads.surface_motion(*loads.kinematics(xp.zeros(())))
     if motion is not None:
-        surface = surface + wheels.stiffness * motion[0][:, None]
+        surface = surface + wheels.stiffness * motion[0].reshape(len(surface), -1)
     states = [group.initial_state(surface[group.wheels]) for group in wheels.vehicles]
     return xp.concatenate([part.reshape(-1, part.shape[-1]) for part in states])
 

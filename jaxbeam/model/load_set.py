@@ -203,11 +203,20 @@ class LoadSet(Module):
 
     def surface_motion(
         self, position: Float[Array, "*wheel"], speed, acceleration
-    ) -> tuple[Float[Array, "*wheel"], ...] | None:
-        """Height r (m) of the profile under wheels, and its rates: v r', v^2 r'' + a r'."""
+    ) -> tuple[Float[Array, "..."], ...] | None:
+        """Height r (m) of the profile under wheels, and its rates: v r', v^2 r'' + a r'.
+
+        Profiles of the runs of a batch give a last axis of runs.
+        """
         if self.profile is None:
             return None
         height, slope, curvature = self.profile.heights(position)
+        if xp.ndim(height) > xp.ndim(position):  # many known numbers, which are changed in place
+            curvature *= speed[..., None] ** 2
+            if np.any(acceleration):
+                curvature += acceleration[..., None] * slope
+            slope *= speed[..., None]
+            return height, slope, curvature
         return height, speed * slope, speed**2 * curvature + acceleration * slope
 
     def cubics(self) -> tuple[Float[Array, "wheel piece"], Float[Array, "wheel piece 4"]]:

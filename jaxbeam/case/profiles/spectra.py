@@ -9,7 +9,7 @@ nothing else is said.
 import abc
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -25,6 +25,7 @@ from jaxbeam.case.profiles.shapes import (
     smooth_step,
 )
 from jaxbeam.runtime.arrays import Array, Number, checkpoint, is_known, scan, xp, zeros
+from jaxbeam.runtime.module import Module
 
 DIRECT_SIZE = 100_000  # cosines that are computed at once; more than these wave by wave
 BLOCK = 16  # waves at once then: memory does not grow with their number
@@ -32,7 +33,6 @@ BLOCK = 16  # waves at once then: memory does not grow with their number
 # many Chebyshev points each: their series of a cosine ends at J_24(4) = 2e-17.
 PANEL_PHASE, PANEL_POINTS = 8.0, 24
 LEAST_INTERPOLATED, LEAST_POSITIONS = 50_000, 4  # cosines in all, positions a panel
-POSITIONS_AT_ONCE = 4096
 
 
 class AbstractSpectralProfile(AbstractProfile):
@@ -56,11 +56,16 @@ class AbstractSpectralProfile(AbstractProfile):
 
     def heights(self, x):
         x = xp.asarray(x, float)
-        wavenumbers, amplitudes, phases = self.lines()
-        if self.contact_length is not None:
-            amplitudes = amplitudes * xp.sinc(wavenumbers * self.contact_length)
-        heights = sum_of_cosines(x, wavenumbers, amplitudes, phases)
+        wavenumbers, _, phases = self.lines()
+        heights = sum_of_cosines(x, wavenumbers, self.averaged_amplitudes(), phases)
         return heights if self.switch_on is None else _switched(x, self.switch_on, heights)
+
+    def averaged_amplitudes(self) -> Float[Array, " line"]:
+        """Amplitudes (m) of what a wheel feels, the mean over its contact patch."""
+        wavenumbers, amplitudes, _ = self.lines()
+        if self.contact_length is None:
+            return amplitudes
+        return amplitudes * xp.sinc(wavenumbers * self.contact_length)
 
     def validate(self, address):
         if self.switch_on is None or not is_concrete(self.switch_on):
@@ -118,32 +123,56 @@ def _interpolated_sum(x: np.ndarray, waves, half: float) -> Heights:
     """The same at many known positions, interpolated on panels of a `half` length (m).
 
     The waves at the Chebyshev points of all panels are products of those at their centres and of
-    those at the points of one: few cosines, and products of matrices.
+    those at the points of one: few cosines, and products of matrices. Amplitudes and phases of
+    several runs (run, line) give a last axis of runs.
     """
     wavenumbers, amplitudes, phases = waves
     k, first = 2 * np.pi * wavenumbers, np.min(x)
-    panel = ((x - first) / (2 * half)).astype(int).ravel()
-    centres = first + half * (2 * np.arange(panel.max() + 1) + 1)
-    at_centres = np.exp(1j * (centres[:, None] * k + phases))
-    at_points = np.exp(1j * half * np.outer(k, chebyshev.chebpts1(PANEL_POINTS)))
-    factors = (amplitudes, 1j * k * amplitudes, -(k**2) * amplitudes)
-    values = np.stack([((at_centres * one) @ at_points).real for one in factors], axis=2)
-    points = chebyshev.chebvander(chebyshev.chebpts1(PANEL_POINTS), PANEL_POINTS - 1)
-    series = np.where(np.arange(PANEL_POINTS) == 0, 1.0, 2.0)[:, None] / PANEL_POINTS * points.T
-    series = series @ values
-    local = (x.ravel() - centres[panel]) / half
-    found = np.empty((x.size, 3))
-    for start in range(0, x.size, POSITIONS_AT_ONCE):
-        here = slice(start, start + POSITIONS_AT_ONCE)
-        table = chebyshev.chebvander(local[here], PANEL_POINTS - 1)
-        found[here] = (table[:, None] @ series[panel[here]])[:, 0]
-    height, slope, curvature = found.T.reshape(3, *x.shape)
+    flat, runs = np.ravel(x), phases.shape[:-1]
+    panel = ((flat - first) / (2 * half)).astype(np.int32)
+    used, counts = np.unique(panel, return_counts=True)
+    centres = first + half * (2 * used + 1)
+    at_centres = np.exp(1j * np.outer(centres, k))
+    points = chebyshev.chebpts1(PANEL_POINTS)
+    at_points = np.exp(1j * half * np.outer(k, points))
+    # A real part is a product of two real matrices: of cosines and sines, side by side.
+    parts = np.concatenate([at_centres.real, at_centres.imag], axis=1)
+    to_series = np.where(np.arange(PANEL_POINTS) == 0, 1.0, 2.0)[:, None] / PANEL_POINTS
+    to_series = (to_series * chebyshev.chebvander(points, PANEL_POINTS - 1).T).T
+    series = np.empty((used.size, PANEL_POINTS, 3, math.prod(runs)))
+    complex_amplitudes = (amplitudes * np.exp(1j * phases)).reshape(-1, k.size)
+    for run, of_run in enumerate(complex_amplitudes):
+        for i, factor in enumerate((1.0, 1j * k, -(k**2))):
+            of_waves = (of_run * factor)[:, None] * at_points
+            rows = np.concatenate([of_waves.real, -of_waves.imag]) @ to_series
+            series[:, :, i, run] = parts @ rows
+    series = series.reshape(used.size, PANEL_POINTS, -1)
+    order = np.argsort(panel, kind="stable")  # positions of each panel, one panel after the other
+    found = np.empty((x.size, series.shape[2]))
+    starts = np.cumsum(counts) - counts
+    for centre, one, start, size in zip(centres, series, starts, counts, strict=True):
+        here = order[start : start + size]
+        table = chebyshev.chebvander((flat[here] - centre) / half, PANEL_POINTS - 1)
+        found[here] = table @ one
+    parts = found.reshape(*x.shape, 3, *runs)
+    height, slope, curvature = np.moveaxis(parts, x.ndim, 0)
     return height, slope, curvature
 
 
 def _switched(x, switch_on, heights) -> Heights:
-    """Product of a profile and the quintic from 0 to 1 between two positions."""
+    """Product of a profile and the quintic from 0 to 1 between two positions.
+
+    Known heights may have a last axis of runs.
+    """
     length = switch_on[1] - switch_on[0]
+    if is_known(x) and is_known(switch_on) and all(map(is_known, heights)):
+        before = (x - switch_on[0]) / length < 1.0  # elsewhere the factor is 1
+        if x.ndim and not before.all():
+            own = x[before].reshape(-1, *(1,) * (heights[0].ndim - x.ndim))
+            parts = _switched(own, switch_on, tuple(part[before] for part in heights))
+            for part, changed in zip(heights, parts, strict=True):
+                part[before] = changed
+            return heights
     _, factor, slope, curvature = smooth_step(xp.clip((x - switch_on[0]) / length, 0.0, 1.0))
     slope, curvature = slope / length, curvature / length**2
     r, r_x, r_xx = heights
@@ -257,6 +286,37 @@ class SpectrumProfile(AbstractSpectralProfile):
         if size == 0:
             return f"{address}.wavenumbers needs at least one entry; it has none"
         return super().validate(address)
+
+
+class ProfilesOfRuns(Module):
+    """Profiles of the runs of a batch, whose waves differ in amplitudes and phases only.
+
+    Of known numbers. Its heights, slopes and curvatures have a last axis of runs.
+    """
+
+    first: SpectrumProfile
+    amplitudes: Float[np.ndarray, "run line"]
+    phases: Float[np.ndarray, "run line"]
+
+    def heights(self, x) -> tuple[Float[np.ndarray, "*x run"], ...]:
+        """Height (m), slope (1) and curvature (1/m) of each profile at positions x (m)."""
+        x, wavenumbers = np.asarray(x, float), self.first.wavenumbers
+        half = 0.5 * PANEL_PHASE / (2 * np.pi * np.max(np.abs(wavenumbers)))
+        heights = _interpolated_sum(x, (wavenumbers, self.amplitudes, self.phases), half)
+        switch_on = self.first.switch_on
+        return heights if switch_on is None else _switched(x, switch_on, heights)
+
+
+def profiles_of_runs(profiles: Sequence[AbstractProfile | None]) -> ProfilesOfRuns | None:
+    """Profiles of runs together; None unless they are waves of the same wavenumbers."""
+    first, same = profiles[0], ("wavenumbers", "switch_on", "contact_length")
+    given = [one for one in profiles if isinstance(one, SpectrumProfile)]
+    if len(given) < len(profiles) or not isinstance(first, SpectrumProfile):
+        return None
+    if not all(np.array_equal(getattr(a, n), getattr(first, n)) for a in given for n in same):
+        return None
+    amplitudes = np.stack([one.averaged_amplitudes() for one in given])
+    return ProfilesOfRuns(first, amplitudes, np.stack([one.phases for one in given]))
 
 
 class AbstractRandomProfile(AbstractSpectralProfile):

@@ -85,9 +85,8 @@ void update_contact_minimum(const Workspace *w, const Step *step, const Group *g
 /* Force on a wheel in addition to its weight at a path node. */
 static inline Register force_at(const Workspace *w, const Step *step, const Group *g, int64_t wheel,
                                 int node) {
-    const double *force = w->inputs[LOAD_FORCES] +
-                          ((step->number * w->loads + wheel) * PATH_NODES + node) * w->forced_runs;
-    return w->forced_runs == 1 ? broadcast(*force) : load(force + g->first, g->count);
+    const int64_t at = (step->number * w->loads + wheel) * PATH_NODES + node;
+    return of_group(w->inputs[LOAD_FORCES] + at * w->forced_runs, w->forced_runs, g);
 }
 
 /* Contact forces at the Gauss nodes of a step, for a number of loads that may be known when
@@ -102,13 +101,13 @@ static inline ALWAYS_INLINE void contact_forces(const Workspace *w, const Step *
         const ptrdiff_t at = step->load_numbers[s] * w->batch_size + g->first;
         Register mass = load(w->inputs[INERTIA] + at, g->count),
                  weight = load(w->inputs[WEIGHT] + at, g->count);
-        const double *profile =
-            profile_motion(w, step, step->load_numbers[s], HEIGHT_SECOND_RATE);
+        const int64_t wheel = step->load_numbers[s];
         for (int k = 0; k < NODES; k++) {
             const int i = s * NODES + k;
-            if (profile) forces[i] += profile[k];
+            if (w->has_surface)
+                forces[i] += profile_motion(w, step, g, wheel, HEIGHT_SECOND_RATE, k);
             forces[i] = -(weight + mass * forces[i]);
-            if (w->has_forces) forces[i] -= force_at(w, step, g, step->load_numbers[s], k);
+            if (w->has_forces) forces[i] -= force_at(w, step, g, wheel, k);
             for (int j = 0; j < rows; j++)
                 matrix[i * rows + j] = mass * step->contact_compliance[ACCELERATION][i * rows + j];
             matrix[i * rows + i] += 1;
@@ -145,12 +144,12 @@ void end_forces(const Workspace *w, const Step *step, const Group *g) {
             for (int s = 0; s < loads; s++) {
                 const ptrdiff_t at = step->load_numbers[s] * w->batch_size + g->first;
                 const Register mass = load(w->inputs[INERTIA] + at, g->count);
-                const double *profile =
-                    profile_motion(w, step, step->load_numbers[s], HEIGHT_SECOND_RATE);
-                if (profile) right[s] += profile[NODES + end];
+                const int64_t wheel = step->load_numbers[s];
+                if (w->has_surface)
+                    right[s] += profile_motion(w, step, g, wheel, HEIGHT_SECOND_RATE, NODES + end);
                 right[s] = -(load(w->inputs[WEIGHT] + at, g->count) + mass * right[s]);
                 if (w->has_forces)
-                    right[s] -= force_at(w, step, g, step->load_numbers[s], NODES + end);
+                    right[s] -= force_at(w, step, g, wheel, NODES + end);
                 for (int q = 0; q < loads; q++)
                     matrix[s * loads + q] =
                         mass * step->end_compliance[(end * loads + s) * loads + q];

@@ -15,8 +15,7 @@ static void reset(Workspace *w) {
     const size_t vehicle_bytes = 8 * (size_t)w->vehicle_states * batch_size;
     if (w->has_initial) memcpy(w->vehicle_state, w->inputs[INITIAL_VEHICLES], vehicle_bytes);
     else memset(w->vehicle_state, 0, vehicle_bytes);
-    for (size_t i = 0; i < batch_size; i += REGISTER_WIDTH)
-        w->vehicle_kind[i / REGISTER_WIDTH] = -1;
+    for (size_t i = 0; i < vehicle_propagator_count(w); i++) w->vehicle_kind[i] = -1;
     memset(w->peak_samples, 0, 8 * PEAK_POINTS * sampled);
     memset(w->peak, 0, 8 * sampled);
     memset(w->peak_step_start, 0, 8 * sampled);
@@ -164,6 +163,8 @@ int integrate_peaks(int64_t max_loads, const Array *arguments, double *const *ou
                            .has_forces = sizes[LOAD_FORCES][1] > 0,
                            .has_initial = sizes[INITIAL_VEHICLES][1] > 0,
                            .forced_runs = sizes[LOAD_FORCES][3],
+                           .surface_runs = sizes[SURFACE][3],
+                           .vehicle_runs = sizes[VEHICLE_STATE_MATRIX][2],
                            .loop = loop,
                            .memory_size = (int)sizes[MEMORY][1],
                            .outputs = outputs};

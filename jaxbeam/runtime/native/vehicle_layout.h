@@ -18,7 +18,13 @@ static Vehicle vehicle_at(Register *start, int states, int wheels) {
     return vehicle;
 }
 
-/* Propagators of the vehicles of all loads for a group of runs. */
-static Register *vehicles_of(const Workspace *w, const Group *g) {
-    return w->vehicle_propagators + g->first / REGISTER_WIDTH * w->vehicle_registers;
+/* Number of the propagators of a step: a group of runs has its own, or all share those of its
+ * length. */
+static ptrdiff_t propagators_of(const Workspace *w, const Step *step, const Group *g) {
+    return w->vehicle_runs == 1 ? step->kind : g->first / REGISTER_WIDTH;
+}
+
+/* Propagators of the vehicles of all loads for a group of runs in a step. */
+static Register *vehicles_of(const Workspace *w, const Step *step, const Group *g) {
+    return w->vehicle_propagators + propagators_of(w, step, g) * w->vehicle_registers;
 }

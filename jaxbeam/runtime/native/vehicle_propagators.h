@@ -1,14 +1,22 @@
-/* Propagators of vehicles, of each run its own: integrator/vehicles.py. */
+/* Propagators of vehicles, which the runs of a batch share or have of their own:
+ * integrator/vehicles.py. */
 
 #pragma once
 
 #include "propagators.h"
 #include "vehicle_layout.h"
 
-/* Matrices of the vehicles of a load for some runs, with the runs as the last axis. */
+/* Matrices of the vehicles of a load for some runs, with the runs as the last axis, or
+ * one for all. */
 typedef struct {
     const double *state, *input, *output;
 } VehicleMatrices;
+
+/* An entry of a matrix. */
+static inline Register entry_of(const Workspace *w, const Group *g, const double *matrix,
+                                int64_t entry) {
+    return of_group(matrix + entry * w->vehicle_runs, w->vehicle_runs, g);
+}
 
 /* Add response to q at the nodes up to a fraction of a step, and to the state at its start. */
 static void store_vehicle(Workspace *w, const VehicleMatrices *matrices, const Group *g,
@@ -38,7 +46,7 @@ static void store_vehicle(Workspace *w, const VehicleMatrices *matrices, const G
             for (int v = 0; v < wheels; v++) {
                 Register sum = broadcast(u == v && f == fraction);
                 for (int i = 0; i < states; i++)
-                    sum -= load(matrices->output + (u * states + i) * w->batch_size, g->count) *
+                    sum -= entry_of(w, g, matrices->output, u * states + i) *
                            response[i * wheels + v];
                 to->press[((u * wheels + v) * NODES + fraction) * NODES + f] = sum;
             }
@@ -52,7 +60,7 @@ static void store_vehicle(Workspace *w, const VehicleMatrices *matrices, const G
             for (int u = 0; u < wheels; u++) {
                 Register sum = {0};
                 for (int i = 0; i < states; i++)
-                    sum += load(matrices->output + (u * states + i) * w->batch_size, g->count) *
+                    sum += entry_of(w, g, matrices->output, u * states + i) *
                            w->exponential[i * states + j] * (scale[j] / scale[i]);
                 to->pull[(u * NODES + fraction) * states + j] = sum;
             }
@@ -66,23 +74,22 @@ static void balance_vehicle(const Workspace *w, const double *matrix, const Grou
     for (int i = dofs; i < states; i++) {
         Register sum = broadcast(1);
         for (int j = 0; j < dofs; j++)
-            sum += absolute(load(matrix + (i * states + j) * w->batch_size, g->count));
+            sum += absolute(entry_of(w, g, matrix, i * states + j));
         largest = maximum(sum, largest);
     }
     for (int i = 0; i < states; i++)
         for (int l = 0; l < REGISTER_WIDTH; l++)
-            w->vehicle_scale[i][l] = i < dofs && l < g->count ? sqrt(largest[l]) : 1;
+            w->vehicle_scale[i][l] = i < dofs ? sqrt(largest[l]) : 1;
 }
 
 /* Propagators of the vehicles of a group of runs for the steps of a length. */
 static void vehicle_propagators(Workspace *w, const Step *step, const Group *g) {
-    int64_t *kind = w->vehicle_kind + g->first / REGISTER_WIDTH;
+    int64_t *kind = w->vehicle_kind + propagators_of(w, step, g);
     if (*kind == step->kind) return;
     *kind = step->kind;
-    VehicleMatrices m = {w->inputs[VEHICLE_STATE_MATRIX] + g->first,
-                         w->inputs[VEHICLE_INPUT_MATRIX] + g->first,
-                         w->inputs[VEHICLE_OUTPUT_MATRIX] + g->first};
-    Register *start = vehicles_of(w, g);
+    VehicleMatrices m = {w->inputs[VEHICLE_STATE_MATRIX], w->inputs[VEHICLE_INPUT_MATRIX],
+                         w->inputs[VEHICLE_OUTPUT_MATRIX]};
+    Register *start = vehicles_of(w, step, g);
     for (int group = 0; group < w->groups_of_vehicles; group++) {
         const int64_t *numbers = w->vehicles + group * VEHICLE_NUMBERS;
         const int states = (int)numbers[STATES], wheels = (int)numbers[WHEELS];
@@ -92,20 +99,20 @@ static void vehicle_propagators(Workspace *w, const Step *step, const Group *g) 
         for (int i = 0; i < states; i++)
             for (int v = 0; v < wheels; v++)
                 w->input_matrix[i * wheels + v] =
-                    load(m.input + (i * wheels + v) * w->batch_size, g->count) * scale[i];
+                    entry_of(w, g, m.input, i * wheels + v) * scale[i];
         for (int fraction = 0; fraction < STEP_FRACTIONS; fraction++) {
             const double part = fraction < NODES ? w->inputs[GAUSS_NODES][fraction] : 1;
             for (int i = 0; i < states; i++)
                 for (int j = 0; j < states; j++)
                     w->block_matrix[i * states + j] =
-                        load(m.state + (i * states + j) * w->batch_size, g->count) *
+                        entry_of(w, g, m.state, i * states + j) *
                         (scale[i] / scale[j]) * (step->length * part / (1 << DOUBLINGS));
             exponential_and_phi(w, states, wheels);
             store_vehicle(w, &m, g, &to, states, wheels, fraction, step->length);
         }
-        m.state += states * states * w->batch_size;
-        m.input += states * wheels * w->batch_size;
-        m.output += states * wheels * w->batch_size;
+        m.state += states * states * w->vehicle_runs;
+        m.input += states * wheels * w->vehicle_runs;
+        m.output += states * wheels * w->vehicle_runs;
         start += vehicle_registers(states, wheels);
     }
 }

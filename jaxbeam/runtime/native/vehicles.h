@@ -18,10 +18,10 @@ static void press_by_profile(const Workspace *w, const Step *step, const Group *
         const ptrdiff_t at = wheel * w->batch_size + g->first;
         const Register stiffness = load(w->inputs[STIFFNESS] + at, g->count),
                        damping = load(w->inputs[DAMPING] + at, g->count);
-        const double *height = profile_motion(w, step, wheel, HEIGHT),
-                     *rate = profile_motion(w, step, wheel, HEIGHT_RATE);
         for (int k = 0; k < NODES; k++)
-            g->profile[wheel * NODES + k] = stiffness * height[k] + damping * rate[k];
+            g->profile[wheel * NODES + k] =
+                stiffness * profile_motion(w, step, g, wheel, HEIGHT, k) +
+                damping * profile_motion(w, step, g, wheel, HEIGHT_RATE, k);
     }
 }
 
@@ -65,7 +65,7 @@ static inline ALWAYS_INLINE void add_vehicles(const Workspace *w, const Step *st
     }
     if (w->has_surface) press_by_profile(w, step, g);
     const Register *z = g->vehicle_state;
-    Register *start = vehicles_of(w, g), pressed[NODES];
+    Register *start = vehicles_of(w, step, g), pressed[NODES];
     for (int group = 0; group < w->groups_of_vehicles; group++) {
         const int64_t *numbers = w->vehicles + group * VEHICLE_NUMBERS;
         const int states = (int)numbers[STATES], wheels = (int)numbers[WHEELS];
@@ -102,7 +102,7 @@ static inline ALWAYS_INLINE void add_vehicles(const Workspace *w, const Step *st
 void propagate_vehicles(const Workspace *w, const Step *step, Group *g) {
     const int rows = step->rows;
     const Register *z = g->vehicle_state;
-    Register *next = g->next_vehicle_state, *surface = g->surface, *start = vehicles_of(w, g);
+    Register *next = g->next_vehicle_state, *surface = g->surface, *start = vehicles_of(w, step, g);
     memset(next, 0, (size_t)w->vehicle_states * sizeof *next);
     if (rows)
         add_matrix_product(surface, g->impedance, rows, g->state + w->states, rows, 1);

@@ -80,7 +80,8 @@ enum { FIRST_WHEEL, WHEELS, STATES, COUNT, VEHICLE_NUMBERS };
 /* Motions of the beam under a wheel; the last two are those that springs of vehicles need. */
 enum { ACCELERATION, DEFLECTION, VELOCITY, MOTIONS };
 
-/* Motions of the profile under a wheel, in the order of SURFACE: (step, wheel, motion, path node). */
+/* Motions of the profile under a wheel, in the order of SURFACE: (step, wheel, motion, path node,
+ * run). */
 enum { HEIGHT, HEIGHT_RATE, HEIGHT_SECOND_RATE, SURFACE_MOTIONS };
 
 /* A step and its matrices, stored by columns: contact response (state, row), contact compliance
@@ -126,7 +127,8 @@ typedef struct {
     const Loop *loop;
     int commands, marks, memory_size;
     int has_surface, has_forces, has_initial;
-    int64_t forced_runs; /* runs with forces over time of their own: all, or one for all */
+    /* Runs with forces over time, a surface, vehicles of their own: all, or one for all. */
+    int64_t forced_runs, surface_runs, vehicle_runs;
     ptrdiff_t batch_size;
     const double *inputs[ARGUMENT_COUNT];
     double *const *outputs;
@@ -148,7 +150,7 @@ typedef struct {
     /* Of each run: state, running peaks, smallest contact forces; whether it is finite. */
     double *state, *peak, *peak_samples, *peak_step_start, *peak_step_length, *lowest_force,
         *contact_loss_time, *finite, *vehicle_state, *memory, *amplitudes;
-    /* Of each group of runs: propagators of vehicles, and the length of steps they are for. */
+    /* Propagators of vehicles, and the length of steps that they are for. */
     Register *vehicle_propagators;
     int64_t *vehicle_kind;
     double first_vehicle_entry, last_vehicle_exit; /* s */
@@ -173,6 +175,12 @@ static size_t transition_size(const Workspace *w) { return (size_t)w->states * w
 static size_t sample_rows_size(const Workspace *w) { return (size_t)w->states * w->sample_count; }
 static size_t sample_response_size(const Workspace *w) {
     return (size_t)NODES * w->all_modes * padded_size(w->sample_count);
+}
+
+/* How many propagators of vehicles are kept: of each length, or of each group of runs. */
+static size_t vehicle_propagator_count(const Workspace *w) {
+    if (w->vehicle_runs == 1) return (size_t)w->lengths;
+    return (size_t)(w->batch_size + REGISTER_WIDTH - 1) / REGISTER_WIDTH;
 }
 
 /* Next part of the workspace, aligned to registers. */
@@ -228,11 +236,11 @@ static size_t partition_workspace(Workspace *w, uintptr_t start) {
     w->finite = allocate(start, &used, batch_size);
     w->memory = allocate(start, &used, (size_t)w->memory_size * batch_size);
     w->amplitudes = allocate(start, &used, (size_t)w->marks * batch_size);
-    const size_t register_count = (batch_size + REGISTER_WIDTH - 1) / REGISTER_WIDTH;
+    const size_t propagators = vehicle_propagator_count(w);
     w->vehicle_state = allocate(start, &used, (size_t)w->vehicle_states * batch_size);
     w->vehicle_propagators =
-        allocate(start, &used, register_count * (size_t)w->vehicle_registers * REGISTER_WIDTH);
-    w->vehicle_kind = allocate(start, &used, register_count);
+        allocate(start, &used, propagators * (size_t)w->vehicle_registers * REGISTER_WIDTH);
+    w->vehicle_kind = allocate(start, &used, propagators);
     for (int k = 0; k < INTERLEAVED_GROUPS; k++) {
         Group *g = w->groups + k;
         g->state = allocate(start, &used, (states + rows + ends) * REGISTER_WIDTH);
@@ -310,12 +318,17 @@ static int length_of_panel(const Workspace *w, int panel) {
     return w->loop ? (int)((const int64_t *)w->inputs[LENGTHS_OF_PANELS])[panel] : panel;
 }
 
-/* Motion of the profile at the path nodes under a wheel, NULL without a profile. */
-static const double *profile_motion(const Workspace *w, const Step *step, int64_t wheel,
-                                    int motion) {
-    if (!w->has_surface) return NULL;
-    return w->inputs[SURFACE] +
-           ((step->number * w->loads + wheel) * SURFACE_MOTIONS + motion) * PATH_NODES;
+/* Numbers of a group of runs, from those of all runs, or of one for all. */
+static inline Register of_group(const double *numbers, int64_t runs, const Group *g) {
+    return runs == 1 ? broadcast(*numbers) : load(numbers + g->first, g->count);
+}
+
+/* Motion of the profile under a wheel at a path node. */
+static inline Register profile_motion(const Workspace *w, const Step *step, const Group *g,
+                                      int64_t wheel, int motion, int node) {
+    const int64_t of_wheel = (step->number * w->loads + wheel) * SURFACE_MOTIONS + motion;
+    return of_group(w->inputs[SURFACE] + (of_wheel * PATH_NODES + node) * w->surface_runs,
+                    w->surface_runs, g);
 }
 
 /* Number of runs of the group that begins with the run `first`. */
