@@ -35,6 +35,10 @@ POSITION_ADDRESS = re.compile(
     r"|(supports|actuators)\.(\d+|\*)\.(position|start|end)"
 )
 
+# Number of the profile of a run among those of a sweep: changes what drives the wheels only.
+PROFILE_NUMBER = "profile"
+MOST_PROFILES = 64  # runs of a batch whose profiles differ: what they feel in each step is kept
+
 STEPS_PER_MODE = 40  # of a crossing: twice those with which a search for step sizes begins
 
 
@@ -58,7 +62,7 @@ def addresses_within_batches(case: Case, addresses: Collection[str]) -> list[str
     return [
         address
         for address in addresses
-        if address == "run.gravity"
+        if address in ("run.gravity", PROFILE_NUMBER)
         or (address.startswith("loads.") and unit_at(case, address) not in PATH_UNITS)
     ]
 
@@ -96,6 +100,14 @@ def make_batches(
         batched_values[padded_index],
         index,
     )
+
+
+def with_few_runs(batches: Batches, most: int) -> Batches:
+    """The batches with evenly spaced runs of theirs, the first and the last among them."""
+    runs = batches.run_index.shape[1]
+    chosen = np.unique(np.linspace(0, runs - 1, min(most, runs)).round().astype(int))
+    values, index = batches.batched_values[:, chosen], batches.run_index[:, chosen]
+    return dataclasses.replace(batches, batched_values=values, run_index=index)
 
 
 def values_at(case: Case, batches: Batches, address: str) -> Float[np.ndarray, " path"]:
@@ -153,7 +165,7 @@ class RunSizes(NamedTuple):
 
     A wheel passes `places` on the beam where steps end, besides those of corrected sensors. With
     histories there are `samples`, and so many `steps` in a run; so many `given_steps` where a
-    profile or forces over time are given at the nodes of each, forces of each run.
+    profile or forces over time are given at the nodes of each, forces of each run, or profiles.
     """
 
     modes: int
@@ -165,6 +177,7 @@ class RunSizes(NamedTuple):
     steps: int
     given_steps: int
     has_forces: bool
+    has_profiles: bool
 
     def batch_bytes(self, sensors: Sequence[Sensor], runs: int) -> float:
         """Memory (bytes) of a batch of so many runs with some sensors, at most.
@@ -184,7 +197,7 @@ class RunSizes(NamedTuple):
 
     def input_bytes(self, sensors: Sequence[Sensor], runs: int) -> float:
         """Memory (bytes) of the time grid and the loads of a batch, and to make them."""
-        of_node = 3 + runs * self.has_forces
+        of_node = 3 * (runs if self.has_profiles else 1) + runs * self.has_forces
         given = self.given_steps * self.wheels * native_peaks.PATH_NODES * of_node
         panels = 4 * self.panels(sensors) * (self.wheels + 8)
         return 8.0 * (panels + 20 * self.wheels * runs + 2 * given)
@@ -195,10 +208,12 @@ class RunSizes(NamedTuple):
         return 1 + self.samples + self.wheels * (2 + self.places + corrected)
 
 
-def run_sizes(case: Case, speeds: Float[np.ndarray, " speed"], histories: bool) -> RunSizes:
+def run_sizes(
+    case: Case, speeds: Float[np.ndarray, " speed"], histories: bool, profiles: bool
+) -> RunSizes:
     """Sizes of the runs of a case, of which the loads have `speeds` (m/s) up to the largest.
 
-    Those of loads that stand are NaN, and cross nothing.
+    They may have `profiles` of their own. Those of loads that stand are NaN, and cross nothing.
     """
     case = concrete_case(case)
     loads, layout, modes = load_set(case), mesh_layout(case), case.beam.modes
@@ -222,6 +237,7 @@ def run_sizes(case: Case, speeds: Float[np.ndarray, " speed"], histories: bool) 
         steps=steps,
         given_steps=given_steps,
         has_forces=bool(loads.wheels.histories),
+        has_profiles=profiles,
     )
 
 

@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.case.profiles.shapes import AbstractProfile
+from jaxbeam.case.profiles.spectra import AbstractSpectralProfile
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.integrate import max_stable_step
 from jaxbeam.integrator.static_shapes import StaticShapes, max_concurrent_loads
@@ -38,6 +40,7 @@ from jaxbeam.sweeps.integration import (
 )
 from jaxbeam.sweeps.native_integration import NativeBatches, known_model
 from jaxbeam.sweeps.step_size import (
+    RANDOM_SHARE,
     PathTimes,
     Trials,
     choose_step_sizes,
@@ -56,7 +59,10 @@ MAX_VECTORISED_RUNS = 16384
 MIN_BLOCKS = 8  # of a large sweep, to use all cores
 MAX_TRIAL_RUNS = 256  # about; runs per call while step sizes are measured
 MIN_TRIAL_BATCHES = 4  # for which step sizes are measured
-MAX_CHECKED_RUNS = 256  # of paths of their own: to check all takes three times as long
+# Batches, and runs of paths of their own, up to which the errors of all are measured: their results
+# are then known, too. Of few batches a sample is most of them.
+MAX_MEASURED_BATCHES, MAX_MEASURED_RUNS = 16, 256
+MAX_SEARCHED_RUNS = 8  # of a batch, with which the search for its step begins
 MAX_TRIAL_BATCHES = 16  # more of one run each cost more than the steps that they would save
 # Paths and runs up to which NumPy gives the first answer sooner than a compiler: each path takes
 # some hundredths of a second, programs some seconds.
@@ -69,9 +75,9 @@ class Runner:
 
     With `single` precision the integration is in float32, models and propagators are made in
     float64; `native` steps are taken in C. Memory allows blocks of `most_batches`, and inputs of C
-    for `most_inputs` batches at once. If `small`, NumPy takes the steps of a few batches, and
-    nothing is compiled. Raises ValueError if positions along the beam change their order within the
-    sweep.
+    for `most_inputs` batches at once. Only C takes `profiles` of runs. If `small`, NumPy takes the
+    steps of a few batches, and nothing is compiled. Raises ValueError if positions along the beam
+    change their order within the sweep.
     """
 
     def __init__(
@@ -85,9 +91,10 @@ class Runner:
         most_batches: int = 2**31,
         most_inputs: int = 2**31,
         small: bool = False,
+        profiles: tuple[AbstractProfile, ...] = (),
     ):
         self.case, self.batches, self.tolerance = case, batches, tolerance
-        self.histories, self.single = histories, single
+        self.histories, self.single, self.profiles = histories, single, profiles
         self.schedule = None
         if case.controller is not None:
             self.schedule = loop_schedule(
@@ -136,6 +143,7 @@ class Runner:
             self.schedule if case.controller is not None else None,
             known_outputs=self.known_model.outputs if shared else None,
             devices=self.devices,
+            profiles=self.profiles,
         )
 
     def _compile(self) -> CompiledBatches:
@@ -211,35 +219,47 @@ class Runner:
             self.program = self._make_program(native=False)
         return None
 
-    def choose_step_sizes(self) -> tuple[Float[np.ndarray, " path"], float]:
-        """Step sizes (s) of all batches, and the estimated relative error of their peaks.
+    def choose_step_sizes(self) -> tuple[Float[np.ndarray, " steps"], float]:
+        """Step sizes (s) of all batches, then extra steps, and the estimated error of their peaks.
 
-        Raises RuntimeError if no time step meets the tolerance.
+        The error is relative. Raises RuntimeError if no time step meets the tolerance.
         """
         count = MIN_TRIAL_BATCHES
         if isinstance(self.backend, CompiledBatches):  # calls of a program take equally many
             count = _round_up(count, self.trial_batches)
-
-        def peaks(batch_indices, steps, extra_steps, single=False):
-            results = self._trial_results(batch_indices, steps, extra_steps, single)
-            if not single:
-                final = extra_steps == 0  # as those of blocks
-                of_final = {name: values[final] for name, values in results.items()}
-                self.trials.add(batch_indices[final], steps[final], of_final)
-            return self._compared_by_quantity(results["peak_deflection"])
-
-        masses, checked = swept_masses(self.case, self.batches), None
+        of_all = functools.partial(self._trial_peaks, self.backend, self.trials)
+        masses, few = swept_masses(self.case, self.batches), None
         batches, runs = self.batches.run_index.shape
-        if runs == 1 and batches <= MAX_CHECKED_RUNS:
-            checked = np.arange(batches)
+        all_measured = batches <= (MAX_MEASURED_RUNS if runs == 1 else MAX_MEASURED_BATCHES)
+        if runs > MAX_SEARCHED_RUNS:
+            with_few = self.backend.with_few_runs(MAX_SEARCHED_RUNS)
+            few = with_few and functools.partial(self._trial_peaks, with_few, Trials())
+        is_random = isinstance(self.case.profile, AbstractSpectralProfile)
+        share = RANDOM_SHARE if is_random else 1.0
         rates, initial_steps, max_steps = self.limits
         search = rates, masses, initial_steps, max_steps, count
-        steps, error = choose_step_sizes(peaks, *search, self.tolerance, checked)
+        steps, extra, error = choose_step_sizes(
+            of_all, *search, self.tolerance, all_measured, few, share
+        )
         if self.single:
             sample = stratified_sample(rates, count)
-            given = sample, steps[sample], np.zeros(sample.size, int)
-            error += rounding_error(*(peaks(*given, single) for single in (False, True)))
-        return steps, error
+            given = sample, steps[sample], extra[sample]
+            error += rounding_error(*(of_all(*given, single) for single in (False, True)))
+        return np.append(steps, extra), error
+
+    def _trial_peaks(self, backend, trials, batch_indices, steps, extra_steps, single=False):
+        """Peaks (path, batch and quantity, sensor) of batches; their results become `trials`."""
+        given = batch_indices, steps, extra_steps
+        if single:
+            results = self._trial_results(backend, *given, single)
+            return self._compared_by_quantity(results["peak_deflection"])
+        _, which = np.unique(np.stack(given), axis=1, return_index=True)
+        new = which[~trials.known(*(part[which] for part in given))]
+        if new.size:
+            own = [part[new] for part in given]
+            trials.add(*own, self._trial_results(backend, *own, single))
+        results = trials.completed({}, *given, np.ones(len(steps), bool))
+        return self._compared_by_quantity(results["peak_deflection"])
 
     def _compared_by_quantity(self, peaks):
         """Peaks (path, batch, sensor) of each quantity as further runs: they are not compared."""
@@ -254,26 +274,31 @@ class Runner:
         return int((self.batches.run_index[rows] >= 0).sum())
 
     def block_function(
-        self, steps: Float[np.ndarray, " path"], trials: Trials | None = None
+        self, steps: Float[np.ndarray, " steps"], trials: Trials | None = None
     ) -> Callable[[int], dict[str, np.ndarray]]:
         """Function of a block's number: its results (path, batch, ...) by name.
 
-        `steps` (s) are those of all batches. Results among the `trials` are not computed again.
+        `steps` are those of `choose_step_sizes`. Results among the `trials` are not
+        computed again.
         """
         substeps, known_results = None, trials or Trials()
+        steps, extra = np.split(steps, 2)
+        extra = extra.astype(int)
         if self.histories:
             substeps = steps_per_interval(float(self.schedule.lengths.max()), steps.min())
-        integrate = self.backend.block_integrator(self._batches_of, steps, substeps, self.single)
+        stepping = steps, extra, substeps
+        integrate = self.backend.block_integrator(self._batches_of, *stepping, self.single)
         if self.histories or self.single:
             known_results = Trials()  # trials are of peaks, in double precision
 
         def compute(block: int) -> dict[str, np.ndarray]:
-            batch_indices = self._batches_of(block)
-            known = known_results.known(batch_indices, steps[batch_indices])
+            rows = self._batches_of(block)
+            given = rows, steps[rows], extra[rows]
+            known = known_results.known(*given)
             results = {} if known.all() else integrate(block, ~known)
             if not known.any():
                 return results
-            return known_results.completed(results, batch_indices, known)
+            return known_results.completed(results, *given, known)
 
         return compute
 
@@ -282,13 +307,13 @@ class Runner:
         first, count = block * self.batches_per_block, self.batches.run_index.shape[0]
         return np.arange(first, first + self.batches_per_block) % count
 
-    def _trial_results(self, batch_indices, steps, extra_steps, single):
+    def _trial_results(self, backend, batch_indices, steps, extra_steps, single):
         """Results of batches by name, on all cores."""
         count = batch_indices.size
         results = []
-        for rows in np.array_split(np.arange(count), -(-count // self.backend.most_at_once)):
+        for rows in np.array_split(np.arange(count), -(-count // backend.most_at_once)):
             given = batch_indices[rows], steps[rows], extra_steps[rows], single
-            integrate, calls = self.backend.of_parts(*given, self.trial_batches)
+            integrate, calls = backend.of_parts(*given, self.trial_batches)
             results += self.pool.map(integrate, np.array_split(np.arange(rows.size), calls))
         return {name: np.concatenate([one[name] for one in results]) for name in results[0]}
 
@@ -326,14 +351,15 @@ class SensorGroups:
         """Threads that compute blocks."""
         return self.runners[0].pool
 
-    def choose_step_sizes(self) -> tuple[Float[np.ndarray, " path"], float]:
-        """Step sizes (s) of all batches that suit all sensors, and the estimated error of peaks."""
+    def choose_step_sizes(self) -> tuple[Float[np.ndarray, " steps"], float]:
+        """Steps of all batches that suit all sensors, as of a runner, and the error of peaks."""
         found = [runner.choose_step_sizes() for runner in self.runners]
         steps, errors = zip(*found, strict=True)
-        return np.min(steps, axis=0), largest_error(errors)
+        sizes, extra = np.split(np.array(steps), 2, axis=1)
+        return np.append(np.min(sizes, axis=0), np.max(extra, axis=0)), largest_error(errors)
 
     def block_function(
-        self, steps: Float[np.ndarray, " path"], trials: None = None
+        self, steps: Float[np.ndarray, " steps"], trials: None = None
     ) -> Callable[[int], dict[str, np.ndarray]]:
         """Function of a block's number: its results (path, batch, ...) by name."""
         functions = [runner.block_function(steps) for runner in self.runners]

@@ -24,7 +24,7 @@ from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.simulation.integration_plan import sample_times
 from jaxbeam.simulation.labels import SWEEP_VARIABLES, sensor_coordinates
 from jaxbeam.sweeps import cluster, store as sweep_store
-from jaxbeam.sweeps.batches import Batches
+from jaxbeam.sweeps.batches import PROFILE_NUMBER, Batches
 from jaxbeam.sweeps.quality import WorstRun, estimated_errors, is_corrected
 from jaxbeam.sweeps.specification import AnyRunner, SweepSpecification
 from jaxbeam.sweeps.store import BlockStore, MemoryStore
@@ -176,6 +176,7 @@ def _to_dataset(
             {"units": unit_at(case, address) or "1", "long_name": address_words(case, address)},
         )
         for address, values in specification.axes.items()
+        if address != PROFILE_NUMBER
     }
     coordinates |= sensor_coordinates(case)
     if "deflection" in flat:

@@ -21,6 +21,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case, concrete_case, replace
+from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import (
@@ -53,7 +54,7 @@ from jaxbeam.runtime.compiling import (
 )
 from jaxbeam.runtime.vectorised import NotVectorisedError, vectorised
 from jaxbeam.simulation.closed_loop import closed_loop
-from jaxbeam.sweeps.batches import Batches
+from jaxbeam.sweeps.batches import PROFILE_NUMBER, Batches, with_few_runs
 from jaxbeam.sweeps.step_size import PathEvents
 
 # Rows of what the sensors measure, and their static correction.
@@ -74,7 +75,7 @@ class Program(NamedTuple):
     With a `schedule` steps end at its events; with `substeps` there are so many between events, and
     histories are saved, otherwise the step size of each batch determines their number.
     `known_outputs` are those of all batches, if they share them. Each of the `devices` computes a
-    part of a block.
+    part of a block. Batches may differ in which of the `profiles` each run has.
     """
 
     case: Case
@@ -85,6 +86,7 @@ class Program(NamedTuple):
     substeps: int | None = None
     known_outputs: Outputs | None = None
     devices: int = 1
+    profiles: tuple[AbstractProfile, ...] = ()
 
     def case_with(self, shared_values) -> Case:
         """Case of a batch."""
@@ -95,8 +97,9 @@ class Program(NamedTuple):
         varied = self.case_with(shared_values)
 
         def wheels_of_run(values):
-            pairs = zip(self.batched_addresses, values, strict=True)
-            wheels = wheel_set(replace(varied, dict(pairs)))
+            pairs = dict(zip(self.batched_addresses, values, strict=True))
+            pairs.pop(PROFILE_NUMBER, None)  # changes no wheel
+            wheels = wheel_set(replace(varied, pairs))
             if wheels.massless:  # known to be, which `vmap` would hide: no equations of contact
                 wheels = eqx.tree_at(_inertia, wheels, None)
             return jax.tree.map(lambda part: part[..., 0], wheels)
@@ -314,6 +317,11 @@ class Batchwise:
 
     most_at_once = sys.maxsize  # of which calls are made together
 
+    def with_few_runs(self, most: int) -> "Batchwise | None":
+        """The batches with at most so many of their runs; None where that saves nothing."""
+        del most
+        return None
+
     def of_parts(self, batch_indices, steps, extra_steps, single: bool, per_call: int):
         """Function of some rows of the batches: their results by name; and number of calls."""
 
@@ -323,16 +331,17 @@ class Batchwise:
         count = batch_indices.size
         return integrate, min(count, max(2, -(-count // per_call)))  # two at least, side by side
 
-    def block_integrator(self, batches_of: Callable, steps, substeps: int | None, single: bool):
+    def block_integrator(
+        self, batches_of: Callable, steps, extra_steps, substeps: int | None, single: bool
+    ):
         """Function of a block's number and a mask of its batches: results of those in the mask.
 
-        `batches_of` a block are its batches, `steps` (s) those of all.
+        `batches_of` a block are its batches, `steps` (s) and `extra_steps` those of all.
         """
 
         def integrate_block(block, mask):
             rows = batches_of(block)
-            stepping = steps[rows], np.zeros(rows.size, int)
-            return self.integrate(rows, *stepping, mask, substeps, single)
+            return self.integrate(rows, steps[rows], extra_steps[rows], mask, substeps, single)
 
         return integrate_block
 
@@ -514,6 +523,11 @@ class NumpyBatches(Batchwise):
         self.batches, self.model, self.schedule = batches, model, schedule
         self.load_events = load_events
         self._of_batch = functools.cache(self._case_and_loads)
+
+    def with_few_runs(self, most):
+        """The batches with at most so many of their runs."""
+        few = with_few_runs(self.batches, most)
+        return NumpyBatches(self.program, few, self.model, self.load_events, self.schedule)
 
     def make_models(self) -> Float[np.ndarray, " path"]:
         """Longest stable steps (s) of all batches."""

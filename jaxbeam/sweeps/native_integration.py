@@ -21,12 +21,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case, concrete_case, structure_of
+from jaxbeam.case.profiles.spectra import profiles_of_runs
 from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.growth import growth_limit, load_amplitude
 from jaxbeam.integrator.inputs import StepInfo
 from jaxbeam.integrator.peaks import Peaks
 from jaxbeam.integrator.time_grid import event_places, grid_between_events, grid_by_schedule
-from jaxbeam.model.load_set import WheelSet, load_set
+from jaxbeam.model.load_set import LoadSet, WheelSet, load_set
 from jaxbeam.model.modal_model import ModalModel, has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.output_rows import corrected_places
@@ -45,7 +46,7 @@ from jaxbeam.runtime.remembering import remembered
 from jaxbeam.runtime.vectorised import NotVectorisedError, vectorised
 from jaxbeam.simulation.closed_loop import closed_loop
 from jaxbeam.simulation.sampled_loop import LoopMemory, SampledLoop
-from jaxbeam.sweeps.batches import Batches, values_at
+from jaxbeam.sweeps.batches import PROFILE_NUMBER, Batches, values_at, with_few_runs
 from jaxbeam.sweeps.integration import Outputs, Program, outputs_of
 from jaxbeam.sweeps.step_size import PathEvents
 
@@ -306,6 +307,7 @@ class NativeBatches:
         self.program, self.batches = program, batches
         self.block_size, self.most_at_once = block_size, most_at_once
         self.known, self.loops = known, None
+        self._load_set = functools.cache(self._load_set_of)
         self.events = events, values_at(program.case, batches, "run.duration")
         with np.errstate(all="ignore"):  # as in compiled code
             if program.schedule is None:
@@ -342,6 +344,7 @@ class NativeBatches:
             else:
                 stepping = max_steps, extra_steps, events[0]
                 found = self.loops.of_batches(batch_indices, *stepping, loads)
+        found |= native_peaks.shared_vehicles(found)
         if native_peaks.has_courses(self.program.case):
             found |= self._over_time(batch_indices, loads[1], found)
         return native_peaks.NativeInputs(**self.of_model, **found)
@@ -350,17 +353,28 @@ class NativeBatches:
         """Inputs of batches that are functions of time, for the steps that have been found."""
         batches = []
         for row, batch in enumerate(batch_indices):
-            case = self.program.case_with(self.batches.shared_values[batch])
             own = jax.tree.map(lambda part, row=row: part[row], wheels)
-            loads = load_set(case, self.program.shapes.layout)
-            batches.append(dataclasses.replace(loads, wheels=own))
+            batches.append(dataclasses.replace(self._load_set(int(batch)), wheels=own))
         names = "panel_starts", "step_counts", "step_lengths"
         starts, counts, lengths = (found[name] for name in names)
         if self.loops is not None:
             lengths = np.take_along_axis(lengths, found["lengths_of_panels"], axis=1)
         panels = starts, counts, lengths
         swept = any(name.startswith("profile.") for name in self.batches.shared_addresses)
-        return native_peaks.inputs_over_time(batches, *panels, one_profile=not swept)
+        one_profile = not (swept or self.program.profiles)
+        return native_peaks.inputs_over_time(batches, *panels, one_profile)
+
+    def _load_set_of(self, batch: int) -> LoadSet:
+        """Loads of a batch, with the profiles of its runs."""
+        case = self.program.case_with(self.batches.shared_values[batch])
+        loads, profiles = load_set(case, self.program.shapes.layout), self.program.profiles
+        if not profiles:
+            return loads
+        numbers = self.batches.batched_values[batch][
+            :, self.batches.batched_addresses.index(PROFILE_NUMBER)
+        ]
+        together = profiles_of_runs([profiles[int(number)] for number in numbers])
+        return dataclasses.replace(loads, profile=together)
 
     def of_parts(self, batch_indices, steps, extra_steps, single: bool, per_call: int):
         """Function of some rows of the batches: their results by name; and number of calls."""
@@ -373,11 +387,20 @@ class NativeBatches:
 
         return integrate, min(batch_indices.size, os.cpu_count() or 1)
 
-    def block_integrator(self, batches_of: Callable, steps, substeps: int | None, single: bool):
+    def with_few_runs(self, most: int) -> "NativeBatches | None":
+        """The batches with at most so many of their runs; None with a loop, which is made once."""
+        if self.loops is not None:
+            return None
+        few, sizes = with_few_runs(self.batches, most), (self.block_size, self.most_at_once)
+        return NativeBatches(self.program, self.known, self.events[0], few, *sizes)
+
+    def block_integrator(
+        self, batches_of: Callable, steps, extra_steps, substeps: int | None, single: bool
+    ):
         """Function of a block's number and a mask of its batches: results of those in the mask.
 
-        `batches_of` a block are its batches, `steps` (s) those of all. Inputs are made for several
-        blocks at once.
+        `batches_of` a block are its batches, `steps` (s) and `extra_steps` those of all. Inputs are
+        made for several blocks at once.
         """
         del substeps, single
         count, runs = self.batches.run_index.shape
@@ -390,8 +413,7 @@ class NativeBatches:
         @functools.lru_cache(maxsize=4)  # blocks are taken in their order, by few threads
         def of_group(group: int) -> native_peaks.NativeInputs:
             batch_indices = np.arange(group * group_size, (group + 1) * group_size) % count
-            no_more = np.zeros(batch_indices.size, int)
-            return self.of_batches(batch_indices, steps[batch_indices], no_more)
+            return self.of_batches(batch_indices, steps[batch_indices], extra_steps[batch_indices])
 
         def integrate_block(block, mask):
             group, place = divmod(block, blocks)

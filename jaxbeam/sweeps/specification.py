@@ -29,17 +29,20 @@ from jaxbeam.case.contact import ONE_RUN
 from jaxbeam.case.declared_checks import describe_value
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.former_words import attribute_address
+from jaxbeam.case.profiles.shapes import AbstractProfile
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.case.reading.units import in_si
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.integrator import native_peaks
+from jaxbeam.integrator.native_peaks import MIN_RUNS_TO_COMPILE
 from jaxbeam.integrator.step_size import check_tolerance
 from jaxbeam.runtime.memory import block_memory
 from jaxbeam.sweeps import MAX_RUNS
 from jaxbeam.sweeps.batches import (
     MAX_BATCH_SIZE,
+    MOST_PROFILES,
     Batches,
     RunSizes,
     addresses_within_batches,
@@ -75,6 +78,7 @@ class SweepSpecification:
     second, and so on. `tolerance` is the relative error allowed of peaks, rounding in `single`
     precision excluded. A block of runs takes at most `block_bytes` of memory, if one run takes no
     more. One of `several` sweeps of one structure shares its compiled programs with the others.
+    `profiles` are those of the runs, whose numbers are values of an axis, `PROFILE_NUMBER`.
     """
 
     case: Case
@@ -85,6 +89,7 @@ class SweepSpecification:
     single: bool
     block_bytes: float
     several: bool = False
+    profiles: tuple[AbstractProfile, ...] = ()
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -114,7 +119,8 @@ class SweepSpecification:
         controller = self.case.controller
         one_run_each = controller is not None and controller.design_depends_on_loads
         within = [] if one_run_each else addresses_within_batches(self.case, self.axes)
-        most = largest_group(MAX_BATCH_SIZE, lambda runs: self._fits(self.case.sensors[:1], runs))
+        largest = MOST_PROFILES if self.profiles else MAX_BATCH_SIZE
+        most = largest_group(largest, lambda runs: self._fits(self.case.sensors[:1], runs))
         return make_batches(list(self.axes), self.runs(), within, most)
 
     @functools.cached_property
@@ -122,7 +128,8 @@ class SweepSpecification:
         """Sizes of the runs that decide how much memory they take."""
         swept = [values for name, values in self.axes.items() if name.endswith(".speed")]
         speeds = [float(concrete(load.speed)) for load in self.case.loads if hasattr(load, "speed")]
-        return run_sizes(self.case, np.concatenate([speeds, *swept]), self.histories)
+        speeds = np.concatenate([speeds, *swept])
+        return run_sizes(self.case, speeds, self.histories, bool(self.profiles))
 
     def _fits(self, sensors: Sequence[Sensor], runs: int) -> bool:
         """Whether a batch of so many runs with some sensors fits into a block."""
@@ -147,7 +154,7 @@ class SweepSpecification:
     @functools.cached_property
     def _force_runner(self) -> ForceRunner | None:
         """Runner of peaks in closed form; None where there is none."""
-        if self.histories or self.single:
+        if self.histories or self.single or self.profiles:
             return None
         return force_runner(self.case, self.batches, self.tolerance, self.block_bytes)
 
@@ -172,6 +179,7 @@ class SweepSpecification:
             native,
             *limits,
             small,
+            self.profiles,
         )
         if len(groups) == 1:
             return Runner(self.case, *settings)
@@ -199,7 +207,8 @@ class SweepSpecification:
         peaks_in_double = not (self.histories or self.single)
         if self._force_runner is not None:
             return False
-        return peaks_in_double and native_peaks.chosen_for(self.case, self.count)
+        count = max(self.count, MIN_RUNS_TO_COMPILE) if self.profiles else self.count
+        return peaks_in_double and native_peaks.chosen_for(self.case, count)
 
     @functools.cached_property
     def case_dict(self) -> dict[str, Any]:

@@ -15,6 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case, concrete_case, replace
+from jaxbeam.case.fields import concrete
+from jaxbeam.case.profiles.spectra import AbstractSpectralProfile
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.integrator.integrate import longest_force_step
 from jaxbeam.integrator.time_grid import LoadEvents
@@ -26,7 +28,12 @@ from jaxbeam.sweeps.batches import Batches, values_at
 
 CONVERGENCE_ORDER = 9  # assumed order of the error in the step; the true order is higher
 REFINEMENT = 1.25  # ratio of a step to the finer step with which its error is measured
+# Of the errors allowed of runs over random profiles: others are up to three times as large.
+RANDOM_SHARE = 0.4
+WAVES_PER_STEP = 0.6  # of the shortest waves of a profile, at first, for errors of 1e-7
 MAX_ROUNDS = 12
+MEASURED_SAFETY = 2  # error stated / largest difference, where all runs are measured
+LEAST_SHARE = 0.3  # of the tolerance: least error stated where steps were searched for it
 SAFETY_FACTOR = 6  # tolerance / largest error allowed in the sample
 TARGET_ERROR = 0.6  # aim of a longer step, relative to the error allowed
 # Errors relative to the error allowed from which steps are extrapolated unmeasured: the sample
@@ -35,6 +42,7 @@ MIN_USEFUL_ERROR, MAX_USEFUL_ERROR = 3e-3, 10
 LIMIT_RATIO = 1.3  # initial step / longest step from which on the longest is taken unmeasured
 SAMPLE_DIVISOR = 4  # the sample grows with the square root of the number of batches over this
 SMALL_TOLERANCE = 1e-10  # below it, rounding in double precision may be what no step lessens
+MOST_TRIALS = 4  # of a batch that are kept: those of two pairs
 NEGLIGIBLE_PEAK = 1e-6  # of a run's largest peak; errors of smaller peaks are relative to this
 
 # Peaks (path, batch, sensor) of batches for their steps (s) and numbers of extra steps per panel.
@@ -91,17 +99,20 @@ def log_spaced_sample(
     return order[np.where(heaviest, distances, np.inf).argmin(axis=0)]
 
 
-def step_errors(peaks: PeaksFunction, batches, steps) -> Float[np.ndarray, " path"]:
+def step_errors(
+    peaks: PeaksFunction, batches, steps, extra_steps: Int[np.ndarray, " path"] | int = 0
+) -> Float[np.ndarray, " path"]:
     """Largest relative change of the peaks of each batch with steps REFINEMENT times finer.
 
-    At least one step is added between events, of which there may be few. Runs that fail are left
-    out; NaN if all do.
+    At least one step is added to the `extra_steps` between events, of which there may be few. Runs
+    that fail are left out; NaN if all do.
     """
     # The finer runs take longer: each half has those of every other batch.
     fine_first = np.arange(len(batches)) % 2 == 0
     is_fine = np.append(fine_first, ~fine_first)
     both_steps = np.tile(steps, 2) / np.where(is_fine, REFINEMENT, 1.0)
-    halves = np.split(peaks(np.tile(batches, 2), both_steps, is_fine.astype(int)), 2)
+    both_extra = np.tile(np.broadcast_to(extra_steps, len(batches)), 2) + is_fine
+    halves = np.split(peaks(np.tile(batches, 2), both_steps, both_extra), 2)
     fine, coarse = (np.where(fine_first[:, None, None], *pair) for pair in (halves, halves[::-1]))
     return relative_changes(coarse, fine)
 
@@ -163,44 +174,52 @@ def choose_step_sizes(
     max_steps: Float[np.ndarray, " path"],
     count: int,
     tolerance: float,
-    checked: Int[np.ndarray, " checked"] | None = None,
-) -> tuple[Float[np.ndarray, " path"], float]:
-    """Longest steps (s) of all batches for a tolerance, and the estimated error of their runs.
+    all_measured: bool = False,
+    few_peaks: PeaksFunction | None = None,
+    search_share: float = 1.0,
+) -> tuple[Float[np.ndarray, " path"], Int[np.ndarray, " path"], float]:
+    """Longest steps (s) of all batches for a tolerance, extra steps, and the error of their runs.
 
     That is SAFETY_FACTOR times the largest error of the sample: of random sweeps of beams of one
     and two spans and all quantities, 0.02 % of the runs had larger true errors, at most twice.
 
     The search over `crossing_rates` (1/s), among the batches of the largest `masses` (kg), starts
-    from `initial_steps` (s) and is limited by `max_steps` (s). The steps are then checked on the
-    batches `checked`, by default a stratified sample. Raises RuntimeError if no step meets the
-    tolerance. The error is NaN if all runs fail.
+    from `initial_steps` (s) and is limited by `max_steps` (s); it takes `few_peaks`, those of few
+    runs of the batches, if they are given, and allows a share of the error. The steps are then
+    checked on a stratified sample, or the errors of all batches are measured (`_measured_steps`).
+    Raises RuntimeError if no step meets the tolerance. The error is NaN if all runs fail.
     """
-    target_error = tolerance / SAFETY_FACTOR
+    target_error = tolerance / (MEASURED_SAFETY if all_measured else SAFETY_FACTOR)
     chosen = log_spaced_sample(crossing_rates, masses, count)
     valid_steps, succeeds = _search_step_sizes(
-        peaks, chosen, initial_steps[chosen], max_steps[chosen], target_error
+        few_peaks or peaks,
+        chosen,
+        initial_steps[chosen],
+        max_steps[chosen],
+        search_share * target_error,
     )
     if not np.all(valid_steps > 0):
         raise _no_step_error(tolerance)
+    nothing = np.zeros(crossing_rates.size, int)
     if not succeeds.any():
-        return np.minimum(initial_steps, max_steps), np.nan
+        return np.minimum(initial_steps, max_steps), nothing, np.nan
     chosen, valid_steps = chosen[succeeds], valid_steps[succeeds]
     start = np.minimum(initial_steps, max_steps)
     step_ratio = _interpolate_conservatively(
         crossing_rates, crossing_rates[chosen], valid_steps / start[chosen]
     )  # to the initial step
     steps = np.minimum(start * step_ratio, max_steps)
-    sample = checked
-    if sample is None:
-        groups = max(1, round(np.sqrt(crossing_rates.size / count) / SAMPLE_DIVISOR))
-        sample = stratified_sample(crossing_rates, count * groups)
+    if all_measured:
+        return _measured_steps(peaks, steps, max_steps, tolerance)
+    groups = max(1, round(np.sqrt(crossing_rates.size / count) / SAMPLE_DIVISOR))
+    sample = stratified_sample(crossing_rates, count * groups)
     error, fails = np.full(sample.size, np.nan), np.ones(sample.size, bool)
     for _ in range(MAX_ROUNDS):
         found = step_errors(peaks, sample[fails], steps[sample[fails]])
         error[fails] = found
         fails, known = error > target_error, ~np.isnan(error)  # NaN: no run succeeds
         if not fails.any():
-            return steps, SAFETY_FACTOR * largest_error(error)
+            return steps, nothing, SAFETY_FACTOR * largest_error(error)
         with np.errstate(divide="ignore"):
             factor = np.maximum(0.7, 0.92 * (target_error / error) ** (1 / CONVERGENCE_ORDER))
         # Only up to the next batches of the sample, whose steps are short enough.
@@ -208,6 +227,41 @@ def choose_step_sizes(
         steps = steps * _interpolate_conservatively(
             crossing_rates, crossing_rates[sample[known]], factor[known]
         )
+    raise _no_step_error(tolerance)
+
+
+def _measured_steps(
+    peaks: PeaksFunction,
+    steps: Float[np.ndarray, " path"],
+    max_steps: Float[np.ndarray, " path"],
+    tolerance: float,
+) -> tuple[Float[np.ndarray, " path"], Int[np.ndarray, " path"], float]:
+    """Steps (s) of batches all of which are measured, extra steps in each panel, and their error.
+
+    The results of each are those of the finer of two runs, whose peaks differ by no more than half
+    the tolerance. Its own error is a quarter of the difference in the median of 288 runs of trucks
+    and quarter cars over random profiles, with REFINEMENT**-CONVERGENCE_ORDER for a sixth, and 2.6
+    times it at most where the difference is more than rounding. The error is MEASURED_SAFETY times
+    the largest difference, and, as two peaks may agree by chance, no less than LEAST_SHARE of the
+    tolerance, unless the longest steps meet it. Of runs that differ by more the finer one becomes
+    the coarser of the next pair, unless it would still be much too coarse.
+    """
+    allowed = tolerance / MEASURED_SAFETY
+    steps, extra = steps.copy(), np.zeros(steps.size, int)
+    error, left = np.full(steps.size, np.nan), np.arange(steps.size)
+    for _ in range(MAX_ROUNDS):
+        found = step_errors(peaks, left, steps[left], extra[left])
+        error[left] = found
+        left = left[found > allowed]
+        if not left.size:
+            least = LEAST_SHARE * tolerance * np.any((steps < max_steps) & ~np.isnan(error))
+            stated = max(MEASURED_SAFETY * largest_error(error), least)
+            return steps / REFINEMENT, extra + 1, stated
+        with np.errstate(divide="ignore"):
+            factor = np.maximum(0.3, 0.92 * (allowed / error[left]) ** (1 / CONVERGENCE_ORDER))
+        is_near = factor > REFINEMENT**-2
+        steps[left] = np.where(is_near, steps[left] / REFINEMENT, steps[left] * factor)
+        extra[left] += is_near
     raise _no_step_error(tolerance)
 
 
@@ -272,40 +326,54 @@ def _no_step_error(tolerance: float) -> RuntimeError:
 
 
 class Trials:
-    """Latest results of batches by name, with their steps (s).
+    """Latest results of batches by name, with their steps (s) and extra steps in each panel.
 
     Four of the 64 batches of 4096 crossings are checked with their final steps: a sixteenth less
-    is left to be computed.
+    is left to be computed. Of sweeps of few batches all are measured, and nothing is left. A batch
+    has the results of the last runs, of which pairs are compared.
     """
 
     def __init__(self):
-        self._latest: dict[int, tuple[float, dict[str, np.ndarray]]] = {}
+        self._latest: dict[int, dict[tuple[float, int], dict[str, np.ndarray]]] = {}
 
     def add(
         self,
         batch_indices: Int[np.ndarray, " path"],
         steps: Float[np.ndarray, " path"],
+        extra_steps: Int[np.ndarray, " path"],
         results: dict[str, np.ndarray],
     ) -> None:
         """Keep the results (path, batch, ...) of batches."""
-        for row, (batch, step) in enumerate(zip(batch_indices, steps, strict=True)):
-            self._latest[int(batch)] = step, {name: part[row] for name, part in results.items()}
+        for row, key in enumerate(zip(steps.tolist(), extra_steps.tolist(), strict=True)):
+            kept = self._latest.setdefault(int(batch_indices[row]), {})
+            kept.pop(key, None)
+            kept[key] = {name: part[row] for name, part in results.items()}
+            while len(kept) > MOST_TRIALS:
+                kept.pop(next(iter(kept)))
 
     def known(
-        self, batch_indices: Int[np.ndarray, " path"], steps: Float[np.ndarray, " path"]
+        self,
+        batch_indices: Int[np.ndarray, " path"],
+        steps: Float[np.ndarray, " path"],
+        extra_steps: Int[np.ndarray, " path"],
     ) -> Bool[np.ndarray, " path"]:
         """Whether the results of batches are known for these steps."""
-        of_batches = (self._latest.get(batch, (None,))[0] for batch in batch_indices.tolist())
-        return np.array([step == given for step, given in zip(of_batches, steps, strict=True)])
+        rows = zip(*(part.tolist() for part in (batch_indices, steps, extra_steps)), strict=True)
+        return np.array([(step, more) in self._latest.get(i, {}) for i, step, more in rows], bool)
 
     def completed(
         self,
         results: dict[str, np.ndarray],
         batch_indices: Int[np.ndarray, " path"],
+        steps: Float[np.ndarray, " path"],
+        extra_steps: Int[np.ndarray, " path"],
         known: Bool[np.ndarray, " path"],
     ) -> dict[str, np.ndarray]:
         """Results (path, batch, ...) of batches with those that are known; they may be all."""
-        own = {row: self._latest[int(batch_indices[row])][1] for row in np.flatnonzero(known)}
+        own = {
+            row: self._latest[int(batch_indices[row])][float(steps[row]), int(extra_steps[row])]
+            for row in np.flatnonzero(known)
+        }
         if known.all():
             return {name: np.stack([one[name] for one in own.values()]) for name in own[0]}
         results = {name: np.array(values) for name, values in results.items()}
@@ -383,5 +451,9 @@ def step_limits(
     if longest is not None:
         max_steps = np.minimum(max_steps, longest)
     initial = initial_step_sizes(crossing_time, limits, case.beam.modes, tolerance)
-    share = initial_share(sensor.quantity for sensor in case.sensors)
-    return StepLimits(1 / crossing_time, initial * share, max_steps)
+    initial = initial * initial_share(sensor.quantity for sensor in case.sensors)
+    if isinstance(case.profile, AbstractSpectralProfile):
+        shortest = 1 / np.max(concrete(case.profile.lines()[0]))
+        of_wave = WAVES_PER_STEP * shortest / float(concrete(case.beam.length)) * crossing_time
+        initial = np.minimum(initial, of_wave * (tolerance / 1e-7) ** (1 / CONVERGENCE_ORDER))
+    return StepLimits(1 / crossing_time, initial, max_steps)

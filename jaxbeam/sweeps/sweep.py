@@ -74,11 +74,13 @@ def sweep(
     (..., time, sensor) in m is at the run's sample rate.
 
     Runs are computed in blocks on all cores, compiled once, with the longest time steps whose
-    relative errors of peaks are below `tolerance`. Errors are measured on a stratified random
-    sample of the runs, where they are at most a sixth of the tolerance; `error_estimate` is six
-    times the largest of these, as errors of other runs may be larger: one run in thousands exceeds
-    it, near the critical speed of a heavy mass. Of at most 256 runs with paths of their own (random
-    speeds) all are measured; of more, single heavy and fast loads may have larger errors.
+    relative errors of peaks are below `tolerance`. On up to 16 paths, or 256 with a run each, each
+    run is repeated with finer steps, whose results are given: `error_estimate` is twice the largest
+    difference, or three tenths of the tolerance, if that is more. On more paths errors are measured
+    on a stratified random sample of the runs, where they are at most a sixth of the tolerance; then
+    it is six times the largest of these, as errors of other runs may be larger: one run in
+    thousands exceeds it, near the critical speed of a heavy mass. Runs that differ in seeds of the
+    profile share all that depends on their paths, where there is a C compiler.
 
     In `precision` "single" models and propagators are made in float64 and runs are integrated in
     float32, which is faster where arithmetic dominates, as on a GPU. Results are then float32, and

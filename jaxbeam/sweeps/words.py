@@ -18,9 +18,11 @@ import numpy as np
 
 from jaxbeam.case.case import ALL, Case, address_words, addresses
 from jaxbeam.case.former_words import attribute_address
+from jaxbeam.case.profiles.spectra import profiles_of_runs
 from jaxbeam.files.case_file import case_to_dict, with_settings
 from jaxbeam.runtime.progress import ProgressBar
 from jaxbeam.sweeps import MAX_RUNS, store as sweep_store
+from jaxbeam.sweeps.batches import PROFILE_NUMBER
 from jaxbeam.sweeps.computation import compute_sweep, worst_runs
 from jaxbeam.sweeps.quality import estimated_errors
 from jaxbeam.sweeps.specification import SweepSpecification, sweep_specification
@@ -215,10 +217,16 @@ def compute_word_sweep(
     if path is not None and state == "new":
         with new_store(path, fingerprint):
             pass
-    datasets = []
+    datasets: dict[int, xarray.Dataset] = {}
+    if path is None:
+        for group in _alike_but_for_profiles(plan.sweeps):
+            found = _computed_together([plan.sweeps[i] for i in group], progress_bar)
+            datasets |= zip(group, found, strict=False)
     for i, part in enumerate(plan.sweeps):
         part_path = None if path is None else path / BLOCKS_GROUP / str(i)
-        datasets.append(_compute_part(part, part_path, client, progress_bar))
+        if i not in datasets:
+            datasets[i] = _compute_part(part, part_path, client, progress_bar)
+    datasets = [datasets[i] for i in range(len(plan.sweeps))]
     joined = plan.join(datasets)
     for quantity, share in _estimates(plan, datasets).items():
         joined[f"peak_{quantity}"].attrs["truncation_error"] = share
@@ -228,6 +236,40 @@ def compute_word_sweep(
     if path is not None:
         replace_blocks(path, joined)
     return joined
+
+
+def _alike_but_for_profiles(sweeps: Sequence[SweepSpecification]) -> list[list[int]]:
+    """Numbers of several sweeps whose runs differ in their profiles alone, of which C knows."""
+    groups: dict[str, list[int]] = {}
+    for i, part in enumerate(sweeps):
+        if profiles_of_runs([part.case.profile]) is not None:
+            level = dataclasses.replace(part.case, profile=None)
+            alike = dataclasses.replace(part, case=level).fingerprint()
+            groups.setdefault(alike, []).append(i)
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def _computed_together(
+    parts: Sequence[SweepSpecification], progress_bar: ProgressBar
+) -> "list[xarray.Dataset]":
+    """Datasets of sweeps that are alike but for their profiles, as runs of one; none without C.
+
+    What depends on the paths of the loads is computed once for all of them.
+    """
+    first = parts[0]
+    profiles = [part.case.profile for part in parts]
+    if profiles_of_runs(profiles) is None:
+        return []
+    axes = {PROFILE_NUMBER: np.arange(float(len(parts)))} | first.axes
+    together = dataclasses.replace(first, axes=axes, profiles=tuple(profiles))
+    if not together.uses_c():
+        return []
+    joined = compute_sweep(together, None, "new", None, progress_bar, estimates=False)
+    found = []
+    for i in range(len(parts)):
+        own = joined.isel({PROFILE_NUMBER: i}, drop=True)
+        found.append(own.assign_attrs(failed_runs=int(own.failed.sum())))
+    return found
 
 
 def _estimates(plan: WordSweep, datasets: "Sequence[xarray.Dataset]") -> dict[str, float]:

@@ -8,7 +8,9 @@ import pytest
 import scipy
 
 import jaxbeam as jb
+from jaxbeam.integrator import native_peaks
 from jaxbeam.plot import plot_realisations
+from jaxbeam.sweeps import words
 from jaxbeam.sweeps.realisations import (
     interval_ranks,
     least_count,
@@ -63,6 +65,66 @@ def test_mean_fractile_and_need():
     few = realisation_statistics(values[:40, 0], 0.95)
     assert few["high"] == np.inf and few["needed"] == 32
     assert np.isnan(realisation_statistics(np.full(3, np.nan), 0.5)["mean"])
+
+
+ROUGH = jb.Case(
+    jb.Beam(20.0, 4e9, 8e3, damping_ratio=0.02, modes=3),
+    sensors=[jb.Sensor(10.0), jb.Sensor(7.0, quantity="moment")],
+    loads=[
+        jb.QuarterCar(
+            body_mass=4000.0,
+            axle_mass=600.0,
+            suspension_stiffness=4e5,
+            suspension_damping=1e4,
+            tyre_stiffness=1.5e6,
+            speed=20.0,
+        ),
+        jb.MovingMass(mass=500.0, speed=20.0, entry_time=0.2),
+    ],
+    profile=jb.profiles.ISO8608Profile("B", seed=0, highest_wavenumber=2.0),
+    run=jb.Run(1.6, sample_rate=100.0),
+)
+
+
+@pytest.fixture(scope="module")
+def c_library(tmp_path_factory):
+    """The C integrator in a cache folder of these tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        native_peaks.LIBRARY.build()
+        yield
+
+
+def relative_difference(first, second) -> float:
+    names = "peak_deflection", "peak_moment"
+    return max(float(np.nanmax(np.abs(first[name] / second[name] - 1))) for name in names)
+
+
+def test_seeds_as_runs_of_a_batch_and_one_by_one(c_library, monkeypatch):
+    """Profiles of their own in C, with vehicles that all share, against a sweep of each seed."""
+    over = {"profile.seed": range(1, 11), "loads.0.speed": [18.0, 23.0]}
+    together = jb.sweep(ROUGH, over, progress=False)
+    some = {"profile.seed": [2, 9], "loads.0.speed": [18.0, 23.0]}
+    monkeypatch.setattr(words, "_computed_together", lambda parts, bar: [])
+    alone = jb.sweep(ROUGH, some, progress=False)
+    assert together["profile.seed"].values.tolist() == list(range(1, 11))
+    found = together.sel({"profile.seed": [2, 9]})
+    assert relative_difference(found, alone) < 1e-7
+    np.testing.assert_allclose(found.peak_time, alone.peak_time, atol=1e-4)
+    assert found.cases.values.tolist() == alone.cases.values.tolist()
+
+
+def test_stated_errors_of_twenty_profiles(c_library):
+    """Against a tenth of the tolerance: all together, and each with its own statement."""
+    seeds, speed = range(20), {"loads.0.speed": [22.0]}
+    exact = jb.sweep(ROUGH, {"profile.seed": seeds} | speed, tolerance=1e-8, progress=False)
+    found = jb.sweep(ROUGH, {"profile.seed": seeds} | speed, progress=False)
+    assert relative_difference(found, exact) < min(1.5 * found.error_estimate, 1e-7)
+    for seed in seeds:
+        profile = dataclasses.replace(ROUGH.profile, seed=seed)
+        one = jb.sweep(dataclasses.replace(ROUGH, profile=profile), speed, progress=False)
+        error = relative_difference(one, exact.sel({"profile.seed": seed}))
+        assert error < min(1.5 * one.error_estimate, 1e-7)
 
 
 def test_sweep_over_seeds_and_figure():

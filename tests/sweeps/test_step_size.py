@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from jaxbeam.sweeps.step_size import (
+    LEAST_SHARE,
     LIMIT_RATIO,
     SAFETY_FACTOR,
     choose_step_sizes,
@@ -34,7 +35,7 @@ def test_steps_are_near_the_longest_within_tolerance(off):
     best = 0.3 / rates**0.7  # steps with a relative error of one
     tolerance = 1e-7
     longest = best * tolerance ** (1 / ORDER)
-    steps, error = choose_step_sizes(
+    steps, _, error = choose_step_sizes(
         peaks_with_error(best), rates, np.ones(50), off * longest, np.full(50, np.inf), 8, tolerance
     )
     assert np.all(steps <= longest * 1.05)
@@ -45,7 +46,7 @@ def test_steps_are_near_the_longest_within_tolerance(off):
 def test_steps_stay_below_their_limits():
     rates = np.geomspace(1, 10, 20)
     limits = np.linspace(0.01, 0.02, 20)
-    steps, _ = choose_step_sizes(
+    steps, *_ = choose_step_sizes(
         peaks_with_error(np.ones(20)), rates, np.ones(20), np.full(20, 5.0), limits, 4, 1e-6
     )
     assert np.all(steps <= limits) and np.all(steps > 0.95 * limits)
@@ -61,7 +62,7 @@ def test_steps_at_their_limit_are_checked_without_search(best):
         measured.append(steps.max())
         return peaks(chosen, steps, extra_steps)
 
-    steps, error = choose_step_sizes(
+    steps, _, error = choose_step_sizes(
         recorded_peaks, rates, np.ones(rates.size), LIMIT_RATIO * limits, limits, 4, 1e-6
     )
     assert error <= 1e-6
@@ -80,7 +81,7 @@ def test_failed_runs_are_left_out():
         choose_step_sizes(some_fail, *settings)[0], choose_step_sizes(all_succeed, *settings)[0]
     )
     all_fail = peaks_with_error(np.ones(20), failing=range(20))
-    steps, error = choose_step_sizes(all_fail, *settings)
+    steps, _, error = choose_step_sizes(all_fail, *settings)
     assert np.isnan(error) and np.all(steps == 0.02)
 
 
@@ -89,7 +90,7 @@ def test_sample_shortens_steps_that_are_too_long():
     rates = np.geomspace(1, 10, 64)
     measured = np.unique(log_spaced_sample(rates, np.ones(64), 4))
     best = np.where(np.isin(np.arange(64), measured), 0.5, 0.25)
-    steps, error = choose_step_sizes(
+    steps, _, error = choose_step_sizes(
         peaks_with_error(best), rates, np.ones(64), np.full(64, 0.1), np.full(64, np.inf), 4, 1e-6
     )
     assert error <= 1e-6
@@ -117,10 +118,47 @@ def test_settled_batches_are_not_measured_again():
 def test_short_initial_steps_are_lengthened():
     rates, best = np.geomspace(1, 10, 20), np.full(20, 0.1)
     longest = 0.1 * (1e-7 / SAFETY_FACTOR) ** (1 / ORDER)
-    steps, error = choose_step_sizes(
+    steps, _, error = choose_step_sizes(
         peaks_with_error(best), rates, np.ones(20), np.full(20, 0.7 * longest), np.ones(20), 4, 1e-7
     )
     assert np.all(steps > 0.9 * longest) and error <= 1e-7
+
+
+@pytest.mark.parametrize("off", [0.5, 1.0, 1.3, 3.0])
+def test_errors_of_all_runs_are_measured(off):
+    """Results are those of the finer runs, each of which is computed once."""
+    rates, best = np.geomspace(1, 10, 6), 0.1 * np.array([1.0, 0.9, 0.8, 0.7, 1.1, 1.0])
+    computed, peaks = [], peaks_with_error(best)
+
+    def recorded_peaks(chosen, steps, extra_steps):
+        computed.append(
+            set(zip(*map(np.ndarray.tolist, (chosen, steps, extra_steps)), strict=True))
+        )
+        return peaks(chosen, steps, extra_steps)
+
+    guesses = np.full(6, off * 0.08 * 1e-7 ** (1 / ORDER))
+    given = rates, np.ones(6), guesses, np.ones(6), 4, 1e-7
+    steps, extra, error = choose_step_sizes(recorded_peaks, *given, all_measured=True)
+    true_errors = (steps / best) ** ORDER
+    assert np.all(steps > 0.55 * best * 1e-7 ** (1 / ORDER))
+    assert true_errors.max() <= error <= 1e-7
+    assert set(zip(range(6), steps.tolist(), extra.tolist(), strict=True)) <= set().union(*computed)
+    later = computed[-1] & set().union(*computed[:-1])
+    assert len(computed) == 2 or later  # the finer run is the next coarser one
+
+
+def test_peaks_that_agree_by_chance_do_not_make_the_error_small():
+    def measure(chosen, steps, extra_steps):
+        return np.ones((len(chosen), 1, 1))
+
+    rates = np.geomspace(1, 10, 3)
+    steps = np.full(3, 0.1), np.full(3, 0.01)
+    *_, error = choose_step_sizes(measure, rates, rates, *steps, 4, 1e-6, all_measured=True)
+    assert error == 0.0  # of the longest steps
+    changed = peaks_with_error(np.full(3, 0.1), order=30)
+    given = rates, rates, np.full(3, 0.058), np.full(3, 0.1), 4, 1e-6
+    *_, error = choose_step_sizes(changed, *given, all_measured=True)
+    assert error >= LEAST_SHARE * 1e-6
 
 
 def test_no_step_meets_the_tolerance():
@@ -190,7 +228,7 @@ def test_between_two_rates_the_shorter_step_holds():
     best = np.full(41, 0.2)
     best[measured[2]] = 0.1
     guesses = np.full(41, 0.02)
-    steps, _ = choose_step_sizes(
+    steps, *_ = choose_step_sizes(
         peaks_with_error(best), rates, np.ones(41), guesses, np.ones(41), 4, 1e-7
     )
     near = np.arange(measured[1] + 1, measured[3])

@@ -18,13 +18,19 @@ OVER = {"loads.0.mass": [0.2, 0.4], "loads.0.speed": np.linspace(1.0, 5.0, 40)}
 
 def test_only_results_with_the_same_steps_are_known():
     trials, results = Trials(), {"peak": np.arange(6.0).reshape(3, 2)}
-    trials.add(np.array([4, 7, 9]), np.array([0.1, 0.2, 0.3]), results)
-    trials.add(np.array([7]), np.array([0.4]), {"peak": np.array([[8.0, 9.0]])})
-    batches, steps = np.array([9, 7, 5, 4]), np.array([0.3, 0.2, 0.1, 0.1])
-    known = trials.known(batches, steps)
-    assert known.tolist() == [True, False, False, True]
-    found = trials.completed({"peak": np.full((4, 2), -1.0)}, batches, known)
-    assert found["peak"].tolist() == [[4.0, 5.0], [-1.0, -1.0], [-1.0, -1.0], [0.0, 1.0]]
+    trials.add(np.array([4, 7, 9]), np.array([0.1, 0.2, 0.3]), np.array([0, 0, 1]), results)
+    latest = {"peak": np.array([[8.0, 9.0]])}
+    for step in (0.5, 0.4, 0.3, 0.25):  # as many as are kept, so that the first is forgotten
+        trials.add(np.array([7]), np.array([step]), np.array([0]), latest)
+    given = (
+        np.array([9, 9, 7, 7, 5]),
+        np.array([0.3, 0.3, 0.2, 0.4, 0.1]),
+        np.array([1, 0, 0, 0, 0]),
+    )
+    known = trials.known(*given)
+    assert known.tolist() == [True, False, False, True, False]
+    found = trials.completed({"peak": np.full((5, 2), -1.0)}, *given, known)["peak"].tolist()
+    assert found == [[4.0, 5.0], [-1.0, -1.0], [-1.0, -1.0], [8.0, 9.0], [-1.0, -1.0]]
 
 
 @pytest.mark.parametrize("way", ["C", "XLA", "single"])
@@ -37,9 +43,10 @@ def test_results_of_trials_are_those_of_stored_sweeps(way, tmp_path, monkeypatch
     monkeypatch.setattr(native_peaks, "available", lambda: native)
     masks, completed = [], Trials.completed
 
-    def counted(trials, results, batch_indices, known):
-        masks.append(known.sum())
-        return completed(trials, results, batch_indices, known)
+    def counted(trials, results, batch_indices, steps, extra_steps, known):
+        if results:  # of a block, not of a trial
+            masks.append(known.sum())
+        return completed(trials, results, batch_indices, steps, extra_steps, known)
 
     monkeypatch.setattr(Trials, "completed", counted)
     given = {"progress": False, "precision": precision}
