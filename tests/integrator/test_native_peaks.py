@@ -56,8 +56,9 @@ STREAM = jb.Case(
     run=jb.Run(1.5),
 )
 # A heavy mass at high speed: contact is lost, and some runs diverge.
+# Damped a little: free vibration of a pinned beam would repeat its peak, and rounding choose one.
 LOST_CONTACT = jb.Case(
-    jb.Beam(0.6, 11.68, 0.535, modes=6, damping_ratio=0.0),
+    jb.Beam(0.6, 11.68, 0.535, modes=6, damping_ratio=1e-3),
     sensors=SENSORS,
     loads=[jb.MovingMass(mass=5.0, speed=20.0)],
     run=jb.Run(0.2),
