@@ -21,6 +21,8 @@ REFUSED = {
     "python-control": lambda case, path: jb.state_space(case).unloaded.to_control(),
     "MATLAB": lambda case, path: jb.state_space(case).unloaded.to_mat(path / "plant.mat"),
     "file": lambda case, path: jb.save(jb.simulate(case), path / "run.csv"),
+    "table": lambda case, path: jb.simulate(case).columns,
+    "figure": lambda case, path: jb.simulate(case).plot(),
     "dataset": lambda case, path: jb.simulate(case).to_xarray(),
 }
 OF_PLANTS = "python-control, plant and loop", "python-control", "MATLAB"
@@ -29,6 +31,27 @@ TRANSFORMED = {
     "jit": lambda function: jax.jit(function)(1.0),
     "vmap": lambda function: jax.vmap(function)(np.array([0.8, 1.0])),
 }
+
+
+@pytest.mark.parametrize("transformed", ["jit", "vmap"])
+def test_the_verdict_of_a_compiled_run_is_refused(transformed):
+    def function(share):
+        return jb.simulate(jb.replace(CASE, {MASS: 0.3 * share})).verdict
+
+    with pytest.raises(ValueError, match="a verdict can be neither differentiated nor compiled"):
+        TRANSFORMED[transformed](function)
+
+
+@pytest.mark.parametrize("transformed", TRANSFORMED)
+def test_a_traced_record_says_that_it_is_one(transformed):
+    texts = []
+
+    def function(share):
+        texts.append(repr(jb.simulate(jb.replace(CASE, {MASS: 0.3 * share}))))
+        return share
+
+    TRANSFORMED[transformed](function)
+    assert all("traced or of several runs" in text for text in texts)
 
 
 @pytest.mark.parametrize("transformed", TRANSFORMED)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, is_concrete, refuse_traced
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.output_rows import sensor_history
@@ -355,6 +355,8 @@ class Record(RecordViews):
     @property
     def verdict(self) -> str:
         """Sentence on divergence, size, contact, steps of the controller that failed, and error."""
+        if not is_concrete(self.coordinates):  # it is known while a run is differentiated
+            refuse_traced("a verdict", "read it outside jit and vmap", self)
         diverged = float(concrete(self.diverged_time))
         if np.isfinite(diverged):
             return (

@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.display import with_prefix
-from jaxbeam.case.fields import is_concrete, refuse_traced
+from jaxbeam.case.fields import refuse_traced
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.files.endings import check_ending
@@ -22,7 +22,7 @@ from jaxbeam.files.interactive import interactive_page
 from jaxbeam.files.netcdf import write_netcdf
 from jaxbeam.files.tables import write_result
 from jaxbeam.model.modes import Modes
-from jaxbeam.runtime.arrays import Array
+from jaxbeam.runtime.arrays import Array, any_traced
 from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.module import Module
 from jaxbeam.runtime.output_file import whole_file
@@ -225,7 +225,7 @@ class RecordViews(TableViews, Module):
 
     @property
     def _is_one_known_run(self) -> bool:
-        return is_concrete(self.coordinates) and self.times.ndim == 1
+        return not any_traced(self) and self.times.ndim == 1
 
     def _dataset_parts(self) -> tuple[dict, dict, dict]:
         """Variables, coordinates and attributes of the labelled dataset."""
@@ -245,17 +245,20 @@ class RecordViews(TableViews, Module):
         """
         from jaxbeam.plot import plot_record
 
+        refuse_traced("a figure", "call it outside jit and grad", self)
         return plot_record(self, quantity, **options)
 
     def plot_envelope(self, quantity: str = "moment", **options: Any) -> "Figure | SubFigure":
         """Figure of the envelope of a quantity; see `jaxbeam.plot.plot_envelope`."""
         from jaxbeam.plot import plot_envelope
 
+        refuse_traced("a figure", "call it outside jit and grad", self)
         return plot_envelope(self, quantity, **options)
 
     @property
     def columns(self) -> dict[str, Float[ndarray, " time"]]:
         """Histories by head, as "midspan deflection (m)"; `to_dataframe` has them too."""
+        refuse_traced("a table", "call it outside jit and grad", self)
         histories = self.sensor_values, self.contact_force, self.command
         return record_columns(self.case, self.times, *histories)
 
