@@ -5,7 +5,10 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
-from jaxbeam.analysis.sections import record_amplification
+from jaxbeam.analysis.combinations import combine
+from jaxbeam.analysis.load_models import crossing_envelope, load_model_envelope
+from jaxbeam.analysis.margins import stability_margin
+from jaxbeam.analysis.sections import influence_table, record_amplification
 
 CASE = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.02, modes=2),
@@ -23,6 +26,13 @@ REFUSED = {
     "file": lambda case, path: jb.save(jb.simulate(case), path / "run.csv"),
     "table": lambda case, path: jb.simulate(case).columns,
     "figure": lambda case, path: jb.simulate(case).plot(),
+    "load model": lambda case, path: load_model_envelope(case, "HL-93", [0.3]),
+    "crossing of a load model": lambda case, path: crossing_envelope(case, "HL-93", 2.0, [0.3]),
+    "combinations": lambda case, path: combine(
+        case, {"deck": {"uniform": "20 N/m"}}, {"all": {"deck": 1.35}}, [0.3]
+    ),
+    "influences": lambda case, path: influence_table(case),
+    "margin": lambda case, path: stability_margin(case),
     "dataset": lambda case, path: jb.simulate(case).to_xarray(),
 }
 OF_PLANTS = "python-control, plant and loop", "python-control", "MATLAB"

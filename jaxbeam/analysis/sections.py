@@ -269,6 +269,7 @@ def influence_table(
     are by default those of `model.along_beam`, with more around the extremes of each line. Raises
     ValueError as `influence_line` does.
     """
+    refuse_traced("a table of influences", "call it outside jit and grad", case)
     parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
     lines = _sections(case, quantities, x)
 
