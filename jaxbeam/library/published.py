@@ -73,7 +73,12 @@ def _wagon(content: dict[str, Any], table: dict[str, Any]) -> Train:
 
 
 def _axles(content: dict[str, Any], table: dict[str, Any]) -> Train:
-    """Axles of a load model, at their distances."""
+    """Axles of a load model at their distances, the least ones of a `vehicle` of `load_models`."""
+    if "vehicle" in table:
+        model, name = table["vehicle"]
+        vehicle = next(one for one in load_models()[model].vehicles if one.name == name)
+        offsets, forces = vehicle.with_spacing(None), np.array(vehicle.axle_forces)
+        return Train(offsets, forces, None, None, content["source"])
     offsets = np.concatenate([[0.0], np.cumsum(table["axle_spacings"])])
     return Train(offsets, np.array(table["axle_forces"]), None, None, content["source"])
 
