@@ -116,9 +116,9 @@ class SemiActive(AbstractController):
 
     def design_law(self, plant):
         count = len(plant.case.driven)
-        limits = (xp.broadcast_to(one, count) for one in (self.min_damping, self.max_damping))
+        low, high = (xp.broadcast_to(one, count) for one in (self.min_damping, self.max_damping))
         sensors = velocity_sensors(plant.case)[:count]
-        return SemiActiveLaw(self._inner().law(plant), *limits, sensors, self.rates == "on-off")
+        return SemiActiveLaw(self._inner().law(plant), low, high, sensors, self.rates == "on-off")
 
     def _inner(self) -> AbstractController:
         """The desired law with the period and the delay of this one."""

@@ -256,8 +256,9 @@ class Runner:
         _, which = np.unique(np.stack(given), axis=1, return_index=True)
         new = which[~trials.known(*(part[which] for part in given))]
         if new.size:
-            own = [part[new] for part in given]
-            trials.add(*own, self._trial_results(backend, *own, single))
+            indices, own, extra = (part[new] for part in given)
+            found = self._trial_results(backend, indices, own, extra, single)
+            trials.add(indices, own, extra, found)
         results = trials.completed({}, *given, np.ones(len(steps), bool))
         return self._compared_by_quantity(results["peak_deflection"])
 

@@ -217,16 +217,16 @@ def compute_word_sweep(
     if path is not None and state == "new":
         with new_store(path, fingerprint):
             pass
-    datasets: dict[int, xarray.Dataset] = {}
+    known: dict[int, xarray.Dataset] = {}
     if path is None:
         for group in _alike_but_for_profiles(plan.sweeps):
             found = _computed_together([plan.sweeps[i] for i in group], progress_bar)
-            datasets |= zip(group, found, strict=False)
+            known |= zip(group, found, strict=False)
     for i, part in enumerate(plan.sweeps):
         part_path = None if path is None else path / BLOCKS_GROUP / str(i)
-        if i not in datasets:
-            datasets[i] = _compute_part(part, part_path, client, progress_bar)
-    datasets = [datasets[i] for i in range(len(plan.sweeps))]
+        if i not in known:
+            known[i] = _compute_part(part, part_path, client, progress_bar)
+    datasets = [known[i] for i in range(len(plan.sweeps))]
     joined = plan.join(datasets)
     for quantity, share in _estimates(plan, datasets).items():
         joined[f"peak_{quantity}"].attrs["truncation_error"] = share

@@ -298,7 +298,7 @@ class ProfilesOfRuns(Module):
     amplitudes: Float[np.ndarray, "run line"]
     phases: Float[np.ndarray, "run line"]
 
-    def heights(self, x) -> tuple[Float[np.ndarray, "*x run"], ...]:
+    def heights(self, x) -> Heights:
         """Height (m), slope (1) and curvature (1/m) of each profile at positions x (m)."""
         x, wavenumbers = np.asarray(x, float), self.first.wavenumbers
         half = 0.5 * PANEL_PHASE / (2 * np.pi * np.max(np.abs(wavenumbers)))
