@@ -102,7 +102,10 @@ def combined(
 def action_extremes(
     case: Case, action: Mapping, x: Float[np.ndarray, " position"], quantity: str, where: str = ""
 ) -> Extremes:
-    """Lowest and highest effect of an action at positions x (m); see `combine`."""
+    """Lowest and highest effect of an action at positions x (m); see `combine`.
+
+    Raises ValueError as that does, for the action at the address `where`.
+    """
     source = next((one for one in SOURCES if one in action), None)
     allowed = () if source is None else (source, *OPTIONS[source])
     wrong = [key for key in action if key not in allowed]

@@ -111,15 +111,19 @@ def questions(
 def answer(work: Callable[[dict[str, Any]], Any], text: str | bytes) -> tuple[bool, Content]:
     """Whether a question in JSON could be answered, and its answer or the problem, as bytes."""
     try:
-        question = json.loads(text)
-        if not isinstance(question, dict):
-            raise ValueError("a question is a table")
-        if not isinstance(question.get("text", ""), str):
-            raise ValueError("the text of a question is text")
-        found = work(question)
+        found = work(_question(text))
     except (ValueError, KeyError, OSError, RuntimeError, ImportError, TypeError) as error:
         return False, as_json({"problem": problem_of(error)})
     return True, found if isinstance(found, Content) else as_json(found)
+
+
+def _question(text: str | bytes) -> dict[str, Any]:
+    question = json.loads(text)
+    if not isinstance(question, dict):
+        raise ValueError("a question is a table")
+    if not isinstance(question.get("text", ""), str):
+        raise ValueError("the text of a question is text")
+    return question
 
 
 def problem_of(error: Exception) -> dict[str, Any]:

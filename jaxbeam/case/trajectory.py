@@ -21,6 +21,7 @@ from jaxbeam.runtime.module import Module
 NEVER = 1e30  # s, beyond any run; finite, also in single precision, so that derivatives exist
 SAME_TIME = 1e-12  # of a time: a sample that is earlier by less is at it
 SAME_SHARE = 1e-9  # of a crossing, likewise
+SAME_SAMPLE = 3e-7  # of a time, likewise in single precision
 
 
 def has_come(time, t):

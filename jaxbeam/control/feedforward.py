@@ -27,7 +27,7 @@ from jaxbeam.case.fields import (
     number,
 )
 from jaxbeam.case.loads.base import trajectory
-from jaxbeam.case.trajectory import NEVER, SAME_SHARE, SAME_TIME, has_come
+from jaxbeam.case.trajectory import NEVER, SAME_SAMPLE, SAME_SHARE, SAME_TIME, has_come
 from jaxbeam.runtime.arrays import Array, Number, xp
 
 
@@ -107,7 +107,9 @@ class Prescribed(AbstractStaticController):
             angle = angle if self.phases is None else angle + self.phases
             command = command + xp.sum(self.amplitudes * xp.sin(angle), axis=-1)
         if self.times is not None:
-            command = command + _tabulated(self.times, self.values, t, SAME_TIME * t)
+            # A sample at an end of the table is at it in single precision, too.
+            rounding = SAME_TIME if self.period is None else SAME_SAMPLE
+            command = command + _tabulated(self.times, self.values, t, rounding * t)
         return command
 
     def breakpoints(self, case):

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.contact import ONE_RUN
+from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check_case
@@ -204,6 +205,8 @@ def _known_run(case: Case, times, tolerance: float) -> tuple[Record | None, Inte
 
     Of a derivative of a run that is compiled there is no record: it would take another program.
     """
+    if not isinstance(case.controller, AbstractController | None):
+        check_case(case)  # which the first run does, too
     moving = case.controller is not None and moves_events(case, times)
     traced, case = any_jax(case, times), concrete_case(case)
     times = None if times is None else concrete(times)

@@ -3,6 +3,7 @@
 import ctypes
 import dataclasses
 import json
+import os
 import pathlib
 import platform
 import re
@@ -168,6 +169,32 @@ def test_a_beam_without_loads_stays_at_rest():
     case = dataclasses.replace(PLAIN, loads=[])
     results = jb.sweep(case, {"beam.flexural_rigidity": [9.0, 12.0]}, progress=False)
     assert np.all(results.peak_deflection == 0) and not results.failed.any()
+
+
+FILLED_SCRIPT = """
+import jaxbeam as jb
+from jaxbeam.integrator import native_peaks
+from tests.integrator.test_native_peaks import COILED
+native_peaks.MIN_RUNS_OF_LOOPS = 1
+runs = jb.sweep(COILED, {"loads.0.speed": [0.8, 1.2]}, progress=False)
+print(runs.lowest_contact_force.values.tobytes().hex(), runs.peak_deflection.values.tobytes().hex())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="its allocator fills memory")
+def test_results_do_not_depend_on_what_memory_held():
+    """A sample falls on the exit of the vehicle, but for rounding."""
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", FILLED_SCRIPT],
+            env=os.environ | {"MALLOC_PERTURB_": filled, "PYTHONPATH": str(ROOT)},
+            cwd=ROOT,
+            capture_output=True,
+            check=True,
+        ).stdout
+        for filled in ("0", "170")
+    ]
+    assert found[0] == found[1]
 
 
 NARROW_SCRIPT = """

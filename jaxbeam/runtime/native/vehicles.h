@@ -7,9 +7,24 @@
 #include "matrices.h"
 #include "vehicle_layout.h"
 
+/* Index of a wheel of a vehicle in a step, below zero for wheels of others. */
+static inline int64_t wheel_of(const Step *step, int s, int64_t first, int wheels) {
+    const int64_t wheel = step->load_numbers[s] - first;
+    return wheel < wheels ? wheel : -1; /* wheels before the first are below zero, too */
+}
+
 int vehicles_move(const Workspace *w, const Step *step) {
     const double middle = step->start + step->length / 2;
-    return (w->has_surface || w->first_vehicle_entry < middle) && middle < w->last_vehicle_exit;
+    if ((w->has_surface || w->first_vehicle_entry < middle) && middle < w->last_vehicle_exit)
+        return 1;
+    /* Beside an exit, by rounding, a step of hardly any length has the wheel that leaves. */
+    for (int group = 0; group < w->groups_of_vehicles; group++) {
+        const int64_t *numbers = w->vehicles + group * VEHICLE_NUMBERS;
+        for (int s = 0; s < step->loads; s++)
+            if (wheel_of(step, s, numbers[FIRST_WHEEL], (int)(numbers[COUNT] * numbers[WHEELS])) >= 0)
+                return 1;
+    }
+    return 0;
 }
 
 /* Forces of the profile on the springs of all wheels at the nodes. */
@@ -36,12 +51,6 @@ void set_vehicle_times(Workspace *w) {
             w->last_vehicle_exit = fmax(w->last_vehicle_exit, interval[1]);
         }
     }
-}
-
-/* Index of a wheel of a vehicle in a step, below zero for wheels of others. */
-static inline int64_t wheel_of(const Step *step, int s, int64_t first, int wheels) {
-    const int64_t wheel = step->load_numbers[s] - first;
-    return wheel < wheels ? wheel : -1; /* wheels before the first are below zero, too */
 }
 
 /* Add the springs of vehicles to contact equations, `matrix` times forces = `right`. */
