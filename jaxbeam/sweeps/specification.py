@@ -69,6 +69,9 @@ SCHEDULE_ADDRESS = re.compile(
     r"|sensors\.(\d+|\*)\.(sampling_period|delay|dropout|jitter)"
 )
 
+# What a store keeps of steps; a sweep that was begun with other contents is not continued.
+STORED_STEPS = "sizes of batches, extra steps, error"
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SweepSpecification:
@@ -239,6 +242,7 @@ class SweepSpecification:
                 jax.default_backend(),
                 len(jax.local_devices()),
             ],
+            "steps": STORED_STEPS,
             "versions": [_version(), jax.__version__],
         }
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
