@@ -138,9 +138,6 @@ def _propagators(group: VehicleGroup, lengths: Float[Array, " length"]) -> Vehic
     )
 
 
-MAX_UNROLLED_ROWS = 24  # of contact equations whose elimination is spelt out
-
-
 class VehicleStep(Module):
     """Wheels of the rows of a step, and the surface, for each step of a chunk.
 

@@ -225,9 +225,6 @@ def repeat_plant(plant: SampledPlant, periods: int) -> SampledPlant:
 # of the fastest mode, or of a vehicle, in one, with which fewer have maps exact to about 1e-9.
 CELLS, MAX_PHASE_PER_CELL = 8, 1.7
 
-# State at the end of a cell from the state at its start and the held commands.
-CellMap = Float[Array, "*cell all all_and_command"]
-
 
 class Preview(Module):
     """Plant under its loads, and what its maps have in common at all samples.

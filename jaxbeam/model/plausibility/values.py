@@ -20,7 +20,6 @@ WALKING, LARGEST_PERSON = (0.5, 3.0), 1200.0  # m/s, N
 ROAD_KINDS = ("quarter-car", "half-car")
 ROAD_SPEED, RAIL_SPEED = 60.0, 120.0  # m/s; 1.2 times 350 km/h is 117 m/s
 CLAMPING_STIFFNESS = 10.0  # E I / L: of two springs that hold the rotation, too
-SUPPORTED = 1e-3  # of the largest influence on a mode: a place that moves as little is held
 LEAST_SAMPLES = 2.0  # in a period
 LARGEST_IN_KHZ = 10.0  # of a sample rate of 10 kHz
 LATE_BY_TABLE = 100.0  # times the run, until a load leaves
