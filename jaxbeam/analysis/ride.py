@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.simulation.record import Record
 
@@ -190,7 +189,7 @@ def wheel_unloading(record: Record) -> Float[Array, " load"]:
     >>> print(jb.ride.wheel_unloading(jb.simulate(case)).shape)
     (1,)
     """
-    loads = load_set(record.case)
+    loads = record.loads
     static = loads.weight[:, 0]
     entry, leave = loads.entry_exit_times().T
     crosses = (entry < record.times[-1]) & (leave > 0)

@@ -134,7 +134,7 @@ def pictures(record: Record) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     actuator) are histories over `times`, in SI units. Only so many samples as a screen can show are
     among them.
     """
-    case, loads = record.case, load_set(record.case)
+    case, loads = record.case, record.loads
     frames = _spread(record.times.size, MAX_FRAMES)
     samples = _spread(record.times.size, MAX_SAMPLES)
     x = np.asarray(concrete(positions_along(case, BEAM_POINTS)))
@@ -147,7 +147,7 @@ def pictures(record: Record) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         "verdict": record.verdict,
         "steps": int(record.steps),
         "diverged": diverged if np.isfinite(diverged) else None,
-        "wheels": wheel_labels(case).tolist(),
+        "wheels": wheel_labels(loads).tolist(),
         "bodies": record.bodies,
         "shownWheels": shown,
         "lost": [

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.integrator.kinks import KinkPassages, kink_passages
-from jaxbeam.model.load_set import load_set
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.runtime.arrays import (
     Array,
@@ -424,15 +424,14 @@ def event_places(
     return own if places is None else xp.concatenate([own, model.load_places(places)])
 
 
-def _events_between(case: Case, model: ModalModel, places, start, end, known=None):
+def _events_between(case: Case, model: ModalModel, places, start, end, known=None, loads=None):
     """Events of the loads, if not `known`, clipped to start and end, and passages over kinks.
 
     Of these each time twice: a panel of no length lies in between. Then the passages, and the
     index of each, -1 for one that does not happen, whose times are the end.
     """
-    loads = None
     if known is None:
-        loads = load_set(case, model.modes.layout)
+        loads = load_set(case, model.modes.layout) if loads is None else loads
         known = loads.events(event_places(model, places))
     windows, events = known
     events, kinks = xp.clip(events, start, end), kink_passages(case, model, loads)
@@ -538,15 +537,16 @@ def grid_by_schedule(
     substeps: int | Int[Array, ""],
     places: Float[Array, " place"] | None = None,
     known_events: LoadEvents | None = None,
+    loads: LoadSet | None = None,
 ) -> TimeGrid:
     """Panels between the events of a schedule and the load events, of `substeps` steps each.
 
     Nearly all panels share a few step lengths, hence their propagators. Steps also end where a
-    wheel passes one of the `places` (m). The events of the loads at all `event_places` can be
+    wheel passes one of the `places` (m). The loads, or their events at all `event_places`, can be
     given, if they are known.
     """
     times = schedule.times
-    between = times[0], times[-1], known_events
+    between = times[0], times[-1], known_events, loads
     windows, events, twice, kinks, index = _events_between(case, model, places, *between)
     if schedule.control_sample is not None:
         # A step of zero length after the end: the controller acts at the last event too.

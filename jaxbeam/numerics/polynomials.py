@@ -9,6 +9,7 @@ from numpy.polynomial import chebyshev, legendre
 from jaxbeam.runtime.arrays import (
     Array,
     any_jax,
+    array_namespace,
     custom_jvp,
     optimization_barrier,
     slice_in_dim,
@@ -168,12 +169,12 @@ def chebyshev_polynomials(t, terms: int):
 
     By doubling, T_(k+j) = 2 T_k T_j - T_(k-j): few steps, and accurate.
     """
-    axis = t.ndim
-    table = xp.stack([xp.ones_like(t), t], axis=axis)
+    axis, lib = t.ndim, array_namespace(t)
+    table = lib.stack([lib.ones_like(t), t], axis=axis)
     while table.shape[axis] < terms:
         table = optimization_barrier(table)
         last = 2 * slice_in_dim(table, -1, None, axis)
-        lower = xp.flip(slice_in_dim(table, 0, -1, axis), axis)
+        lower = lib.flip(slice_in_dim(table, 0, -1, axis), axis)
         higher = last * slice_in_dim(table, 1, None, axis) - lower
-        table = xp.concatenate([table, higher], axis=axis)
+        table = lib.concatenate([table, higher], axis=axis)
     return slice_in_dim(table, 0, terms, axis)

@@ -11,7 +11,6 @@ from PIL import Image
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.along_beam import positions_along
-from jaxbeam.model.load_set import load_set
 from jaxbeam.plot.schematic import (
     ACTUATOR_MARKER,
     actuator_positions,
@@ -65,7 +64,7 @@ def animate(
         raise ValueError(f"there is nothing to show: {record.verdict}")
     controlled = record.case.controller is not None
     quantities = list(dict.fromkeys(sensor.quantity for sensor in record.case.sensors))
-    stage = 3.0 if load_set(record.case).on_ground.any() else 2.2
+    stage = 3.0 if record.loads.on_ground.any() else 2.2
     heights = [stage] + [1.3] * (len(quantities) + controlled)
     figure = Figure(figsize=size or (6.4, 0.8 + sum(heights)), dpi=dpi)
     canvas = FigureCanvasAgg(figure)

@@ -9,7 +9,7 @@ The other functions here replace what the two write differently: indexed updates
 import functools
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,30 +47,56 @@ def any_traced(*trees: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
-def _einsum(subscripts: str, *operands: np.ndarray) -> np.ndarray | np.generic:
-    """`numpy.einsum`; of two operands as products of matrices, several times as fast."""
+class _Product(NamedTuple):
+    """A sum of products of two arrays as a product of matrices: axes of each, in their order.
+
+    Those of both in the result, those of one of them alone, and those that are summed.
+    """
+
+    first: tuple[int, ...]
+    second: tuple[int, ...]
+    batch: int
+    left: int
+    output: tuple[int, ...]
+
+
+@functools.cache
+def _product(subscripts: str) -> _Product | None:
+    """The product of matrices for the subscripts of two arrays, None where there is none."""
     inputs, _, output = subscripts.partition("->")
-    if len(operands) != 2 or "." in subscripts or not output:
-        return np.einsum(subscripts, *operands)
-    (first, second), (a, b) = inputs.split(","), operands
-    sizes = dict(zip(first + second, a.shape + b.shape, strict=True))
+    first, comma, second = inputs.partition(",")
+    if not comma or "," in second or "." in subscripts or not output:
+        return None
     shared = [label for label in first if label in second]
     batch = [label for label in shared if label in output]
     summed = [label for label in shared if label not in output]
     left = [label for label in first if label not in second]
     right = [label for label in second if label not in first]
     if set(left + right) - set(output):
+        return None
+    found = batch + left + right
+    return _Product(
+        tuple(map(first.index, batch + left + summed)),
+        tuple(map(second.index, batch + summed + right)),
+        len(batch),
+        len(left),
+        tuple(map(found.index, output)),
+    )
+
+
+def _einsum(subscripts: str, *operands: np.ndarray) -> np.ndarray | np.generic:
+    """`numpy.einsum`; of two operands as products of matrices, several times as fast."""
+    product = _product(subscripts)
+    if product is None:
         return np.einsum(subscripts, *operands)
-
-    def matrices(array, labels, rows, columns):
-        array = array.transpose([labels.index(label) for label in batch + rows + columns])
-        shape = (math.prod(sizes[label] for label in part) for part in (rows, columns))
-        return array.reshape(*(sizes[label] for label in batch), *shape)
-
-    product = matrices(a, first, left, summed) @ matrices(b, second, summed, right)
-    labels = batch + left + right
-    product = product.reshape([sizes[label] for label in labels])
-    return product.transpose([labels.index(label) for label in output])
+    a, b = operands[0].transpose(product.first), operands[1].transpose(product.second)
+    i, j = product.batch, product.batch + product.left
+    k = i + a.ndim - j  # of the first axis of `b` that is not summed
+    batch, left, right = a.shape[:i], a.shape[i:j], b.shape[k:]
+    summed = math.prod(a.shape[j:])
+    rows = a.reshape(*batch, math.prod(left), summed)
+    columns = b.reshape(*batch, summed, math.prod(right))
+    return (rows @ columns).reshape(batch + left + right).transpose(product.output)
 
 
 def _asarray(value: Any, dtype: Any = None) -> Any:

@@ -6,35 +6,34 @@ from jaxtyping import Float, Int
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete
 from jaxbeam.case.sensors import sensor_labels
-from jaxbeam.model.load_set import LoadSet, load_set
+from jaxbeam.model.load_set import LoadSet
 from jaxbeam.runtime.module import Module
 
 MAX_LISTED = 4  # wheels in a sentence
 ROUNDING = 1e-12  # of a given force
 
 
-def wheel_labels(case: Case) -> np.ndarray:
+def wheel_labels(loads: LoadSet) -> np.ndarray:
     """Labels of all wheels: the number of the load, "0", or of one of its wheels, "0 wheel 2".
 
     Wheels of a load of several are counted from 1, front first, through all its vehicles. Absorbers
     come last, "absorber 0".
     """
-    loads, labels = load_set(case).load_of_wheel, []
-    for wheel, load in enumerate(loads):
-        is_only = loads.count(load) == 1
-        label = f"{load}" if is_only else f"{load} wheel {wheel - loads.index(load) + 1}"
-        absorber = load - len(case.loads)
+    owners, labels = loads.load_of_wheel, []
+    for wheel, load in enumerate(owners):
+        is_only = owners.count(load) == 1
+        label = f"{load}" if is_only else f"{load} wheel {wheel - owners.index(load) + 1}"
+        absorber = load - len(loads.trajectories) + loads.absorbers
         labels.append(label if absorber < 0 else f"absorber {absorber}")
     return np.array(labels, dtype=str)
 
 
-def contact_sentence(case: Case, lost_times, lost_positions, lowest_forces) -> str:
-    """Where and when (s, m) wheels first would have to pull, and their smallest forces (N).
+def contact_sentence(case: Case, loads: LoadSet, lost_times, lost_positions, lowest_forces) -> str:
+    """Where and when (s, m) wheels of the loads would first have to pull, and least forces (N).
 
     Times are NaN for wheels that press on the beam throughout. The first of many wheels are listed.
     Prescribed forces may be negative: these pull because they were given so.
     """
-    loads = load_set(case)
     negative, prescribed = np.isfinite(lost_times), loads.prescribed
     rounding = ROUNDING * _given_forces(loads)
     lowest_forces = np.where(np.abs(lowest_forces) <= rounding, 0.0, lowest_forces)
@@ -45,12 +44,12 @@ def contact_sentence(case: Case, lost_times, lost_positions, lowest_forces) -> s
         i = int(pulling[np.argmin(lowest_forces[pulling])])
         more = f" and {pulling.size - 1} others" if pulling.size > 1 else ""
         return (
-            f"the prescribed force of load {wheel_labels(case)[i]}{more} is negative at times, down"
-            f" to {lowest_forces[i]:.4g} N, as given"
+            f"the prescribed force of load {wheel_labels(loads)[i]}{more} is negative at times,"
+            f" down to {lowest_forces[i]:.4g} N, as given"
         )
     if not lost.size:
         return _pressing_sentence(case, loads, lowest_forces)
-    labels = wheel_labels(case)
+    labels = wheel_labels(loads)
     first = lost[np.argsort(lost_times[lost], kind="stable")][:MAX_LISTED]
     parts = [
         f"load {labels[i]} loses contact, first at t = {lost_times[i]:.4g} s,"
@@ -78,12 +77,12 @@ class Flights(Module):
     gap: Float[np.ndarray, " flight"]
 
 
-def flights_sentence(case: Case, flights: Flights) -> str:
+def flights_sentence(case: Case, loads: LoadSet, flights: Flights) -> str:
     """When and where wheels leave the beam and land, how high they fly, how hard they land.
 
     The first flight of each of the first wheels, and how many more there are.
     """
-    labels, length, parts = wheel_labels(case), float(concrete(case.beam.length)), []
+    labels, length, parts = wheel_labels(loads), float(concrete(case.beam.length)), []
     wheels = list(dict.fromkeys(flights.wheel.tolist()))
     for wheel in wheels[:MAX_LISTED]:
         own = np.flatnonzero(flights.wheel == wheel)
@@ -118,7 +117,7 @@ def _pressing_sentence(case: Case, loads: LoadSet, lowest_forces) -> str:
     """Which wheels press on the beam throughout, where none pulls: none without weight, say."""
     if not case.loads:
         return "the case has no loads"
-    labels = wheel_labels(case)
+    labels = wheel_labels(loads)
     enter, leave = concrete(loads.entry_exit_times()).T
     crosses = (enter < concrete(case.run.duration)) & (leave > 0) & ~loads.fixed
     if not np.any(crosses):

@@ -1,6 +1,7 @@
 """Record of one simulated run: histories, section forces, peaks, error; as xarray and netCDF."""
 
 import enum
+import functools
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -9,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete, refuse_traced
-from jaxbeam.model.load_set import load_set
+from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.output_rows import sensor_history
 from jaxbeam.model.sensing.sensor_signals import (
@@ -113,10 +114,15 @@ class Record(RecordViews):
     result: Int[Array, ""] | None = None
     flights: Flights | None = None
 
+    @functools.cached_property
+    def loads(self) -> LoadSet:
+        """Wheels and vehicles of the loads of the case, the absorbers behind them."""
+        return load_set(self.case)
+
     @property
     def bodies(self) -> list[str]:
         """Names of the degrees of freedom of vehicles and absorbers: "loads.0 vehicle 2 body"."""
-        loads, names = load_set(self.case), []
+        loads, names = self.loads, []
         for group in loads.wheels.vehicles:
             number = loads.load_of_wheel[group.first_wheel]
             absorber = number - len(self.case.loads)
@@ -366,9 +372,9 @@ class Record(RecordViews):
         contact = self.contact_lost_time, self.contact_lost_position, self.lowest_contact_force
         if self.flights is None or not self.flights.wheel.size:
             contact = (np.asarray(concrete(part)) for part in contact)
-            parts = [contact_sentence(self.case, *contact)]
+            parts = [contact_sentence(self.case, self.loads, *contact)]
         else:
-            parts = [flights_sentence(self.case, self.flights)]
+            parts = [flights_sentence(self.case, self.loads, self.flights)]
         parts += self._stroke_sentences() + self._size_sentences()
         failures = int(concrete(self.failures)[-1])
         if failures:

@@ -253,7 +253,7 @@ def _with_result(record: Record, errors, tolerance: float, inside) -> Record:
     """The record with errors of the steps added, and with its `Result`."""
     # As arrays: of single numbers each value would have a program of its own.
     of_steps = record.error_estimate + errors[:1]
-    lost = xp.isfinite(record.contact_lost_time) & ~load_set(record.case).prescribed
+    lost = xp.isfinite(record.contact_lost_time) & ~record.loads.prescribed
     flags = {
         Result.CONTACT_LOST: xp.any(lost) & (record.flights is None),
         Result.STEPS_TOO_LONG: xp.any(of_steps > tolerance),
@@ -271,7 +271,7 @@ def _with_result(record: Record, errors, tolerance: float, inside) -> Record:
 def _with_warning(record: Record) -> Record:
     """The same record; warns of loads that lose contact, if their numbers are known."""
     if is_concrete(record.contact_lost_time):
-        lost = np.isfinite(concrete(record.contact_lost_time)) & ~load_set(record.case).prescribed
+        lost = np.isfinite(concrete(record.contact_lost_time)) & ~record.loads.prescribed
         if lost.any() and np.isnan(concrete(record.diverged_time)):
             warnings.warn(record.verdict, ContactLossWarning, stacklevel=3)
     return record
@@ -511,7 +511,7 @@ def integration_setup(
         policy = policy or closed_loop(case, layout, loads, schedule, noisy)
         model = policy.model
     places = None if monitored is None else corrected_places(case, model, monitored)
-    grid = grid_by_schedule(case, model, schedule, plan.substeps, places)
+    grid = grid_by_schedule(case, model, schedule, plan.substeps, places, loads=loads)
     outputs = None if monitored is None else sensor_rows(model, case, monitored)
     correction = outputs and static_correction(model, case, monitored, outputs)
 

@@ -21,6 +21,7 @@ from jaxbeam.files.endings import check_ending
 from jaxbeam.files.interactive import interactive_page
 from jaxbeam.files.netcdf import write_netcdf
 from jaxbeam.files.tables import write_result
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.runtime.arrays import Array, any_traced
 from jaxbeam.runtime.dataset import labelled_dataset
@@ -97,7 +98,7 @@ def dataset_parts(
     coordinates = {
         "time": ("time", np.asarray(times), {"units": "s"}),
         **sensor_coordinates(case),
-        "load": ("load", wheel_labels(case)),
+        "load": ("load", wheel_labels(load_set(case))),
         "body": ("body", np.array(bodies, dtype=str)),
         **({"support": ("support", supports, {"units": "m"})} if supports.size else {}),
         "frequency": ("mode", np.asarray(modes.frequencies), {"units": "Hz"}),
@@ -126,7 +127,7 @@ def record_columns(
         head = f"{sensor.name or f'sensor {i}'} {sensor.quantity}{_in_brackets(sensor.unit)}"
         head = f"sensor {i} {head}" if head in columns else head  # of equal names
         columns[head] = sensor_values[:, i]
-    for i, label in enumerate(wheel_labels(case)):
+    for i, label in enumerate(wheel_labels(load_set(case))):
         columns[f"load {label} contact force (N)"] = contact_force[:, i]
     for i, actuator in enumerate(case.actuators):
         columns[f"actuator {i} command{_in_brackets(actuator.command_unit)}"] = command[:, i]

@@ -32,6 +32,7 @@ BLOCK = 16  # waves at once then: memory does not grow with their number
 # Of known numbers the sum is interpolated on panels of so many rad of its shortest wave, with so
 # many Chebyshev points each: their series of a cosine ends at J_24(4) = 2e-17.
 PANEL_PHASE, PANEL_POINTS = 8.0, 24
+PANELS_AT_ONCE = 64  # a call for each panel takes longer than its sum
 LEAST_INTERPOLATED, LEAST_POSITIONS = 50_000, 4  # cosines in all, positions a panel
 
 
@@ -148,12 +149,16 @@ def _interpolated_sum(x: np.ndarray, waves, half: float) -> Heights:
             series[:, :, i, run] = parts @ rows
     series = series.reshape(used.size, PANEL_POINTS, -1)
     order = np.argsort(panel, kind="stable")  # positions of each panel, one panel after the other
+    inside = (flat[order] - np.repeat(centres, counts)) / half
     found = np.empty((x.size, series.shape[2]))
-    starts = np.cumsum(counts) - counts
-    for centre, one, start, size in zip(centres, series, starts, counts, strict=True):
-        here = order[start : start + size]
-        table = chebyshev.chebvander((flat[here] - centre) / half, PANEL_POINTS - 1)
-        found[here] = table @ one
+    ends = np.cumsum(counts)
+    for block in range(0, used.size, PANELS_AT_ONCE):
+        own = ends[block : block + PANELS_AT_ONCE]
+        places = np.s_[ends[block] - counts[block] : own[-1]]
+        table = chebyshev.chebvander(inside[places], PANEL_POINTS - 1)
+        parts = (np.split(part, own[:-1] - places.start) for part in (order[places], table))
+        for one, here, rows in zip(series[block : block + own.size], *parts, strict=True):
+            found[here] = rows @ one
     parts = found.reshape(*x.shape, 3, *runs)
     height, slope, curvature = np.moveaxis(parts, x.ndim, 0)
     return height, slope, curvature

@@ -91,10 +91,9 @@ def _wheel_lines(record: "jb.Record") -> list[str]:
     import numpy as np
 
     from jaxbeam.analysis.ride import wheel_unloading
-    from jaxbeam.model.load_set import load_set
     from jaxbeam.simulation.labels import wheel_labels
 
-    loads, labels = load_set(record.case), wheel_labels(record.case)
+    loads, labels = record.loads, wheel_labels(record.loads)
     static, lowest = np.asarray(loads.weight)[:, 0], np.asarray(record.lowest_contact_force)
     largest = np.max(record.contact_force, axis=0, initial=0.0)
     unloading = np.asarray(wheel_unloading(record))

@@ -7,7 +7,6 @@ import numpy as np
 from jaxbeam.case.case import crossing_times
 from jaxbeam.case.display import with_prefix
 from jaxbeam.case.fields import concrete
-from jaxbeam.model.load_set import load_set
 from jaxbeam.plot.style import (
     ALARM,
     GREY,
@@ -36,8 +35,8 @@ def forces_vary(record: Record) -> bool:
     It does where a mass or a vehicle is on the beam, or a force is a function of time.
     """
     on = np.isfinite(np.asarray(record.load_position))
-    static = np.asarray(concrete(load_set(record.case).weight))[:, 0]
-    on = on & ~load_set(record.case).fixed
+    static = np.asarray(concrete(record.loads.weight))[:, 0]
+    on = on & ~record.loads.fixed
     deviation = np.where(on, np.abs(np.asarray(record.contact_force) - static), 0.0)
     return bool(np.any(deviation > SAME_FORCE * np.abs(static)))
 
@@ -52,7 +51,7 @@ def draw_forces(axes, record: Record) -> None:
     on = np.isfinite(np.asarray(record.load_position))
     factor, unit = unit_scale(force[on], "N")
     force = np.where(on, force, np.nan) / factor
-    loads, labels = load_set(record.case), wheel_labels(record.case)
+    loads, labels = record.loads, wheel_labels(record.loads)
     static = np.asarray(concrete(loads.weight))[:, 0] / factor
     load_of_wheel, heights, names, tints = np.array(loads.load_of_wheel), [], [], []
     for load in range(len(record.case.loads)):
@@ -111,7 +110,7 @@ def _mark_losses(axes, record) -> None:
         for flight in zip(record.flights.lift_time, record.flights.landing_time, strict=True):
             axes.plot(flight, [0, 0], color=ALARM, linewidth=3, solid_capstyle="butt")
     first = lost[np.argmin(times[lost])]
-    label = wheel_labels(record.case)[first]
+    label = wheel_labels(record.loads)[first]
     wheel = f", load {label}" if len(times) > 1 else ""
     left = times[first] > np.mean(np.asarray(record.times)[[0, -1]])
     style = {"ha": "right" if left else "left", "va": "top", "color": ALARM}
@@ -130,7 +129,7 @@ def draw_accelerations(axes, record: Record) -> None:
     Not of axles and bogies, which shake more and carry nobody; of many vehicles the envelope.
     """
     times, acceleration = np.asarray(record.times), np.asarray(record.body_acceleration)
-    loads, first, curves = load_set(record.case), 0, []
+    loads, first, curves = record.loads, 0, []
     for group in loads.wheels.vehicles:
         load = loads.load_of_wheel[group.first_wheel]
         if load == len(record.case.loads):

@@ -10,7 +10,6 @@ import numpy as np
 from PIL import Image
 
 from jaxbeam.case.fields import concrete
-from jaxbeam.model.load_set import load_set
 from jaxbeam.plot.schematic import LOAD_MARKER, surface_height
 from jaxbeam.plot.style import COLOURS, GREY, INK
 from jaxbeam.plot.traffic.drawing import vehicle_art
@@ -31,7 +30,7 @@ class Traffic:
 
     def __init__(self, record: Record, x, beam, factor: float):
         self._record, self._x, self._beam, self._factor = record, x, beam, factor
-        self._loads = load_set(record.case)
+        self._loads = record.loads
         positions = np.asarray(concrete(self._loads.kinematics(record.times)[0])).T
         on_beam = np.isfinite(np.asarray(record.load_position))
         self._positions = np.where(on_beam | self._loads.on_ground, positions, np.nan)

@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
+from jaxbeam.model.load_set import load_set
 from jaxbeam.simulation.labels import contact_sentence, wheel_labels
 from jaxbeam.simulation.stored_record import record_from_xarray
 from tests.simulation.test_record import assert_same
@@ -49,7 +50,7 @@ def record():
 
 def test_wheels_and_bodies_are_labelled(record):
     dataset = record.to_xarray()
-    assert list(dataset["load"].values) == WHEELS == list(wheel_labels(CASE))
+    assert list(dataset["load"].values) == WHEELS == list(wheel_labels(load_set(CASE)))
     assert list(dataset.body.values) == BODIES == record.bodies
     assert_array_equal(dataset.contact_force.sel(load="1 wheel 3"), record.contact_force[:, 10])
     pitch = dataset.body_acceleration.sel(body="loads.1 vehicle 1 body pitch")
@@ -72,21 +73,21 @@ def test_datasets_without_vehicles_and_labels_are_read():
 
 
 def test_wheels_that_would_have_to_pull_are_named():
-    nan = np.nan
+    nan, loads = np.nan, load_set(CASE)
     times = np.full(16, nan)
     times[8], times[10] = 0.3, 0.2
-    said = contact_sentence(CASE, times, np.full(16, 7.5), np.full(16, -12.0))
+    said = contact_sentence(CASE, loads, times, np.full(16, 7.5), np.full(16, -12.0))
     assert said == (
         "load 1 wheel 1 loses contact, first at t = 0.3 s, x = 7.5 m (smallest contact force -12 N)"
         "; load 1 wheel 3 loses contact, first at t = 0.2 s, x = 7.5 m"
         " (smallest contact force -12 N)"
     )
-    pressing = contact_sentence(CASE, np.full(16, nan), times, np.ones(16))
+    pressing = contact_sentence(CASE, loads, np.full(16, nan), times, np.ones(16))
     assert pressing == (  # the run ends before the last wheels enter
         "loads 1 wheel 5, 1 wheel 6, 1 wheel 7, 1 wheel 8 are not on the beam;"
         " every other load presses on the beam throughout"
     )
-    many = contact_sentence(CASE, 2.0 - 0.1 * np.arange(16), np.ones(16), np.ones(16))
+    many = contact_sentence(CASE, loads, 2.0 - 0.1 * np.arange(16), np.ones(16), np.ones(16))
     assert many.count("loses contact, first at") == 4
     assert many.startswith("load 1 wheel 5 ") and many.endswith("; 12 more wheels lose contact")
 
