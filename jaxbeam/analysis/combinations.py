@@ -15,12 +15,16 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.analysis.load_models import crossing_envelope, influence_at, load_model_envelope
+from jaxbeam.analysis.load_models import (
+    check_quantity,
+    crossing_envelope,
+    influence_at,
+    load_model_envelope,
+)
 from jaxbeam.analysis.sections import envelope
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import suggestion
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.quantities import quantity_of
 from jaxbeam.case.reading.units import number_in_si
 from jaxbeam.model.along_beam import sections
 from jaxbeam.model.statics import REACTION
@@ -173,8 +177,7 @@ def combine(
     >>> print(f"{found.highest[0, 0]:.4g} N m")  # 1.35 (20 kN/m L^2 / 8 + 4.17 MN m)
     6.98e+06 N m
     """
-    if quantity != REACTION:
-        quantity_of(quantity)
+    check_quantity(quantity)
     x = np.atleast_1d(np.asarray(concrete(x), float))
     extremes = {
         name: action_extremes(case, action, x, quantity, f"actions.{name}")

@@ -79,6 +79,18 @@ class LoadModelEnvelope:
     at_highest: tuple[WorstPlace, ...]
 
 
+def check_quantity(quantity: str) -> None:
+    """Check that a quantity has an influence line of loads that are on the axis of the beam.
+
+    Raises ValueError for unknown ones, and for those of the twist.
+    """
+    if quantity != REACTION and quantity_of(quantity).of_twist:
+        raise ValueError(
+            f"{quantity} depends on the eccentricity of the loads, which load models do not have:"
+            " give a case loads with an eccentricity, and take their envelope"
+        )
+
+
 def load_model_envelope(
     case: Case,
     model: str | LoadModel,
@@ -117,8 +129,8 @@ def load_model_envelope(
     x = np.atleast_1d(np.asarray(concrete(x), float))
     check_on_beam("x", x, case.beam.length)
     points, left_of = x, np.zeros(0, int)
+    check_quantity(quantity)
     if quantity != REACTION:
-        quantity_of(quantity)
         points, left_of = map(np.asarray, sections(case, x, quantity))
     found = [
         _extremes(influence_at(case, float(point), quantity), chosen, lane, 1 + allowance)

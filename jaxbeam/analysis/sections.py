@@ -290,7 +290,11 @@ def influence_table(
         # A shear force jumps by the load as it passes the section: a position on each side.
         length = float(concrete(case.beam.length))
         own = np.array([place for _, _, place in lines])
-        beside = [min(p + LEFT_SHARE * length, length) for q, _, p in lines if q == "shear"]
+        beside = [
+            min(p + LEFT_SHARE * length, length)
+            for q, _, p in lines
+            if q != REACTION and QUANTITIES[q].jumps
+        ]
         start = positions_along(case, places=np.concatenate([own, beside]))
         found_at, found = refined(case, at, curves, start)
         positions = np.asarray(found_at)

@@ -326,6 +326,12 @@ class Support(ReprWithUnits):
     mass: Float[Number, ""] | None = number(
         "kg", "mass of an elastic bearing that moves with the beam", NOT_NEGATIVE, default=None
     )
+    torsional_stiffness: Float[Number, ""] | None = number(
+        "N m/rad",
+        "spring against twist; if left out, a rigid support holds it and an elastic one does not",
+        NOT_NEGATIVE,
+        default=None,
+    )
     settlement: Float[Number, ""] | None = number(
         "m", "lowering of its foot before the run, positive downwards", default=None
     )
@@ -347,6 +353,11 @@ class Beam(ReprWithUnits):
     eta of hysteretic damping is taken as the equivalent ratio eta / 2 of every mode; those of
     `segments` count by their shares of the strain energy of each mode. A `material` has the ratio
     of EN 1991-2, table 6.6, for the longest span of the beam.
+
+    With a `torsional_rigidity` G J and a `polar_inertia` it twists, too, by St Venant's law; both
+    are constant along it. The axis is then that of the shear centres. Ends that hold the deflection
+    and rigid supports hold the twist, as forks. The `modes` are the lowest of all, of bending and
+    of torsion; a `mass_eccentricity` couples them.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(0.6, width=0.03, height=0.005, youngs_modulus=69e9, density=2700.0)
@@ -390,6 +401,15 @@ class Beam(ReprWithUnits):
     material: str = choice("material of a bridge, for its damping", "", *MATERIALS, default="")
     axial_force: Float[Number, ""] | None = number(
         "N", "axial force, tension positive", default=None
+    )
+    torsional_rigidity: Float[Number, ""] | None = number(
+        "N m^2", "torsional rigidity G J; no twist if left out", POSITIVE, default=None
+    )
+    polar_inertia: Float[Number, ""] | None = number(
+        "kg m", "mass moment of inertia per length about the axis of twist", POSITIVE, default=None
+    )
+    mass_eccentricity: Float[Number, ""] | None = number(
+        "m", "centre of mass left of the axis of twist, looking right", default=None
     )
     segments: Sequence[Segment] = parts("segments, from left to right", Segment)
     hinges: Sequence[Hinge] = parts("hinges between the ends", Hinge)
@@ -450,7 +470,39 @@ class Beam(ReprWithUnits):
             inconsistent = self._validate_section(address)
         if inconsistent is not None:
             return inconsistent
-        return self._validate_hinges(address) or self._validate_damping(address)
+        for check in (self._validate_hinges, self._validate_damping, self._validate_torsion):
+            inconsistent = inconsistent or check(address)
+        return inconsistent
+
+    def _validate_torsion(self, address: str) -> str | None:
+        rigidity, inertia, arm = (
+            self.torsional_rigidity,
+            self.polar_inertia,
+            self.mass_eccentricity,
+        )
+        if (rigidity is None) != (inertia is None):
+            absent = "torsional_rigidity" if rigidity is None else "polar_inertia"
+            return f"{address}.{absent} is missing; a beam that twists has both G J and its inertia"
+        if rigidity is None and arm is not None:
+            return (
+                f"{address}.mass_eccentricity would have no effect on a beam that does not twist:"
+                " give torsional_rigidity and polar_inertia, or leave it out"
+            )
+        lossy = [i for i, one in enumerate(self.segments) if one.loss_factor is not None]
+        if rigidity is not None and lossy:
+            return (
+                f"{address}.segments.{lossy[0]}.loss_factor is that of bending, and the beam"
+                f" twists: give {address}.damping_ratio or {address}.loss_factor for all modes"
+            )
+        if inertia is None or arm is None or not all(map(is_concrete, jax.tree.leaves(self))):
+            return None
+        least = float(concrete(self.linear_density)) * float(concrete(arm)) ** 2
+        if not concrete(inertia) > least:
+            return (
+                f"{address}.polar_inertia is about the axis of twist and must exceed that of the"
+                f" mass at its eccentricity, {least:g} kg m; it is {concrete(inertia):g} kg m"
+            )
+        return None
 
     def _validate_section(self, address: str) -> str | None:
         section = ("width", "height")

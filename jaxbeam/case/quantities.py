@@ -1,4 +1,4 @@
-"""Quantities that a point sensor measures, in terms of the deflection w(x, t).
+"""Quantities that a point sensor measures, in terms of deflection w(x, t) and twist theta(x, t).
 
 This is their only list: names and units of sensors, outputs of state spaces and of frequency
 responses, and histories of records derive from it (rows: `model.sensing.output_rows`).
@@ -8,6 +8,12 @@ from typing import NamedTuple
 
 SIDES = ("left", "right")  # of a position
 OF_QUANTITY = "unit of quantity"  # unit of the entries of a sensor that are in that of its quantity
+# Orders of fields of the beam that are no x-derivatives of the deflection: see `Modes.fields`.
+SLOPE, TWIST, TWIST_RATE = -1, -2, -3
+NO_TORSION = (
+    "the beam does not twist: give beam.torsional_rigidity (G J) and beam.polar_inertia for"
+    " twist, torque and eccentric loads"
+)
 
 
 class Quantity(NamedTuple):
@@ -16,7 +22,8 @@ class Quantity(NamedTuple):
     The derivative is multiplied by -z `at_fibre`, z (m) being the height of a fibre above the
     neutral axis; by the bending stiffness E I if it is a `section_force`, to which active moments
     of patches belong; and divided by the section modulus (m^3) if it is `over_modulus`. A slope
-    `of_axis` is w' also where a section that is flexible in shear has another rotation.
+    `of_axis` is w' also where a section that is flexible in shear has another rotation. Those
+    `of_twist` are theta, and its x-derivative times the torsional rigidity G J.
     """
 
     unit: str
@@ -26,16 +33,24 @@ class Quantity(NamedTuple):
     section_force: bool = False
     over_modulus: bool = False
     of_axis: bool = False
+    of_twist: bool = False
 
     @property
     def field(self) -> int:
-        """Order of the field of the beam (see `model.modes.Modes.fields`); -1 is the slope w'."""
-        return -1 if self.of_axis else self.x_derivative
+        """Order of the field of the beam (see `model.modes.Modes.fields`)."""
+        if self.of_twist:
+            return TWIST_RATE if self.x_derivative else TWIST
+        return SLOPE if self.of_axis else self.x_derivative
 
     @property
     def bends(self) -> bool:
-        """Whether it is a curvature or a derivative of it, whose modal sums need a correction."""
-        return self.x_derivative >= 2 and self.time_derivative == 0
+        """Whether it is a curvature, a derivative of it, twist or torque: sums are corrected."""
+        return (self.x_derivative >= 2 or self.of_twist) and self.time_derivative == 0
+
+    @property
+    def jumps(self) -> bool:
+        """Whether it jumps under a load: a shear force or torque."""
+        return self.x_derivative == 3 or self.field == TWIST_RATE
 
     @property
     def has_active_moment(self) -> bool:
@@ -54,6 +69,8 @@ QUANTITIES = {
     "moment": Quantity("N m", x_derivative=2, section_force=True),
     "shear": Quantity("N", x_derivative=3, section_force=True),
     "stress": Quantity("Pa", x_derivative=2, section_force=True, over_modulus=True),
+    "twist": Quantity("rad", of_twist=True),
+    "torque": Quantity("N m", x_derivative=1, of_twist=True),
 }
 
 # Quantities of the bodies of vehicles and absorbers, and those of the beam in the same units; a

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.absorbers import Absorber
 from jaxbeam.case.actuators.base import AbstractActuator
-from jaxbeam.case.beam import Beam, Support, has
+from jaxbeam.case.beam import END_CONDITIONS, Beam, Support, has
 from jaxbeam.case.case import Case, list_sizes, parts
 from jaxbeam.case.contact import ONE_RUN, AbstractContact
 from jaxbeam.case.declared_checks import (
@@ -34,7 +34,7 @@ from jaxbeam.case.loads.base import (
 )
 from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSensor
 from jaxbeam.case.profiles.shapes import AbstractProfile
-from jaxbeam.case.quantities import QUANTITIES
+from jaxbeam.case.quantities import NO_TORSION, QUANTITIES
 from jaxbeam.case.sensors import Sensor, sensor_labels
 from jaxbeam.case.track import Track
 from jaxbeam.runtime.arrays import Array
@@ -90,6 +90,7 @@ def check_plant(case: Case) -> None:
     _check_supports(case.supports, case.beam.length)
     _check_wheels(case)
     _check_track(case)
+    _check_torsion(case)
     _check_kinks(case)
     _check_profile(case)
     _check_labels(case.sensors)
@@ -177,6 +178,58 @@ def _check_track(case: Case) -> None:
                 " take the weights of its axles as forces, or leave the track out"
             )
         _check_start(f"loads.{i}", load, case)
+
+
+def _check_torsion(case: Case) -> None:
+    """Validate that a beam of eccentric loads and of sensors of twist twists, and that it is held.
+
+    Left out are couplings that the theory does not have: of controllers, of actuators and dampers
+    with an eccentric mass, and of rigid masses over kinks of the twist.
+    """
+    eccentric = [i for i, load in enumerate(case.loads) if load.eccentricity is not None]
+    if case.beam.torsional_rigidity is None:
+        for i in eccentric:
+            raise ValueError(f"loads.{i}.eccentricity would have no effect: {NO_TORSION}")
+        for i, sensor in enumerate(case.sensors):
+            if QUANTITIES[sensor.quantity].of_twist:
+                raise ValueError(f"sensors.{i} measures {sensor.quantity}: {NO_TORSION}")
+        for i, support in enumerate(case.supports):
+            if support.torsional_stiffness is not None:
+                raise ValueError(
+                    f"supports.{i}.torsional_stiffness would have no effect: {NO_TORSION}"
+                )
+        return
+    if case.controller is not None:
+        raise ValueError(
+            "beam.torsional_rigidity and controller cannot be together: laws are designed for"
+            " beams that bend; leave one of them out"
+        )
+    if case.beam.mass_eccentricity is not None:
+        damped = [f"supports.{i}" for i, one in enumerate(case.supports) if one.damping is not None]
+        for part in (*damped, *(f"actuators.{i}" for i in range(len(case.actuators)))):
+            raise ValueError(
+                f"beam.mass_eccentricity and {part} cannot be together: its force would twist the"
+                " beam; leave one of them out"
+            )
+    springs = [one.torsional_stiffness for one in case.supports]
+    ends = (case.beam.left_end, case.beam.right_end)
+    if not any(END_CONDITIONS[end][0] for end in ends) and not any(
+        (support.stiffness is None if k is None else not is_concrete(k) or concrete(k) > 0)
+        for support, k in zip(case.supports, springs, strict=True)
+    ):
+        raise ValueError(
+            "nothing holds the beam against twist: give a support a torsional_stiffness, or leave"
+            " it out of a rigid one"
+        )
+    sprung = [i for i, k in enumerate(springs) if k is not None]
+    for i in eccentric if sprung else ():
+        masses = case.loads[i].vehicle(case.run.gravity).wheel_masses
+        if not is_concrete(masses) or np.any(concrete(masses)):
+            raise ValueError(
+                f"loads.{i} has an eccentricity and mass that is rigidly on it, with a kink"
+                f" at the torsional_stiffness of supports.{sprung[0]}: take its weight as a force,"
+                " or leave the stiffness out"
+            )
 
 
 def _check_start(address: str, load: AbstractLoad, case: Case) -> None:

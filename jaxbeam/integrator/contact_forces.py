@@ -224,7 +224,8 @@ def end_rows(
         for part in loads.kinematics(times)
     )
     active = xp.broadcast_to(on_beam[:, None], position.shape)
-    rows = surface_rows(model, position, speed, acceleration, active)
+    arms = None if loads.eccentricity is None else take(loads.eccentricity, index)
+    rows = surface_rows(model, position, speed, acceleration, active, eccentricity=arms)
     surface = loads.surface_motion(position, speed, acceleration)
     return EndRows(
         rows.shape.reshape(*active.shape, -1),

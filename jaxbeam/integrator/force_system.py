@@ -15,6 +15,7 @@ the second term of r being static (`LinearOutputs`). r is found once for a speed
 of shifted copies of it.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -82,11 +83,15 @@ class ForceSystem(NamedTuple):
 
 
 def force_system(
-    model: ModalModel, outputs: LinearOutputs, places: Float[np.ndarray, " place"]
+    model: ModalModel,
+    outputs: LinearOutputs,
+    places: Float[np.ndarray, " place"],
+    eccentricity: float = 0.0,
 ) -> ForceSystem | None:
     """Model and outputs for moving forces; None for repeated poles, as of rigid-body motion.
 
-    At the `places` (m) the influence of a force on outputs has kinks or jumps.
+    At the `places` (m) the influence of a force on outputs has kinks or jumps. All forces have one
+    `eccentricity` (m).
     """
     poles, vectors = np.linalg.eig(model.A)
     if not np.linalg.cond(vectors) < MAX_CONDITION or not np.abs(poles).min() > 0:
@@ -96,7 +101,12 @@ def force_system(
     if model.mode_map is not None:
         into = into @ model.mode_map.T
     on_outputs = outputs.rows @ vectors[:, own] * np.where(poles[own].imag > 0, 2.0, 1.0)
-    nodes, series = np.asarray(model.load_nodes), np.asarray(model.load_series) @ into.T
+    series = np.asarray(model.load_series)
+    if model.load_twist is not None:
+        series = series + eccentricity * np.asarray(model.load_twist)
+    if outputs.influence is not None:
+        outputs = dataclasses.replace(outputs, influence=outputs.influence.on_line(eccentricity))
+    nodes, series = np.asarray(model.load_nodes), series @ into.T
     if model.spread is not None:  # shares of an axle may pass nodes at one time
         long = np.diff(nodes) > SHORTEST * (nodes[-1] - nodes[0])
         nodes, series = np.append(nodes[:-1][long], nodes[-1]), series[long]

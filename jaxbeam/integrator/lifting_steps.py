@@ -193,7 +193,8 @@ def instants(model: ModalModel, loads: LoadSet, times, on_beam) -> Instants:
     position, speed, acceleration = (
         np.moveaxis(np.asarray(part), 0, -1) for part in loads.kinematics(times)
     )
-    rows = surface_rows(model, position, speed, acceleration, on_beam, True)
+    motion = position, speed, acceleration, on_beam
+    rows = surface_rows(model, *motion, True, eccentricity=loads.eccentricity)
     parts = (rows.deflection, rows.velocity, rows.acceleration)
     shape = (*position.shape, -1)
     stacked = np.stack([np.asarray(part).reshape(shape) for part in parts], axis=-3)

@@ -74,11 +74,12 @@ def load_path(
     on_beam_at_nodes = xp.broadcast_to(on_beam[:, :, None], position.shape)
     springs = bool(loads.wheels.vehicles)
     motion = position, speed, acceleration, on_beam_at_nodes
-    rows = surface_rows(model, *motion, springs, not loads.massless)
+    arms = None if loads.eccentricity is None else take(loads.eccentricity, load_index)[..., None]
+    rows = surface_rows(model, *motion, springs, not loads.massless, arms)
     surface = None if surface is None else xp.stack(surface, axis=1)
     influence = ends = None
     if discrete.load_influence is not None:
-        influence = _static_influence(discrete, loads, start, length, load_index, on_beam)
+        influence = _static_influence(discrete, loads, start, length, load_index, on_beam, arms)
         if discrete.modal_command_matrix is None:
             ends = end_rows(model, loads, start, length, load_index, on_beam)
     kinks = None
@@ -90,7 +91,9 @@ def load_path(
     )
 
 
-def _static_influence(discrete: DiscreteModel, loads: LoadSet, start, length, load_index, on_beam):
+def _static_influence(
+    discrete: DiscreteModel, loads: LoadSet, start, length, load_index, on_beam, arms
+):
     """Static influence of wheels on corrected outputs at the peak nodes of steps.
 
     It is (step, load, sample, output). At the ends of a step the limits within it: a wheel may pass
@@ -102,5 +105,6 @@ def _static_influence(discrete: DiscreteModel, loads: LoadSet, start, length, lo
     active = on_beam[:, :, None]
     position = xp.where(active, position, 0.0)
     middle = xp.broadcast_to(position[..., -1:], position[..., :-1].shape)
-    influence = discrete.load_influence.of_forces_at(position[..., :-1], middle)
+    at = position[..., :-1], middle
+    influence = discrete.load_influence.of_forces_at(*at, eccentricity=arms)
     return xp.where(active[..., None], influence, 0.0)

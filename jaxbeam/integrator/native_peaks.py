@@ -110,6 +110,7 @@ def chosen_for(case: Case, runs: int) -> bool:
 def supports(case: Case) -> bool:
     """Whether the C integrator can compute the peaks of a case."""
     plain = not has_settlement(case) and not may_have_kinks(case)
+    plain &= case.beam.torsional_rigidity is None  # its wheels press at a point of a line
     if case.controller is not None:  # accelerations would follow from the contact forces
         sampled = case.controller.period is not None
         plain &= sampled and not any(sensor.has_feedthrough for sensor in case.sensors)

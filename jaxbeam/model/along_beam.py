@@ -101,12 +101,12 @@ class EnvelopeSections(NamedTuple):
 def sections(case: Case, x: Float[Array, " position"], quantity: str) -> EnvelopeSections:
     """EnvelopeSections at which a quantity is computed for positions x (m) of an envelope.
 
-    Shear forces are taken on both sides of all positions, as a load may be at any; moments and
-    other derivatives of the deflection on both sides of the special ones.
+    Shear forces and torques are taken on both sides of all positions, as a load may be at any;
+    moments and other derivatives of the deflection on both sides of the special ones.
     """
     order, left = QUANTITIES[quantity].x_derivative, np.zeros(0, int)
     places = special_positions(case)
-    if order == 3 or (order and not (is_concrete(x) and is_concrete(places))):
+    if QUANTITIES[quantity].jumps or (order and not (is_concrete(x) and is_concrete(places))):
         left = np.arange(x.shape[0])
     elif order:
         places = np.unique(concrete(places))

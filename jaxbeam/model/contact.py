@@ -63,21 +63,29 @@ class SurfaceRows(Module):
 
 
 def surface_rows(
-    model: ModalModel, position, speed, acceleration, active, springs=False, inertia=True
+    model: ModalModel,
+    position,
+    speed,
+    acceleration,
+    active,
+    springs=False,
+    inertia=True,
+    eccentricity=None,
 ) -> SurfaceRows:
     """Rows at wheels; velocity and deflection with `springs`, acceleration with `inertia` only.
 
     Position (m), speed (m/s), acceleration (m/s^2) and `active` (on the beam) of the wheels all
-    have the shape (*wheel,).
+    have the shape (*wheel,), to which that of the `eccentricity` (m) is broadcast.
     """
     position_on_beam = xp.where(active, position, 0.0)
     blocks, modes_per_block = model.state_matrix.shape[0], model.modes_per_block
     block_shape = (*position.shape, blocks, modes_per_block)
     if not (inertia or springs):
-        shape = xp.where(active[..., None], model.load_shapes(position_on_beam, (0,))[0], 0.0)
+        found = model.load_shapes(position_on_beam, (0,), eccentricity)
+        shape = xp.where(active[..., None], found[0], 0.0)
         return SurfaceRows(shape.reshape(block_shape), None, None, None)
     shape, slope, curvature = xp.where(
-        active[..., None], model.load_shapes(position_on_beam, (0, 1, 2)), 0.0
+        active[..., None], model.load_shapes(position_on_beam, (0, 1, 2), eccentricity), 0.0
     )
     speed, acceleration = speed[..., None], acceleration[..., None]
     side = model.state_matrix.shape[1]
@@ -143,7 +151,8 @@ def _contact_at(model: ModalModel, loads: LoadSet, times, states, commands) -> C
     kinematics = (*loads.kinematics(times), loads.on_beam(times))
     position, speed, acceleration, active = (xp.moveaxis(part, 0, -1) for part in kinematics)
     springs = bool(loads.wheels.vehicles)
-    rows = surface_rows(model, position, speed, acceleration, active, springs)
+    motion = position, speed, acceleration, active
+    rows = surface_rows(model, *motion, springs, eccentricity=loads.eccentricity)
     profile = loads.surface_motion(position, speed, acceleration)
     states, vehicle_states = split_states(model.state_count, loads, states)
     shape = rows.shape.reshape(*position.shape, model.mode_count)
@@ -152,12 +161,12 @@ def _contact_at(model: ModalModel, loads: LoadSet, times, states, commands) -> C
     rates = (model.state_matrix @ state_blocks).reshape(states.shape)
     modal_acceleration = rates[..., model.rate_index, :]
 
-    def motion(row, height):
+    def surface_of(row, height):
         beam = row.reshape(*position.shape, model.state_count) @ states
         return beam if height is None else beam + height[..., None]
 
     height, height_rate, height_acceleration = (None,) * 3 if profile is None else profile
-    surface_acceleration = motion(rows.acceleration, height_acceleration)
+    surface_acceleration = surface_of(rows.acceleration, height_acceleration)
     if commands is not None:
         command_acceleration = model.command_matrix[model.rate_index] @ commands
         modal_acceleration = modal_acceleration + command_acceleration
@@ -165,8 +174,8 @@ def _contact_at(model: ModalModel, loads: LoadSet, times, states, commands) -> C
     weight, vehicle_acceleration = loads.varying_weight(times), ()
     if springs:
         wheels = loads.wheels
-        surface = wheels.stiffness * motion(rows.deflection, height)
-        surface = surface + wheels.damping * motion(rows.velocity, height_rate)
+        surface = wheels.stiffness * surface_of(rows.deflection, height)
+        surface = surface + wheels.damping * surface_of(rows.velocity, height_rate)
         pairs = list(zip(wheels.vehicles, vehicle_states, strict=True))
         weight = weight + forces_of_wheels(
             loads, [g.spring_forces(z, surface[..., g.wheels, :]) for g, z in pairs], surface
@@ -313,7 +322,7 @@ def contact_rows(model: ModalModel, loads: LoadSet, times: Float[Array, "*time"]
     position, speed, acceleration, active = (xp.moveaxis(part, 0, -1) for part in kinematics)
     wheels, springs = loads.wheels, bool(loads.wheels.vehicles)
     motion = position, speed, acceleration, active
-    mass_rows, rows = _mass_rows(model, motion, loads.inertia[:, 0], springs)
+    mass_rows, rows = _mass_rows(model, motion, loads.inertia[:, 0], springs, loads.eccentricity)
     if not springs:
         return mass_rows
     shape, mass, force = mass_rows.shape, mass_rows.mass, mass_rows.force
@@ -339,10 +348,12 @@ def mass_contact_rows(
     return _mass_rows(model, (position, speed, xp.zeros_like(speed), active), mass, False)[0]
 
 
-def _mass_rows(model, motion, inertia, springs) -> tuple[ContactRows, SurfaceRows]:
+def _mass_rows(
+    model, motion, inertia, springs, eccentricity=None
+) -> tuple[ContactRows, SurfaceRows]:
     """Contact law of the masses (kg) alone, and the rows of the surface under the wheels."""
-    position, speed, acceleration, active = motion
-    rows = surface_rows(model, position, speed, acceleration, active, springs)
+    position, *_, active = motion
+    rows = surface_rows(model, *motion, springs, eccentricity=eccentricity)
     shape = rows.shape.reshape(*position.shape, model.mode_count)
     of_acceleration = rows.acceleration.reshape(*position.shape, model.state_count)
     mass = xp.where(active, inertia, 0.0)

@@ -4,6 +4,7 @@ and peaks of a slow crossing (see `flexibility`).
 Static influence of forces over their position: Chebyshev series.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from jaxtyping import Float, Int
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.declared_checks import check_on_beam
 from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.quantities import TWIST, TWIST_RATE
 from jaxbeam.case.track import Kernel
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.case.validation import check_case
@@ -24,6 +26,7 @@ from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Layout, Modes, mesh_layout
 from jaxbeam.model.spread import spread_series, to_series
 from jaxbeam.model.theory.statics import SectionFlexibility
+from jaxbeam.model.theory.torsion import TwistFlexibility, twist_flexibility
 from jaxbeam.numerics.peak_search import estimate_peak, refine_peak
 from jaxbeam.numerics.polynomials import chebyshev_polynomials, piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, add_at, is_known, set_at, solve, take, xp
@@ -55,10 +58,26 @@ def _to_ends() -> Float[np.ndarray, "point point"]:
 TO_ENDS = _to_ends()
 
 
+Greens = Flexibility | SectionFlexibility | TwistFlexibility
+
+
+def influence_functions(case: Case, layout: Layout, x: Float[Array, " position"], order: int):
+    """Influence functions of a field of an order (see `Modes.fields`) at x (m), in beam units.
+
+    Per unit of force; per unit of torque for TWIST and TWIST_RATE.
+    """
+    if order in (TWIST, TWIST_RATE):
+        return twist_flexibility(case, layout, x, order)
+    return flexibility(case, layout, x, order)
+
+
 @compiled_if_traced
 def unchecked_influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
-    """`influence_line` of a case and positions (arrays) that are known to be valid."""
-    greens = flexibility(case, layout, x.reshape(-1), derivative)
+    """`influence_line` of a case and positions (arrays) that are known to be valid.
+
+    Of an order TWIST or TWIST_RATE that under 1 N at 1 m left of the axis.
+    """
+    greens = influence_functions(case, layout, x.reshape(-1), derivative)
     length = case.beam.length
     order = abs(derivative)  # that of the slope is 1, too
     line = -greens(load_positions / length) * length ** (3 - order) / case.beam.bending_stiffness
@@ -168,14 +187,17 @@ def peak_under_loads(
     line: Callable[[Float[Array, "*position"]], Float[Array, "*position x"]],
     breaks: Float[Array, " break"],
     wave_intervals: int = 0,
+    of_torque: bool = False,
 ) -> Float[Array, " x"]:
     """Largest absolute value of the sums F_l(t) line(y_l(t)) over the loads l and all times.
 
     `line` is that of a quantity per newton over the position y (m) of a force, a cubic between the
     `breaks` (m). Between events the sum is a polynomial in time, of degree POINTS - 1 at most;
-    under waves it is interpolated in `wave_intervals` more (see `intervals_of_waves`).
+    under waves it is interpolated in `wave_intervals` more (see `intervals_of_waves`). With
+    `of_torque` the line is one per unit of torque, and the forces have their eccentricities.
     """
     loads, low, high = load_set(case), 0.0, case.beam.length
+    arms = loads.eccentricity
     if case.track is not None:
         first, last = case.track.ends()
         low, high = low - last, high - first
@@ -197,6 +219,8 @@ def peak_under_loads(
         else:
             wheel, at = np.divmod(np.arange(loads.wheel_count * part.size), part.size)
         force = (forces[:, at, wheel] * active[wheel, at])[..., None]
+        if of_torque:
+            force = force * (0.0 if arms is None else arms[wheel][:, None])
         total = xp.zeros((len(PEAK_POSITIONS), part.size, count))
         total = add_at(total, np.s_[:, at], force * line(position[wheel, :, at].T))
         total = total + xp.tensordot(TO_ENDS, total, axes=1)
@@ -271,20 +295,24 @@ class LoadInfluence(Module):
 
     Chebyshev `series` of the outputs per newton upwards between the `breaks` (m): nodes of the
     beam, and the outputs, at which moments have kinks and shear forces jump. `mirrored` outputs are
-    those, then their negatives.
+    those, then their negatives. `twist` is the series per unit of torque, where the beam twists.
     """
 
     breaks: Float[Array, " break"]
     series: Float[Array, "piece term output"]
     mirrored: bool = eqx.field(static=True, default=False)
+    twist: Float[Array, "piece term output"] | None = None
 
     def of_forces_at(
         self,
         x: Float[Array, "*position"],
         near: Float[Array, "*position"],
         output: Int[Array, "*position"] | None = None,
+        eccentricity: Float[Array, "..."] | None = None,
     ) -> Float[Array, "..."]:
         """Outputs (*position, output) per newton upwards at positions x (m).
+
+        At an `eccentricity` (m), which is broadcast to the positions, or on the axis.
 
         Off the beam as at its nearer end. At a break the limit on the side of it on which `near`
         (m) is. Only one `output` at each position, if its number is given: (*position,).
@@ -300,28 +328,48 @@ class LoadInfluence(Module):
         if output is not None:
             return xp.sum(table * self.series[piece, :, output], axis=-1)
         influence = xp.einsum("...k,...ko->...o", table, take(self.series, piece))
+        if eccentricity is not None and self.twist is not None:
+            of_torque = xp.einsum("...k,...ko->...o", table, take(self.twist, piece))
+            influence = influence + xp.asarray(eccentricity)[..., None] * of_torque
         return xp.concatenate([influence, -influence], -1) if self.mirrored else influence
 
     def spread(self, kernel: Kernel) -> "LoadInfluence":
         """Influence of loads that a track spreads."""
         nodes, series = spread_series(kernel, self.breaks, self.series)
-        return LoadInfluence(nodes, series, self.mirrored)
+        twist = self.twist
+        if twist is not None:
+            twist = spread_series(kernel, self.breaks, twist)[1]
+        return LoadInfluence(nodes, series, self.mirrored, twist)
 
     def plus(self, other: "LoadInfluence") -> "LoadInfluence":
         """Sum with another, whose breaks are among those of this one."""
 
-        def values(x):
-            return other.of_forces_at(x, x)
+        breaks, terms = self.breaks, self.series.shape[1]
+        series, twist = (
+            None
+            if own is None
+            else own + to_series(breaks, terms, lambda x, one=one: one.of_forces_at(x, x))
+            for own, one in ((self.series, other), (self.twist, other.of_torques()))
+        )
+        return dataclasses.replace(self, series=series, twist=twist)
 
-        added = to_series(self.breaks, self.series.shape[1], values)
-        return eqx.tree_at(lambda one: one.series, self, self.series + added)
+    def of_torques(self) -> "LoadInfluence | None":
+        """Influence per unit of torque; None where the beam does not twist."""
+        if self.twist is None:
+            return None
+        return dataclasses.replace(self, series=self.twist, twist=None)
+
+    def on_line(self, eccentricity) -> "LoadInfluence":
+        """Influence of forces that are all at one eccentricity (m)."""
+        series = self.series if self.twist is None else self.series + eccentricity * self.twist
+        return dataclasses.replace(self, series=series, twist=None)
 
 
 def load_influence(
     case: Case,
     modes: Modes,
     on_modes: Float[Array, "mode output"],
-    greens: Sequence[tuple[Flexibility | SectionFlexibility, Float[Array, " _"], Sequence[int]]],
+    greens: Sequence[tuple[Greens, Float[Array, " _"], Sequence[int]]],
 ) -> LoadInfluence:
     """Influence of forces on outputs, from influence functions less that of the modes.
 
@@ -336,14 +384,20 @@ def load_influence(
     breaks = case.beam.length * xp.sort(xp.clip(xp.concatenate(breakpoints), 0.0, 1.0))
     terms = terms if uniform else max(terms, PART_TERMS)
 
-    def influence(x):
-        values = -piecewise_chebyshev(modes.nodes, modes.series @ on_modes, x, (0,))[0]
+    def influence(x, series, of_torque=False):
+        values = -piecewise_chebyshev(modes.nodes, series @ on_modes, x, (0,))[0]
         for one, factor, index in greens:
+            if of_torque != isinstance(one, TwistFlexibility):
+                continue
             at = np.s_[..., np.array(index, int)]
             values = set_at(values, at, values[at] + factor * one(x / case.beam.length))
         return values
 
-    return LoadInfluence(breaks, to_series(breaks, terms, influence))
+    twist = modes.twist_series
+    if twist is not None:
+        twist = to_series(breaks, terms, lambda x: influence(x, modes.twist_series, True))
+    series = to_series(breaks, terms, lambda x: influence(x, modes.series))
+    return LoadInfluence(breaks, series, twist=twist)
 
 
 def residual_influence(case: Case, model: ModalModel, x, order: int) -> LoadInfluence:
@@ -355,7 +409,7 @@ def residual_influence(case: Case, model: ModalModel, x, order: int) -> LoadInfl
     on_modes = solve(model.stiffness(), rows.T)
     if model.mode_map is not None:
         on_modes = model.mode_map @ on_modes
-    greens = flexibility(case, model.modes.layout, x.reshape(-1), order)
+    greens = influence_functions(case, model.modes.layout, x.reshape(-1), order)
     factor = case.beam.length ** (3 - abs(order)) / case.beam.bending_stiffness * xp.ones(x.size)
     found = load_influence(case, model.modes, on_modes, [(greens, factor, range(x.size))])
     return found if case.track is None else found.spread(case.track.kernel())

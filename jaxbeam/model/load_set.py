@@ -127,6 +127,7 @@ class LoadSet(Module):
 
     The runs of a batch share everything but the numbers of the wheels. `profile` is that of the
     surface, if it has one. The last wheels are those of `absorbers`, which are fixed to the beam.
+    `eccentricity` (m) is that of each wheel, None where all are on the axis.
     """
 
     trajectories: tuple[AbstractTrajectory, ...]
@@ -135,6 +136,7 @@ class LoadSet(Module):
     profile: Module | None = None
     absorbers: int = eqx.field(static=True, default=0)
     track: Track | None = None
+    eccentricity: Float[Array, " wheel"] | None = None
 
     @property
     def inertia(self) -> Float[Array, "wheel batch"]:
@@ -313,7 +315,20 @@ def load_set(case: Case, layout: Layout | None = None) -> LoadSet:
         surface(case, layout),
         len(case.absorbers),
         case.track,
+        _eccentricities(case, vehicles),
     )
+
+
+def _eccentricities(case: Case, vehicles: Sequence[VehicleModel]) -> Float[Array, " wheel"] | None:
+    """Distances (m) of all wheels left of the axis; None where no load has one."""
+    arms = [getattr(load, "eccentricity", None) for load in case.carried]
+    if all(arm is None for arm in arms):
+        return None
+    parts = []
+    for load, vehicle, arm in zip(case.carried, vehicles, arms, strict=True):
+        count = load.spacings().shape[0] * vehicle.offsets.shape[0]
+        parts.append((0.0 if arm is None else arm) * xp.ones(count))
+    return xp.concatenate(parts)
 
 
 def wheel_set(case: Case) -> WheelSet:

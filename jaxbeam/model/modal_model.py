@@ -15,6 +15,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.model.modes import Layout, Modes, mesh_layout, modes
 from jaxbeam.model.spread import SpreadShapes, spread_series
+from jaxbeam.numerics.polynomials import piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, block_diag, set_at, solve_triangular, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.module import Module
@@ -74,14 +75,18 @@ class ModalModel(Module):
         rows = self.modes.shape_derivatives(x, derivatives)
         return rows if self.mode_map is None else rows @ self.mode_map
 
-    def load_shapes(self, x, derivatives: tuple[int, ...]) -> Float[Array, "order *position mode"]:
+    def load_shapes(
+        self, x, derivatives: tuple[int, ...], eccentricity=None
+    ) -> Float[Array, "order *position mode"]:
         """Rows from q to the deflection (m) under wheels at x (m), or its x-derivatives.
 
-        Transposed, they map the force of a wheel to generalised forces on q.
+        Transposed, they map the force of a wheel to generalised forces on q. With an `eccentricity`
+        (m), of a shape that x has, the deflection is w + e theta.
         """
-        if self.spread is None:
-            return self.shapes(x, derivatives)
-        rows = self.spread.derivatives(x, derivatives)
+        rows = piecewise_chebyshev(self.load_nodes, self.load_series, x, derivatives)
+        if eccentricity is not None:
+            twist = piecewise_chebyshev(self.load_nodes, self.load_twist, x, derivatives)
+            rows = rows + xp.asarray(eccentricity)[..., None] * twist
         return rows if self.mode_map is None else rows @ self.mode_map
 
     @property
@@ -93,6 +98,11 @@ class ModalModel(Module):
     def load_series(self) -> Float[Array, "segment degree mode"]:
         """Chebyshev series of the modes under a wheel between the `load_nodes`."""
         return self.modes.series if self.spread is None else self.spread.series
+
+    @property
+    def load_twist(self) -> Float[Array, "segment degree mode"] | None:
+        """Series of the twist (rad) under a wheel; None of a beam that does not twist."""
+        return self.modes.twist_series if self.spread is None else self.spread.twist
 
     def load_places(self, places: Float[Array, " place"]) -> Float[Array, " wheel_place"]:
         """Positions of a wheel (m) at which its force, or a share of it, is at places (m)."""
@@ -190,8 +200,10 @@ def assemble_modal_model(case: Case, modes: Modes, coupled: bool = True) -> Moda
 def _spread_shapes(case: Case, modes: Modes) -> SpreadShapes | None:
     if case.track is None:
         return None
-    kernel = case.track.kernel()
-    return SpreadShapes(*spread_series(kernel, modes.nodes, modes.series), kernel.offsets)
+    kernel, twist = case.track.kernel(), modes.twist_series
+    if twist is not None:
+        twist = spread_series(kernel, modes.nodes, twist)[1]
+    return SpreadShapes(*spread_series(kernel, modes.nodes, modes.series), kernel.offsets, twist)
 
 
 def _state_space_matrices(stiffness, damping, displacement_map, attachments):

@@ -10,6 +10,7 @@ enter through a Cholesky factor, so neither costs accuracy. The problem is solve
 Beams that are not uniform have their elements in `model.theory`.
 """
 
+import dataclasses
 import functools
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,7 @@ from numpy.polynomial import legendre
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.quantities import NO_TORSION, SLOPE, TWIST, TWIST_RATE
 from jaxbeam.case.validation import check_plant
 from jaxbeam.model.layout import Layout, find_layout, is_uniform, longest_span, node_positions
 from jaxbeam.model.theory.damping import (
@@ -31,7 +33,7 @@ from jaxbeam.model.theory.damping import (
     safe_sqrt,
 )
 from jaxbeam.model.theory.elements import (
-    SLOPE,
+    MASS,
     FieldParts,
     Sections,
     assemble_sections,
@@ -40,9 +42,10 @@ from jaxbeam.model.theory.elements import (
     sections,
 )
 from jaxbeam.model.theory.statics import check_buckling
+from jaxbeam.model.theory.torsion import TorsionMatrices, torsion_matrices, twists
 from jaxbeam.numerics.matrices import REPEATED_EIGENVALUE_TOLERANCE, eigen
 from jaxbeam.numerics.polynomials import legendre_to_chebyshev, piecewise_chebyshev
-from jaxbeam.runtime.arrays import Array, add_at, set_at, stop_gradient, xp
+from jaxbeam.runtime.arrays import Array, add_at, block_diag, set_at, stop_gradient, take, xp
 from jaxbeam.runtime.dataset import labelled_dataset
 from jaxbeam.runtime.module import Module
 from jaxbeam.runtime.printer import TableViews
@@ -74,7 +77,8 @@ class Modes(TableViews, Module):
     end; `series` are their Chebyshev series between the `nodes` (m) of the `layout`.
 
     Those of a beam that is not uniform have its `sections`, and if it is flexible in shear the
-    `rotation_series` (m^-1 kg^-1/2) of its rotation phi; otherwise phi is the slope w'.
+    `rotation_series` (m^-1 kg^-1/2) of its rotation phi; otherwise phi is the slope w'. Those of a
+    beam that twists have the `twist_series` (rad kg^-1/2).
     """
 
     stiffness: Float[Array, " mode"]
@@ -87,6 +91,7 @@ class Modes(TableViews, Module):
     layout: Layout = eqx.field(static=True)
     sections: Sections | None = None
     rotation_series: Float[Array, "segment degree mode"] | None = None
+    twist_series: Float[Array, "segment degree mode"] | None = None
 
     def __repr__(self) -> str:
         if not is_concrete(self.stiffness) or self.stiffness.ndim != 1:
@@ -127,21 +132,12 @@ class Modes(TableViews, Module):
 
     def lowest(self, count: int) -> "Modes":
         """The lowest modes, as many as `count`."""
-        selection = slice(0, count)
-        return Modes(
-            stiffness=self.stiffness[selection],
-            damping=self.damping[selection],
-            coupling=self.coupling[selection, selection],
-            damping_coupling=self.damping_coupling[selection, selection],
-            nodes=self.nodes,
-            series=self.series[..., selection],
-            stiffness_unit=self.stiffness_unit,
-            layout=self.layout,
-            sections=self.sections,
-            rotation_series=(
-                None if self.rotation_series is None else self.rotation_series[..., selection]
-            ),
-        )
+        lines = "stiffness", "damping", "series", "rotation_series", "twist_series"
+        found = {name: getattr(self, name) for name in lines}
+        found = {name: None if one is None else one[..., :count] for name, one in found.items()}
+        squares = "coupling", "damping_coupling"
+        found |= {name: getattr(self, name)[:count, :count] for name in squares}
+        return dataclasses.replace(self, **found)
 
     @property
     def angular_frequencies(self) -> Float[Array, " mode"]:
@@ -187,7 +183,18 @@ class Modes(TableViews, Module):
 
         Of orders 0 to 3 (or SLOPE): deflection w, rotation phi of the section, curvature phi', and
         shear force over bending stiffness V / E I. Those of a uniform beam are w, w', w'', w'''.
+        TWIST and TWIST_RATE are theta and theta'. Raises ValueError for those of a beam that does
+        not twist.
         """
+        if set(orders) & {TWIST, TWIST_RATE}:
+            if self.twist_series is None:
+                raise ValueError(NO_TORSION)
+            of_twist = piecewise_chebyshev(self.nodes, self.twist_series, x, (0, 1))
+            rows = dict(zip((TWIST, TWIST_RATE), of_twist, strict=True))
+            others = tuple(order for order in orders if order not in rows)
+            if others:
+                rows |= zip(others, self.fields(x, others), strict=True)
+            return xp.stack([rows[order] for order in orders])
         if self.sections is None:
             derivatives = tuple(1 if order == SLOPE else order for order in orders)
             return self.shape_derivatives(x, derivatives)
@@ -214,6 +221,7 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     Euler-Bernoulli beam, E I w'''' + m w_tt = 0, with supports, rotational springs and bonded
     patches; suspensions of actuators and support dampers are left to the modal model. The equations
     of beams that are not uniform are in `model.theory.elements`.
+    A beam with a torsional rigidity has modes of torsion among them (`model.theory.torsion`).
     Differentiable in every number, at repeated frequencies too. Inside `jit`, pass the `layout`
     found outside by `mesh_layout(case)`, for which the case is taken as valid.
 
@@ -234,27 +242,60 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
         found = sections(case, layout)
         nodes = found.nodes
         stiffness, mass, to_series, to_rotation = assemble_sections(case, layout, found)
-    values, vectors, coupling = eigen(stiffness, mass)
-    lowest = slice(beam.modes)
-    values, coupling = values[lowest], coupling[lowest, lowest]
+    if twists(case):
+
+        def density(element: int, positions):
+            if found is None:
+                return section_properties(case, layout, element)[1]
+            return found.in_element(element, positions)[:, MASS]
+
+        torsion = torsion_matrices(case, layout, nodes, to_series, density)
+        values, vectors, of_twist, coupling = _with_torsion(beam.modes, stiffness, mass, torsion)
+    else:
+        values, vectors, coupling = (part[..., : beam.modes] for part in eigen(stiffness, mass))
+        coupling, of_twist, torsion = coupling[: beam.modes], None, None
     values, coupling = values * _stiffness_unit(beam), coupling * _stiffness_unit(beam)
     unit = xp.sqrt(beam.linear_density * beam.length)
 
-    def shapes(to_series):
-        series = xp.einsum("std,dm->stm", to_series, vectors[:, lowest])
+    def shapes(to_series, vectors=vectors):
+        series = xp.einsum("std,dm->stm", to_series, vectors)
         return _without_rounding(series) / unit
 
     rotation = None if to_rotation is None else shapes(to_rotation) / beam.length
+    twist = None if torsion is None else shapes(torsion.series, of_twist) / beam.length
     nodes = nodes * beam.length
     span = longest_span(case, layout, nodes)
     undamped = normalised_modes(
-        beam, values, coupling, nodes, shapes(to_series), layout, found, rotation, span
+        beam, values, coupling, nodes, shapes(to_series), layout, found, rotation, span, twist
     )
     if found is None or not has_lossy_segments(beam):
         return undamped
     ratios = ratios_of_segments(beam, layout, found, undamped.stiffness, undamped.fields)
     damping = damping_of_ratios(ratios, undamped.stiffness, undamped.coupling)
     return eqx.tree_at(lambda m: (m.damping, m.damping_coupling), undamped, damping)
+
+
+def _with_torsion(count: int, stiffness, mass, torsion: TorsionMatrices):
+    """Lowest values of bending and torsion, vectors of both, and coupling (see `eigen`)."""
+    first, second = stiffness.shape[0], torsion.stiffness.shape[0]
+    if torsion.coupling is not None:
+        blocks = [[mass, torsion.coupling], [torsion.coupling.T, torsion.mass]]
+        values, vectors, coupling = eigen(
+            block_diag(stiffness, torsion.stiffness), xp.block(blocks)
+        )
+        vectors, coupling = vectors[:, :count], coupling[:count, :count]
+        return values[:count], vectors[:first], vectors[first:], coupling
+    bending, twist = eigen(stiffness, mass), eigen(torsion.stiffness, torsion.mass)
+    most = min(count, first), min(count, second)
+    values = xp.concatenate([bending[0][: most[0]], twist[0][: most[1]]])
+    order = xp.argsort(stop_gradient(values))[:count]
+    zeros = np.zeros((first, most[1])), np.zeros((second, most[0]))
+    of_bending = xp.concatenate([bending[1][:, : most[0]], zeros[0]], axis=1)
+    of_twist = xp.concatenate([zeros[1], twist[1][:, : most[1]]], axis=1)
+    blocks = (one[2][:n, :n] for one, n in zip((bending, twist), most, strict=True))
+    coupling = take(take(block_diag(*blocks), order).T, order).T
+    of_bending, of_twist = (take(part.T, order).T for part in (of_bending, of_twist))
+    return take(values, order), of_bending, of_twist, coupling
 
 
 def _without_rounding(series):
@@ -268,11 +309,21 @@ def _without_rounding(series):
 
 
 def normalised_modes(
-    beam, values, coupling, nodes, series, layout: Layout, sections=None, rotation=None, span=None
+    beam,
+    values,
+    coupling,
+    nodes,
+    series,
+    layout: Layout,
+    sections=None,
+    rotation=None,
+    span=None,
+    twist=None,
 ) -> Modes:
     """Modes of given stiffness (1/s^2) with the beam's damping, positive near the left end."""
     damping, damping_coupling = modal_damping(beam, values, coupling, span)
-    left_values = piecewise_chebyshev(nodes, series, beam.length * 1e-3 / beam.modes, (0,))[0]
+    moves = series if twist is None else series + beam.length * twist
+    left_values = piecewise_chebyshev(nodes, moves, beam.length * 1e-3 / beam.modes, (0,))[0]
     signs = stop_gradient(xp.where(left_values < 0, -1.0, 1.0))
     sign_products = signs[:, None] * signs[None, :]
     return Modes(
@@ -286,6 +337,7 @@ def normalised_modes(
         layout,
         sections,
         None if rotation is None else rotation * signs,
+        None if twist is None else twist * signs,
     )
 
 

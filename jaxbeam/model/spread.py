@@ -15,21 +15,21 @@ from jaxtyping import Float
 from numpy.polynomial import chebyshev
 
 from jaxbeam.case.track import Kernel
-from jaxbeam.numerics.polynomials import chebyshev_polynomials, piecewise_chebyshev
+from jaxbeam.numerics.polynomials import chebyshev_polynomials
 from jaxbeam.runtime.arrays import Array, add_at, take, xp
 from jaxbeam.runtime.module import Module
 
 
 class SpreadShapes(Module):
-    """Series of filtered mode shapes (kg^-1/2) between nodes (m), over the position of an axle."""
+    """Series of filtered mode shapes (kg^-1/2) between nodes (m), over the position of an axle.
+
+    And of those of the twist, of a beam that has it.
+    """
 
     nodes: Float[Array, " node"]
     series: Float[Array, "segment degree mode"]
     offsets: Float[Array, " share"]
-
-    def derivatives(self, x, orders: tuple[int, ...]) -> Float[Array, "order *position mode"]:
-        """x-derivatives of some orders at positions x (m), as of `Modes.shape_derivatives`."""
-        return piecewise_chebyshev(self.nodes, self.series, x, orders)
+    twist: Float[Array, "segment degree mode"] | None = None
 
 
 def to_series(breaks, terms: int, function: Callable) -> Float[Array, "piece term output"]:

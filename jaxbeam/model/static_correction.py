@@ -14,6 +14,7 @@ from jaxtyping import Float
 from jaxbeam.case.beam import has
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import is_concrete
+from jaxbeam.case.quantities import TWIST, TWIST_RATE
 from jaxbeam.model.deflection_lines import (
     residual_influence,
     static_deflection_per_port_force,
@@ -21,11 +22,15 @@ from jaxbeam.model.deflection_lines import (
     validated_layout,
 )
 from jaxbeam.model.flexibility import check_supported
+from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import Layout, Modes, mesh_layout
 from jaxbeam.model.theory.elements import rigidity_at
+from jaxbeam.model.theory.torsion import twists
 from jaxbeam.runtime.arrays import Array, is_known, set_at, solve, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
+
+OF_TWIST = TWIST, TWIST_RATE
 
 
 def residual_actuator_gain(
@@ -82,7 +87,8 @@ def _residual_flexibility(case: Case, x, load_positions, derivative: int, layout
 def modal_influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
     """The part of the modes in `unchecked_influence_line`."""
     model = modal_model(case, layout)
-    load_shapes = model.shapes(load_positions.reshape(-1), (0,))[0]
+    of_load = derivative if derivative in OF_TWIST else 0
+    load_shapes = model.fields(load_positions.reshape(-1), (TWIST if of_load else 0,))[0]
     amplitudes = solve(model.stiffness(), -load_shapes.T)
     line = model.fields(x.reshape(-1), (derivative,))[0] @ amplitudes
     return line.T.reshape((*load_positions.shape, *x.shape))
@@ -120,6 +126,8 @@ def corrected_history(
         return history
     if case.carried:
         history = history + _loads_history(case, motion, x, derivative, layout)
+    if derivative in OF_TWIST:  # dampers and actuators are on the axis
+        return history
     for support in case.supports:
         if support.damping is not None:
             velocity = motion.rates @ modes.shapes(support.position)
@@ -135,13 +143,15 @@ def corrected_history(
 def _loads_history(case: Case, motion: Motion, x, derivative: int, layout: Layout):
     """Residual of the modes under the contact forces, (time, *position)."""
     on_beam = xp.isfinite(motion.load_position)  # wheels of vehicles press on the ground, too
+    arms = load_set(case, layout).eccentricity if twists(case) else None
     if not all(map(is_known, jax.tree.leaves((case, motion, x)))):
         positions = xp.where(on_beam, motion.load_position, 0.0)
-        residual = _under_loads(case, x, positions, derivative, layout)
+        residual = _under_loads(case, x, positions, derivative, layout, arms)
         return xp.einsum("tl,tl...->t...", xp.where(on_beam, motion.contact_force, 0.0), residual)
     time, load = np.nonzero(on_beam)
     positions, forces = motion.load_position[time, load], motion.contact_force[time, load]
-    residual = _under_loads(case, x, positions, derivative, layout)
+    arms = None if arms is None else arms[load]
+    residual = _under_loads(case, x, positions, derivative, layout, arms)
     history = xp.zeros((on_beam.shape[0], *x.shape))
     if not time.size:
         return history
@@ -150,17 +160,20 @@ def _loads_history(case: Case, motion: Motion, x, derivative: int, layout: Layou
     return set_at(history, time[starts], np.add.reduceat(values, starts, axis=0))
 
 
-def _under_loads(case: Case, x, positions, derivative: int, layout: Layout):
-    """Residual flexibility for the forces of loads at positions (m), as the track spreads them."""
-    if case.track is None:
+def _under_loads(case: Case, x, positions, derivative: int, layout: Layout, arms):
+    """Residual flexibility for the forces of loads at positions (m), as the track spreads them.
+
+    `arms` are their eccentricities (m), which are broadcast to the positions.
+    """
+    if case.track is None and not twists(case):
         return _residual_flexibility(case, x, positions, derivative, layout)
-    return _spread_residual(case, layout, x, positions, derivative)
+    return _spread_residual(case, layout, x, positions, derivative, arms)
 
 
 @compiled_if_traced
-def _spread_residual(case: Case, layout: Layout, x, positions, derivative: int):
+def _spread_residual(case: Case, layout: Layout, x, positions, derivative: int, arms):
     influence = residual_influence(case, modal_model(case, layout), x, derivative)
-    found = -influence.of_forces_at(positions, positions)
+    found = -influence.of_forces_at(positions, positions, eccentricity=arms)
     return found.reshape((*positions.shape, *x.shape))
 
 

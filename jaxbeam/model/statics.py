@@ -13,8 +13,9 @@ from jaxbeam.case.beam import END_CONDITIONS
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam, suggestion
 from jaxbeam.case.fields import concrete
-from jaxbeam.case.quantities import QUANTITIES, SIDES, quantity_of
+from jaxbeam.case.quantities import QUANTITIES, SIDES, SLOPE, quantity_of
 from jaxbeam.model.deflection_lines import (
+    influence_functions,
     intervals_of_waves,
     peak_under_loads,
     spread_line,
@@ -22,12 +23,10 @@ from jaxbeam.model.deflection_lines import (
     unchecked_influence_line,
     validated_layout,
 )
-from jaxbeam.model.flexibility import flexibility
 from jaxbeam.model.layout import Layout, is_uniform
 from jaxbeam.model.sensing.output_rows import SIDE_SHARE, beside, quantity_factor
 from jaxbeam.model.settlement import settlement_response
 from jaxbeam.model.static_correction import section_stiffness
-from jaxbeam.model.theory.elements import SLOPE
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 
@@ -177,7 +176,8 @@ def _static_peak(
 ):
     line, breaks = _line(case, layout, x.reshape(-1), kind, fibre_distance, section_modulus)
     line, breaks = spread_line(case, line, breaks)
-    return peak_under_loads(case, line, breaks, wave_intervals).reshape(x.shape)
+    of_torque = kind.quantity != REACTION and QUANTITIES[kind.quantity].of_twist
+    return peak_under_loads(case, line, breaks, wave_intervals, of_torque).reshape(x.shape)
 
 
 def _line(case: Case, layout: Layout, x, kind: _Kind, fibre_distance, section_modulus):
@@ -188,7 +188,7 @@ def _line(case: Case, layout: Layout, x, kind: _Kind, fibre_distance, section_mo
     length, rigidity = case.beam.length, case.beam.bending_stiffness
 
     def field(at, order: int):
-        greens = flexibility(case, layout, at, order)
+        greens = influence_functions(case, layout, at, order)
         scale = -(length ** (3 - abs(order))) / rigidity
         return (lambda y: scale * greens(y / length)), length * greens.breakpoints
 

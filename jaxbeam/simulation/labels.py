@@ -203,12 +203,11 @@ MODE_VARIABLES = {
     "series": (("segment", "degree", "mode"), "kg^-0.5", "Chebyshev series of the mode shapes"),
     "unit": ((), "1/s^2", "flexural rigidity / (mass per length x length^4)"),
 }
-# Of the modes of a beam that is flexible in shear too.
-ROTATION_SERIES = (
-    ("segment", "degree", "mode"),
-    "m^-1 kg^-0.5",
-    "Chebyshev series of the rotations of the modes",
-)
+# Units and words of the series of the modes of beams that are flexible in shear, or twist.
+FURTHER_SERIES = {
+    "rotation_series": ("m^-1 kg^-0.5", "Chebyshev series of the rotations of the modes"),
+    "twist_series": ("rad kg^-0.5", "Chebyshev series of the twists of the modes"),
+}
 # Fields of `Modes` by their names in files, where they differ.
 MODE_FIELDS = {"unit": "stiffness_unit"}
 

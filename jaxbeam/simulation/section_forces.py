@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.quantities import SIDES, quantity_of
+from jaxbeam.case.quantities import SIDES, SLOPE, quantity_of
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.output_rows import SIDE_SHARE, beside, quantity_factor, quantity_history
 from jaxbeam.model.settlement import has_settlement, settled_beam
@@ -19,7 +19,6 @@ from jaxbeam.model.static_correction import (
     corrected_history,
     port_forces,
 )
-from jaxbeam.model.theory.elements import SLOPE
 from jaxbeam.runtime.arrays import Array, xp
 
 

@@ -15,6 +15,7 @@ from jaxbeam.model.layout import Layout, is_uniform
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modes import Modes, mesh_layout, modes
 from jaxbeam.model.theory.elements import sections
+from jaxbeam.model.theory.torsion import twists
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.runtime.input_file import check_input, not_as_named
 from jaxbeam.simulation.labels import MODE_FIELDS, MODE_VARIABLES, OF_FLIGHTS, VARIABLES, Flights
@@ -69,6 +70,9 @@ def record_from_xarray(dataset: "xarray.Dataset") -> Record:
             layout=layout,
             sections=None if is_uniform(case) else sections(case, layout),
             rotation_series=_rotation_series(dataset, case, layout),
+            twist_series=(
+                xp.asarray(dataset["mode_twist_series"].values) if twists(case) else None
+            ),
         ),
         times=xp.asarray(dataset["time"].values),
         error_estimate=xp.asarray(float(dataset.attrs["error_estimate"])),

@@ -31,11 +31,11 @@ from jaxbeam.runtime.printer import TableViews, html_table, text_table
 from jaxbeam.simulation.errors import Extremes
 from jaxbeam.simulation.labels import (
     ACTING_COMMAND,
+    FURTHER_SERIES,
     MODE_FIELDS,
     MODE_VARIABLES,
     OF_ABSORBERS,
     OF_FLIGHTS,
-    ROTATION_SERIES,
     VARIABLES,
     sensor_coordinates,
     wheel_labels,
@@ -87,10 +87,11 @@ def dataset_parts(
         )
         for name, (dims, unit, words) in MODE_VARIABLES.items()
     }
-    if modes.rotation_series is not None:
-        dims, unit, words = ROTATION_SERIES
-        labels = {"units": unit, "long_name": words}
-        variables["mode_rotation_series"] = (dims, np.asarray(modes.rotation_series), labels)
+    for name, (unit, words) in FURTHER_SERIES.items():
+        if (series := getattr(modes, name)) is not None:
+            labels = {"units": unit, "long_name": words}
+            dims = "segment", "degree", "mode"
+            variables[f"mode_{name}"] = (dims, np.asarray(series), labels)
     if (acting := value("acting_command")) is not None:
         dims, unit, words = ACTING_COMMAND
         labels = {"units": unit, "long_name": words}

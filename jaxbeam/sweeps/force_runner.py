@@ -199,15 +199,22 @@ def force_runner(
     loads = load_set(case)
     if loads.wheel_count < MIN_WHEELS or not constant_speeds(loads):
         return None
+    arms = np.zeros(1) if loads.eccentricity is None else np.unique(loads.eccentricity)
+    if arms.size > 1:  # forces of one speed would not have one response
+        return None
     content = case_to_dict(case)
-    system = json.dumps({key: content[key] for key in OF_BEAM if key in content})
+    system = json.dumps([{key: content[key] for key in OF_BEAM if key in content}, *arms.tolist()])
     return None if _systems(system) is None else ForceRunner(case, batches, system, block_bytes)
 
 
 @functools.lru_cache(maxsize=4)
 def _systems(content: str) -> list[ForceSystem] | None:
-    """Systems of the beam and groups of sensors of a case, from those of its file as JSON."""
-    case = case_from_dict(json.loads(content))
+    """Systems of the beam and groups of sensors of a case, from those of its file as JSON.
+
+    And the eccentricity (m) of the forces.
+    """
+    of_case, arm = json.loads(content)
+    case = case_from_dict(of_case)
     layout = mesh_layout(case)
     if not is_supported(case, layout):
         return None
@@ -219,7 +226,7 @@ def _systems(content: str) -> list[ForceSystem] | None:
         correction = static_correction(model, case, sensors, rows)
         places = corrected_places(case, model, sensors)
         places = np.zeros(0) if places is None else np.asarray(places)
-        found.append(force_system(model, linear_outputs(model, rows, correction), places))
+        found.append(force_system(model, linear_outputs(model, rows, correction), places, arm))
     return None if None in found else found
 
 

@@ -295,7 +295,7 @@ def sweep_specification(
     if not case.sensors:
         raise ValueError("the case has no sensors, and peaks are taken there; add one to `sensors`")
     for i, sensor in enumerate(case.sensors):
-        if QUANTITIES[sensor.quantity].x_derivative > 2 and not is_corrected(case):
+        if QUANTITIES[sensor.quantity].jumps and not is_corrected(case):
             raise ValueError(
                 f"sensors.{i} measures {sensor.quantity}, whose sum of modes converges too slowly,"
                 " and which is not statically corrected, as the beam can move as a rigid body:"

@@ -134,6 +134,7 @@ class AbstractLoad(ReprWithUnits):
     positions: eqx.AbstractVar[Float[Array, " point"] | None]
 
     start_position: eqx.AbstractVar[Float[Array, ""] | None]
+    eccentricity: eqx.AbstractVar[Float[Array, ""] | None]
 
     @abc.abstractmethod
     def vehicle(self, gravity: Float[Array, ""]) -> VehicleModel:
@@ -239,6 +240,9 @@ class AbstractVehicleLoad(AbstractLoad):
         "position of the first wheel at entry_time, before the beam",
         default=None,
         kw_only=True,
+    )
+    eccentricity: Float[Number, ""] | None = number(
+        "m", "distance left of the axis of the beam, looking right", default=None, kw_only=True
     )
 
 

@@ -49,6 +49,9 @@ class MovingForce(AbstractLoad):
     start_position: Float[Number, ""] | None = number(
         "m", "position at entry_time, before the beam", default=None
     )
+    eccentricity: Float[Number, ""] | None = number(
+        "m", "distance left of the axis of the beam, looking right", default=None, kw_only=True
+    )
 
     def validate(self, address):
         return validate_exactly_one(address, self, "force", "mass") or super().validate(address)
@@ -158,6 +161,9 @@ class MovingMass(AbstractLoad):
     positions: Float[Number, " point"] | None = number("m", "table: positions", default=None)
     start_position: Float[Number, ""] | None = number(
         "m", "position at entry_time, before the beam", default=None
+    )
+    eccentricity: Float[Number, ""] | None = number(
+        "m", "distance left of the axis of the beam, looking right", default=None, kw_only=True
     )
 
     def total_mass(self, gravity):

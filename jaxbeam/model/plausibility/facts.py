@@ -384,6 +384,8 @@ class Facts:
         if not sag or first is None:
             return None
         quantity = QUANTITIES[sensor.quantity]
+        if quantity.of_twist:
+            return None
         size = sag * (math.pi / self.numbers.span) ** quantity.x_derivative
         size *= (2 * math.pi * first) ** quantity.time_derivative
         if quantity.at_fibre:

@@ -25,13 +25,13 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.quantities import QUANTITIES, Quantity, quantity_of
+from jaxbeam.case.quantities import QUANTITIES, TWIST_RATE, Quantity, quantity_of
 from jaxbeam.case.sensors import Sensor
-from jaxbeam.model.deflection_lines import LoadInfluence, load_influence
-from jaxbeam.model.flexibility import flexibility
+from jaxbeam.model.deflection_lines import LoadInfluence, influence_functions, load_influence
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.static_correction import (
+    OF_TWIST,
     Motion,
     active_moments,
     corrected_history,
@@ -104,6 +104,8 @@ def modal_row(
 def quantity_factor(case: Case, x, quantity: Quantity, fibre_distance, section_modulus):
     """Factor from the derivative of the deflection at positions x (m) to a quantity."""
     factor = section_stiffness(case, x) if quantity.section_force else xp.ones(())
+    if quantity.field == TWIST_RATE:
+        factor = case.beam.torsional_rigidity * xp.ones(xp.shape(x))
     if quantity.at_fibre:
         factor = -xp.asarray(fibre_distance) * factor
     return factor / xp.asarray(section_modulus) if quantity.over_modulus else factor
@@ -235,7 +237,7 @@ def quantity_history(
         rows = modal_row(modes.fields, case, x, name, *parameters) * band_weights(modes, mode_band)
         amplitudes = (motion.coordinates, motion.rates, motion.accelerations)
         return xp.tensordot(amplitudes[quantity.time_derivative], rows, axes=[1, -1])
-    history = corrected_history(case, modes, motion, x, quantity.x_derivative)
+    history = corrected_history(case, modes, motion, x, quantity.field)
     history = quantity_factor(case, x, quantity, *parameters) * history
     if quantity.has_active_moment and case.actuators:
         modulus = xp.asarray(section_modulus) if quantity.over_modulus else 1.0
@@ -310,7 +312,7 @@ def static_correction(
     of_modes = xp.where(np.isin(np.arange(count), bending), of_modes, 0.0)
     rates = accelerations = xp.zeros((count, modes))
     commands = xp.zeros((count, len(case.actuators)))
-    orders = {i: quantity_of(*_channel(sensors[i])).x_derivative for i in bending}
+    orders = {i: quantity_of(*_channel(sensors[i])).field for i in bending}
     groups = {
         order: [i for i in bending if orders[i] == order] for order in sorted(set(orders.values()))
     }
@@ -319,8 +321,10 @@ def static_correction(
     for order, index in groups.items():
         x = xp.stack([place_of(case, sensors[i]) for i in index])
         own = xp.stack([_factor(case, sensors[i], x[n]) for n, i in enumerate(index)])
-        all_greens.append(flexibility(case, layout, x, order))
-        factors.append(own * length ** (3 - order) / case.beam.bending_stiffness)
+        all_greens.append(influence_functions(case, layout, x, order))
+        factors.append(own * length ** (3 - abs(order)) / case.beam.bending_stiffness)
+        if order in OF_TWIST:  # dampers and actuators are on the axis
+            continue
         for support in case.supports:
             if support.damping is None:
                 continue
@@ -413,7 +417,8 @@ def linear_outputs(
         on_modes = model.mode_map @ on_modes
     influence = None
     if correction is not None or outputs.has_feedthrough.any():
-        influence = LoadInfluence(model.load_nodes, model.load_series @ on_modes)
+        twist = None if model.load_twist is None else model.load_twist @ on_modes
+        influence = LoadInfluence(model.load_nodes, model.load_series @ on_modes, twist=twist)
     if correction is not None:
         influence = correction.influence.plus(influence)
     return LinearOutputs(xp.array(rows).reshape(count, model.state_count), influence)

@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.beam import MATERIALS, Beam
+from jaxbeam.case.quantities import SLOPE
 from jaxbeam.model.layout import Layout
-from jaxbeam.model.theory.elements import RIGIDITY, SHEAR, SLOPE, Sections
+from jaxbeam.model.theory.elements import RIGIDITY, SHEAR, Sections
 from jaxbeam.runtime.arrays import Array, xp
 
 FURTHER_POINTS = 8  # of the quadrature, for properties of degree up to 15

@@ -26,13 +26,11 @@ from jaxbeam.case.beam import (
     segment_edges,
 )
 from jaxbeam.case.case import Case
+from jaxbeam.case.quantities import SLOPE
 from jaxbeam.model.layout import Layout, hinge_nodes, node_positions
 from jaxbeam.numerics.polynomials import legendre_to_chebyshev, piecewise_chebyshev
 from jaxbeam.runtime.arrays import Array, add_at, set_at, xp
 from jaxbeam.runtime.module import Module
-
-SLOPE = -1  # order of the slope w' of the axis, which is the rotation only without shear
-
 
 PROPERTIES = ("rigidity", "mass", "shear_stiffness", "rotary_inertia", "foundation_stiffness")
 RIGIDITY, MASS, SHEAR, ROTARY, FOUNDATION = range(len(PROPERTIES))

@@ -21,12 +21,12 @@ from numpy.polynomial import chebyshev
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete
+from jaxbeam.case.quantities import SLOPE
 from jaxbeam.model.layout import Layout, actuator_nodes
 from jaxbeam.model.theory.elements import (
     FOUNDATION,
     RIGIDITY,
     SHEAR,
-    SLOPE,
     Sections,
     add_nodal_parts,
     assemble_sections,

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
 from jaxbeam.case.filters import Filter
-from jaxbeam.case.quantities import QUANTITIES as ROW_QUANTITIES, Quantity, quantity_of
+from jaxbeam.case.quantities import QUANTITIES as ROW_QUANTITIES, TWIST, Quantity, quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check_case
 from jaxbeam.files.case_file import case_from_dict
@@ -312,7 +312,7 @@ def test_seeds_are_whole_numbers():
 
 FIBRE, MODULUS = 0.003, 2e-6
 ROW_CASE = jb.Case(
-    jb.Beam(1.2, 11.68, 0.535, modes=4),
+    jb.Beam(1.2, 11.68, 0.535, modes=6, torsional_rigidity=4.2, polar_inertia=2e-4),
     supports=[jb.Support(0.7, stiffness=3e3, damping=2.0)],
     actuators=[jb.Shaker(0.3, stiffness=100.0, damping=1.0)],
 )
@@ -333,11 +333,12 @@ def sensor(name: str) -> jb.Sensor:
 def test_rows_are_x_derivatives_of_the_deflection(name):
     """By central differences of one order less."""
     quantity, model, h = ROW_QUANTITIES[name], modal_model(ROW_CASE), 1e-5
-    lower = max(quantity.x_derivative - 1, 0)
-    shapes = model.shapes(jnp.array([0.45 - h, 0.45, 0.45 + h]), (lower,))[0]
+    lower = TWIST if quantity.of_twist else max(quantity.x_derivative - 1, 0)
+    shapes = model.fields(jnp.array([0.45 - h, 0.45, 0.45 + h]), (lower,))[0]
     expected = (shapes[2] - shapes[0]) / (2 * h) if quantity.x_derivative else shapes[1]
     expected = -FIBRE * expected if quantity.at_fibre else expected
     expected = 11.68 * expected if quantity.section_force else expected
+    expected = 4.2 * expected if name == "torque" else expected
     expected = expected / MODULUS if quantity.over_modulus else expected
     found = modal_row(model.fields, ROW_CASE, 0.45, name, FIBRE, MODULUS)
     assert_allclose(found, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
