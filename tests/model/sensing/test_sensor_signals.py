@@ -404,7 +404,7 @@ def test_active_moments_of_commands_belong_to_moment_and_stress():
     sensors = [sensor("moment"), sensor("stress"), sensor("curvature"), jb.Sensor(0.6, "moment")]
     rows = sensor_rows(modal_model(case), case, sensors)
     assert_allclose(rows.on_commands[:, 0], [2e-3, 2e-3 / MODULUS, 0.0, 0.0])
-    _, D = rows.of_system(modal_model(case), np.eye(8), np.ones((8, 1)))
+    _, D = rows.of_system(modal_model(case), np.eye(12), np.ones((12, 1)))
     assert_allclose(D, rows.on_commands)
 
 
