@@ -18,11 +18,24 @@ static inline Register entry_of(const Workspace *w, const Group *g, const double
     return of_group(matrix + entry * w->vehicle_runs, w->vehicle_runs, g);
 }
 
-/* Add response to q at the nodes up to a fraction of a step, and to the state at its start. */
+/* A number of one lane, or with `EACH` that of each. */
+enum { EACH = -1 };
+static inline Register in_lane(Register values, int lane) {
+    return lane == EACH ? values : broadcast(values[lane]);
+}
+
+/* Part of a step at a fraction of it. */
+static double part_of_step(const Workspace *w, int fraction) {
+    return fraction < NODES ? w->inputs[GAUSS_NODES][fraction] : 1;
+}
+
+/* Add response to q at the nodes up to a fraction of a step, which is in a lane, and to the state
+ * at its start. */
 static void store_vehicle(Workspace *w, const VehicleMatrices *matrices, const Group *g,
-                          const Vehicle *to, int states, int wheels, int fraction, double length) {
+                          const Vehicle *to, int states, int wheels, int fraction, double length,
+                          int lane) {
     const int columns = NODES * wheels;
-    const double part = fraction < NODES ? w->inputs[GAUSS_NODES][fraction] : 1;
+    const double part = part_of_step(w, fraction);
     Register *response = w->product, *scale = w->vehicle_scale; /* response: (state, wheel) */
     for (int f = 0; f < NODES; f++) {
         double weights[NODES], power = length * part;
@@ -33,7 +46,7 @@ static void store_vehicle(Workspace *w, const VehicleMatrices *matrices, const G
             for (int v = 0; v < wheels; v++) {
                 Register sum = {0};
                 for (int p = 0; p < NODES; p++)
-                    sum += weights[p] * w->phi[i * columns + p * wheels + v];
+                    sum += weights[p] * in_lane(w->phi[i * columns + p * wheels + v], lane);
                 response[i * wheels + v] = sum / scale[i];
             }
         if (fraction == NODES) {
@@ -55,13 +68,13 @@ static void store_vehicle(Workspace *w, const VehicleMatrices *matrices, const G
         if (fraction == NODES) {
             for (int i = 0; i < states; i++)
                 to->transition[i * states + j] =
-                    w->exponential[i * states + j] * (scale[j] / scale[i]);
+                    in_lane(w->exponential[i * states + j], lane) * (scale[j] / scale[i]);
         } else {
             for (int u = 0; u < wheels; u++) {
                 Register sum = {0};
                 for (int i = 0; i < states; i++)
                     sum += entry_of(w, g, matrices->output, u * states + i) *
-                           w->exponential[i * states + j] * (scale[j] / scale[i]);
+                           in_lane(w->exponential[i * states + j], lane) * (scale[j] / scale[i]);
                 to->pull[(u * NODES + fraction) * states + j] = sum;
             }
         }
@@ -82,8 +95,10 @@ static void balance_vehicle(const Workspace *w, const double *matrix, const Grou
             w->vehicle_scale[i][l] = i < dofs ? sqrt(largest[l]) : 1;
 }
 
-/* Propagators of the vehicles of a group of runs for the steps of a length. */
+/* Propagators of the vehicles of a group of runs for the steps of a length. Lanes are runs or, of
+ * vehicles that all runs share, fractions of the step. */
 static void vehicle_propagators(Workspace *w, const Step *step, const Group *g) {
+    const int shared = w->vehicle_runs == 1, at_once = shared ? REGISTER_WIDTH : 1;
     int64_t *kind = w->vehicle_kind + propagators_of(w, step, g);
     if (*kind == step->kind) return;
     *kind = step->kind;
@@ -100,15 +115,19 @@ static void vehicle_propagators(Workspace *w, const Step *step, const Group *g) 
             for (int v = 0; v < wheels; v++)
                 w->input_matrix[i * wheels + v] =
                     entry_of(w, g, m.input, i * wheels + v) * scale[i];
-        for (int fraction = 0; fraction < STEP_FRACTIONS; fraction++) {
-            const double part = fraction < NODES ? w->inputs[GAUSS_NODES][fraction] : 1;
+        for (int first = 0; first < STEP_FRACTIONS; first += at_once) {
+            Register length;
+            for (int l = 0; l < REGISTER_WIDTH; l++)
+                length[l] = step->length * part_of_step(w, first + (shared ? l : 0));
             for (int i = 0; i < states; i++)
                 for (int j = 0; j < states; j++)
                     w->block_matrix[i * states + j] =
                         entry_of(w, g, m.state, i * states + j) *
-                        (scale[i] / scale[j]) * (step->length * part / (1 << DOUBLINGS));
+                        (scale[i] / scale[j]) * (length / (1 << DOUBLINGS));
             exponential_and_phi(w, states, wheels);
-            store_vehicle(w, &m, g, &to, states, wheels, fraction, step->length);
+            for (int l = 0; l < at_once && first + l < STEP_FRACTIONS; l++)
+                store_vehicle(w, &m, g, &to, states, wheels, first + l, step->length,
+                              shared ? l : EACH);
         }
         m.state += states * states * w->vehicle_runs;
         m.input += states * wheels * w->vehicle_runs;
