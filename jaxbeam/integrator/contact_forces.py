@@ -131,7 +131,7 @@ PARABOLAS = _parabolas()
 def _vertices(pulls: Float[Array, "fraction step row batch"]):
     """Tops of the parabolas through three fractions, -inf without one, and zeros before them."""
     rise, fall, slope, curvature = (xp.tensordot(weights, pulls, 1) for weights in PARABOLAS)
-    inside = (rise > 0) & (fall < 0)
+    inside = (rise > 0) & (fall < 0) & (curvature < 0)  # which rounding of a level pull may not be
     curvature = xp.where(inside, curvature, -1.0)
     top = xp.where(inside, pulls[1:-1] - slope**2 / (4 * curvature), -xp.inf)
     at = FORCE_FRACTIONS[1:-1, None, None, None] - slope / (2 * curvature)
