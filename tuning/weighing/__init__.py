@@ -1,5 +1,6 @@
 """Weighing in motion: loads found in a log of a beam that is known."""
 
+from tuning.weighing.accuracy import Accuracy, accuracy_class, relative_errors
 from tuning.weighing.axles import AxleWeighing, weigh_axles
 from tuning.weighing.calibration import calibrate_influence_lines
 from tuning.weighing.influence_lines import (
@@ -8,9 +9,12 @@ from tuning.weighing.influence_lines import (
 )
 
 __all__ = [
+    "Accuracy",
     "AxleWeighing",
     "InfluenceLines",
+    "accuracy_class",
     "calibrate_influence_lines",
     "model_influence_lines",
+    "relative_errors",
     "weigh_axles",
 ]

@@ -53,7 +53,7 @@ def test_two_loads_that_meet_on_the_beam():
     assert weighed.load_counts == []  # the residuals are white noise
     assert np.all(np.abs(deviations(weighed.fit, truth)) < 3.5)
     assert weighed.fit.errors[0] < 0.01 and weighed.fit.errors[3] < 0.01  # kg
-    assert str(weighed).startswith("2 loads found\nparameter ")
+    assert str(weighed).startswith("2 loads found\nthe model explains the logs: ")
     assert weighed.to_dict()["loads"][1]["mass"]["value"] == pytest.approx(0.3, rel=0.02)
 
 
