@@ -293,7 +293,7 @@ def influence_table(
         beside = [
             min(p + LEFT_SHARE * length, length)
             for q, _, p in lines
-            if q != REACTION and QUANTITIES[q].jumps
+            if q in QUANTITIES and QUANTITIES[q].jumps
         ]
         start = positions_along(case, places=np.concatenate([own, beside]))
         found_at, found = refined(case, at, curves, start)
