@@ -56,6 +56,7 @@ SENSORS = tuple(
         section_modulus=1e-6 if entry.over_modulus else None,
     )
     for i, (quantity, entry) in enumerate(QUANTITIES.items())
+    if not entry.of_twist
 )
 TABLE = {"times": [0.0, 0.05, 0.2, 0.3], "positions": [0.9, 0.6, 0.7, 0.2]}
 RUN = jb.Run(duration=0.25, sample_rate=200.0)
@@ -72,6 +73,17 @@ MASSES = jb.Case(
 )
 CASES = {
     "masses on two spans": MASSES,
+    "eccentric masses": dataclasses.replace(
+        MASSES,
+        beam=dataclasses.replace(
+            BEAM, modes=6, damping_ratio=0.02, torsional_rigidity=4.0, polar_inertia=2e-4
+        ),
+        sensors=(
+            jb.Sensor(0.3, "twist"),
+            jb.Sensor(0.4, "torque"),
+        ),
+        loads=[dataclasses.replace(load, eccentricity=0.02) for load in MASSES.loads],
+    ),
     "a table of positions": dataclasses.replace(
         MASSES, supports=(), loads=(jb.MovingMass(mass=0.1, **TABLE),)
     ),
@@ -215,7 +227,7 @@ def test_records_of_known_and_traced_numbers_are_the_same(name):
         record = jb.simulate(case, times, plan)
         # A known run takes the steps of its peaks as two halves, for their errors.
         record = eqx.tree_at(errors, record, (np.zeros(()), np.zeros(len(case.sensors))))
-        histories = [record.at(0.33, quantity, 1e-3, 1e-6) for quantity in QUANTITIES]
+        histories = [record.at(0.33, sensor.quantity, 1e-3, 1e-6) for sensor in SENSORS]
         left = record.shear_force(0.33, "left")
         return record, histories, record.measured, record.strain, left, record.reactions
 
