@@ -74,7 +74,7 @@ def test_cited_sources_are_listed(place):
 def test_every_explanation_names_its_sources():
     """Those about the thesis are about one source."""
     for path in (ROOT / "docs" / "explanation").glob("*.md"):
-        if path.stem not in ("index", "thesis", "thesis_changes"):
+        if path.stem not in ("index", "thesis"):
             assert "**Sources.**" in path.read_text(encoding="utf-8"), path.name
 
 
@@ -83,7 +83,6 @@ def test_every_explanation_names_its_sources():
 # Pages whose tables have numbers in the source, and why.
 WRITTEN = {
     "docs/explanation/thesis.md": "written by `experiments.thesis.page`",
-    "docs/explanation/thesis_changes.md": "a history: verdicts before and after new rules",
 }
 GENERATED = ("docs/_static/", "docs/reference/api/", "docs/reference/case_file/")
 GENERATED = (*GENERATED, "docs/reference/commands.md", "docs/reference/modal_constants.md")

@@ -25,6 +25,7 @@ from experiments.thesis.verdicts import (
     NULL_MET,
     REPEATED,
     REPRODUCED,
+    STATEMENT,
     VERDICTS,
 )
 
@@ -38,20 +39,20 @@ Each number in the thesis that can be computed stands here with a verdict, which
 somebody who tries to refute it. The rules:
 
 - A computed number is *reproduced* if it follows from printed parameters to a unit of its last
-  digit, the rounding of those parameters included; a measured one within the scatter that the
-  thesis itself shows between its two spans and between series of one case.
+  digit, the rounding of those parameters included; a measured one within twice the noise of the
+  sensors, which section 5.1 prints: no table is judged by its own scatter.
 - It is *explained* if a reading of the text other than the literal one gives it, and no parameter
-  was fitted to that very number. One reading serves for all numbers of a group: the likeliest, with
-  all readings in the report.
+  was fitted to that very number. One reading serves for all numbers of a physical rig in a chapter:
+  the likeliest, with all readings in the report.
 - It *cannot be right* only by a proof that the report shows; else it is *not reproduced*.
-- A number that a null model (no control, static, one mode) meets within the same tolerance counts
-  for nothing, nor does one that a parameter was fitted to, nor one that repeats another.
+- A number that a null model (no control, static, one mode) meets within the same tolerance, or that
+  cannot tell the reading from it, counts for nothing, nor does one that a parameter was fitted to,
+  one that repeats another or follows from printed ones by arithmetic, or a yes or a no.
 
 In the lists the number of the thesis comes first, the computed one in brackets, then the reason.
 This page is written from the report of `jaxbeam reproduce --all`, by
-`python -m experiments.thesis.page`. [Verdicts that changed](thesis_changes.md) has each number
-whose verdict was another one before these rules. Where numbers were computed with parameters that
-are not printed, these can be identified: [two of them from one
+`python -m experiments.thesis.page`. Where numbers were computed with parameters that are not
+printed, these can be identified: [two of them from one
 figure](../tutorials/notebooks/13_read_a_thesis) predict another.
 """
 
@@ -76,7 +77,8 @@ def sentence(report: dict) -> str:
         f" {found[REPRODUCED]} are reproduced, {found[EXPLAINED]} are explained by a named reading,"
         f" {found[IRREPRODUCIBLE]} cannot be right and {found[NOT_REPRODUCED]} are not reproduced."
         f" The others count for nothing: a null model meets {found[NULL_MET]} of them as well,"
-        f" a parameter was fitted to {found[FITTED]}, and {found[REPEATED]} repeat others."
+        f" a parameter was fitted to {found[FITTED]}, {found[REPEATED]} repeat others or are"
+        f" arithmetic, and {found[STATEMENT]} are a yes or a no."
     )
 
 
@@ -89,7 +91,10 @@ def page(report: dict) -> str:
         if own:
             rows.append((name, *(str(own[word]) for word in ALL_VERDICTS)))
     rows.append(("all", *(str(counts(report)[word]) for word in ALL_VERDICTS)))
+    readings = {one["rig"]: one["reading of the rig"] for _, one in findings(report)}
     parts = [INTRODUCTION, sentence(report), "", _table(header, rows), ""]
+    parts += ["## Reading of each rig", "", *(f"- {rig}: {its}." for rig, its in readings.items())]
+    parts += [""]
     for verdict in (EXPLAINED, IRREPRODUCIBLE, NOT_REPRODUCED, *NOT_COUNTED):
         lines = [_line(one, verdict) for _, one in findings(report) if verdict in one["verdicts"]]
         if lines:
@@ -112,6 +117,7 @@ def _line(one: dict, verdict: str) -> str:
         NULL_MET: one["null model"],
         FITTED: one["reading"],
         REPEATED: one["repeats"],
+        STATEMENT: "",
     }
     reason = reasons[verdict]
     return f"- {one['where']}, {one['what']}: {pairs}" + (f": {reason}." if reason else ".")

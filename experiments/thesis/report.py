@@ -13,6 +13,7 @@ from experiments.thesis.verdicts import (
     ExperimentRun,
     Finding,
     FindingVerdicts,
+    reading_name,
 )
 from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable
 from jaxbeam.runtime.printer import text_table
@@ -23,15 +24,16 @@ COLUMNS = ("number", "published", "computed", "null model", "tolerance", "verdic
 METHOD = (
     "The thesis's figures and measured curves are not available: comparisons are with printed"
     " numbers, and figures have the thesis's axes. A tolerance is a unit of the last printed digit,"
-    " with the rounding of the printed parameters, or the scatter of measurements that the thesis"
-    " shows. One reading serves for all numbers of a group, the likeliest by its misfit: squared"
-    " differences over half the tolerance, cut off at three tolerances, and two for each fitted"
-    " parameter. A number that a null model meets within the same tolerance, that a parameter was"
-    ' fitted to, or that repeats another counts for nothing. No proof, no "cannot be right".'
+    " with the rounding of the printed parameters, or twice the noise of the sensors that section"
+    " 5.1 prints. One reading serves for all numbers of a rig in a chapter, the likeliest by its"
+    " misfit: squared differences over half the tolerance, cut off at three tolerances, and two for"
+    " each fitted parameter. A number that a null model meets as well, or that cannot tell the two"
+    " apart, that a parameter was fitted to, or that repeats another, and a yes or a no, count for"
+    ' nothing. No proof, no "cannot be right".'
 )
 VERDICT_STYLE = (
     ".reproduced { color: #00694c } .explained { color: #0072b2 } .not, .cannot { color: #b34700 }"
-    " .met, .fitted, .repeats { color: #777777 }"
+    " .met, .fitted, .repeats, .a { color: #777777 }"
 )
 
 
@@ -80,14 +82,21 @@ def _finding_rows(finding: Finding, assigned: FindingVerdicts) -> list[tuple[str
     columns = (
         published.value_labels,
         published.printed_text.split(),
-        finding.interpretations[assigned.interpretation],
+        finding.values(assigned.reading),
         finding.null.values,
+        published.allowed_error,
         assigned.verdicts,
     )
-    tolerance = str(published.tolerance)
     return [
-        (label.replace(",", ", "), printed, _number(value), _number(null), tolerance, verdict)
-        for label, printed, value, null, verdict in zip(*columns, strict=True)
+        (
+            label.replace(",", ", "),
+            printed,
+            _number(value),
+            _number(null),
+            f"{allowed:.3g}",
+            verdict,
+        )
+        for label, printed, value, null, allowed, verdict in zip(*columns, strict=True)
     ]
 
 
@@ -99,26 +108,27 @@ def _finding_notes(finding: Finding, assigned: FindingVerdicts) -> list[str]:
     """Sentences on the null model, on each reading and its misfit, and on what is not met."""
     published, verdicts = finding.published, assigned.verdicts
     misfits = assigned.misfits
-    sentences = [f"Null model: {finding.null.name}."]
+    sentences = [f"Tolerance: {published.tolerance.basis}. Null model: {finding.null.name}."]
     if published.interpretation:
         sentences.append(f"Interpretation: {published.interpretation}.")
-    if len(finding.interpretations) > 1:
-        for name, values in finding.interpretations.items():
+    if len(finding.readings) > 1:
+        for reading, values in finding.readings.items():
             numbers = " ".join(_number(value) for value in values)
-            taken = ", taken" if name == assigned.interpretation else ""
-            hits = int(finding.within_tolerance(name).sum())
+            taken = ", taken" if reading == assigned.reading & finding.answers else ""
+            hits = int(finding.within_tolerance(reading).sum())
+            least = f"{misfits[reading]:.3g}" if reading in misfits else "\N{EM DASH}"
             sentences.append(
-                f"{name}: {numbers} ({hits} of {len(verdicts)} within the tolerance; misfit"
-                f" {misfits[name]:.3g}{taken})"
+                f"{reading_name(reading)}: {numbers} ({hits} of {len(verdicts)} within the"
+                f" tolerance; misfit of the rig {least}{taken})"
             )
         sentences.append(f"Misfit of the null model: {misfits[None]:.3g}.")
+    sentences.append(f"Reading of {published.rig}: {reading_name(assigned.reading)}.")
     if FITTED in verdicts:
-        labels = finding.fitted[assigned.interpretation].split() or ["it"]
-        sentences.append(f"The reading was fitted to {', '.join(labels)}.")
+        sentences.append("Parameters of the reading were fitted to it.")
     if REPEATED in verdicts:
         sentences.append(f"Repeats {published.repeats}.")
     if IRREPRODUCIBLE in verdicts:
-        sentences.append(f"Cannot be right because {finding.impossible}.")
+        sentences.append(f"Cannot be right because {'; '.join(finding.impossible.values())}.")
     if finding.remark:
         sentences.append(f"{finding.remark[0].upper()}{finding.remark[1:]}.")
     return sentences

@@ -23,6 +23,7 @@ from experiments.thesis.verdicts import (
     Finding,
     FindingVerdicts,
     assign_verdicts,
+    reading_name,
 )
 from jaxbeam import rigs
 from jaxbeam.files.report import check_report_folder, write_report
@@ -87,14 +88,16 @@ def reproduce(
     """Run experiments in `processes` and write report.md, .html, .json and figures to a folder.
 
     The report has the experiments that are done, so that an interrupt loses none of them.
-    `report_progress` receives the text of each experiment, in order. Raises ValueError for an
-    unknown name, FileExistsError if the folder is not empty and `overwrite` is not set.
+    `report_progress` receives a line for each experiment when it is done, then the text of each:
+    verdicts rest on all experiments of a rig. Raises ValueError for an unknown name,
+    FileExistsError if the folder is not empty and `overwrite` is not set.
     """
     select_experiments(names)
     folder = Path(folder)
     check_report_folder(folder, overwrite)
     folder.mkdir(parents=True, exist_ok=True)
-    runs, kept = [], []  # those in the report
+    runs: list[ExperimentRun] = []
+    kept: list[str] = []  # those in the report
 
     def sentence() -> str:
         left = " ".join(name for name in names if name not in kept)
@@ -104,11 +107,20 @@ def reproduce(
 
     with keeping(sentence), contextlib.closing(_run_all(names, folder, processes)) as done:
         for run in done:
-            report_progress(report.as_text(run))
-            runs.append(run)
+            runs = judged([*runs, run])
             _write(folder, runs)
             kept.append(run.experiment.name)
+            numbers = sum(one.published.numbers.size for one in run.outcome.findings)
+            report_progress(f"{run.experiment.name}: {numbers} numbers, {run.seconds:.0f} s")
+    for run in runs:
+        report_progress(report.as_text(run))
     return runs
+
+
+def judged(runs: Sequence[ExperimentRun]) -> list[ExperimentRun]:
+    """The runs with verdicts by the findings of all: a rig is that of several experiments."""
+    assigned = iter(assign_verdicts([one for run in runs for one in run.outcome.findings]))
+    return [run._replace(verdicts=[next(assigned) for _ in run.outcome.findings]) for run in runs]
 
 
 def _write(folder: Path, runs: Sequence[ExperimentRun]) -> None:
@@ -186,24 +198,31 @@ def as_dict(runs: Sequence[ExperimentRun]) -> dict:
 
 
 def _finding_as_dict(finding: Finding, assigned: FindingVerdicts) -> dict:
-    published = finding.published
+    published, reading = finding.published, assigned.reading & finding.answers
     return {
         "where": published.location,
         "what": published.quantity,
         "unit": published.unit,
         "kind": published.origin,
-        "tolerance": str(published.tolerance),
+        "rig": published.rig,
+        "tolerance": published.tolerance.basis,
+        "allowed": published.allowed_error.tolist(),
         "labels": published.value_labels,
         "published": published.numbers.tolist(),
         "readings": {
-            name: list(map(float, values)) for name, values in finding.interpretations.items()
+            reading_name(answers): list(map(float, values))
+            for answers, values in finding.readings.items()
         },
-        "reading": assigned.interpretation,
-        "misfits": {name or finding.null.name: value for name, value in assigned.misfits.items()},
+        "reading": reading_name(reading),
+        "reading of the rig": reading_name(assigned.reading),
+        "misfits": {
+            finding.null.name if answers is None else reading_name(answers): value
+            for answers, value in assigned.misfits.items()
+        },
         "null model": finding.null.name,
         "null": list(map(float, finding.null.values)),
         "verdicts": assigned.verdicts,
-        "impossible because": finding.impossible,
+        "impossible because": "; ".join(finding.impossible.values()),
         "repeats": published.repeats,
         "remark": finding.remark,
     }

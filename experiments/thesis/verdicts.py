@@ -1,9 +1,11 @@
 """Verdicts on published numbers, computed from readings of the thesis and from null models.
 
-The rules are strict. One reading serves for all numbers of a group: the likeliest, by the sum of
-squared differences over tolerances, plus two for each fitted parameter (Akaike). A number that a
-null model (no control, static, one mode) meets within the same tolerance counts for nothing, nor
-does one that a parameter of the reading was fitted to, nor one that repeats another.
+The rules are strict. One reading serves for all numbers of a physical rig in a chapter: the
+likeliest set of answers to what the text leaves open, by the sum of squared differences over
+tolerances, plus two for each fitted parameter (Akaike). A number that a null model (no control,
+static, one mode) meets within the same tolerance, or that cannot tell the reading from the null
+model, counts for nothing, nor does one that a parameter of the reading was fitted to, one that
+repeats another, arithmetic with printed numbers, or a yes or a no.
 """
 
 import dataclasses
@@ -18,12 +20,15 @@ from experiments.thesis.published_numbers import PublishedNumbers
 
 REPRODUCED, EXPLAINED = "reproduced", "explained"
 IRREPRODUCIBLE, NOT_REPRODUCED = "cannot be right", "not reproduced"
-NULL_MET, FITTED, REPEATED = "met by the null model", "fitted to it", "repeats another"
+NULL_MET, FITTED = "met by the null model", "fitted to it"
+REPEATED, STATEMENT = "repeats another", "a yes or a no"
 VERDICTS = (REPRODUCED, EXPLAINED, IRREPRODUCIBLE, NOT_REPRODUCED)  # those that count
-NOT_COUNTED = (NULL_MET, FITTED, REPEATED)
-LITERAL = "as printed"  # name of the interpretation that takes the thesis at its word
+NOT_COUNTED = (NULL_MET, FITTED, REPEATED, STATEMENT)
+LITERAL = "as printed"  # name of the reading that takes the thesis at its word
 # Differences in tolerances beyond which they are alike, and those that one standard deviation is.
 FARTHEST, STANDARD_DEVIATION = 3.0, 0.5
+
+Reading = frozenset[str]  # answers other than those printed; none takes the thesis at its word
 
 
 class NullModel(NamedTuple):
@@ -35,75 +40,100 @@ class NullModel(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Published numbers beside computed ones, under one or more interpretations of the thesis.
+    """Published numbers beside computed ones, under one or more readings of the thesis.
 
-    `interpretations` maps a name to computed values (number,); the first takes the thesis at its
-    word, the others are what it may have meant. `fitted` maps an interpretation to the labels of
-    the numbers that its parameters were fitted to, one label for each parameter unless `parameters`
-    has their number, so that parameters of several findings count once. `impossible` is a
-    computed proof that no value can be right for the stated rig, or empty, `remark` says why a
-    number is not met where that is known.
+    `readings` maps the answers that matter for these numbers to computed values (number,); the
+    first has none and takes the thesis at its word. `fitted` maps an answer to the labels of the
+    numbers that its parameters were fitted to, one label for each parameter unless `parameters` has
+    their number, so that parameters of several findings count once. `impossible` maps the labels of
+    numbers, or "" for all, to a computed proof that they cannot be right for the stated rig;
+    `remark` says why a number is not met where that is known.
 
     Raises ValueError if a model has another count of values than is published.
     """
 
     published: PublishedNumbers
-    interpretations: Mapping[str, np.ndarray]
+    readings: Mapping[Reading, np.ndarray]
     null: NullModel
     fitted: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    impossible: str = ""
+    impossible: Mapping[str, str] = dataclasses.field(default_factory=dict)
     remark: str = ""
     parameters: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self):
         count = self.published.numbers.size
-        for name, values in (self.interpretations | {self.null.name: self.null.values}).items():
-            if np.shape(values) != (count,):
+        values = {reading_name(reading): values for reading, values in self.readings.items()}
+        for name, each in (values | {self.null.name: self.null.values}).items():
+            if np.shape(each) != (count,):
                 raise ValueError(f"{self.published.location}, {name}: {count} numbers are printed")
 
-    def within_tolerance(self, interpretation: str) -> np.ndarray:
-        """Whether each computed number is within the tolerance, (number,)."""
-        return self.published.agrees(self.interpretations[interpretation])
-
     @property
-    def null_within_tolerance(self) -> np.ndarray:
-        """Whether the null model meets each number within its tolerance, (number,)."""
-        return self.published.agrees(self.null.values)
+    def answers(self) -> Reading:
+        """All answers that change a value of this finding."""
+        return frozenset().union(*self.readings)
 
-    def misfit(self, interpretation: str | None) -> float:
+    def values(self, reading: Reading) -> np.ndarray:
+        """Computed values (number,) under a reading of the rig; other questions do not matter."""
+        return self.readings[reading & self.answers]
+
+    def within_tolerance(self, reading: Reading) -> np.ndarray:
+        """Whether each computed number is within the tolerance, (number,)."""
+        return self.published.agrees(self.values(reading))
+
+    def null_within_tolerance(self, reading: Reading) -> np.ndarray:
+        """Whether the null model meets each number, or cannot be told from the reading, (number,).
+
+        It cannot where both differ by less than the tolerance.
+        """
+        with np.errstate(invalid="ignore"):  # infinite limits
+            apart = np.abs(self.null.values - self.values(reading))
+        return self.published.agrees(self.null.values) | (apart < self.published.allowed_error)
+
+    def misfit(self, reading: Reading | None) -> float:
         """Minus twice the logarithm of the likelihood, up to a constant; of the null if None.
 
         Normal with a standard deviation of half the tolerance, differences cut off at three
-        tolerances, over the numbers that repeat no others, and two for each fitted parameter.
+        tolerances, over the numbers that count, and two for each fitted parameter.
         """
-        by_null = interpretation is None
-        values = self.null.values if by_null else self.interpretations[interpretation]
-        off = np.abs(np.asarray(values) - self.published.numbers) / self.published.allowed_error
+        values = self.null.values if reading is None else self.values(reading)
+        off = np.abs(values - self.published.numbers) / self.published.allowed_error
         off = np.minimum(np.where(np.isnan(off), FARTHEST, off), FARTHEST) / STANDARD_DEVIATION
-        labels = "" if by_null else self.fitted.get(interpretation, "")
-        by_labels = len(labels.split())
-        parameters = 0 if by_null else self.parameters.get(interpretation, by_labels)
-        return float(np.sum(off[~self.published.repeated] ** 2)) + 2 * parameters
+        counted = ~(self.published.repeated | self.published.statement)
+        parameters = sum(
+            self.parameters.get(answer, len(self.fitted.get(answer, "").split()))
+            for answer in reading or ()
+        )
+        return float(np.sum(off[counted] ** 2)) + 2 * parameters
+
+
+def reading_name(reading: Reading) -> str:
+    """The answers of a reading in words."""
+    return "; ".join(sorted(reading)) or LITERAL
 
 
 def make_finding(
     published: PublishedNumbers,
     values,
-    alternatives: Mapping[str, np.ndarray] | None = None,
+    alternatives: Mapping[str | tuple[str, ...], object] | None = None,
     *,
     null: tuple[str, object],
     fitted: Mapping[str, str] | None = None,
     parameters: Mapping[str, int] | None = None,
-    impossible: str = "",
+    impossible: Mapping[str, str] | None = None,
     remark: str = "",
 ) -> Finding:
-    """A finding with `values` by the literal interpretation, and `alternatives` by name.
+    """A finding with `values` as printed, and `alternatives` by an answer or several.
 
     Values are numbers or arrays (number,), and so are those of the `null` model (name, values),
     where one number stands for all. Raises ValueError if their count is not that published.
     """
-    interpretations = {LITERAL: values} | dict(alternatives or {})
-    arrays = {name: np.atleast_1d(np.asarray(v, float)) for name, v in interpretations.items()}
+    readings = {(): values} | dict(alternatives or {})
+    arrays = {
+        frozenset([answers] if isinstance(answers, str) else answers): np.atleast_1d(
+            np.asarray(v, float)
+        )
+        for answers, v in readings.items()
+    }
     name, null_values = null
     null_array = np.asarray(null_values, float)
     if null_array.ndim == 0:
@@ -113,73 +143,106 @@ def make_finding(
         arrays,
         NullModel(name, null_array),
         fitted or {},
-        impossible,
+        {labels: proof for labels, proof in (impossible or {}).items() if proof},
         remark,
         parameters or {},
     )
 
 
-def group_of(finding: Finding, findings: Sequence[Finding]) -> list[Finding]:
-    """The findings that have the same interpretations: one of them must serve for all."""
-    names = list(finding.interpretations)
-    return [one for one in findings if list(one.interpretations) == names]
+def readings_of(group: Sequence[Finding]) -> list[Reading]:
+    """All readings of a rig: sets of answers of which each finding has a value.
+
+    Answers that a finding has apart, but never together, exclude one another.
+    """
+    readings = {frozenset(): None}
+    for one in group:
+        readings |= {
+            reading | answers: None
+            for reading in readings
+            for answers in one.readings
+            if reading & one.answers <= answers
+        }
+    return [
+        reading
+        for reading in readings
+        if all(reading & one.answers in one.readings for one in group)
+    ]
 
 
-def likeliest_interpretation(group: Sequence[Finding]) -> str:
-    """Name of the interpretation with the least misfit over all findings of a group."""
-    names = list(group[0].interpretations)
-    return min(names, key=lambda name: sum(one.misfit(name) for one in group))
+def likeliest_reading(group: Sequence[Finding]) -> Reading:
+    """The reading with the least misfit over all findings of a rig."""
+    return min(readings_of(group), key=lambda reading: _misfit(group, reading))
+
+
+def _misfit(group: Sequence[Finding], reading: Reading | None) -> float:
+    return sum(one.misfit(reading) for one in group)
 
 
 class FindingVerdicts(NamedTuple):
-    """Verdict on each number of a finding, and the interpretation that all of them rest on.
+    """Verdict on each number of a finding, and the reading of the rig that all of them rest on.
 
-    `misfits` are those of the group by interpretation, that of the null models under None.
+    `misfits` are those of the rig by the answers that matter for the finding, the others being the
+    likeliest; that of the null models under None.
     """
 
     verdicts: list[str]
-    interpretation: str
-    misfits: dict[str | None, float]
+    reading: Reading
+    misfits: dict[Reading | None, float]
 
 
 def assign_verdicts(findings: Sequence[Finding]) -> list[FindingVerdicts]:
-    """Verdicts on the numbers of each finding, by the likeliest interpretation of its group.
+    """Verdicts on the numbers of each finding, by the likeliest reading of its rig.
 
-    Numbers that repeat others count for nothing. One that is within tolerance is "met by the null
-    model" if that meets it too, "fitted to it" if a parameter was; else "reproduced", if the thesis
-    taken at its word gives the same, or "explained". One that is not is "cannot be right" if there
-    is a proof, else "not reproduced". No interpretation that is less likely than the null model
-    explains anything.
+    Numbers that repeat others, and statements, count for nothing. One that is within tolerance is
+    "met by the null model" if that meets it too or is as near, "fitted to it" if a parameter was;
+    else "reproduced", if the thesis taken at its word gives the same, or "explained". One that is
+    not is "cannot be right" if there is a proof, else "not reproduced". No reading that is less
+    likely than the null model explains anything.
     """
-    assigned = []
+    groups: dict[str, list[Finding]] = {}
     for one in findings:
-        group = group_of(one, findings)
-        name = likeliest_interpretation(group)
-        misfits = {
-            key: sum(each.misfit(key) for each in group) for key in (*one.interpretations, None)
-        }
-        met, null_met = one.within_tolerance(name), one.null_within_tolerance
-        as_printed = np.isclose(
-            one.interpretations[name], one.interpretations[LITERAL], rtol=1e-9, atol=0
-        )
-        used = one.published.has_label(one.fitted[name]) if name in one.fitted else 0 * met
-        likely = misfits[name] < misfits[None]
-        verdicts = [
-            REPEATED
-            if one.published.repeated[i]
-            else (IRREPRODUCIBLE if one.impossible else NOT_REPRODUCED)
-            if not (met[i] and likely)
-            else NULL_MET
-            if null_met[i]
-            else FITTED
-            if used[i]
-            else REPRODUCED
-            if as_printed[i]
-            else EXPLAINED
-            for i in range(met.size)
-        ]
-        assigned.append(FindingVerdicts(verdicts, name, misfits))
-    return assigned
+        groups.setdefault(one.published.rig, []).append(one)
+    judged = {}
+    for rig, group in groups.items():
+        misfits = {reading: _misfit(group, reading) for reading in readings_of(group)}
+        best = min(misfits, key=misfits.__getitem__)
+        judged[rig] = best, misfits, _misfit(group, None)
+    return [_verdicts(one, *judged[one.published.rig]) for one in findings]
+
+
+def _verdicts(
+    one: Finding, best: Reading, by_rig: Mapping[Reading, float], by_null: float
+) -> FindingVerdicts:
+    own: dict[Reading | None, float] = {}
+    for reading, misfit in by_rig.items():
+        answers = reading & one.answers
+        own[answers] = min(misfit, own.get(answers, np.inf))
+    met, null_met = one.within_tolerance(best), one.null_within_tolerance(best)
+    as_printed = np.isclose(one.values(best), one.values(frozenset()), rtol=1e-9, atol=0)
+    used = np.zeros(met.size, bool)
+    for answer in best & one.fitted.keys():
+        used |= one.published.has_label(one.fitted[answer])
+    refuted = np.zeros(met.size, bool)
+    for labels in one.impossible:
+        refuted |= one.published.has_label(labels) if labels else True
+    likely = by_rig[best] < by_null
+    verdicts = [
+        STATEMENT
+        if one.published.statement
+        else REPEATED
+        if one.published.repeated[i]
+        else (IRREPRODUCIBLE if refuted[i] else NOT_REPRODUCED)
+        if not (met[i] and likely)
+        else NULL_MET
+        if null_met[i]
+        else FITTED
+        if used[i]
+        else REPRODUCED
+        if as_printed[i]
+        else EXPLAINED
+        for i in range(met.size)
+    ]
+    return FindingVerdicts(verdicts, best, own | {None: by_null})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,11 +21,20 @@ from experiments.thesis.cases import (
     critical_speed,
     one_span,
     two_spans,
+    with_duration,
     with_modes,
     with_sensors,
 )
 from experiments.thesis.chapter2 import published
-from experiments.thesis.verdicts import Experiment, ExperimentResult, make_finding
+from experiments.thesis.chapter2.shaker import beams_of_rig_a
+from experiments.thesis.verdicts import (
+    LITERAL,
+    Experiment,
+    ExperimentResult,
+    Finding,
+    make_finding,
+)
+from jaxbeam.model.plausibility.check import PlausibilityWarning
 from jaxbeam.model.statics import static_peak
 from jaxbeam.plot.style import GREY, INK, SHADE, colour, set_title, unit_scale, use_style
 from jaxbeam.simulation.simulate import ContactLossWarning
@@ -156,12 +165,20 @@ ONE_SPAN_RATIOS = np.append(np.geomspace(0.05, 0.2, 9)[:-1], np.linspace(0.2, 1.
 TWO_SPAN_RATIOS = np.append(np.geomspace(0.05, 0.2, 9)[:-1], np.linspace(0.2, 2.0, 37))
 DURATION = 1.0  # s: the slowest crossing, and free vibration after all others
 TOLERANCE = 1e-4  # relative, of peaks
-MODE_SENSITIVITY = 0.02  # relative change with twice the modes from which modes matter
-ONE_SPAN_POINTS = (0.7, 0), (0.5, 0), (0.75, 0)  # speed ratio and sensor, of Fig. 2.25
+SAMPLE_RATE = 5000.0  # Hz
+# Hz, s: each sample of a run whose contact is lost takes a step of its own.
+LIFTING_RATE, LIFTING_DURATION = 2000.0, 0.3
+# Mass (kg, None for a force), speed ratio and sensor, of Figs 2.25 and 2.27.
+ONE_SPAN_POINTS = (None, 0.7, 0), (0.26, 0.5, 0), (0.5, 0.75, 0)
+TWO_SPAN_POINTS = (0.261, 0.45, 0), (0.261, 0.45, 1), (0.261, 1.75, 1)
+YANG_RATIOS = np.linspace(0.2, 0.9, 15)
 ONE_MODE = "a moving force on one mode"
 WHILE_LOADED = "while the load is on the beam"
 # The shaker of section 2.3 without current is a spring: m, N/m.
 SHAKER_POSITION, SHAKER_STIFFNESS = 0.5, 12000.0
+AFTER_EXIT = "in free vibration after the exit"
+FEWER_LOSSES = "no damping, 10 modes"
+LIFTS = "the mass lifts off"
 ON_SHAKER_SPRING = (
     f"on the spring of the shaker, {SHAKER_STIFFNESS:g} N/m, in ratios to its own critical speed"
 )
@@ -172,97 +189,100 @@ SINE_FREQUENCIES, SINE_AMPLITUDES = (2.0, 4.0), (0.0, 1.0, 2.0)  # Hz, V, of Fig
 class AmplificationSweep(NamedTuple):
     """Amplification of a sweep over masses (kg) and speeds over the critical speed.
 
-    `amplification` (mass, speed, sensor) is that of the whole run, `amplification_on_beam` that
-    until the load leaves. `contact_force_ratio` (mass, speed) is the lowest contact force over the
-    weight, negative where the mass would have to pull.
+    `amplification` is (mass, speed, sensor). `contact_force_ratio` (mass, speed) is the lowest
+    contact force over the weight, negative where the mass would have to pull.
     """
 
     masses: np.ndarray
     speed_ratios: np.ndarray
     amplification: np.ndarray
-    amplification_on_beam: np.ndarray
     contact_force_ratio: np.ndarray
-
-    def at(self, mass: float, ratio: float, sensor: int = 0) -> np.ndarray:
-        """Amplification in the whole run and until the load leaves, (2,), at swept values."""
-        i, j = np.argmin(np.abs(self.masses - mass)), np.argmin(np.abs(self.speed_ratios - ratio))
-        return np.array(
-            [values[i, j, sensor] for values in (self.amplification, self.amplification_on_beam)]
-        )
 
 
 def sweep_amplification(case: jb.Case, masses, ratios) -> AmplificationSweep:
     """Amplification at the sensors over masses (kg) and speeds over the critical speed."""
     masses, ratios = np.sort(masses), np.asarray(ratios)
-    speeds = critical_speed(case) * ratios
-    mass, speed, on_beam_only = (
-        part.ravel() for part in np.meshgrid(masses, speeds, [False, True], indexing="ij")
+    mass, speed = (
+        part.ravel() for part in np.meshgrid(masses, critical_speed(case) * ratios, indexing="ij")
     )
-    crossing = float(case.beam.length) / speed
     axes = {
         "loads.0.mass": mass,
         "loads.0.speed": speed,
-        "run.duration": np.where(on_beam_only, crossing, np.maximum(DURATION, crossing)),
+        "run.duration": np.maximum(DURATION, float(case.beam.length) / speed),
     }
     results = jb.sweep(case, axes, paired=True, progress=False, tolerance=TOLERANCE)
-    positions = np.array([float(sensor.position) for sensor in case.sensors])
-    static = np.asarray(static_peak(jb.replace(case, {"loads.0.mass": 1.0}), positions))
-    peaks = results.peak_deflection.values.reshape(masses.size, ratios.size, 2, positions.size)
-    ratio = peaks / (static * masses[:, None, None, None])
-    contact = results.lowest_contact_force.values.reshape(masses.size, ratios.size, 2).min(axis=2)
+    static = _static_deflections(case)
+    peaks = results.peak_deflection.values.reshape(masses.size, ratios.size, static.size)
+    contact = results.lowest_contact_force.values.reshape(masses.size, ratios.size)
     weights = masses[:, None] * float(case.run.gravity)
-    return AmplificationSweep(masses, ratios, ratio[:, :, 0], ratio[:, :, 1], contact / weights)
+    return AmplificationSweep(
+        masses, ratios, peaks / (static * masses[:, None, None]), contact / weights
+    )
+
+
+def _static_deflections(case: jb.Case) -> np.ndarray:
+    """Largest static deflections at the sensors (m/kg)."""
+    positions = np.array([float(sensor.position) for sensor in case.sensors])
+    return np.asarray(static_peak(jb.replace(case, {"loads.0.mass": 1.0}), positions))
+
+
+def amplification_at(case: jb.Case, mass: float, ratio: float) -> dict[str, np.ndarray]:
+    """Amplification at each sensor, (sensor,), by what it is the largest of, at one mass and speed.
+
+    Of the whole run, while the load is on the beam, and after its exit; the last two are read from
+    samples at `SAMPLE_RATE`.
+    """
+    speed = ratio * critical_speed(case)
+    crossing = float(case.beam.length) / speed
+    case = jb.replace(case, {"loads.0.mass": mass, "loads.0.speed": speed})
+    lifts = case.contact is not None
+    timing = (LIFTING_DURATION, LIFTING_RATE) if lifts else (DURATION, SAMPLE_RATE)
+    case = with_duration(case, *timing)
+    record = jb.simulate(case, tolerance=TOLERANCE)
+    size, loaded = np.abs(np.asarray(record.deflection)), np.asarray(record.times) <= crossing
+    peaks = {
+        LITERAL: np.asarray(record.peak_deflection),
+        WHILE_LOADED: size[loaded].max(axis=0),
+        AFTER_EXIT: size[~loaded].max(axis=0),
+    }
+    return {name: peak / (mass * _static_deflections(case)) for name, peak in peaks.items()}
+
+
+def _at_points(
+    case: jb.Case, answers: tuple[str, ...], points
+) -> dict[tuple[str, ...], np.ndarray]:
+    """Amplification (point,) by the answers, which hold for the case, and what it is largest of.
+
+    Points are a mass (kg), or None for a moving force, a speed ratio, and the number of a sensor.
+    """
+    found = [
+        {
+            name: values[sensor]
+            for name, values in amplification_at(
+                as_moving_force(case) if mass is None else case, mass or 1.0, ratio
+            ).items()
+        }
+        for mass, ratio, sensor in points
+    ]
+    return {
+        answers if name == LITERAL else (*answers, name): np.array([one[name] for one in found])
+        for name in found[0]
+    }
 
 
 def run(load_rig) -> ExperimentResult:
     """Amplification of one and two spans by masses and by forces, with histories and maps."""
     one = with_sensors(one_span(load_rig), 0.3, duration=DURATION)
     two = with_sensors(two_spans(load_rig), 0.3, 0.9, duration=DURATION)
-    undamped = jb.replace(two, {"beam.damping_ratio": 0.0})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactLossWarning)  # the maps show lost contact
+        warnings.simplefilter("ignore", PlausibilityWarning)  # speeds are meant
         mass_one = sweep_amplification(one, MASSES, ONE_SPAN_RATIOS)
         mass_two = sweep_amplification(two, MASSES, TWO_SPAN_RATIOS)
         force_one = sweep_amplification(as_moving_force(one), [1.0], ONE_SPAN_RATIOS)
         force_two = sweep_amplification(as_moving_force(two), [1.0], TWO_SPAN_RATIOS)
-        yang = sweep_amplification(as_moving_force(undamped), [1.0], TWO_SPAN_RATIOS[:24])
-        more_modes = sweep_amplification(with_modes(two, 16), [0.261], [0.45, 1.75])
-        on_spring = _on_spring(one)
         history, figures = _histories(load_rig)
-        one_mode_yang = sweep_amplification(
-            as_moving_force(with_modes(undamped, 1)), [1.0], TWO_SPAN_RATIOS[:24]
-        )
-    yang = np.array(
-        [values[0].max(axis=0) for values in (yang.amplification, yang.amplification_on_beam)]
-    )
-    loads = (force_one, 1.0), (mass_one, 0.26), (mass_one, 0.5)
-    single = [
-        found.at(mass, ratio)
-        for (found, mass), (ratio, _) in zip(loads, ONE_SPAN_POINTS, strict=True)
-    ]
-    points = [(0.261, 0.45, 0), (0.261, 0.45, 1), (0.261, 1.75, 1)]
-    double, fine = ([found.at(*point) for point in points] for found in (mass_two, more_modes))
-    whole, on = _with_interpretations(single)
-    findings = (
-        *history,
-        make_finding(
-            published.ONE_SPAN_AMPLIFICATION,
-            whole,
-            on | {ON_SHAKER_SPRING: on_spring},
-            null=(ONE_MODE, _one_mode(one, ONE_SPAN_POINTS)),
-        ),
-        make_finding(
-            published.YANG_AMPLIFICATION,
-            *_with_interpretations(yang.T),
-            null=(ONE_MODE, one_mode_yang.amplification[0].max(axis=0)),
-        ),
-        make_finding(
-            published.TWO_SPAN_AMPLIFICATION,
-            *_with_interpretations(double),
-            null=(ONE_MODE, _one_mode(two, [(ratio, sensor) for _, ratio, sensor in points])),
-            remark=_mode_dependence(more_modes, double, fine),
-        ),
-    )
+        findings = (*history, _one_span_finding(one), *_two_span_findings(two))
     midspans = "first midspan", "second midspan"
     figures |= {
         "fig-2-25": draw_curves(
@@ -280,40 +300,56 @@ def run(load_rig) -> ExperimentResult:
     return ExperimentResult(findings, figures)
 
 
-def _on_spring(bare: jb.Case) -> np.ndarray:
-    """Amplification of Fig. 2.25, (3,), with the beam on the spring of the shaker."""
-    case = dataclasses.replace(
-        bare, supports=(jb.Support(SHAKER_POSITION, stiffness=SHAKER_STIFFNESS),)
+def _one_span_finding(one: jb.Case) -> Finding:
+    """Fig. 2.25, by the beam, the spring of the shaker, and what the amplification is of."""
+    values = {}
+    spring = jb.Support(SHAKER_POSITION, stiffness=SHAKER_STIFFNESS)
+    for name, beam in beams_of_rig_a(one.beam).items():
+        answers = () if name == LITERAL else (name,)
+        bare = dataclasses.replace(one, beam=beam)
+        values |= _at_points(bare, answers, ONE_SPAN_POINTS)
+        on_spring = dataclasses.replace(bare, supports=(spring,))
+        values |= _at_points(on_spring, (*answers, ON_SHAKER_SPRING), ONE_SPAN_POINTS)
+    null = _one_mode(one, ONE_SPAN_POINTS)
+    return make_finding(
+        published.ONE_SPAN_AMPLIFICATION, values.pop(()), values, null=(ONE_MODE, null)
     )
-    force = sweep_amplification(as_moving_force(case), [1.0], [0.7])
-    mass = sweep_amplification(case, [0.26, 0.5], [0.5, 0.75])
-    amplification = force.amplification[0, 0], mass.amplification[0, 0], mass.amplification[1, 1]
-    return np.array([value[0] for value in amplification])
+
+
+def _two_span_findings(two: jb.Case) -> tuple[Finding, Finding]:
+    """Amplification of a moving force after Yang, and Fig. 2.27."""
+    undamped = jb.replace(two, {"beam.damping_ratio": 0.0})
+    force = as_moving_force(undamped)
+    yang = [amplification_at(force, 1.0, ratio) for ratio in YANG_RATIOS]
+    largest = {name: np.max([each[name] for each in yang], axis=0) for name in yang[0]}
+    one_mode = sweep_amplification(with_modes(force, 1), [1.0], YANG_RATIOS)
+    of_force = make_finding(
+        published.YANG_AMPLIFICATION,
+        largest.pop(LITERAL),
+        largest,
+        null=(ONE_MODE, one_mode.amplification[0].max(axis=0)),
+    )
+    values = {}
+    for answers, case in (((), two), ((FEWER_LOSSES,), with_modes(undamped, 10))):
+        values |= _at_points(case, answers, TWO_SPAN_POINTS)
+        lifting = dataclasses.replace(case, contact=jb.UnilateralContact())
+        values |= _at_points(lifting, (*answers, LIFTS), TWO_SPAN_POINTS)
+    finer = _at_points(with_modes(two, 16), (), TWO_SPAN_POINTS)[()]
+    of_mass = make_finding(
+        published.TWO_SPAN_AMPLIFICATION,
+        values.pop(()),
+        values,
+        null=(ONE_MODE, _one_mode(two, TWO_SPAN_POINTS)),
+        remark="held to the beam, the mass would have to pull with many times its weight; with 16"
+        f" modes instead of 8 the amplification is then {', '.join(f'{x:.2f}' for x in finer)}",
+    )
+    return of_force, of_mass
 
 
 def _one_mode(case: jb.Case, points) -> np.ndarray:
-    """Amplification by a moving force of one mode, (point,), at speed ratios and sensors."""
-    case = as_moving_force(with_modes(case, 1))
-    found = sweep_amplification(case, [1.0], [ratio for ratio, _ in points])
-    return np.array([found.amplification[0, i, sensor] for i, (_, sensor) in enumerate(points)])
-
-
-def _with_interpretations(values):
-    """Amplification of whole runs, and of the crossing alone as the other interpretation."""
-    whole, on = np.array(values).T
-    return whole, {WHILE_LOADED: on}
-
-
-def _mode_dependence(more_modes: AmplificationSweep, coarse, fine) -> str:
-    """Why an amplification depends on the number of modes: the mass has lost contact. Or empty."""
-    change = np.max(np.abs(np.array(fine) / np.array(coarse) - 1))
-    if more_modes.contact_force_ratio.max() > 0 or change < MODE_SENSITIVITY:
-        return ""
-    worst = " and ".join(f"{-force:.0f}" for force in more_modes.contact_force_ratio[0])
-    return (
-        f"the mass would have to pull with {worst} times its weight to stay on the beam, which the"
-        f" model lets it do; with 16 modes instead of 8 the amplification changes by {change:.0%}"
-    )
+    """Amplification by a moving force of one mode, (point,)."""
+    forces = [(None, ratio, sensor) for _, ratio, sensor in points]
+    return _at_points(with_modes(case, 1), (), forces)[()]
 
 
 def _histories(load_rig):
@@ -328,6 +364,10 @@ def _histories(load_rig):
     shaker_case = with_sensors(load_rig("A"), 0.25, duration=1.0)
     shaker_case = jb.replace(shaker_case, {"loads.0.mass": 0.509, "loads.0.speed": 0.9})
     peak_differences = [_peak_difference(shaker_case, volts) for volts in SINE_AMPLITUDES]
+    by_beam = {
+        name: _peak_difference(dataclasses.replace(shaker_case, beam=beam), 0.0)
+        for name, beam in list(beams_of_rig_a(shaker_case.beam).items())[1:]
+    }
     fast = with_sensors(two_spans(load_rig), 0.75, duration=0.8)
     fast = jb.replace(fast, {"loads.0.mass": 0.261, "loads.0.speed": 3.0})
     pairs = {
@@ -353,6 +393,7 @@ def _histories(load_rig):
         make_finding(
             published.FORCE_MASS_DIFFERENCE,
             peak_differences[0],
+            by_beam,
             null=("no inertia of the load", 0.0),
             remark=_unknown_voltage(peak_differences),
         ),

@@ -2,6 +2,9 @@
 
 from experiments.thesis.published_numbers import DIGITS, FORMULA, HZ, PublishedNumbers
 
+RIG_A, RIG_B, RIG_D = "rig A, chapter 2", "rig B, chapter 2", "rig D, chapter 2"
+RIG_A_CONTROLLED = "rig A, chapter 5"
+TWO_SPANS = "two spans of the beam of rig A, chapter 2"
 MODE_LABELS = "1 2 3 4 5 6 7 8"
 
 # Modes and critical speeds.
@@ -13,6 +16,7 @@ FREQUENCY_PARAMETERS = PublishedNumbers(
     DIGITS,
     "3.1416 3.9266 6.2832 7.0686 9.4248 10.2102 12.5664 13.3518",
     MODE_LABELS,
+    rig=TWO_SPANS,
 )
 ANALYTICAL_FREQUENCIES = PublishedNumbers(
     "Table 2.2",
@@ -25,6 +29,7 @@ ANALYTICAL_FREQUENCIES = PublishedNumbers(
     "12.11 N m^2 and 0.5411 kg/m, as beside the table",
     "Table 2.1, squared, times one factor",
     "2 3 4 5 6 7 8",
+    rig=TWO_SPANS,
 )
 APPROXIMATE_FREQUENCIES = PublishedNumbers(
     "Table 2.2",
@@ -37,6 +42,7 @@ APPROXIMATE_FREQUENCIES = PublishedNumbers(
     "a rigid support as a spring in eight sine modes",
     "the row above it",
     "1 3 5 7",
+    rig=TWO_SPANS,
 )
 FREQUENCY_ERRORS = PublishedNumbers(
     "Table 2.2",
@@ -46,19 +52,29 @@ FREQUENCY_ERRORS = PublishedNumbers(
     DIGITS,
     "0.322 1.06 2.43 273240",
     "2 4 6 8",
-    repeats="the two rows above it, by division",
-    repeated_labels="2 4 6",
+    repeats="the two rows above it, by division (27235 % for the last)",
+    rig=TWO_SPANS,
 )
-CRITICAL_SPEEDS = PublishedNumbers(
+CRITICAL_SPEED = PublishedNumbers(
     "2.3",
-    "critical speeds, eqs (2.38) and (2.39)",
+    "critical speed of one span, eq. (2.38)",
     "m/s",
     "computed",
     FORMULA,
-    "24.03 48.95 38.24",
-    "one-span two-spans,1st two-spans,2nd",
-    repeats="the first frequency of Table 2.2, times twice the span",
-    repeated_labels="two-spans,1st",
+    "24.03",
+    "one-span",
+    rig=RIG_A,
+)
+TWO_SPAN_CRITICAL_SPEEDS = PublishedNumbers(
+    "2.3",
+    "critical speeds of two spans, eqs (2.38) and (2.39)",
+    "m/s",
+    "computed",
+    FORMULA,
+    "48.95 38.24",
+    "1st 2nd",
+    repeats="the frequencies of Table 2.2, times a length",
+    rig=TWO_SPANS,
 )
 SPEED_RATIOS = PublishedNumbers(
     "2.3",
@@ -70,6 +86,7 @@ SPEED_RATIOS = PublishedNumbers(
     "0.9m/s,one-span 1.5m/s,two-spans 3m/s,two-spans",
     "v_cr2 for two spans",
     "the critical speeds, by division",
+    rig=RIG_A,
 )
 ANGULAR_FREQUENCIES = PublishedNumbers(
     "2.3",
@@ -80,6 +97,7 @@ ANGULAR_FREQUENCIES = PublishedNumbers(
     "128 200.22",
     "1 2",
     repeats="the critical speeds of two spans, by eqs (2.38) and (2.39)",
+    rig=TWO_SPANS,
 )
 MASS_RATIO = PublishedNumbers(
     "Fig. 2.25",
@@ -89,6 +107,8 @@ MASS_RATIO = PublishedNumbers(
     DIGITS,
     "0.81 1.56",
     "0.26kg 0.5kg",
+    repeats="the masses, over the mass of the beam",
+    rig=RIG_A,
 )
 SHAKER_MODES = PublishedNumbers(
     "5.1",
@@ -99,11 +119,19 @@ SHAKER_MODES = PublishedNumbers(
     "24 72 159",
     "1 2 3",
     "the stiffness of the shaker is not stated there; 3500 N/m as where it is active",
+    rig=RIG_A_CONTROLLED,
 )
 
 # Patches and sections.
 PATCH_MOMENT = PublishedNumbers(
-    "2.4.2", "C0 of the patch, eq. (2.43)", "N m/V", "computed", DIGITS, "8.292e-4"
+    "2.4.2",
+    "C0 of the patch, eq. (2.43)",
+    "N m/V",
+    "computed",
+    DIGITS,
+    "8.292e-4",
+    repeats="the dimensions printed beside it, by eq. (2.43)",
+    rig=RIG_B,
 )
 PATCH_SECTION = PublishedNumbers(
     "2.4.2",
@@ -114,6 +142,8 @@ PATCH_SECTION = PublishedNumbers(
     "13.211",
     "",
     "h = 2.83 mm as printed beside it; 65 GPa",
+    repeats="the printed mass per length, by the section of 2.9 mm that both belong to",
+    rig=RIG_B,
 )
 
 # Moving force and moving mass.
@@ -126,6 +156,7 @@ FREE_AMPLITUDE_RATIO = PublishedNumbers(
     "3",
     "",
     "up to three times",
+    rig=RIG_D,
 )
 FREE_PHASE_DIFFERENCE = PublishedNumbers(
     "Fig. 2.23",
@@ -134,6 +165,7 @@ FREE_PHASE_DIFFERENCE = PublishedNumbers(
     "computed",
     DIGITS,
     "180",
+    rig=RIG_D,
 )
 FORCE_MASS_DIFFERENCE = PublishedNumbers(
     "Fig. 2.24",
@@ -144,6 +176,7 @@ FORCE_MASS_DIFFERENCE = PublishedNumbers(
     "0.04",
     "",
     "the prescribed voltage is not printed",
+    rig=RIG_A,
 )
 ONE_SPAN_AMPLIFICATION = PublishedNumbers(
     "Fig. 2.25",
@@ -154,6 +187,7 @@ ONE_SPAN_AMPLIFICATION = PublishedNumbers(
     "1.6 2.0 2.2",
     "force,0.7 0.26kg,0.5 0.5kg,0.75",
     "at the speed ratio v / v_cr, without the shaker",
+    rig=RIG_A,
 )
 TWO_SPAN_AMPLIFICATION = PublishedNumbers(
     "Fig. 2.27",
@@ -164,6 +198,7 @@ TWO_SPAN_AMPLIFICATION = PublishedNumbers(
     "3.6 4.5 5",
     "1st-midspan,0.45 2nd-midspan,0.45 2nd-midspan,1.75",
     "at the speed ratio v / v_cr1",
+    rig=TWO_SPANS,
 )
 YANG_AMPLIFICATION = PublishedNumbers(
     "2.3",
@@ -174,6 +209,7 @@ YANG_AMPLIFICATION = PublishedNumbers(
     "1.5 3.25",
     "1st-midspan 2nd-midspan",
     "largest over the speed, undamped; first span as Yang's simply supported beam",
+    rig=TWO_SPANS,
 )
 
 # Frequency responses with the electrodynamic shaker.
@@ -185,6 +221,7 @@ FORCE_DROPS = PublishedNumbers(
     DIGITS,
     "21 84 189 340",
     "1 2 3 4",
+    rig=RIG_A,
 )
 SHAKER_GAIN = PublishedNumbers(
     "Fig. 2.15",
@@ -194,9 +231,16 @@ SHAKER_GAIN = PublishedNumbers(
     DIGITS,
     "2.5 10",
     "low peak",
+    rig=RIG_A,
 )
 SHAKER_PEAK_FREQUENCY = PublishedNumbers(
-    "Fig. 2.15", "the peak is at", HZ, "computed", DIGITS, "27"
+    "Fig. 2.15",
+    "the peak is at",
+    HZ,
+    "computed",
+    DIGITS,
+    "27",
+    rig=RIG_A,
 )
 TRANSMITTED_PEAK_FREQUENCY = PublishedNumbers(
     "Fig. 2.18",
@@ -205,13 +249,32 @@ TRANSMITTED_PEAK_FREQUENCY = PublishedNumbers(
     "computed",
     DIGITS,
     "27",
+    rig=RIG_A,
 )
 STATIONARY_MASS_DROP = PublishedNumbers(
-    "Fig. 2.16", "further force drop with 0.5 kg at 0.3 m", HZ, "computed", DIGITS, "13"
+    "Fig. 2.16",
+    "further force drop with 0.5 kg at 0.3 m",
+    HZ,
+    "computed",
+    DIGITS,
+    "13",
+    rig=RIG_A,
 )
 STATIONARY_MASS_PEAK = PublishedNumbers(
-    "Fig. 2.16", "peak with 0.5 kg at 0.3 m", "N/V", "computed", DIGITS, "32.5"
+    "Fig. 2.16",
+    "peak with 0.5 kg at 0.3 m",
+    "N/V",
+    "computed",
+    DIGITS,
+    "32.5",
+    rig=RIG_A,
 )
 STATIONARY_MASS_PEAK_FREQUENCY = PublishedNumbers(
-    "Fig. 2.16", "the peak with 0.5 kg at 0.3 m is at", HZ, "computed", DIGITS, "27"
+    "Fig. 2.16",
+    "the peak with 0.5 kg at 0.3 m is at",
+    HZ,
+    "computed",
+    DIGITS,
+    "27",
+    rig=RIG_A,
 )

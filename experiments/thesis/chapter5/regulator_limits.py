@@ -24,6 +24,7 @@ COMMAND_WEIGHT = 9e-8  # R of the example in 5.1
 ACTIVE_STIFFNESS = 3500.0  # N/m
 TWO_MODE_STATES = (0, 1, 3, 4, 6)  # of the seven states of three modes
 OTHER_SHAKER = "4.6 N/V over root two, alpha = beta = 1000, section of 60 mm by 3.3 mm"
+OTHER_FORCE = 4.6 / np.sqrt(2)  # N/V
 OTHER_SECTION = {"width": 0.06, "height": 3.3e-3, "youngs_modulus": 65e9, "density": 2700.0}
 # Shakers for all of which the printed gain of 0.2 ms is tried: N/V, rad/s, N/m.
 SHAKER_GRID = (1.0, 2.5, 4.6, 10.0), (500.0, 1e3, 1e4, 2e4), (0.0, 3500.0, 12000.0, 3e4)
@@ -48,7 +49,7 @@ def with_other_shaker(rig: jb.Case) -> jb.Case:
     return jb.replace(
         rig,
         {
-            "actuators.0.force_per_volt": 4.6 / np.sqrt(2),
+            "actuators.0.force_per_volt": OTHER_FORCE,
             "actuators.0.bandwidth": 1000.0,
             "beam.flexural_rigidity": float(section.bending_stiffness),
             "beam.mass_per_length": float(section.linear_density),
@@ -96,7 +97,7 @@ def _gain_finding(numbers, case, period, weights) -> Finding:
         {OTHER_SHAKER: other},
         null=("no control", 0.0),
         fitted=fitted,
-        impossible=_instability(case, period, numbers.numbers),
+        impossible={"": _instability(case, period, numbers.numbers)},
     )
 
 
@@ -129,15 +130,10 @@ def _instability(case: jb.Case, period: float, gain: np.ndarray) -> str:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TimeVaryingLoops:
-    """The time-varying loop with few states fed back, and with all.
-
-    Frozen poles are computed over `crossing_share` of the crossing: towards its end finite-horizon
-    gains change fast, and frozen poles with them.
-    """
+    """The time-varying loop with few states fed back, and with all."""
 
     partial_feedback: jb.Case
     full_feedback: jb.Case
-    crossing_share: float = 1.0
     _known: dict[tuple[float, float], float] = dataclasses.field(default_factory=dict, init=False)
 
     def largest_real_part(self, case: jb.Case) -> float:
@@ -145,7 +141,7 @@ class TimeVaryingLoops:
         load = case.loads[0]
         key = float(load.speed), float(load.mass)
         if key not in self._known:
-            self._known[key] = largest_real_part(case, self.crossing_share)
+            self._known[key] = largest_real_part(case)
         return self._known[key]
 
 
@@ -158,7 +154,7 @@ def frozen_pole_findings(interpretations: Mapping[str, TimeVaryingLoops]) -> lis
         rates = [
             loops.largest_real_part(partial),
             loops.largest_real_part(jb.replace(partial, fast)),
-            largest_real_part(jb.replace(loops.full_feedback, fast), loops.crossing_share),
+            largest_real_part(jb.replace(loops.full_feedback, fast)),
         ]
         unstable[name] = np.array(rates) > 0
         searches = ("loads.0.speed", SPEEDS), ("loads.0.mass", MASSES)
@@ -169,17 +165,18 @@ def frozen_pole_findings(interpretations: Mapping[str, TimeVaryingLoops]) -> lis
             ]
         )
     literal, *others = interpretations
+    answers = {tuple(name.split("; ")): name for name in others}
     return [
         make_finding(
             published.UNSTABLE_FROZEN_POLES,
             unstable[literal].astype(float),
-            {name: unstable[name].astype(float) for name in others},
+            {key: unstable[name].astype(float) for key, name in answers.items()},
             null=("no control, stable everywhere", 0.0),
         ),
         make_finding(
             published.FROZEN_POLE_LIMITS,
             limits[literal],
-            {name: limits[name] for name in others},
+            {key: limits[name] for key, name in answers.items()},
             null=("no control, stable everywhere", np.inf),
         ),
     ]
@@ -189,8 +186,6 @@ def growth_remark(interpretations: Mapping[str, TimeVaryingLoops]) -> str:
     """Growth of deviations in the loops with few states, which frozen poles do not show."""
     parts = []
     for name, loops in interpretations.items():
-        if loops.crossing_share < 1:
-            continue
         for speed in SPEEDS:
             changes = {"loads.0.speed": speed, "loads.0.mass": MASSES[0]}
             case = jb.replace(loops.partial_feedback, changes)
@@ -216,14 +211,16 @@ def draw_poles(partial_feedback: jb.Case, interpretation: str) -> Figure | SubFi
     )
 
 
-def largest_real_part(case: jb.Case, crossing_share: float = 1.0) -> float:
-    """The largest real part (1/s) of the frozen poles over a share of the crossing."""
-    crossing = float(case.beam.length / case.loads[0].speed)
-    return float(
-        frozen_poles(
-            case, crossing_share * np.linspace(0, crossing, LOAD_POSITIONS)[1:-1]
-        ).largest_real_part.max()
-    )
+def largest_real_part(case: jb.Case) -> float:
+    """The largest real part (1/s) of the frozen poles over the crossing, those of A - B K."""
+    law, plant = case.controller, jb.state_space(case, "sine")
+    shares = np.linspace(0.0, 1.0, LOAD_POSITIONS)[1:-1]
+    table = law.gain_table(law.design.design_plant(plant, "sine"))
+    gains = np.stack([np.asarray(table(share)) for share in shares]) * law.feedback_shares
+    systems = plant.at(shares * float(case.beam.length / case.loads[0].speed))
+    command_columns = np.asarray(systems.B)[..., : gains.shape[1]]  # loads follow
+    poles = np.linalg.eigvals(np.asarray(systems.A) - command_columns @ gains)
+    return float(poles.real.max())
 
 
 def _stability_limit(case, address, bounds, rate) -> float:

@@ -10,7 +10,12 @@ from typing import NamedTuple
 
 import jaxbeam as jb
 from experiments.thesis.cases import data_physics_v4, plan_with_steps
-from experiments.thesis.chapter5.regulator_limits import TimeVaryingLoops
+from experiments.thesis.chapter5.regulator_limits import (
+    OTHER_FORCE,
+    OTHER_SHAKER,
+    TimeVaryingLoops,
+    with_other_shaker,
+)
 from experiments.thesis.verdicts import LITERAL
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.control.design_model import DesignModel
@@ -35,13 +40,16 @@ LAWS = {
 class RegulatorInterpretation(NamedTuple):
     """How the printed regulator is interpreted: plant, command weight, and states fed back.
 
-    `force_per_volt` (N/V) and `stiffness` (N/m) are those of the plant's shaker.
+    `force_per_volt` (N/V) and `stiffness` (N/m) are those of the plant's shaker. The law is
+    designed for `design_force` (N/V), on the rig of `with_other_shaker` if `other` is set.
     """
 
     force_per_volt: float
     command_weight: float
     stiffness: float
     feedback: list[float]
+    design_force: float = 4.6
+    other: bool = False
 
 
 WEAK_SHAKER = "2.5 N/V reach the beam"
@@ -50,15 +58,25 @@ INTERPRETATIONS = {
     LITERAL: RegulatorInterpretation(4.6, COMMAND_WEIGHT, 12000.0, PRINTED_STATES),
     WEAK_SHAKER: RegulatorInterpretation(2.5, COMMAND_WEIGHT, 12000.0, PRINTED_STATES),
     OTHER_WEIGHT: RegulatorInterpretation(4.6, 5e-4, 3500.0, ALL_STATES),
+    OTHER_SHAKER: RegulatorInterpretation(
+        OTHER_FORCE, COMMAND_WEIGHT, 12000.0, PRINTED_STATES, OTHER_FORCE, True
+    ),
+    f"{OTHER_SHAKER}; {WEAK_SHAKER}": RegulatorInterpretation(
+        2.5, COMMAND_WEIGHT, 12000.0, PRINTED_STATES, OTHER_FORCE, True
+    ),
 }
 FULL_SHAKER = "full model of the shaker, Table 2.3"
 REFITTED_SHAKER = "full model, 12000 N/m and 80 N s/m with its back-EMF"
 
 
 def regulator(
-    kind: str, command_weight: float, feedback, damping: float | None = None
+    kind: str,
+    command_weight: float,
+    feedback,
+    damping: float | None = None,
+    design_force: float = 4.6,
 ) -> AbstractController:
-    """A regulator of chapter 5, designed for 4.6 N/V.
+    """A regulator of chapter 5, designed for a force per volt (N/V).
 
     `kind` is a key of LAWS, `feedback` the share of each state that is fed back, and `damping`
     (N s/m) that of the suspension in the design, as in the plant if left out.
@@ -69,7 +87,7 @@ def regulator(
         command_weight=[command_weight],
         feedback=feedback,
         coordinates="sine",
-        design=DesignModel(force_per_volt=4.6, damping=damping),
+        design=DesignModel(force_per_volt=design_force, damping=damping),
     )
 
 
@@ -77,7 +95,7 @@ def interpreted_rigs(rig: jb.Case) -> dict[str, jb.Case]:
     """Rig A with the shaker of each interpretation."""
     return {
         name: jb.replace(
-            rig,
+            with_other_shaker(rig) if one.other else rig,
             {
                 "actuators.0.force_per_volt": one.force_per_volt,
                 "actuators.0.stiffness": one.stiffness,
@@ -97,14 +115,14 @@ def electromechanical_shakers(rig: jb.Case) -> dict[str, jb.Electrodynamic]:
 
 
 def time_varying_loops(
-    case: jb.Case, command_weight: float, damping: float | None = None
+    case: jb.Case, one: RegulatorInterpretation, damping: float | None = None
 ) -> TimeVaryingLoops:
     """The loop under the time-varying regulator, with some states fed back and with all.
 
     `damping` (N s/m) is that of the suspension in the design.
     """
     laws = (
-        regulator("time-varying", command_weight, feedback, damping)
+        regulator("time-varying", one.command_weight, feedback, damping, one.design_force)
         for feedback in (PRINTED_STATES, ALL_STATES)
     )
     return TimeVaryingLoops(*(dataclasses.replace(case, controller=law) for law in laws))
@@ -133,7 +151,12 @@ class RegulatorRuns:
         if kind in LAWS:
             interpretation = INTERPRETATIONS.get(name, INTERPRETATIONS[LITERAL])
             states = interpretation.feedback if feedback is None else feedback
-            law = regulator(kind, interpretation.command_weight, states)
+            law = regulator(
+                kind,
+                interpretation.command_weight,
+                states,
+                design_force=interpretation.design_force,
+            )
             changes = {} if design_mass is None else {"loads.0.mass": design_mass}
             nominal = dataclasses.replace(jb.replace(design, changes), controller=law)
             nominal_plant = jb.state_space(nominal, layout=self.layout)

@@ -33,6 +33,7 @@ from experiments.thesis.chapter6.patch_rigs import (
     with_feedback,
 )
 from experiments.thesis.figures import plot_commands, plot_deflections
+from experiments.thesis.published_numbers import PublishedNumbers
 from experiments.thesis.verdicts import Experiment, ExperimentResult, Finding, make_finding
 from jaxbeam.plot.style import colour, set_title, use_style
 
@@ -41,6 +42,8 @@ CORRECTION_FACTORS = (0.32, 0.39)  # c_p as in 2.4.2, and that of two spans
 HEADWAYS = (0.3, 0.9, 1.5)  # s between two masses
 # s and 1: not printed in section 6.2, and possible explanations of the instability
 EXTRA_DELAY, LOW_DAMPING_RATIO = 0.03, 0.01
+SPEEDS = tuple(np.linspace(0.1, 2.0, 20))  # m/s, at which a peak is compared with statics
+LINEAR_GAINS = 1.0, 2.0, 4.0  # V/mm
 
 
 def run(load_rig) -> ExperimentResult:
@@ -51,10 +54,87 @@ def run(load_rig) -> ExperimentResult:
 
 
 def _two_spans(case: jb.Case):
-    """Findings and figures of rig C."""
-    changes = [{"loads.0.mass": mass} for mass in MASSES]
+    """Findings and figures of rig C, by each answer to its damping and the delay of its loop."""
+    low, late = f"damping {LOW_DAMPING_RATIO:g}", f"{1e3 * EXTRA_DELAY:g} ms later"
+    answers = {
+        (): (0.03, None),
+        (low,): (LOW_DAMPING_RATIO, None),
+        (late,): (0.03, EXTRA_DELAY),
+        (low, late): (LOW_DAMPING_RATIO, EXTRA_DELAY),
+    }
+    tables, figures = {}, {}
+    for names, (damping, delay) in answers.items():
+        tables[names], records = _tables(case, damping, delay)
+        if not names:
+            heaviest = {name: row[-1] for name, row in zip(LAWS, records, strict=True)}
+            figures = {"two-spans": _draw(heaviest, "Two spans, 0.509 kg (Figs 6.8, 6.9)")}
+    proofs = _proofs(case)
+    findings = []
+    for numbers, _, null in tables[()]:
+        by_answer = {
+            names: value
+            for names, rows in tables.items()
+            for one, value, _ in rows
+            if one is numbers
+        }
+        findings.append(
+            make_finding(
+                numbers, by_answer.pop(()), by_answer, null=null, impossible=proofs.get(numbers)
+            )
+        )
+    lightest = {
+        names: _lightest_unstable(case, delay, damping)
+        for names, (damping, delay) in answers.items()
+    }
+    unstable = make_finding(
+        published.UNSTABLE_MASS,
+        lightest.pop(()),
+        lightest,
+        null=("no control, stable", np.nan),
+        fitted={low: "lightest", late: "lightest"},
+    )
+    return [*findings, _two_mass_finding(case), unstable], figures
+
+
+def _proofs(case: jb.Case) -> dict[PublishedNumbers, dict[str, str]]:
+    """Why some printed peaks of rig C cannot be right, by number and label."""
+    lightest, statics = MASSES[0], 1e3 * static_extremes(case)[0][1] * MASSES[0]
+    at_speeds = [
+        1e3 * float(one.peak_deflection[1])
+        for one in simulate_changes(
+            case, [{"loads.0.mass": lightest, "loads.0.speed": speed} for speed in SPEEDS]
+        )
+    ]
+    printed = published.FREE_S3_COMPUTED.numbers[0]
+    proofs = {}
+    if min(at_speeds) > printed + published.FREE_S3_COMPUTED.allowed_error[0]:
+        proofs[published.FREE_S3_COMPUTED] = {
+            "m1": f"the static deflection by this mass is {statics:.4f} mm, and at {SPEEDS[0]:g} to"
+            f" {SPEEDS[-1]:g} m/s the peak is {min(at_speeds):.4f} mm at least"
+        }
+    spread, by_gain = 0.0, [{"loads.0.mass": mass} for mass in MASSES]
+    free = [float(one.peak_deflection[1]) for one in simulate_changes(case, by_gain)]
+    for gain in LINEAR_GAINS:
+        held = simulate_changes(with_feedback(case, 1, TWO_SPAN_CUTOFF, gain), by_gain)
+        spread = max(spread, np.ptp(reduction(free, [one.peak_deflection[1] for one in held])))
+    peaks, half = published.FREE_S3_COMPUTED.numbers, published.FREE_S3_COMPUTED.allowed_error / 2
+    under, law_half = published.LINEAR_S3.numbers, published.LINEAR_S3.allowed_error / 2
+    most, least = (reduction(peaks + sign * half, under - sign * law_half) for sign in (1, -1))
+    if least.max() - most.min() > spread:
+        proofs[published.LINEAR_S3] = {
+            "": f"the printed peaks, however they were rounded, are reduced by {most.min():.2f} %"
+            f" at most and {least.max():.2f} % at least, while by one linear law, k from"
+            f" {LINEAR_GAINS[0]:g} to {LINEAR_GAINS[-1]:g}, reductions of these masses differ by"
+            f" {spread:.2f} points at most"
+        }
+    return proofs
+
+
+def _tables(case: jb.Case, damping: float, delay: float | None):
+    """Rows (numbers, values, null model) of Tables 6.1 to 6.3, and the records by law and mass."""
+    changes = [{"loads.0.mass": mass, "beam.damping_ratio": damping} for mass in MASSES]
     records = [
-        simulate_changes(with_feedback(case, power, TWO_SPAN_CUTOFF), changes)
+        simulate_changes(with_feedback(case, power, TWO_SPAN_CUTOFF, delay=delay), changes)
         for power in LAWS.values()
     ]
     down, up = (
@@ -97,25 +177,7 @@ def _two_spans(case: jb.Case):
             no_control,
         ),
     )
-    findings = [make_finding(numbers, values, null=null) for numbers, values, null in table]
-    findings += [_two_mass_finding(case), _unstable_mass_finding(case)]
-    heaviest = {name: row[-1] for name, row in zip(LAWS, records, strict=True)}
-    return findings, {"two-spans": _draw(heaviest, "Two spans, 0.509 kg (Figs 6.8, 6.9)")}
-
-
-def _unstable_mass_finding(case: jb.Case) -> Finding:
-    """The lightest mass (kg) that makes the cubic loop unstable, by damping and delay."""
-    dampings = {"zeta 0.03": 0.03, f"zeta {LOW_DAMPING_RATIO:g}": LOW_DAMPING_RATIO}
-    delays = {"": None, f"{1e3 * EXTRA_DELAY:g} ms later": EXTRA_DELAY}
-    lightest = {
-        f"{damped} {late}".strip(): _lightest_unstable(case, delay, damping)
-        for late, delay in delays.items()
-        for damped, damping in dampings.items()
-    }
-    (_, literal), *others = lightest.items()
-    fitted = {name: "lightest" for name, _ in others}
-    null = "no control, stable", np.nan
-    return make_finding(published.UNSTABLE_MASS, literal, dict(others), null=null, fitted=fitted)
+    return table, records
 
 
 def _lightest_unstable(case: jb.Case, delay: float | None, damping: float) -> float:
@@ -168,17 +230,20 @@ def _two_mass_reductions(case: jb.Case) -> list[float]:
 def _one_span(case: jb.Case):
     """Findings, figures and remarks of rig B."""
     corrections = (*CORRECTION_FACTORS, fitted_correction(case))
-    changes = [
-        {"loads.0.mass": mass, "actuators.0.correction": correction}
-        for correction in corrections
-        for mass in MASSES
-    ]
+    names = [(), *((f"c_p {one:.3g}",) for one in corrections[1:])]
+    low = f"damping {LOW_DAMPING_RATIO:g}"
+    answers = {
+        (*name, *damped): {"actuators.0.correction": correction, "beam.damping_ratio": ratio}
+        for damped, ratio in (((), 0.03), ((low,), LOW_DAMPING_RATIO))
+        for name, correction in zip(names, corrections, strict=True)
+    }
+    changes = [change | {"loads.0.mass": mass} for change in answers.values() for mass in MASSES]
     records = [
         simulate_changes(with_feedback(case, power, ONE_SPAN_CUTOFF), changes)
         for power in LAWS.values()
     ]
     peaks = [[float(one.peak_deflection[0]) for one in row] for row in records]
-    shape = len(corrections), len(MASSES)
+    shape = len(answers), len(MASSES)
     linear, cubic = (reduction(peaks[0], row).reshape(shape) for row in peaks[1:])
     higher_gain_peaks = []
     for gain in HIGHER_GAINS:
@@ -190,11 +255,10 @@ def _one_span(case: jb.Case):
     switches, last = switching_masses(
         MASSES, np.reshape(peaks, (3, *shape)), np.array(higher_gain_peaks)
     )
-    labels = [f"c_p {correction:.3g}" for correction in corrections]
 
-    def by_correction(numbers, values):
-        others = dict(zip(labels[1:], values[1:], strict=True))
-        return make_finding(numbers, values[0], others, null=("no control", 0.0))
+    def by_answer(numbers, values):
+        found = dict(zip(answers, values, strict=True))
+        return make_finding(numbers, found.pop(()), found, null=("no control", 0.0))
 
     def of_each(select):
         """Values of the linear and of the cubic law for each correction factor."""
@@ -202,14 +266,14 @@ def _one_span(case: jb.Case):
 
     frequency = jb.modes(case).frequencies[0]
     findings = [
-        by_correction(published.ONE_SPAN_LINEAR, [[v.min(), v.max()] for v in linear]),
-        by_correction(published.ONE_SPAN_CUBIC, [[v.min(), v.max()] for v in cubic]),
-        by_correction(published.SUMMARY_ONE, of_each(lambda row: row[-1])),
-        by_correction(published.LIGHTEST_MASS_REDUCTION, of_each(lambda row: row[0])),
-        *schedule_findings(case, corrections, switches, last),
+        by_answer(published.ONE_SPAN_LINEAR, [[v.min(), v.max()] for v in linear]),
+        by_answer(published.ONE_SPAN_CUBIC, [[v.min(), v.max()] for v in cubic]),
+        by_answer(published.SUMMARY_ONE, of_each(lambda row: row[-1])),
+        by_answer(published.LIGHTEST_MASS_REDUCTION, of_each(lambda row: row[0])),
+        *schedule_findings(case, answers, switches, last, *names[-1]),
         make_finding(published.FREE_VIBRATION_FREQUENCY, frequency, null=("one mode", frequency)),
     ]
-    oscillating, filters = oscillation_findings(with_feedback(case, 3, ONE_SPAN_CUTOFF))
+    oscillating, filters = oscillation_findings(with_feedback(case, 3, ONE_SPAN_CUTOFF), answers)
     schedule, remark = derived_schedules(
         with_feedback(case, 1, ONE_SPAN_CUTOFF), MASSES[:: len(MASSES) - 1]
     )

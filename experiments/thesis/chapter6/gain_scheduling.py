@@ -12,7 +12,7 @@ a crossing, with filters, delays and limits.
 
 import dataclasses
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -212,6 +212,7 @@ def _largest_gain_with_margin(case: Case, mass: float, max_gain: float, margin: 
 
 
 HIGHER_GAINS = (3.0, 4.5)  # V/mm, of the scheduled linear law
+BY_STATICS = "Fig. 6.7 by statics"
 MAX_GAIN = 24.0  # V/mm, the largest gain tried
 MASS_GRID = np.linspace(0.2, 0.6, 81)  # kg
 
@@ -248,33 +249,48 @@ def uncontrolled_schedule(case: jb.Case, heaviest: float) -> tuple[float, ...]:
     return float(masses[0]), float(masses[1]), GAIN * (deflection * heaviest) ** 2
 
 
-def schedule_findings(case: jb.Case, corrections, switches, equal_gains) -> list[Finding]:
-    """The scheduled gains of Fig. 6.7 and the gain margin, by c_p, by crossings and by statics.
+def schedule_findings(
+    case: jb.Case,
+    answers: Mapping[tuple[str, ...], Mapping[str, float]],
+    switches,
+    equal_gains,
+    fitted: str,
+) -> list[Finding]:
+    """The scheduled gains of Fig. 6.7 and the gain margin, by `answers`, crossings and statics.
 
-    The last of `corrections` is fitted to the margin. `switches` (kg) and `equal_gains` (V/mm) are
-    those of crossings, by c_p.
+    The answer `fitted` is c_p by the margin. `switches` (kg) and `equal_gains` (V/mm) are those of
+    crossings, by answer.
     """
-    by_statics = f"c_p {corrections[-1]:.3g}, by statics"
-    light, middle, last = static_schedule(case, MASSES[-1], corrections[-1])
     null_light, null_middle, null_last = uncontrolled_schedule(case, MASSES[-1])
-    names = [f"c_p {correction:.3g}, by crossings" for correction in corrections]
+    corrections = [change["actuators.0.correction"] for change in answers.values()]
+    statics = [static_schedule(case, MASSES[-1], one) for one in corrections]
     margins = [gain_margin(case, correction) for correction in corrections]
-    fitted = {names[-1]: "margin", by_statics: "margin"}
     rows = (
-        (published.SWITCHING_MASSES, switches, [light, middle], [null_light, null_middle]),
-        (published.EQUIVALENT_LINEAR_GAIN, equal_gains, last, null_last),
-        (published.GAIN_MARGIN, margins, margins[-1], np.nan),
+        (
+            published.SWITCHING_MASSES,
+            switches,
+            [one[:2] for one in statics],
+            [null_light, null_middle],
+        ),
+        (published.EQUIVALENT_LINEAR_GAIN, equal_gains, [one[2] for one in statics], null_last),
+        (published.GAIN_MARGIN, margins, margins, np.nan),
     )
-    return [
-        make_finding(
-            numbers,
-            values[0],
-            dict(zip(names[1:], values[1:], strict=True)) | {by_statics: static},
-            null=("static, without control", null),
-            fitted=fitted if numbers is published.GAIN_MARGIN else None,
+    findings = []
+    for numbers, by_crossings, by_statics, null in rows:
+        values = dict(zip(answers, by_crossings, strict=True))
+        if numbers is not published.GAIN_MARGIN:
+            keys = [(*one, BY_STATICS) for one in answers]
+            values |= dict(zip(keys, by_statics, strict=True))
+        findings.append(
+            make_finding(
+                numbers,
+                values.pop(()),
+                values,
+                null=("static, without control", null),
+                fitted={fitted: "margin"} if numbers is published.GAIN_MARGIN else None,
+            )
         )
-        for numbers, values, static, null in rows
-    ]
+    return findings
 
 
 def derived_schedules(case: jb.Case, masses: Sequence[float]) -> tuple[Figure, str]:

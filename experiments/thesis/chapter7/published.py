@@ -7,6 +7,8 @@ from experiments.thesis.published_numbers import (
     PublishedNumbers,
 )
 
+RIG_B, RIG_C = "rig B, chapter 7", "rig C, chapter 7"
+
 # Model predictive control, 0.509 kg at 1 m/s.
 ONE_SPAN_REDUCTION = PublishedNumbers(
     "Fig. 7.1, Table 8.1",
@@ -15,6 +17,7 @@ ONE_SPAN_REDUCTION = PublishedNumbers(
     "computed",
     DIGITS,
     "22",
+    rig=RIG_B,
 )
 ONE_SPAN_SATURATION = PublishedNumbers(
     "Figs 7.1, 7.2",
@@ -24,6 +27,7 @@ ONE_SPAN_SATURATION = PublishedNumbers(
     SAMPLE_INSTANT,
     "0.04 0.32",
     "r_w=1e-11 r_w=1e-6",
+    rig=RIG_B,
 )
 TWO_SPAN_REDUCTION = PublishedNumbers(
     "Fig. 7.5, Table 8.1",
@@ -34,6 +38,7 @@ TWO_SPAN_REDUCTION = PublishedNumbers(
     "29 46 19",
     "s1,1st-half s2,1st-half s2,2nd-half",
     "r_w as for one span",
+    rig=RIG_C,
 )
 REDUCED_MODEL = PublishedNumbers(
     "Fig. 7.9",
@@ -43,6 +48,7 @@ REDUCED_MODEL = PublishedNumbers(
     YES_OR_NO,
     "1 1",
     "s1 s2",
+    rig=RIG_C,
 )
 ONE_MOVE_PEAKS = PublishedNumbers(
     "Fig. 7.3",
@@ -52,6 +58,7 @@ ONE_MOVE_PEAKS = PublishedNumbers(
     SAMPLE_INSTANT,
     "0.06 0.58",
     "first last",
+    rig=RIG_B,
 )
 SECOND_HALF_REDUCTION = PublishedNumbers(
     "Figs 7.5, 7.7",
@@ -61,6 +68,7 @@ SECOND_HALF_REDUCTION = PublishedNumbers(
     DIGITS,
     "64 54",
     "Np=4,Nc=3 Np=6,Nc=4",
+    rig=RIG_C,
 )
 TWO_SPAN_SATURATION = PublishedNumbers(
     "Fig. 7.6",
@@ -70,4 +78,5 @@ TWO_SPAN_SATURATION = PublishedNumbers(
     SAMPLE_INSTANT,
     "0.08 0.09",
     "u1,7.5V u2,-2.5V",
+    rig=RIG_C,
 )

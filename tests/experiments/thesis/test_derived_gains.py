@@ -30,7 +30,7 @@ from experiments.thesis.chapter6.gain_scheduling import (
     equivalent_gains,
     scheduled_controller,
 )
-from experiments.thesis.verdicts import LITERAL, NOT_REPRODUCED, REPRODUCED, assign_verdicts
+from experiments.thesis.verdicts import LITERAL, STATEMENT, assign_verdicts
 from jaxbeam import rigs
 from jaxbeam.case.validation import check_case
 from tests.analysis.test_compare import critical_gain
@@ -116,10 +116,11 @@ def ratios(varying, invariant):
 
 def test_statements_hold_or_not():
     as_printed = ratios({"q1 q2": 84.0, "q1 q2 q1'": 83.0, "q1": 85.0}, {"all": 101.0})
-    assert assign_verdicts([claims(as_printed)])[0].verdicts == [REPRODUCED] * 3
+    assert claims(as_printed).values(frozenset()).tolist() == [1.0, 1.0, 1.0]
+    assert assign_verdicts([claims(as_printed)])[0].verdicts == [STATEMENT] * 3
     opposite = ratios({"q1 q2": 86.0, "q1 q2 q1'": 87.0, "q1": 85.0}, {"all": 99.0})
-    assert assign_verdicts([claims(opposite)])[0].verdicts == [NOT_REPRODUCED] * 3
-    diverging = claims(ratios({}, {"all": np.nan})).interpretations[LITERAL]
+    assert claims(opposite).values(frozenset()).tolist() == [0.0, 0.0, 0.0]
+    diverging = claims(ratios({}, {"all": np.nan})).values(frozenset())
     assert diverging.tolist() == [0.0, 0.0, 1.0]
 
 
@@ -129,8 +130,8 @@ def test_difference_of_gains_in_percent_of_the_largest():
     step[100, 1] += 0.01  # half a percent of the gain of the second state
     step[-1, 0] = 0.0  # at the end of the crossing
     found = identical_gains({"finite-time": finite, "step-by-step": step, "constant": 2 * finite})
-    np.testing.assert_allclose(found.interpretations[LITERAL], 100.0)
-    np.testing.assert_allclose(found.interpretations[BUT_FOR_THE_END], 0.5)
+    np.testing.assert_allclose(found.values(frozenset()), 100.0)
+    np.testing.assert_allclose(found.values(frozenset({BUT_FOR_THE_END})), 0.5)
     np.testing.assert_allclose(found.null.values, 100.0)
 
 

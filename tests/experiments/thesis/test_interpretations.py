@@ -5,9 +5,14 @@ import dataclasses
 import numpy as np
 from scipy.linalg import expm, solve_discrete_are
 
-from experiments.thesis.cases import one_span
+import jaxbeam as jb
+from experiments.thesis.cases import critical_speed, one_span
 from experiments.thesis.chapter2 import frequencies, published, shaker
-from experiments.thesis.chapter5 import published as published_regulators
+from experiments.thesis.chapter5 import (
+    published as published_regulators,
+    regulator_limits,
+    regulators,
+)
 from experiments.thesis.chapter5.regulator_limits import (
     COMMAND_WEIGHT,
     optimal_gain,
@@ -16,6 +21,7 @@ from experiments.thesis.chapter5.regulator_limits import (
 )
 from experiments.thesis.chapter5.regulators import STATE_WEIGHTS
 from jaxbeam import rigs
+from jaxbeam.analysis.stability import frozen_poles
 
 LENGTH, RIGIDITY, DENSITY, DAMPING = 0.6, 11.68, 0.535, 0.03
 MODAL = DENSITY * LENGTH / 2  # kg, of the sine modes
@@ -30,12 +36,11 @@ def sines(modes):
 def test_critical_speed_of_the_denser_beam():
     heavier = 2800 * 0.06 * 3.3e-3
     speed = np.pi / LENGTH * np.sqrt(RIGIDITY / heavier)
-    computed = LENGTH * frequencies._frequency_at_patch_density(one_span(rigs.load)) / np.pi
+    case = one_span(rigs.load)
+    beam = shaker.beams_of_rig_a(case.beam)[shaker.DENSER]
+    computed = critical_speed(dataclasses.replace(case, beam=beam))
     np.testing.assert_allclose(computed, speed, rtol=1e-9)
-    assert (
-        abs(speed - published.CRITICAL_SPEEDS.numbers[0])
-        < published.CRITICAL_SPEEDS.allowed_error[0]
-    )
+    assert np.all(published.CRITICAL_SPEED.agrees([speed]))
 
 
 def mobility(s, mass):
@@ -116,3 +121,14 @@ def test_printed_frequencies_with_the_shaker_are_the_damped_ones():
     computed = frequencies.damped_frequencies(rigs.load("A"), 3500, 80)
     np.testing.assert_allclose(computed, expected, rtol=1e-9)
     assert np.all(published.SHAKER_MODES.agrees(expected))
+
+
+def test_frozen_poles_by_gains_of_the_table():
+    """A - B K at each position, against the poles of the linearised loop."""
+    name = regulators.WEAK_SHAKER
+    rig = regulators.interpreted_rigs(rigs.load("A"))[name]
+    loops = regulators.time_varying_loops(rig, regulators.INTERPRETATIONS[name])
+    case = jb.replace(loops.partial_feedback, {"loads.0.speed": 2.0, "loads.0.mass": 0.509})
+    times = np.linspace(0.0, 0.3, regulator_limits.LOAD_POSITIONS)[1:-1]
+    expected = frozen_poles(case, times).largest_real_part.max()
+    np.testing.assert_allclose(regulator_limits.largest_real_part(case), expected, rtol=1e-9)
