@@ -7,7 +7,7 @@ import os
 # XLA reads this variable before its first computation; a setting by the user prevails.
 os.environ.setdefault("PJRT_NPROC", str(max(8, os.cpu_count() or 1)))
 
-from tuning import control, fit, logs, modal, weighing
+from tuning import control, fit, logs, modal, monitoring, weighing
 from tuning.control.load_cases import LoadCases, full_grid, latin_hypercube, read_load_cases
 from tuning.control.objective import Objective
 from tuning.control.pareto import pareto
@@ -58,6 +58,7 @@ MOVED = {  # names of former versions, each with the module in which it is now
 __all__ = [
     "weighing",
     "modal",
+    "monitoring",
     "logs",
     "control",
     "fit",

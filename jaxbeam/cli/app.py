@@ -31,6 +31,7 @@ from jaxbeam.cli.commands.frequency import frf, modes, state_space
 from jaxbeam.cli.commands.identify import identify
 from jaxbeam.cli.commands.models import compare_models, design_experiment
 from jaxbeam.cli.commands.modes_from_log import modes_from_log
+from jaxbeam.cli.commands.monitor import monitor
 from jaxbeam.cli.commands.new import new, schema
 from jaxbeam.cli.commands.simulate import simulate
 from jaxbeam.cli.commands.stability import stability
@@ -49,6 +50,7 @@ COMMANDS = {
     "Identification": (
         identify,
         modes_from_log,
+        monitor,
         identify_responses,
         weigh,
         compare_models,

@@ -32,6 +32,7 @@ LINES = {
     "identify case.toml none.csv --free beam.length": "none.csv: there is no such log file",
     "compare case.toml --controllers none.toml": "cannot read the case file none.toml",
     "weigh case.toml log.csv --speeds fast": "--speeds takes LOW:HIGH",
+    "monitor none": "there is no folder none",
     "compare-models fit.npz": "one fit alone",
     "reproduce": "name an experiment",
     "describe --help": "static wheel loads",

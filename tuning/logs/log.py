@@ -51,6 +51,7 @@ class Log:
     sensor on a vehicle; `loads` are those that crossed, None if unknown. Samples that are not
     `valid` (time, channel) are left out of fits, by default none. `notes` are sentences on how the
     log was read; `start` is the date and time of its first sample, if the file has one.
+    `conditions` are means of columns that are no channels, as temperatures, by their headings.
 
     Raises ValueError if lengths disagree, a value is not finite or times do not increase.
 
@@ -78,6 +79,7 @@ class Log:
     notes: tuple[str, ...] = ()
     vehicle_sensors: tuple[int | None, ...] = ()
     start: str = ""
+    conditions: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self):
         channels = self.values.shape[1]

@@ -38,7 +38,7 @@ from tuning.logs.log import Log, LogWarning, check_samples, doubts, with_named_c
 from tuning.logs.logger import interpolate_invalid
 from tuning.logs.readers import LogTable, is_time_name, read_tables
 from tuning.logs.readers.table import shown
-from tuning.logs.units import UNITS, transducer_unit, unit
+from tuning.logs.units import UNITS, is_unit, transducer_unit, unit
 
 MAX_TEXT = 120  # characters of the name or the unit of a column, as messages quote it
 
@@ -164,6 +164,9 @@ def _make_log(
         columns or description.columns or [name for name in names if name != time_column]
     )
     channels = [name for name in channels if name not in (time_column, "run")]
+    asked = [*(columns or ()), *description.columns, *(units if isinstance(units, Mapping) else ())]
+    aside = [] if units else _no_channels(table, channels, asked, description)
+    channels = [name for name in channels if name not in aside]
     for name in (*channels, *description.columns, *(units if isinstance(units, Mapping) else ())):
         _check_column(path, name, names)
     if not channels:
@@ -202,6 +205,8 @@ def _make_log(
         ]
     source = f"{path}:{run}" if run else str(path)
     check_samples(source, (time_column, *channels), values, table.lines)
+    conditions = _conditions(table, aside)
+    notes += [f"{name} is no channel, as its unit is unknown" for name in conditions]
     unit_of_times = column_units[0][0]
     given = declared.get(time_column) or description.unit(time_column)
     sure = table.time is not None or bool(given)
@@ -224,8 +229,35 @@ def _make_log(
         valid=valid[:, 1:],
         notes=(*notes, *said),
         start=table.start,
+        conditions=tuple(conditions.items()),
     )
     return log, said
+
+
+def _no_channels(
+    table: LogTable, channels: Sequence[str], asked: Sequence[str], description: LogDescription
+) -> list[str]:
+    """Columns whose units are unknown, as those of temperatures, and that nobody asks for.
+
+    None where no channel would be left: then a unit is misspelt.
+    """
+    units = dict(zip(table.names, table.units, strict=True))
+    known = {name: not units[name] or is_unit(str(units[name])) for name in channels}
+    found = [
+        name for name in channels if not (known[name] or name in asked or description.unit(name))
+    ]
+    return found if any(known.values()) else []
+
+
+def _conditions(table: LogTable, names: Sequence[str]) -> dict[str, float]:
+    """Means of columns by name and unit; without those that have no number."""
+    found = {}
+    for name in names:
+        i = table.names.index(name)
+        finite = table.values[np.isfinite(table.values[:, i]), i]
+        if finite.size:
+            found[f"{name} ({table.units[i]})"] = float(finite.mean())
+    return found
 
 
 def _check_texts(path, table: LogTable) -> None:

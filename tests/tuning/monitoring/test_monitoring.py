@@ -1,0 +1,170 @@
+"""Monitoring against planted histories: effects of temperature, false alarms, loss of rigidity.
+
+Frequencies of planted histories are sums in closed form. Logs of the command are ambient responses
+of oscillators that scipy integrates.
+"""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import scipy.signal
+from numpy.testing import assert_allclose
+
+from tuning.monitoring import LogModes, ModeHistory, analyse, read_history, tracks_of
+from tuning.monitoring.monitor import monitored
+
+FREQUENCIES = np.array([2.1, 5.9, 6.4])  # Hz
+SHAPES = np.array([[0.6, 1.0, 0.7], [1.0, 0.1, -0.9], [0.8, -0.9, 0.7]])
+PER_KELVIN, SCATTER = -2e-3, 2e-3
+
+
+def history(seed, logs=200, loss=0.0, first=150, missing=0.1, swap=False) -> ModeHistory:
+    """A year with -0.2 %/K, scatter of 0.2 %, and a loss of rigidity from a log on."""
+    rng = np.random.default_rng(seed)
+    year = 2 * np.pi * np.arange(logs) / 130
+    warm = 12 + 11 * np.sin(year) + 4 * rng.normal(size=logs)
+    entries = []
+    for i in range(logs):
+        stiffer = np.sqrt(1 - loss) if i >= first else 1.0
+        scale = stiffer * (1 + PER_KELVIN * (warm[i] - 12))
+        found = FREQUENCIES * scale * (1 + SCATTER * rng.normal(size=3))
+        if swap:  # the second and third cross
+            found[1] *= 1 + 0.2 * i / logs
+        shapes = SHAPES + 0.03 * rng.normal(size=SHAPES.shape)
+        here = rng.random(3) > missing
+        phases = np.exp(1j * rng.uniform(0, 2 * np.pi, 3))[:, None]
+        parts = found[here], 1e-3 * found[here], np.full(here.sum(), 0.01), (shapes * phases)[here]
+        entries.append(LogModes(f"{i:03d}.csv", "", "", *parts, {"T (°C)": warm[i]}))
+    return ModeHistory(tuple(entries), {})
+
+
+def test_effects_of_temperature_are_found():
+    found = monitored(history(1), baseline=100)
+    assert len(found.tracks) == 3 and found.chart is not None
+    for own in found.chart.regressions:
+        (effect,) = own.effects
+        assert effect.half_width < 2e-4
+        assert effect.slope == pytest.approx(PER_KELVIN, abs=3 * effect.half_width / 1.96)
+        assert own.deviation == pytest.approx(SCATTER, rel=0.25)
+    assert found.chart.since is None and "no alarm in the last" in found.verdict
+    assert "% per T (°C)" in str(found)
+
+
+@pytest.mark.parametrize("baseline", [50, 100])
+def test_false_alarms_are_rare(baseline):
+    """Less than 1 % of the logs of 24 unchanged structures, though a year is not seen."""
+    alarms = [monitored(history(seed), baseline=baseline).chart.alarm for seed in range(24)]
+    assert np.mean(np.array(alarms)[:, baseline:]) < 0.01
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_loss_of_rigidity_of_one_per_cent_is_found(seed):
+    found = monitored(history(seed, loss=0.01), baseline=100)
+    assert found.chart.since is not None and 150 <= found.chart.since <= 158
+    for value, half in found.chart.change(found.chart.since):
+        assert value == pytest.approx(np.sqrt(0.99) - 1, abs=1.6 * half) and half < 2e-3
+    assert f"ALARM since {found.chart.since:03d}.csv" in found.verdict
+
+
+def test_intervals_of_a_change_hold():
+    inside = []
+    for seed in range(25):
+        found = monitored(history(seed, loss=0.02), baseline=100)
+        for value, half in found.chart.change(150):
+            inside.append(abs(value - (np.sqrt(0.98) - 1)) <= half)
+    assert 0.9 <= np.mean(inside) <= 0.99
+
+
+def test_modes_that_cross_are_told_apart_by_their_shapes():
+    entries = history(3, swap=True).entries
+    second, third = tracks_of(entries)[1:]
+    # The second ends above the third.
+    tracks = sorted((second, third), key=lambda one: one.frequencies[~np.isnan(one.frequencies)][0])
+    last = [one.frequencies[~np.isnan(one.frequencies)][-1] for one in tracks]
+    assert len(tracks_of(entries)) == 3 and last[0] > last[1]
+
+
+def test_modes_are_born_and_end():
+    entries = list(history(4, missing=0.0).entries)
+    for i, entry in enumerate(entries):
+        kept = [0, 1, 2] if 40 <= i < 120 else [0, 2]
+        names = "frequencies", "frequency_sds", "damping_ratios", "shapes"
+        entries[i] = entry._replace(**{name: getattr(entry, name)[kept] for name in names})
+    found = tracks_of(entries)
+    assert [(one.born, one.last, one.ended) for one in found] == [
+        (0, 199, False), (40, 119, True), (0, 199, False)
+    ]  # fmt: skip
+
+
+def write_log(path, seed, warm, loss=0.0, seconds=120.0, rate=50.0):
+    """An ambient log of three channels, with its temperature in a column."""
+    rng = np.random.default_rng(seed)
+    count = int(seconds * rate)
+    total = np.zeros((count, 3))
+    for frequency, shape in zip(FREQUENCIES[:2], SHAPES, strict=False):
+        w = 2 * np.pi * frequency * np.sqrt(1 - loss) * (1 + PER_KELVIN * (warm - 12))
+        system = scipy.signal.lti([1.0, 0.0, 0.0], [1.0, 2 * 0.01 * w, w**2])
+        fine = np.arange(4 * count) / (4 * rate)
+        total += scipy.signal.lsim(system, rng.normal(size=fine.size), fine)[1][::4, None] * shape
+    total += 0.02 * total.std() * rng.normal(size=total.shape)
+    rows = np.column_stack([np.arange(count) / rate, total, np.full(count, warm)])
+    head = "time [s],a1 [m/s^2],a2 [m/s^2],a3 [m/s^2],T [°C]"
+    np.savetxt(path, rows, "%.6g", ",", header=head, comments="")
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bridge")
+    for i in range(4):
+        write_log(folder / f"log{i + 1}.csv", i, 10.0 + i)
+    (folder / "broken.csv").write_text("nothing\n")
+    return folder
+
+
+def test_only_new_logs_are_analysed(logs, tmp_path, monkeypatch):
+    store = tmp_path / "modes.json"
+    found = analyse(logs, store, band=(1.0, 10.0))
+    assert [entry.file for entry in found.entries][-4:] == [f"log{i}.csv" for i in range(1, 5)]
+    assert found.entries[0].problem and not found.entries[-1].problem
+    assert dict(found.entries[-1].conditions) == {"T (°C)": 13.0}
+    again = read_history(store)
+    for one, other in zip(found.entries, again.entries, strict=True):
+        assert_allclose(one.shapes, other.shapes)
+        assert one.to_dict() == other.to_dict()
+
+    def refuse(*_):
+        raise AssertionError("a log was analysed again")
+
+    monkeypatch.setattr("tuning.monitoring.history.entry_of", refuse)
+    assert analyse(logs, store, band=(1.0, 10.0)).entries[-1].file == "log4.csv"
+    with pytest.raises(ValueError, match="was made with another band"):
+        analyse(logs, store, band=(1.0, 12.0))
+    with pytest.raises(FileNotFoundError, match="no log in .* that matches 'none"):
+        analyse(logs, store, pattern="none*")
+    (tmp_path / "other.json").write_text("{}")
+    with pytest.raises(ValueError, match="is no history of modes"):
+        read_history(tmp_path / "other.json")
+    (tmp_path / "table.csv").write_text("log,rain\nunknown.csv,1\n")
+    with pytest.raises(ValueError, match="names no log of the folder"):
+        monitored(found, tmp_path / "table.csv")
+
+
+@pytest.mark.parametrize("seed", [0])
+def test_command_finds_a_loss_of_rigidity(tmp_path, seed):
+    """Sixty logs of two minutes, the last fifteen with three per cent less."""
+    folder, rng = tmp_path / "logs", np.random.default_rng(seed)
+    folder.mkdir()
+    for i in range(60):
+        loss = 0.03 if i >= 45 else 0.0
+        write_log(folder / f"{i:02d}.csv", 1000 * seed + i, 12 + 6 * rng.normal(), loss)
+    command = [sys.executable, "-m", "jaxbeam", "monitor", "logs", "--band", "1:10", "--json"]
+    command += ["--baseline", "40", "--plot", "-o", "modes.csv"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    found = json.loads(ended.stdout)
+    assert "45.csv" <= found["since"] <= "50.csv"
+    assert found["effects"]["mode 1"]["T (°C)"][0] == pytest.approx(PER_KELVIN, abs=6e-4)
+    assert (tmp_path / "modes.png").exists() and (tmp_path / "logs.modes.json").exists()

@@ -1,0 +1,261 @@
+"""Modes of each log of a folder, kept in a file so that only new logs are analysed."""
+
+import concurrent.futures
+import csv
+import dataclasses
+import json
+import multiprocessing
+import os
+import re
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from jaxbeam.runtime.input_file import read_text_input
+from jaxbeam.runtime.interrupts import keeping
+from jaxbeam.runtime.output_file import whole_file
+from jaxbeam.runtime.progress import ProgressBar
+from tuning.logs.log import LogWarning
+from tuning.logs.reading import read_log
+from tuning.modal.arguments import ModalSettings
+from tuning.modal.identify_modes import identify_modes
+
+FORMAT = "jaxbeam modes of logs 1"
+
+
+class LogModes(NamedTuple):
+    """Modes of one log: frequencies (Hz) and damping ratios with deviations, and shapes.
+
+    `start` is the date and time of the first sample, "" if the log has none; `conditions` are means
+    of columns such as temperatures, by name. `problem` is the sentence why there are no modes, if
+    there are none; `mark` tells a log from one that was changed.
+    """
+
+    file: str
+    mark: str
+    start: str = ""
+    frequencies: Float[np.ndarray, " mode"] = np.zeros(0)
+    frequency_sds: Float[np.ndarray, " mode"] = np.zeros(0)
+    damping_ratios: Float[np.ndarray, " mode"] = np.zeros(0)
+    shapes: Complex[np.ndarray, "mode channel"] = np.zeros((0, 0), complex)
+    conditions: Mapping[str, float] = {}
+    problem: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers for JSON."""
+        found = self._asdict() | {"conditions": dict(self.conditions)}
+        del found["shapes"]
+        parts = {"shapes_real": self.shapes.real, "shapes_imag": self.shapes.imag}
+        return {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in (found | parts).items()
+        }
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> "LogModes":
+        """The entry of plain numbers."""
+        arrays = {
+            name: np.array(content[name], float)
+            for name in ("frequencies", "frequency_sds", "damping_ratios")
+        }
+        parts = (np.array(content[f"shapes_{part}"], float) for part in ("real", "imag"))
+        real, imag = (part.reshape(part.shape if part.size else (0, 0)) for part in parts)
+        words = {name: content[name] for name in ("file", "mark", "start", "problem")}
+        conditions = {name: float(value) for name, value in content["conditions"].items()}
+        return cls(**words, **arrays, shapes=real + 1j * imag, conditions=conditions)
+
+
+@dataclasses.dataclass(frozen=True)
+class ModeHistory:
+    """Entries of a folder in the order of time, and how they were found."""
+
+    entries: tuple[LogModes, ...]
+    settings: Mapping[str, Any]
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the history to a JSON file, in place of what was there, whole or not at all."""
+        content = {"format": FORMAT, "settings": dict(self.settings)}
+        content["entries"] = [entry.to_dict() for entry in self.entries]
+        with whole_file(path, overwrite=True) as beside:
+            beside.write_text(json.dumps(content), encoding="utf-8")
+
+
+def read_history(path: str | os.PathLike) -> ModeHistory:
+    """ModeHistory in a JSON file. Raises ValueError for a file that is none."""
+    try:
+        content = json.loads(read_text_input(path, "history of modes"))
+        if content["format"] != FORMAT:
+            raise KeyError("format")
+        entries = tuple(map(LogModes.from_dict, content["entries"]))
+        return ModeHistory(entries, content["settings"])
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{os.fspath(path)} is no history of modes ({error}): give another name"
+        ) from None
+
+
+def analyse(
+    folder: str | os.PathLike,
+    store: str | os.PathLike,
+    *,
+    pattern: str = "*",
+    band: tuple[float, float] | None = None,
+    method: str | None = None,
+    channels: Sequence[str] | None = None,
+    columns: str | None = None,
+    rate: float | None = None,
+    order: int | None = None,
+    processes: int = 1,
+    progress: bool = False,
+) -> ModeHistory:
+    """Modes of all logs of a `folder`, of which those in the `store` are not analysed again.
+
+    The store, a JSON file, is written after each log. Logs are the files that match the `pattern`
+    but descriptions (.toml) and hidden ones. The other arguments are those of `tuning.read_log` and
+    `tuning.identify_modes`. Logs that cannot be analysed have an entry with the reason. More than
+    one of the `processes` need a program whose main module may be imported.
+
+    Raises FileNotFoundError without the folder or without a log in it, ValueError for a store of
+    other settings.
+    """
+    folder, store = Path(folder), Path(store)
+    settings = {"pattern": pattern, "band": None if band is None else list(band)}
+    settings |= {"method": method, "channels": None if channels is None else list(channels)}
+    settings |= {"columns": columns, "rate": rate, "order": order}
+    files = logs_in(folder, pattern, store)
+    known: dict[str, LogModes] = {}
+    if store.exists():
+        former = read_history(store)
+        changed = [k for k, v in settings.items() if former.settings.get(k) != v]
+        if changed:
+            raise ValueError(
+                f"{store} was made with another {changed[0]}"
+                f" ({former.settings.get(changed[0])!r}, not {settings[changed[0]]!r}): give the"
+                " same, or another store"
+            )
+        known = {entry.file: entry for entry in former.entries}
+    marks = {path.name: _mark(path) for path in files}
+    known = {name: one for name, one in known.items() if marks.get(name) == one.mark}
+    left = [path for path in files if path.name not in known]
+    kept = keeping(lambda: f"{len(known)} of {len(files)} logs are in {store}: go on by the same")
+    with ProgressBar(len(files), "log", shown=progress, initial=len(known)) as bar, kept:
+        for entry in _analysed(left, settings, processes):
+            known[entry.file] = entry
+            _history(known, settings).save(store)
+            bar.update()
+    return _history(known, settings)
+
+
+def logs_in(folder: Path, pattern: str, store: Path) -> list[Path]:
+    """Files of a folder that match a pattern. Raises FileNotFoundError without one."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"there is no folder {folder}")
+    found = [
+        path
+        for path in sorted(folder.glob(pattern))
+        if path.is_file()
+        and path.suffix.lower() not in (".toml", ".png", ".md")
+        and not path.name.startswith(".")
+        and path.resolve() != store.resolve()
+    ]
+    if not found:
+        raise FileNotFoundError(f"there is no log in {folder} that matches {pattern!r}")
+    return found
+
+
+def _mark(path: Path) -> str:
+    about = path.stat()
+    return f"{about.st_size}-{about.st_mtime_ns}"
+
+
+def _history(known: Mapping[str, LogModes], settings: Mapping[str, Any]) -> ModeHistory:
+    """ModeHistory of entries by the time of their first samples, or else by their names."""
+    entries = list(known.values())
+    dated = all(entry.start for entry in entries if not entry.problem)
+    in_time = dated and any(entry.start for entry in entries)
+
+    def key(entry: LogModes):
+        numbers = re.split(r"(\d+)", entry.file)
+        natural = [(int(part), "") if part.isdigit() else (-1, part) for part in numbers]
+        return (entry.start if in_time else "", natural)
+
+    return ModeHistory(tuple(sorted(entries, key=key)), settings)
+
+
+def _analysed(
+    paths: Sequence[Path], settings: Mapping[str, Any], processes: int
+) -> Iterable[LogModes]:
+    """Entries of some logs, as they are found."""
+    if processes <= 1 or len(paths) < 2:
+        yield from (entry_of(path, settings) for path in paths)
+        return
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(min(processes, len(paths)), context) as pool:
+        futures = [pool.submit(entry_of, path, settings) for path in paths]
+        try:
+            for future in concurrent.futures.as_completed(futures):
+                yield future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def entry_of(path: Path, settings: Mapping[str, Any]) -> LogModes:
+    """LogModes of one log."""
+    mark = _mark(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LogWarning)
+            log = read_log(path, columns=settings["columns"], rate=settings["rate"])
+            band = settings["band"]
+            fit = identify_modes(
+                log,
+                band=None if band is None else (band[0], band[1]),
+                method=settings["method"],
+                channels=settings["channels"],
+                settings=ModalSettings(order=settings["order"]),
+            )
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        return LogModes(path.name, mark, problem=" ".join(str(error).split()))
+    modes, count = fit.modes, len(fit.channels.names)
+    return LogModes(
+        path.name,
+        mark,
+        log.start,
+        np.array([mode.frequency for mode in modes]),
+        np.array([mode.frequency_sd for mode in modes]),
+        np.array([mode.damping_ratio for mode in modes]),
+        np.array([mode.shape for mode in modes], complex).reshape(len(modes), count),
+        dict(log.conditions),
+        "" if modes else "no mode is well identified",
+    )
+
+
+def with_conditions(history: ModeHistory, path: str | os.PathLike) -> ModeHistory:
+    """The history with conditions from a CSV table: names of files, then a column for each.
+
+    Raises ValueError for a table without the name of a log, and for cells that are no numbers.
+    """
+    rows = list(csv.reader(read_text_input(path, "table of conditions").splitlines()))
+    head, *body = [row for row in rows if row] or [[]]
+    if len(head) < 2 or not body:
+        raise ValueError(f"{path}: a table of conditions has the names of logs and a column more")
+    known: dict[str, dict[str, float]] = {}
+    for number, row in enumerate(body, 2):
+        try:
+            values = [float(cell) for cell in row[1:]]
+        except ValueError:
+            raise ValueError(f"{path}, line {number}: a condition is no number") from None
+        if len(values) != len(head) - 1:
+            raise ValueError(f"{path}, line {number}: it has {len(row)} cells, not {len(head)}")
+        known[Path(row[0].strip()).name] = dict(zip(map(str.strip, head[1:]), values, strict=True))
+    if not any(entry.file in known for entry in history.entries):
+        raise ValueError(f"{path}: it names no log of the folder in its first column")
+    entries = tuple(
+        entry._replace(conditions={**entry.conditions, **known.get(entry.file, {})})
+        for entry in history.entries
+    )
+    return dataclasses.replace(history, entries=entries)

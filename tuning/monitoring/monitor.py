@@ -1,0 +1,199 @@
+"""Monitoring of a structure: modes over time, what conditions explain of them, and alarms."""
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxbeam.runtime.printer import TableViews, text_table
+from tuning.monitoring.chart import ControlChart, chart_of
+from tuning.monitoring.history import ModeHistory, analyse, with_conditions
+from tuning.monitoring.tracks import ModeTrack, tracks_of
+
+BASELINE = 50  # logs
+MAX_LISTED = 5  # logs without modes, in the text
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Monitoring(TableViews):
+    """Modes of a folder of logs over time; see `monitor`.
+
+    `tracks` are the modes followed, ascending in frequency; the `chart` is None without enough logs
+    for a baseline.
+    """
+
+    history: ModeHistory
+    tracks: tuple[ModeTrack, ...]
+    chart: ControlChart | None
+    baseline: int
+
+    @property
+    def verdict(self) -> str:
+        """Whether the structure has changed, from which log on, and by how much."""
+        entries, chart = self.history.entries, self.chart
+        if not self.tracks:
+            return f"no mode is found in enough of {len(entries)} logs to be followed"
+        followed = f"{len(self.tracks)} mode{'s' * (len(self.tracks) > 1)} followed in"
+        followed = f"{followed} {len(entries)} logs"
+        if chart is None:
+            return (
+                f"{followed}; no control chart: no mode is in enough of the first {self.baseline}"
+                " logs (the baseline), with the conditions of the others"
+            )
+        after = int(np.isfinite(chart.statistic[self.baseline :]).sum())
+        if chart.since is not None:
+            changes = [
+                f"{_frequency(self.tracks[i]):.4g} Hz by {100 * value:+.2f} +- {100 * half:.2f} %"
+                for i, (value, half) in zip(chart.used, chart.change(chart.since), strict=True)
+                if np.isfinite(value)
+            ]
+            return (
+                f"{followed}; ALARM since {entries[chart.since].file}: frequencies have changed"
+                f" from what conditions explain, {', '.join(changes)}; a rigidity changes by twice"
+                " as much where all change alike"
+            )
+        passing = int(chart.alarm.sum())
+        expected = chart.false_alarms * after
+        return (
+            f"{followed}; no alarm in the last of {after} logs after the baseline of"
+            f" {self.baseline}; {passing} passed, {expected:.1f} are expected without a change"
+        )
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """One row a log: file, start, conditions, and of each mode what was found and predicted."""
+        entries, chart = self.history.entries, self.chart
+        found: dict[str, np.ndarray] = {
+            "file": np.array([entry.file for entry in entries], str),
+            "start": np.array([entry.start for entry in entries], str),
+        }
+        for name in dict.fromkeys(name for entry in entries for name in entry.conditions):
+            found[name] = np.array([entry.conditions.get(name, np.nan) for entry in entries])
+        for number, track in enumerate(self.tracks, 1):
+            found[f"mode {number} frequency (Hz)"] = track.frequencies
+            found[f"mode {number} standard deviation (Hz)"] = track.deviations
+            found[f"mode {number} damping ratio"] = track.damping_ratios
+            found[f"mode {number} MAC"] = track.mac
+            if chart is not None and number - 1 in chart.used:
+                own = chart.regressions[chart.used.index(number - 1)]
+                found[f"mode {number} predicted (Hz)"] = own.predicted
+        if chart is not None:
+            found |= {"statistic": chart.statistic, "alarm": chart.alarm.astype(float)}
+        found["problem"] = np.array([entry.problem for entry in entries], str)
+        return found
+
+    def __str__(self) -> str:
+        header = ["mode", "frequency (Hz)", "logs", "first", "last", "scatter (%)", "explained"]
+        rows, entries = [], self.history.entries
+        names = self.chart.conditions if self.chart is not None else ()
+        for number, track in enumerate(self.tracks, 1):
+            row = [f"{number}", f"{_frequency(track):.5g}", f"{track.seen}"]
+            row += [entries[track.born].file]
+            row += [f"{entries[track.last].file}{', ended' * track.ended}"]
+            if self.chart is None or number - 1 not in self.chart.used:
+                rows.append([*row, *[""] * (2 + len(names))])
+                continue
+            own = self.chart.regressions[self.chart.used.index(number - 1)]
+            row += [f"{100 * own.deviation:.2g}", f"{100 * own.explained:.0f} %" * bool(names)]
+            row += [f"{100 * e.slope:+.3g} +- {100 * e.half_width:.2g}" for e in own.effects]
+            rows.append(row)
+        lines = [self.verdict, ""]
+        lines += text_table([*header, *(f"% per {name}" for name in names)], rows)
+        failed = [entry for entry in entries if entry.problem]
+        lines += [f"{entry.file}: {entry.problem}" for entry in failed[:MAX_LISTED]]
+        if len(failed) > MAX_LISTED:
+            lines.append(f"{len(failed) - MAX_LISTED} more logs without modes")
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers for JSON: the verdict, alarms, effects of conditions, the rows."""
+        chart, files = self.chart, [entry.file for entry in self.history.entries]
+        content: dict[str, Any] = {"verdict": self.verdict, "columns": self.columns}
+        if chart is not None:
+            content |= {
+                "limit": chart.limit,
+                "alarms": [files[i] for i in np.flatnonzero(chart.alarm)],
+                "since": None if chart.since is None else files[chart.since],
+                "effects": {
+                    f"mode {i + 1}": {e.condition: [e.slope, e.half_width] for e in own.effects}
+                    for i, own in zip(chart.used, chart.regressions, strict=True)
+                },
+            }
+        return content
+
+    def plot(self, path: str | os.PathLike | None = None) -> Any:
+        """Figure of the frequencies, what conditions explain of them, and the control chart.
+
+        It is saved to `path` if given.
+        """
+        from tuning.monitoring.plot import plot_monitoring
+
+        return plot_monitoring(self, path)
+
+
+def _frequency(track: ModeTrack) -> float:
+    return float(np.nanmedian(track.frequencies))
+
+
+def monitor(
+    folder: str | os.PathLike,
+    store: str | os.PathLike,
+    *,
+    conditions: str | os.PathLike | None = None,
+    baseline: int = BASELINE,
+    pattern: str = "*",
+    band: tuple[float, float] | None = None,
+    method: str | None = None,
+    channels: Sequence[str] | None = None,
+    columns: str | None = None,
+    rate: float | None = None,
+    order: int | None = None,
+    processes: int = 1,
+    progress: bool = False,
+) -> Monitoring:
+    """Follow the modes of a structure through the logs of a `folder`, and tell when they change.
+
+    Modes of new logs are found by `tuning.identify_modes`, and kept in the `store`, a JSON file;
+    those of logs that have not changed are taken from it. They are followed by frequency and MAC
+    (see `tracks_of`). Of the first logs, the `baseline`, frequencies are regressed on `conditions`:
+    columns of the logs without a unit of vibrations, as temperatures, and those of a CSV table with
+    the names of logs in its first column. A control chart of what remains has the alarms (see
+    `chart_of`). Logs are in the order of their dates, if all have one, else of their names. The
+    other arguments are those of `analyse`.
+
+    Raises FileNotFoundError without the folder or a log, ValueError for a baseline below two, a
+    store of other settings and a table of conditions that names no log.
+    """
+    if baseline < 2:
+        raise ValueError(f"the baseline must be 2 logs at least, not {baseline}")
+    history = analyse(
+        folder,
+        store,
+        pattern=pattern,
+        band=band,
+        method=method,
+        channels=channels,
+        columns=columns,
+        rate=rate,
+        order=order,
+        processes=processes,
+        progress=progress,
+    )
+    return monitored(history, conditions, baseline)
+
+
+def monitored(
+    history: ModeHistory, conditions: str | os.PathLike | None = None, baseline: int = BASELINE
+) -> Monitoring:
+    """Tracks and control chart of a history of modes; see `monitor`.
+
+    Raises ValueError for a table of conditions that names no log.
+    """
+    if conditions is not None:
+        history = with_conditions(history, Path(conditions))
+    tracks = tuple(tracks_of(history.entries))
+    chart = chart_of(tracks, [entry.conditions for entry in history.entries], baseline)
+    return Monitoring(history, tracks, chart, baseline)
