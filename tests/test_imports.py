@@ -29,7 +29,7 @@ tuning.checkpoint  tuning.optional
 tuning.logs
 tuning.parameters  tuning.modal
 tuning.fit
-tuning.weighing  tuning.control
+tuning.weighing  tuning.control  tuning.monitoring
 tuning
 jaxbeam.tuning
 experiments.thesis  experiments.demo

@@ -28,7 +28,7 @@ differ in a column called run. `read_logs` reads them all.
 import dataclasses
 import difflib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +38,7 @@ from tuning.logs.log import Log, LogWarning, check_samples, doubts, with_named_c
 from tuning.logs.logger import interpolate_invalid
 from tuning.logs.readers import LogTable, is_time_name, read_tables
 from tuning.logs.readers.table import shown
-from tuning.logs.units import UNITS, is_unit, transducer_unit, unit
+from tuning.logs.units import UNITS, UNITS_OF_CONDITIONS, is_unit, transducer_unit, unit
 
 MAX_TEXT = 120  # characters of the name or the unit of a column, as messages quote it
 
@@ -164,11 +164,11 @@ def _make_log(
         columns or description.columns or [name for name in names if name != time_column]
     )
     channels = [name for name in channels if name not in (time_column, "run")]
-    asked = [*(columns or ()), *description.columns, *(units if isinstance(units, Mapping) else ())]
-    aside = [] if units else _no_channels(table, channels, asked, description)
-    channels = [name for name in channels if name not in aside]
     for name in (*channels, *description.columns, *(units if isinstance(units, Mapping) else ())):
         _check_column(path, name, names)
+    asked = columns or description.columns or units
+    aside = [] if asked else _no_channels(table, channels, description)
+    channels = [name for name in channels if name not in aside]
     if not channels:
         raise ValueError(f"{path}: there is no column besides the time, {time_column!r}")
     declared = units if isinstance(units, Mapping) else dict.fromkeys(channels, units)
@@ -206,12 +206,12 @@ def _make_log(
     source = f"{path}:{run}" if run else str(path)
     check_samples(source, (time_column, *channels), values, table.lines)
     conditions = _conditions(table, aside)
-    notes += [f"{name} is no channel, as its unit is unknown" for name in conditions]
     unit_of_times = column_units[0][0]
     given = declared.get(time_column) or description.unit(time_column)
     sure = table.time is not None or bool(given)
     said = [
         *table.warnings,
+        *_left_out(table, aside),
         *doubts(channels, values[:, 0], values[:, 1:], table.lines, unit_of_times, sure),
     ]
     log = Log(
@@ -235,18 +235,30 @@ def _make_log(
 
 
 def _no_channels(
-    table: LogTable, channels: Sequence[str], asked: Sequence[str], description: LogDescription
+    table: LogTable, channels: Sequence[str], description: LogDescription
 ) -> list[str]:
-    """Columns whose units are unknown, as those of temperatures, and that nobody asks for.
+    """Columns whose units are unknown, as those of temperatures, and of no description.
 
     None where no channel would be left: then a unit is misspelt.
     """
     units = dict(zip(table.names, table.units, strict=True))
-    known = {name: not units[name] or is_unit(str(units[name])) for name in channels}
-    found = [
-        name for name in channels if not (known[name] or name in asked or description.unit(name))
+    unknown = [
+        name
+        for name in channels
+        if units[name] and not is_unit(str(units[name])) and not description.unit(name)
     ]
-    return found if any(known.values()) else []
+    return unknown if len(unknown) < len(channels) else []
+
+
+def _left_out(table: LogTable, names: Sequence[str]) -> Iterator[str]:
+    """Sentences on columns that are no channels, of units that are not those of conditions."""
+    for name in names:
+        text = str(table.units[table.names.index(name)])
+        if text not in UNITS_OF_CONDITIONS:
+            try:
+                unit(text)
+            except ValueError as error:
+                yield f"column {name!r} is no channel: {error}"
 
 
 def _conditions(table: LogTable, names: Sequence[str]) -> dict[str, float]:

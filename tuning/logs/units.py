@@ -95,6 +95,13 @@ def unit(text: str) -> Unit:
     return UNITS[name]
 
 
+# Of columns beside the channels: temperature, humidity, pressure, light, wind, speed, current.
+UNITS_OF_CONDITIONS = frozenset(
+    ["°C", "degC", "C", "°F", "degF", "K", "%", "%RH", "hPa", "mbar", "bar", "kPa"]
+    + ["lx", "lux", "W/m^2", "W/m²", "km/h", "mph", "rpm", "1/min", "A", "mA", "Hz", "°"]
+)
+
+
 def is_unit(text: str) -> bool:
     """Whether a text is the name of a known unit."""
     try:

@@ -131,7 +131,8 @@ class Monitoring(TableViews):
         """
         from tuning.monitoring.plot import plot_monitoring
 
-        return plot_monitoring(self, path)
+        files = len(self.history.entries)
+        return plot_monitoring(files, self.tracks, self.chart, path)
 
 
 def _frequency(track: ModeTrack) -> float:

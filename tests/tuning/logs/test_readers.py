@@ -340,7 +340,6 @@ def test_special_blocks_are_passed_over(tmp_path):
         ("0.0012", "0.0000", "line 24: time 0 s is repeated"),
         ("0.0012", "-1", "line 24: time -1 s comes after 0 s"),
         ("Y_Unit_Label,g,", "Y_Unit_Label,,", "column 'a': no unit found"),
-        ("Y_Unit_Label,g,", "Y_Unit_Label,lux,", "column 'a': unknown unit 'lux'"),
         ("X_Value,a,b", "Zeit,a,b", "line 22: the column headings must be X_Value"),
         ("LabVIEW Measurement", "Something", "line 1: a LabVIEW measurement file starts with"),
     ],
@@ -350,6 +349,24 @@ def test_mistakes(tmp_path, old, new, message):
     assert old in text
     with pytest.raises(ValueError, match=message):
         read_log(write(tmp_path, text.replace(old, new)))
+
+
+def test_columns_of_other_units_are_conditions(tmp_path):
+    """Means of 1.5 and so on: a known unit of conditions is no cause to warn, a misspelt one is."""
+    text = lvm()
+    plain = read_log(write(tmp_path, text))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = read_log(write(tmp_path, text.replace("Y_Unit_Label,g,", "Y_Unit_Label,°C,")))
+    assert found.names == ("b",) and not found.notes
+    raw = plain.values[:, 0].mean() / 9.80665
+    assert dict(found.conditions) == {"a (°C)": pytest.approx(raw, rel=1e-6)}
+    with pytest.warns(LogWarning, match="column 'a' is no channel: unknown unit 'parsec'"):
+        read_log(write(tmp_path, text.replace("Y_Unit_Label,g,", "Y_Unit_Label,parsec,")))
+    with pytest.raises(ValueError, match="unknown unit '°C'"):
+        read_log(
+            write(tmp_path, text.replace("Y_Unit_Label,g,", "Y_Unit_Label,°C,")), columns="a,b"
+        )
 
 
 def test_a_key_without_a_value_counts_as_empty(tmp_path):
