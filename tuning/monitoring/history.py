@@ -89,7 +89,7 @@ def read_history(path: str | os.PathLike) -> ModeHistory:
     try:
         content = json.loads(read_text_input(path, "history of modes"))
         if content["format"] != FORMAT:
-            raise KeyError("format")
+            raise ValueError(f"{os.fspath(path)} is a history of modes of another format")
         entries = tuple(map(LogModes.from_dict, content["entries"]))
         return ModeHistory(entries, content["settings"])
     except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:

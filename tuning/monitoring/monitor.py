@@ -23,6 +23,11 @@ class Monitoring(TableViews):
 
     `tracks` are the modes followed, ascending in frequency; the `chart` is None without enough logs
     for a baseline.
+
+    >>> from tuning.monitoring.history import ModeHistory
+    >>> from tuning.monitoring.monitor import monitored
+    >>> print(monitored(ModeHistory((), {})).verdict)
+    no mode is found in enough of 0 logs to be followed
     """
 
     history: ModeHistory
@@ -162,11 +167,26 @@ def monitor(
     (see `tracks_of`). Of the first logs, the `baseline`, frequencies are regressed on `conditions`:
     columns of the logs without a unit of vibrations, as temperatures, and those of a CSV table with
     the names of logs in its first column. A control chart of what remains has the alarms (see
-    `chart_of`). Logs are in the order of their dates, if all have one, else of their names. The
-    other arguments are those of `analyse`.
+    `chart_of`). Logs are the files of a `pattern`, in the order of their dates, if all have one,
+    else of their names; so many `processes` analyse them at once. The other arguments are those of
+    `tuning.read_log` and `tuning.identify_modes`; `order` is the highest of the models.
 
     Raises FileNotFoundError without the folder or a log, ValueError for a baseline below two, a
     store of other settings and a table of conditions that names no log.
+
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> import tuning
+    >>> Path("bridge").mkdir()
+    >>> times = 0.005 * np.arange(1600)
+    >>> for day in range(3):
+    ...     decay = np.exp(-0.3 * times) * np.cos(2 * np.pi * (3.2 - 0.1 * day) * times)
+    ...     noise = 1e-3 * np.random.default_rng(day).normal(size=times.size)
+    ...     rows = [f"{t:.3f},{a:.6f}" for t, a in zip(times, decay + noise)]
+    ...     _ = Path(f"bridge/{day}.csv").write_text("\\n".join(["t [s],a [m/s^2]", *rows]))
+    >>> found = tuning.monitoring.monitor("bridge", "modes.json")
+    >>> print(found.tracks[0].frequencies.round(2))
+    [3.2 3.1 3. ]
     """
     if baseline < 2:
         raise ValueError(f"the baseline must be 2 logs at least, not {baseline}")

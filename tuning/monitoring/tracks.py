@@ -127,5 +127,7 @@ def _finished(track: _GrowingTrack, entries: Sequence[LogModes]) -> ModeTrack:
         over_time([getattr(entries[i], name)[k] for i, k in zip(logs, track.modes, strict=True)])
         for name in ("frequencies", "frequency_sds", "damping_ratios")
     ]
+    found, deviations, ratios = columns
     ended = len(entries) - 1 - track.logs[-1] > GONE
-    return ModeTrack(*columns, over_time(track.mac), track.logs[0], track.logs[-1], ended)
+    parts = found, deviations, ratios, over_time(track.mac)
+    return ModeTrack(*parts, track.logs[0], track.logs[-1], ended)

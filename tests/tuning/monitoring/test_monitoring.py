@@ -13,8 +13,9 @@ import pytest
 import scipy.signal
 from numpy.testing import assert_allclose
 
-from tuning.monitoring import LogModes, ModeHistory, analyse, read_history, tracks_of
+from tuning.monitoring.history import LogModes, ModeHistory, analyse, read_history
 from tuning.monitoring.monitor import monitored
+from tuning.monitoring.tracks import tracks_of
 
 FREQUENCIES = np.array([2.1, 5.9, 6.4])  # Hz
 SHAPES = np.array([[0.6, 1.0, 0.7], [1.0, 0.1, -0.9], [0.8, -0.9, 0.7]])

@@ -113,7 +113,7 @@ def free_end(
     fine = range(later.start, earliest, -max(int(cycle / 2), 2))
     found = _earliest_good(ends, fine, compared) or later
     # Soon after the beginning, errors may be those of vibrations that are gone at once.
-    if found.start < since + count // PARTS or not found.is_decay:
+    if found.start < since + max(count // PARTS, PARTS) or not found.is_decay:
         return None
     # What decays from the beginning, but not quite linearly, has no forces before the end, either.
     squares = np.mean(values[since : found.start] ** 2, axis=1)
