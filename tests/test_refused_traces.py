@@ -1,11 +1,16 @@
 """What is written, or handed to other packages, refuses traced numbers in one sentence."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 
 import jaxbeam as jb
+import tuning
+from jaxbeam.analysis import stability
 from jaxbeam.analysis.combinations import combine
+from jaxbeam.analysis.compare import compare
 from jaxbeam.analysis.load_models import crossing_envelope, load_model_envelope
 from jaxbeam.analysis.margins import stability_margin
 from jaxbeam.analysis.sections import influence_table, record_amplification
@@ -17,7 +22,10 @@ CASE = jb.Case(
     loads=[jb.MovingMass(mass=0.3, speed=2.0)],
     run=jb.Run(0.1, 100.0),
 )
-MASS, RIGIDITY = "loads.0.mass", "beam.flexural_rigidity"
+MASS, RIGIDITY, GAIN = "loads.0.mass", "beam.flexural_rigidity", "controller.gains.0"
+TIMES = np.linspace(0.0, 0.3, 31)
+LOG = tuning.Log(TIMES, np.sin(TIMES)[:, None], ("w",), ("deflection",), ("m",), sensors=(0,))
+TRAINING = tuning.LoadCases(({MASS: 0.2},))
 REFUSED = {
     "amplification of a record": lambda case, _: record_amplification(jb.simulate(case)),
     "python-control, plant and loop": lambda case, path: jb.to_control(case),
@@ -34,6 +42,39 @@ REFUSED = {
     "influences": lambda case, path: influence_table(case),
     "margin": lambda case, path: stability_margin(case),
     "dataset": lambda case, path: jb.simulate(case).to_xarray(),
+    "bound": lambda case, path: jb.bound(case, period=0.02),
+    "comparison": lambda case, path: compare(case, {"feedback": jb.Feedback([9.0], period=0.01)}),
+    "case file": lambda case, path: jb.save_case(case, path / "case.toml"),
+    "assessment": lambda case, path: jb.assess(case, 40.0),
+    "sweep": lambda case, path: jb.sweep(case, {"loads.0.speed": [1.0, 2.0]}),
+    "growth": lambda case, path: stability.growth(case),
+    "fit": lambda case, path: tuning.identify(case, LOG, RIGIDITY),
+    "design of experiments": lambda case, path: tuning.design_experiment(
+        case, [RIGIDITY], {"loads.0.speed": (1.0, 3.0)}
+    ),
+    "tuning": lambda case, path: tuning.tune(case, {GAIN: (1.0, 9.0)}, TRAINING),
+    "front": lambda case, path: tuning.pareto(
+        case, {GAIN: (1.0, 9.0)}, TRAINING, tuning.Objective(), "effort", [1.0]
+    ),
+    "weighing": lambda case, path: tuning.weigh(case, LOG, (1.0, 3.0)),
+    "axles": lambda case, path: tuning.weighing.weigh_axles(case, LOG, (1.0, 3.0)),
+    "influences of logs": lambda case, path: tuning.weighing.model_influence_lines(case),
+}
+BESIDE_THE_CASE = {
+    "period of a bound": lambda share: jb.bound(CASE, period=0.02 * share),
+    "positions of a bound": lambda share: jb.bound(CASE, [0.3 * share], period=0.02),
+    "speed of an assessment": lambda share: jb.assess(CASE, 40.0 * share),
+    "damping of an assessment": lambda share: jb.assess(CASE, 40.0, added_damping=1e-3 * share),
+    "tolerance of a sweep": lambda share: jb.sweep(
+        CASE, {"loads.0.speed": [1.0]}, tolerance=1e-6 * share
+    ),
+    "loads of a log": lambda share: tuning.identify(
+        CASE, dataclasses.replace(LOG, loads=(jb.MovingMass(0.3 * share, 2.0),)), RIGIDITY
+    ),
+    "bounds of a fit": lambda share: tuning.identify(CASE, LOG, {RIGIDITY: (9.0 * share, 14.0)}),
+    "bounds of a tuning": lambda share: tuning.tune(CASE, {GAIN: (1.0, 9.0 * share)}, TRAINING),
+    "speeds of a weighing": lambda share: tuning.weigh(CASE, LOG, (1.0 * share, 3.0)),
+    "band of a modal fit": lambda share: tuning.identify_modes(LOG, band=(1.0 * share, 9.0)),
 }
 OF_PLANTS = "python-control, plant and loop", "python-control", "MATLAB"
 TRANSFORMED = {
@@ -77,3 +118,44 @@ def test_traced_numbers_are_refused(name, transformed, tmp_path):
     with pytest.raises(ValueError, match="can be neither differentiated nor compiled: call it"):
         TRANSFORMED[transformed](function)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("transformed", TRANSFORMED)
+@pytest.mark.parametrize("name", BESIDE_THE_CASE)
+def test_traced_numbers_beside_the_case_are_refused(name, transformed):
+    def function(share):
+        BESIDE_THE_CASE[name](share)
+        return share
+
+    with pytest.raises(ValueError, match="can be neither differentiated nor compiled: [a-z ]+"):
+        TRANSFORMED[transformed](function)
+
+
+@pytest.mark.parametrize("transformed", TRANSFORMED)
+@pytest.mark.parametrize("measure", ["weighted_rms", "vibration_dose", "sperling_index"])
+def test_times_of_ride_measures_are_known(measure, transformed):
+    times = np.arange(400) / 200.0
+
+    def function(share):
+        return getattr(jb.ride, measure)(share * times, np.sin(50 * times))
+
+    with pytest.raises(ValueError, match="times of ride measures must be known numbers"):
+        TRANSFORMED[transformed](function)
+
+
+@pytest.mark.parametrize("of_record", [True, False])
+def test_extremes_along_the_beam_are_differentiated_where_they_are(of_record):
+    case = dataclasses.replace(CASE, actuators=())
+
+    def largest(mass):
+        changed = jb.replace(case, {MASS: mass})
+        if of_record:
+            return jb.simulate(changed).envelope("moment").largest.max()
+        return jb.envelope(changed, quantity="moment").highest.max()
+
+    value, slope = jax.jvp(largest, (0.3,), (1.0,))
+    step = 1e-3
+    differences = (largest(0.3 + step) - largest(0.3 - step)) / (2 * step)
+    # Positions between those of the grid, where the moment is 1 % larger, included.
+    assert float(value) == pytest.approx(float(largest(0.3)), rel=1e-9)
+    assert float(slope) == pytest.approx(float(differences), rel=1e-4)

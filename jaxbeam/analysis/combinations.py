@@ -24,7 +24,7 @@ from jaxbeam.analysis.load_models import (
 from jaxbeam.analysis.sections import envelope
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import suggestion
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.reading.units import number_in_si
 from jaxbeam.model.along_beam import sections
 from jaxbeam.model.statics import REACTION
@@ -147,6 +147,7 @@ def action_extremes(
     return np.asarray(moving.lowest), np.asarray(moving.highest)
 
 
+@refuses_traced("a combination of actions")
 def combine(
     case: Case,
     actions: Mapping[str, Mapping],

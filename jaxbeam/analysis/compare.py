@@ -17,6 +17,7 @@ from jaxbeam.analysis.limit_cycles import CommandOscillation, command_oscillatio
 from jaxbeam.analysis.margins import StabilityMargin, stability_margin
 from jaxbeam.case.case import Case, crossing_times
 from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.runtime.module import Module
 from jaxbeam.runtime.printer import TableViews
 from jaxbeam.simulation.commands import with_exact_compensation
@@ -120,6 +121,7 @@ class Comparison(TableViews, Module):
         return "; ".join(parts)
 
 
+@refuses_traced("a comparison")
 def compare(
     case: Case, controllers: dict[str, AbstractController], period: float | None = None
 ) -> Comparison:

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from jaxbeam.analysis.stationary_loop import loop_with_mass_at, standing_mass
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete, refuse_traced
+from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.loads.point import MovingMass
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.state_space import state_space
@@ -27,6 +27,7 @@ class ControlSystems(NamedTuple):
     closed: Any
 
 
+@refuses_traced("a system of python-control")
 def to_control(
     case: Case, position: float | None = None, mass: float | None = None
 ) -> ControlSystems:
@@ -52,9 +53,6 @@ def to_control(
     >>> systems.plant.input_labels, systems.plant.output_labels, systems.loop.dt
     (['command_0', 'load_0'], ['sensor_0_deflection'], 0.002)
     """
-    refuse_traced(
-        "a system of python-control", "call it outside jit and grad", case, position, mass
-    )
     check_case(case)
     if position is None and mass is not None:
         raise ValueError("mass needs a position (m) of the mass on the beam")

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxbeam.analysis.sections import Envelope, envelope
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam, suggestion
-from jaxbeam.case.fields import concrete, refuse_traced
+from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.loads.axles import Axles
 from jaxbeam.case.quantities import quantity_of
 from jaxbeam.case.track import Kernel
@@ -91,6 +91,7 @@ def check_quantity(quantity: str) -> None:
         )
 
 
+@refuses_traced("an envelope of a load model")
 def load_model_envelope(
     case: Case,
     model: str | LoadModel,
@@ -118,7 +119,6 @@ def load_model_envelope(
     >>> print(f"{found.highest[0]:.4g} N m")
     4.17e+06 N m
     """
-    refuse_traced("an envelope of a load model", "call it outside jit and grad", case)
     chosen = load_model(model) if isinstance(model, str) else model
     allowance = chosen.allowance if allowance is None else allowance
     for name, value in (("lane", lane or 0.0), ("allowance", allowance)):
@@ -149,6 +149,7 @@ def load_model_envelope(
     )
 
 
+@refuses_traced("an envelope of a load model")
 def crossing_envelope(
     case: Case, model: str | LoadModel, speed: float, x, *, quantity: str = "moment"
 ) -> Envelope:
@@ -158,7 +159,6 @@ def crossing_envelope(
     forces without allowance and lane load, and the run goes on for one period of the lowest mode.
     Raises as `envelope`, and ValueError for an unknown model or a speed that is not above 0.
     """
-    refuse_traced("an envelope of a load model", "call it outside jit and grad", case)
     if not 0 < speed < np.inf:
         raise ValueError(f"the speed of a crossing must be above 0 m/s, not {speed:g}")
     chosen = load_model(model) if isinstance(model, str) else model
@@ -219,11 +219,11 @@ class TabulatedLine(NamedTuple):
         return float(np.sum(np.diff(self.positions) * share * heights / 2))
 
 
+@refuses_traced("a table of influences")
 def influence_at(
     case: Case, x: float, quantity: str, side: str = "right", points: int = LINE_POINTS
 ) -> TabulatedLine:
     """Influence line of a quantity at x (m), for loads at equally spaced `points` and its kinks."""
-    refuse_traced("a table of influences", "call it outside jit and grad", case)
     length = float(concrete(case.beam.length))
     places = np.linspace(0.0, length, points)
     # Shear forces jump at the section: a point on both sides of it.

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from jaxbeam.analysis.linearised_loop import LinearisedLoop
 from jaxbeam.analysis.stationary_loop import stationary_loops
 from jaxbeam.case.case import Case, crossing_times
-from jaxbeam.case.fields import concrete, refuse_traced
+from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.control.predictive.mpc import MPC
 from jaxbeam.estimation.kalman import Kalman
 
@@ -192,6 +192,7 @@ class StabilityMargin(NamedTuple):
         )
 
 
+@refuses_traced("a margin of stability")
 def stability_margin(case: Case, verdict_only: bool = False) -> StabilityMargin:
     """Stability margin of the closed loop of a case, the smallest along the crossing.
 
@@ -200,7 +201,6 @@ def stability_margin(case: Case, verdict_only: bool = False) -> StabilityMargin:
     Stationary loads lack the velocity terms of moving ones, which act as damping of either sign;
     `stability.growth` includes these.
     """
-    refuse_traced("a margin of stability", "call it outside jit and grad", case)
     controller = case.controller
     if controller is None or controller.open_loop:
         return _no_margin("commands that do not depend on readings close no loop")

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from jaxbeam.case.fields import concrete, is_concrete
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, not_differentiated, xp
 from jaxbeam.simulation.record import Record
 
 __all__ = [
@@ -34,6 +34,7 @@ MEMORY = 15.0  # s, after which the slowest of the filters has forgotten all but
 
 # Sperling's index: band (Hz) and exponent of `sperling.m` in janiex/SimulinkMatlab on GitHub.
 SPERLING_BAND, SPERLING_EXPONENT = (0.5, 30.0), 1 / 6.67
+UNKNOWN = "must be known numbers"
 CENTIMETRES = 100.0  # of a metre: the index is defined for cm/s^2
 
 
@@ -257,7 +258,8 @@ def ride_measures(record: Record) -> RideMeasures:
 def _time_step(times, highest_frequency: float) -> float:
     """Spacing (s) of known times that resolve frequencies up to the highest one (Hz)."""
     if not is_concrete(times):
-        raise ValueError("times of ride measures must be known numbers, not traced ones")
+        raise ValueError(f"times of ride measures {UNKNOWN}, not traced ones")
+    not_differentiated(times, f"times of ride measures {UNKNOWN}: there are no derivatives by them")
     steps = np.diff(np.asarray(concrete(times), float))
     if steps.size == 0 or np.ptp(steps) > 1e-6 * np.max(np.abs(steps)):
         raise ValueError(

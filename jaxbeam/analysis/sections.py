@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.beam import END_CONDITIONS
-from jaxbeam.case.case import Case
+from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.declared_checks import check_on_beam, suggestion
-from jaxbeam.case.fields import concrete, refuse_traced
+from jaxbeam.case.fields import OUTSIDE, concrete, refuse_traced, refuses_traced
 from jaxbeam.case.quantities import QUANTITIES, quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.integrate import integrate_peaks
@@ -25,7 +26,7 @@ from jaxbeam.model.statics import (
     influence_line,
     static_peak,
 )
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, any_jax, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.module import Module
 from jaxbeam.runtime.printer import TableViews
@@ -126,8 +127,11 @@ def envelope(
         values = xp.stack([-found.lowest, found.highest], axis=-1)
         return values, xp.max(xp.abs(values)), [np.zeros((values.shape[0], 0))] * 2
 
-    if x is None:
+    if x is None and not any_jax(case):
         return refined(case, at, curves)[1]
+    if x is None:  # those of the known case, at which the extremes are differentiated
+        known = concrete_case(case), None, tolerance
+        x = envelope(*known, quantity=quantity, **jax.tree.map(concrete, parameters)).positions
     x = xp.asarray(x, float)
     check_on_beam("x", x, case.beam.length)
     return at(x)
@@ -252,6 +256,7 @@ class InfluenceTable:
         return heads
 
 
+@refuses_traced("a table of influences")
 def influence_table(
     case: Case,
     quantities: tuple[str, ...] = (),
@@ -269,7 +274,6 @@ def influence_table(
     are by default those of `model.along_beam`, with more around the extremes of each line. Raises
     ValueError as `influence_line` does.
     """
-    refuse_traced("a table of influences", "call it outside jit and grad", case)
     parameters = {"fibre_distance": fibre_distance, "section_modulus": section_modulus}
     lines = _sections(case, quantities, x)
 
@@ -350,7 +354,7 @@ def record_amplification(record: Record) -> list[float | None]:
     not known (see `static_peak`).
     """
     case = record.case
-    refuse_traced("an amplification", "call it outside jit and grad", case)
+    refuse_traced("an amplification", OUTSIDE, case)
     wheels = load_set(case).wheel_count
     if case.controller is not None or not 0 < wheels <= MAX_WHEELS:
         return [None] * len(case.sensors)

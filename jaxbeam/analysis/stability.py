@@ -25,7 +25,7 @@ from jaxbeam.analysis.linearised_loop import (
     sampled_matrices,
 )
 from jaxbeam.case.case import Case, concrete_case, crossing_times, replace
-from jaxbeam.case.fields import concrete, refuse_traced
+from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.trajectory import NEVER
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.numerics.discretisation import propagate
@@ -33,7 +33,6 @@ from jaxbeam.runtime.arrays import known, ravel_pytree, scan, xp
 from jaxbeam.runtime.compiling import compiled
 
 MAX_PHASE_PER_STEP = 0.4  # rad: phase of the fastest mode per step of the transition matrix
-UNTRACED = "the stability of a loop", "call it outside jit and grad"
 SAMPLES_AT_ONCE = 2048  # of which the plant is propagated together
 
 
@@ -85,12 +84,12 @@ class Stream(NamedTuple):
         return self.largest_multiplier < 1
 
 
+@refuses_traced("the stability of a loop")
 def frozen_poles(case: Case, times: Float[np.ndarray, " time"] | None = None) -> FrozenPoles:
     """Poles of the closed loop with loads frozen at ascending times (s) (Figs 5.17, 5.18).
 
     Default: 100 times of the crossing. Raises ValueError as `linearised_loop`.
     """
-    refuse_traced(*UNTRACED, case)
     timing = loop_timing(case)
     if times is None:
         times = np.linspace(*_crossing_interval(case), 101)[:-1] if case.loads else np.zeros(1)
@@ -100,13 +99,13 @@ def frozen_poles(case: Case, times: Float[np.ndarray, " time"] | None = None) ->
     return FrozenPoles(times, _tracked_branches(np.stack(poles)))
 
 
+@refuses_traced("the stability of a loop")
 def growth(case: Case, points: int = 100) -> Growth:
     """Growth of deviations over a crossing, at `points` intervals or at the sampling instants.
 
     The loop is linearised about rest, where a cubic law has no gain. Raises ValueError as
     `linearised_loop`, and for a case without loads.
     """
-    refuse_traced(*UNTRACED, case)
     timing = loop_timing(case)
     start, end = _crossing_interval(case)
     loop = loop_dynamics(case, mesh_layout(concrete_case(case)))
@@ -125,6 +124,7 @@ def growth(case: Case, points: int = 100) -> Growth:
     return Growth(times, np.linalg.norm(energy_transitions, ord=2, axis=(1, 2)))
 
 
+@refuses_traced("the stability of a loop")
 def stream(case: Case, spacing: float) -> Stream:
     """Floquet multipliers of the loop under a periodic stream of loads, `spacing` (s) apart.
 
@@ -132,7 +132,6 @@ def stream(case: Case, spacing: float) -> Stream:
     time. Raises ValueError for a case without exactly one load, one that stays on the beam, or a
     spacing that is not a multiple of the sampling period, and as `linearised_loop`.
     """
-    refuse_traced(*UNTRACED, case)
     timing = loop_timing(case)
     if len(case.loads) != 1:
         raise ValueError(f"a stream repeats the one load of a case; this has {len(case.loads)}")

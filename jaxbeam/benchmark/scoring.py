@@ -26,6 +26,7 @@ from jaxbeam.benchmark.environment import Environment
 from jaxbeam.benchmark.problem import TEST_SEEDS, BenchmarkProblem, load
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import AbstractController
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.control.state_controller import AbstractStateController
 from jaxbeam.files.case_file import load_controller
 from jaxbeam.model.state_space import state_space
@@ -65,6 +66,7 @@ class Score(Module):
         return float(np.min(np.fmax(self.shares, LEAST_SHARE)))
 
 
+@refuses_traced("a score")
 def score(
     problem: str | BenchmarkProblem,
     controller: Any = None,

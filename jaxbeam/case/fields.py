@@ -1,12 +1,13 @@
 """Field declarations shared by all data classes of a case, and the kinds of a family."""
 
+import dataclasses
 import functools
 import importlib
 import importlib.util
 import pkgutil
 import re
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.abc import InspectLoader
 
 import equinox as eqx
@@ -16,6 +17,8 @@ import numpy as np
 
 from jaxbeam.case.reading.units import in_si
 from jaxbeam.runtime.arrays import any_traced, not_differentiated, xp
+
+F = typing.TypeVar("F", bound=Callable)
 
 
 def _as_array(unit: str, meaning: str):
@@ -144,13 +147,38 @@ class TracedNumberError(jax.errors.ConcretizationTypeError):
         TypeError.__init__(self, sentence)
 
 
+OUTSIDE = "call it outside jit, vmap and grad"
+
+
 def refuse_traced(what: str, instead: str, *trees) -> None:
     """Raises ValueError, in one sentence, if numbers of some trees are traced by JAX.
 
     `what` computes with NumPy, so that its derivatives would be zero; said is what to do `instead`.
+    Data classes that are no trees are searched, too.
     """
-    if any_traced(trees):
+    if any_traced(trees) or any(map(_holds_traced, jax.tree.leaves(trees))):
         raise ValueError(f"{what} can be neither differentiated nor compiled: {instead}")
+
+
+def _holds_traced(leaf) -> bool:
+    if not dataclasses.is_dataclass(leaf) or isinstance(leaf, type):
+        return False
+    leaves = jax.tree.leaves(dict(vars(leaf)))
+    return any_traced(leaves) or any(map(_holds_traced, leaves))
+
+
+def refuses_traced(what: str, instead: str = OUTSIDE) -> Callable[[F], F]:
+    """Decorator of functions whose arguments must be known, for `what` they return."""
+
+    def decorated(function):
+        @functools.wraps(function)
+        def of_known(*args, **kwargs):
+            refuse_traced(what, instead, args, kwargs)
+            return function(*args, **kwargs)
+
+        return of_known
+
+    return decorated
 
 
 def concrete(

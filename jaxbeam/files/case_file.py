@@ -19,7 +19,7 @@ import tomli_w
 from jaxbeam.case.case import Case, each_address, list_sizes, part_classes, unknown_address_error
 from jaxbeam.case.controller import AbstractController
 from jaxbeam.case.declared_checks import describe_value, suggestion
-from jaxbeam.case.fields import concrete, kind_of, kinds
+from jaxbeam.case.fields import concrete, kind_of, kinds, refuses_traced
 from jaxbeam.case.former_words import attribute_address
 from jaxbeam.case.loads.vehicles.vehicle import IMPLIED, is_path
 from jaxbeam.case.reading.tables import read_part, read_parts
@@ -180,6 +180,7 @@ def load_controller(path: str | os.PathLike) -> AbstractController:
         raise ValueError(f"{path}: {error}") from None
 
 
+@refuses_traced("a file")
 def save_case(case: Case, path: str | os.PathLike, overwrite: bool = False) -> None:
     """Write a case to a TOML file, with the unit of each number in a comment.
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxbeam.case.case import Case, address_words, unit_at
-from jaxbeam.case.fields import refuse_traced
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_from_dict
 from jaxbeam.files.endings import DATASETS, RESULTS, TABLES, check_ending
@@ -55,6 +55,7 @@ Columns = Mapping[str, np.ndarray]  # equally long, of numbers or texts, by thei
 MAX_EXCEL_ROWS = 1_048_575  # below the heads
 
 
+@refuses_traced("a file")
 def save(result: Any, path: str | os.PathLike, overwrite: bool = False) -> None:
     """Write a result to a file: a record, modes, frequency responses, an envelope, a sweep, a fit.
 
@@ -73,7 +74,6 @@ def save(result: Any, path: str | os.PathLike, overwrite: bool = False) -> None:
     >>> print(path.read_text().splitlines()[0])
     mode,frequency (Hz),damping ratio
     """
-    refuse_traced("a file", "call it outside jit and grad", result)
     path = Path(path)
     has_dataset = hasattr(result, "data_vars") or hasattr(result, "to_xarray")
     check_ending(path, "a result", RESULTS if has_dataset else TABLES)

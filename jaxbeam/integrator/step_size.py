@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, concrete_case, replace
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, refuse_traced
 from jaxbeam.case.limits import MAX_SAMPLES
 from jaxbeam.integrator.discrete_model import discrete_model
 from jaxbeam.integrator.integrate import integrate_history
@@ -81,7 +81,8 @@ def check_step_count(count: float, step: float) -> None:
 
 
 def check_tolerance(tolerance: float) -> None:
-    """Raises ValueError for a tolerance that is no share, or below double precision."""
+    """Raises ValueError for a tolerance that is no share, or below double precision, or traced."""
+    refuse_traced("a tolerance", "give a known number", tolerance)
     if not SMALLEST_TOLERANCE <= tolerance < 1:
         raise ValueError(
             f"tolerance must be at least {SMALLEST_TOLERANCE:g} and below 1, as a share of the"

@@ -9,7 +9,7 @@ import scipy
 from jaxtyping import Complex, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import refuse_traced
+from jaxbeam.case.fields import OUTSIDE, refuse_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.channels import check_pairs, input_column, output_row
 from jaxbeam.model.frequency_responses import (
@@ -73,7 +73,7 @@ class StateSpace(Module):
 
         Raises ImportError, saying what to install, if that package is missing.
         """
-        refuse_traced("a system of python-control", "call it outside jit and grad", self)
+        refuse_traced("a system of python-control", OUTSIDE, self)
         try:
             import control
         except ImportError:
@@ -95,7 +95,7 @@ class StateSpace(Module):
         `period` is 0 for continuous time, as in MATLAB's `ss`. Raises FileExistsError if the file
         exists and `overwrite` is not set.
         """
-        refuse_traced("a file", "call it outside jit and grad", self)
+        refuse_traced("a file", OUTSIDE, self)
         content = {name: np.asarray(getattr(self, name)) for name in "ABCD"}
         content["period"] = np.asarray(0.0 if self.period is None else self.period)
         for kind in ("states", "inputs", "outputs"):

@@ -194,8 +194,9 @@ class Record(RecordViews):
         From the samples, free vibration included; what jumps at a position is taken on both sides.
         By default positions are ends, supports, hinges, changes of section, actuators, sensors,
         loads that stand, 100 equal steps, and as many more as it takes for the smallest and the
-        largest value along the beam to change by less than 1e-4. The quantities are those of `at`;
-        a moment has its peak as a load passes, so that a load should move by a small part of the
+        largest value along the beam to change by less than 1e-4 (of these there are none under
+        `jit` and `vmap`, where their number is not known). The quantities are those of `at`; a
+        moment has its peak as a load passes, so that a load should move by a small part of the
         length between samples. With each value is that of another, `coincident` quantity at the
         same place and time, if one is named. Raises ValueError as `at` does.
         """

@@ -3,10 +3,12 @@
 from typing import TYPE_CHECKING
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
+from jaxbeam.case.fields import concrete, is_concrete
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.model.along_beam import refined, sections
 from jaxbeam.model.modes import Modes
@@ -115,6 +117,12 @@ def record_envelope(
         places = found.smallest_load_position, found.largest_load_position
         return values, xp.max(xp.abs(values)), tuple(map(np.asarray, places))
 
+    numbers = case, modes, motion, times, parameters
+    leaves = jax.tree.leaves(numbers)
+    if positions is None and any_traced(leaves) and all(map(is_concrete, leaves)):
+        # Those of the known numbers, at which the extremes are differentiated.
+        *plain, others = jax.tree.map(lambda n: concrete(n) if any_traced(n) else n, numbers)
+        positions = record_envelope(*plain, quantity, None, *others).positions
     if positions is not None:
         return at(xp.asarray(positions, float))
     return refined(case, at, curves)[1]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxbeam.case.case import Case, unit_at
-from jaxbeam.case.fields import refuse_traced
+from jaxbeam.case.fields import OUTSIDE, refuses_traced
 from jaxbeam.case.reading.units import in_si
 from jaxbeam.files.case_file import with_settings
 from jaxbeam.model.plausibility.check import warn_if_implausible
@@ -23,7 +23,7 @@ from jaxbeam.sweeps.words import compute_word_sweep, split_words, word_sweep
 if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
 
-SINGLE_RUNS = "call it outside jit, vmap and grad, or differentiate jaxbeam.simulate of each run"
+SINGLE_RUNS = f"{OUTSIDE}, or differentiate jaxbeam.simulate of each run"
 
 
 def first_and_last(case: Case, over: dict[str, Any]) -> list[Case]:
@@ -41,6 +41,7 @@ def first_and_last(case: Case, over: dict[str, Any]) -> list[Case]:
     return ends
 
 
+@refuses_traced("a sweep", SINGLE_RUNS)
 def sweep(
     case: Case,
     over: dict[str, Any],
@@ -112,7 +113,6 @@ def sweep(
     >>> print(dict(runs.peak_deflection.sizes))
     {'loads.0.speed': 2, 'sensor': 1}
     """
-    refuse_traced("a sweep", SINGLE_RUNS, case, over)
     if client is not None and store is None:
         raise ValueError("workers write their blocks to a store; name one")
     words, numbers = split_words(case, over)

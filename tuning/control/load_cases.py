@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats.qmc import LatinHypercube
 
 from jaxbeam.case.case import Case, crossing_times, replace, unit_at, value_at
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import OUTSIDE, concrete, refuse_traced
 from jaxbeam.case.reading.tables import COUNT, NUMBERS, TABLE, check_entry, check_table
 from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.case.reading.units import in_si, is_quantity
@@ -53,6 +53,7 @@ class LoadCases:
     held_out: tuple[AddressValues, ...] = ()
 
     def __post_init__(self):
+        refuse_traced("a set of load cases", OUTSIDE, self.training, self.held_out)
         if not self.training:
             raise ValueError("there is nothing to tune on: give at least one training case")
         repeated = [run for run in self.held_out if run in self.training]

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.control.optimal.lqr import LQR
 from jaxbeam.runtime.printer import text_table
 from tuning.control.load_cases import LoadCases
@@ -56,6 +57,7 @@ class ParetoFront:
         return plot_pareto_front(lines, self.metric, title=self.tuned[0].case.title)
 
 
+@refuses_traced("a tuning")
 def pareto(
     case: Case,
     free: ParameterBounds,
@@ -108,6 +110,7 @@ def pareto(
     return ParetoFront(metric, limits, tuple(tuned))
 
 
+@refuses_traced("a tuning")
 def lexicographic(
     case: Case,
     free: ParameterBounds,
@@ -218,6 +221,7 @@ class IntegerSearchResult:
         return "\n".join(["objective by choice", *lines, "", str(self.best)])
 
 
+@refuses_traced("a tuning")
 def tune_integers(
     case: Case,
     choices: Mapping[str, Sequence[int]],
@@ -332,6 +336,7 @@ class ReducedFeedback:
         return "\n".join([*lines, "", str(self.tuned)])
 
 
+@refuses_traced("a tuning")
 def tune_reduced(
     case: Case,
     keep: int,

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from jaxbeam.analysis.bound.bound import DEFAULT_PERIOD, least_achievable_peak
 from jaxbeam.case.case import Case, crossing_times, replace, stack_cases, value_at
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
@@ -33,6 +34,7 @@ from tuning.fit.uncertainty.posterior import Posterior
 MAX_DRAWS_PER_PLANT = 100  # draws from which each plant within the bounds is selected
 
 
+@refuses_traced("a plant of a fit")
 def with_identified_plant(case: Case, found: Fit | Posterior) -> Case:
     """The case with the identified parameters of beam, supports, actuators and sensors.
 
@@ -50,6 +52,7 @@ def with_identified_plant(case: Case, found: Fit | Posterior) -> Case:
     return replace(case, _plant_values(found.addresses, values))
 
 
+@refuses_traced("a plant of a fit")
 def draw_plants(found: Fit | Posterior, count: int, seed: int = 0) -> tuple[AddressValues, ...]:
     """Parameters of plants, by address, drawn from the uncertainty of an identification.
 

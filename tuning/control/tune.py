@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxbeam.case.case import Case, replace
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.runtime.compiling import compiled
@@ -31,6 +32,7 @@ from tuning.parameters.free import free_parameters
 ParameterBounds = Mapping[str, tuple[float, float] | None]
 
 
+@refuses_traced("a tuning")
 def tune(
     case: Case,
     free: ParameterBounds,

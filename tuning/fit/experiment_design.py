@@ -14,7 +14,7 @@ import scipy.optimize
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace, unit_at, value_at
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.runtime.arrays import xp
 from jaxbeam.runtime.compiling import compiled
@@ -62,6 +62,7 @@ class ExperimentDesign:
         return "\n".join(lines)
 
 
+@refuses_traced("a design of experiments")
 def design_experiment(
     case: Case,
     free: Sequence[str],

@@ -16,6 +16,7 @@ import scipy.signal
 from jaxtyping import Complex, Float
 
 from jaxbeam.case.case import Case, replace
+from jaxbeam.case.fields import OUTSIDE, refuse_traced, refuses_traced
 from jaxbeam.model.frequency_responses import StationaryMasses, frequency_response
 from jaxbeam.model.modes import mesh_layout
 from tuning.fit.least_squares import MAX_STEPS, LeastSquares
@@ -58,6 +59,7 @@ class Responses:
     source: str = "responses"
 
     def __post_init__(self):
+        refuse_traced("a measured response", OUTSIDE, self.frequencies, self.values)
         if self.values.shape != (self.frequencies.size, len(self.pairs)):
             raise ValueError(
                 f"{self.source}: {self.values.shape} values for {self.frequencies.size} "
@@ -206,6 +208,7 @@ class ResponseFit:
         return "\n".join([*lines, f"responses are off by {errors}", self.verdict])
 
 
+@refuses_traced("a fit")
 def identify_responses(
     case: Case,
     measured: Responses,

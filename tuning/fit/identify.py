@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxbeam.case.case import Case, structure_of
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.model.plausibility.check import warn_if_implausible
 from jaxbeam.runtime.progress import BAR_DELAY, ProgressBar, following
 from tuning.checkpoint import Checkpoint, checkpoint_path, fingerprint
@@ -21,6 +21,7 @@ from tuning.logs.log import Log
 from tuning.parameters.free import LOG_ADDRESS, FreeParameter, Prior, free_parameters
 
 
+@refuses_traced("a fit")
 def identify(
     case: Case,
     logs: Log | Sequence[Log],

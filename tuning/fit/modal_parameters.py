@@ -18,6 +18,7 @@ from jaxtyping import Float
 from scipy.stats import norm
 
 from jaxbeam.case.case import Case, replace
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.model.modes import mesh_layout, modes
 from tuning.fit.least_squares import WEAK_PRIOR_WIDTH
 from tuning.fit.summary import parameter_table
@@ -104,6 +105,7 @@ class ModalParameterFit:
         }
 
 
+@refuses_traced("a fit")
 def identify_from_modes(
     case: Case,
     identified: ModalEstimates,

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.runtime.compiling import compiled
 from tuning.fit.dataset import make_dataset
 from tuning.fit.result import Fit
@@ -114,6 +115,7 @@ class HeldOutPrediction:
         return f"{self.log}: {word}; residuals are {worst:.3g} times the noise at most"
 
 
+@refuses_traced("a prediction of logs")
 def cross_validate(fit: Fit) -> list[HeldOutPrediction]:
     """Leave-one-out cross-validation: each log predicted by a fit to all others.
 
@@ -158,6 +160,7 @@ def cross_validate(fit: Fit) -> list[HeldOutPrediction]:
     return found
 
 
+@refuses_traced("a prediction of logs")
 def predict_held_out(fit: Fit, logs: Sequence[Log]) -> list[HeldOutPrediction]:
     """Logs that the fit did not use, predicted by the fitted case with the loads of each log.
 

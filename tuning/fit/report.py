@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.files import report
 from jaxbeam.files.report import ReportFigure, ReportSection, ReportTable
 from tuning.fit.model_validation import HeldOutPrediction, ModelCriteria
@@ -14,6 +15,7 @@ from tuning.fit.uncertainty.posterior import Posterior
 from tuning.fit.uncertainty.profile import Profile
 
 
+@refuses_traced("a report")
 def write_report(
     folder: str | os.PathLike,
     fit: Fit,

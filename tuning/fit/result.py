@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case, replace
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.case.quantities import unit_of
 from jaxbeam.files.case_file import case_from_dict, case_to_dict
 from jaxbeam.runtime.printer import TableViews
@@ -281,6 +282,7 @@ _LOG_FIELDS = (
 )
 
 
+@refuses_traced("a file")
 def save_fit(fit: Fit, path: str | os.PathLike, overwrite: bool = False) -> None:
     """Write a fit with its logs and case to a file (.npz), without any loss of precision.
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxbeam.case.fields import OUTSIDE, refuse_traced
 from jaxbeam.case.loads.base import AbstractLoad
 from tuning.logs.readers import LogTable, is_time_name, parse_heading
 from tuning.logs.units import UNITS
@@ -82,6 +83,7 @@ class Log:
     conditions: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self):
+        refuse_traced("a log", OUTSIDE, self.times, self.values)
         channels = self.values.shape[1]
         if self.valid is None:
             object.__setattr__(self, "valid", np.ones(self.values.shape, bool))

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxbeam.case.fields import refuses_traced
 from tuning.logs.log import Log
 from tuning.logs.logger import sensor_readings
 from tuning.logs.units import time_derivative
@@ -64,6 +65,7 @@ NARROW = 0.005  # damping ratio of a mode below which it may be a harmonic
 TRANSIENT_SHARE = 0.01  # excited samples of a log with transients of crossing loads
 
 
+@refuses_traced("a modal fit")
 def identify_modes(
     log: Log | Sequence[Log],
     *,

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.case.loads.axles import Axles
 from jaxbeam.runtime.printer import text_table
 from tuning.logs.log import Log
@@ -139,6 +140,7 @@ def _of_weight(weight: tuple[float, float]) -> dict:
     return {"value": weight[0], "standard_error": weight[1]}
 
 
+@refuses_traced("a weighing")
 def weigh_axles(
     case: Case,
     log: Log,

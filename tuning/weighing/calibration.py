@@ -26,6 +26,7 @@ import scipy.optimize
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.model.load_set import load_set
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
@@ -47,6 +48,7 @@ KEPT = 1e-8  # share of variance below which a deviation is left out
 STIFFNESSES = 1e9, 1e12
 
 
+@refuses_traced("a table of influences")
 def calibrate_influence_lines(case: Case, logs: Log | Sequence[Log]) -> InfluenceLines:
     """Influence lines from logs of vehicles of known wheel loads, speeds and entry times.
 

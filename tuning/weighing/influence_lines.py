@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, refuses_traced
 from tuning.weighing.unit_force import UnitForce, driven
 
 POINTS = 81  # equally spaced, and one at each sensor, where lines of strain have a kink
@@ -196,6 +196,7 @@ def _interpolated(x, points, table: Float[np.ndarray, "point number"]):
     return np.stack([np.interp(x, points, column) for column in table.T], axis=1)
 
 
+@refuses_traced("a table of influences")
 def model_influence_lines(case: Case) -> InfluenceLines:
     """Influence lines of a case at points, linear in between, and its first modes.
 

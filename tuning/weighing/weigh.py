@@ -8,7 +8,7 @@ criterion (BIC) rises.
 import dataclasses
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.loads.base import AbstractLoad
 from jaxbeam.case.loads.point import MovingMass
 from tuning.fit.dataset import WHITENESS_SIGNIFICANCE
@@ -61,6 +61,7 @@ class Weighing:
         return "\n".join([*lines, str(self.fit)])
 
 
+@refuses_traced("a weighing")
 def weigh(
     case: Case, log: Log, speeds: tuple[float, float], max_count: int = 3, both_ways: bool = True
 ) -> Weighing:

@@ -16,7 +16,7 @@ from jaxbeam.analysis.assessment.train_checks import TrackState, train_checks
 from jaxbeam.analysis.sections import spans
 from jaxbeam.case.case import Case, Run
 from jaxbeam.case.declared_checks import suggestion
-from jaxbeam.case.fields import concrete, refuse_traced
+from jaxbeam.case.fields import OUTSIDE, concrete, refuses_traced
 from jaxbeam.case.reading.units import number_in_si
 from jaxbeam.case.track import Track, track_of
 from jaxbeam.case.validation import check_case
@@ -33,6 +33,7 @@ FASTEST = 150.0  # m/s, 540 km/h: no train in service or on trial comes near
 MANY_MODES = 60  # among which those that count for accelerations are found
 
 
+@refuses_traced("an assessment", f"{OUTSIDE}, or differentiate jaxbeam.simulate under a train")
 def assess(
     case: Case,
     line_speed,
@@ -80,8 +81,6 @@ def assess(
     >>> print(found.checks[1].subject, found.checks[1].outcome)
     dynamic analysis not required
     """
-    instead = "call it outside jit and grad, or differentiate jaxbeam.simulate under a train"
-    refuse_traced("an assessment", instead, case, line_speed, lowest_speed)
     if track in DECKS:
         raise ValueError(f"track is its state, {' or '.join(TRACKS)}; {track!r} is the deck")
     given = dict(deck=deck, track=track, code=code)

@@ -26,7 +26,7 @@ from jaxbeam.analysis.bound.linear_program import least_peak
 from jaxbeam.case.case import Case
 from jaxbeam.case.controller import commanded
 from jaxbeam.case.declared_checks import check_on_beam
-from jaxbeam.case.fields import refuse_traced
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedforward import Prescribed
 from jaxbeam.integrator.discrete_model import discrete_model
@@ -117,6 +117,7 @@ class Bound(Module):
         return Prescribed(offsets=offsets, period=self.period, **table)
 
 
+@refuses_traced("a bound")
 def bound(
     case: Case,
     positions: ArrayLike | None = None,
@@ -153,6 +154,7 @@ def bound(
     return dataclasses.replace(least, uncontrolled=_uncontrolled_peak(case, least.positions))
 
 
+@refuses_traced("a bound")
 def least_achievable_peak(case: Case, positions: ArrayLike | None, period: float) -> float:
     """Peak (m) of `bound`, without the run for the uncontrolled peak. Raises as `bound`."""
     return _bound_without_baseline(case, positions, period, None).peak
@@ -185,7 +187,6 @@ def checked_influence(
 
     Raises ValueError as `bound`.
     """
-    refuse_traced("a bound", "call it outside jit and grad", case)
     check_case(case)
     own_period = None if case.controller is None else case.controller.period
     period = (

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from jaxbeam.case.case import Case, concrete_case
-from jaxbeam.case.fields import concrete, refuse_traced
+from jaxbeam.case.fields import concrete, refuses_traced
 from jaxbeam.case.loads.base import known_numbers
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import Modes, modes
@@ -41,6 +41,7 @@ class PlausibilityWarning(UserWarning):
     """
 
 
+@refuses_traced("a check")
 def check(case: Case) -> Plausibility:
     """Numbers by which the plausibility of a case is seen, with warnings of what looks wrong.
 
@@ -61,7 +62,6 @@ def check(case: Case) -> Plausibility:
     >>> print(found.warnings[0].split(" under")[0])
     beam.flexural_rigidity: the beam sags by 3.186 m
     """
-    refuse_traced("a check", "call it outside jit and grad", case)
     check_case(case)
     return _checked(concrete_case(case), rows=(*RANGES, *ADVICE))
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.files.report import ReportTable
 from jaxbeam.runtime.arrays import Array
 from jaxbeam.runtime.printer import TableViews, text_table
@@ -146,6 +147,7 @@ class Posterior(TableViews):
         return "\n".join([*lines, self.verdict])
 
 
+@refuses_traced("a posterior")
 def sample(
     fit: Fit,
     draws: int = 500,

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.plot.style import COLOURS, FAINT, INK, use_style
 from tuning.fit.result import Fit
 from tuning.fit.uncertainty.covariance import t_quantile
@@ -52,6 +53,7 @@ class Profile:
         return f"{statement}; the linearised interval is misleading, use this one"
 
 
+@refuses_traced("a profile")
 def profile(fit: Fit, address: str, points: int = 4) -> Profile:
     """Profile likelihood of a parameter, on both sides of its fitted value.
 

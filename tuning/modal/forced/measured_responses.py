@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 from matplotlib.figure import Figure
 
+from jaxbeam.case.fields import refuses_traced
 from tuning.logs.log import Log
 from tuning.modal.forced.forces import (
     Windows,
@@ -95,6 +96,7 @@ class MeasuredResponses:
         return plot_responses(self, path)
 
 
+@refuses_traced("a measured response")
 def measured_responses(
     log: Log | Sequence[Log],
     force: Sequence[str] | None = None,

@@ -23,6 +23,7 @@ import scipy.optimize
 from jaxtyping import Int
 from scipy.stats import chi2
 
+from jaxbeam.case.fields import refuses_traced
 from tuning.logs.log import Log, even_records
 from tuning.modal.fit import Choice, ModalFit
 from tuning.modal.forced.forces import without_forces
@@ -365,6 +366,7 @@ class MultiSetupFit(ModalEstimates):
 UNLIKELY = 0.01  # probability by chance, below which setups are said to disagree
 
 
+@refuses_traced("a modal fit")
 def merge_setups(
     setups: Sequence[ModalFit], *, references: Sequence[str] | None = None
 ) -> MultiSetupFit:
