@@ -1,17 +1,16 @@
-"""Peaks of many runs by the C integrator (`integrate_peaks.c`), where there is a C compiler.
+"""Peaks of many runs by the C integrator (`integrate_peaks.c`), of the wheel or of a C compiler.
 
 XLA splits a step into some forty loops over the runs of a batch; in C it is one, and so are all
 steps of all tasks. It serves sweeps of peaks of all quantities (not of histories), without a
-controller or with one that acts at samples, in double precision, on CPUs. The first large sweep
-compiles it, once for a machine, in 1.2 s of processor time. Each new structure regains 3 s, as XLA
-has less to compile, or nothing (two spans, benchmark `first_answer`), and 4096 crossings 0.05 (3
-modes) to 0.26 s (12 modes, benchmark `sweep`). XLA's own calls of C would take headers, an aligned
-workspace as one of the results, and rules of derivatives that no sweep needs; and compile after the
-C.
+controller or with one that acts at samples, in double precision, on CPUs. Where the wheel has none
+the first large sweep compiles it, once for a machine, in 1.2 s of processor time. Each new
+structure regains 3 s, as XLA has less to compile, or nothing (two spans, benchmark `first_answer`),
+and 4096 crossings 0.05 (3 modes) to 0.26 s (12 modes, benchmark `sweep`). XLA's own calls of C
+would take headers, an aligned workspace as one of the results, and rules of derivatives that no
+sweep needs; and compile after the C.
 """
 
 import ctypes
-import sys
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -24,23 +23,13 @@ from jaxbeam.case.profiles.spectra import ProfilesOfRuns
 from jaxbeam.integrator.contact_forces import (
     END_FRACTIONS,
     FORCE_FRACTIONS,
-    FORCE_GAP,
-    ZERO_ITERATIONS,
     force_weights_at_fractions,
-    spread_factor,
 )
 from jaxbeam.integrator.discrete_model import bounds_by_energy, commands_at_once
 from jaxbeam.integrator.growth import MARK_COUNT
 from jaxbeam.integrator.kinks import may_have_kinks
-from jaxbeam.integrator.peaks import PEAK_MARGIN, Peaks
-from jaxbeam.integrator.propagators import (
-    DOUBLINGS,
-    GAUSS_NODES,
-    NODE_COUNT,
-    PEAK_NODES,
-    TAYLOR_TERMS,
-)
-from jaxbeam.integrator.step_matrices import CHUNK_STEPS
+from jaxbeam.integrator.peaks import Peaks
+from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT, PEAK_NODES
 from jaxbeam.integrator.time_grid import TimeGrid
 from jaxbeam.model.contact import initial_vehicle_states
 from jaxbeam.model.layout import is_uniform
@@ -48,14 +37,7 @@ from jaxbeam.model.load_set import LoadSet, WheelSet
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.output_rows import OutputRows, StaticCorrection, linear_outputs
 from jaxbeam.model.settlement import has_settlement
-from jaxbeam.numerics.peak_search import (
-    ESTIMATE_ITERATIONS,
-    NEWTON_ITERATIONS,
-    START_POINTS,
-    TIE_ROUNDING_UNITS,
-    interpolation_matrix,
-    newton_step_limit,
-)
+from jaxbeam.numerics.peak_search import interpolation_matrix
 from jaxbeam.numerics.polynomials import lagrange_coefficients
 from jaxbeam.runtime.arrays import Array, xp
 from jaxbeam.runtime.native_library import Library
@@ -64,35 +46,14 @@ PATH_NODES = NODE_COUNT + len(END_FRACTIONS)
 MIN_RUNS_TO_COMPILE = 1000  # smaller sweeps do not wait for a compiler
 # The same of a law, each of which is compiled by itself: in half a second, predictive ones in ten.
 MIN_RUNS_OF_LOOPS = 32
-PADDING = 8  # doubles in the widest vector register
-C_MACROS = {
-    "PADDING": PADDING,
-    "CHUNK_STEPS": CHUNK_STEPS,
-    "NODES": NODE_COUNT,
-    "TAYLOR_TERMS": TAYLOR_TERMS,
-    "DOUBLINGS": DOUBLINGS,
-    "PEAK_POINTS": len(PEAK_NODES),
-    "FORCE_POINTS": len(FORCE_FRACTIONS),
-    "FORCE_GAP": FORCE_GAP,
-    "ZERO_ITERATIONS": ZERO_ITERATIONS,
-    "SPREAD_FACTOR": spread_factor(),
-    "PEAK_MARGIN": PEAK_MARGIN,
-    "END_PEAK_MARGIN": (PEAK_MARGIN - 1)
-    * float(np.diff(PEAK_NODES)[0] / np.diff(PEAK_NODES).max()) ** 2,
-    "NEWTON_STEP_LIMIT": newton_step_limit(PEAK_NODES),
-    "ESTIMATE_ITERATIONS": ESTIMATE_ITERATIONS,
-    "START_POINTS": START_POINTS,
-    "NEWTON_ITERATIONS": NEWTON_ITERATIONS,
-    "TIE_TOLERANCE": TIE_ROUNDING_UNITS * sys.float_info.epsilon,
-}
 HEADERS = (
-    *("contact", "load_path", "matrices", "peak_search", "preparation", "propagators", "registers"),
-    *("step_matrices", "steps", "vehicle_layout", "vehicle_propagators", "vehicles", "workspace"),
+    *("constants", "contact", "load_path", "matrices", "peak_search", "preparation", "propagators"),
+    *("registers", "step_matrices", "steps", "vehicle_layout", "vehicle_propagators", "vehicles"),
+    "workspace",
 )
 LIBRARY = Library(
-    sources=("integrate_peaks.c", "contact.c", "preparation.c", "matrices.c"),
+    sources=("integrate_peaks.c", "contact.c", "preparation.c", "matrices.c", "processor.c"),
     headers=tuple(f"{name}.h" for name in HEADERS),
-    macros=tuple(C_MACROS.items()),
 )
 
 

@@ -1,7 +1,8 @@
-"""Optional C code: compiled when first of use, stored in the cache folder.
+"""Optional C code: that of a wheel, or compiled when first of use and stored in the cache folder.
 
-A library is named by a hash of its source, its compiler flags and the machine. Everything also runs
-without it.
+A library of the cache is named by a hash of its source, its compiler flags and the machine; one of
+a wheel (`hatch_build.py`) by a hash of the source and its architecture. Everything also runs
+without them.
 """
 
 import contextlib
@@ -28,14 +29,14 @@ from jaxbeam.runtime.cache_folder import (
     read_file,
     write_file,
 )
-from jaxbeam.runtime.trusted_code import NativeCode, loaded_library
+from jaxbeam.runtime.trusted_code import NativeCode, library_of_wheel, loaded_library
 
 LOGGER = logging.getLogger(__name__)
 C_FOLDER = pathlib.Path(__file__).parent / "native"
 # Functions that are called once are not made part of their callers: the compiler takes a third less
 # time, and the code runs as fast.
 COMPILER_FLAGS = (
-    *("-O2", "-fno-inline-functions-called-once", "-march=native", "-fno-math-errno"),
+    *("-O2", "-fno-inline-functions-called-once", "-fno-math-errno"),
     *(
         () if sys.platform == "win32" else ("-fPIC",)
     ),  # there all code is so; clang refuses the word
@@ -43,18 +44,21 @@ COMPILER_FLAGS = (
 
 
 class Library(NamedTuple):
-    """A C library: file names in C_FOLDER, and macros; or the text of its only file."""
+    """A C library: file names in C_FOLDER, or the text of its only file.
+
+    It is compiled for an architecture, as compilers name it.
+    """
 
     sources: tuple[str, ...]
     headers: tuple[str, ...]
-    macros: tuple[tuple[str, float], ...]
     text: str | None = None
+    architecture: str = "native"
 
     @property
     def compiler_flags(self) -> tuple[str, ...]:
         """Arguments of the compiler, without the sources."""
         own = () if self.text is None else ("-I", str(C_FOLDER), "-O1")
-        return (*COMPILER_FLAGS, *own, *(f"-D{name}={value}" for name, value in self.macros))
+        return (*COMPILER_FLAGS, f"-march={self.architecture}", *own)
 
     @property
     def file_name(self) -> str:
@@ -81,9 +85,9 @@ class Library(NamedTuple):
             raise RuntimeError(f"the C code cannot be stored: {error}") from None
 
     def can_be_built(self) -> bool:
-        """Whether there is a compiler, and the library never was compiled here, nor removed."""
+        """Whether there is a compiler, and no library: in the wheel, compiled here or removed."""
         try:
-            if os.path.lexists(self.library_path()):
+            if os.path.lexists(self.library_path()) or self.available():
                 return False
         except CacheError:
             return False
@@ -120,19 +124,33 @@ class Library(NamedTuple):
             raise RuntimeError(f"the C code cannot be removed: {error}") from None
 
     def available(self) -> bool:
-        """Whether the library is compiled, authentic and loadable.
+        """Whether the library is compiled, authentic and loadable, or came with the wheel.
 
         Warns of a library that is refused.
         """
         try:
             status = self.library_path().lstat()
         except (CacheError, OSError):
-            return False
+            return self.text is None and _in_wheel(C_FOLDER) is not None
         return _is_usable(self, self.library_path(), status.st_ctime_ns, status.st_size)
 
     def load(self) -> NativeCode:
         """The library; only where it is `available`."""
-        return _load(self)
+        return _load(self).code
+
+    def loaded_architecture(self) -> str:
+        """Architecture of the library; only where it is `available`.
+
+        Code that the library calls is compiled for the same one, with registers of the same width.
+        """
+        return _load(self).architecture
+
+
+class Loaded(NamedTuple):
+    """A loaded library, and the architecture that it was compiled for."""
+
+    code: NativeCode
+    architecture: str
 
 
 def find_compiler() -> str | None:
@@ -188,9 +206,34 @@ def _is_usable(library: Library, path: pathlib.Path, changed: int, size: int) ->
 
 
 @functools.cache
-def _load(library: Library) -> NativeCode:
-    """Load a library, once a process."""
-    return loaded_library(library.file_name)
+def _load(library: Library) -> Loaded:
+    """Load a library, once a process: that of the cache folder, or else of the wheel."""
+    compiled_here = True
+    with contextlib.suppress(CacheError):
+        compiled_here = os.path.lexists(library.library_path())
+    of_wheel = None if compiled_here or library.text is not None else _in_wheel(C_FOLDER)
+    return of_wheel or Loaded(loaded_library(library.file_name), library.architecture)
+
+
+@functools.cache
+def _in_wheel(folder: pathlib.Path) -> Loaded | None:
+    """The library that came with the wheel for this processor; None without one that loads."""
+    found = sorted((folder / "compiled").glob(f"{source_hash(folder)}-*"))
+    loaded = None
+    try:
+        for path in found:  # the least architecture first, whose code tells if the next runs here
+            if loaded is None or loaded.code.runs_x86_64_v3():
+                architecture = path.stem.partition("-")[2]
+                loaded = Loaded(library_of_wheel(path), architecture)
+    except OSError as error:
+        LOGGER.info("C code of the wheel not used: %s", error)
+    return loaded
+
+
+def source_hash(folder: pathlib.Path) -> str:
+    """Hash of all C files of a folder, by which wheels name what was compiled of them."""
+    texts = (path.read_bytes() for path in sorted(folder.glob("*.[ch]")))
+    return hashlib.sha256(b"".join(texts)).hexdigest()[:16]
 
 
 @functools.cache

@@ -1,13 +1,15 @@
 """The one file in which bytes become code that runs: pickles, compiled programs, C libraries.
 
-Each of these runs with the rights of the user. What is read here comes from the cache folder alone,
-after `cache_folder.read_file` has verified its owner, its mode and its HMAC. No other module of the
+Each of these runs with the rights of the user. What is read here comes from the cache folder,
+after `cache_folder.read_file` has verified its owner, its mode and its HMAC, or is a library that
+was installed with the package, as its Python code was. No other module of the
 repository unpickles, evaluates or executes what it reads, or loads a library: a test of the store
 goes through the source of all.
 """
 
 import ctypes
 import io
+import pathlib
 import pickle
 import sys
 import types
@@ -88,3 +90,8 @@ def loaded_library(name: str) -> NativeCode:
     """
     with temporary_file(private_folder(), read_file(name) or b"") as path:
         return ctypes.CDLL(path)
+
+
+def library_of_wheel(path: pathlib.Path) -> NativeCode:
+    """C library in the installed package. Raises OSError if it cannot be loaded here."""
+    return ctypes.CDLL(str(path))

@@ -170,7 +170,8 @@ class NativeLoops:
             first = self.translations[0]
             if any(one.text != first.text for one in self.translations):
                 raise NotVectorisedError("laws of several structures")
-            library = Library((), LOOP_HEADERS, (), first.text)
+            architecture = native_peaks.LIBRARY.loaded_architecture()
+            library = Library((), LOOP_HEADERS, first.text, architecture)
             if not library.available():
                 library.build()
             self.process = library.load().process_event

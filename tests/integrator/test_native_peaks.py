@@ -19,8 +19,9 @@ from numpy.testing import assert_allclose
 
 import jaxbeam as jb
 from jaxbeam.cli import main
-from jaxbeam.integrator import native_peaks
+from jaxbeam.integrator import contact_forces, native_peaks, peaks, propagators, step_matrices
 from jaxbeam.integrator.propagators import PEAK_NODES
+from jaxbeam.numerics import peak_search
 from jaxbeam.numerics.peak_search import interpolation_matrix, refine_peak
 from jaxbeam.runtime import native_library
 from jaxbeam.sweeps import blocks
@@ -235,6 +236,33 @@ def test_arguments_are_those_of_the_c_code():
     text = (native_library.C_FOLDER / "workspace.h").read_text()
     names = re.search(r"enum \{\n    MASK,\n(.*?),\n    GAUSS_NODES", text, re.DOTALL).group(1)
     assert tuple(names.lower().replace(" ", "").split(",\n")) == native_peaks.NativeInputs._fields
+
+
+def test_constants_are_those_of_the_c_code():
+    spacing = np.diff(PEAK_NODES)
+    margin = (peaks.PEAK_MARGIN - 1) * (spacing[0] / spacing.max()) ** 2  # beside an end
+    expected = {
+        "PADDING": 8,  # doubles in the widest vector register
+        "CHUNK_STEPS": step_matrices.CHUNK_STEPS,
+        "NODES": propagators.NODE_COUNT,
+        "TAYLOR_TERMS": propagators.TAYLOR_TERMS,
+        "DOUBLINGS": propagators.DOUBLINGS,
+        "PEAK_POINTS": len(PEAK_NODES),
+        "FORCE_POINTS": len(contact_forces.FORCE_FRACTIONS),
+        "FORCE_GAP": contact_forces.FORCE_GAP,
+        "ZERO_ITERATIONS": contact_forces.ZERO_ITERATIONS,
+        "SPREAD_FACTOR": contact_forces.spread_factor(),
+        "PEAK_MARGIN": peaks.PEAK_MARGIN,
+        "END_PEAK_MARGIN": margin,
+        "NEWTON_STEP_LIMIT": peak_search.newton_step_limit(PEAK_NODES),
+        "ESTIMATE_ITERATIONS": peak_search.ESTIMATE_ITERATIONS,
+        "START_POINTS": peak_search.START_POINTS,
+        "NEWTON_ITERATIONS": peak_search.NEWTON_ITERATIONS,
+        "TIE_TOLERANCE": peak_search.TIE_ROUNDING_UNITS * sys.float_info.epsilon,
+    }
+    text = (native_library.C_FOLDER / "constants.h").read_text()
+    found = {name: float(value) for name, value in re.findall(r"#define (\w+) (\S+)", text)}
+    assert found == pytest.approx(expected, rel=1e-15)
 
 
 @pytest.mark.parametrize("last", ["loads.0.speed", "beam.flexural_rigidity"])

@@ -179,7 +179,7 @@ def test_a_sweep_says_who_takes_its_steps(caplog):
 
 
 def test_a_missing_compiler_and_one_that_fails_are_told(caplog, monkeypatch):
-    library = native_library.Library((), (), (), "this is no C")
+    library = native_library.Library((), (), "this is no C")
     with caplog.at_level(logging.INFO, "jaxbeam"):
         monkeypatch.setattr(native_library, "find_compiler", lambda: None)
         assert not library.can_be_built()

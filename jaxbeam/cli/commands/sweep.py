@@ -369,9 +369,10 @@ def _contact_lines(
 
 
 def native(*, remove: bool = False, options: PrintOptions = PrintOptions()) -> None:
-    """Compile the C code of sweeps now, or say why that fails.
+    """Compile the C code of sweeps for this processor now, or say why that fails.
 
-    The first sweep of a thousand runs or more does so by itself where there is a C compiler.
+    Wheels of Linux, macOS and Windows have it compiled for most processors; elsewhere the first
+    sweep of a thousand runs or more compiles it by itself where there is a C compiler.
 
     Parameters
     ----------

@@ -139,8 +139,8 @@ static void end_slopes(Workspace *w) {
 
 /* Integrate the tasks, and write their outputs, (task, run, position) or (task, run, load); 1 if
  * there is no memory for it. */
-int integrate_peaks(int64_t max_loads, const Array *arguments, double *const *outputs,
-                    const Loop *loop) {
+EXPORTED int integrate_peaks(int64_t max_loads, const Array *arguments, double *const *outputs,
+                             const Loop *loop) {
     const int64_t *sizes[ARGUMENT_COUNT];
     for (int i = 0; i < ARGUMENT_COUNT; i++) sizes[i] = arguments[i].sizes;
     Workspace workspace = {.panels = (int)sizes[STEP_COUNTS][1],
@@ -170,9 +170,9 @@ int integrate_peaks(int64_t max_loads, const Array *arguments, double *const *ou
                            .outputs = outputs};
     Workspace *w = &workspace;
     derive_sizes(w);
-    void *memory = aligned_alloc(sizeof(Register), partition_workspace(w, 0));
+    void *memory = malloc(partition_workspace(w, 0) + sizeof(Register)); /* Windows aligns none */
     if (!memory) return 1;
-    partition_workspace(w, (uintptr_t)memory);
+    partition_workspace(w, ((uintptr_t)memory + sizeof(Register) - 1) & -sizeof(Register));
     for (int64_t task = 0; task < sizes[MASK][0]; task++) {
         set_inputs(w, arguments, task);
         if (task == 0) end_slopes(w);

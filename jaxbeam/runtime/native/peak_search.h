@@ -1,11 +1,12 @@
-/* Peak of the polynomial through the samples of a step: numerics/peak_search.py, with macros of the
- * same names for its constants. PEAK_POINTS samples include both ends; PEAK_MARGIN is that of
+/* Peak of the polynomial through the samples of a step: numerics/peak_search.py, whose constants
+ * have the same names. PEAK_POINTS samples include both ends; PEAK_MARGIN is that of
  * integrator/peaks.py, END_PEAK_MARGIN its equivalent beside an end. */
 
 #pragma once
 
 #include <math.h>
 
+#include "constants.h"
 #include "matrices.h"
 
 static inline Register polynomial(const Register *coefficients, int terms, Register x) {

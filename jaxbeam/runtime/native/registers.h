@@ -16,6 +16,11 @@ enum { REGISTER_WIDTH = 2 };
 #endif
 
 #define ALWAYS_INLINE __attribute__((always_inline))
+#if defined _WIN32
+#define EXPORTED __declspec(dllexport) /* and nothing else, not even the runtime of C */
+#else
+#define EXPORTED
+#endif
 
 typedef double Register __attribute__((vector_size(8 * REGISTER_WIDTH)));
 typedef int64_t Mask __attribute__((vector_size(8 * REGISTER_WIDTH)));

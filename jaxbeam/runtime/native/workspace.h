@@ -1,12 +1,12 @@
-/* Arguments, outputs and workspace of a call. Macros: CHUNK_STEPS (steps of a chunk), NODES (Gauss
- * nodes of a step), PEAK_POINTS (samples of a step), FORCE_POINTS (fractions at which its forces are
- * compared), SPREAD_FACTOR (of these). A last axis of nodes or samples is padded to a
- * multiple of PADDING. */
+/* Arguments, outputs and workspace of a call. CHUNK_STEPS are steps of a chunk, NODES Gauss nodes of
+ * a step, PEAK_POINTS its samples, FORCE_POINTS fractions at which its forces are compared. A last
+ * axis of nodes or samples is padded to a multiple of PADDING. */
 
 #pragma once
 
 #include <math.h>
 
+#include "constants.h"
 #include "registers.h"
 
 enum { PADDED_NODES = (NODES + PADDING - 1) / PADDING * PADDING };
