@@ -170,13 +170,13 @@ def _holds_traced(leaf) -> bool:
 def refuses_traced(what: str, instead: str = OUTSIDE) -> Callable[[F], F]:
     """Decorator of functions whose arguments must be known, for `what` they return."""
 
-    def decorated(function):
+    def decorated(function: F) -> F:
         @functools.wraps(function)
         def of_known(*args, **kwargs):
             refuse_traced(what, instead, args, kwargs)
             return function(*args, **kwargs)
 
-        return of_known
+        return typing.cast(F, of_known)
 
     return decorated
 

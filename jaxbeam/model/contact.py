@@ -352,8 +352,9 @@ def _mass_rows(
     model, motion, inertia, springs, eccentricity=None
 ) -> tuple[ContactRows, SurfaceRows]:
     """Contact law of the masses (kg) alone, and the rows of the surface under the wheels."""
-    position, *_, active = motion
-    rows = surface_rows(model, *motion, springs, eccentricity=eccentricity)
+    position, speed, acceleration, active = motion
+    kinematics = position, speed, acceleration
+    rows = surface_rows(model, *kinematics, active, springs, eccentricity=eccentricity)
     shape = rows.shape.reshape(*position.shape, model.mode_count)
     of_acceleration = rows.acceleration.reshape(*position.shape, model.state_count)
     mass = xp.where(active, inertia, 0.0)

@@ -121,8 +121,9 @@ def record_envelope(
     leaves = jax.tree.leaves(numbers)
     if positions is None and any_traced(leaves) and all(map(is_concrete, leaves)):
         # Those of the known numbers, at which the extremes are differentiated.
-        *plain, others = jax.tree.map(lambda n: concrete(n) if any_traced(n) else n, numbers)
-        positions = record_envelope(*plain, quantity, None, *others).positions
+        plain = jax.tree.map(lambda n: concrete(n) if any_traced(n) else n, numbers)
+        places = dict(zip(("fibre_distance", "section_modulus"), plain[4], strict=True))
+        positions = record_envelope(*plain[:4], quantity, **places).positions
     if positions is not None:
         return at(xp.asarray(positions, float))
     return refined(case, at, curves)[1]
