@@ -122,8 +122,9 @@ def record_envelope(
     if positions is None and any_traced(leaves) and all(map(is_concrete, leaves)):
         # Those of the known numbers, at which the extremes are differentiated.
         plain = jax.tree.map(lambda n: concrete(n) if any_traced(n) else n, numbers)
-        places = dict(zip(("fibre_distance", "section_modulus"), plain[4], strict=True))
-        positions = record_envelope(*plain[:4], quantity, **places).positions
+        own_case, own_modes, own_motion, own_times, (fibre, modulus) = plain
+        run = own_case, own_modes, own_motion, own_times
+        positions = record_envelope(*run, quantity, None, fibre, modulus).positions
     if positions is not None:
         return at(xp.asarray(positions, float))
     return refined(case, at, curves)[1]
