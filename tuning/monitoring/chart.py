@@ -26,6 +26,7 @@ MIN_FREE = 10  # logs more than coefficients, which a regression needs
 CLIPPED = 3.0  # deviations; a log that is farther off is an outlier, not a change
 OUTLIER = 4.0  # robust deviations, beyond which a log is left out of the regression
 MAX_ROUNDS = 5
+LEAST_CHANCE = 1e-300  # of a statistic, whose quantile would be infinite below
 CONFIDENCE = 0.95
 
 
@@ -227,6 +228,7 @@ def _statistic(
         part = correlation[np.ix_(ready, ready)]
         # Of fewer modes than all, as a quantile of as many.
         chance = scipy.stats.f.sf(*_as_f(scaled @ np.linalg.solve(part, scaled), part, least))
+        chance = max(float(chance), LEAST_CHANCE)
         statistic[log] = scipy.stats.f.isf(chance, count, max(least - count + 1, 1))
         statistic[log] *= _factor(count, least)
     limit = _factor(count, least) * scipy.stats.f.isf(

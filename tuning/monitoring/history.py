@@ -119,14 +119,16 @@ def analyse(
     `tuning.identify_modes`. Logs that cannot be analysed have an entry with the reason. More than
     one of the `processes` need a program whose main module may be imported.
 
-    Raises FileNotFoundError without the folder or without a log in it, ValueError for a store of
-    other settings.
+    Raises FileNotFoundError without the folder, that of the store, or a log, ValueError for a store
+    of other settings.
     """
     folder, store = Path(folder), Path(store)
     settings = {"pattern": pattern, "band": None if band is None else list(band)}
     settings |= {"method": method, "channels": None if channels is None else list(channels)}
     settings |= {"columns": columns, "rate": rate, "order": order}
     files = logs_in(folder, pattern, store)
+    if not store.parent.is_dir():
+        raise FileNotFoundError(f"there is no folder {store.parent} to write {store.name} to")
     known: dict[str, LogModes] = {}
     if store.exists():
         former = read_history(store)
@@ -234,10 +236,10 @@ def entry_of(path: Path, settings: Mapping[str, Any]) -> LogModes:
     )
 
 
-def with_conditions(history: ModeHistory, path: str | os.PathLike) -> ModeHistory:
-    """The history with conditions from a CSV table: names of files, then a column for each.
+def read_conditions(path: str | os.PathLike) -> dict[str, dict[str, float]]:
+    """Conditions by the name of a log, from a CSV table: names, then a column for each condition.
 
-    Raises ValueError for a table without the name of a log, and for cells that are no numbers.
+    Raises ValueError for a table without columns or rows, and for cells that are no numbers.
     """
     rows = list(csv.reader(read_text_input(path, "table of conditions").splitlines()))
     head, *body = [row for row in rows if row] or [[]]
@@ -252,8 +254,16 @@ def with_conditions(history: ModeHistory, path: str | os.PathLike) -> ModeHistor
         if len(values) != len(head) - 1:
             raise ValueError(f"{path}, line {number}: it has {len(row)} cells, not {len(head)}")
         known[Path(row[0].strip()).name] = dict(zip(map(str.strip, head[1:]), values, strict=True))
+    return known
+
+
+def with_conditions(history: ModeHistory, known: Mapping[str, Mapping[str, float]]) -> ModeHistory:
+    """The history with conditions, by the names of logs, beside those of the logs themselves.
+
+    Raises ValueError if they are those of none of its logs.
+    """
     if not any(entry.file in known for entry in history.entries):
-        raise ValueError(f"{path}: it names no log of the folder in its first column")
+        raise ValueError("the table of conditions names no log of the folder in its first column")
     entries = tuple(
         entry._replace(conditions={**entry.conditions, **known.get(entry.file, {})})
         for entry in history.entries

@@ -2,15 +2,14 @@
 
 import dataclasses
 import os
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from jaxbeam.runtime.printer import TableViews, text_table
 from tuning.monitoring.chart import ControlChart, chart_of
-from tuning.monitoring.history import ModeHistory, analyse, with_conditions
+from tuning.monitoring.history import ModeHistory, analyse, read_conditions, with_conditions
 from tuning.monitoring.tracks import ModeTrack, tracks_of
 
 BASELINE = 50  # logs
@@ -42,7 +41,7 @@ class Monitoring(TableViews):
         if not self.tracks:
             return f"no mode is found in enough of {len(entries)} logs to be followed"
         followed = f"{len(self.tracks)} mode{'s' * (len(self.tracks) > 1)} followed in"
-        followed = f"{followed} {len(entries)} logs"
+        followed = "; ".join([f"{followed} {len(entries)} logs", *self.come_and_gone])
         if chart is None:
             return (
                 f"{followed}; no control chart: no mode is in enough of the first {self.baseline}"
@@ -66,6 +65,18 @@ class Monitoring(TableViews):
             f"{followed}; no alarm in the last of {after} logs after the baseline of"
             f" {self.baseline}; {passing} passed, {expected:.1f} are expected without a change"
         )
+
+    @property
+    def come_and_gone(self) -> list[str]:
+        """Sentences on modes that ended or began after the baseline, as by a large change."""
+        files = [entry.file for entry in self.history.entries]
+        found = []
+        for track in self.tracks:
+            if track.ended and track.last >= self.baseline:
+                found.append(f"{_frequency(track):.4g} Hz is not found after {files[track.last]}")
+            if track.born >= self.baseline:
+                found.append(f"{_frequency(track):.4g} Hz is found since {files[track.born]} only")
+        return [f"ALARM: {', '.join(found)}"] if found else []
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
@@ -116,7 +127,8 @@ class Monitoring(TableViews):
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for JSON: the verdict, alarms, effects of conditions, the rows."""
         chart, files = self.chart, [entry.file for entry in self.history.entries]
-        content: dict[str, Any] = {"verdict": self.verdict, "columns": self.columns}
+        content: dict[str, Any] = {"verdict": self.verdict, "come_and_gone": self.come_and_gone}
+        content["columns"] = self.columns
         if chart is not None:
             content |= {
                 "limit": chart.limit,
@@ -190,6 +202,7 @@ def monitor(
     """
     if baseline < 2:
         raise ValueError(f"the baseline must be 2 logs at least, not {baseline}")
+    known = None if conditions is None else read_conditions(conditions)  # before any work
     history = analyse(
         folder,
         store,
@@ -203,18 +216,20 @@ def monitor(
         processes=processes,
         progress=progress,
     )
-    return monitored(history, conditions, baseline)
+    return monitored(history, known, baseline)
 
 
 def monitored(
-    history: ModeHistory, conditions: str | os.PathLike | None = None, baseline: int = BASELINE
+    history: ModeHistory,
+    conditions: Mapping[str, Mapping[str, float]] | None = None,
+    baseline: int = BASELINE,
 ) -> Monitoring:
-    """Tracks and control chart of a history of modes; see `monitor`.
+    """Tracks and control chart of a history of modes, and of conditions by the names of logs.
 
-    Raises ValueError for a table of conditions that names no log.
+    See `monitor`. Raises ValueError for conditions of none of its logs.
     """
     if conditions is not None:
-        history = with_conditions(history, Path(conditions))
+        history = with_conditions(history, conditions)
     tracks = tuple(tracks_of(history.entries))
     chart = chart_of(tracks, [entry.conditions for entry in history.entries], baseline)
     return Monitoring(history, tracks, chart, baseline)

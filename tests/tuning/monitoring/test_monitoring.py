@@ -13,8 +13,14 @@ import pytest
 import scipy.signal
 from numpy.testing import assert_allclose
 
-from tuning.monitoring.history import LogModes, ModeHistory, analyse, read_history
-from tuning.monitoring.monitor import monitored
+from tuning.monitoring.history import (
+    LogModes,
+    ModeHistory,
+    analyse,
+    read_conditions,
+    read_history,
+)
+from tuning.monitoring.monitor import monitor, monitored
 from tuning.monitoring.tracks import tracks_of
 
 FREQUENCIES = np.array([2.1, 5.9, 6.4])  # Hz
@@ -68,6 +74,20 @@ def test_a_loss_of_rigidity_of_one_per_cent_is_found(seed):
     for value, half in found.chart.change(found.chart.since):
         assert value == pytest.approx(np.sqrt(0.99) - 1, abs=1.6 * half) and half < 2e-3
     assert f"ALARM since {found.chart.since:03d}.csv" in found.verdict
+
+
+def test_a_large_change_has_a_finite_statistic():
+    found = monitored(history(2, loss=0.08, missing=0.5), baseline=100)
+    known = found.chart.statistic[~np.isnan(found.chart.statistic)]
+    assert found.chart.since in (150, 151, 152) and np.all(np.isfinite(known))
+
+
+def test_modes_that_jump_farther_than_they_are_followed_are_an_alarm():
+    found = monitored(history(2, loss=0.4, missing=0.0), baseline=100)
+    assert len(found.come_and_gone) == 1 and "ALARM: " in found.verdict
+    assert found.come_and_gone[0].count("is not found after 149.csv") == 3
+    assert found.come_and_gone[0].count("is found since 150.csv only") == 3
+    assert monitored(history(2), baseline=100).come_and_gone == []
 
 
 def test_intervals_of_a_change_hold():
@@ -150,7 +170,13 @@ def test_only_new_logs_are_analysed(logs, tmp_path, monkeypatch):
         read_history(tmp_path / "other.json")
     (tmp_path / "table.csv").write_text("log,rain\nunknown.csv,1\n")
     with pytest.raises(ValueError, match="names no log of the folder"):
-        monitored(found, tmp_path / "table.csv")
+        monitored(found, read_conditions(tmp_path / "table.csv"))
+    (tmp_path / "table.csv").write_text("log,rain\nlog1.csv,much\n")
+    with pytest.raises(ValueError, match="line 2: a condition is no number"):
+        monitor(logs, tmp_path / "unwritten.json", conditions=tmp_path / "table.csv")
+    assert not (tmp_path / "unwritten.json").exists()  # before any work
+    with pytest.raises(FileNotFoundError, match="there is no folder .*nowhere to write"):
+        monitor(logs, tmp_path / "nowhere" / "modes.json")
 
 
 @pytest.mark.parametrize("seed", [0])
