@@ -1,7 +1,6 @@
 """Record of one simulated run: histories, section forces, peaks, error; as xarray and netCDF."""
 
 import enum
-import functools
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -114,7 +113,7 @@ class Record(RecordViews):
     result: Int[Array, ""] | None = None
     flights: Flights | None = None
 
-    @functools.cached_property
+    @property
     def loads(self) -> LoadSet:
         """Wheels and vehicles of the loads of the case, the absorbers behind them."""
         return load_set(self.case)

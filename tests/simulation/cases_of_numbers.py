@@ -482,7 +482,27 @@ JUMPING = {
     f"{part} jump": (JUMPS_OF_ALL, f"{part}.")
     for part in ("sensors", "vehicle_sensors", "controller")
 }
+BOX = dict(torsional_rigidity=4.0, polar_inertia=2e-4)
+TWISTING = [jb.Sensor(0.25, "twist"), jb.Sensor(0.35, "torque"), SENSOR]
+TORSION = {
+    "eccentric loads": rig(
+        [
+            changed("mass", eccentricity=0.02),
+            jb.MovingForce(force=3.0, speed=2.4, eccentricity=-0.01),
+            changed("axles", eccentricity=0.015),
+        ],
+        beam=jb.Beam(0.6, 11.68, 0.535, 0.03, **BOX, modes=4),
+        sensors=TWISTING,
+    ),
+    "an eccentric beam on springs": rig(
+        [jb.MovingForce(force=3.0, speed=2.4, eccentricity=-0.01)],
+        beam=jb.Beam(0.6, 11.68, 0.535, 0.03, **BOX, mass_eccentricity=5e-3, modes=4),
+        supports=[jb.Support(0.31, stiffness=500.0, torsional_stiffness=20.0)],
+        sensors=TWISTING,
+    ),
+}
 CASES: dict[str, tuple[jb.Case, str | tuple[str, ...]]] = {
+    **{name: (case, ("beam.", "supports.", "loads.")) for name, case in TORSION.items()},
     **{name: (case, "beam.") for name, case in OF_BEAM.items()},
     "supports": (SUPPORTS, "supports."),
     "absorbers": (ABSORBERS, "absorbers."),

@@ -29,6 +29,7 @@ MORE_EXACT = (
 # Their answers are those at a tolerance of 1e-12: 0.2.0 chose steps by another error of peaks
 # between them, too small for the mass on a ramp (1.2e-8 in its peak), too large for the half car.
 OTHER_STEPS = ("a mass on a ramp", "a half car")
+LATER = ("eccentric masses",)  # what 0.2.0 had not
 SAMPLES = 3  # of each history that is kept
 LOOP_NAMES = (
     "feedback",
@@ -54,7 +55,7 @@ def _quarter(speed=30.0, **others):
 
 
 CASES = {
-    **{f"open: {name}": case for name, case in OPEN.items()},
+    **{f"open: {name}": case for name, case in OPEN.items() if name not in LATER},
     **{
         f"law: {name}": dataclasses.replace(CONTROLLED, controller=law)
         for name, law in LAWS.items()
