@@ -40,7 +40,7 @@ TABLE_FILE = Path(__file__).parents[2] / "docs" / "_static" / "modal_methods.md"
 EXCITATIONS_FILE = TABLE_FILE.with_name("modal_excitations.md")
 EXCITATIONS = ("motor", "shaken", "impacts", "decay", "1 impact", "10 impacts", "random force")
 JAXBEAM = "jaxbeam, by itself"
-METHODS = ("covariance", "data", "plscf")
+METHODS = ("covariance", "data")
 PYOMA = "pyOMA-2, SSI-COV"
 HEADER = (
     "method", "strong modes found", "of those stable in pyOMA-2", "error of frequency, median",

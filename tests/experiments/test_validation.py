@@ -236,7 +236,7 @@ def test_a_dip_within_the_errors_may_be_taken_for_the_loss():
 def test_both_programs_find_the_modes_of_a_structure():
     pytest.importorskip("pyoma2")
     planted = sampled(small_structure(0), "ambient", 0, 100.0)
-    found = {PYOMA: [pyoma(planted)], "plscf": [ours(planted, "plscf")]}
+    found = {PYOMA: [pyoma(planted)], "covariance": [ours(planted, "covariance")]}
     for (one,) in found.values():
         assert np.all(np.abs(one.errors) < [0.01, 0.5])
     result = table([planted], found)

@@ -10,7 +10,7 @@ from tuning.modal.result import IdentifiedMode
 
 KINDS = ("free decay", "ambient")
 DECAY = "decay"  # the method for free decays; the others are for responses to broadband forces
-METHODS = (DECAY, "covariance", "data", "plscf")
+METHODS = (DECAY, "covariance", "data", "plscf")  # the last is for measured forces
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def check_method(kind: str | None, method: str | None) -> None:
     if method == "fdd":
         raise ValueError(
             "method 'fdd' is gone: other methods find more modes and smaller errors of damping; "
-            "use 'covariance' or 'plscf'"
+            "use 'covariance' or 'data'"
         )
     if method not in (None, *METHODS):
         raise ValueError(f"method must be {' or '.join(map(repr, METHODS))}, not {method!r}")
@@ -108,6 +108,11 @@ def check_method(kind: str | None, method: str | None) -> None:
         raise ValueError(
             f"method {method!r} takes a log for the response to broadband excitation; for kind "
             "'free decay' leave the method out"
+        )
+    if kind == "ambient" and method == "plscf":
+        raise ValueError(
+            "method 'plscf' fits the responses to measured forces; for kind 'ambient' use "
+            "'covariance' or 'data'"
         )
     if kind == "ambient" and method == DECAY:
         raise ValueError("method 'decay' fits free decays; for kind 'ambient' leave the method out")

@@ -6,7 +6,7 @@
 
 The excitation is recognised: free decays, after one impact or many or after a load has left the
 beam, are fitted together by poles (`decay.poles`), starting from those of a subspace method; all
-else is a response to ambient excitation (`ambient`, or from spectra: `spectral`). Harmonic lines
+else is a response to ambient excitation (`ambient`). Harmonic lines
 are subtracted. Modes that the log determines well are the result; others are listed with the reason
 for rejecting them.
 """
@@ -48,7 +48,6 @@ from tuning.modal.impacts.whole_log import (
     modes_after_unseen_impacts,
     modes_of_decays,
 )
-from tuning.modal.plscf import plscf_modes
 from tuning.modal.preprocessing import (
     Samples,
     energy_band,
@@ -82,11 +81,10 @@ def identify_modes(
     `window` (s) is the part of the log to use; `band` (Hz) the range of frequencies, by default
     that of the resonances with most kinetic energy; `kind` is "free decay" or "ambient", by default
     decided from the log; `method` is "decay" (poles of free decays), "covariance" or "data"
-    (subspace identification) or "plscf" (poly-reference least-squares complex frequency), of which
-    all but the first take a log for the response to broadband excitation; where forces were
-    measured, "plscf" fits the responses to them, and is the default. `channels` are the names of
-    those to use. `settings` tell what else may be chosen. `progress` is called with a few words on
-    what is being done.
+    (subspace identification), which take a log for the response to broadband excitation; where
+    forces were measured, "plscf" (poly-reference least-squares complex frequency) fits the
+    responses to them, and is the default. `channels` are the names of those to use. `settings` tell
+    what else may be chosen. `progress` is called with a few words on what is being done.
 
     Raises ValueError for a log without evenly sampled records, or too short, a window outside the
     log, a band above half the sampling rate, unknown channels, kinds and methods, a kind or forces
@@ -115,6 +113,11 @@ def identify_modes(
     logs, dead = without_constant([without_forces(with_channels(one, channels)) for one in logs])
     if not forces and force_window is not None:
         raise ValueError(f"{logs[0].source}: a force window is for measured forces; none is in N")
+    if not forces and method == "plscf":
+        raise ValueError(
+            f"{logs[0].source}: method 'plscf' fits the responses to measured forces, and none is "
+            "in N; without them use 'covariance' or 'data'"
+        )
     samples = samples_of(logs, window).with_notes(dead)
     check_band(logs[0], samples.rate, band)
     choices = _together(logs)
@@ -189,7 +192,7 @@ def identify_modes(
         says = _kind_words(found, excited, lines)
         choices.append(Choice(says, "--kind ambient, --kind 'free decay', --from and --to"))
     if method is None:
-        choices.append(Choice(f"method {used_method}", f"--method {', '.join(METHODS)}"))
+        choices.append(Choice(f"method {used_method}", f"--method {', '.join(METHODS[:-1])}"))
     _add_order(choices, order, found)
     choices = [*_band_choice(band, used_band), *choices]
     return _result(logs, samples, found, used_band, lines, choices, used_method, settings)
@@ -245,8 +248,6 @@ def _forced(samples: Samples, driving, band, order, progress) -> tuple[_Found, f
 def _ambient_modes(cleaned, samples: Samples, band, method, order, progress) -> _Found:
     """What a method for ambient excitation finds in records without harmonic lines."""
     arguments = (cleaned, samples.starts, samples.rate, band)
-    if method == "plscf":
-        return _Found(*plscf_modes(*arguments, order=order, progress=progress), None)
     data_driven = method == "data"
     found = subspace_modes(*arguments, data_driven=data_driven, order=order, progress=progress)
     return _Found(*found, None)

@@ -79,8 +79,8 @@ def modes_from_log(
         Highest order of the models of the stabilisation diagram.
     method
         decay: poles of free decays; for all else covariance or data: stochastic subspace
-        identification, covariance- or data-driven; plscf: poly-reference least-squares complex
-        frequency (p-LSCF).
+        identification, covariance- or data-driven; plscf, for measured forces: poly-reference
+        least-squares complex frequency (p-LSCF).
     references
         NAME,NAME,...: channels that stay at their places in all logs, while sensors of the same
         names move; by default channels of one name are one place, if positions do not differ.

@@ -338,7 +338,6 @@ def test_mistakes(arguments, message):
         ),
         (100, {"order": 60}, r"models of order 60 \(lower ones need fewer\): at least 124"),
         (100, {"order": 60, "method": "data"}, "too few for models of order 60"),
-        (70, {"method": "plscf"}, "too few for method 'plscf': at least 96"),
     ],
 )
 def test_logs_too_short_for_a_method(count, arguments, message):
