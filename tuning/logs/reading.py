@@ -29,6 +29,7 @@ import dataclasses
 import difflib
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,9 @@ from tuning.logs.readers import LogTable, is_time_name, read_tables
 from tuning.logs.readers.table import shown
 from tuning.logs.units import UNITS, UNITS_OF_CONDITIONS, is_unit, transducer_unit, unit
 
+EPOCH, LATEST = 3e8, 1e10  # s since 1970: times of so much are dates, from 1979 on
+EPOCH_START, WORKBOOK_DAYS = datetime(1970, 1, 1, tzinfo=UTC), 25569  # days from 1899-12-30 to it
+EPOCHS = {"ns": 3e17, "us": 3e14, "ms": 3e11, "s": EPOCH}  # likewise, in the unit that it tells
 MAX_TEXT = 120  # characters of the name or the unit of a column, as messages quote it
 
 
@@ -158,6 +162,7 @@ def _make_log(
     path, run, table: LogTable, description: LogDescription, columns, units, time, missing
 ) -> tuple[Log, list[str]]:
     """Log of one run, in SI units, and what its user must know."""
+    table = _without_repeats(table)
     names = _check_names(path, table.names)
     time_column = _time_column(path, table, time or description.time)
     channels = list(
@@ -193,6 +198,14 @@ def _make_log(
         kept = [i for i in range(len(column_units)) if i not in clocks]
         values, column_units = values[:, kept], [column_units[i] for i in kept]
         channels = [channels[i - 1] for i in kept[1:]]
+    began, factor = table.start, column_units[0][1].factor
+    if (
+        len(values) and EPOCH < factor * values[0, 0] < LATEST
+    ):  # a date, by the seconds since 1970, or days of workbooks
+        origin = WORKBOOK_DAYS * 86400.0 if column_units[0][0] == "d" else 0.0
+        moment = EPOCH_START + timedelta(seconds=float(factor * values[0, 0]) - origin)
+        began = began or moment.isoformat(timespec="milliseconds")
+        values[:, 0] -= values[0, 0]
     with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is looked for below
         values = values * np.array([unit.factor for _, unit in column_units])
     valid, notes = np.isfinite(values), [*table.notes]
@@ -228,10 +241,26 @@ def _make_log(
         loads=description.loads_of(run),
         valid=valid[:, 1:],
         notes=(*notes, *said),
-        start=table.start,
+        start=began,
         conditions=tuple(conditions.items()),
     )
     return log, said
+
+
+def _without_repeats(table: LogTable) -> LogTable:
+    """The table without rows that are those before once more, with a warning."""
+    values = table.values
+    same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
+    again = np.flatnonzero(same.all(axis=1)) + 1
+    if not again.size or values.shape[1] < 2:
+        return table
+    lines = None if table.lines is None else np.delete(table.lines, again)
+    where = "" if table.lines is None else f", the first in line {table.lines[again[0]]}"
+    said = f"{again.size} rows are those before them once more and left out{where}"
+    return dataclasses.replace(
+        table, values=np.delete(values, again, axis=0), lines=lines,
+        warnings=(*table.warnings, said),
+    )  # fmt: skip
 
 
 def _no_channels(
@@ -239,13 +268,14 @@ def _no_channels(
 ) -> list[str]:
     """Columns whose units are unknown, as those of temperatures, and of no description.
 
-    None where no channel would be left: then a unit is misspelt.
+    Columns without a unit are none as well, where others have one. None where no channel would be
+    left: then a unit is misspelt.
     """
     units = dict(zip(table.names, table.units, strict=True))
     unknown = [
         name
         for name in channels
-        if units[name] and not is_unit(str(units[name])) and not description.unit(name)
+        if not is_unit(str(units[name] or "")) and not description.unit(name)
     ]
     return unknown if len(unknown) < len(channels) else []
 
@@ -253,8 +283,10 @@ def _no_channels(
 def _left_out(table: LogTable, names: Sequence[str]) -> Iterator[str]:
     """Sentences on columns that are no channels, of units that are not those of conditions."""
     for name in names:
-        text = str(table.units[table.names.index(name)])
-        if text not in UNITS_OF_CONDITIONS:
+        text = table.units[table.names.index(name)]
+        if not text:
+            yield f"column {name!r} is no channel, having no unit; write it in the heading"
+        elif text not in UNITS_OF_CONDITIONS:
             try:
                 unit(text)
             except ValueError as error:
@@ -268,7 +300,8 @@ def _conditions(table: LogTable, names: Sequence[str]) -> dict[str, float]:
         i = table.names.index(name)
         finite = table.values[np.isfinite(table.values[:, i]), i]
         if finite.size:
-            found[f"{name} ({table.units[i]})"] = float(finite.mean())
+            unit_of = f" ({table.units[i]})" if table.units[i] else ""
+            found[f"{name}{unit_of}"] = float(finite.mean())
     return found
 
 
@@ -333,8 +366,11 @@ def _unit_of(
     """Unit of a column, as text and as `Unit`; an error names the `example` of one."""
     in_file = table.units[table.names.index(name)]
     text = declared.get(name) or description.unit(name) or in_file
-    if not text and table.lines is None and is_time_name(name):
-        text = "s"  # as variables of numerical programs have it; `doubts` looks at the steps
+    if not text and is_time_name(name):
+        first = float(table.values[0, table.names.index(name)]) if len(table.values) else 0.0
+        text = next((u for u, least in EPOCHS.items() if first > least), None)
+        # As variables of numerical programs have it; `doubts` looks at the steps.
+        text = text or ("s" if table.lines is None else None)
     if not text:
         raise ValueError(
             f"{path}, column {name!r}: no unit found; write it in the heading, {name} [{example}], "

@@ -26,6 +26,7 @@ UNITS = {
     "s": Unit("s", 1.0, "time"),
     "ms": Unit("s", 1e-3, "time"),
     "us": Unit("s", 1e-6, "time"),
+    "ns": Unit("s", 1e-9, "time"),
     "min": Unit("s", 60.0, "time"),
     "h": Unit("s", 3600.0, "time"),
     "d": Unit("s", 86400.0, "time"),
@@ -52,6 +53,9 @@ UNITS = {
     "kN": Unit("N", 1e3, "force"),
     "V": Unit("V", 1.0, "voltage"),
     "mV": Unit("V", 1e-3, "voltage"),
+    "mV/V": Unit("1", 1e-3, "voltage ratio"),  # of bridges of strain gauges, over their supply
+    "V/V": Unit("1", 1.0, "voltage ratio"),
+    "counts": Unit("1", 1.0, "counts"),  # of a converter
 }
 for _name, _quantity in QUANTITIES.items():
     UNITS.setdefault(_quantity.unit, Unit(_quantity.unit, 1.0, _name))
@@ -64,6 +68,7 @@ _SPELLINGS = {
     **dict.fromkeys(("mins", "minutes", "minute", "Minuten"), "min"),
     **dict.fromkeys(("hr", "hrs", "hours", "hour", "Stunden"), "h"),
     **dict.fromkeys(("days", "day", "Tage"), "d"),
+    **dict.fromkeys(("count", "Counts", "cts", "LSB", "digits", "digit"), "counts"),
     "inch": "in",
     "g_n": "g",
     "°": "deg",
@@ -97,8 +102,9 @@ def unit(text: str) -> Unit:
 
 # Of columns beside the channels: temperature, humidity, pressure, light, wind, speed, current.
 UNITS_OF_CONDITIONS = frozenset(
-    ["°C", "degC", "C", "°F", "degF", "K", "%", "%RH", "hPa", "mbar", "bar", "kPa"]
-    + ["lx", "lux", "W/m^2", "W/m²", "km/h", "mph", "rpm", "1/min", "A", "mA", "Hz", "°"]
+    ["°C", "ºC", "℃", "degC", "DegC", "Deg C", "deg C", "C", "Celsius", "°F", "degF", "Deg F"]
+    + ["K", "%", "%RH", "hPa", "mbar", "bar", "kPa", "lx", "lux", "W/m^2", "W/m²", "km/h", "mph"]
+    + ["rpm", "1/min", "A", "mA", "Hz", "°"]
 )
 
 
@@ -112,7 +118,8 @@ def is_unit(text: str) -> bool:
 
 
 _SENSITIVITY = re.compile(
-    r"\s*(?P<size>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<out>[^\s/]+)\s*/(?P<of>.+)"
+    r"\s*(?P<size>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*"
+    r"\(?(?P<out>mV/V|V/V|[^\s/()]+)\)?\s*/(?P<of>.+)"
 )
 
 

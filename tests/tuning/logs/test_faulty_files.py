@@ -5,6 +5,8 @@ The right values are those of the functions of which the files are samples.
 
 import re
 import warnings
+import zoneinfo
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
@@ -140,6 +142,17 @@ def universal_file(path, count=3, starts=(0.0, 0.0, 0.0), binary=True):
         pyuff.UFF(str(path)).write_sets(function, mode="add" if i else "overwrite")
 
 
+def test_a_universal_file_with_exponents_of_fortran(tmp_path):
+    path = tmp_path / "run.uff"
+    universal_file(path, binary=False)
+    text, times = path.read_text(), read_log(path).times
+    path.write_text(re.sub(r"(?<=\d)[eE](?=[-+]\d\d)", "D", text))
+    assert path.read_text().count("D-01") > 100
+    log = read_log(path)
+    np.testing.assert_array_equal(log.times, times)
+    np.testing.assert_allclose(1e3 * log.values[:, 1], 2 * signal(TIMES), atol=1e-5)
+
+
 @pytest.mark.parametrize("binary", [True, False])
 def test_a_universal_file_that_is_cut_off_names_the_channel(tmp_path, binary):
     path = tmp_path / "run.uff"
@@ -242,12 +255,18 @@ def test_units_as_quotients_and_in_words(tmp_path):
     ("times", "said"),
     [
         (np.where(TIMES < 1, TIMES, TIMES - 0.5), "line 202: time 0.5 s comes after 0.995 s"),
-        (np.where(TIMES[7] == TIMES, TIMES[6], TIMES), "line 9: time 0.03 s is repeated"),
+        (np.where(TIMES[7] == TIMES, TIMES[6] + 1e-8, TIMES), "line 9: time 0.03 s is repeated"),
     ],
 )
 def test_times_that_go_back_or_stand_are_refused(tmp_path, times, said):
     with pytest.raises(ValueError, match=rf"run.csv, {said}"):
-        read_log(csv(tmp_path / "run.csv", times))
+        read_log(csv(tmp_path / "run.csv", times, form="{:.6f},{:.12f}\n"))
+
+
+def test_rows_that_are_written_twice_are_left_out(tmp_path):
+    path = csv(tmp_path / "run.csv", np.repeat(TIMES, np.where(np.arange(400) % 150 == 7, 2, 1)))
+    log = read_warned(path, "3 rows are those before them once more and left out, .* in line 10")
+    np.testing.assert_allclose(log.times, TIMES, atol=1e-9)
 
 
 def test_rates_in_kilohertz_are_told(tmp_path):
@@ -444,12 +463,157 @@ def test_dates_and_times_are_seconds_from_the_first_sample(tmp_path, form, separ
     assert log.start.startswith(("2024-05-14T23:59:59", "23:59:59.000"))
 
 
+def stamps_of(moments, form):
+    return [moment.strftime(form) for moment in moments]
+
+
+SET = [
+    datetime(2024, 10, 27, 0, 59, 59, tzinfo=UTC) + timedelta(seconds=STEP * i) for i in range(400)
+]
+BERLIN = [moment.astimezone(zoneinfo.ZoneInfo("Europe/Berlin")) for moment in SET]
+SPRING = [(moment - timedelta(days=210)).astimezone(BERLIN[0].tzinfo) for moment in SET]
+NIGHT = [datetime(2024, 5, 4, 23, 59, 59) + timedelta(seconds=STEP * i) for i in range(400)]
+EPOCHS = [1.7e9 + STEP * i for i in range(400)]
+TIME_CELLS = {  # of the same samples, by what is special of them
+    "a.m. and p.m. by points": [
+        f"{t:%I:%M:%S.%f} {'a.m.' if t.hour < 12 else 'p.m.'}"
+        for t in (moment - timedelta(hours=12) for moment in NIGHT)
+    ],
+    "names of months": stamps_of(NIGHT, "%d-%b-%Y %H:%M:%S.%f"),
+    "names of zones, and the clock is set": [
+        f"{t:%Y-%m-%d %H:%M:%S.%f} {t.tzname()}" for t in BERLIN
+    ],
+    "offsets of zones, and the clock is set": [t.isoformat() for t in BERLIN],
+    "day first, told by midnight alone": stamps_of(NIGHT, "%d/%m/%Y %H:%M:%S.%f"),
+    "month first, told by midnight alone": stamps_of(NIGHT, "%m/%d/%Y %H:%M:%S.%f"),
+    "seconds since 1970": [f"{t:.3f}" for t in EPOCHS],
+    "milliseconds since 1970": [f"{1e3 * t:.0f}" for t in EPOCHS],
+    "nanoseconds since 1970": [f"{round(1e3 * t)}000000" for t in EPOCHS],
+}
+
+
+@pytest.mark.parametrize("kind", TIME_CELLS)
+def test_times_are_those_of_the_clock(tmp_path, kind):
+    rows = [f"{cell},{signal(t):.6f}" for cell, t in zip(TIME_CELLS[kind], TIMES, strict=True)]
+    (tmp_path / "run.csv").write_text("Time,w [mm]\n" + "\n".join(rows) + "\n")
+    log = read_log(tmp_path / "run.csv")
+    np.testing.assert_allclose(log.times, TIMES, atol=3e-7)  # of doubles of 1.7e18 ns
+    np.testing.assert_allclose(1e3 * log.values[:, 0], signal(TIMES), atol=1e-6)
+    year = (
+        "2023-11-14T22:13:20" if "1970" in kind else "2024-" if "a.m." not in kind else "11:59:59"
+    )
+    assert log.start.startswith(year)
+
+
+@pytest.mark.parametrize(("moments", "way"), [(BERLIN, "back"), (SPRING, "forward")])
+def test_a_clock_that_is_set_by_an_hour_goes_on(tmp_path, moments, way):
+    """Daylight saving begins and ends at full hours; stamps have no zone."""
+    cells = stamps_of(moments, "%Y-%m-%d %H:%M:%S.%f")
+    rows = [f"{cell},{signal(t):.6f}" for cell, t in zip(cells, TIMES, strict=True)]
+    (tmp_path / "run.csv").write_text("Time,w [mm]\n" + "\n".join(rows) + "\n")
+    log = read_warned(tmp_path / "run.csv", f"clock is set {way} by an hour in line 202 .daylight")
+    np.testing.assert_allclose(log.times, TIMES, atol=1e-9)
+
+
+@pytest.mark.parametrize("rate", [200.0, 51.2])
+def test_stamps_of_whole_seconds_are_counted(tmp_path, rate):
+    times = np.arange(int(12 * rate)) / rate
+    moments = [datetime(2024, 5, 4, 9, 30) + timedelta(seconds=int(t + 0.37)) for t in times]
+    cells = stamps_of(moments, "%d.%m.%Y %H:%M:%S")
+    rows = [f"{cell};{signal(t):.6f}" for cell, t in zip(cells, times, strict=True)]
+    (tmp_path / "run.csv").write_text("Time;w [mm]\n" + "\n".join(rows) + "\n")
+    log = read_warned(tmp_path / "run.csv", "stamps of whole seconds: times are those of ")
+    # A count of samples in ten seconds is right within one of them.
+    np.testing.assert_allclose(log.sample_rate, rate, rtol=1e-12 if rate == 200.0 else 0.1 / rate)
+
+
+def test_a_column_of_dates_beside_one_of_times(tmp_path):
+    cells = stamps_of(NIGHT, "%d.%m.%Y;%H:%M:%S,%f")
+    rows = [
+        f"{cell};{signal(t):.6f}".replace(".", ",")
+        .replace("05,2024", "05.2024")
+        .replace(",05.", ".05.")
+        for cell, t in zip(cells, TIMES, strict=True)
+    ]
+    (tmp_path / "run.csv").write_text("Datum;Zeit;w [mm]\n" + "\n".join(rows) + "\n")
+    log = read_log(tmp_path / "run.csv")
+    np.testing.assert_allclose(log.times, TIMES, atol=1e-9)
+    np.testing.assert_allclose(1e3 * log.values[:, 0], signal(TIMES), atol=1e-6)
+    assert log.start == "2024-05-04T23:59:59"
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+def test_dates_of_a_workbook_over_midnight(tmp_path, parts):
+    """In one column, or dates beside times of day, over midnight."""
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.active.append([*("Date", "Time")[-parts:], "w [mm]"])
+    for moment, t in zip(NIGHT, TIMES, strict=True):
+        day = datetime(moment.year, moment.month, moment.day)
+        book.active.append([*([moment] if parts == 1 else [day, moment.time()]), float(signal(t))])
+    book.save(tmp_path / "run.xlsx")
+    log = read_log(tmp_path / "run.xlsx")
+    np.testing.assert_allclose(log.times, TIMES, atol=1e-6)
+    np.testing.assert_allclose(1e3 * log.values[:, 0], signal(TIMES), atol=1e-9)
+    assert log.start == "2024-05-04T23:59:59"
+
+
+def test_days_of_a_workbook_saved_as_numbers(tmp_path):
+    rows = [f"{45416 + (10 + t) / 86400:.12f},{signal(t):.6f}" for t in TIMES]
+    (tmp_path / "run.csv").write_text("time [d],w [mm]\n" + "\n".join(rows) + "\n")
+    log = read_log(tmp_path / "run.csv")
+    np.testing.assert_allclose(log.times, TIMES, atol=2e-6)
+    assert log.start.startswith(("2024-05-04T00:00:10", "2024-05-04T00:00:09.999"))
+
+
+@pytest.mark.parametrize("word", ["OVR", "-OL-", "Overload", "#N/A"])
+def test_samples_beyond_the_range_are_missing(tmp_path, word):
+    cells = [
+        word if i in (0, 57, 58) else f"{signal(t):.6E}".replace("E", "D")
+        for i, t in enumerate(TIMES)
+    ]
+    rows = [f"{t:.3f},{cell}" for t, cell in zip(TIMES, cells, strict=True)]
+    (tmp_path / "run.csv").write_text("time [s],w [mm]\n" + "\n".join(rows) + "\n")
+    with pytest.raises(
+        ValueError, match="run.csv, line 2, column 'w': the cell is empty, or says nan"
+    ):
+        read_log(tmp_path / "run.csv")
+    log = read_log(tmp_path / "run.csv", missing="mask")
+    valid = log.valid[:, 0]
+    assert np.flatnonzero(~valid).tolist() == [0, 57, 58]
+    np.testing.assert_allclose(1e3 * log.values[valid, 0], signal(TIMES[valid]), atol=1e-6)
+
+
+def test_units_of_amplifiers_and_converters(tmp_path):
+    rows = [f"{t:.3f},{signal(t) / 4:.8f},{round(1e5 * signal(t))},21.5" for t in TIMES]
+    path = tmp_path / "run.csv"
+    path.write_text("time [s],p [mV/V],a [counts],t [Deg C]\n" + "\n".join(rows) + "\n")
+    log = read_log(path)
+    assert log.names == ("p", "a") and log.conditions == (("t (Deg C)", 21.5),)
+    assert log.quantities == ("voltage ratio", "counts")
+    path.with_suffix(".toml").write_text(
+        '[columns]\np = {unit = "mV/V", sensitivity = "0.25 mV/V/kN"}\n'
+        'a = {unit = "counts", sensitivity = "1e5 counts/(m/s^2)"}\n'
+    )
+    log = read_log(path)
+    assert log.quantities == ("force", "acceleration")
+    np.testing.assert_allclose(1e-3 * log.values[:, 0], signal(TIMES), atol=1e-7)
+    np.testing.assert_allclose(log.values[:, 1], signal(TIMES), atol=6e-6)
+
+
+def test_a_column_without_a_unit_is_no_channel_beside_others(tmp_path):
+    rows = [f"{t:.3f},{signal(t):.6f},{i % 2}" for i, t in enumerate(TIMES)]
+    (tmp_path / "run.csv").write_text("time [s],w [mm],door\n" + "\n".join(rows) + "\n")
+    log = read_warned(tmp_path / "run.csv", "'door' is no channel, having no unit; write it in")
+    assert log.names == ("w",) and log.conditions == (("door", 0.5),)
+
+
 def test_times_of_day_and_dates_go_over_midnight(tmp_path):
     stamps = ["23:59:59.5", "23:59:59.75", "0:00:00.0", "0:00:00.25"]
-    seconds, _ = seconds_of(tmp_path, "t", stamps, [1, 2, 3, 4])
+    seconds = seconds_of(tmp_path, "t", stamps, [1, 2, 3, 4]).seconds
     np.testing.assert_allclose(seconds, [0, 0.25, 0.5, 0.75])
     stamps = ["31.12.2023 23:59:59", "01.01.2024 00:00:01"]
-    assert seconds_of(tmp_path, "t", stamps, [1, 2])[0] == [0.0, 2.0]
+    assert seconds_of(tmp_path, "t", stamps, [1, 2]).seconds == [0.0, 2.0]
     with pytest.raises(ValueError, match="line 2, column 't': '7' is no date and time"):
         seconds_of(tmp_path, "t", ["0:00:01", "7"], [1, 2])
     with pytest.raises(ValueError, match="whether the day or the month comes first"):

@@ -1,11 +1,16 @@
 """Logs in binary formats, written by other libraries: the same run is read from each."""
 
+import gzip
+import io
 import re
 import warnings
+import wave
+import zipfile
 
 import numpy as np
 import pytest
 import scipy.io
+import scipy.io.wavfile
 from scipy.signal import lfilter
 
 from tuning import Log, read_log, read_logs
@@ -92,7 +97,41 @@ def xlsx(path, runs=("",)):
     book.save(path)
 
 
+def npz(path):
+    np.savez(path, **{"d1 [mm]": D1, "d2 [mm]": D2}, fs=1 / TIMES[1])
+
+
+def npy(path):
+    table = np.zeros(TIMES.size, [("time [s]", "f8"), ("d1 [mm]", "f8"), ("d2 [mm]", "f8")])
+    for name, values in zip(table.dtype.names, (TIMES, D1, D2), strict=True):
+        table[name] = values
+    np.save(path, table)
+
+
+def text(file):
+    file.write("time [s]\td1 [mm]\td2 [mm]\n")
+    for row in zip(TIMES.tolist(), D1.tolist(), D2.tolist(), strict=True):
+        file.write("\t".join(map(repr, row)) + "\n")
+
+
+def zipped(path):
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("README.md", "Logger 7")
+        written = io.StringIO()
+        text(written)
+        archive.writestr("log/run.asc", written.getvalue())
+
+
+def gzipped(path):
+    with gzip.open(path, "wt") as file:
+        text(file)
+
+
 FORMATS = {
+    "run.npz": npz,
+    "run.npy": npy,
+    "run.zip": zipped,
+    "run.csv.gz": gzipped,
     "run.xlsx": xlsx,
     "run.tdms": tdms,
     "run.h5": hdf5,
@@ -110,6 +149,80 @@ def test_the_same_run_is_read_from_every_format(tmp_path, name):
     assert log.names == ("d1", "d2") and log.units == ("mm", "mm")
     np.testing.assert_allclose(log.times, TIMES, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(log.values, 1e-3 * np.column_stack([D1, D2]), rtol=1e-12)
+
+
+def test_text_of_two_bytes_a_letter(tmp_path):
+    with open(tmp_path / "run.txt", "w", encoding="utf-16") as file:
+        text(file)
+    log = read_log(tmp_path / "run.txt")
+    np.testing.assert_allclose(log.values, 1e-3 * np.column_stack([D1, D2]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["<i2", "<i4", "<f4", "u1", "3 bytes"])
+def test_sound_files_hold_shares_of_the_range(tmp_path, kind):
+    path, signal = tmp_path / "run.wav", 0.9 * np.sin(0.3 * np.arange(400))
+    size = {"<i2": 2**15, "<i4": 2**31, "<f4": 1.0, "u1": 2**7, "3 bytes": 2**23}[kind]
+    samples = np.stack([signal, -0.5 * signal], axis=1) * size
+    if kind == "3 bytes":
+        with wave.open(str(path), "wb") as file:
+            file.setparams((2, 3, 100, 0, "NONE", ""))
+            whole = np.round(samples).astype("<i4")
+            file.writeframes(whole.view("u1").reshape(400, 2, 4)[:, :, :3].tobytes())
+    else:
+        whole = samples + 128 if kind == "u1" else samples
+        whole = whole if kind == "<f4" else np.round(whole)
+        scipy.io.wavfile.write(path, 100, whole.astype(kind))
+    with pytest.raises(ValueError, match="column 'channel 1': no unit found"):
+        read_log(path)
+    log = read_log(path, units="g")
+    np.testing.assert_allclose(log.times, np.arange(400) / 100, atol=1e-12)
+    expected, rounding = 9.80665 * np.stack([signal, -0.5 * signal], axis=1), 5.1 / size + 1e-8
+    np.testing.assert_allclose(log.values, expected, atol=5e-6 if kind == "<f4" else rounding)
+
+
+def test_runs_of_an_archive_and_what_is_no_log(tmp_path):
+    path = tmp_path / "runs.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in ("a.csv", "b.csv"):
+            archive.writestr(name, f"t [s],{name[0]} [mm]\n0,1\n1,2\n2,3\n")
+    logs = read_logs(path)
+    assert [log.source for log in logs] == [f"{path}:a.csv", f"{path}:b.csv"]
+    assert read_log(path, run="b.csv").names == ("b",)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.csv", "t [s],a [mm]\n0,1\n1,x\n")
+    with pytest.raises(ValueError, match=r"^\S+/runs.zip, a.csv, line 3, column 'a': 'x' is no"):
+        read_log(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("README.md", "nothing")
+    with pytest.raises(ValueError, match="runs.zip: there is no log in the archive: README.md"):
+        read_log(path)
+    with gzip.open(tmp_path / "run.gz", "wt") as file:
+        file.write("t [s],a [mm]\n")
+    with pytest.raises(ValueError, match="run.gz: the name should end like run.csv.gz, which"):
+        read_log(tmp_path / "run.gz")
+    (tmp_path / "cut.csv.gz").write_bytes((tmp_path / "run.gz").read_bytes()[:25])
+    with pytest.raises(ValueError, match="cut.csv.gz: the file is damaged or cut off"):
+        read_log(tmp_path / "cut.csv.gz")
+
+
+@pytest.mark.parametrize("name", ["run.npy", "run.npz", "run.mat", "run.h5"])
+def test_channels_that_stand_in_rows(tmp_path, name):
+    table, path = np.stack([D1, D2]), tmp_path / name
+    if name == "run.npy":
+        np.save(path, table)
+        log = read_log(path, columns="d1 [mm], d2 [mm]", rate=1 / TIMES[1])
+    else:
+        content = {"data": table, "fs": 1 / TIMES[1]}
+        if name == "run.h5":
+            with pytest.importorskip("h5py").File(path, "w") as file:
+                for key, value in content.items():
+                    file[key] = value
+        else:
+            (np.savez(path, **content) if name == "run.npz" else scipy.io.savemat(path, content))
+        log = read_log(path, units="mm")
+        assert log.names == ("data.0", "data.1")
+    np.testing.assert_allclose(log.times, TIMES, atol=1e-12)
+    np.testing.assert_allclose(log.values, 1e-3 * table.T, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["run.tdms", "run.h5", "run.mat"])
@@ -229,9 +342,10 @@ def test_formats_are_found_in_the_modules_of_the_readers():
     assert len(set(suffixes)) == len(suffixes)
     binary = {suffix for f in readers.FORMATS if not f.is_text for suffix in f.suffixes}
     assert binary == {
-        ".tdms", ".mat", ".h5", ".hdf5", ".nc", ".parquet", ".xlsx", ".uff", ".unv"
+        ".tdms", ".mat", ".h5", ".hdf5", ".nc", ".parquet", ".xlsx", ".uff", ".unv", ".npy",
+        ".npz", ".wav", ".gz", ".zip",
     }  # fmt: skip
-    assert set(suffixes) - binary == {".csv", ".tsv", ".txt", ".dat", ".lvm"}
+    assert set(suffixes) - binary == {".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm"}
 
 
 # LabVIEW measurement files, written by the tests after the published format.
@@ -339,7 +453,6 @@ def test_special_blocks_are_passed_over(tmp_path):
         ("2.5", "", "line 24, column 'a': the cell is empty"),
         ("0.0012", "0.0000", "line 24: time 0 s is repeated"),
         ("0.0012", "-1", "line 24: time -1 s comes after 0 s"),
-        ("Y_Unit_Label,g,", "Y_Unit_Label,,", "column 'a': no unit found"),
         ("X_Value,a,b", "Zeit,a,b", "line 22: the column headings must be X_Value"),
         ("LabVIEW Measurement", "Something", "line 1: a LabVIEW measurement file starts with"),
     ],
@@ -361,8 +474,9 @@ def test_columns_of_other_units_are_conditions(tmp_path):
     assert found.names == ("b",) and not found.notes
     raw = plain.values[:, 0].mean() / 9.80665
     assert dict(found.conditions) == {"a (°C)": pytest.approx(raw, rel=1e-6)}
-    with pytest.warns(LogWarning, match="column 'a' is no channel: unknown unit 'parsec'"):
-        read_log(write(tmp_path, text.replace("Y_Unit_Label,g,", "Y_Unit_Label,parsec,")))
+    for unit, said in (("parsec", ": unknown unit 'parsec'"), ("", ", having no unit")):
+        with pytest.warns(LogWarning, match=f"column 'a' is no channel{said}"):
+            read_log(write(tmp_path, text.replace("Y_Unit_Label,g,", f"Y_Unit_Label,{unit},")))
     with pytest.raises(ValueError, match="unknown unit '°C'"):
         read_log(
             write(tmp_path, text.replace("Y_Unit_Label,g,", "Y_Unit_Label,°C,")), columns="a,b"

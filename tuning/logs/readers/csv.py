@@ -1,4 +1,4 @@
-"""Separated values (.csv, .tsv, .txt, .dat): names with units in the headings, numbers below.
+"""Separated values (.csv, .tsv, .txt, .dat, .asc): names with units in the headings, numbers below.
 
     time (s); d1 [mm]; d2 [mm]
     0,000; 0,12; -0,03
@@ -9,6 +9,7 @@ names. Dates and times of day become seconds from the first.
 """
 
 import csv
+import dataclasses
 import io
 import re
 from pathlib import Path
@@ -19,19 +20,16 @@ from tuning.logs.readers.headings import (
     MAX_HEADING_ROWS,
     Headings,
     find_headings,
-    is_stamp,
-    seconds_of,
+    table_of_rows,
+    unnamed,
 )
 from tuning.logs.readers.table import (
     CHECKED_ROWS,
     LogFormat,
     LogTable,
     check_last_line,
-    check_widths,
-    parse_numbers,
     read_text,
 )
-from tuning.logs.units import is_unit
 
 RECORD_NUMBER = "RN"  # the unit that Campbell loggers give it
 _COMMENTS = ("#", "%", "//")
@@ -68,37 +66,14 @@ def read_csv(path: Path) -> dict[str, LogTable]:
         path, lines[first:][-CHECKED_ROWS:], numbers[first:][-CHECKED_ROWS:], separator
     )
     check_last_line(path, text, tail, tail_lines)
-    values, numbers, stamped, began = _numbers(
-        path, lines[first:], numbers[first:], separator, headings, width
-    )
-    has_headings = bool(headings.names)
-    names = headings.names or tuple(f"column {i + 1}" for i in range(values.shape[1]))
-    units = list(headings.units or (None,) * len(names))
-    for i in stamped:
-        units[i] = "s"
-    # Campbell loggers count their records.
-    kept = [i for i, unit in enumerate(units) if unit != RECORD_NUMBER]
-    table = LogTable(
-        tuple(names[i] for i in kept),
-        tuple(units[i] for i in kept),
-        values[:, kept],
-        np.array(numbers),
-        time=names[stamped[0]] if stamped else None,
-        notes=headings.notes,
-        has_headings=has_headings,
-        start=began,
-    )
-    return {"": table}
+    return {"": _table(path, lines[first:], numbers[first:], separator, headings, width)}
 
 
 def _campbell_headings(rows) -> Headings | None:
     """Headings of a file of Campbell loggers (TOA5): station, names, units, processing."""
     if len(rows) < 5 or rows[0][0] != "TOA5":
         return None
-    units = tuple(
-        unit if unit == RECORD_NUMBER or is_unit(unit) else None
-        for unit in (cell.strip() for cell in rows[2])
-    )
+    units = tuple(cell.strip() if cell.strip() != "TS" else None for cell in rows[2])
     return Headings(tuple(cell.strip() for cell in rows[1]), units, 4, ())
 
 
@@ -129,32 +104,28 @@ def _rows(path, lines, numbers, separator):
     return rows, last
 
 
-def _numbers(path, lines, numbers, separator, headings: Headings, width: int):
-    """Values (row, column) of the lines of numbers, their line numbers, columns of dates, start."""
+def _table(path, lines, numbers, separator, headings: Headings, width: int) -> LogTable:
+    """Table of the lines below the headings."""
     values = _fast_numbers(lines, separator, width)
-    if values is not None:
-        return values, numbers, [], ""
-    rows, numbers = _rows(path, lines, numbers, separator)
-    # A separator that ends every line closes the last column; it opens no new one.
-    names = headings.names
-    if not names:
-        if rows and all(not row[-1].strip() for row in rows):
+    if values is None:
+        rows, numbers = _rows(path, lines, numbers, separator)
+        # A separator that ends every line closes the last column; it opens no new one.
+        if not headings.names and rows and all(not row[-1].strip() for row in rows):
             width -= 1
-        names = [f"column {i + 1}" for i in range(width)]
-    trailing = len(names) + 1
-    rows = [row[:-1] if len(row) == trailing and not row[-1].strip() else row for row in rows]
-    stamped = [i for i, cell in enumerate(rows[0]) if is_stamp(cell)] if rows else []
-    rows, others, began = [list(row) for row in rows], rows, ""
-    if stamped:
-        check_widths(path, names, rows, numbers)
-        others = [[cell for i, cell in enumerate(row) if i not in stamped] for row in rows]
-    for i in stamped:
-        seconds, first = seconds_of(path, names[i], [row[i] for row in rows], numbers)
-        began = began or first
-        for row, second in zip(rows, seconds, strict=True):
-            row[i] = repr(second)
-    decimal_comma = separator != "," and _has_decimal_comma(path, others, numbers)
-    return parse_numbers(path, names, rows, numbers, decimal_comma), numbers, stamped, began
+        trailing = width + 1
+        rows = [row[:-1] if len(row) == trailing and not row[-1].strip() else row for row in rows]
+        table = table_of_rows(path, headings, rows, numbers, separator != ",")
+    else:
+        names = headings.names or unnamed(width)
+        units = headings.units or (None,) * width
+        table = LogTable(
+            names, units, values, np.array(numbers), notes=headings.notes,
+            has_headings=bool(headings.names),
+        )  # fmt: skip
+    # Campbell loggers count their records.
+    kept = [i for i, unit in enumerate(table.units) if unit != RECORD_NUMBER]
+    names, units = (tuple(all_[i] for i in kept) for all_ in (table.names, table.units))
+    return dataclasses.replace(table, names=names, units=units, values=table.values[:, kept])
 
 
 def _fast_numbers(lines, separator, width):
@@ -174,18 +145,6 @@ def _fast_numbers(lines, separator, width):
     return values if values.shape == (len(lines), width) else None
 
 
-def _has_decimal_comma(path, rows, lines) -> bool:
-    """Whether cells have decimal commas. Raises ValueError for a file with points as well."""
-    comma = next((i for i, row in enumerate(rows) if any("," in cell for cell in row)), None)
-    point = next((i for i, row in enumerate(rows) if any("." in cell for cell in row)), None)
-    if comma is not None and point is not None:
-        raise ValueError(
-            f"{path}, lines {lines[comma]} and {lines[point]}: numbers have both decimal commas "
-            "and decimal points; write one of them throughout, without thousands separators"
-        )
-    return comma is not None
-
-
 FORMAT = LogFormat(
-    "separated values", read_csv, suffixes=(".csv", ".tsv", ".txt", ".dat"), is_text=True
+    "separated values", read_csv, suffixes=(".csv", ".tsv", ".txt", ".dat", ".asc"), is_text=True
 )

@@ -16,6 +16,13 @@ from tuning.logs.units import is_unit
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 _QUOTIENT = re.compile(r"^(?P<name>[^/]*?\S)(\s*/\s*|\s+in\s+)(?P<unit>\S+)$")
+_FORTRAN = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+))[dD]([-+]?\d+)")
+# Words of loggers, in small letters, for samples beyond the range and for none.
+_NO_SAMPLE = frozenset(
+    ["ovr", "ovrng", "ovf", "ovfl", "ol", "o.l.", "-ol-", "+ol", "-ol", "+ovr", "-ovr", "over"]
+    + ["overload", "overflow", "overrange", "over range", "over-range", "clip", "clipped"]
+    + ["#n/a", "n/a", "na", "null", "none", "#num!", "#value!", "missing", "---", "--", "*****"]
+)
 MAX_SHOWN = 40  # characters of a cell in a message
 MIN_CHANNEL_SHARE = 0.1  # of the samples: shorter arrays are no channels, and may be left out
 CHECKED_ROWS = 200  # at the end of a file, with which its last one is compared
@@ -95,7 +102,7 @@ def table_of(
     has_times = any(is_time_name(parse_heading(label)[0]) for label in arrays)
     times, said = None, list(warnings)
     if clocks and not has_times:
-        timed = {label: _upright(arrays[label]) for label in arrays if label in clocks}
+        timed = {label: upright(arrays[label]) for label in arrays if label in clocks}
         timed = {label: array for label, array in timed.items() if len(array) > 1}
         if timed:
             own = {label: clocks[label] for label in timed}
@@ -130,7 +137,7 @@ def table_of(
     )
 
 
-def _upright(array: np.ndarray) -> np.ndarray:
+def upright(array: np.ndarray) -> np.ndarray:
     """An array with time along its first axis: channels that stand in rows are few."""
     return array.T if array.ndim == 2 and array.shape[0] < array.shape[1] else array
 
@@ -171,11 +178,13 @@ def read_bytes(path: Path, count: int | None = None) -> bytes:
 
 
 def read_text(path: Path) -> str:
-    """Text of a file in UTF-8 or the Windows encoding (cp1252) of older loggers.
+    """Text of a file in UTF-8, UTF-16 or the Windows encoding (cp1252) of older loggers.
 
     Raises ValueError if there is no such file, it is empty, or it is no text.
     """
     data = read_bytes(path)
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):  # as Windows writes "Unicode"
+        data = data.decode("utf-16", errors="replace").encode()
     if b"\0" in data:
         raise ValueError(
             f"{path}: this is no text but a binary file of an unknown format:"
@@ -211,7 +220,7 @@ def parse_numbers(
     lines: Sequence[int],
     decimal_comma: bool,
 ) -> Float[np.ndarray, "row column"]:
-    """Numbers in the cells of a table; empty cells become NaN.
+    """Numbers in the cells of a table; cells that are empty or say OVR or the like become NaN.
 
     `lines` are the line numbers of the rows. Raises ValueError, naming file, line and column, for a
     cell that is no number.
@@ -219,13 +228,34 @@ def parse_numbers(
     if not rows:
         raise ValueError(f"{path}: the log is empty: there are column names but no rows")
     check_widths(path, names, rows, lines)
-    rows = [[cell if cell.strip() else "nan" for cell in row] for row in rows]
     if decimal_comma:
         rows = [[cell.replace(",", ".") for cell in row] for row in rows]
     try:
         return np.array(rows, dtype=float)
     except ValueError:
-        raise _bad_cell(path, names, rows, lines) from None
+        pass
+    numbers = [[number_of(cell) if cell.strip() else np.nan for cell in row] for row in rows]
+    for found, row, line in zip(numbers, rows, lines, strict=True):
+        if None in found:
+            i = found.index(None)
+            place = f"{path}, line {line}, column {shown(names[i])}"
+            raise ValueError(f"{place}: {shown(row[i])} is no number")
+    return np.array(numbers, dtype=float)
+
+
+def number_of(cell: str) -> float | None:
+    """Number in a cell, with decimal comma or point, or an exponent D; None if it is none.
+
+    NaN for words of loggers that stand for no sample, as OVR.
+    """
+    text = cell.strip().replace(",", ".")
+    try:
+        return float(text)
+    except ValueError:
+        found = _FORTRAN.fullmatch(text)
+        if found:
+            return float(f"{found[1]}e{found[2]}")
+        return np.nan if text.lower() in _NO_SAMPLE else None
 
 
 def check_widths(
@@ -258,18 +288,6 @@ def check_last_line(
         raise ValueError(
             f"{path}, line {lines[-1]}: the file breaks off in its last line; delete that line"
         )
-
-
-def _bad_cell(path, names, rows, lines) -> ValueError:
-    """Error for the first cell that is no number."""
-    for row, line in zip(rows, lines, strict=True):
-        for name, cell in zip(names, row, strict=True):
-            try:
-                float(cell)
-            except ValueError:
-                place = f"{path}, line {line}, column {shown(name)}"
-                return ValueError(f"{place}: {shown(cell)} is no number")
-    raise AssertionError("numpy refused what Python reads as numbers")
 
 
 def shown(text: str) -> str:

@@ -7,7 +7,9 @@ The format is described by the Structural Dynamics Research Laboratory, Universi
 import contextlib
 import io
 import re
+import tempfile
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ MAGIC = b"    -1\n"
 MAGICS = (MAGIC, MAGIC.replace(b"\n", b"\r\n"), MAGIC.replace(b"\n", b" "))
 TIME_RESPONSE = 1
 _MARK = re.compile(rb"    -1(?=[\r\n]|$| {74})")  # before and after a data set
+_FORTRAN = re.compile(rb"(\d\.\d*)D([-+]\d)")
 _TYPES = ([b"58"], [b"58b"])
 # Code of the quantity of the ordinate: unit in a file of SI units.
 UNITS = {2: "N/m^2", 3: "strain", 8: "m", 9: "N", 11: "m/s", 12: "m/s^2", 13: "N"}
@@ -41,9 +44,10 @@ def read_uff(path: Path) -> dict[str, LogTable]:
         # pyuff prints what it does not know.
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            file = pyuff.UFF(str(path))
-            kinds = file.get_set_types()
-            sets = [file.read_sets(i) for i in np.flatnonzero(np.asarray(kinds) == 58)]
+            with _with_exponents_e(path) as readable:
+                file = pyuff.UFF(str(readable))
+                kinds = file.get_set_types()
+                sets = [file.read_sets(i) for i in np.flatnonzero(np.asarray(kinds) == 58)]
     except Exception as error:  # pyuff raises many types for damaged files
         raise damaged_file_error(path, error) from None
     responses = [one for one in sets if int(one.get("func_type", 0)) == TIME_RESPONSE]
@@ -69,6 +73,20 @@ def read_uff(path: Path) -> dict[str, LogTable]:
     if len(set(names)) == len(names) and even:
         return {"": _joined(str(path), tables, cut)}
     return {f"{i + 1}": table for i, table in enumerate(tables)}
+
+
+@contextlib.contextmanager
+def _with_exponents_e(path: Path) -> Iterator[Path]:
+    """The file, or a copy in which exponents of Fortran, as 1.5D+00, are written with E."""
+    data = read_bytes(path)
+    if b"   58b" in data or not _FORTRAN.search(data):
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / path.name
+        with open(copy, "wb") as file:
+            file.write(_FORTRAN.sub(rb"\1E\2", data))
+        yield copy
 
 
 def _joined(source: str, tables: list[LogTable], cut) -> LogTable:

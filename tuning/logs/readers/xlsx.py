@@ -3,10 +3,8 @@
 import datetime
 from pathlib import Path
 
-import numpy as np
-
-from tuning.logs.readers.headings import find_headings, is_numeric
-from tuning.logs.readers.table import LogFormat, LogTable, damaged_file_error, parse_numbers
+from tuning.logs.readers.headings import find_headings, is_numeric, table_of_rows
+from tuning.logs.readers.table import LogFormat, LogTable, damaged_file_error
 from tuning.optional import import_extra
 
 MAGIC = b"PK\x03\x04"
@@ -15,8 +13,8 @@ MAGIC = b"PK\x03\x04"
 def read_xlsx(path: Path) -> dict[str, LogTable]:
     """Tables of a workbook: one run for each sheet with numbers, by the name of the sheet.
 
-    Headings are those of separated values. Dates become seconds since the first. Formulas have the
-    values with which the file was saved.
+    Headings are those of separated values. Dates and times of day become seconds from
+    the first. Formulas have the values with which the file was saved.
 
     Raises ValueError, naming sheet and row, for a damaged file and for cells that are no numbers,
     ImportError without openpyxl.
@@ -38,9 +36,8 @@ def read_xlsx(path: Path) -> dict[str, LogTable]:
 
 def _table(source: str, rows) -> LogTable | None:
     """Table of a sheet; None for one without numbers."""
-    origin = next((cell for row in rows for cell in row if _is_date(cell)), None)
     numbered = [
-        (number, [_text(cell, origin) for cell in row])
+        (number, list(map(_text, row)))
         for number, row in enumerate(rows, 1)
         if any(cell is not None for cell in row)
     ]
@@ -50,30 +47,19 @@ def _table(source: str, rows) -> LogTable | None:
     if not any(map(is_numeric, cells)):
         return None
     found = find_headings(cells)
-    names = found.names or tuple(f"column {i + 1}" for i in range(len(used)))
     lines = [number for number, _ in numbered[found.first_row :]]
-    values = parse_numbers(Path(source), names, cells[found.first_row :], lines, False)
-    units = found.units or (None,) * len(names)
-    return LogTable(
-        names, units, values, np.array(lines), notes=found.notes, has_headings=bool(found.names)
-    )
+    return table_of_rows(Path(source), found, cells[found.first_row :], lines, False)
 
 
-def _is_date(cell) -> bool:
-    return isinstance(cell, datetime.datetime)
-
-
-def _text(cell, origin) -> str:
-    """Text of a cell; seconds since the first date for dates."""
+def _text(cell) -> str:
+    """Text of a cell; dates and times of day as in ISO 8601, durations in seconds."""
     if cell is None:
         return ""
-    if _is_date(cell):
-        return repr((cell - origin).total_seconds())
+    if isinstance(cell, datetime.datetime):
+        return cell.isoformat(sep=" ")
     if isinstance(cell, datetime.timedelta):
         return repr(cell.total_seconds())
-    if isinstance(cell, datetime.time):
-        return repr(3600 * cell.hour + 60 * cell.minute + cell.second + 1e-6 * cell.microsecond)
-    if isinstance(cell, datetime.date):
+    if isinstance(cell, datetime.date | datetime.time):
         return cell.isoformat()
     return cell.replace("_x000D_", "\r") if isinstance(cell, str) else repr(float(cell))
 
