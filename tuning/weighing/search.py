@@ -34,8 +34,8 @@ MOST_AXLES = 9  # of a comb: the heaviest
 JOINED = 0.75  # m, between forces of one axle
 LEAST_SHARE = 0.1  # of the heaviest axle of a comb, in the others
 ROUNDS = 2  # of fewer and of more axles
-LEAST_GAIN = 1.0  # of the criterion, by another number of axles
-TRIED = 2  # changes that are fitted, of all
+LEAST_GAIN = 1.0  # of the criterion, by other axles
+TRIED = 3  # changes that are fitted, of all
 COMBS = 3  # one after the other
 FREQUENCY_SHARES = np.linspace(0.85, 1.15, 121)  # of that of the lines, tried in free vibration
 MIN_CYCLES = 3.0  # of free vibration that tell its frequency
@@ -87,12 +87,14 @@ def find_axles(
         change = _with_one_more if fit.forces.size < number else _with_one_less
         best = _changed(_Trial.of(fit), change, fit, log)
         fit = fits[best.forces.size] = fit_axles(lines, *best[1:], log, fit.weights)
-    changes = (_with_one_less, _with_one_more), (_with_one_more, _with_one_less)
-    for change, back in ROUNDS * changes:
-        while change is _with_one_more or fit.forces.size > 1:
-            trial = _changed(_Trial.of(fit), change, fit, log)
-            if number:  # the number is that again after the opposite change
-                trial = _changed(trial, back, fit, log)
+    less, more = _with_one_less, _with_one_more
+    # Of a known number that is so again after each pair.
+    changes = ((less, more), (more, less)) if number else ((less,), (more,))
+    for steps in ROUNDS * (*changes, (_with_one_moved,)):
+        while fit.forces.size > 1 or steps[0] is more:
+            trial = _Trial.of(fit)
+            for change in steps:
+                trial = _changed(trial, change, fit, log)
             count = trial.forces.size
             tried[count] = min(trial.criterion, tried.get(count, np.inf))
             if count > MOST_AXLES or trial.criterion > fit.criterion - LEAST_GAIN:
@@ -130,7 +132,7 @@ def _changed(trial: _Trial, change, fit: AxleFit, log: CrossingLog) -> _Trial:
         entry = trial.geometry.entry_time + places[0] / abs(speed)
         geometry = AxleGeometry(speed, entry, places - places[0], fit.lines.length)
         ranked.append((*log.linear(fit.lines, geometry, fit.weights), geometry))
-    ranked.sort(key=lambda one: one[0])
+    ranked.sort(key=lambda one: one[0] + unlikeliness(fit.rows, one[2].offsets, one[1]))
     trials = []
     for _, forces, start in ranked[:TRIED]:
         deviance, geometry, forces = refined(fit, start, forces, log)
@@ -160,6 +162,14 @@ def _with_one_more(places, forces) -> list[np.ndarray]:
             middle = np.average(places[own], weights=np.maximum(forces[own], 1e-300))
             new = middle + GROUP_MEAN * (np.arange(len(own) + 1) - len(own) / 2)
             trials.append(np.sort(np.concatenate([np.delete(places, own), new])))
+    return trials
+
+
+def _with_one_moved(places, forces) -> list[np.ndarray]:
+    """Places of as many axles, of which one is left out and another is a group of one more."""
+    trials = []
+    for i in range(places.size):
+        trials += _with_one_more(np.delete(places, i), np.delete(forces, i))
     return trials
 
 
