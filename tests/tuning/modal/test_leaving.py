@@ -13,37 +13,11 @@ from tuning.modal.decay.leaving import (
     PARTS,
     growing_share,
     has_split,
-    shaken_until,
     undisturbed,
     without_excitation,
 )
 from tuning.modal.decay.stretches import Stretch, after_impact
 from tuning.modal.result import IdentifiedMode
-
-
-def test_a_part_with_more_than_noise_ends_the_excitation():
-    """Noise all along, and a third of the energy of the fourth part by forces."""
-    random = np.random.default_rng(1)
-    fitted = np.exp(-np.arange(2000) / 800)[:, None] * np.ones((1, 2))
-    noise = 0.05 * random.normal(size=fitted.shape)
-    assert shaken_until(fitted + noise, fitted, 0.5) == 0
-    noise[600:800] += 0.4 * fitted[600:800]
-    assert shaken_until(fitted + noise, fitted, 0.5) == 800
-    # What is little of a part's energy may be nonlinearity.
-    noise[:200] += 0.15 * fitted[:200]
-    noise[600:800] = noise[800:1000]
-    assert shaken_until(fitted + noise, fitted, 0.5) == 0
-
-
-def test_errors_in_proportion_to_a_decay_are_no_forces():
-    """A nonlinear structure leaves a share of its energy, loud or not; a force acts for a time."""
-    random = np.random.default_rng(1)
-    fitted = np.exp(-np.arange(2000) / 400)[:, None] * np.ones((1, 2))
-    errors = 0.01 * random.normal(size=fitted.shape)
-    errors += 0.35 * fitted * random.normal(size=fitted.shape)
-    assert shaken_until(fitted + errors, fitted, 0.5) == 0
-    errors[:400] *= 2
-    assert shaken_until(fitted + errors, fitted, 0.5) == 400
 
 
 def test_decays_with_more_than_noise_do_not_count():
@@ -91,7 +65,6 @@ def test_three_close_modes_of_one_shape_are_made_by_forces(frequencies, third, a
         tuple(Candidate(one, "", 1) for one in modes),
         channels=2,
         rate=100.0,
-        independent=0.5,
         after_impact=after,
     )
     assert rest.start - decay.start == (2000 // PARTS if is_cut else 0)

@@ -1,8 +1,8 @@
 """Decays in which something still excites the structure, told by what their fit leaves.
 
-A load that excites little while it leaves shows in the fit: decaying modes leave the noise alone,
-which is the same throughout, but more where forces act; or the fit explains these, too, by several
-modes where there is one, or by vibrations that grow.
+A load that excites little while it leaves shows in the fit: it explains forces by several modes
+where there is one, or by vibrations that grow; of several decays it leaves more of those in which
+forces act.
 """
 
 import numpy as np
@@ -12,13 +12,13 @@ from tuning.modal.ambient import Candidate
 from tuning.modal.decay.stretches import Stretch
 from tuning.modal.result import mac_matrix
 
-PARTS = 10  # of a decay, whose errors are compared
-MIN_RATIO, RATIO_SDS = 2.5, 5.0  # of errors of a part to the median; or deviations of the ratio
+PARTS = 10  # of a decay, of which one is cut off where forces seem to act
+MIN_RATIO = 2.5  # of errors of a decay to the least of others
 SPLIT_RATIO, SPLIT_MAC = 1.1, 0.9  # of three frequencies, and of the shapes of modes of one
 SPLIT_POLES = 4  # within the same ratio
 MIN_GROWTH = 0.2  # nepers of a vibration over the decay
 MIN_GROWING_SHARE = 0.01  # of the energy
-MIN_UNEXPLAINED = 0.05  # of the energy of a part, and of the mean; less may be nonlinearity
+MIN_UNEXPLAINED = 0.05  # of the energy of a decay; less may be nonlinearity
 
 
 def without_excitation(
@@ -29,14 +29,13 @@ def without_excitation(
     *,
     channels: int,
     rate: float,
-    independent: float,
     after_impact: bool,
 ) -> tuple[Stretch, ...]:
-    """Those of several fitted decays that are undisturbed, or the part of one; all if nothing is.
+    """Those of several fitted decays that are undisturbed, or one without its first part; all if
+    nothing is disturbed.
 
     Columns are the `channels` of each decay, at a `rate` (Hz). `candidates` are the modes of the
-    fit, `independent` is the share of samples that are, in its band; `after_impact` says that
-    nothing acts from the beginning.
+    fit; `after_impact` says that nothing acts from the beginning.
     """
     first, *others = decays
     split = has_split(candidates)
@@ -44,10 +43,8 @@ def without_excitation(
         grows = growing_share(candidates, len(measured) / rate) > MIN_GROWING_SHARE
         least = 0.0 if grows or split else MIN_UNEXPLAINED
         return undisturbed(decays, measured, fitted, channels, least)
-    shaken = shaken_until(measured, fitted, independent)
-    if not shaken and not after_impact and split:
-        shaken = len(measured) // PARTS
-    return (first._replace(start=first.start + shaken),)
+    cut = len(measured) // PARTS if split and not after_impact else 0
+    return (first._replace(start=first.start + cut),)
 
 
 def growing_share(candidates: tuple[Candidate, ...], duration: float) -> float:
@@ -93,39 +90,6 @@ def _crowds(frequencies: list[float]) -> list[int]:
         numbers.append(int(inside[most].sum()))
         left = left[~inside[most]]
     return numbers
-
-
-def shaken_until(
-    measured: Float[np.ndarray, "sample channel"],
-    fitted: Float[np.ndarray, "sample channel"],
-    independent: float,
-) -> int:
-    """Sample of a fitted decay up to which errors are more than elsewhere; 0 if they are not.
-
-    They must be more than the noise, and than their share of the energy, of what comes after.
-    `independent` is the share of samples that are, in the band of the fit.
-    """
-    scale = np.maximum(np.mean(measured**2, axis=0), 1e-300)
-    errors, energy = (
-        np.array([np.mean(part) for part in np.array_split(squares / scale, PARTS)])
-        for squares in ((measured - fitted) ** 2, measured**2)
-    )
-    freedom = max(independent * measured.size / PARTS, 1.0)
-    ratio = max(MIN_RATIO, 1 + RATIO_SDS * np.sqrt(2 / freedom))
-    # What is little of the whole decay tells little of it, and may be chance.
-    least = MIN_UNEXPLAINED * np.maximum(energy, energy.mean())
-    more = (errors > ratio * np.median(errors)) & (errors > least)
-    last = _last(more)
-    # Errors in proportion to the energy, before as after, are those of a nonlinear structure.
-    noise = np.median(errors[last:]) if last < PARTS else 0.0
-    share = max(np.sum(errors[last:] - noise) / max(np.sum(energy[last:]), 1e-300), 0.0)
-    more &= errors > ratio * (noise + share * energy)
-    return len(measured) * _last(more) // PARTS
-
-
-def _last(more) -> int:
-    """Number of parts to the last of some."""
-    return int(np.max(np.flatnonzero(more) + 1, initial=0))
 
 
 def undisturbed(

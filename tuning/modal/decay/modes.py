@@ -263,7 +263,6 @@ def _rest(one: _Fitted, samples: Samples, excited, band, cycle) -> tuple[Stretch
         one.candidates,
         channels=samples.records[0].shape[1],
         rate=samples.rate,
-        independent=2 * (band[1] - band[0]) / samples.rate,
         after_impact=after_impact(one.used[0], excited[one.used[0].record], cycle),
     )
 
