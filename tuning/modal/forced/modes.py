@@ -43,8 +43,6 @@ from tuning.modal.forced.significance import (
     criterion,
     missing_pole,
     mode_chances,
-    single_pole_chances,
-    split_pole,
 )
 from tuning.modal.result import (
     MIN_COLLINEARITY,
@@ -343,21 +341,11 @@ def completed(lines, model, scale, part):
     tried: list[complex] = []
     for _ in range(MAX_ADDED):
         missing, chance = missing_pole(model, part)
-        chances = [chance, *single_pole_chances(model)]
-        places = [missing, *model.poles[model.moving]]
-        new = [
-            k
-            for k in np.argsort(chances)
-            if chances[k] < CHANCE
-            and all(abs(places[k] - one) > SAME_POLE * -one.real for one in tried)
-        ]
-        if not new:
+        apart = all(abs(missing - one) > SAME_POLE * -one.real for one in tried)
+        if chance >= CHANCE or not apart:
             break
-        tried.append(complex(places[new[0]]))
-        poles = np.append(model.poles, missing)
-        if new[0] > 0:
-            poles = split_pole(model, int(model.moving[new[0] - 1]))
-        other, _ = refined_model(lines, poles, scale, part)
+        tried.append(missing)
+        other, _ = refined_model(lines, np.append(model.poles, missing), scale, part)
         fit = linear_fit(model.lines, other.poles)
         if criterion(fit, other.poles.size) < criterion(model.fit, model.poles.size):
             model = other

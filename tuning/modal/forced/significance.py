@@ -1,14 +1,12 @@
-"""Tests of a modal model: poles that chance explains, resonances that are two, missing poles.
+"""Tests of a modal model: poles that chance explains, and missing poles.
 
 A pole placed at a chance peak of the noise fits it well, so that its errors tell nothing against
-it; but what it explains, at one of many lines, is not more than the noise makes it. Two poles close
-together taken for one leave errors along the derivative of the resonance by its pole,
-1 / (s - p)^2, with residues of its own: were there one pole, these would be those of noise. A pole
-that is missing leaves errors along 1 / (s - p). These are tests of F.
+it; but what it explains, at one of many lines, is not more than the noise makes it. A pole that is
+missing leaves errors along 1 / (s - p). These are tests of F.
 """
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 from scipy.stats import f as fisher
 
 from tuning.modal.forced.likelihood import (
@@ -18,8 +16,6 @@ from tuning.modal.forced.likelihood import (
     both_parts,
     coefficient_places,
     line_means,
-    linear_fit,
-    refined_poles,
     resonances_of,
     times_signals,
     transients_of,
@@ -30,7 +26,6 @@ DAMPING_RATIOS = (0.004, 0.016, 0.064)  # of poles that are tried
 NEAR_LINES, NEAR_WIDTHS = 32, 16.0  # about a pole that is tried: lines, and decay rates
 MIN_SIZE = 1e-12  # of the largest; directions below it were left out of the fit
 MOST_PROMISING = 3  # of them, whose probabilities are computed
-SPLITS = 0.5 * np.array([1j, 1.0, 3j, 1 + 1j, 1 - 1j])  # of a pole, over its decay rate
 
 
 def mode_chances(model: FittedModel) -> Float[np.ndarray, " mode"]:
@@ -55,20 +50,11 @@ def mode_chances(model: FittedModel) -> Float[np.ndarray, " mode"]:
     return np.array(found)
 
 
-def single_pole_chances(model: FittedModel) -> Float[np.ndarray, " moving"]:
-    """Probability that noise alone leaves the errors along the derivative of each resonance."""
-    found = []
-    for k in model.moving.tolist():
-        chance = _chance(model, complex(model.poles[k]), model.freedom(k), 2)
-        found.append(chance * max(model.moving.size, 1))
-    return np.array(found)
-
-
 def missing_pole(model: FittedModel, band: tuple[float, float]) -> tuple[complex, float]:
     """The pole (1/s) that would lower the errors most, and the probability that noise does so."""
     tried = promising_poles(model.lines, model.fit.errors, band)
     best = tried[:MOST_PROMISING]
-    chances = [_chance(model, pole, model.freedom_at(pole), 1) for pole in best]
+    chances = [_chance(model, pole) for pole in best]
     least = int(np.argmin(chances))
     return best[least], len(tried) * chances[least]
 
@@ -100,37 +86,34 @@ def _least_statistics(lines: Lines, errors, tried) -> Float[np.ndarray, " tried"
     found = []
     for pole in tried:
         near = np.abs(angular - pole.imag) < reach + NEAR_WIDTHS * abs(pole.real)
-        columns = _columns_of(lines.part(near), pole, 1)
+        columns = _columns_of(lines.part(near), pole)
         along = np.linalg.qr(columns)[0].T @ errors[:, near].reshape(len(columns), -1)
         own = variance[np.argmin(np.abs(angular - pole.imag))]
         found.append(np.sum(np.sum(along**2, axis=0) / np.maximum(own, 1e-300)))
     return np.array(found)
 
 
-def _columns_of(lines: Lines, pole, power):
-    """Columns (row, column) of 1 / (s - p)^power, forced and free."""
+def _columns_of(lines: Lines, pole):
+    """Columns (row, column) of 1 / (s - p), forced and free."""
     parts = []
-    for signals, (own, other) in (
+    for signals, (first, second) in (
         (lines.inputs, resonances_of(lines, np.array([pole]))),
         (lines.unforced, transients_of(lines, np.array([pole]))),
     ):
-        first, second = own**power, other**power
         parts += [times_signals(first + second, signals)]
         parts += [times_signals(1j * (first - second), signals)]
     return both_parts(np.concatenate(parts, axis=1))
 
 
-def _chance(model: FittedModel, pole: complex, freedom: float, power: int) -> float:
-    """Probability by noise of what 1 / (s - p)^power explains of the errors."""
-    fit, columns = model.fit, _columns_of(model.lines, pole, power)
+def _chance(model: FittedModel, pole: complex) -> float:
+    """Probability by noise of what 1 / (s - p) explains of the errors."""
+    fit, columns = model.fit, _columns_of(model.lines, pole)
     basis = np.linalg.qr(columns - fit.basis @ (fit.basis.T @ columns))[0]
     along = basis.T @ fit.errors
     variance = _without(model, basis, along, model.peak_at(pole))
-    # Errors are already least along two directions for each pole, its own change.
-    count = max(along.size - 2 * (power - 1), 1)
-    statistic = np.sum(np.sum(along**2, axis=0) / variance) / count
-    freedom = max(freedom - basis.shape[1], 1.0) * fit.errors.shape[1]
-    return float(fisher.sf(statistic, count, freedom))
+    statistic = np.sum(np.sum(along**2, axis=0) / variance) / along.size
+    freedom = max(model.freedom_at(pole) - basis.shape[1], 1.0) * fit.errors.shape[1]
+    return float(fisher.sf(statistic, along.size, freedom))
 
 
 def _without(model: FittedModel, basis, along, peak):
@@ -160,27 +143,10 @@ def _criterion(squares, rows, columns, modes) -> float:
 
 def criterion_with(lines: Lines, fit: LinearFit, modes: int, pole: complex) -> float:
     """The same of a fit to which a pole (1/s) is added as it is."""
-    columns = _columns_of(lines, pole, 1)
+    columns = _columns_of(lines, pole)
     basis = np.linalg.qr(columns - fit.basis @ (fit.basis.T @ columns))[0]
     squares = np.sum(fit.errors**2, axis=0) - np.sum((basis.T @ fit.errors) ** 2, axis=0)
     return _criterion(squares, len(columns), fit.columns.shape[1] + columns.shape[1], modes + 1)
-
-
-def split_pole(model: FittedModel, k: int) -> Complex[np.ndarray, " mode"]:
-    """Poles of the model with two in the place of the k-th: of several starts, the best."""
-    best, least = model.poles, np.inf
-    for split in SPLITS:
-        step = -model.poles[k].real * split
-        pair = np.array([model.poles[k] - step, model.poles[k] + step])
-        pair = np.minimum(pair.real, 0.1 * model.poles[k].real) + 1j * pair.imag
-        poles = np.concatenate([np.delete(model.poles, k), pair])
-        moving = np.flatnonzero(np.isin(np.delete(np.arange(model.poles.size), k), model.moving))
-        moving = np.concatenate([moving, poles.size - np.array([2, 1])])
-        poles = refined_poles(model.lines, poles, moving)
-        size = np.sum(np.log(np.sum(linear_fit(model.lines, poles).errors ** 2, axis=0)))
-        if size < least:
-            best, least = poles, size
-    return best
 
 
 def _local_variance(errors, free):
