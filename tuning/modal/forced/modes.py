@@ -192,7 +192,6 @@ def _power(lines: Lines, bands):
 
 
 MAX_ADDED = 12  # poles, one at a time
-PASSES = 2  # of the search for modes
 WEIGHT_DEGREE_SHARE = 0.5  # degree of the denominator that weights lines, over the highest
 MIN_WEIGHT = 1e-3  # size of the denominator, over its median, below which weights are equal
 CHANCE = 1e-3  # probability below which noise is no explanation
@@ -255,21 +254,12 @@ def _poles(found):
 def _modes_of_lines(lines: Lines, scale, part, band, duration, order, known):
     """Candidates and diagram of a part of a band, and the powers of errors and responses.
 
-    What the modes found leave is searched again, for modes that stood in the shade of others.
     Poles `known` from other parts of the band reach into this one by their flanks.
     """
-    drawn, used, rest, dropped = None, known, lines, []
-    for _ in range(PASSES):
-        diagram = _diagram(rest, scale, part, order)
-        drawn = drawn or diagram
-        before = used.size
-        used = _distinct(used, diagram)
-        if used.size == before and drawn is not diagram:
-            break
-        model, gone = refined_model(lines, used, scale, part)
-        model = completed(lines, model, scale, part)
-        dropped += gone
-        used, rest = model.poles, unexplained(model)
+    diagram = _diagram(lines, scale, part, order)
+    model, dropped = refined_model(lines, _distinct(known, diagram), scale, part)
+    model = completed(lines, model, scale, part)
+    rest = unexplained(model)
     modes = [mode for mode in modes_of_model(model, scale) if part[0] <= mode.frequency <= part[1]]
     candidates = [Candidate(mode, mode_reason(mode, duration, band), 1) for mode in modes]
     candidates += [
@@ -279,7 +269,7 @@ def _modes_of_lines(lines: Lines, scale, part, band, duration, order, known):
     ]
     return (
         candidates,
-        drawn,
+        diagram,
         (np.sum(np.abs(rest.outputs) ** 2), np.sum(np.abs(model.plain.outputs) ** 2)),
     )
 
