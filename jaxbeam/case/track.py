@@ -1,8 +1,9 @@
-"""Track between wheels and beam: it spreads the force of each axle along the beam.
+"""Track between wheels and beam: it spreads the force of each axle, or moves with beam and wheels.
 
 An axle at x presses with shares w_k at x + o_k: on three sleepers, at any offsets, or evenly over a
 length. What is off the beam then rests on the ground. A force on the modes psi is thus that of the
-filtered shapes sum_k w_k psi(x + o_k) (see `jaxbeam.model.deflection_lines`).
+filtered shapes sum_k w_k psi(x + o_k) (see `jaxbeam.model.deflection_lines`). A track of layers,
+rail, pads, sleepers and ballast, has modes with the beam (see `jaxbeam.model.theory.layers`).
 """
 
 from typing import NamedTuple
@@ -26,6 +27,8 @@ from jaxbeam.runtime.arrays import Array, Number, xp
 
 THREE_SLEEPERS = "3 sleepers"
 SHARES = (0.25, 0.5, 0.25)  # of the rail supports under and beside an axle
+APPROACH = 20.0  # m, of a rail on the ground
+LAYERS = "rail_mass", "pad_stiffness", "sleeper_mass", "ballast_stiffness"
 
 
 class Kernel(NamedTuple):
@@ -40,12 +43,22 @@ class Kernel(NamedTuple):
 
 
 class Track(ReprWithUnits):
-    """How the track spreads the force of an axle along the beam, alike for all loads.
+    """Track on the beam, alike for all loads: a rule that spreads axles, or layers that move.
 
-    On "3 sleepers" half of it acts on the middle one, and a quarter on each neighbour, at the
-    `sleeper_spacing` (EN 1991-2, figure 6.4). Or the force is even over a `spread_length`, or acts
-    at `spread_offsets` in the proportion of the `spread_shares`. For loads without mass or springs;
-    one that has no `start_position` starts where its first share enters the beam.
+    On "3 sleepers" half of the force of an axle acts on the middle one, and a quarter on each
+    neighbour, at the `sleeper_spacing` (EN 1991-2, figure 6.4). Or the force is even over a
+    `spread_length`, or acts at `spread_offsets` in the proportion of the `spread_shares`. These
+    rules are for loads without mass or springs.
+
+    With a `rail_rigidity` all wheels run on a rail, an Euler-Bernoulli beam on pads, sleepers and
+    ballast: pads, sleepers and ballast of one sleeper, for both rails, are even along the
+    `sleeper_spacing`. The rail lies on the beam and, for the length of an `approach`, on rigid
+    ground on both sides; its ends are pinned. The mass of the ballast is part of that of the beam.
+    The modes of the case are then those of beam and track together, and `beam.modes` must reach the
+    frequencies of interest of both.
+
+    A load without a `start_position` starts where its first share enters the beam, or at the end of
+    the rail.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -73,20 +86,81 @@ class Track(ReprWithUnits):
         "1", "proportions of the shares of an axle", NOT_NEGATIVE, default=None
     )
 
+    rail_rigidity: Float[Number, ""] | None = number(
+        "N m^2", "bending stiffness E I of both rails", POSITIVE, default=None
+    )
+    rail_mass: Float[Number, ""] | None = number(
+        "kg/m", "mass per length of both rails", POSITIVE, default=None
+    )
+    pad_stiffness: Float[Number, ""] | None = number(
+        "N/m", "stiffness of the pads of a sleeper", POSITIVE, default=None
+    )
+    pad_damping: Float[Number, ""] = number(
+        "N s/m", "damper of the pads of a sleeper", NOT_NEGATIVE, default=0.0
+    )
+    sleeper_mass: Float[Number, ""] | None = number(
+        "kg", "mass of a sleeper", POSITIVE, default=None
+    )
+    ballast_stiffness: Float[Number, ""] | None = number(
+        "N/m", "stiffness of the ballast under a sleeper", POSITIVE, default=None
+    )
+    ballast_damping: Float[Number, ""] = number(
+        "N s/m", "damper of the ballast under a sleeper", NOT_NEGATIVE, default=0.0
+    )
+    approach: Float[Number, ""] | None = number(
+        "m",
+        "length of the rail on the ground before and behind the beam; 20 m if left out",
+        POSITIVE,
+        default=None,
+    )
+
+    @property
+    def layered(self) -> bool:
+        """Whether it has a rail on layers that move, instead of a rule that spreads forces."""
+        return self.rail_rigidity is not None
+
+    @property
+    def ground(self) -> Float[Array, ""]:
+        """Length of the rail on the ground (m), on each side of the beam."""
+        return xp.asarray(APPROACH if self.approach is None else self.approach)
+
+    def least_modes(self, length: Float[Array, ""]) -> int:
+        """Least number of modes with which the rail on a beam of a length (m) bends under a wheel.
+
+        Their sines reach wavelengths of five times (4 B / k)^(1/4), the length of a rail of the
+        rigidity B on the springs k (N/m^2) of pads and ballast one on the other.
+        """
+        springs = 1.0 / (1.0 / self.pad_stiffness + 1.0 / self.ballast_stiffness)
+        wave = 5.0 * (4.0 * self.rail_rigidity * self.sleeper_spacing / springs) ** 0.25
+        return int(np.ceil(4.0 * (length + 2.0 * self.ground) / wave))
+
     def validate(self, address: str) -> str | None:
         """First inconsistency between its fields as an error message, or None."""
         ways = {
             "spread": bool(self.spread),
             "spread_length": self.spread_length is not None,
             "spread_offsets": self.spread_offsets is not None,
+            "rail_rigidity": self.layered,
         }
         given = [name for name, one in ways.items() if one]
         if len(given) > 1:
             return f"{address} has both {given[0]} and {given[1]}; leave one out"
+        layers = {name: getattr(self, name) is not None for name in (*LAYERS, "approach")}
+        absent = [name for name in LAYERS if not layers[name]]
+        if self.layered and absent:
+            names = ", ".join(("rail_rigidity", *LAYERS))
+            return f"{address}.{absent[0]} is missing; a track of layers has {names}"
+        if not self.layered and any(layers.values()):
+            first = next(name for name, given in layers.items() if given)
+            return (
+                f"{address}.{first} would have no effect: give {address}.rail_rigidity, or leave it"
+                " out"
+            )
         if not given:
             return (
-                f"{address} spreads nothing: give spread = {THREE_SLEEPERS!r}, a spread_length, or"
-                " spread_offsets with spread_shares; or leave the track out"
+                f"{address} spreads nothing: give spread = {THREE_SLEEPERS!r}, a spread_length,"
+                " spread_offsets with spread_shares, or a rail_rigidity and the layers below; or"
+                " leave the track out"
             )
         if (self.spread_offsets is None) != (self.spread_shares is None):
             absent = "spread_shares" if self.spread_shares is None else "spread_offsets"
@@ -106,7 +180,9 @@ class Track(ReprWithUnits):
         return None
 
     def kernel(self) -> Kernel:
-        """Filter of what depends on the position of a load."""
+        """Filter of what depends on the position of a load; that of layers leaves it as it is."""
+        if self.layered:
+            return Kernel(np.zeros(1), np.ones(1), False)
         if self.spread:
             offsets = self.sleeper_spacing * np.array([-1.0, 0.0, 1.0])
             return Kernel(offsets, xp.asarray(SHARES), False)
@@ -116,7 +192,9 @@ class Track(ReprWithUnits):
         return Kernel(self.spread_offsets, self.spread_shares / xp.sum(self.spread_shares), False)
 
     def ends(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Lowest and highest offset (m) of the shares of an axle."""
+        """Lowest and highest offset (m) from which an axle presses, on the beam or on its rail."""
+        if self.layered:
+            return -self.ground, self.ground
         offsets = self.kernel().offsets
         return offsets[0], offsets[-1]
 

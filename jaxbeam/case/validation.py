@@ -160,6 +160,9 @@ def _check_track(case: Case) -> None:
             "track and controller cannot be together: laws are designed for loads at points; leave"
             " one of them out"
         )
+    if case.track.layered:
+        _check_layers(case)
+        return
     lowest, highest = case.track.ends()
     length = case.beam.length
     if all(map(is_concrete, (lowest, highest, length))):
@@ -177,6 +180,36 @@ def _check_track(case: Case) -> None:
                 f"track spreads forces, and loads.{i} has mass, which follows the beam at a point:"
                 " take the weights of its axles as forces, or leave the track out"
             )
+        _check_start(f"loads.{i}", load, case)
+
+
+def _check_layers(case: Case) -> None:
+    """Validate that nothing is beside a track of layers that its modes do not have."""
+    beam = case.beam
+    ratios = beam.damping_ratio is not None and np.ndim(beam.damping_ratio) > 0
+    others = {
+        "contact.kind 'unilateral'": case.lifts,
+        "beam.torsional_rigidity": beam.torsional_rigidity is not None,
+        "several damping ratios in beam.damping_ratio": ratios,
+        "a loss_factor of one of beam.segments": any(
+            s.loss_factor is not None for s in beam.segments
+        ),
+        "a settlement of supports": any(s.settlement is not None for s in case.supports),
+    }
+    for name, given in others.items():
+        if given:
+            raise ValueError(
+                f"track.rail_rigidity and {name} cannot be together: the modes of beam and track"
+                " do not have it; leave one of them out"
+            )
+    if known_numbers(case.track) and is_concrete(beam.length):
+        least = case.track.least_modes(beam.length)
+        if beam.modes < least:
+            raise ValueError(
+                f"beam.modes is {beam.modes}; a rail of this track and length needs {least} at"
+                " least to bend under a wheel: raise it, or make track.approach shorter"
+            )
+    for i, load in enumerate(case.loads):
         _check_start(f"loads.{i}", load, case)
 
 

@@ -78,6 +78,8 @@ def kink_passages(
     `loads` are those of the case, if they are known.
     """
     nodes = np.array(kink_nodes(case, model.modes.layout), int)
+    if model.modes.rail_series is not None:  # which has none
+        nodes = nodes[:0]
     if not (nodes.size or case.profile is not None or has_settlement(case)):
         return None
     wheels = np.flatnonzero(np.concatenate([np.zeros(0, bool), *map(_has_mass, case.loads)]))

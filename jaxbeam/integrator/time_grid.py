@@ -420,7 +420,7 @@ def event_places(
     model: ModalModel, places: Float[Array, " place"] | None
 ) -> Float[Array, " event_place"]:
     """Places (m) at which a passing wheel is a load event: those of the model, and some more."""
-    own = model.load_nodes[1:-1]
+    own = model.load_breaks
     return own if places is None else xp.concatenate([own, model.load_places(places)])
 
 

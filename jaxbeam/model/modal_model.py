@@ -27,7 +27,7 @@ class ModalModel(Module):
     The coordinates q have the unit mass matrix. Where the moving mass of an actuator couples the
     `modes`, `mode_map` maps q to their amplitudes; else it is None. `displacement_map` maps q to
     the displacement (m, or rotation in rad) at each actuator. `spread` are the mode shapes under
-    axles that a track spreads, None without one.
+    axles that a track spreads, or those of its rail; None without one.
     """
 
     modes: Modes
@@ -93,6 +93,11 @@ class ModalModel(Module):
     def load_nodes(self) -> Float[Array, " node"]:
         """Positions of a wheel (m) between which its mode shapes are polynomials."""
         return self.modes.nodes if self.spread is None else self.spread.nodes
+
+    @property
+    def load_breaks(self) -> Float[Array, " break"]:
+        """Those of the `load_nodes` at which the mode shapes under a wheel are not smooth (m)."""
+        return self.load_nodes[1:-1] if self.modes.rail_series is None else xp.zeros(0)
 
     @property
     def load_series(self) -> Float[Array, "segment degree mode"]:
@@ -200,6 +205,8 @@ def assemble_modal_model(case: Case, modes: Modes, coupled: bool = True) -> Moda
 def _spread_shapes(case: Case, modes: Modes) -> SpreadShapes | None:
     if case.track is None:
         return None
+    if modes.rail_series is not None:
+        return SpreadShapes(modes.rail_nodes, modes.rail_series, np.zeros(1))
     kernel, twist = case.track.kernel(), modes.twist_series
     if twist is not None:
         twist = spread_series(kernel, modes.nodes, twist)[1]

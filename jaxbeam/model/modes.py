@@ -41,6 +41,7 @@ from jaxbeam.model.theory.elements import (
     section_fields,
     sections,
 )
+from jaxbeam.model.theory.layers import layers
 from jaxbeam.model.theory.statics import check_buckling
 from jaxbeam.model.theory.torsion import TorsionMatrices, torsion_matrices, twists
 from jaxbeam.numerics.matrices import REPEATED_EIGENVALUE_TOLERANCE, eigen
@@ -78,7 +79,8 @@ class Modes(TableViews, Module):
 
     Those of a beam that is not uniform have its `sections`, and if it is flexible in shear the
     `rotation_series` (m^-1 kg^-1/2) of its rotation phi; otherwise phi is the slope w'. Those of a
-    beam that twists have the `twist_series` (rad kg^-1/2).
+    beam that twists have the `twist_series` (rad kg^-1/2). Those of a beam under a track of layers
+    have the `rail_series` of the rail between the `rail_nodes` (m).
     """
 
     stiffness: Float[Array, " mode"]
@@ -92,6 +94,8 @@ class Modes(TableViews, Module):
     sections: Sections | None = None
     rotation_series: Float[Array, "segment degree mode"] | None = None
     twist_series: Float[Array, "segment degree mode"] | None = None
+    rail_nodes: Float[Array, " rail_node"] | None = None
+    rail_series: Float[Array, "piece term mode"] | None = None
 
     def __repr__(self) -> str:
         if not is_concrete(self.stiffness) or self.stiffness.ndim != 1:
@@ -132,7 +136,7 @@ class Modes(TableViews, Module):
 
     def lowest(self, count: int) -> "Modes":
         """The lowest modes, as many as `count`."""
-        lines = "stiffness", "damping", "series", "rotation_series", "twist_series"
+        lines = "stiffness", "damping", "series", "rotation_series", "twist_series", "rail_series"
         found = {name: getattr(self, name) for name in lines}
         found = {name: None if one is None else one[..., :count] for name, one in found.items()}
         squares = "coupling", "damping_coupling"
@@ -221,7 +225,8 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     Euler-Bernoulli beam, E I w'''' + m w_tt = 0, with supports, rotational springs and bonded
     patches; suspensions of actuators and support dampers are left to the modal model. The equations
     of beams that are not uniform are in `model.theory.elements`.
-    A beam with a torsional rigidity has modes of torsion among them (`model.theory.torsion`).
+    A beam with a torsional rigidity has modes of torsion among them (`model.theory.torsion`), one
+    under a track of layers those of beam and track together (`model.theory.layers`).
     Differentiable in every number, at repeated frequencies too. Inside `jit`, pass the `layout`
     found outside by `mesh_layout(case)`, for which the case is taken as valid.
 
@@ -235,7 +240,7 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     if layout is None:
         check_plant(case)
         layout = mesh_layout(case)
-    beam, found, to_rotation = case.beam, None, None
+    beam, found, to_rotation, track = case.beam, None, None, None
     if is_uniform(case):
         nodes, stiffness, mass, to_series = assemble_matrices(case, layout)
     else:
@@ -252,8 +257,14 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
         torsion = torsion_matrices(case, layout, nodes, to_series, density)
         values, vectors, of_twist, coupling = _with_torsion(beam.modes, stiffness, mass, torsion)
     else:
-        values, vectors, coupling = (part[..., : beam.modes] for part in eigen(stiffness, mass))
+        matrices = stiffness, mass
+        if case.track is not None and case.track.layered:
+            track = layers(case, layout, nodes, to_series)
+            matrices = track.with_beam(stiffness, mass)
+        values, vectors, coupling = (part[..., : beam.modes] for part in eigen(*matrices))
         coupling, of_twist, torsion = coupling[: beam.modes], None, None
+    every, own = vectors, values
+    vectors = vectors[: stiffness.shape[0]]
     values, coupling = values * _stiffness_unit(beam), coupling * _stiffness_unit(beam)
     unit = xp.sqrt(beam.linear_density * beam.length)
 
@@ -265,9 +276,13 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     twist = None if torsion is None else shapes(torsion.series, of_twist) / beam.length
     nodes = nodes * beam.length
     span = longest_span(case, layout, nodes)
+    rail = None if track is None else track.rail(case, every, unit)
     undamped = normalised_modes(
-        beam, values, coupling, nodes, shapes(to_series), layout, found, rotation, span, twist
+        beam, values, coupling, nodes, shapes(to_series), layout, found, rotation, span, twist, rail
     )
+    if track is not None:
+        damping = track.damping(case, every, undamped.damping, own, stiffness)
+        return eqx.tree_at(lambda m: m.damping, undamped, damping)
     if found is None or not has_lossy_segments(beam):
         return undamped
     ratios = ratios_of_segments(beam, layout, found, undamped.stiffness, undamped.fields)
@@ -319,6 +334,7 @@ def normalised_modes(
     rotation=None,
     span=None,
     twist=None,
+    rail=None,
 ) -> Modes:
     """Modes of given stiffness (1/s^2) with the beam's damping, positive near the left end."""
     damping, damping_coupling = modal_damping(beam, values, coupling, span)
@@ -338,6 +354,8 @@ def normalised_modes(
         sections,
         None if rotation is None else rotation * signs,
         None if twist is None else twist * signs,
+        None if rail is None else rail[0],
+        None if rail is None else rail[1] * signs,
     )
 
 

@@ -203,7 +203,12 @@ def port_forces(
 
 
 def is_supported(case: Case, layout: Layout) -> bool:
-    """Whether the beam is held against rigid-body motion; if traced, by the kind of its holds."""
+    """Whether exact statics corrects sums of modes: the beam is held and has no track of layers.
+
+    If traced, held by the kind of its holds.
+    """
+    if case.track is not None and case.track.layered:
+        return False
     unloaded = Case(case.beam, case.supports, case.actuators)
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(unloaded)):
         try:

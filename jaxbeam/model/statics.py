@@ -4,6 +4,7 @@ An influence line is the static value of a quantity under 1 N downwards, over th
 force. Static peaks are the largest values under the loads of a case wherever they are.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -132,6 +133,8 @@ def static_peak(
     layout = validated_layout(case, layout, x=x)
     if not case.loads:
         return xp.zeros(x.shape)
+    if case.track is not None and case.track.layered:
+        case = dataclasses.replace(case, track=None)  # its axles press on the beam as points
     return _static_peak(case, layout, x, kind, *parameters, intervals_of_waves(case))
 
 

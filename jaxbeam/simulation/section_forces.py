@@ -123,7 +123,9 @@ def _shares(case: Case) -> list[tuple[Any, Any]]:
     if case.track is None:
         return [(0.0, 1.0)]
     kernel = case.track.kernel()
-    return [] if kernel.integrated else list(zip(kernel.offsets, kernel.weights, strict=True))
+    if kernel.integrated or case.track.layered:
+        return []
+    return list(zip(kernel.offsets, kernel.weights, strict=True))
 
 
 def _vertical_force(case: Case, modes: Modes, motion: Motion, x, side: str):

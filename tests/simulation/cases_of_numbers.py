@@ -229,6 +229,21 @@ SPREAD = [jb.MovingForce(force=3.0, speed=2.4)]
 OF_TRACKS = {
     "sleepers": rig(SPREAD, track=jb.Track(spread="3 sleepers", sleeper_spacing=0.03)),
     "even": rig(SPREAD, track=jb.Track(spread_length=0.07)),
+    "layered": rig(
+        [changed("oscillator", entry_time=0.0231)],
+        beam=jb.Beam(0.6, 11.68, 0.535, 0.03, modes=10),
+        track=jb.Track(
+            rail_rigidity=0.5,
+            rail_mass=0.1,
+            pad_stiffness=2e3,
+            pad_damping=0.5,
+            sleeper_mass=2e-3,
+            ballast_stiffness=2e3,
+            ballast_damping=0.3,
+            sleeper_spacing=0.05,
+            approach=0.2,
+        ),
+    ),
     "uneven": rig(
         SPREAD, track=jb.Track(spread_offsets=[-0.03, 0.01, 0.05], spread_shares=[0.5, 1.0, 0.7])
     ),

@@ -18,7 +18,7 @@ from jaxbeam.case.case import Case, Run
 from jaxbeam.case.declared_checks import suggestion
 from jaxbeam.case.fields import OUTSIDE, concrete, refuses_traced
 from jaxbeam.case.reading.units import number_in_si
-from jaxbeam.case.track import Track, track_of
+from jaxbeam.case.track import THREE_SLEEPERS, Track, track_of
 from jaxbeam.case.validation import check_case
 from jaxbeam.library.published import trains as library
 from jaxbeam.model.modes import modes
@@ -71,9 +71,9 @@ def assess(
     code, their clauses and open sources are in `analysis/assessment/en1991_2.toml`; what has no
     open source is left out and named in the report.
 
-    Raises ValueError for an unknown code, deck, track or train, a controlled case, several
-    spans without a determinant length, a beam that can move as a rigid body, or numbers that are
-    out of range or traced by JAX.
+    Raises ValueError for an unknown code, deck, track or train, a track of layers, a controlled
+    case, several spans without a determinant length, a beam that can move as a rigid body, or
+    numbers that are out of range or traced by JAX.
 
     >>> import jaxbeam as jb
     >>> bridge = jb.Case(jb.Beam(25.0, 3e10, 15000.0, damping_ratio=0.01))
@@ -108,6 +108,11 @@ def assess(
     if spread is not None:
         given = spread if isinstance(spread, Track) else track_of(spread)
         case = dataclasses.replace(case, track=given)
+    if case.track is not None and case.track.layered:
+        raise ValueError(
+            "track.rail_rigidity: the trains of the code are forces on the beam; spread them by a"
+            f" rule, as track.spread = {THREE_SLEEPERS!r}, or leave the track out"
+        )
     bridge = _bridge(case)
     warn_if_implausible(bridge)
     length = _determinant_length(bridge, determinant_length)

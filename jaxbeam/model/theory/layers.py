@@ -1,0 +1,151 @@
+"""Track of layers: a rail on pads, sleepers and ballast, on the beam and on the ground beside it.
+
+    B r'''' + mu r_tt + p (r - s) = F,    sigma s_tt - p (r - s) + b (s - w) = 0,
+
+with the deflections r of the rail and s of the sleepers, the beam's w below them or, on the ground,
+0; B and mu are the bending stiffness and mass per length of the rail, sigma, p and b the mass of a
+sleeper and the stiffnesses of its pads and ballast over the sleeper spacing. The beam bears
+b (s - w). Forces F of wheels act on the rail.
+
+Rail and sleepers are sums of sin(n pi (x + a) / l) over the length l = L + 2 a of the rail, half as
+many as the case has modes; the beam is that of its own Ritz expansion. Undamped modes of all
+together have the damping of their dampers, and that of the beam by its share of their strain
+energy; damping between different modes is left out.
+
+It is the track of Zhai, Wang and Lin (2004) with two of its layers, even along it.
+"""
+
+import numpy as np
+from jaxtyping import Float
+from numpy.polynomial import chebyshev, legendre
+
+from jaxbeam.case.case import Case
+from jaxbeam.model.layout import Layout
+from jaxbeam.model.spread import to_series
+from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.module import Module
+
+SINES_PER_PIECE, PIECE_TERMS = 6, 32  # of the series of the rail: exact to rounding
+FURTHER_POINTS = 10  # of the quadrature, beyond the degree of the beam and the number of sines
+
+
+class Layers(Module):
+    """Rail and sleepers of a case, and springs between them and the beam, in beam units.
+
+    Unknowns are those of the beam, then of the rail, then of the sleepers. `pad` and `ballast` are
+    the stiffness matrices of unit springs per length; `rail_stiffness` and `masses` are diagonals.
+    """
+
+    rail_stiffness: Float[Array, " unknown"]
+    masses: Float[Array, " unknown"]
+    pad: Float[np.ndarray, "unknown unknown"]
+    ballast: Float[Array, "unknown unknown"]
+    springs: tuple[Float[Array, ""], Float[Array, ""]]
+
+    def with_beam(
+        self, stiffness: Float[Array, "own own"], mass: Float[Array, "own own"]
+    ) -> tuple[Float[Array, "unknown unknown"], Float[Array, "unknown unknown"]]:
+        """Stiffness and mass matrix of beam and track, from those of the beam."""
+        of_pads, of_ballast = self.springs
+        more = self.masses.shape[0] - stiffness.shape[0]
+        stiffness, mass = (xp.pad(each, (0, more)) for each in (stiffness, mass))
+        stiffness = stiffness + xp.diag(self.rail_stiffness)
+        stiffness = stiffness + of_pads * self.pad + of_ballast * self.ballast
+        return stiffness, mass + xp.diag(self.masses)
+
+    def damping(
+        self,
+        case: Case,
+        vectors: Float[Array, "unknown mode"],
+        of_beam: Float[Array, " mode"],
+        values: Float[Array, " mode"],
+        stiffness: Float[Array, "own own"],
+    ) -> Float[Array, " mode"]:
+        """Damping of the modes (1/s) of these vectors and values, in beam units.
+
+        `of_beam` is what the beam's damping would be, if all energy were its own; `stiffness` is
+        its matrix.
+        """
+        track, beam = case.track, case.beam
+        per_mass = 1.0 / (track.sleeper_spacing * beam.linear_density)
+        of_pads, of_ballast = (
+            xp.sum(vectors * (matrix @ vectors), axis=0) for matrix in (self.pad, self.ballast)
+        )
+        own = vectors[: stiffness.shape[0]]
+        elastic = values > 0
+        energy = xp.sum(own * (stiffness @ own), axis=0) / xp.where(elastic, values, 1.0)
+        share = xp.where(elastic, energy, 1.0)
+        dampers = track.pad_damping * of_pads + track.ballast_damping * of_ballast
+        return share * of_beam + per_mass * dampers
+
+    def rail(
+        self, case: Case, vectors: Float[Array, "unknown mode"], unit: Float[Array, ""]
+    ) -> tuple[Float[Array, " node"], Float[Array, "piece term mode"]]:
+        """Nodes (m) of the rail, and series of its mode shapes (kg^-1/2) between them."""
+        count, length = sine_count(case), case.beam.length
+        approach = case.track.ground
+        pieces = -(-count // SINES_PER_PIECE)
+        nodes = -approach + (length + 2 * approach) * np.linspace(0.0, 1.0, pieces + 1)
+        first = vectors.shape[0] - 2 * count
+        amplitudes = vectors[first : first + count] / unit
+
+        def shapes(x):
+            return _sines(case, x / length) @ amplitudes
+
+        return nodes, to_series(nodes, PIECE_TERMS, shapes)
+
+
+def sine_count(case: Case) -> int:
+    """Number of sines of the rail, and of the sleepers: half of the modes.
+
+    Each sine has two modes, of rail and sleepers in phase and against each other.
+    """
+    return max(1, case.beam.modes // 2)
+
+
+def _sines(case: Case, x: Float[Array, "*position"]) -> Float[Array, "*position sine"]:
+    """Sines of the rail at positions (in L), whose squares have the integral 1 over its length."""
+    approach = case.track.ground / case.beam.length
+    length, number = 1.0 + 2 * approach, np.arange(1, sine_count(case) + 1)
+    return xp.sqrt(2.0 / length) * xp.sin(np.pi * number * (x[..., None] + approach) / length)
+
+
+def layers(
+    case: Case,
+    layout: Layout,
+    nodes: Float[Array, " node"],
+    series: Float[Array, "segment term own"],
+) -> Layers:
+    """Layers of the track of a case on the beam with these nodes (in L) and series of unknowns."""
+    beam, track, count, own = case.beam, case.track, sine_count(case), series.shape[2]
+    length = 1.0 + 2 * track.ground / beam.length
+    waves = (np.pi * np.arange(1, count + 1) / length) ** 4
+    rail = track.rail_rigidity / beam.bending_stiffness * waves
+    identity = np.eye(own + 2 * count)
+    stretch = identity[own : own + count] - identity[own + count :]
+    points, weights = legendre.leggauss(max(layout.degrees) + count + FURTHER_POINTS)
+    table = chebyshev.chebvander(points, series.shape[1] - 1)
+    squares, products = xp.zeros((own, own)), xp.zeros((own, count))
+    for i in range(len(layout.degrees)):
+        half = (nodes[i + 1] - nodes[i]) / 2
+        values = table @ series[i]
+        weighted = (half * weights)[:, None] * values
+        squares = squares + weighted.T @ values
+        products = products + weighted.T @ _sines(case, nodes[i] + half * (points + 1))
+    none = np.zeros((own, count))
+    ballast = [
+        xp.concatenate([squares, none, -products], axis=1),
+        np.zeros((count, own + 2 * count)),
+        xp.concatenate([-products.T, np.zeros((count, count)), np.eye(count)], axis=1),
+    ]
+    spread = track.sleeper_spacing * beam.linear_density
+    parts = np.zeros(own), track.rail_mass / beam.linear_density, track.sleeper_mass / spread
+    masses = xp.concatenate([parts[0], *(xp.broadcast_to(part, count) for part in parts[1:])])
+    unit = beam.length**4 / (beam.bending_stiffness * track.sleeper_spacing)
+    return Layers(
+        xp.concatenate([np.zeros(own), rail, np.zeros(count)]),
+        masses,
+        stretch.T @ stretch,
+        xp.concatenate(ballast),
+        (track.pad_stiffness * unit, track.ballast_stiffness * unit),
+    )
