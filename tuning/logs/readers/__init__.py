@@ -85,19 +85,27 @@ def _read_gz(path: Path) -> dict[str, LogTable]:
     return _unpacked(path, name, content, "")
 
 
+# A place before the start of the file is a ValueError.
+_DAMAGED_ZIP = (OSError, EOFError, RuntimeError, ValueError, zipfile.BadZipFile, zlib.error)
+
+
 def _read_zip(path: Path) -> dict[str, LogTable]:
     """Tables of the logs in a zip archive; other files are passed over.
 
     The runs of several are named by the files. Raises ValueError for a damaged file, one without
     logs, and as the readers of the logs do.
     """
+    packed = io.BytesIO(read_bytes(path))
     try:
-        with zipfile.ZipFile(io.BytesIO(read_bytes(path))) as archive:
-            sizes = {one.filename: one.file_size for one in archive.infolist() if not one.is_dir()}
-            logs = [name for name in sizes if Path(name).suffix.lower() in _SUFFIXES]
-            _check_size(path, sum(sizes[name] for name in logs))
-            contents = {name: archive.read(name) for name in logs}
-    except (OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        archive = zipfile.ZipFile(packed)
+    except _DAMAGED_ZIP as error:
+        raise damaged_file_error(path, error) from None
+    sizes = {one.filename: one.file_size for one in archive.infolist() if not one.is_dir()}
+    logs = [name for name in sizes if Path(name).suffix.lower() in _SUFFIXES]
+    _check_size(path, sum(sizes[name] for name in logs))
+    try:
+        contents = {name: archive.read(name) for name in logs}
+    except _DAMAGED_ZIP as error:
         raise damaged_file_error(path, error) from None
     if not logs:
         raise ValueError(f"{path}: there is no log in the archive: {', '.join([*sizes][:5])}")
