@@ -45,7 +45,9 @@ def spans() -> list[str]:
 def options_of_commands() -> set[str]:
     """Options of all commands."""
     names = {one.__name__.replace("_", "-") for group in COMMANDS.values() for one in group}
-    arguments = [a for name in names for a in app[name].assemble_argument_collection()]
+    commands = [app[name] for name in names]
+    commands += [one[part] for one in commands for part in one if not part.startswith("-")]
+    arguments = [a for one in commands for a in one.assemble_argument_collection()]
     return {option for argument in arguments for option in argument.names}
 
 

@@ -233,13 +233,19 @@ def command_page() -> str:
     for title, group in COMMANDS.items():
         lines += ["", f"## {title}", ""]
         for function in group:
-            lines += command(function.__name__.replace("_", "-"))
+            name = function.__name__.replace("_", "-")
+            lines += command(name)
+            for part in commands[name]:
+                if not part.startswith("-"):
+                    lines += command(f"{name} {part}")
     return "\n".join(lines) + "\n"
 
 
 def command(name: str) -> list[str]:
     """Section of one command."""
-    one = commands[name]
+    one = commands
+    for word in name.split():
+        one = one[word]
     arguments = [a for a in one.assemble_argument_collection() if a.parameter.show is not False]
     arguments = [a for a in arguments if a.names and not a.names[0].startswith("*")]
     summary, _, more = (one.help or "").partition("Parameters\n")

@@ -119,10 +119,7 @@ REFUSED = [
         "weigh case.toml old.nc --speeds 5:20 --calibration old.nc",
         "--calibration is for axles: say how many --axles, or --axles auto",
     ),
-    (
-        "weigh case.toml old.nc --speeds 5:20 --axles 2 --lines lines.json",
-        "--lines writes what --calibration LOG finds",
-    ),
+    ("weigh calibrate case.toml", "weigh calibrate needs a log: jaxbeam weigh calibrate CASE"),
     (
         "weigh case.toml old.nc --speeds 5:20 --axles 2 --calibration a.json --calibration old.nc",
         "--calibration takes one file of lines",

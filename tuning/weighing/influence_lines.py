@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, refuses_traced
+from jaxbeam.runtime.printer import text_table
 from tuning.weighing.unit_force import UnitForce, driven
 
 POINTS = 81  # equally spaced, and one at each sensor, where lines of strain have a kink
@@ -119,6 +120,29 @@ class InfluenceLines(NamedTuple):
             for shape, ratio, damping, part in rows
         ]
 
+    @property
+    def errors(self) -> Float[np.ndarray, "point sensor"]:
+        """Standard errors of the ordinates; zero for the lines of a case."""
+        if self.deviations is None:
+            return np.zeros(self.values.shape)
+        return np.sqrt(np.sum(self.deviations**2, axis=0))
+
+    def __str__(self) -> str:
+        sizes = np.abs(self.values)
+        rows = [
+            [str(i), f"{self.values[k, i]:.4g}", f"{self.positions[k]:.4g}",
+             f"{100 * self.errors[k, i] / max(sizes[k, i], 1e-300):.2g}"]
+            for i, k in enumerate(sizes.argmax(axis=0).tolist())
+        ]  # fmt: skip
+        head = ("sensor", "largest ordinate (SI unit/N)", "at (m)", "standard error (%)")
+        about = "" if self.frequency is None else (
+            f"; the first mode vibrates at {self.frequency:.4g} Hz, dynamic wheel forces are"
+            f" {self.dynamic_share:.2g} of the static ones"
+        )  # fmt: skip
+        count = self.values.shape[1]
+        first = f"influence lines of {count} sensor{'s' * (count > 1)}{about}"
+        return "\n".join([first, *text_table(head, rows, ">>>>")])
+
     def to_dict(self) -> dict:
         """Plain numbers, from which `lines_from_dict` makes the lines again."""
         return {
@@ -147,7 +171,7 @@ def lines_from_dict(content: dict) -> InfluenceLines:
     if found != FORMAT:
         raise ValueError(
             f"these are no calibrated influence lines: format {found!r}, not {FORMAT!r}; write them"
-            " by weigh --calibration LOG --lines FILE"
+            " by weigh calibrate CASE LOG -o FILE"
         )
     names = "deviations", "shapes", "frequency_ratios", "damping_ratios"
     tables = [None if content[name] is None else np.array(content[name]) for name in names]

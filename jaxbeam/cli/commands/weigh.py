@@ -24,7 +24,6 @@ def weigh(
     one_way: bool = False,
     axles: str | None = None,
     calibration: tuple[Path, ...] = (),
-    lines: Path | None = None,
     output: Output = None,
     options: CaseOptions = CaseOptions(),
 ) -> None:
@@ -47,19 +46,14 @@ def weigh(
         forces and spacings.
     calibration
         Log of a vehicle of known axle loads (in the TOML file beside it), from which influence
-        lines are found; repeat it for more runs. Or one JSON file of lines that `--lines` wrote.
-    lines
-        Write the influence lines found to this file, JSON, for other logs of the bridge.
+        lines are found; repeat it for more runs. Or one JSON file of lines that `jaxbeam weigh
+        calibrate` wrote.
     output
         Write the case with the identified loads to this file, TOML.
     """
-    options.check_outputs(output, lines)
+    options.check_outputs(output)
     saved = [path for path in calibration if path.suffix == ".json"]
     refuse_option(bool(saved) and len(calibration) > 1, "--calibration takes one file of lines")
-    refuse_option(
-        lines is not None and (not calibration or bool(saved)),
-        "--lines writes what --calibration LOG finds",
-    )
     speed_range = parse_range("--speeds", speeds, "m/s, such as 0.5:3")
     number = None if axles in (None, "auto") else _axle_count(axles)
     check_exists("log file", log)
@@ -73,7 +67,6 @@ def weigh(
 
     import tuning  # sets XLA's threads, therefore before the case is read
     from jaxbeam.files.case_file import save_case
-    from jaxbeam.runtime.output_file import whole_file
 
     parsed_case, read = options.read(case), tuning.read_log(log)
     if axles is None:
@@ -84,12 +77,43 @@ def weigh(
             parsed_case, read, speed_range, number, both_ways=not one_way,
             influence_lines=calibrated,
         )  # fmt: skip
-        if lines is not None and calibrated is not None:
-            with whole_file(lines, options.overwrite) as beside:
-                beside.write_text(json.dumps(calibrated.to_dict()))
     if output:
         save_case(weighing.case, output, overwrite=True)  # checked before the work
-    options.report(weighing.to_dict(), [str(weighing)], output, lines)
+    options.report(weighing.to_dict(), [str(weighing)], output)
+
+
+def calibrate(
+    case: Path,
+    /,
+    *logs: Path,
+    output: Output = None,
+    options: CaseOptions = CaseOptions(),
+) -> None:
+    """Find the influence lines of a bridge, with their errors, by runs of known vehicles.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML, with sensors on the beam.
+    logs
+        LOG...: logs of vehicles of known axle loads (in the TOML files beside them), best at three
+        speeds or more; runs on another lane are calibrated by themselves.
+    output
+        Write the lines to this file, JSON, for `jaxbeam weigh --calibration`.
+    """
+    refuse_option(not logs, "weigh calibrate needs a log: jaxbeam weigh calibrate CASE LOG...")
+    options.check_outputs(output)
+    check_exists("log file", *logs)
+    options.check_case(case)
+
+    import tuning  # noqa: F401  (sets XLA's threads, therefore before the case is read)
+    from jaxbeam.runtime.output_file import whole_file
+
+    lines = _lines_of(options.read(case), logs)
+    if output:
+        with whole_file(output, options.overwrite) as beside:
+            beside.write_text(json.dumps(lines.to_dict()))
+    options.report(lines.to_dict(), [str(lines)], output)
 
 
 def _lines_of(case, calibration: tuple[Path, ...]):

@@ -71,12 +71,14 @@ def test_influence_lines_of_several_logs_are_kept(call, tmp_path, monkeypatch):
     for name in ("log", "first", "second"):
         (tmp_path / f"{name}.csv").write_text("t [s],a [mm]\n0,1\n1,2\n2,1\n")
     weigh = "weigh case.toml log.csv --speeds 0.5:3 --axles auto"
-    runs = "--calibration first.csv --calibration second.csv --lines lines.json"
-    code, out, err = call(f"{weigh} {runs}")
-    assert (code, out) == (0, "2 axles found\nwritten: lines.json\n"), err
-    assert len(calibrated) == 2
+    code, out, err = call(f"{weigh} --calibration first.csv --calibration second.csv")
+    assert (code, out) == (0, "2 axles found\n"), err
+    assert calibrated == ["first.csv", "second.csv"]
+    code, out, err = call("weigh calibrate case.toml first.csv second.csv -o lines.json")
+    assert code == 0 and out.endswith("written: lines.json\n"), err
+    assert out.startswith("influence lines of ") and calibrated[2:] == ["first.csv", "second.csv"]
     code, out, err = call(f"{weigh} --calibration lines.json")
-    assert code == 0 and len(calibrated) == 2, err
+    assert code == 0 and len(calibrated) == 4, err
     for one, again in zip(used[0], used[1], strict=True):
         np.testing.assert_array_equal(one, again)
     (tmp_path / "other.json").write_text("[1, 2")
