@@ -5,7 +5,7 @@ It draws by the scripts of `jaxbeam app`, which it contains, and asks nothing of
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib import resources
 
@@ -42,10 +42,15 @@ def interactive_page(title: str, sentence: str, columns: Mapping[str, np.ndarray
         panel = panels.setdefault(
             f"{quantity} ({unit})", {"title": quantity, "unit": unit or "1", "series": []}
         )
-        panel["series"].append({"name": name or quantity, "y": _plain(values)})
-    data = {"axis": axis, "x": _plain(x), "panels": list(panels.values())}
+        panel["series"].append({"name": name or quantity, "y": plain_numbers(values)})
+    data = {"axis": axis, "x": plain_numbers(x), "panels": list(panels.values())}
+    return page_of(title, sentence, SCRIPTS, data, SHOW)
+
+
+def page_of(title: str, sentence: str, scripts: Sequence[str], data: Mapping, show: str) -> str:
+    """Page of data (DATA) that a text of JavaScript shows by scripts of the page in the browser."""
     folder = resources.files("jaxbeam") / "app" / "static"
-    texts = [(folder / name).read_text(encoding="utf-8") for name in SCRIPTS]
+    texts = [(folder / name).read_text(encoding="utf-8") for name in scripts]
     modules = re.sub(r"^import .*$|^export ", "", "\n".join(texts), flags=re.MULTILINE)
     # A name may hold "</script>", which would end the script.
     content = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
@@ -53,11 +58,11 @@ def interactive_page(title: str, sentence: str, columns: Mapping[str, np.ndarray
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
         f"<style>{style}</style></head><body><h1>{escape(title)}</h1><p>{escape(sentence)}</p>"
-        f'<script type="module">{modules}\nconst DATA = {content};{SHOW}</script></body></html>'
+        f'<script type="module">{modules}\nconst DATA = {content};{show}</script></body></html>'
     )
 
 
-def _plain(values) -> list[float | None]:
+def plain_numbers(values) -> list[float | None]:
     """Numbers to `DIGITS` digits, None for those that are not finite."""
     numbers = np.asarray(values, float).tolist()
     return [float(f"{one:.{DIGITS}g}") if np.isfinite(one) else None for one in numbers]

@@ -1,5 +1,6 @@
 """The open case and its results, without any web."""
 
+import dataclasses
 import json
 import re
 import tomllib
@@ -15,6 +16,8 @@ from jaxbeam.app import views
 from jaxbeam.app.workspace import PREVIEW_TOLERANCE, changed
 from tests.app.conftest import RIG
 from tests.modules import ROOT
+from tests.tuning.modal.test_modal import ambient
+from tuning import identify_modes
 
 
 def test_a_model_has_tables_scene_and_numbers(workspace):
@@ -322,3 +325,33 @@ def test_a_browser_draws_it_without_requests(written, browser):
     page.wait_for_function("document.querySelector('output').textContent.includes('sensor 1')")
     page.close()
     assert wrong == [] and requests == [written[1].as_uri()]
+
+
+def test_modes_are_chosen_by_clicks_on_a_page_without_requests(tmp_path, browser):
+    fit, path = identify_modes(ambient(0)), tmp_path / "log.html"
+    fit.to_html(path)
+    data = json.loads(re.search(r"^const DATA = (.*);$", path.read_text(), re.MULTILINE)[1])
+    found = np.array(data["frequencies"])[data["chosen"]]
+    np.testing.assert_allclose(found, fit.frequencies, rtol=0.01)
+    requests, wrong, page = [], [], browser.new_page()
+    page.on("request", lambda request: requests.append(request.url))
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.goto(path.as_uri())
+    assert page.locator("circle").count() == len(data["orders"])
+    command = page.locator("output").text_content()
+    assert command.endswith("--choose " + ",".join(f"{one:.6g}" for one in found))
+    page.evaluate(f"document.querySelector('[data-pole=\"{data['chosen'][0]}\"]').dispatchEvent("
+                  "new MouseEvent('click'))")  # fmt: skip
+    left = page.locator("output").text_content()
+    assert left.endswith("--choose " + ",".join(f"{one:.6g}" for one in found[1:]))
+    other = next(i for i, stable in enumerate(data["stable"]) if not stable)
+    page.evaluate(f"document.querySelector('[data-pole=\"{other}\"]').dispatchEvent("
+                  "new MouseEvent('click'))")  # fmt: skip
+    assert f"{data['frequencies'][other]:.6g}" in page.locator("output").text_content()
+    assert page.locator("tbody tr").count() == len(found)
+    page.close()
+    assert wrong == [] and requests == [path.as_uri()]
+    with pytest.raises(FileExistsError):
+        fit.to_html(path)
+    with pytest.raises(ValueError, match="have no stabilisation diagram; choose --method cov"):
+        dataclasses.replace(fit, diagrams=()).to_html(tmp_path / "other.html")

@@ -21,6 +21,13 @@ def decay_log(folder):
 COLUMNS = "--columns t[s],a[g],b[g]"
 
 
+def test_a_stabilisation_diagram_is_a_page(run, refused, decay_log):
+    line = f"modes-from-log node.csv {COLUMNS} --band 5:60 --html"
+    assert "written: node.html" in run(f"{line} --method covariance")
+    assert "jaxbeam modes-from-log node.csv --band 5:60" in (decay_log / "node.html").read_text()
+    assert "node.html exists" in refused(line)
+
+
 def test_modes_of_a_file_without_headings(run, decay_log):
     printed = run(f"modes-from-log node.csv {COLUMNS} --band 5:60 --plot --length 2")
     assert "excitation: a free decay  [--kind" in printed and "50.00" in printed

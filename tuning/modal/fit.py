@@ -1,11 +1,14 @@
 """Modes identified from a log, with all that was chosen on the way."""
 
+import os
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxbeam.files.endings import check_ending
+from jaxbeam.runtime.output_file import whole_file
 from tuning.logs.log import Log
 from tuning.modal.ambient import MAX_BAND_RATIO
 from tuning.modal.harmonics import Line
@@ -118,6 +121,19 @@ class ModalFit(ModalEstimates):
                 for mode, why in self.rejected
             ],
         }
+
+    def to_html(self, path: str | os.PathLike, overwrite: bool = False) -> None:
+        """Write the stabilisation diagram, in which modes are chosen by clicks, as a page.
+
+        Raises ValueError for another ending than .html and a fit without a diagram,
+        FileExistsError if the file exists, without `overwrite`.
+        """
+        from tuning.modal.diagram_page import diagram_page
+
+        check_ending(path, "an interactive figure", (".html",))
+        page = diagram_page(self)
+        with whole_file(path, overwrite) as beside:
+            beside.write_text(page, encoding="utf-8")
 
     def plot(self, path=None, length: float | None = None):
         """Figure of log, spectrum with stabilisation diagram, fit, and shapes on the beam.

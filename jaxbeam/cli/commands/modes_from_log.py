@@ -45,6 +45,7 @@ def modes_from_log(
     align: bool = False,
     as_logged: bool = False,
     plot: bool = False,
+    html: bool = False,
     length: float | None = None,
     case: Path | None = None,
     free: Free = (),
@@ -112,6 +113,9 @@ def modes_from_log(
     plot
         Draw the log, its spectrum with the stabilisation diagram, and the shapes to a PNG named
         after the first log; of setups LOG_setup1.png and so on, and merged LOG_setups.png.
+    html
+        Write the stabilisation diagram of each setup, in which modes are chosen by clicks, to a
+        page LOG.html for any browser.
     length
         Length (m) of the beam on which the shapes are drawn.
     case
@@ -155,7 +159,8 @@ def modes_from_log(
     if plot and len(setups) > 1:
         pictures.append(_picture(logs[0], "_setups"))
     drawn = [_picture(logs[0], f"{word}_responses") for word in several if responses]
-    options.check_outputs(*pictures, *drawn)
+    pages = [_picture(logs[0], word).with_suffix(".html") for word in several if html]
+    options.check_outputs(*pictures, *drawn, *pages)
     fits = []
     for setup in setups:
         window = _window(setup[0], from_, to)
@@ -196,6 +201,8 @@ def modes_from_log(
         lines += ["", str(found)]
     for fit, picture in zip(dict.fromkeys([*fits, found]), pictures, strict=False):
         fit.plot(picture, length=length)
+    for fit, page in zip(fits, pages, strict=False):
+        fit.to_html(page, options.overwrite)
     answer = found.to_dict()
     if case is not None:
         model = options.read(case)
@@ -203,7 +210,7 @@ def modes_from_log(
         answer, lines = {**answer, "fit": updated.to_dict()}, [*lines, "", str(updated)]
         if output is not None:
             jb.save_case(updated.case, output, options.overwrite)
-    options.report(answer, lines, output, *pictures, *drawn)
+    options.report(answer, lines, output, *pictures, *drawn, *pages)
 
 
 def _picture(log: Path, word: str) -> Path:
