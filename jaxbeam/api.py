@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from jaxbeam.case.case import Case, part_classes
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.case.reading.toml_file import parse_toml
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_from_tables, load_case_with
@@ -95,8 +96,11 @@ def problem(error: Exception) -> Problem:
     return Problem(message, address, int(line[1]) if line else None)
 
 
+@refuses_traced("plain data")
 def plain(value: Any) -> Any:
     """A value of JSON types: arrays as lists, keys as strings, None for infinite and NaN.
+
+    Raises ValueError for traced numbers.
 
     >>> plain({"peaks": np.array([1.0, np.nan])})
     {'peaks': [1.0, None]}
@@ -110,10 +114,12 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
+@refuses_traced("plain data")
 def content(result: "Record | Plausibility | xarray.Dataset") -> dict[str, Any]:
     """Numbers of a `result` by their names (SI units), those that the commands print with `--json`.
 
     Results are those of `simulate`, `check` and `sweep`; histories of a record are its `columns`.
+    Raises ValueError for traced numbers.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)

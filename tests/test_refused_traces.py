@@ -7,13 +7,19 @@ import numpy as np
 import pytest
 
 import jaxbeam as jb
+import jaxbeam.plot
 import tuning
 from jaxbeam.analysis import stability
 from jaxbeam.analysis.combinations import combine
 from jaxbeam.analysis.compare import compare
 from jaxbeam.analysis.load_models import crossing_envelope, load_model_envelope
 from jaxbeam.analysis.margins import stability_margin
-from jaxbeam.analysis.sections import influence_table, record_amplification
+from jaxbeam.analysis.sections import (
+    characteristic_points,
+    influence_table,
+    record_amplification,
+)
+from jaxbeam.control.receptance_method import closed_loop_poles, receptance_feedback
 
 CASE = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.02, modes=2),
@@ -26,6 +32,14 @@ MASS, RIGIDITY, GAIN = "loads.0.mass", "beam.flexural_rigidity", "controller.gai
 TIMES = np.linspace(0.0, 0.3, 31)
 LOG = tuning.Log(TIMES, np.sin(TIMES)[:, None], ("w",), ("deflection",), ("m",), sensors=(0,))
 TRAINING = tuning.LoadCases(({MASS: 0.2},))
+LAW = receptance_feedback(CASE, [-9 + 99j])
+
+
+def responses(case):
+    """A frequency response of a case."""
+    return jb.frequency_response(case, np.array([5.0, 9.0]), [("force@0.3", "velocity@0.2")])
+
+
 REFUSED = {
     "amplification of a record": lambda case, _: record_amplification(jb.simulate(case)),
     "python-control, plant and loop": lambda case, path: jb.to_control(case),
@@ -34,6 +48,18 @@ REFUSED = {
     "file": lambda case, path: jb.save(jb.simulate(case), path / "run.csv"),
     "table": lambda case, path: jb.simulate(case).columns,
     "figure": lambda case, path: jb.simulate(case).plot(),
+    "figure of a function": lambda case, path: jaxbeam.plot.plot_record(jb.simulate(case)),
+    "plain data": lambda case, path: jb.api.content(jb.simulate(case)),
+    "table of an envelope": lambda case, path: jb.simulate(case).envelope("moment").columns,
+    "dataset of an envelope": lambda case, path: jb.simulate(case).envelope("moment").to_xarray(),
+    "table of modes": lambda case, path: jb.modes(case).columns,
+    "dataset of modes": lambda case, path: jb.modes(case).to_xarray(),
+    "table of responses": lambda case, path: responses(case).columns,
+    "dataset of responses": lambda case, path: responses(case).to_xarray(),
+    "figure of responses": lambda case, path: responses(case).plot(),
+    "points": lambda case, path: characteristic_points(case),
+    "poles": lambda case, path: closed_loop_poles(case, LAW),
+    "feedback that keeps modes": lambda case, path: receptance_feedback(case, [-9 + 99j], keep=[1]),
     "load model": lambda case, path: load_model_envelope(case, "HL-93", [0.3]),
     "crossing of a load model": lambda case, path: crossing_envelope(case, "HL-93", 2.0, [0.3]),
     "combinations": lambda case, path: combine(
@@ -61,6 +87,10 @@ REFUSED = {
     "influences of logs": lambda case, path: tuning.weighing.model_influence_lines(case),
 }
 BESIDE_THE_CASE = {
+    "plain numbers": lambda share: jb.api.plain({"peak": share}),
+    "grid of values": lambda share: tuning.full_grid({MASS: [0.2 * share]}),
+    "draws of values": lambda share: tuning.latin_hypercube({MASS: (0.2 * share, 0.4)}, 3),
+    "assigned poles": lambda share: receptance_feedback(CASE, [-9 * share + 99j]),
     "period of a bound": lambda share: jb.bound(CASE, period=0.02 * share),
     "positions of a bound": lambda share: jb.bound(CASE, [0.3 * share], period=0.02),
     "speed of an assessment": lambda share: jb.assess(CASE, 40.0 * share),
@@ -76,7 +106,10 @@ BESIDE_THE_CASE = {
     "speeds of a weighing": lambda share: tuning.weigh(CASE, LOG, (1.0 * share, 3.0)),
     "band of a modal fit": lambda share: tuning.identify_modes(LOG, band=(1.0 * share, 9.0)),
 }
-OF_PLANTS = "python-control, plant and loop", "python-control", "MATLAB"
+OF_PLANTS = (
+    *("python-control, plant and loop", "python-control", "MATLAB", "table of modes"),
+    *("dataset of modes", "table of responses", "dataset of responses", "figure of responses"),
+)
 TRANSFORMED = {
     "grad": lambda function: jax.jvp(function, (1.0,), (1.0,)),
     "jit": lambda function: jax.jit(function)(1.0),
@@ -159,3 +192,40 @@ def test_extremes_along_the_beam_are_differentiated_where_they_are(of_record):
     # Positions between those of the grid, where the moment is 1 % larger, included.
     assert float(value) == pytest.approx(float(largest(0.3)), rel=1e-9)
     assert float(slope) == pytest.approx(float(differences), rel=1e-4)
+
+
+@pytest.mark.parametrize("transformed", TRANSFORMED)
+def test_ranges_of_a_simulator_are_known(transformed):
+    def function(share):
+        jb.Simulator(CASE, {MASS: (0.1 * share, 0.4)})
+        return share
+
+    with pytest.raises(ValueError, match="make it outside of jax.jit, vmap and grad"):
+        TRANSFORMED[transformed](function)
+
+
+def test_a_law_of_receptances_is_differentiated_with_its_controller():
+    def gain(rigidity):
+        case = jb.replace(CASE, {RIGIDITY: rigidity})
+        velocity = dataclasses.replace(CASE, sensors=(jb.Sensor(0.3), jb.Sensor(0.3, "velocity")))
+        return receptance_feedback(case, [-9 + 99j]).controller(velocity).gains[0, 0]
+
+    slope = jax.jvp(gain, (11.68,), (1.0,))[1]
+    assert slope == pytest.approx((gain(11.69) - gain(11.67)) / 0.02, rel=1e-5)
+
+
+@pytest.mark.parametrize("address", ["supports.0.position", "loads.0.speed"])
+def test_extremes_at_supports_and_loads_move_with_them(address):
+    """The place of an extreme at a kink of the moments has a derivative, too."""
+    case = dataclasses.replace(
+        CASE, actuators=(), supports=(jb.Support(0.37),), run=jb.Run(0.28, 200.0)
+    )
+
+    def extremes(number):
+        found = jb.simulate(jb.replace(case, {address: number})).envelope("moment")
+        return jax.numpy.stack([found.smallest.min(), found.largest.max()])
+
+    value = float(jb.addresses(case)[address])
+    slopes, step = jax.jvp(extremes, (value,), (1.0,))[1], 1e-4 * value
+    differences = (extremes(value + step) - extremes(value - step)) / (2 * step)
+    np.testing.assert_allclose(slopes, differences, rtol=3e-3)

@@ -17,7 +17,7 @@ from jaxbeam.case.fields import OUTSIDE, concrete, refuse_traced, refuses_traced
 from jaxbeam.case.quantities import QUANTITIES, quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.integrate import integrate_peaks
-from jaxbeam.model.along_beam import LEFT_SHARE, positions_along, refined, sections
+from jaxbeam.model.along_beam import LEFT_SHARE, moving_with, positions_along, refined, sections
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.static_correction import bending_moment, shear_force
 from jaxbeam.model.statics import (
@@ -66,6 +66,7 @@ class Envelope(TableViews, Module):
     quantity: str = eqx.field(static=True, default="deflection")
 
     @property
+    @refuses_traced("a table")
     def columns(self) -> dict[str, np.ndarray]:
         """Position (m), lowest and highest value, by head."""
         unit = QUANTITIES[self.quantity].unit
@@ -129,9 +130,15 @@ def envelope(
 
     if x is None and not any_jax(case):
         return refined(case, at, curves)[1]
-    if x is None:  # those of the known case, at which the extremes are differentiated
+    if x is None:  # those of the known case, where the extremes are differentiated
         known = concrete_case(case), None, tolerance
-        x = envelope(*known, quantity=quantity, **jax.tree.map(concrete, parameters)).positions
+        found = envelope(*known, quantity=quantity, **jax.tree.map(concrete, parameters))
+        own = np.asarray(found.positions)
+        x, moving = moving_with(case, own)
+        if moving.any():  # apart: steps end where a load passes them, so that derivatives take long
+            parts = at(xp.asarray(own[~moving])), at(x[moving])
+            order = np.argsort(np.concatenate([own[~moving], own[moving]]), kind="stable")
+            return jax.tree.map(lambda *both: xp.concatenate(both)[order], *parts)
     x = xp.asarray(x, float)
     check_on_beam("x", x, case.beam.length)
     return at(x)
@@ -206,10 +213,12 @@ def spans(case: Case) -> list[tuple[float, float]]:
     return [(a, b) for a, b in itertools.pairwise(marks) if b - a > 1e-9 * length]
 
 
+@refuses_traced("a list of points")
 def characteristic_points(case: Case) -> list[CharacteristicPoint]:
     """Supports, quarter points and midspans of all spans, hinges and free ends, left to right.
 
-    Spans and supports are counted from 1; of an overhang the points are those of a span.
+    Spans and supports are counted from 1; of an overhang the points are those of a span. Raises
+    ValueError for a case whose numbers are traced.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)

@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Complex, Float
 from numpy.typing import ArrayLike
 
-from jaxbeam.case.case import Case, concrete_case
+from jaxbeam.case.case import Case
 from jaxbeam.case.controller import commanded
-from jaxbeam.case.fields import concrete
+from jaxbeam.case.fields import OUTSIDE, concrete, refuse_traced, refuses_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.control.feedback import OutputFeedback
 from jaxbeam.model.modal_model import ModalModel, modal_model
@@ -80,9 +80,9 @@ class ReceptanceFeedback(Module):
         driven = commanded(case.actuators)
         if self.actuator not in driven:
             raise ValueError(f"actuators.{self.actuator} of the case takes no command")
-        gains = np.zeros((len(driven), 2 * count))
-        gains[driven.index(self.actuator)] = np.concatenate([self.displacement, self.velocity])
-        return OutputFeedback(gains=gains, period=period, delay=delay or None)
+        own = np.arange(len(driven)) == driven.index(self.actuator)
+        gains = own[:, None] * xp.concatenate([self.displacement, self.velocity])
+        return OutputFeedback(gains=gains, period=period, delay=self.delay if delay else None)
 
 
 def receptances(case: Case, s, actuator: int = 0) -> Complex[Array, "pole sensor"]:
@@ -158,7 +158,7 @@ def receptance_gains(
     modes of the open-loop poles `kept_poles` (1/s) with deflections `kept` (pole, sensor) at the
     sensors do not change. A complex pole takes two gains, a real pole one; where gains are left,
     the smallest are taken. Raises ValueError if there are too few sensors, or if the poles
-    cannot be assigned.
+    cannot be assigned, and for traced numbers other than receptances `assigned`.
 
     The `actuator` is driven with the `delay` (s) from measurement to command.
 
@@ -172,6 +172,7 @@ def receptance_gains(
     >>> print(np.abs(closed).max() < 1e-9)
     True
     """
+    refuse_traced("an assignment of poles", "only receptances may be", poles, delay, kept_poles)
     assigned, poles = xp.asarray(assigned) + 0j, np.asarray(poles, complex)
     count = assigned.shape[1]
     kept = np.asarray(kept, complex).reshape(-1, count)
@@ -215,7 +216,8 @@ def receptance_feedback(
     `poles` are one of each conjugate pair; `keep` are the indices, from 0, of modes whose poles and
     shapes stay, in the order of their frequencies with supports and actuators. Loads and filters
     are left out. Differentiable in the numbers of the case, unless modes are kept. Raises
-    ValueError as `receptance_gains` does, for an invalid case, and for modes that it does not have.
+    ValueError as `receptance_gains` does, for an invalid case, for modes that it does not have, and
+    for a traced one whose modes are kept.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -230,7 +232,8 @@ def receptance_feedback(
     model = _checked_model(case, actuator)
     shapes, kept_poles = np.zeros((0, len(case.sensors))), np.zeros(0)
     if len(keep):
-        found, vectors = _oscillating_modes(concrete_case(case))
+        refuse_traced("a feedback that keeps modes", OUTSIDE, case)
+        found, vectors = _oscillating_modes(case)
         if min(keep) < 0 or max(keep) >= len(found):
             raise ValueError(f"keep must list modes from 0 to {len(found) - 1}, not {list(keep)}")
         kept_poles = found[list(keep)]
@@ -241,6 +244,7 @@ def receptance_feedback(
     return receptance_gains(assigned, poles, delay, shapes, kept_poles, actuator)
 
 
+@refuses_traced("a list of poles")
 def closed_loop_poles(
     case: Case, feedback: ReceptanceFeedback, delay: float | None = None, count: int = 24
 ) -> Complex[np.ndarray, " pole"]:
@@ -250,7 +254,7 @@ def closed_loop_poles(
     the delay (Breda, Maset and Vermiglio, SIAM Journal on Scientific Computing 27, 2005), and the
     `count` rightmost poles are refined by inverse iteration. `delay` (s) may differ from that of
     the design, which tells how robust it is. Loads and filters are left out. Raises ValueError for
-    an invalid case; needs known numbers.
+    an invalid case, and for numbers that are traced.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -262,7 +266,6 @@ def closed_loop_poles(
     >>> bool(abs(jb.receptance_method.closed_loop_poles(case, law) - (-12.8 + 127.5j)).min() < 1e-8)
     True
     """
-    case = concrete_case(case)
     model = _checked_model(case, feedback.actuator)
     delay = float(concrete(feedback.delay)) if delay is None else delay
     shapes = _sensor_shapes(case, model)

@@ -36,20 +36,40 @@ def special_positions(case: Case) -> Float[Array, " place"]:
 
     Loads are those that stand on the beam for good.
     """
-    length, loads = case.beam.length, load_set(case)
+    sensors = (sensor.position for sensor in case.sensors)
+    return xp.clip(xp.stack([*_kink_places(case), *sensors]), 0.0, case.beam.length)
+
+
+def _kink_places(case: Case) -> list:
+    loads = load_set(case)
     places = [
         *node_positions(case),
         *segment_edges(case.beam),
         *(hinge.position for hinge in case.beam.hinges),
         *(place for place, _, _ in actuator_terms(case)),
-        *(sensor.position for sensor in case.sensors),
     ]
     enter, leave = loads.entry_exit_times().T
     stands = (enter < NEVER) & (leave >= NEVER)
     standing = xp.where(stands, loads.kinematics(xp.full((), NEVER))[0], 0.0)
     if case.track is not None:
         standing = (standing[:, None] + case.track.kernel().offsets).reshape(-1)
-    return xp.clip(xp.concatenate([xp.stack(places), standing]), 0.0, length)
+    return [*places, *standing]
+
+
+def moving_with(case: Case, x, beside=()) -> tuple[Float[Array, " position"], np.ndarray]:
+    """Known positions x (m) that move with what is there, and which do.
+
+    Of what is at one place the first of `special_positions` counts, after them the places `beside`
+    the positions, of loads at the times of extremes there. Sensors, and what is known, do not move.
+    """
+    tolerance = NODE_TOLERANCE * float(concrete(case.beam.length))
+    known, moving = x, np.zeros(x.size, bool)
+    for place in (*beside, *reversed(_kink_places(case))):
+        near = np.abs(concrete(place) - known) <= tolerance
+        if near.any():
+            moving = np.where(near, any_traced(place), moving)
+            x = xp.where(near, place if any_traced(place) else known, x)
+    return (x if moving.any() else known), moving
 
 
 def positions_along(

@@ -18,7 +18,7 @@ from jaxtyping import Complex, Float
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.declared_checks import check_on_beam
-from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.fields import concrete, is_concrete, refuses_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.channels import ChannelPair, check_pairs, common_pairs, input_column, output_row
 from jaxbeam.model.modal_model import ModalModel, modal_model
@@ -89,6 +89,7 @@ class FrequencyResponse(TableViews, Module):
         return plot_frequency_response(self, **options)
 
     @property
+    @refuses_traced("a table")
     def columns(self) -> dict[str, np.ndarray]:
         """Frequency (Hz), and magnitude and phase (degrees) of each pair, by head."""
         columns = {"frequency (Hz)": np.asarray(self.frequencies)}
@@ -99,6 +100,7 @@ class FrequencyResponse(TableViews, Module):
             columns[f"{pair} phase (degree)"] = phase[:, i]
         return columns
 
+    @refuses_traced("a dataset")
     def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units, of real variables that every file format can hold."""
         dims = ("frequency", "pair")

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from numpy.polynomial import legendre
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.fields import concrete, is_concrete, refuses_traced
 from jaxbeam.case.quantities import NO_TORSION, SLOPE, TWIST, TWIST_RATE
 from jaxbeam.case.validation import check_plant
 from jaxbeam.model.layout import Layout, find_layout, is_uniform, longest_span, node_positions
@@ -112,6 +112,7 @@ class Modes(TableViews, Module):
         return f"Modes: {self.stiffness.shape[-1]} of the beam"
 
     @property
+    @refuses_traced("a table")
     def columns(self) -> dict[str, np.ndarray]:
         """Number, frequency (Hz) and damping ratio of each mode, by head."""
         frequencies = np.asarray(self.frequencies)
@@ -121,6 +122,7 @@ class Modes(TableViews, Module):
             "damping ratio": np.asarray(self.damping_ratios),
         }
 
+    @refuses_traced("a dataset")
     def to_xarray(self, positions: int = 101) -> "xarray.Dataset":
         """Frequencies, damping ratios, and shapes at equally spaced positions, with units."""
         heads = self.columns

@@ -1,5 +1,8 @@
 """Shared style of all figures: colours, fonts, unit prefixes, labels that do not overlap."""
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import numpy as np
 from cycler import cycler
 from jaxtyping import Float
@@ -9,6 +12,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure, SubFigure
 
 from jaxbeam.case.display import UnitScale as UnitScale, unit_scale as unit_scale
+from jaxbeam.case.fields import refuses_traced
 
 INK, GREY, FAINT, SHADE = "#22282e", "#6b747c", "#dfe3e6", "#eef2f5"
 # Okabe and Ito's colours, distinct with any kind of colour vision.
@@ -16,6 +20,8 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 ALARM = COLOURS[1]
 LIMIT = "#b00020"
 LIMIT_STYLE = {"color": LIMIT, "linewidth": 1.2, "linestyle": ":"}
+F = TypeVar("F", bound=Callable)
+
 STYLES = "-", "--", ":"  # of curves whose colours are used up
 LABEL_HEIGHT = 0.17  # inches, of a line of text
 LOAD_COLOURS = (INK, "#A6611A", "#7B3294", "#7A868F")  # distinct from COLOURS too
@@ -50,7 +56,12 @@ STYLE = {
     "legend.frameon": False,
 }
 
-use_style = rc_context(STYLE)
+
+def use_style(draw: F) -> F:
+    """Decorator of functions that draw: with the style of all figures, of known numbers."""
+    return rc_context(STYLE)(refuses_traced("a figure")(draw))
+
+
 """Decorator of functions that draw: the style holds inside them only."""
 
 

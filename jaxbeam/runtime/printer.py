@@ -168,12 +168,11 @@ class TableViews:
 
     def _repr_html_(self) -> str | None:
         """Table of the columns in a notebook; None leaves traced or several results to the text."""
-        import jax.errors
+        from jaxbeam.runtime.arrays import any_traced
 
-        try:
-            columns = self.columns
-        except jax.errors.JAXTypeError:  # traced
+        if any_traced(self):
             return None
+        columns = self.columns
         lengths = {column.shape for column in columns.values()}
         if len(lengths) != 1 or len(next(iter(lengths))) != 1:
             return None

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.fields import concrete, is_concrete, refuses_traced
 from jaxbeam.case.quantities import QUANTITIES
-from jaxbeam.model.along_beam import refined, sections
+from jaxbeam.model.along_beam import moving_with, refined, sections
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, any_traced, known, take, xp
@@ -46,6 +46,7 @@ class RecordEnvelope(TableViews, Module):
     coincident: str = eqx.field(static=True, default="")
 
     @property
+    @refuses_traced("a table")
     def columns(self) -> dict[str, np.ndarray]:
         """Position (m), smallest and largest value with their times (s), by head."""
         head = _head(self.quantity)
@@ -62,6 +63,7 @@ class RecordEnvelope(TableViews, Module):
             columns[f"{other} at largest"] = np.asarray(self.largest_coincident)
         return columns
 
+    @refuses_traced("a dataset")
     def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units."""
         unit, words = QUANTITIES[self.quantity].unit, self.quantity
@@ -120,11 +122,17 @@ def record_envelope(
     numbers = case, modes, motion, times, parameters
     leaves = jax.tree.leaves(numbers)
     if positions is None and any_traced(leaves) and all(map(is_concrete, leaves)):
-        # Those of the known numbers, at which the extremes are differentiated.
+        # Those of the known numbers, where the extremes are differentiated.
         plain = jax.tree.map(lambda n: concrete(n) if any_traced(n) else n, numbers)
         own_case, own_modes, own_motion, own_times, (fibre, modulus) = plain
         run = own_case, own_modes, own_motion, own_times
-        positions = record_envelope(*run, quantity, None, fibre, modulus).positions
+        found = record_envelope(*run, quantity, None, fibre, modulus)
+        at_extremes = [
+            motion.load_position[np.searchsorted(own_times, time)]
+            for time in (found.smallest_time, found.largest_time)
+        ]
+        beside = xp.concatenate(at_extremes, axis=1).T
+        positions, _ = moving_with(case, np.asarray(found.positions), list(beside))
     if positions is not None:
         return at(xp.asarray(positions, float))
     return refined(case, at, curves)[1]

@@ -48,10 +48,11 @@ class Simulator(Module):
     tolerance: float = eqx.field(static=True)
 
     def __init__(self, case: Case, vary: Any = (), times=None, tolerance: float = TOLERANCE):
-        if any_traced(case, times):
+        if any_traced(case, vary, times, tolerance):
             raise ValueError(
-                "a Simulator chooses time steps from the numbers of its case: make it outside of"
-                " jax.jit, vmap and grad, and call it with the traced values"
+                "a Simulator chooses time steps from the numbers of its case and from what else it"
+                " is given: make it outside of jax.jit, vmap and grad, and call it with the traced"
+                " values"
             )
         self.case, self.tolerance = case, float(tolerance)
         self.times = None if times is None else np.asarray(times, float)

@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.display import with_prefix
-from jaxbeam.case.fields import OUTSIDE, refuse_traced
+from jaxbeam.case.fields import refuses_traced
 from jaxbeam.case.sensors import sensor_labels
 from jaxbeam.files.case_file import case_to_dict
 from jaxbeam.files.endings import check_ending
@@ -235,9 +235,9 @@ class RecordViews(TableViews, Module):
             self.case, self.modes, self.times, self.bodies, lambda name: getattr(self, name)
         )
 
+    @refuses_traced("a dataset")
     def to_xarray(self) -> "xarray.Dataset":
         """Labelled dataset with units; `record_from_xarray` restores the record exactly."""
-        refuse_traced("a dataset", OUTSIDE, self)
         return labelled_dataset(*self._dataset_parts())
 
     def plot(self, quantity: str | None = None, **options: Any) -> "Figure | SubFigure":
@@ -247,20 +247,18 @@ class RecordViews(TableViews, Module):
         """
         from jaxbeam.plot import plot_record
 
-        refuse_traced("a figure", OUTSIDE, self)
         return plot_record(self, quantity, **options)
 
     def plot_envelope(self, quantity: str = "moment", **options: Any) -> "Figure | SubFigure":
         """Figure of the envelope of a quantity; see `jaxbeam.plot.plot_envelope`."""
         from jaxbeam.plot import plot_envelope
 
-        refuse_traced("a figure", OUTSIDE, self)
         return plot_envelope(self, quantity, **options)
 
     @property
+    @refuses_traced("a table")
     def columns(self) -> dict[str, Float[ndarray, " time"]]:
         """Histories by head, as "midspan deflection (m)"; `to_dataframe` has them too."""
-        refuse_traced("a table", OUTSIDE, self)
         histories = self.sensor_values, self.contact_force, self.command
         return record_columns(self.case, self.times, *histories)
 

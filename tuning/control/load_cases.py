@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats.qmc import LatinHypercube
 
 from jaxbeam.case.case import Case, crossing_times, replace, unit_at, value_at
-from jaxbeam.case.fields import OUTSIDE, concrete, refuse_traced
+from jaxbeam.case.fields import OUTSIDE, concrete, refuse_traced, refuses_traced
 from jaxbeam.case.reading.tables import COUNT, NUMBERS, TABLE, check_entry, check_table
 from jaxbeam.case.reading.toml_file import read_toml
 from jaxbeam.case.reading.units import in_si, is_quantity
@@ -80,6 +80,7 @@ def _all_pairs(
     return tuple({**run, **plant} for run in runs for plant in plants)
 
 
+@refuses_traced("a set of load cases", "give known numbers")
 def full_grid(values: Mapping[str, Sequence[float | int]]) -> tuple[AddressValues, ...]:
     """Full grid: every combination of the values given by address.
 
@@ -91,6 +92,7 @@ def full_grid(values: Mapping[str, Sequence[float | int]]) -> tuple[AddressValue
     return tuple(dict(zip(values, map(float, row), strict=True)) for row in rows)
 
 
+@refuses_traced("a set of load cases", "give known numbers")
 def latin_hypercube(
     ranges: Mapping[str, Sequence[float | int]], count: int, seed: int = 0
 ) -> tuple[AddressValues, ...]:
