@@ -1,5 +1,7 @@
 """Commands, options, modules, files and links in README and docs exist."""
 
+import ast
+import contextlib
 import importlib.util
 import re
 import shlex
@@ -7,7 +9,7 @@ import shlex
 import pytest
 
 from experiments.thesis.reproduction import experiments
-from jaxbeam.cli.app import COMMANDS, app, refuse_former_words
+from jaxbeam.cli.app import COMMANDS, RENAMED_OPTIONS, app, refuse_former_words
 from tests.modules import ROOT
 
 # Not the pages that a build of the site writes among its sources.
@@ -174,3 +176,54 @@ def test_speeds_are_those_that_the_benchmark_printed():
     found = re.findall(r"([0-9.]+) s\s+((?:in|by) \w+)", TEXT["README.md"])
     shown = {name: float(value) for value, name in found}
     assert shown == {name: first[row] for name, row in SPEED_ROWS.items()}
+
+
+def texts_of(package: str) -> list[tuple[str, str]]:
+    """Names of the files of a package, and texts in them: messages, docstrings, annotations."""
+    return [
+        (path.relative_to(ROOT).as_posix(), node.value)
+        for path in (ROOT / package).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    ]
+
+
+def is_there(name: str) -> bool:
+    """Whether a dotted name, as jb.ride.weighted_rms, is that of a module or of what it has."""
+    first, *parts = name.split(".")
+    found = importlib.import_module({"jb": "jaxbeam"}.get(first, first))
+    for part in parts:
+        if hasattr(found, "__path__") and not hasattr(found, part):
+            with contextlib.suppress(ModuleNotFoundError):
+                importlib.import_module(f"{found.__name__}.{part}")
+        fields = getattr(found, "__dataclass_fields__", ())  # those without a default
+        if part in fields or part in getattr(found, "__annotations__", ()):
+            return True
+        if not hasattr(found, part):
+            return False
+        found = getattr(found, part)
+    return True
+
+
+@pytest.mark.parametrize("package", ["jaxbeam", "tuning"])
+def test_messages_and_docstrings_name_options_and_functions_that_exist(package):
+    options = options_of_commands() | {"--help"}
+    options |= {former for table in RENAMED_OPTIONS.values() for former in table}
+    unknown, count = [], 0
+    for file, text in texts_of(package):
+        named = re.findall(r"(?<![\w-])--[a-z][a-z0-9-]*", text)
+        dotted = re.findall(r"(?<![\w./])(?:jb|jaxbeam|tuning)(?:\.[A-Za-z_]\w*)+", text)
+        dotted = [name for name in dotted if not name.endswith((".py", ".exe", ".toml"))]
+        count += len(named) + len(dotted)
+        unknown += [(file, one) for one in named if one not in options]
+        unknown += [(file, one) for one in dotted if not is_there(one)]
+    assert count > 100
+    assert not unknown
+
+
+@pytest.mark.parametrize("page", [page for page in TEXT if "CHANGELOG" not in page])
+def test_functions_that_pages_name_exist(page):
+    """But for those of a picture's address."""
+    named = set(re.findall(r"(?<![\w./])(?:jb|jaxbeam|tuning)(?:\.[A-Za-z_]\w*)+", TEXT[page]))
+    named = {name for name in named if not name.endswith((".py", ".toml", ".md", ".svg"))}
+    assert sorted(name for name in named if not is_there(name)) == []

@@ -20,6 +20,7 @@ from jaxbeam.analysis.sections import (
     record_amplification,
 )
 from jaxbeam.control.receptance_method import closed_loop_poles, receptance_feedback
+from jaxbeam.model import linear_system
 
 CASE = jb.Case(
     jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.02, modes=2),
@@ -58,6 +59,8 @@ REFUSED = {
     "dataset of responses": lambda case, path: responses(case).to_xarray(),
     "figure of responses": lambda case, path: responses(case).plot(),
     "points": lambda case, path: characteristic_points(case),
+    "poles of a plant": lambda case, path: linear_system.poles(case),
+    "zeros of a plant": lambda case, path: linear_system.zeros(case, ("force@0.3", "velocity@0.2")),
     "poles": lambda case, path: closed_loop_poles(case, LAW),
     "feedback that keeps modes": lambda case, path: receptance_feedback(case, [-9 + 99j], keep=[1]),
     "load model": lambda case, path: load_model_envelope(case, "HL-93", [0.3]),
@@ -108,6 +111,7 @@ BESIDE_THE_CASE = {
 }
 OF_PLANTS = (
     *("python-control, plant and loop", "python-control", "MATLAB", "table of modes"),
+    *("poles of a plant", "zeros of a plant"),
     *("dataset of modes", "table of responses", "dataset of responses", "figure of responses"),
 )
 TRANSFORMED = {

@@ -61,8 +61,8 @@ MAX_SAMPLES = 2000  # recorded ones, of the start of the run
 class CProgram(NamedTuple):
     """Texts of the files of a program by their names, and its cost in double precision.
 
-    `operations` are those of a step at worst, counted as in `jaxbeam.c_code.source`; the bytes are
-    those of the state, work space included, and of the constants.
+    `operations` are those of a step at worst (see `jaxbeam.c_code.translation.operations`); the
+    bytes are those of the state, work space included, and of the constants.
     """
 
     files: dict[str, str]

@@ -9,7 +9,7 @@ import scipy
 from jaxtyping import Complex, Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.fields import OUTSIDE, refuse_traced
+from jaxbeam.case.fields import OUTSIDE, refuse_traced, refuses_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.channels import check_pairs, input_column, output_row
 from jaxbeam.model.frequency_responses import (
@@ -106,10 +106,11 @@ class StateSpace(Module):
             scipy.io.savemat(file, content)
 
 
+@refuses_traced("a list of poles")
 def poles(case: Case, stationary_masses: StationaryMasses = ()) -> Complex[np.ndarray, " state"]:
     """Poles of beam, supports, absorbers and actuators in rad/s, in order of magnitude.
 
-    Not differentiable. Raises ValueError as `frequency_response` does.
+    Raises ValueError as `frequency_response` does, and for a case whose numbers are traced.
     """
     check_case(case)
     masses = checked_masses(case, stationary_masses)
@@ -117,13 +118,14 @@ def poles(case: Case, stationary_masses: StationaryMasses = ()) -> Complex[np.nd
     return _sort_by_magnitude(scipy.linalg.eigvals(np.asarray(A), np.asarray(E)))
 
 
+@refuses_traced("a list of zeros")
 def zeros(
     case: Case, pair: tuple[str, str], stationary_masses: StationaryMasses = ()
 ) -> Complex[np.ndarray, " zero"]:
     """Transmission zeros of a pair (input, output) in rad/s, in order of magnitude.
 
-    Those for the input `actuators.I.active_force` are those for the command. Not differentiable.
-    Raises ValueError as `frequency_response` does.
+    Those for the input `actuators.I.active_force` are those for the command. Raises
+    ValueError as `frequency_response` does, and for a case whose numbers are traced.
     """
     check_case(case)
     (checked_pair,) = check_pairs(case, [pair])

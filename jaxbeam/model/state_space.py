@@ -131,7 +131,7 @@ class Plant(Module):
     def unloaded(self) -> StateSpace:
         """Time-invariant system without loads and absorbers; its inputs are the commands.
 
-        Absorbers are among the wheels of `at`; `jaxbeam.model.poles_zeros` has their poles.
+        Absorbers are among the wheels of `at`; `jaxbeam.model.linear_system.poles` has theirs.
         """
         return _unloaded_plant(self)
 

@@ -13,6 +13,7 @@ from jaxbeam.cli.arguments import check_exists, parse_sweep_values, refuse_optio
 from jaxbeam.cli.options import CaseOptions, DrawingOptions, Output, Over, table
 
 if TYPE_CHECKING:
+    from jaxbeam.analysis.bound.bound import Bound
     from jaxbeam.analysis.compare import Comparison, MetricsOverCases, PerformanceMetrics
 
 
@@ -214,7 +215,7 @@ def _to_dict(comparison: "Comparison") -> dict:
     }
 
 
-def _bound_to_dict(bound: "jb.Bound") -> dict:
+def _bound_to_dict(bound: "Bound") -> dict:
     return {
         "uncontrolled_peak": bound.uncontrolled,
         "least_peak": bound.peak,
