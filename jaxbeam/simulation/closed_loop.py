@@ -135,9 +135,14 @@ def moves_events(case: Case, times=None) -> bool:
     numbers = [case.run.duration, case.run.sample_rate, times]
     if controller.open_loop and controller.period is None:
         numbers.append(controller.breakpoints(case))
-    for part in (controller, *case.sensors):
+    for part in (controller, *_sampled_sensors(case)):
         numbers += [getattr(part, name, None) for name in MOVING]
     return any(isinstance(number, jax.core.Tracer) for number in numbers)
+
+
+def _sampled_sensors(case: Case) -> tuple:
+    """Sensors whose delays move events: a law without a period takes no samples of them."""
+    return () if case.controller.period is None else case.sensors
 
 
 def with_fixed_losses(case: Case) -> Case:
@@ -152,7 +157,8 @@ def with_fixed_events(case: Case, times) -> tuple[Case, Any]:
     """
     if not moves_events(case, times):
         return case, times
-    case = _fixed(case, FIXED, *MOVING)
+    fixed = _fixed(dataclasses.replace(case, sensors=_sampled_sensors(case)), FIXED, *MOVING)
+    case = dataclasses.replace(fixed, sensors=fixed.sensors or case.sensors)
     values = {name: getattr(case.run, name) for name in ("duration", "sample_rate")}
     values = {name: not_differentiated(value, FIXED) for name, value in values.items()}
     changed = dataclasses.replace(case, run=dataclasses.replace(case.run, **values))

@@ -226,11 +226,15 @@ def explained(channels: Sequence[ChannelResiduals]) -> str:
 
 
 def residual_remarks(
-    channels: Sequence[ChannelResiduals], sources: Sequence[str], names: Sequence[str]
+    channels: Sequence[ChannelResiduals],
+    sources: Sequence[str],
+    names: Sequence[str],
+    driven: Sequence[bool] = (),
 ) -> list[str]:
     """Sentences on autocorrelated residuals and on time shifts; none if all is well.
 
-    `sources` are the names of the logs, `names` those of the channels.
+    `sources` are the names of the logs, `names` those of the channels; `driven` tells which logs
+    have commands.
     """
     remarks, missed = [], coloured(channels)
     for i, source in enumerate(sources):
@@ -254,8 +258,10 @@ def residual_remarks(
                 )
             if abs(c.time_shift) > MIN_TIME_SHIFT_SD * c.time_shift_sd:
                 what = "late" if c.time_shift > 0 else "early"
+                held = what == "late" and any(driven[i : i + 1])
+                why = ", as under commands held from sample to sample, half of one" if held else ""
                 remarks.append(
                     f"{source}: {names[c.sensor]} seems {1e3 * abs(c.time_shift):.3g} ms {what} "
-                    f"(+- {2e3 * c.time_shift_sd:.2g} ms): free its delay, or check its clock"
+                    f"(+- {2e3 * c.time_shift_sd:.2g} ms{why}): free its delay, or check its clock"
                 )
     return remarks

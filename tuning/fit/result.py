@@ -157,7 +157,12 @@ class Fit(TableViews):
             *summary.correlation_remarks(self.addresses, self.correlation),
             *summary.prior_remarks(self.parameters, self.errors),
             *summary.noise_remarks(self.case, logs, self.noise),
-            *residual_remarks(self.channel_residuals, [log.source for log in logs], channel_names),
+            *residual_remarks(
+                self.channel_residuals,
+                [log.source for log in logs],
+                channel_names,
+                [any(one is not None for one in log.actuators) for log in logs],
+            ),
             *summary.log_remarks(logs),
         ]
 

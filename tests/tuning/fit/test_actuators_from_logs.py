@@ -118,9 +118,12 @@ def test_a_patch_alone_from_a_file(tmp_path):
     assert fit.cases[0].controller.values.shape == (2, 1001)
 
 
-def test_a_spring_beside_a_patch_whose_commands_are_held():
-    """Steps of a converter every 2 ms, exactly: read as ramps they are damping less by k dt / 2."""
-    stiffness, damping, period = 3500.0, 6.0, 2
+SPRING = 3500.0, 6.0  # N/m, N s/m
+
+
+def spring_beside_a_patch(period: int) -> Log:
+    """Log of both, exactly, under steps of a converter every `period` samples."""
+    stiffness, damping = SPRING
     frequencies = (np.arange(1, MODES + 1) * np.pi / LENGTH) ** 2 * np.sqrt(RIGIDITY / DENSITY)
     at, n = shapes(0.5), MODES
     moment = (shapes(PATCH["start"], 1) - shapes(PATCH["end"], 1)) * GAIN
@@ -136,14 +139,14 @@ def test_a_spring_beside_a_patch_whose_commands_are_held():
     )
     B = np.append(np.zeros(n), moment)[:, None]
     C = np.hstack([[shapes(x) for x in POSITIONS], np.zeros((2, n))])
-    walk = np.cumsum(np.random.default_rng(3).normal(size=501))
-    levels = np.clip(0.4 * (walk - np.linspace(0.0, walk[-1], 501)), -2.4, 7.4)
+    walk = np.cumsum(np.random.default_rng(3).normal(size=1002 // period))
+    levels = np.clip(0.4 * (walk - np.linspace(0.0, walk[-1], walk.size)), -2.4, 7.4)
     volts = np.repeat(levels, period)[:1001]
     exact = scipy.signal.cont2discrete((A, B, C, np.zeros((2, 1))), 1e-3, "zoh")[:4]
     readings = scipy.signal.dlsim((*exact, 1e-3), volts)[1]
     readings = readings + 2e-7 * np.random.default_rng(4).normal(size=readings.shape)
     table = np.column_stack([readings, volts])
-    held = Log(
+    return Log(
         TIMES,
         table,
         ("d1", "d2", "v"),
@@ -151,15 +154,38 @@ def test_a_spring_beside_a_patch_whose_commands_are_held():
         ("m", "m", "V"),
         actuators=(None, None, 0),
     )
+
+
+def fit_of_spring_and_patch(log: Log, free=(), **changes):
+    """Fit of a spring's numbers and the patch's, and of others, by readings with `changes`."""
     rig = case()
     spring = jb.SpringDamper(0.5, stiffness=4300.0, damping=9.0)
-    rig = dataclasses.replace(rig, actuators=(rig.actuators[1], spring))
-    free = ["actuators.0.correction", "actuators.1.stiffness", "actuators.1.damping"]
-    fit = identify(rig, [held], free)
-    np.testing.assert_array_less(
-        np.abs(fit.values - [PATCH["correction"], stiffness, damping]), 4 * fit.errors
-    )
+    sensors = tuple(dataclasses.replace(sensor, **changes) for sensor in rig.sensors)
+    rig = dataclasses.replace(rig, actuators=(rig.actuators[1], spring), sensors=sensors)
+    addresses = ["actuators.0.correction", "actuators.1.stiffness", "actuators.1.damping", *free]
+    fit = identify(rig, [log], addresses)
+    deviations = np.abs(fit.values[:3] - [PATCH["correction"], *SPRING]) / fit.errors[:3]
+    return fit, deviations
+
+
+def test_a_spring_beside_a_patch_whose_commands_are_held():
+    """Steps every 2 ms: read as ramps they are damping less by k dt / 2."""
+    fit, deviations = fit_of_spring_and_patch(spring_beside_a_patch(2))
+    assert np.all(deviations < 4)
     assert fit.errors[2] < 0.01  # of a bias of 1.75 N s/m
+
+
+def test_commands_that_are_logged_once_a_period_are_seen_by_delays():
+    """They cannot be told from others that change between samples, but are half a sample late."""
+    log = spring_beside_a_patch(1)
+    fit, deviations = fit_of_spring_and_patch(log)
+    assert np.max(deviations) > 4
+    assert fit.verdict.startswith("the model misses something")
+    assert "late" in str(fit) and "under commands held from sample to sample" in str(fit)
+    delays = "sensors.0.delay", "sensors.1.delay"
+    fit, deviations = fit_of_spring_and_patch(log, delays, delay=2e-4)
+    assert np.all(deviations < 4)
+    np.testing.assert_allclose(fit.values[3:], 0.5e-3, rtol=0.02)
 
 
 def test_faulty_commands_are_refused():
