@@ -30,6 +30,7 @@ from jaxbeam.runtime.printer import text_table
 
 if TYPE_CHECKING:
     from jaxbeam.model.plausibility.facts import Plausibility
+    from tuning import Log
 
 PICTURES = (".png", ".svg", ".pdf")
 # Half the effort of the default: 10 ms less for a picture, and files a seventh larger.
@@ -140,6 +141,39 @@ class CaseOptions(OutputOptions):
         if judged:
             print_warnings(jb.check(case if judged == "case" else structure_of(case)))
         return case
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class LogOptions:
+    """Options of a command that reads logs."""
+
+    columns: Annotated[
+        str | None,
+        Parameter(
+            help='Columns to read, with units, as "a1, a2 [g]"; of files without headings all, as'
+            ' "time [s], a1 [g]".'
+        ),
+    ] = None
+    rate: Annotated[float | None, Parameter(help="Sampling rate (Hz) of logs without times.")] = (
+        None
+    )
+    missing: Annotated[
+        Literal["refuse", "mask"],
+        Parameter(help="Samples that are missing are refused, or left out by mask."),
+    ] = "refuse"
+
+    def read(self, path: Path) -> "Log":
+        """The log in a file. Raises ValueError as `tuning.read_log` does."""
+        import tuning
+
+        return tuning.read_log(path, columns=self.columns, rate=self.rate, missing=self.missing)
+
+    def read_runs(self, path: Path) -> "list[Log]":
+        """The logs of all runs in a file. Raises ValueError as `tuning.read_logs` does."""
+        import tuning
+
+        return tuning.read_logs(path, columns=self.columns, rate=self.rate, missing=self.missing)
 
 
 @Parameter(name="*")

@@ -1,5 +1,6 @@
 """Command `identify`: parameters of a case from logs, or modes of a free decay."""
 
+import dataclasses
 from pathlib import Path
 
 from jaxbeam.cli.arguments import (
@@ -15,6 +16,7 @@ from jaxbeam.cli.arguments import (
 from jaxbeam.cli.options import (
     CaseOptions,
     Free,
+    LogOptions,
     Output,
     PictureOptions,
     Resume,
@@ -44,6 +46,7 @@ def identify(
     output: Output = None,
     pictures: PictureOptions = PictureOptions(),
     resume: Resume = False,
+    reading: LogOptions = LogOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Identify parameters of a case from logs; without --free, the modes of a free decay.
@@ -112,7 +115,7 @@ def identify(
         with kept_in(searched, drawn):
             fit = tuning.identify(
                 parsed_case,
-                _read_logs(logs, mask),
+                _read_logs(logs, mask, reading),
                 priors,
                 loss=loss,
                 starts=starts,
@@ -147,7 +150,7 @@ def identify(
         )
     files_of_logs = [pictures.path(None, log) for log in logs]
     options.check_outputs(*files_of_logs)
-    _identify_modes(logs, files_of_logs, pictures, options)
+    _identify_modes(logs, files_of_logs, pictures, reading, options)
 
 
 def _with_suffix(output: Path | None, suffix: str) -> Path | None:
@@ -160,12 +163,13 @@ def _remove_checkpoints(output: Path | None) -> None:
         output.with_suffix(suffix).unlink(missing_ok=True)
 
 
-def _read_logs(files, fault_kinds) -> list:
+def _read_logs(files, fault_kinds, reading: LogOptions) -> list:
     """Logs of the files without the samples that have faults of the given kinds."""
     import tuning
 
-    missing = "mask" if "missing" in fault_kinds else "refuse"
-    logs = [log for path in files for log in tuning.read_logs(path, missing=missing)]
+    if "missing" in fault_kinds:
+        reading = dataclasses.replace(reading, missing="mask")
+    logs = [log for path in files for log in reading.read_runs(path)]
     masked_kinds = [kind for kind in fault_kinds if kind != "missing"]
     return [tuning.logs.mask(log, masked_kinds) for log in logs] if masked_kinds else logs
 
@@ -248,13 +252,15 @@ def _write_and_print(
     options.report(content, lines, output, _with_suffix(output, ".npz"), picture, page)
 
 
-def _identify_modes(logs, files, pictures: PictureOptions, options: CaseOptions) -> None:
+def _identify_modes(
+    logs, files, pictures: PictureOptions, reading: LogOptions, options: CaseOptions
+) -> None:
     enable_compile_cache()
     import tuning
 
     content = {}
     for log, picture in zip(logs, files, strict=True):
-        fit = tuning.identify_modes(tuning.read_log(log))
+        fit = tuning.identify_modes(reading.read(log))
         content[str(log)] = fit.to_dict()
         if picture:
             pictures.save(pictures.titled(fit.plot()), picture)

@@ -17,7 +17,7 @@ from jaxbeam.cli.arguments import (
     parse_range,
     refuse_option,
 )
-from jaxbeam.cli.options import CaseOptions, Free, Output, print_message
+from jaxbeam.cli.options import CaseOptions, Free, LogOptions, Output, print_message
 
 if TYPE_CHECKING:
     from tuning import Log
@@ -29,8 +29,6 @@ def modes_from_log(
     from_: Annotated[float | None, Parameter("--from")] = None,
     to: float | None = None,
     channels: str | None = None,
-    columns: str | None = None,
-    rate: float | None = None,
     order: int | None = None,
     method: str | None = None,
     references: str | None = None,
@@ -50,6 +48,7 @@ def modes_from_log(
     case: Path | None = None,
     free: Free = (),
     output: Output = None,
+    reading: LogOptions = LogOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Natural frequencies, damping ratios and mode shapes from logs of unknown excitation.
@@ -72,10 +71,6 @@ def modes_from_log(
         End (s) of the part of the log to use.
     channels
         NAME,NAME,...: channels to use.
-    columns
-        Headings of the columns, with units, for files without: "time [s], a1 [g]".
-    rate
-        Sampling rate (Hz) of logs without times.
     order
         Highest order of the models of the stabilisation diagram.
     method
@@ -150,7 +145,7 @@ def modes_from_log(
     import tuning
     from tuning.modal.setups.merge import logs_of_setups
 
-    read = [tuning.read_log(path, columns=columns, rate=rate) for path in logs]
+    read = list(map(reading.read, logs))
     if align:
         read = [tuning.logs.align_logs(read)]
     setups = logs_of_setups(read, _names(references), _names(channels))

@@ -11,7 +11,7 @@ from jaxbeam.cli.arguments import (
     parse_range,
     refuse_option,
 )
-from jaxbeam.cli.options import CaseOptions, Free, Output
+from jaxbeam.cli.options import CaseOptions, Free, LogOptions, Output
 
 
 def weigh(
@@ -25,6 +25,7 @@ def weigh(
     axles: str | None = None,
     calibration: tuple[Path, ...] = (),
     output: Output = None,
+    reading: LogOptions = LogOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Identify the loads that crossed a known beam: their number, masses, speeds, entry times.
@@ -68,11 +69,11 @@ def weigh(
     import tuning  # sets XLA's threads, therefore before the case is read
     from jaxbeam.files.case_file import save_case
 
-    parsed_case, read = options.read(case), tuning.read_log(log)
+    parsed_case, read = options.read(case), reading.read(log)
     if axles is None:
         weighing = tuning.weigh(parsed_case, read, speed_range, max_loads, both_ways=not one_way)
     else:
-        calibrated = _lines_of(parsed_case, calibration) if calibration else None
+        calibrated = _lines_of(parsed_case, calibration, reading) if calibration else None
         weighing = tuning.weighing.weigh_axles(
             parsed_case, read, speed_range, number, both_ways=not one_way,
             influence_lines=calibrated,
@@ -87,6 +88,7 @@ def calibrate(
     /,
     *logs: Path,
     output: Output = None,
+    reading: LogOptions = LogOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Find the influence lines of a bridge, with their errors, by runs of known vehicles.
@@ -109,14 +111,14 @@ def calibrate(
     import tuning  # noqa: F401  (sets XLA's threads, therefore before the case is read)
     from jaxbeam.runtime.output_file import whole_file
 
-    lines = _lines_of(options.read(case), logs)
+    lines = _lines_of(options.read(case), logs, reading)
     if output:
         with whole_file(output, options.overwrite) as beside:
             beside.write_text(json.dumps(lines.to_dict()))
     options.report(lines.to_dict(), [str(lines)], output)
 
 
-def _lines_of(case, calibration: tuple[Path, ...]):
+def _lines_of(case, calibration: tuple[Path, ...], reading: LogOptions):
     """Influence lines from logs of known vehicles, or from a file of lines."""
     import tuning
     from jaxbeam.runtime.input_file import read_text_input
@@ -128,9 +130,7 @@ def _lines_of(case, calibration: tuple[Path, ...]):
         except json.JSONDecodeError as error:
             raise ValueError(f"{calibration[0]} is not JSON: {error}") from error
         return lines_from_dict(content)
-    return tuning.weighing.calibrate_influence_lines(
-        case, [tuning.read_log(path) for path in calibration]
-    )
+    return tuning.weighing.calibrate_influence_lines(case, list(map(reading.read, calibration)))
 
 
 def _axle_count(text: str) -> int:
@@ -148,6 +148,7 @@ def identify_responses(
     free: Free = (),
     segment: float | None = None,
     output: Output = None,
+    reading: LogOptions = LogOptions(),
     options: CaseOptions = CaseOptions(),
 ) -> None:
     """Identify parameters of a case, without its loads, from frequency responses in a log.
@@ -173,7 +174,7 @@ def identify_responses(
     from jaxbeam.files.case_file import save_case
 
     parsed_case = options.read(case)
-    measured = tuning.fit.responses_of(tuning.read_log(log), segment)
+    measured = tuning.fit.responses_of(reading.read(log), segment)
     fit = tuning.identify_responses(parsed_case, measured, bounds_in_si(parsed_case, bounds))
     if output:
         save_case(fit.case, output, overwrite=True)  # checked before the work

@@ -81,6 +81,10 @@ def test_influence_lines_of_several_logs_are_kept(call, tmp_path, monkeypatch):
     assert code == 0 and len(calibrated) == 4, err
     for one, again in zip(used[0], used[1], strict=True):
         np.testing.assert_array_equal(one, again)
+    (tmp_path / "bare.csv").write_text("1,2\n,2\n1,3\n")
+    told = "--columns a[mm],- --rate 10 --missing mask"
+    code, out, err = call(f"weigh calibrate case.toml bare.csv {told}")
+    assert code == 0 and calibrated[4:] == ["bare.csv"], err
     (tmp_path / "other.json").write_text("[1, 2")
     code, _, err = call(f"{weigh} --calibration other.json")
     assert code == 1 and "other.json is not JSON" in err
