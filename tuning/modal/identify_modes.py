@@ -30,7 +30,8 @@ from tuning.modal.arguments import (
     check_method,
     chosen_modes,
 )
-from tuning.modal.decay.modes import Decays, find_excited, free_decay_modes
+from tuning.modal.decay.impacts import impacts_left_out
+from tuning.modal.decay.modes import Decays, find_excited, free_decay_modes, modes_of_decays
 from tuning.modal.fit import Choice, ModalFit
 from tuning.modal.forced.forces import force_at_impacts, force_names, force_records, without_forces
 from tuning.modal.forced.modes import forced_modes
@@ -41,12 +42,6 @@ from tuning.modal.harmonics import (
     is_multiple,
     lines_besides,
     steady_candidates,
-)
-from tuning.modal.impacts.whole_log import (
-    FromDecays,
-    impacts_left_out,
-    modes_after_unseen_impacts,
-    modes_of_decays,
 )
 from tuning.modal.preprocessing import (
     Samples,
@@ -154,20 +149,18 @@ def identify_modes(
     if may_decay:
         bands, narrow = (used_band, wide), band is None
         told = modes_of_decays(samples, excited, derivatives, bands, narrow, how)
-    found, used_band = (_of_decays(told), told.band) if told else (None, wide)
+    found, used_band = (_Found(*told[:3]), told.band) if told else (None, wide)
     if kind == "free decay" and found is None:
         raise ValueError(f"{logs[0].source}: no free decay found; give its window, or kind ambient")
     used_method = method or "covariance"
     if found is None:
         found = _ambient_modes(cleaned, samples, used_band, used_method, order, progress)
-        if may_decay:
-            found = _of_unseen_impacts(found, samples, excited, used_band)
         if may_decay and window is None and all(one.reason for one in found.candidates):
             # The energy of a short decay falls little, but damped vibrations explain all of it.
             how["whole"] = True
             whole = free_decay_modes(samples, excited, derivatives, used_band, **how)
             found = _Found(*whole) if whole else found
-    if found.is_ambient:
+    if found.decays is None:
         if lines:
             choices.append(Choice(f"{len(lines)} harmonic lines subtracted", "--exclude FREQUENCY"))
         wandering, doubtful = steady_candidates(found.candidates, cleaned, samples, used_band)
@@ -182,11 +175,10 @@ def identify_modes(
         ]
     else:
         used_method = DECAY
-        if found.decays is not None and not found.impacts:
-            choices += [
-                Choice(text, "--from and --to")
-                for text in impacts_left_out(samples, excited, found.decays.stretches, used_band)
-            ]
+        choices += [
+            Choice(text, "--from and --to")
+            for text in impacts_left_out(samples, excited, found.decays.stretches, used_band)
+        ]
         lines = lines_besides(lines, [one.mode for one in found.candidates if not one.reason])
     if kind is None:
         says = _kind_words(found, excited, lines)
@@ -214,22 +206,12 @@ def _band_choice(band, used: tuple[float, float]) -> list[Choice]:
 
 
 class _Found(NamedTuple):
-    """Candidates, diagrams, decays that were fitted if any, kind, impacts."""
+    """Candidates, diagrams, decays that were fitted if any, and kind."""
 
     candidates: tuple[Candidate, ...]
     diagrams: tuple[Diagram, ...]
     decays: Decays | None
     kind: str = "ambient"
-    impacts: int = 0
-
-    @property
-    def is_ambient(self) -> bool:
-        """Whether neither decays nor impacts explain the log."""
-        return self.decays is None and not self.impacts
-
-
-def _of_decays(told: FromDecays) -> _Found:
-    return _Found(told.candidates, told.diagrams, told.decays, impacts=told.impacts)
 
 
 def _add_order(choices, order, found: _Found) -> None:
@@ -253,18 +235,8 @@ def _ambient_modes(cleaned, samples: Samples, band, method, order, progress) -> 
     return _Found(*found, None)
 
 
-def _of_unseen_impacts(found: _Found, samples: Samples, excited, band) -> _Found:
-    """Modes of a log without clear decays, of whole records if impacts alone explain them."""
-    told = modes_after_unseen_impacts(found.candidates, samples, excited, band)
-    if told is None:
-        return found
-    return found._replace(candidates=told[0], kind="free decay", impacts=told[1])
-
-
 def _kind_words(found: _Found, excited, lines) -> str:
     """Sentence on the excitation."""
-    if found.impacts:
-        return f"excitation: {found.impacts} impacts, between which records are fitted as a whole"
     if found.decays is not None:
         number = len(found.decays.stretches)
         return f"excitation: {number} free decays, used together" if number > 1 else (
@@ -281,7 +253,7 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, keep: Mo
     """The fit: candidates divided into modes and rejected ones."""
     longest = max(len(record) for record in samples.records)
     resolution = samples.rate / longest
-    speed = fundamental(lines, samples.rate, longest) if found.is_ambient else None
+    speed = fundamental(lines, samples.rate, longest) if found.decays is None else None
     modes, rejected = [], []
     for candidate in found.candidates:
         mode, reason = candidate.mode, candidate.reason
@@ -290,7 +262,7 @@ def _result(logs, samples, found: _Found, band, lines, choices, method, keep: Mo
         hit = [one for one in lines if abs(mode.frequency - one.frequency) < 2 * resolution]
         if near:
             reason = f"excluded, {near[0]:g} Hz"
-        elif hit and found.is_ambient and mode.damping_ratio < 0.002:
+        elif hit and found.decays is None and mode.damping_ratio < 0.002:
             reason = f"a harmonic line, {hit[0].frequency:.3f} Hz"
         elif mode.damping_ratio < NARROW and is_multiple(
             mode.frequency, max(0.5 * resolution, 2 * mode.frequency_sd), speed

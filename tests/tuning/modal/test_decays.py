@@ -9,6 +9,7 @@ from experiments.validation.modal_identification import compare, log_of
 from tests.oracles.planted_structures import Structure, random_structure, response, sampled
 from tuning import Log, identify_modes
 from tuning.modal.decay import modes as decay_modes
+from tuning.modal.decay.impacts import Impact, impacts_left_out, marked_impacts
 from tuning.modal.decay.stretches import (
     Stretch,
     excited_samples,
@@ -17,7 +18,7 @@ from tuning.modal.decay.stretches import (
     until_soft_impact,
 )
 from tuning.modal.harmonics import harmonic_lines
-from tuning.modal.preprocessing import kinetic_band, prepare, strongest_frequency
+from tuning.modal.preprocessing import Samples, kinetic_band, prepare, strongest_frequency
 
 
 def structure(damping=(0.01, 0.03, 0.008)):
@@ -172,6 +173,22 @@ def test_all_of_many_decays_are_used():
     np.testing.assert_allclose(columns, fitted, atol=1e-9)
     energy, whole = np.sum(columns**2), sum(np.sum(record**2) for record in records)
     assert 0.95 * whole < energy <= 1.001 * whole
+
+
+def test_one_long_decay_is_used_alone_where_short_ones_tell_little():
+    """Twenty seconds after a hard impact, and a second after each of five feeble ones."""
+    random, times = np.random.default_rng(0), np.arange(2000) / 100
+    record = 1e-3 * random.normal(size=(2600, 1))
+    record[:2000, 0] += np.exp(-0.2 * times) * np.cos(20 * times)
+    taps = [Stretch(0, 2000 + 100 * i, 2100 + 100 * i, 2.0) for i in range(5)]
+    feeble = 0.02 * np.exp(-2 * times[:100]) * np.cos(20 * times[:100])
+    for tap in taps:
+        record[tap.start : tap.stop, 0] += feeble
+    long = Stretch(0, 0, 2000, 4.0)
+    columns, used = stacked((record,), (long, *taps))
+    assert used == (long,) and columns.shape == (2000, 1)
+    columns, used = stacked((record,), tuple(taps))
+    assert used == tuple(taps) and columns.shape == (100, 5)
 
 
 def test_the_method_says_whether_a_log_is_a_decay():
@@ -394,3 +411,37 @@ def test_the_own_decay_of_an_impact_is_used_though_parts_rattle_in_it(seed, ratt
             (mode.damping_ratio, mode.damping_sd, dampings),
         ):
             assert low - mode.quantile * sd < value < high + mode.quantile * sd
+
+
+def two_impacts(first=3.0, second=6.0):
+    """Samples of a mode of 4 Hz, struck hard at 3 s and softly at another time, and the marks."""
+    rate = 100.0
+    times = np.arange(1200) / rate
+    since = np.maximum(times - np.array([[first], [second]]), 0.0)
+    parts = np.exp(-0.8 * since) * np.sin(2 * np.pi * 4.0 * since)
+    marks = np.isin(np.arange(times.size), [int(first * rate), int(second * rate)])
+    return Samples(((parts[0] + 0.1 * parts[1])[:, None],), (10.0,), rate, ()), (marks,)
+
+
+@pytest.mark.parametrize(
+    ("second", "starts", "said"),
+    [
+        (6.0, (302, 602), ""),
+        (6.0, (602,), "is left out: what follows it is not the free decay that tells most"),
+        (4.5, (452,), "is left out: the next impact comes 1.5 s later"),
+    ],
+)
+def test_a_hard_impact_whose_decay_is_not_used_is_named(second, starts, said):
+    samples, marks = two_impacts(second=second)
+    decays = [Stretch(0, start, start + 250, 2.0) for start in starts]
+    found = impacts_left_out(samples, marks, decays, (2.0, 10.0))
+    assert found == ([f"the hardest impact, at 13 s, {said}"] if said else [])
+    assert impacts_left_out(samples, (np.zeros(1200, bool),), decays, (2.0, 10.0)) == []
+
+
+def test_marks_of_an_impact_and_its_rebounds_are_one():
+    marks = np.zeros(4000, bool)
+    for start, stop in ((400, 409), (430, 436), (2000, 2010), (3000, 3500)):
+        marks[start:stop] = True
+    found = marked_impacts((marks,), 100.0, (1.0, 20.0))
+    assert found == (Impact(0, 404), Impact(0, 2004))  # what lasts for seconds is no impact

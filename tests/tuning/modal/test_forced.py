@@ -8,7 +8,7 @@ import tuning
 from tests.oracles.planted_structures import FINER, coloured_noise, response
 from tests.tuning.modal.test_subspace import small_structure
 from tuning import Log, ModalSettings, identify_modes
-from tuning.modal.forced.likelihood import triangular_factor
+from tuning.modal.forced.likelihood import refined_poles, triangular_factor
 from tuning.modal.forced.measured_responses import fit_common_denominator, products, transforms
 from tuning.modal.result import mac_matrix
 
@@ -76,6 +76,16 @@ def test_shapes_of_an_early_impact_do_not_depend_on_the_degree():
         nearest = np.argmin(np.abs(found.poles[:, None] - poles), axis=0)
         mac = np.diag(mac_matrix(found.shapes[nearest], shapes + 0j))
         assert np.all(mac > 0.95), (degree, mac)
+
+
+def test_poles_leave_a_start_that_hardly_decays():
+    """Steps are compared with the distance of lines, too: less is not told from nothing."""
+    structure = small_structure(0)._replace(damping_ratios=np.array([0.002, 0.001, 0.0015]))
+    values = measured(structure, "impacts", 0, 0.01).values
+    lines = transforms((values[:, 1:],), (values[:, :1],), RATE, (1.0, 12.0))
+    starts = structure.poles.imag * (1j - 1e-6)
+    found = refined_poles(lines, starts, np.arange(starts.size))
+    assert np.all(np.abs(found - structure.poles) < 0.15 * np.abs(structure.poles.real))
 
 
 @pytest.mark.parametrize("kind", ["impacts", "shaker"])

@@ -11,6 +11,7 @@ from tuning.modal.ambient import (
     divided_band,
     overlapping,
     subspace_modes,
+    without_duplicates,
 )
 from tuning.modal.decay.fit import (
     DecayFit,
@@ -42,6 +43,7 @@ from tuning.modal.preprocessing import (
     prepare,
     strongest_frequency,
 )
+from tuning.modal.result import is_at_edge
 from tuning.modal.stabilisation import Diagram
 
 MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
@@ -61,6 +63,75 @@ class Decays(NamedTuple):
     stretches: tuple[Stretch, ...]
     measured: Float[np.ndarray, "sample channel"]
     fitted: Float[np.ndarray, "sample channel"]
+
+
+class DecayModes(NamedTuple):
+    """Candidates, diagrams, the decays of which they are, and the band (Hz) used."""
+
+    candidates: tuple[Candidate, ...]
+    diagrams: tuple[Diagram, ...]
+    decays: Decays
+    band: tuple[float, float]
+
+
+def modes_of_decays(
+    samples: Samples,
+    excited: tuple[Bool[np.ndarray, " time"], ...],
+    derivatives: tuple[int, ...],
+    bands: tuple[tuple[float, float], tuple[float, float]],
+    may_narrow: bool,
+    how: dict,
+) -> DecayModes | None:
+    """Modes of the decays of a log in two bands (Hz), the latter as wide or wider; None without.
+
+    `excited` are samples excited in the former, `derivatives` the orders of the channels as time
+    derivatives, `how` what else `free_decay_modes` takes. A decay is sought in a narrower band,
+    too, if it `may_narrow`: it drowns sooner in the noise of a wide one.
+    """
+    band, wide = bands
+    found = _in_band(samples, excited, derivatives, band, may_narrow, how)
+    if found is None:
+        return None
+    if wide == band or all(one.from_rest for one in found.decays.stretches):
+        return found
+    more = free_decay_modes(samples, excited, derivatives, wide, **how)
+    return _with_others(found, more, wide)
+
+
+def _in_band(samples, excited, derivatives, band, may_narrow, how) -> DecayModes | None:
+    if may_narrow and follow_impacts(samples, excited, derivatives, band):
+        # Contacts and rattling parts have most of the velocities above what the structure moves.
+        displacements = tuple(order + 1 for order in derivatives)
+        narrower = kinetic_band(samples.records, samples.rate, displacements)
+        marks = find_excited(samples, derivatives, narrower)
+        told = free_decay_modes(samples, marks, derivatives, narrower, **how)
+        if told is not None:
+            return DecayModes(*told, narrower)
+    found = free_decay_modes(samples, excited, derivatives, band, **how)
+    if found is None and may_narrow:
+        lower = kinetic_band(samples.records, samples.rate, derivatives, HALF_POWER)
+        others = dict.fromkeys((lower, band_of_ends(samples, derivatives, lower)))
+        for narrower in (one for one in others if one != band):
+            marks = find_excited(samples, derivatives, narrower)
+            found = free_decay_modes(samples, marks, derivatives, narrower, **how)
+            if found is not None:
+                return DecayModes(*found, narrower)
+    return None if found is None else DecayModes(*found, band)
+
+
+def _with_others(found: DecayModes, more, wide: tuple[float, float]) -> DecayModes:
+    """Modes of decays in a band, with those (`more`) of a wider one outside it.
+
+    In the wider band alone, what decays fast would end decays before slow modes are certain.
+    """
+    others = [
+        one
+        for one in (more[0] if more else ())
+        if not one.reason and is_at_edge(one.mode, found.band)
+    ]
+    if not others:
+        return found
+    return found._replace(candidates=without_duplicates([*found.candidates, *others]), band=wide)
 
 
 def find_excited(

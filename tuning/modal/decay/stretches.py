@@ -101,6 +101,9 @@ MIN_DECAY_CYCLES = 5.0  # of the strongest vibration
 MIN_FALL_NEPERS = 1.0  # of the energy over a decay
 MIN_LINEARITY = 0.6  # share of the variance of the log energy that a straight line explains
 MAX_COLUMNS = 24  # channels times decays that are fitted together
+# Of the information of one long decay, below which those side by side are not taken: intervals
+# would be ten times as wide. Impacts at random have a tenth or more (24 planted logs).
+LITTLE_SIDE_BY_SIDE = 0.01
 # Of a record's energy, in decays after impacts that the energy alone tells of. Ambient vibration
 # rises and falls, too: what falls held as much in one of eight short records of one mode.
 MIN_ENERGY_AFTER_SOFT_IMPACTS = 0.7
@@ -441,15 +444,21 @@ def stacked(
     """Decays of one length side by side, channels of the first before those of the second ...
 
     The common length is the median; decays of less than half of it are left out, and those between
-    shorten it. Of more than 24 columns in all, the principal combinations of the decays are
-    returned: weighted sums, of orthonormal weights, that hold most energy. They have the poles and
-    shapes of the decays, and as much noise as one of them.
+    shorten it. One long decay is taken alone where it tells a hundred times as much. Of more than
+    24 columns in all, the principal combinations of the decays are returned: weighted sums, of
+    orthonormal weights, that hold most energy. They have the poles and shapes of the decays, and as
+    much noise as one of them.
     """
     lengths = np.array([one.stop - one.start for one in decays])
     used = tuple(
         one for one, length in zip(decays, lengths, strict=True) if 2 * length >= np.median(lengths)
     )
     length = min(int(np.median(lengths)), min(one.stop - one.start for one in used))
+    known = _information(records, decays)
+    longest = int(np.argmax([one[-1] for one in known]))
+    together = sum(one[length - 1] for one in known if one.size >= length)
+    if together < LITTLE_SIDE_BY_SIDE * known[longest][-1]:
+        used, length = (decays[longest],), int(lengths[longest])
     parts = np.stack([records[one.record][one.start : one.start + length] for one in used])
     most = max(MAX_COLUMNS // records[0].shape[1], 1)
     if len(used) > most:
@@ -458,6 +467,19 @@ def stacked(
         weights = weights * np.where(weights.sum(axis=1) < 0, -1.0, 1.0)[:, None]
         parts = (weights @ flat).reshape(-1, *parts.shape[1:])
     return np.hstack(list(parts)), used
+
+
+def _information(records, decays) -> list[Float[np.ndarray, " sample"]]:
+    """Information on the poles in each decay to each sample: the sum of t^2 times the energy.
+
+    The energy is that above the noise, the least of the last parts of decays, each channel relative
+    to its own.
+    """
+    size = np.maximum(sum(np.sum(one**2, axis=0) for one in records), 1e-300)
+    parts = [records[one.record][one.start : one.stop] for one in decays]
+    energies = [np.sum(part**2 / size, axis=1) for part in parts]
+    noise = min(np.mean(one[-max(one.size // FALL_PARTS, 1) :]) for one in energies)
+    return [np.cumsum(np.arange(one.size) ** 2 * (one - noise)) for one in energies]
 
 
 MIN_DECAY_ENERGY = 0.3  # share of the energy of a log in its decays, if they are to stand for it

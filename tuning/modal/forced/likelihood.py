@@ -216,7 +216,6 @@ def pole_directions(
 
 
 REST_POWERS = (-2, -1, 0, 1, 2)  # of z, for modes above the band and those not found
-REST_TERMS = len(REST_POWERS) + 2  # with those of modes below the band
 FEWER_REST_POWERS = (0, 1)  # with which poles are compared
 STEPS = 12  # of Gauss and Newton, at most
 WIDE = 16  # lines on either side whose errors tell the level of a line
@@ -337,12 +336,11 @@ def refined_poles(
     starts: Complex[np.ndarray, " mode"],
     moving: Int[np.ndarray, " moving"],
     powers: tuple[int, ...] = REST_POWERS,
-    steps: int = STEPS,
 ) -> Complex[np.ndarray, " mode"]:
     """Poles after Gauss-Newton steps; those that leave their surroundings return to the start."""
     poles = starts.astype(complex)
     least = MIN_WIDTH * lines.spacing
-    for _ in range(steps if moving.size else 0):
+    for _ in range(STEPS if moving.size else 0):
         found, gram, along, squares = _reduced(lines, poles, moving, powers)
         directions = pole_directions(lines, found, poles.size, moving)
         weight = 2 * len(lines.z) / np.maximum(squares, 1e-300)
@@ -409,12 +407,10 @@ def whitened(lines: Lines, poles: Complex[np.ndarray, " mode"]) -> Lines:
     )
 
 
-def linear_fit(
-    lines: Lines, poles: Complex[np.ndarray, " mode"], powers: tuple[int, ...] = REST_POWERS
-) -> LinearFit:
-    """Residues, transients and rest by least squares, for poles (1/s) and `powers` of z."""
+def linear_fit(lines: Lines, poles: Complex[np.ndarray, " mode"]) -> LinearFit:
+    """Residues, transients and rest by least squares, for poles (1/s)."""
     target = both_parts(lines.outputs)
-    columns = both_parts(columns_of_model(lines, poles, powers))
+    columns = both_parts(columns_of_model(lines, poles, REST_POWERS))
     basis, factor = np.linalg.qr(columns)
     inside = basis.T @ target
     inverse_factor = np.linalg.pinv(factor)

@@ -131,20 +131,19 @@ def _stacked(found, lines: Lines, modes: int):
 
 
 def modes_of_model(
-    model: FittedModel,
-    scale: Float[np.ndarray, " output"],
-    bands: tuple[tuple[float, float], ...] = (),
+    model: FittedModel, scale: Float[np.ndarray, " output"]
 ) -> tuple[IdentifiedMode, ...]:
     """Modes of a fitted model with uncertainties; those of poles not refined have none.
 
     Outputs are in units of `scale`, shapes in those of the log. Shares in the energy are those of
-    the first of some bands (Hz) in which a mode is, by default of all lines.
+    all lines.
     """
     plain, lines, poles, fit = model.plain, model.lines, model.poles, model.fit
     covariances = pole_covariances(model)
     coefficients = _stacked(fit.found, lines, poles.size)
     changes = _coefficient_steps(model, _steps(model))
     changes = np.array([_stacked(one, lines, poles.size) for one in changes])
+    power = np.maximum(np.sum(np.abs(plain.outputs) ** 2, axis=0), 1e-300)
     resonances, mirrored = resonances_of(plain, poles)
     transients, mirrored_transients = transients_of(plain, poles)
     modes = []
@@ -164,7 +163,6 @@ def modes_of_model(
         frequency, frequency_sd, damping, damping_sd = frequency_and_damping(
             complex(pole), covariances[k]
         )
-        power = _power(plain, [one for one in bands if one[0] <= frequency <= one[1]])
         terms = mirrored[:, [k]] * plain.inputs, mirrored_transients[:, [k]] * plain.unforced
         part = response + np.concatenate(terms, axis=1) @ coefficients[k].conj()
         modes.append(
@@ -180,15 +178,6 @@ def modes_of_model(
             )
         )
     return tuple(modes)
-
-
-def _power(lines: Lines, bands):
-    """Power of the outputs at all lines, or at those of the first of some bands (Hz)."""
-    outputs = lines.outputs
-    if bands:
-        frequencies = np.angle(lines.z) / (2 * np.pi * lines.step)
-        outputs = outputs[(frequencies >= bands[0][0]) & (frequencies <= bands[0][1])]
-    return np.maximum(np.sum(np.abs(outputs) ** 2, axis=0), 1e-300)
 
 
 MAX_ADDED = 12  # poles, one at a time

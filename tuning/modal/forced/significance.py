@@ -131,22 +131,10 @@ def criterion(fit: LinearFit, modes: int) -> float:
 
     It is less for the better model.
     """
-    rows, columns = fit.columns.shape
-    return _criterion(np.sum(fit.errors**2, axis=0), rows, columns, modes)
-
-
-def _criterion(squares, rows, columns, modes) -> float:
+    (rows, columns), squares = fit.columns.shape, np.sum(fit.errors**2, axis=0)
     parameters = squares.size * columns + 2 * modes
     size = np.sum(np.log(np.maximum(squares / rows, 1e-300)))
     return float(rows * size + parameters * np.log(rows))
-
-
-def criterion_with(lines: Lines, fit: LinearFit, modes: int, pole: complex) -> float:
-    """The same of a fit to which a pole (1/s) is added as it is."""
-    columns = _columns_of(lines, pole)
-    basis = np.linalg.qr(columns - fit.basis @ (fit.basis.T @ columns))[0]
-    squares = np.sum(fit.errors**2, axis=0) - np.sum((basis.T @ fit.errors) ** 2, axis=0)
-    return _criterion(squares, len(columns), fit.columns.shape[1] + columns.shape[1], modes + 1)
 
 
 def _local_variance(errors, free):

@@ -1,1 +1,0 @@
-"""Modes after impacts that were not measured, from whole records."""
