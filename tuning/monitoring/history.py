@@ -27,6 +27,34 @@ from tuning.modal.identify_modes import identify_modes
 FORMAT = "jaxbeam modes of logs 1"
 
 
+@dataclasses.dataclass(frozen=True)
+class AnalysisSettings:
+    """Which logs of a folder are analysed, and how.
+
+    Logs are the files that match the `pattern`. `columns` and `rate` (Hz) are those of
+    `tuning.read_log`; `band` (Hz), `method` and `channels` those of `tuning.identify_modes`;
+    `order` is the highest of the models.
+
+    >>> AnalysisSettings(band=(0.5, 20.0)).to_dict()["band"]
+    [0.5, 20.0]
+    """
+
+    pattern: str = "*"
+    band: tuple[float, float] | None = None
+    method: str | None = None
+    channels: Sequence[str] | None = None
+    columns: str | None = None
+    rate: float | None = None
+    order: int | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        found = dataclasses.asdict(self)
+        for name in ("band", "channels"):
+            found[name] = None if found[name] is None else list(found[name])
+        return found
+
+
 class LogModes(NamedTuple):
     """Modes of one log: frequencies (Hz) and damping ratios with deviations, and shapes.
 
@@ -101,42 +129,34 @@ def read_history(path: str | os.PathLike) -> ModeHistory:
 def analyse(
     folder: str | os.PathLike,
     store: str | os.PathLike,
+    settings: AnalysisSettings | None = None,
     *,
-    pattern: str = "*",
-    band: tuple[float, float] | None = None,
-    method: str | None = None,
-    channels: Sequence[str] | None = None,
-    columns: str | None = None,
-    rate: float | None = None,
-    order: int | None = None,
     processes: int = 1,
     progress: bool = False,
 ) -> ModeHistory:
     """Modes of all logs of a `folder`, of which those in the `store` are not analysed again.
 
-    The store, a JSON file, is written after each log. Logs are the files that match the `pattern`
-    but descriptions (.toml) and hidden ones. The other arguments are those of `tuning.read_log` and
-    `tuning.identify_modes`. Logs that cannot be analysed have an entry with the reason. More than
-    one of the `processes` need a program whose main module may be imported.
+    The store, a JSON file, is written after each log. The `settings` say which files are logs, but
+    descriptions (.toml) and hidden ones, and how they are analysed. Logs that cannot be analysed
+    have an entry with the reason. More than one of the `processes` need a program whose main module
+    may be imported; a bar shows `progress`.
 
     Raises FileNotFoundError without the folder, that of the store, or a log, ValueError for a store
     of other settings.
     """
-    folder, store = Path(folder), Path(store)
-    settings = {"pattern": pattern, "band": None if band is None else list(band)}
-    settings |= {"method": method, "channels": None if channels is None else list(channels)}
-    settings |= {"columns": columns, "rate": rate, "order": order}
-    files = logs_in(folder, pattern, store)
+    folder, store, settings = Path(folder), Path(store), settings or AnalysisSettings()
+    told = settings.to_dict()
+    files = logs_in(folder, settings.pattern, store)
     if not store.parent.is_dir():
         raise FileNotFoundError(f"there is no folder {store.parent} to write {store.name} to")
     known: dict[str, LogModes] = {}
     if store.exists():
         former = read_history(store)
-        changed = [k for k, v in settings.items() if former.settings.get(k) != v]
+        changed = [k for k, v in told.items() if former.settings.get(k) != v]
         if changed:
             raise ValueError(
                 f"{store} was made with another {changed[0]}"
-                f" ({former.settings.get(changed[0])!r}, not {settings[changed[0]]!r}): give the"
+                f" ({former.settings.get(changed[0])!r}, not {told[changed[0]]!r}): give the"
                 " same, or another store"
             )
         known = {entry.file: entry for entry in former.entries}
@@ -147,9 +167,9 @@ def analyse(
     with ProgressBar(len(files), "log", shown=progress, initial=len(known)) as bar, kept:
         for entry in _analysed(left, settings, processes):
             known[entry.file] = entry
-            _history(known, settings).save(store)
+            _history(known, told).save(store)
             bar.update()
-    return _history(known, settings)
+    return _history(known, told)
 
 
 def logs_in(folder: Path, pattern: str, store: Path) -> list[Path]:
@@ -189,7 +209,7 @@ def _history(known: Mapping[str, LogModes], settings: Mapping[str, Any]) -> Mode
 
 
 def _analysed(
-    paths: Sequence[Path], settings: Mapping[str, Any], processes: int
+    paths: Sequence[Path], settings: AnalysisSettings, processes: int
 ) -> Iterable[LogModes]:
     """Entries of some logs, as they are found."""
     if processes <= 1 or len(paths) < 2:
@@ -205,20 +225,19 @@ def _analysed(
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def entry_of(path: Path, settings: Mapping[str, Any]) -> LogModes:
+def entry_of(path: Path, settings: AnalysisSettings) -> LogModes:
     """LogModes of one log."""
     mark = _mark(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", LogWarning)
-            log = read_log(path, columns=settings["columns"], rate=settings["rate"])
-            band = settings["band"]
+            log = read_log(path, columns=settings.columns, rate=settings.rate)
             fit = identify_modes(
                 log,
-                band=None if band is None else (band[0], band[1]),
-                method=settings["method"],
-                channels=settings["channels"],
-                settings=ModalSettings(order=settings["order"]),
+                band=settings.band,
+                method=settings.method,
+                channels=settings.channels,
+                settings=ModalSettings(order=settings.order),
             )
     except (ValueError, OSError, ImportError, RuntimeError) as error:
         return LogModes(path.name, mark, problem=" ".join(str(error).split()))

@@ -2,14 +2,20 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from jaxbeam.runtime.printer import TableViews, text_table
 from tuning.monitoring.chart import ControlChart, chart_of
-from tuning.monitoring.history import ModeHistory, analyse, read_conditions, with_conditions
+from tuning.monitoring.history import (
+    AnalysisSettings,
+    ModeHistory,
+    analyse,
+    read_conditions,
+    with_conditions,
+)
 from tuning.monitoring.tracks import ModeTrack, tracks_of
 
 BASELINE = 50  # logs
@@ -159,16 +165,10 @@ def _frequency(track: ModeTrack) -> float:
 def monitor(
     folder: str | os.PathLike,
     store: str | os.PathLike,
+    settings: AnalysisSettings | None = None,
     *,
     conditions: str | os.PathLike | None = None,
     baseline: int = BASELINE,
-    pattern: str = "*",
-    band: tuple[float, float] | None = None,
-    method: str | None = None,
-    channels: Sequence[str] | None = None,
-    columns: str | None = None,
-    rate: float | None = None,
-    order: int | None = None,
     processes: int = 1,
     progress: bool = False,
 ) -> Monitoring:
@@ -179,9 +179,9 @@ def monitor(
     (see `tracks_of`). Of the first logs, the `baseline`, frequencies are regressed on `conditions`:
     columns of the logs without a unit of vibrations, as temperatures, and those of a CSV table with
     the names of logs in its first column. A control chart of what remains has the alarms (see
-    `chart_of`). Logs are the files of a `pattern`, in the order of their dates, if all have one,
-    else of their names; so many `processes` analyse them at once. The other arguments are those of
-    `tuning.read_log` and `tuning.identify_modes`; `order` is the highest of the models.
+    `chart_of`). Logs are in the order of their dates, if all have one, else of their names; the
+    `settings` say which they are and how they are analysed. So many `processes` analyse them at
+    once; a bar shows `progress`.
 
     Raises FileNotFoundError without the folder or a log, ValueError for a baseline below two, a
     store of other settings and a table of conditions that names no log.
@@ -203,19 +203,7 @@ def monitor(
     if baseline < 2:
         raise ValueError(f"the baseline must be 2 logs at least, not {baseline}")
     known = None if conditions is None else read_conditions(conditions)  # before any work
-    history = analyse(
-        folder,
-        store,
-        pattern=pattern,
-        band=band,
-        method=method,
-        channels=channels,
-        columns=columns,
-        rate=rate,
-        order=order,
-        processes=processes,
-        progress=progress,
-    )
+    history = analyse(folder, store, settings, processes=processes, progress=progress)
     return monitored(history, known, baseline)
 
 

@@ -85,11 +85,7 @@ def monitor(
     from jaxbeam.files.tables import write_table
     from tuning import monitoring
 
-    found = monitoring.monitor(
-        folder,
-        place,
-        conditions=conditions,
-        baseline=baseline,
+    settings = monitoring.AnalysisSettings(
         pattern=pattern,
         band=limits,
         method=method,
@@ -97,6 +93,13 @@ def monitor(
         columns=columns,
         rate=rate,
         order=order,
+    )
+    found = monitoring.monitor(
+        folder,
+        place,
+        settings,
+        conditions=conditions,
+        baseline=baseline,
         processes=processes or os.cpu_count() or 1,
         progress=not options.json_,
     )

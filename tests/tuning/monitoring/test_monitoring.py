@@ -14,6 +14,7 @@ import scipy.signal
 from numpy.testing import assert_allclose
 
 from tuning.monitoring.history import (
+    AnalysisSettings,
     LogModes,
     ModeHistory,
     analyse,
@@ -147,7 +148,7 @@ def logs(tmp_path_factory):
 
 def test_only_new_logs_are_analysed(logs, tmp_path, monkeypatch):
     store = tmp_path / "modes.json"
-    found = analyse(logs, store, band=(1.0, 10.0))
+    found = analyse(logs, store, AnalysisSettings(band=(1.0, 10.0)))
     assert [entry.file for entry in found.entries][-4:] == [f"log{i}.csv" for i in range(1, 5)]
     assert found.entries[0].problem and not found.entries[-1].problem
     assert dict(found.entries[-1].conditions) == {"T (°C)": 13.0}
@@ -160,11 +161,11 @@ def test_only_new_logs_are_analysed(logs, tmp_path, monkeypatch):
         raise AssertionError("a log was analysed again")
 
     monkeypatch.setattr("tuning.monitoring.history.entry_of", refuse)
-    assert analyse(logs, store, band=(1.0, 10.0)).entries[-1].file == "log4.csv"
+    assert analyse(logs, store, AnalysisSettings(band=(1.0, 10.0))).entries[-1].file == "log4.csv"
     with pytest.raises(ValueError, match="was made with another band"):
-        analyse(logs, store, band=(1.0, 12.0))
+        analyse(logs, store, AnalysisSettings(band=(1.0, 12.0)))
     with pytest.raises(FileNotFoundError, match="no log in .* that matches 'none"):
-        analyse(logs, store, pattern="none*")
+        analyse(logs, store, AnalysisSettings(pattern="none*"))
     (tmp_path / "other.json").write_text("{}")
     with pytest.raises(ValueError, match="is no history of modes"):
         read_history(tmp_path / "other.json")
