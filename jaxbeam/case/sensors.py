@@ -30,12 +30,13 @@ class Sensor(ReprWithUnits, Module):
     `strain` is the bending strain -z d2w/dx2 of the fibre at z = `fibre_distance` above the neutral
     axis, `moment` the bending moment, positive where the beam sags, `shear` its x-derivative, and
     `stress` the moment over the `section_modulus`. What jumps at the position, as a shear force at
-    a support, is read on one `side` of it, by default the right one. `name` is the label in
-    results. `offset` and noise are added to the quantity; the reading is limited to the range and
-    rounded to the resolution (see `jaxbeam.model.sensing.sensor_signals`). With the probability
-    `dropout` a reading is lost: the last one stays, and a controller knows that it is missing. The
-    others are up to `jitter` older than `delay`, equally distributed. Both are drawn by the seed of
-    the run. What is left out is ideal.
+    a support, is read on one `side` of it, by default the right one. Deflections and their rates at
+    an `eccentricity` e are w + e theta on a beam that twists. `name` is the label in results.
+    `offset` and noise are added to the quantity; the reading is limited to the range and rounded to
+    the resolution (see `jaxbeam.model.sensing.sensor_signals`). With the probability `dropout` a
+    reading is lost: the last one stays, and a controller knows that it is missing. The others are
+    up to `jitter` older than `delay`, equally distributed. Both are drawn by the seed of the run.
+    What is left out is ideal.
 
     >>> import jaxbeam as jb
     >>> sensor = jb.Sensor(0.3, quantity="strain", fibre_distance=0.0025, name="midspan")
@@ -81,6 +82,12 @@ class Sensor(ReprWithUnits, Module):
         "",
         *SIDES,
         default="",
+        kw_only=True,
+    )
+    eccentricity: Float[Number, ""] | None = number(
+        "m",
+        "distance left of the axis of twist, looking right, as of an edge of the deck",
+        default=None,
         kw_only=True,
     )
     dropout: Float[Number, ""] | None = number(
@@ -164,6 +171,11 @@ class Sensor(ReprWithUnits, Module):
             return (
                 f"{address}.side would have no effect on {words}, which is the same on both sides;"
                 " leave it out"
+            )
+        if self.eccentricity is not None and (quantity.x_derivative or quantity.of_twist):
+            return (
+                f"{address}.eccentricity would have no effect on {words}, which is that of the"
+                " section; leave it out"
             )
         if modulus is not None and is_concrete(modulus) and concrete(modulus) == 0:
             return f"{address}.section_modulus must not be zero"

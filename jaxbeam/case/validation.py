@@ -226,6 +226,8 @@ def _check_torsion(case: Case) -> None:
         for i, sensor in enumerate(case.sensors):
             if QUANTITIES[sensor.quantity].of_twist:
                 raise ValueError(f"sensors.{i} measures {sensor.quantity}: {NO_TORSION}")
+            if sensor.eccentricity is not None:
+                raise ValueError(f"sensors.{i}.eccentricity would have no effect: {NO_TORSION}")
         for i, support in enumerate(case.supports):
             if support.torsional_stiffness is not None:
                 raise ValueError(

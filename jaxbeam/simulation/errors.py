@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.quantities import QUANTITIES, quantity_of
+from jaxbeam.case.quantities import QUANTITIES, TWIST, quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.peaks import Peaks, RunningPeaks
 from jaxbeam.integrator.propagators import PEAK_NODES
@@ -16,7 +16,7 @@ from jaxbeam.model.layout import is_uniform
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.sensing.output_rows import band_weights, modal_row, place_of, sensor_history
+from jaxbeam.model.sensing.output_rows import band_weights, place_of, sensor_history, sensor_row
 from jaxbeam.model.static_correction import Motion, corrected_history, is_supported
 from jaxbeam.runtime.arrays import Array, stop_gradient, xp
 from jaxbeam.simulation.motion import motion_at
@@ -37,7 +37,8 @@ class Extremes(NamedTuple):
 def monitored_sensors(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
     """Deflections at all sensors, then the other quantities of those that measure others."""
     others = (sensor for sensor in sensors if sensor.quantity != "deflection")
-    return *(Sensor(sensor.position) for sensor in sensors), *others
+    places = (Sensor(one.position, eccentricity=one.eccentricity) for one in sensors)
+    return *places, *others
 
 
 def own_outputs(sensors: Sequence[Sensor]) -> Int[np.ndarray, " sensor"]:
@@ -179,6 +180,9 @@ def truncation_changes(case: Case, modes: Modes, motion: Motion) -> Float[Array,
         elif quantity.time_derivative == 0 and not quantity.bends:
             order = quantity.x_derivative
             change = corrected_history(case, modes, motion, place_of(case, sensor), order)
+            if sensor.eccentricity is not None:
+                twist = corrected_history(case, modes, motion, sensor.position, TWIST)
+                change = change + sensor.eccentricity * twist
             change = change - sensor_history(case, modes, motion, sensor)
         elif case.beam.modes == 1:
             change = xp.nan
@@ -194,9 +198,8 @@ def _highest_modes(
     """Part of the LEFT_OUT highest modes, or of all but one, in what a sensor measures."""
     quantity = quantity_of(sensor.quantity, sensor.fibre_distance, sensor.section_modulus)
     highest = np.s_[max(1, case.beam.modes - LEFT_OUT) :]
-    parameters = sensor.quantity, sensor.fibre_distance, sensor.section_modulus
-    place = place_of(case, sensor)
-    row = modal_row(modes.fields, case, place, *parameters) * band_weights(modes, sensor.mode_band)
+    row = sensor_row(modes.fields, case, sensor, place_of(case, sensor))
+    row = row * band_weights(modes, sensor.mode_band)
     amplitudes = tuple(part[:, highest] for part in motion[:3])
     if quantity.bends and is_supported(case, modes.layout):
         _, rates, accelerations = amplitudes

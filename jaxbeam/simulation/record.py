@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete, refuse_traced
+from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.load_set import LoadSet, load_set
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.sensing.output_rows import sensor_history
@@ -19,7 +20,7 @@ from jaxbeam.model.sensing.sensor_signals import (
     vehicle_readings,
 )
 from jaxbeam.model.static_correction import Motion
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.simulation import section_forces
 from jaxbeam.simulation.errors import Extremes, chosen_samples, truncation_errors
 from jaxbeam.simulation.labels import Flights, contact_sentence, flights_sentence
@@ -232,7 +233,13 @@ class Record(RecordViews):
         return truncation_errors(self.case, self.modes, motion)
 
     def _at_sensors(self, quantity: str) -> Float[Array, "time sensor"]:
-        return self.at(self.case.sensor_positions, quantity)
+        values = self.at(self.case.sensor_positions, quantity)
+        for i, sensor in enumerate(self.case.sensors):
+            if sensor.eccentricity is not None:
+                there = Sensor(sensor.position, quantity, eccentricity=sensor.eccentricity)
+                own = sensor_history(self.case, self.modes, self.motion, there)
+                values = set_at(values, np.s_[:, i], own)
+        return values
 
     @property
     def deflection(self) -> Float[Array, "time sensor"]:
@@ -251,8 +258,8 @@ class Record(RecordViews):
 
     @property
     def slope(self) -> Float[Array, "time sensor"]:
-        """Slope at the sensors in rad."""
-        return self._at_sensors("slope")
+        """Slope of the axis at the sensors in rad."""
+        return self.at(self.case.sensor_positions, "slope")
 
     @property
     def strain(self) -> Float[Array, "time sensor"]:

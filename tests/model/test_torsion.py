@@ -181,6 +181,53 @@ def test_eccentric_masses_agree_with_finite_elements(loads, arm):
     np.testing.assert_allclose(deflection, on_axis, atol=2e-5 * np.max(np.abs(on_axis)))
 
 
+EDGES = [
+    jb.Sensor(12.0, name, eccentricity=arm)
+    for arm in (3.0, -3.0)
+    for name in ("deflection", "acceleration")
+]
+
+
+def test_edges_of_the_deck_agree_with_finite_elements():
+    load = jb.MovingMass(mass=2e4, speed=40.0, eccentricity=2.0)
+    case = dataclasses.replace(
+        box([load], run=jb.Run(0.7, sample_rate=400.0), modes=4), sensors=EDGES
+    )
+    record, elements = jb.simulate(case), FiniteElements(20)
+    times = np.asarray(record.times)
+    q, vectors = crossing_of_masses(elements, 4, [(2e4, 40.0, 2.0)], times[-1], times)
+    for i, arm in enumerate((3.0, -3.0)):
+        exact = elements.row(12.0, 0, arm) @ vectors @ q
+        size = np.max(np.abs(exact))
+        np.testing.assert_allclose(record.deflection[:, 2 * i], exact, atol=3e-5 * size)
+        np.testing.assert_allclose(record.sensor_values[:, 2 * i], exact, atol=3e-5 * size)
+        np.testing.assert_allclose(record.measured[:, 2 * i], exact, atol=3e-5 * size)
+        extremes = float(record.smallest[2 * i]), float(record.largest[2 * i])
+        assert extremes == pytest.approx((exact.min(), max(exact.max(), 0.0)), abs=2e-3 * size)
+        assert float(record.peak_deflection[2 * i]) == pytest.approx(size, rel=2e-3)
+        # Between samples, by differences of the deflection.
+        second = np.diff(exact, 2) * 400.0**2
+        found = record.sensor_values[1:-1, 2 * i + 1]
+        smooth = np.abs(np.diff(found, prepend=found[0])) < 0.2 * np.max(np.abs(found))
+        error = np.abs(found - second)[smooth]
+        assert np.median(error) < 0.01 * np.max(np.abs(found))
+    sweep = jb.sweep(case, {"loads.0.speed": [35.0, 40.0]})
+    for k, name in enumerate(("deflection", "acceleration")):
+        for i in range(2):
+            own = max(record.largest[2 * i + k], -record.smallest[2 * i + k])
+            assert sweep[f"peak_{name}"].values[1, 2 * i + k] == pytest.approx(own, rel=1e-4)
+
+
+def test_edges_that_cannot_be_read_are_refused():
+    load, edge = jb.MovingForce(force=1e5, speed=40.0), jb.Sensor(12.0, eccentricity=3.0)
+    straight = jb.Case(jb.Beam(LENGTH, EI, MASS), sensors=[edge], loads=[load])
+    with pytest.raises(ValueError, match=r"sensors.0.eccentricity would have no effect: the beam"):
+        jb.simulate(straight)
+    twist = jb.Sensor(12.0, "twist", eccentricity=3.0)
+    with pytest.raises(ValueError, match="no effect on a sensor of twist, which is that of the"):
+        jb.simulate(dataclasses.replace(box([load]), sensors=[twist]))
+
+
 def test_peaks_of_sweeps_are_those_of_runs_and_of_a_train_in_closed_form():
     train = jb.Axles(offsets=np.arange(9) * 3.0, forces=1e5, speed=40.0, eccentricity=2.0)
     case = box([train], modes=4, run=jb.Run(2.0))

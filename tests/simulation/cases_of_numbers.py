@@ -498,7 +498,8 @@ JUMPING = {
     for part in ("sensors", "vehicle_sensors", "controller")
 }
 BOX = dict(torsional_rigidity=4.0, polar_inertia=2e-4)
-TWISTING = [jb.Sensor(0.25, "twist"), jb.Sensor(0.35, "torque"), SENSOR]
+EDGE = jb.Sensor(0.25, eccentricity=0.03)
+TWISTING = [jb.Sensor(0.25, "twist"), jb.Sensor(0.35, "torque"), EDGE]
 TORSION = {
     "eccentric loads": rig(
         [
@@ -517,7 +518,9 @@ TORSION = {
     ),
 }
 CASES: dict[str, tuple[jb.Case, str | tuple[str, ...]]] = {
-    **{name: (case, ("beam.", "supports.", "loads.")) for name, case in TORSION.items()},
+    **{
+        name: (case, ("beam.", "supports.", "loads.", "sensors.")) for name, case in TORSION.items()
+    },
     **{name: (case, "beam.") for name, case in OF_BEAM.items()},
     "supports": (SUPPORTS, "supports."),
     "absorbers": (ABSORBERS, "absorbers."),

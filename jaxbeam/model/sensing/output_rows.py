@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxbeam.case.case import Case
-from jaxbeam.case.quantities import QUANTITIES, TWIST_RATE, Quantity, quantity_of
+from jaxbeam.case.quantities import QUANTITIES, TWIST, TWIST_RATE, Quantity, quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.model.deflection_lines import LoadInfluence, influence_functions, load_influence
 from jaxbeam.model.modal_model import ModalModel
@@ -99,6 +99,16 @@ def modal_row(
     quantity = quantity_of(name, *parameters)
     row = fields(x, (quantity.field,))[0]
     return quantity_factor(case, x, quantity, *parameters)[..., None] * row
+
+
+def sensor_row(
+    fields: Fields, case: Case, sensor: Sensor, x: Float[Array, ""]
+) -> Float[Array, " mode"]:
+    """Row of a sensor that takes d^n q / dt^n to its quantity at x (m); see `modal_row`."""
+    row = modal_row(fields, case, x, *_channel(sensor))
+    if sensor.eccentricity is None:
+        return row
+    return row + sensor.eccentricity * fields(x, (TWIST,))[0]
 
 
 def quantity_factor(case: Case, x, quantity: Quantity, fibre_distance, section_modulus):
@@ -183,7 +193,12 @@ def sensor_rows(model: ModalModel, case: Case, sensors: Sequence[Sensor]) -> Out
         quantity = quantity_of(name, fibre_distance, section_modulus)
         x = beside(case, x, side) if side else x
         fields = banded_fields(model, band)
-        rows.append(modal_row(fields, case, x, name, fibre_distance, section_modulus))
+        found = modal_row(fields, case, x, name, fibre_distance, section_modulus)
+        arms = [sensors[i].eccentricity for i in index]
+        if any(arm is not None for arm in arms):
+            arms = xp.stack([xp.asarray(0.0 if arm is None else arm) for arm in arms])
+            found = found + arms[:, None] * fields(x, (TWIST,))[0]
+        rows.append(found)
         active = active_moments(case, x).T
         if not quantity.has_active_moment:
             active = xp.zeros_like(active)
@@ -250,7 +265,12 @@ def sensor_history(
     case: Case, modes: Modes, motion: Motion, sensor: Sensor
 ) -> Float[Array, " time"]:
     """History of the true quantity of a sensor, in its SI unit; see `quantity_history`."""
-    channel = sensor.position, sensor.quantity, sensor.fibre_distance, sensor.section_modulus
+    if sensor.eccentricity is not None:
+        row = sensor_row(modes.fields, case, sensor, sensor.position)
+        amplitudes = (motion.coordinates, motion.rates, motion.accelerations)
+        derivative = QUANTITIES[sensor.quantity].time_derivative
+        return amplitudes[derivative] @ (row * band_weights(modes, sensor.mode_band))
+    channel = sensor.position, *_channel(sensor)
     return quantity_history(case, modes, motion, *channel, sensor.mode_band, sensor.side)
 
 
