@@ -186,7 +186,7 @@ def test_missing_file_is_named():
 # The examples of docs/vehicles.md are read, and the names in it are those of the library.
 
 TEXT = (ROOT / "docs" / "vehicles.md").read_text(encoding="utf-8")
-KINDS, FILE, SENSORS = re.findall(r"^```toml\n(.*?)^```", TEXT, re.M | re.S)
+KINDS, FILE, TRACK, SENSORS = re.findall(r"^```toml\n(.*?)^```", TEXT, re.M | re.S)
 
 
 def test_loads_of_the_page_are_valid():
@@ -203,6 +203,13 @@ def test_sensors_of_the_page_are_valid():
     case = case_from_dict({"beam": BEAM, "loads": loads, **tomllib.loads(SENSORS)})
     check_case(case)
     assert case.vehicle_sensors[0].body == "axle"
+
+
+def test_track_of_the_page_is_valid():
+    content = tomllib.loads(TRACK)
+    case = case_from_dict({**content, "beam": BEAM | {"length": 24.0} | content["beam"]})
+    check_case(case)
+    assert case.track.layered and float(case.track.approach) == 30.0
 
 
 def test_vehicle_file_of_the_page_is_valid(tmp_path):
