@@ -19,6 +19,7 @@ from experiments.thesis.results_tables import PAGE as RESULTS, with_shares, with
 from experiments.thesis.verdicts import (
     EXPLAINED,
     FITTED,
+    INCONSISTENT,
     IRREPRODUCIBLE,
     NOT_COUNTED,
     NOT_REPRODUCED,
@@ -44,7 +45,9 @@ somebody who tries to refute it. The rules:
 - It is *explained* if a reading of the text other than the literal one gives it, and no parameter
   was fitted to that very number. One reading serves for all numbers of a physical rig in a chapter:
   the likeliest, with all readings in the report.
-- It *cannot be right* only by a proof that the report shows; else it is *not reproduced*.
+- It *cannot be right* only by a proof that the report shows. Where a proof is of several numbers
+  together, these *cannot all be right*, and none of them is called wrong by itself. Else a number
+  is *not reproduced*.
 - A number that a null model (no control, static, one mode) meets within the same tolerance, or that
   cannot tell the reading from it, counts for nothing, nor does one that a parameter was fitted to,
   one that repeats another or follows from printed ones by arithmetic, or a yes or a no.
@@ -75,7 +78,8 @@ def sentence(report: dict) -> str:
     return (
         f"Of the {sum(found.values())} numbers of the thesis that can be computed {counted} count:"
         f" {found[REPRODUCED]} are reproduced, {found[EXPLAINED]} are explained by a named reading,"
-        f" {found[IRREPRODUCIBLE]} cannot be right and {found[NOT_REPRODUCED]} are not reproduced."
+        f" {found[IRREPRODUCIBLE]} cannot be right, {found[INCONSISTENT]} cannot all be right and"
+        f" {found[NOT_REPRODUCED]} are not reproduced."
         f" The others count for nothing: a null model meets {found[NULL_MET]} of them as well,"
         f" a parameter was fitted to {found[FITTED]}, {found[REPEATED]} repeat others or are"
         f" arithmetic, and {found[STATEMENT]} are a yes or a no."
@@ -95,7 +99,7 @@ def page(report: dict) -> str:
     parts = [INTRODUCTION, sentence(report), "", _table(header, rows), ""]
     parts += ["## Reading of each rig", "", *(f"- {rig}: {its}." for rig, its in readings.items())]
     parts += [""]
-    for verdict in (EXPLAINED, IRREPRODUCIBLE, NOT_REPRODUCED, *NOT_COUNTED):
+    for verdict in (*VERDICTS[1:], *NOT_COUNTED):
         lines = [_line(one, verdict) for _, one in findings(report) if verdict in one["verdicts"]]
         if lines:
             parts += [f"## {verdict[0].upper()}{verdict[1:]}", "", *lines, ""]
@@ -113,6 +117,7 @@ def _line(one: dict, verdict: str) -> str:
     reasons = {
         EXPLAINED: one["reading"],
         IRREPRODUCIBLE: one["impossible because"],
+        INCONSISTENT: one["inconsistent because"],
         NOT_REPRODUCED: one["remark"],
         NULL_MET: one["null model"],
         FITTED: one["reading"],

@@ -6,6 +6,7 @@ import numpy as np
 
 from experiments.thesis.verdicts import (
     FITTED,
+    INCONSISTENT,
     IRREPRODUCIBLE,
     NOT_COUNTED,
     REPEATED,
@@ -129,6 +130,8 @@ def _finding_notes(finding: Finding, assigned: FindingVerdicts) -> list[str]:
         sentences.append(f"Repeats {published.repeats}.")
     if IRREPRODUCIBLE in verdicts:
         sentences.append(f"Cannot be right because {'; '.join(finding.impossible.values())}.")
+    if INCONSISTENT in verdicts:
+        sentences.append(f"Cannot all be right because {finding.inconsistent}.")
     if finding.remark:
         sentences.append(f"{finding.remark[0].upper()}{finding.remark[1:]}.")
     return sentences

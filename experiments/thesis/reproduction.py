@@ -223,6 +223,7 @@ def _finding_as_dict(finding: Finding, assigned: FindingVerdicts) -> dict:
         "null": list(map(float, finding.null.values)),
         "verdicts": assigned.verdicts,
         "impossible because": "; ".join(finding.impossible.values()),
+        "inconsistent because": finding.inconsistent,
         "repeats": published.repeats,
         "remark": finding.remark,
     }

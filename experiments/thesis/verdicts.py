@@ -19,10 +19,11 @@ import jaxbeam as jb
 from experiments.thesis.published_numbers import PublishedNumbers
 
 REPRODUCED, EXPLAINED = "reproduced", "explained"
-IRREPRODUCIBLE, NOT_REPRODUCED = "cannot be right", "not reproduced"
+IRREPRODUCIBLE, INCONSISTENT = "cannot be right", "cannot all be right"
+NOT_REPRODUCED = "not reproduced"
 NULL_MET, FITTED = "met by the null model", "fitted to it"
 REPEATED, STATEMENT = "repeats another", "a yes or a no"
-VERDICTS = (REPRODUCED, EXPLAINED, IRREPRODUCIBLE, NOT_REPRODUCED)  # those that count
+VERDICTS = (REPRODUCED, EXPLAINED, IRREPRODUCIBLE, INCONSISTENT, NOT_REPRODUCED)  # that count
 NOT_COUNTED = (NULL_MET, FITTED, REPEATED, STATEMENT)
 LITERAL = "as printed"  # name of the reading that takes the thesis at its word
 # Differences in tolerances beyond which they are alike, and those that one standard deviation is.
@@ -46,8 +47,9 @@ class Finding:
     first has none and takes the thesis at its word. `fitted` maps an answer to the labels of the
     numbers that its parameters were fitted to, one label for each parameter unless `parameters` has
     their number, so that parameters of several findings count once. `impossible` maps the labels of
-    numbers, or "" for all, to a computed proof that they cannot be right for the stated rig;
-    `remark` says why a number is not met where that is known.
+    numbers, or "" for all, to a computed proof that each of them cannot be right for the stated
+    rig; `inconsistent` is one that not all numbers of the finding can be, which marks none of them
+    singly; `remark` says why a number is not met where that is known.
 
     Raises ValueError if a model has another count of values than is published.
     """
@@ -57,6 +59,7 @@ class Finding:
     null: NullModel
     fitted: Mapping[str, str] = dataclasses.field(default_factory=dict)
     impossible: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    inconsistent: str = ""
     remark: str = ""
     parameters: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
@@ -120,6 +123,7 @@ def make_finding(
     fitted: Mapping[str, str] | None = None,
     parameters: Mapping[str, int] | None = None,
     impossible: Mapping[str, str] | None = None,
+    inconsistent: str = "",
     remark: str = "",
 ) -> Finding:
     """A finding with `values` as printed, and `alternatives` by an answer or several.
@@ -144,6 +148,7 @@ def make_finding(
         NullModel(name, null_array),
         fitted or {},
         {labels: proof for labels, proof in (impossible or {}).items() if proof},
+        inconsistent,
         remark,
         parameters or {},
     )
@@ -196,8 +201,9 @@ def assign_verdicts(findings: Sequence[Finding]) -> list[FindingVerdicts]:
     Numbers that repeat others, and statements, count for nothing. One that is within tolerance is
     "met by the null model" if that meets it too or is as near, "fitted to it" if a parameter was;
     else "reproduced", if the thesis taken at its word gives the same, or "explained". One that is
-    not is "cannot be right" if there is a proof, else "not reproduced". No reading that is less
-    likely than the null model explains anything.
+    not is "cannot be right" if there is a proof for it, "cannot all be right" if there is one for
+    the numbers of the finding together, else "not reproduced". No reading that is less likely than
+    the null model explains anything.
     """
     groups: dict[str, list[Finding]] = {}
     for one in findings:
@@ -231,7 +237,9 @@ def _verdicts(
         if one.published.statement
         else REPEATED
         if one.published.repeated[i]
-        else (IRREPRODUCIBLE if refuted[i] else NOT_REPRODUCED)
+        else (
+            IRREPRODUCIBLE if refuted[i] else INCONSISTENT if one.inconsistent else NOT_REPRODUCED
+        )
         if not (met[i] and likely)
         else NULL_MET
         if null_met[i]

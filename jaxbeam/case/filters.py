@@ -57,11 +57,10 @@ def _prototype_damping_ratios(order: int) -> tuple[np.ndarray, bool]:
 
     The flag is True if a first-order section precedes them.
     """
-    from scipy.signal import buttap  # half a second, and most cases have no filter
-
-    _, poles, _ = buttap(order)
-    # Sections of high damping first, so that the resonant ones receive a filtered signal.
-    return np.sort(-poles[poles.imag > 1e-9].real)[::-1], order % 2 == 1
+    # Poles are at equal angles on the left half of the unit circle. Sections of high damping first,
+    # so that the resonant ones receive a filtered signal.
+    angles = np.pi * np.arange(1 + order % 2, order, 2) / (2 * order)
+    return np.cos(angles), order % 2 == 1
 
 
 def second_order_sections(

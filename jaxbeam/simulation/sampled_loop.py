@@ -133,6 +133,10 @@ class SampledLoop(AbstractInputPolicy):
         )
         for i, sensor in enumerate(self.plant.case.sensors):
             number = take(self.schedule.reading, (info.event, i))
+            if not is_jax(number) and number < 0:
+                filter_states.append(memory.filter_states[i])
+                histories.append(readings[:, i])
+                continue
             noise = None if self.noise is None else take(self.noise, (number, i))
             reading, filter_state = filtered_reading(
                 sensor, self.filter_sections[i], memory.filter_states[i], signals[i], noise

@@ -175,7 +175,7 @@ def run(load_rig) -> ExperimentResult:
     figures = {
         "deflections": _draw(drawn),
         "readings": _draw_interpretations(tables, ratios),
-        "poles": draw_poles(undamped.partial_feedback, UNDAMPED_DESIGN),
+        "poles": draw_poles(undamped, UNDAMPED_DESIGN),
         **observer_figures,
     }
     remarks = (

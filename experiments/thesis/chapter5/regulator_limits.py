@@ -4,10 +4,10 @@ Frozen poles are no stability criterion for a time-varying loop; the thesis publ
 """
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Mapping
 
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure, SubFigure
 
@@ -15,7 +15,7 @@ import jaxbeam as jb
 from experiments.thesis.cases import with_modes
 from experiments.thesis.chapter5 import published
 from experiments.thesis.verdicts import Finding, make_finding
-from jaxbeam.analysis.stability import frozen_poles, growth, stability_limit
+from jaxbeam.analysis.stability import Growth, frozen_poles, growth, stability_limit
 from jaxbeam.control.optimal.sampled_lqr import sampling_limit
 from jaxbeam.numerics.riccati import dlqr
 from jaxbeam.plot.modes import plot_poles
@@ -81,11 +81,11 @@ def optimal_gain(case, period: float, weights, command_weight: float = COMMAND_W
     States are those of the thesis: amplitudes of sine modes, their rates, and the shaker.
     """
     plant = jb.state_space(case, "sine").unloaded.discretize(period)
-    return dlqr(plant.A, plant.B, jnp.diag(jnp.array(weights)), command_weight * jnp.eye(1))
+    return dlqr(plant.A, plant.B, np.diag(weights), command_weight * np.eye(1))
 
 
 def _gain_finding(numbers, case, period, weights) -> Finding:
-    """A printed gain beside the optimal one; impossible if no shaker is stable under it."""
+    """A printed gain beside the optimal one; inconsistent if no shaker is stable under it."""
     best, other = (
         np.asarray(optimal_gain(one, period, weights)[0])[0]
         for one in (case, with_other_shaker(case))
@@ -97,7 +97,7 @@ def _gain_finding(numbers, case, period, weights) -> Finding:
         {OTHER_SHAKER: other},
         null=("no control", 0.0),
         fitted=fitted,
-        impossible={"": _instability(case, period, numbers.numbers)},
+        inconsistent=_instability(case, period, numbers.numbers),
     )
 
 
@@ -135,6 +135,16 @@ class TimeVaryingLoops:
     partial_feedback: jb.Case
     full_feedback: jb.Case
     _known: dict[tuple[float, float], float] = dataclasses.field(default_factory=dict, init=False)
+
+    def at_speed(self, speed: float) -> jb.Case:
+        """The loop with few states, crossed by the first mass at a speed (m/s)."""
+        changes = {"loads.0.speed": speed, "loads.0.mass": MASSES[0]}
+        return jb.replace(self.partial_feedback, changes)
+
+    @functools.cache  # noqa: B019 (few loops, all of which live as long as the experiment)
+    def growth(self, speed: float) -> Growth:
+        """Growth of deviations in `at_speed`, computed once for each speed (m/s)."""
+        return growth(self.at_speed(speed))
 
     def largest_real_part(self, case: jb.Case) -> float:
         """`largest_real_part` of the loop with few states, once for each speed and mass."""
@@ -187,9 +197,8 @@ def growth_remark(interpretations: Mapping[str, TimeVaryingLoops]) -> str:
     parts = []
     for name, loops in interpretations.items():
         for speed in SPEEDS:
-            changes = {"loads.0.speed": speed, "loads.0.mass": MASSES[0]}
-            case = jb.replace(loops.partial_feedback, changes)
-            rate, factors = loops.largest_real_part(case), growth(case).factor
+            rate = loops.largest_real_part(loops.at_speed(speed))
+            factors = loops.growth(speed).factor
             parts.append(
                 f"{name}, {speed:g} m/s: frozen poles up to {rate:+.2g} 1/s,"
                 f" deviations grow to at most {factors.max():.3g} times, {factors[-1]:.1g} at the"
@@ -198,16 +207,18 @@ def growth_remark(interpretations: Mapping[str, TimeVaryingLoops]) -> str:
     return "Few states, 0.509 kg. " + "; ".join(parts)
 
 
-def draw_poles(partial_feedback: jb.Case, interpretation: str) -> Figure | SubFigure:
+def draw_poles(loops: TimeVaryingLoops, interpretation: str) -> Figure | SubFigure:
     """Fig. 5.18, few states: frozen poles along a crossing, and the growth of deviations.
 
     The last twentieth of the crossing is left out: there the pole of the shaker's lag moves far
     into the left half-plane.
     """
-    case = jb.replace(partial_feedback, {"loads.0.speed": SPEEDS[1], "loads.0.mass": MASSES[0]})
+    case = loops.at_speed(SPEEDS[1])
     times = np.linspace(0.0, 0.95 * float(case.beam.length) / SPEEDS[1], LOAD_POSITIONS)
     return plot_poles(
-        frozen_poles(case, times), growth(case), f"Few states, {SPEEDS[1]:g} m/s; {interpretation}"
+        frozen_poles(case, times),
+        loops.growth(SPEEDS[1]),
+        f"Few states, {SPEEDS[1]:g} m/s; {interpretation}",
     )
 
 

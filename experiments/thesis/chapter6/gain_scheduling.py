@@ -11,6 +11,7 @@ a crossing, with filters, delays and limits.
 """
 
 import dataclasses
+import itertools
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -24,7 +25,7 @@ from numpy.typing import ArrayLike
 import jaxbeam as jb
 from experiments.thesis.cases import reduction
 from experiments.thesis.chapter6 import published
-from experiments.thesis.chapter6.filter_oscillation import gain_margin
+from experiments.thesis.chapter6.filter_oscillation import fitted_correction, gain_margin
 from experiments.thesis.chapter6.patch_rigs import (
     GAIN,
     MASSES,
@@ -215,6 +216,7 @@ HIGHER_GAINS = (3.0, 4.5)  # V/mm, of the scheduled linear law
 BY_STATICS = "Fig. 6.7 by statics"
 MAX_GAIN = 24.0  # V/mm, the largest gain tried
 MASS_GRID = np.linspace(0.2, 0.6, 81)  # kg
+RIGIDITY_ROUNDING = 0.0005  # N m^2: half a digit of 13.211
 
 
 def switching_masses(
@@ -249,6 +251,26 @@ def uncontrolled_schedule(case: jb.Case, heaviest: float) -> tuple[float, ...]:
     return float(masses[0]), float(masses[1]), GAIN * (deflection * heaviest) ** 2
 
 
+def _rounding_remark(case: jb.Case) -> str:
+    """What the digits of the printed E I and gain margin leave open of the first mass by statics.
+
+    `case` is rig B.
+    """
+    margin, mass = published.GAIN_MARGIN, published.SWITCHING_MASSES
+    rigidity, half = float(case.beam.bending_stiffness), float(mass.allowed_error[0]) / 2
+    share = float(margin.allowed_error[0] / 2 / margin.numbers[0])
+    found = []
+    for stiffer, larger in itertools.product((-1, 1), repeat=2):
+        beam = jb.replace(case, {"beam.flexural_rigidity": rigidity + stiffer * RIGIDITY_ROUNDING})
+        correction = fitted_correction(beam) / (1 + larger * share)
+        found.append(static_schedule(beam, MASSES[-1], correction)[0])
+    return (
+        f"by statics, the rounding of E I and of the gain margin leaves {min(found):.5f} to"
+        f" {max(found):.5f} kg, that of the print {mass.numbers[0] - half:g} to"
+        f" {mass.numbers[0] + half:g} kg"
+    )
+
+
 def schedule_findings(
     case: jb.Case,
     answers: Mapping[tuple[str, ...], Mapping[str, float]],
@@ -275,6 +297,7 @@ def schedule_findings(
         (published.EQUIVALENT_LINEAR_GAIN, equal_gains, [one[2] for one in statics], null_last),
         (published.GAIN_MARGIN, margins, margins, np.nan),
     )
+    remarks = {published.SWITCHING_MASSES: _rounding_remark(case)}
     findings = []
     for numbers, by_crossings, by_statics, null in rows:
         values = dict(zip(answers, by_crossings, strict=True))
@@ -288,6 +311,7 @@ def schedule_findings(
                 values,
                 null=("static, without control", null),
                 fitted={fitted: "margin"} if numbers is published.GAIN_MARGIN else None,
+                remark=remarks.get(numbers, ""),
             )
         )
     return findings

@@ -19,6 +19,7 @@ from experiments.thesis.report import ALL_VERDICTS
 from experiments.thesis.verdicts import (
     EXPLAINED,
     FITTED,
+    INCONSISTENT,
     IRREPRODUCIBLE,
     NOT_REPRODUCED,
     NULL_MET,
@@ -173,6 +174,8 @@ def test_verdicts():
     assert verdicts(make_finding(TWO, [1.1, 22.1], null=FAR)) == [[REPRODUCED, NOT_REPRODUCED]]
     proof = make_finding(TWO, [1.1, 22.1], null=FAR, impossible={"b": "of that"})
     assert verdicts(proof) == [[REPRODUCED, IRREPRODUCIBLE]]
+    together = make_finding(TWO, [1.2, 22.1], null=FAR, impossible={"b": "it"}, inconsistent="both")
+    assert verdicts(together) == [[INCONSISTENT, IRREPRODUCIBLE]]
     other = make_finding(TWO, [1.1, 0.0], {"else": [1.1, 20.0]}, null=FAR)
     assert verdicts(other) == [[REPRODUCED, EXPLAINED]]
     nearer = make_finding(TWO, [1.1, 0.0], {"else": [1.0, 20.0]}, null=FAR)
@@ -329,6 +332,7 @@ FINDING = {
     "reading of the rig": "else",
     "verdicts": [NULL_MET, EXPLAINED, NOT_REPRODUCED],
     "impossible because": "",
+    "inconsistent because": "",
     "repeats": "",
     "remark": "the speed is not printed",
 }
@@ -343,7 +347,7 @@ def test_numbers_are_counted_and_listed_with_their_reasons():
     assert "- Table 9, peaks: 3: the speed is not printed." in text
     assert "- Table 9, peaks: 1 (1.1): no control." in text
     assert "- rig A: else." in text
-    assert "| all | 0 | 1 | 0 | 1 | 1 | 0 | 0 | 0 |" in text and "| none |" not in text
+    assert "| all | 0 | 1 | 0 | 0 | 1 | 1 | 0 | 0 | 0 |" in text and "| none |" not in text
 
 
 def test_counts_are_written_between_the_marks():
