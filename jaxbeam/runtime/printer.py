@@ -5,6 +5,7 @@ Nothing heavy is imported at the top, so that the command line may use it.
 
 import abc
 import os
+import re
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -16,8 +17,10 @@ if TYPE_CHECKING:
     import pandas  # imported where it is used, as it takes half a second
 
 Row = Sequence[str]
+NO_BREAK = "\N{NO-BREAK SPACE}"
 GAP = 2  # spaces between columns
 LEAST_WIDTH = 20  # of a terminal; in a narrower one lines are broken
+UNIT = re.compile(r"\([^()]{1,9}\)")  # as "(N m)", which is not broken
 MAX_SHOWN = 20  # rows of a result in a notebook
 
 
@@ -55,16 +58,20 @@ def text_table(
                           bound
     """
     limit = (width or terminal_width() or sys.maxsize) - len(indent)
-    columns = list(zip(header, *rows, strict=True))
+    columns = [[UNIT.sub(_unbroken, cell) for cell in c] for c in zip(header, *rows, strict=True)]
     natural = [max(map(len, column)) for column in columns]
-    least = [max(len(w) for cell in column for w in [*cell.split(), ""]) for column in columns]
+    least = [max(len(w) for cell in column for w in cell.split(" ")) for column in columns]
     lines: list[str] = []
     for group, widths in _groups(natural, least, limit):
         marks = [(alignment or "<" * len(columns))[i] for i in group]
         lines += [""] if lines else []
         for number, row in enumerate(zip(*(columns[i] for i in group), strict=True)):
             lines += [indent + line for line in _row_lines(row, marks, widths, number == 0)]
-    return [line.rstrip() for line in lines]
+    return [line.replace(NO_BREAK, " ").rstrip() for line in lines]
+
+
+def _unbroken(unit: re.Match) -> str:
+    return unit[0].replace(" ", NO_BREAK)
 
 
 def _groups(

@@ -218,3 +218,10 @@ def test_classes_of_cells_in_html():
         '<table><thead><tr><th>a</th></tr></thead><tbody><tr><td class="wrong">x &lt; y</td></tr>'
         "</tbody></table>"
     )
+
+
+def test_units_are_not_broken():
+    rows = [("pier", "moment (N m)", "1.0"), ("first span", "deflection (m)", "2.0")]
+    for width in (20, 28, 40):
+        text = "\n".join(text_table(("sensor", "quantity", "least (N m)"), rows, width=width))
+        assert "moment" in text and text.count("(N m)") == 2, text
