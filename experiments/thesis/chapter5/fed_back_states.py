@@ -5,8 +5,6 @@ under time-varying gains, and says which is better; and it calls the gains of th
 the step-by-step method identical for its beam.
 """
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -42,6 +40,7 @@ COMBINATIONS = {
 }
 BUT_FOR_THE_END = "but for the last tenth of the crossing"
 SHARES = np.linspace(0.0, 1.0, 401)[1:-1]  # of the crossing, at which gains are compared
+LAST_DRAWN = 0.95  # share up to which axes are scaled
 FED_BACK = np.array([0, 1, 3])  # q1, q2 and the rate of q1 among the states
 POINTS = 800  # intervals of the tables of gains
 
@@ -128,8 +127,8 @@ def gains_over_crossing(rig: jb.Case, horizon: str, mass: float) -> np.ndarray:
         constant = np.asarray(law.time_invariant_gain(plant))[0, FED_BACK]
         return np.tile(constant, (SHARES.size, 1))
     law = jb.LQR(*weights, coordinates="sine", horizon=horizon, points=POINTS)
-    table = jax.jit(lambda plant: law.gain_table(plant))(plant)
-    return np.asarray(jax.vmap(table)(jnp.asarray(SHARES)))[:, 0, FED_BACK]
+    table = law.gain_table(plant)
+    return np.stack([np.asarray(table(share)) for share in SHARES])[:, 0, FED_BACK]
 
 
 def identical_gains(gains) -> Finding:
@@ -160,7 +159,7 @@ def draw_states(ratios) -> Figure:
         axes.axhline(100.0, color="k", linewidth=0.8)
         axes.set_xticks(places, list(COMBINATIONS), rotation=60)
         axes.set(title=law, xlabel="states fed back", ylim=(0, 120))
-    panels[0].set(ylabel="peak at 0.25 m in percent of no control")
+    panels[0].set(ylabel="peak (% of no control)")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     set_title(figure, "0.261 kg at 0.55 m/s by the states fed back (Fig. 5.14)")
     return figure
@@ -174,9 +173,14 @@ def draw_gains(gains) -> Figure:
     for axes, label, column in zip(panels, ("q1", "q2", "q1'"), range(FED_BACK.size), strict=True):
         for i, (name, values) in enumerate(gains.items()):
             axes.plot(SHARES, values[:, column], color=colour(i), label=name)
+        # At the very end gains are many times as large.
+        drawn = np.stack([values[SHARES < LAST_DRAWN, column] for values in gains.values()])
+        low, high = drawn.min(), drawn.max()
+        margin = 0.1 * (high - low)
         axes.set(title=f"gain of {label}", xlabel="share of the crossing")
+        axes.set_ylim(low - margin, high + margin)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    set_title(figure, "Gains of both methods of chapter 3")
+    set_title(figure, f"Gains of both methods of chapter 3, axes by shares below {LAST_DRAWN:g}")
     return figure
 
 

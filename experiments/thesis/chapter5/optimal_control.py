@@ -272,7 +272,7 @@ def _draw(records: dict[str, jb.Record]) -> Figure:
 @use_style
 def _draw_interpretations(tables, ratios) -> Figure:
     """Published peaks beside those of every interpretation."""
-    figure = Figure(figsize=(7.2, 3.6))
+    figure = Figure(figsize=(7.2, 5.0))
     panels = figure.subplots(1, len(tables), sharey=True)
     for axes, (kind, both_speeds) in zip(panels, tables, strict=True):
         printed = np.concatenate([one.numbers for one in both_speeds])
@@ -283,8 +283,8 @@ def _draw_interpretations(tables, ratios) -> Figure:
         axes.set_xticks(bars, [f"{mass:g}" for mass in 2 * MASSES], rotation=90)
         axes.set(title=kind, xlabel="mass (kg), at 0.3 and 0.55 m/s")
     # By one interpretation the response grows without bound; the table has its peak.
-    panels[0].set(ylabel="peak in percent of no control", ylim=(0, 110))
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    panels[0].set(ylabel="peak (% of no control)", ylim=(0, 110))
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=1)
     set_title(figure, "Optimal control by several interpretations (Tables 5.1 to 5.4)")
     return figure
 
