@@ -105,6 +105,6 @@ def _draw(records) -> Figure:
     plot_deflections(axes, dict(zip(labels, records, strict=True)))
     last = float(records[-1].times[-1])
     axes.set(xlabel="time (s)", ylabel="deflection at 0.3 m (mm)", xlim=(0, last))
-    axes.legend(loc="lower right")
+    axes.legend(loc="lower left")
     set_title(figure, "One span, cubic law, 0.509 kg at 0.28 m/s, damping 0.01 (Fig. 6.4)")
     return figure
