@@ -309,7 +309,7 @@ def with_named_columns(
         # A name with brackets may be one of the file; otherwise they hold the unit.
         names = [h.strip() if h.strip() in table.names else n
                  for h, (n, _) in zip(headings, parsed, strict=True)]  # fmt: skip
-        units = {n: u for n, (_, u) in zip(names, parsed, strict=True) if u}
+        units = {own: u for n, (own, u) in zip(names, parsed, strict=True) if u and n == own}
         return table, names or None, units
     count = len(table.names)
     line = "" if table.lines is None else f", line {table.lines[0]}"

@@ -119,6 +119,7 @@ def read_logs(
     tables = {}
     for name, table in read_tables(path).items():
         _check_texts(path, table)
+        table = _told_apart(table)
         table, channels, declared = with_named_columns(path, table, columns)
         table = with_times(path, table, rate, time)
         for part, rows in _split_runs(name, table).items():
@@ -247,6 +248,22 @@ def _make_log(
     return log, said
 
 
+def _told_apart(table: LogTable) -> LogTable:
+    """The table with columns of one name told apart, as a1 and a1 (2), with a warning."""
+    if len(set(table.names)) == len(table.names):
+        return table
+    names: list[str] = []
+    for name in table.names:
+        count, own = 1, name
+        while name and own in names:
+            count += 1
+            own = f"{name} ({count})"
+        names.append(own)
+    new = ", ".join(name for name in names if name not in table.names)
+    said = f"columns of one name are told apart: {new}"
+    return dataclasses.replace(table, names=tuple(names), warnings=(*table.warnings, said))
+
+
 def _without_repeats(table: LogTable) -> LogTable:
     """The table without rows that are those before once more, with a warning."""
     values = table.values
@@ -317,12 +334,10 @@ def _check_texts(path, table: LogTable) -> None:
 
 
 def _check_names(path, names):
-    """Column names, checked to be complete and different."""
+    """Column names, checked to be complete."""
     for i, name in enumerate(names):
         if not name:
             raise ValueError(f"{path}: column {i + 1} has no name")
-        if name in names[:i]:
-            raise ValueError(f"{path}: two columns are called {name!r}; rename one of them")
     return names
 
 

@@ -263,6 +263,15 @@ def test_times_that_go_back_or_stand_are_refused(tmp_path, times, said):
         read_log(csv(tmp_path / "run.csv", times, form="{:.6f},{:.12f}\n"))
 
 
+def test_columns_of_one_name_are_told_apart(tmp_path):
+    rows = "".join(f"{t:.6f},{signal(t):.6f},{2 * signal(t):.6f}\n" for t in TIMES)
+    (tmp_path / "run.csv").write_text(f"time [s],w [mm],w [mm]\n{rows}")
+    log = read_warned(tmp_path / "run.csv", "columns of one name are told apart: w .2.")
+    assert log.names == ("w", "w (2)")
+    log = read_warned(tmp_path / "run.csv", "told apart", columns="w (2)")
+    np.testing.assert_allclose(1e3 * log.values[:, 0], 2 * signal(TIMES), atol=1e-6)
+
+
 def test_rows_that_are_written_twice_are_left_out(tmp_path):
     path = csv(tmp_path / "run.csv", np.repeat(TIMES, np.where(np.arange(400) % 150 == 7, 2, 1)))
     log = read_warned(path, "3 rows are those before them once more and left out, .* in line 10")

@@ -142,7 +142,6 @@ def test_mistakes_beside_the_log(tmp_path, text, message):
         ("t [s],d\n0,1\n1,2\n", r"column 'd': no unit found; write it in the heading, d \[mm\]"),
         ("t [mm],d [mm]\n0,1\n1,2\n", "the column of times, 't', has the unit 'mm'"),
         ("a [mm],d [mm]\n0,1\n1,2\n", "no column is called time"),
-        ("t [s],d [mm],d [mm]\n0,1,1\n1,2,2\n", "two columns are called 'd'"),
         ("t [s],,d [mm]\n0,1,1\n1,2,2\n", "column 2 has no name"),
         ("t [s];d [mm]\n0;1,5\n1;2.5\n", "lines 2 and 3: numbers have both decimal commas"),
         ("t [s]\n0\n1\n", "no column besides the time"),
