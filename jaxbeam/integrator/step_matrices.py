@@ -143,7 +143,8 @@ def chunk_length(
 @jax.named_scope("load_path")
 def step_matrices(discrete: DiscreteModel, path: LoadPath) -> StepMatrices:
     """Matrices of the steps of a chunk."""
-    if not any_jax(discrete.propagators, path.length_index, path.rows):
+    monitored = discrete.monitored_transition, discrete.monitored_input
+    if not any_jax(discrete.propagators, monitored, path.length_index, path.rows):
         matrices = _matrices_by_length(discrete, path)
     elif len(path.length_index) > CHUNK_STEPS:  # a whole run
         propagators = _propagators_of(discrete, path.length_index)

@@ -86,3 +86,19 @@ def test_gradients_agree_with_differences(case, mode):
     for i, address in enumerate(problem.addresses):
         # The absolute tolerance is the rounding of the outputs.
         assert_allclose(found[:, i], differences[:, i], rtol=1e-6, atol=1e-9, err_msg=address)
+
+
+def test_a_sensor_moves_under_steps_of_several_lengths():
+    """Only the rows of the sensor are traced: steps before and after the exit are known."""
+    case = jb.Case(
+        jb.Beam(0.6, 11.68, 0.535, damping_ratio=0.02, modes=5, ends="clamped-clamped"),
+        sensors=[jb.Sensor(0.2)],
+        loads=[jb.MovingMass(mass=0.3, speed=2.0)],
+        run=jb.Run(0.35, 400.0),
+    )
+
+    def peak(position):
+        return jb.simulate(jb.replace(case, {"sensors.0.position": position})).peak_deflection[0]
+
+    slope = jax.jvp(peak, (0.2,), (1.0,))[1]
+    assert_allclose(slope, (peak(0.2 + 1e-5) - peak(0.2 - 1e-5)) / 2e-5, rtol=1e-5)
