@@ -336,7 +336,8 @@ class Record(RecordViews):
     @property
     def effort(self) -> Float[Array, " actuator"]:
         """Integral of the squared command over the run (command^2 s), by the trapezoidal rule."""
-        return xp.trapezoid(self.command**2, self.times, axis=0)
+        with np.errstate(over="ignore"):  # of a loop that diverges it is infinite
+            return xp.trapezoid(self.command**2, self.times, axis=0)
 
     @property
     def diverged_time(self) -> Float[Array, ""]:
