@@ -163,6 +163,7 @@ class Fit(TableViews):
                 channel_names,
                 [any(one is not None for one in log.actuators) for log in logs],
             ),
+            *summary.held_reading_remarks(self.case, logs),
             *summary.log_remarks(logs),
         ]
 

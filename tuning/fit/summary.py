@@ -9,6 +9,7 @@ from jaxbeam.case.case import Case
 from jaxbeam.runtime.printer import Row, text_table
 from tuning.fit.least_squares import LocalMinimum
 from tuning.logs.log import Log
+from tuning.logs.logger import samples_held
 from tuning.logs.quality import find_faults
 from tuning.parameters.free import FreeParameter
 
@@ -121,6 +122,21 @@ def noise_remarks(
         pairs = zip(levels, named, strict=True)
         words = [f"{n:.3g} {unit} ({name})" for n, (unit, name) in pairs if np.isfinite(n)]
         yield f"standard deviation of the residual of {log.source}: {', '.join(words)}"
+
+
+def held_reading_remarks(case: Case, logs: Sequence[Log]) -> Iterator[str]:
+    """Logs with readings between the samples of the case's controller, which holds its own."""
+    period = None if case.controller is None else case.controller.period
+    if period is None or all(sensor.sampling_period is not None for sensor in case.sensors):
+        return
+    for log in logs:
+        step = float(np.median(np.diff(log.times)))
+        if step < 0.9 * float(period) and any(samples_held(one) == 1 for one in log.values.T):
+            yield (
+                f"{log.source}: its readings come every {step:.4g} s, but a controller holds those"
+                f" of sensors without a sampling_period for its period, {float(period):.4g} s: set"
+                f" sensors.N.sampling_period to {step:.4g} s if the log is not the controller's"
+            )
 
 
 def log_remarks(logs: Sequence[Log]) -> Iterator[str]:

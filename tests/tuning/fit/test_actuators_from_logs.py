@@ -188,6 +188,54 @@ def test_commands_that_are_logged_once_a_period_are_seen_by_delays():
     np.testing.assert_allclose(fit.values[3:], 0.5e-3, rtol=0.02)
 
 
+def test_readings_between_the_samples_of_a_loop():
+    """A force on a beam under feedback held for 4 ms, logged every ms; steps are exact."""
+    gain, period, step, speed, weight = 400.0, 4, 1e-3, 1.0, 3.0
+    frequencies = (np.arange(1, MODES + 1) * np.pi / LENGTH) ** 2 * np.sqrt(RIGIDITY / DENSITY)
+    zero, n = np.zeros((MODES, MODES)), MODES
+    # The force is a sine of each mode: oscillators of their own, cut off as it leaves.
+    turning = np.diag(np.arange(1, n + 1) * np.pi * speed / LENGTH)
+    size = weight * np.sqrt(2 / (DENSITY * LENGTH)) * np.eye(n)
+    stiff, damped = -np.diag(frequencies**2), -np.diag(2 * DAMPING * frequencies)
+    A = np.block(
+        [
+            [zero, np.eye(n), zero, zero],
+            [stiff, damped, size, zero],
+            [zero, zero, zero, turning],
+            [zero, zero, -turning, zero],
+        ]
+    )
+    B = np.concatenate([np.zeros(n), shapes(0.5), np.zeros(2 * n)])[:, None]
+    A, B = scipy.signal.cont2discrete((A, B, A[:1], [[0.0]]), step, "zoh")[:2]
+    count = round(LENGTH / speed / step) + 1
+    state = np.concatenate([np.zeros(3 * n), np.ones(n)])
+    reading, readings, held = np.append(shapes(0.3), np.zeros(3 * n)), [], 0.0
+    for i in range(count):
+        readings.append(reading @ state)
+        held = -gain * readings[-1] if i % period == 0 else held
+        state = A @ state + B[:, 0] * held
+    readings = np.array(readings)[:, None]
+    noise = 2e-7 * np.random.default_rng(5).normal(size=readings.shape)
+    times = step * np.arange(count)
+    log = Log(times, noise - readings, ("w",), ("deflection",), ("m",), sensors=(0,))
+    loop = jb.Case(
+        jb.Beam(LENGTH, RIGIDITY, DENSITY, damping_ratio=DAMPING, modes=MODES),
+        actuators=[jb.PointForce(0.5)],
+        sensors=[jb.Sensor(0.3)],
+        loads=[jb.MovingForce(force=weight, speed=speed)],
+        controller=jb.Feedback([300.0], period=period * step),
+    )
+    start = jb.replace(loop, {"beam.flexural_rigidity": 0.9 * RIGIDITY})
+    free = ["beam.flexural_rigidity", "controller.gains.0"]
+    fit = identify(start, [log], free)
+    assert "set sensors.N.sampling_period to 0.001 s" in str(fit)
+    sensors = (jb.Sensor(0.3, sampling_period=step),)
+    fit = identify(dataclasses.replace(start, sensors=sensors), [log], free)
+    assert np.all(np.abs(fit.values - [RIGIDITY, gain]) < 4 * fit.errors)
+    assert fit.verdict.startswith("the model explains the logs")
+    assert "sampling_period" not in str(fit)
+
+
 def test_faulty_commands_are_refused():
     good = log(SWEPT, STEPS)
 
