@@ -198,14 +198,6 @@ def test_loads_of_the_page_are_valid():
     }  # fmt: skip
 
 
-def test_the_track_of_the_page_is_valid():
-    table = tomllib.loads(TRACK)
-    wagon = [one for one in tomllib.loads(KINDS)["loads"] if one["kind"] == "wagon"]
-    case = case_from_dict({**table, "beam": BEAM | table["beam"], "loads": wagon})
-    check_case(case)
-    assert case.track.sleeper_mass == 251.0
-
-
 def test_sensors_of_the_page_are_valid():
     loads = [one for one in tomllib.loads(KINDS)["loads"] if one["kind"] == "quarter-car"]
     case = case_from_dict({"beam": BEAM, "loads": loads, **tomllib.loads(SENSORS)})
