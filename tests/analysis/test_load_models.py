@@ -105,6 +105,30 @@ def test_the_varied_spacing_is_the_worst():
     assert found.lowest[0] <= lowest * (1 - 1e-5)
 
 
+def test_two_trucks_over_an_inner_support():
+    """The hogging moment of two equal spans, -x (L^2 - x^2) / (4 L^2) of a force in one of them.
+
+    Every gap from 15.24 m in steps of 5 cm, front axles in steps of 2.5 cm, both directions.
+    """
+    span = 30.0
+
+    def line(x):
+        x = np.where(x > span, 2 * span - x, x)  # the other span is its mirror image
+        return np.where(x > 0, -x * (span**2 - x**2) / (4 * span**2), 0.0)
+
+    forces = 0.9 * 1e3 * np.array([35.0, 145.0, 145.0, 35.0, 145.0, 145.0])
+    fronts, lowest = np.arange(0.0, 110.0, 0.025)[:, None], 0.0
+    for gap in np.arange(15.24, 45.0, 0.05):
+        offsets = np.cumsum([0.0, 4.3, 4.3, gap, 4.3, 4.3])
+        for axles in (forces, forces[::-1]):
+            lowest = min(lowest, float((line(fronts - offsets) @ axles).min()))
+    lane = -0.9 * 9.3e3 * span**2 / 8
+    found = load_model_envelope(two_spans(span, span), "HL-93-pair", [span])
+    assert_allclose(found.lowest[0], 1.33 * lowest + lane, rtol=2e-5)
+    one = load_model_envelope(two_spans(span, span), "HL-93", [span])
+    assert found.lowest[0] < one.lowest[0]
+
+
 def test_choices_of_a_spacing():
     lorry = vehicle([2.0], [50e3, 50e3], varied=0, choices=(2.0, 6.0))
     assert_allclose(load_model_envelope(SPAN, lorry, [10.0]).highest, 100e3 * 4.5, rtol=1e-6)

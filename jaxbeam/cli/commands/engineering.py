@@ -123,7 +123,7 @@ def envelope(
     case
         Case file, TOML, of which beam, supports and actuators at rest count, not its loads.
     vehicle
-        HL-93, LM1, M1600, S1600, CL-625, HB45, or a train of the library, as HSLM-A1.
+        HL-93, HL-93-pair, LM1, M1600, S1600, CL-625, HB45, or a train of the library, as HSLM-A1.
     quantity
         moment, shear, reaction, deflection, rotation, ...; repeat it for more.
     at
