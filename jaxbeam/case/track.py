@@ -6,6 +6,7 @@ filtered shapes sum_k w_k psi(x + o_k) (see `jaxbeam.model.deflection_lines`). A
 rail, pads, sleepers and ballast, has modes with the beam (see `jaxbeam.model.theory.layers`).
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -224,10 +225,14 @@ def windows(
 ) -> tuple[Float[Array, " wheel"], Float[Array, " wheel"]]:
     """Times (s) at which wheels `behind` the first (m) enter the beam and leave it.
 
-    With a track, at which the first of their shares enters, and the last one leaves.
+    With a track, at which the first of their shares enters, and the last one leaves; or at which
+    they come to the rail and leave it.
     """
     if track is None:
         return path.entry_exit_times(behind)
+    if track.layered:
+        of_rail = dataclasses.replace(path, length=path.length + 2 * track.ground)
+        return of_rail.entry_exit_times(behind - path.direction() * track.ground)
     each = [path.entry_exit_times(behind - path.direction() * end) for end in track.ends()]
     (first_entry, first_exit), (second_entry, second_exit) = each
     return xp.minimum(first_entry, second_entry), xp.maximum(first_exit, second_exit)

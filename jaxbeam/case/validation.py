@@ -274,9 +274,11 @@ def _check_start(address: str, load: AbstractLoad, case: Case) -> None:
         return
     first = float(concrete(case.track.start(speed, case.beam.length)))
     if (concrete(start) - first) * concrete(speed) > POSITION_TOLERANCE * abs(concrete(speed)):
+        where = "a share of the axle is on the beam already; the first one enters at"
+        if case.track.layered:
+            where = "the load is on the rail already, which begins at"
         raise ValueError(
-            f"{address}.start_position is {concrete(start):g} m, where a share of the axle is on"
-            f" the beam already; the first one enters at {first:g} m"
+            f"{address}.start_position is {concrete(start):g} m, where {where} {first:g} m"
         )
 
 

@@ -153,6 +153,12 @@ def test_a_slow_force_deflects_the_beam_as_it_does_at_rest():
     record = jb.simulate(rig(slow, modes=60, run=jb.Run(16.0, 50.0)))
     found = np.interp(0.3, record.load_position[:-1, 0], record.deflection[:-1, 0])
     assert found == pytest.approx(at_rest, rel=1e-3)
+    # A force that stands there, and one that comes from the right and stops there.
+    stands = jb.VaryingForce(force=3.0, position=0.3)
+    stops = jb.MovingForce(force=3.0, speed=-1.0, deceleration=1.0)
+    for load in (stands, stops):
+        record = jb.simulate(rig(load, modes=60, run=jb.Run(6.0, 50.0)))
+        assert float(record.deflection[-1, 0]) == pytest.approx(at_rest, rel=1e-3)
 
 
 FORCE = jb.MovingForce(force=3.0, speed=2.4)
@@ -168,6 +174,10 @@ FORCE = jb.MovingForce(force=3.0, speed=2.4)
         ),
         ({"contact": jb.UnilateralContact()}, "contact.kind 'unilateral' cannot be together"),
         ({"supports": [jb.Support(0.3, settlement=1e-4)]}, "a settlement of supports cannot be"),
+        (
+            {"loads": [dataclasses.replace(FORCE, start_position=-0.1)]},
+            "start_position is -0.1 m, where the load is on the rail already, which begins at -0.2",
+        ),
         ({"track": jb.Track(**(RIG | {"sleeper_mass": None}))}, "track.sleeper_mass is missing"),
         ({"track": jb.Track(spread_length=0.1, rail_mass=0.1)}, "track.rail_mass would have no"),
         ({"track": jb.Track(**RIG, spread_length=0.1)}, "has both spread_length and rail_rigidity"),
