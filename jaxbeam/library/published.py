@@ -150,7 +150,7 @@ def load_models() -> dict[str, LoadModel]:
 
     >>> from jaxbeam.library.published import load_models
     >>> print(", ".join(load_models()))
-    HL-93, LM1, M1600, S1600, CL-625, HB45
+    HL-93, HL-93-pair, LM1, M1600, S1600, CL-625, HB45
     """
     text = (resources.files(__package__) / "load_models.toml").read_text(encoding="utf-8")
     found = {}

@@ -1,5 +1,6 @@
 """Logs in binary formats, written by other libraries: the same run is read from each."""
 
+import gc
 import gzip
 import io
 import re
@@ -32,6 +33,44 @@ def tdms(path, runs=("",), step=0.002, extra=None):
         )
     with nptdms.TdmsWriter(path) as writer:
         writer.write_segment(channels)
+
+
+def mdf(path, groups=None):
+    asammdf = pytest.importorskip("asammdf")
+    file = asammdf.MDF(version="4.10")
+    for times, channels in groups or [(TIMES, {"d1": D1, "d2": D2})]:
+        signals = [asammdf.Signal(v, times, name=n, unit="mm") for n, v in channels.items()]
+        file.append(signals)
+    file.save(path, overwrite=True)
+
+
+def test_groups_of_a_measurement_file_are_joined_by_their_times(tmp_path):
+    """Two groups, the slower 1 ms later; its sine is interpolated."""
+    slow = 1e-3 + np.arange(40) / 100
+    mdf(tmp_path / "run.mf4", [(TIMES, {"d1": D1}), (slow, {"d2": np.sin(5 * slow), "d1": slow})])
+    said = (pytest.warns(LogWarning, match=words) for words in ("have in common", "interpolated"))
+    with next(said), next(said):
+        log = read_log(tmp_path / "run.mf4")
+    assert log.names == ("d1", "d2", "d1 of group 1")
+    times = TIMES[1:][TIMES[1:] < slow[-1]]
+    np.testing.assert_allclose(log.times, times, atol=1e-12)
+    np.testing.assert_allclose(log.values[:, 0], 1e-3 * np.sin(20 * times), rtol=1e-12)
+    np.testing.assert_allclose(log.values[:, 1], 1e-3 * np.sin(5 * times), atol=1e-7)
+    uneven = np.append(TIMES[:-1], 1.0)
+    mdf(tmp_path / "uneven.mf4", [(uneven, {"d1": D1}), (slow, {"d2": slow})])
+    with pytest.raises(ValueError, match=r"uneven.mf4: the times of d1 are uneven, and other"):
+        read_log(tmp_path / "uneven.mf4")
+
+
+def test_a_measurement_file_that_is_cut_off(tmp_path, capfd):
+    mdf(tmp_path / "run.mf4")
+    content = (tmp_path / "run.mf4").read_bytes()
+    for size in (100, len(content) // 2, len(content) - 20):
+        (tmp_path / "cut.mf4").write_bytes(content[:size])
+        with pytest.raises(ValueError, match="cut.mf4: the file is damaged or cut off"):
+            read_log(tmp_path / "cut.mf4")
+    gc.collect()
+    assert capfd.readouterr().err == ""
 
 
 def hdf5(path, runs=("",), units="mm"):
@@ -134,6 +173,7 @@ FORMATS = {
     "run.csv.gz": gzipped,
     "run.xlsx": xlsx,
     "run.tdms": tdms,
+    "run.mf4": mdf,
     "run.h5": hdf5,
     "rate.h5": hdf5_by_rate,
     "run.mat": mat,
@@ -342,8 +382,8 @@ def test_formats_are_found_in_the_modules_of_the_readers():
     assert len(set(suffixes)) == len(suffixes)
     binary = {suffix for f in readers.FORMATS if not f.is_text for suffix in f.suffixes}
     assert binary == {
-        ".tdms", ".mat", ".h5", ".hdf5", ".nc", ".parquet", ".xlsx", ".uff", ".unv", ".npy",
-        ".npz", ".wav", ".gz", ".zip",
+        ".tdms", ".mf4", ".mdf", ".mat", ".h5", ".hdf5", ".nc", ".parquet", ".xlsx", ".uff",
+        ".unv", ".npy", ".npz", ".wav", ".gz", ".zip",
     }  # fmt: skip
     assert set(suffixes) - binary == {".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm"}
 
