@@ -170,7 +170,9 @@ def find_layout(case: Case) -> Layout:
         for middle in midpoints
     )
     # A wave of wavenumber k over a length l needs a little more than k l / 2 terms.
-    phases = np.pi / 2 * (case.beam.modes + len(nodes)) * np.diff(places)
+    layered = case.track is not None and case.track.layered  # half of its waves are of the rail
+    count = case.beam.modes // 2 if layered else case.beam.modes
+    phases = np.pi / 2 * (count + len(nodes)) * np.diff(places)
     constrained = tuple(node_conditions(node) for node in nodes)
     all_nodes = tuple(map(tuple, nodes))
     if is_uniform(case):

@@ -278,7 +278,7 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
     twist = None if torsion is None else shapes(torsion.series, of_twist) / beam.length
     nodes = nodes * beam.length
     span = longest_span(case, layout, nodes)
-    rail = None if track is None else track.rail(case, every, unit)
+    rail = None if track is None else track.rail(case, every[stiffness.shape[0] :], unit)
     undamped = normalised_modes(
         beam, values, coupling, nodes, shapes(to_series), layout, found, rotation, span, twist, rail
     )

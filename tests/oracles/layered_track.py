@@ -1,14 +1,15 @@
 """Beam under a track of layers by finite elements, with all of its damping, under moving loads.
 
-Rail, sleepers and beam are Hermite cubics on equal elements, pads and ballast even along them; an
-oscillator's spring, or a force, moves over the rail. Newmark's rule of average acceleration, whose
-matrix changes with the place of the spring by a matrix of rank one.
+Rail, sleepers and beam are Hermite cubics on equal elements, pads and ballast even along them; the
+sleepers may jump at the ends of the beam. An oscillator's spring, or a force, moves over the rail.
+Newmark's rule of average acceleration, whose matrix changes with the place of the spring by a
+matrix of rank one.
 """
 
 import dataclasses
 
 import numpy as np
-from scipy.sparse import bmat, coo_matrix, csc_matrix, csr_matrix
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, diags
 from scipy.sparse.linalg import splu
 
 POINTS, WEIGHTS = np.polynomial.legendre.leggauss(4)
@@ -30,8 +31,9 @@ def cubics(s, h, order=0):
 
 @dataclasses.dataclass(frozen=True)
 class TrackOnBeam:
-    """A beam with pinned ends of `length` (m), a track on it and on the ground beside it.
+    """A beam of `length` (m), pinned or on two springs `bearings` (N/m), and its track.
 
+    The track is on it and on the ground beside it.
     `beam` and `rail` are bending stiffness and mass per length, `sleepers` mass, `pads` and
     `ballast` stiffness and damping, all per length; `ratio` is the damping ratio of the beam alone
     in its first two modes (Rayleigh).
@@ -46,6 +48,7 @@ class TrackOnBeam:
     ballast: tuple[float, float]
     ratio: float
     size: float  # of an element (m)
+    bearings: float | None = None
 
     def matrices(self):
         """Mass, damping and stiffness of rail, sleepers and beam; rows at a place of each."""
@@ -56,64 +59,49 @@ class TrackOnBeam:
         unit = (w[:, None] * cubics(s, h)).T @ cubics(s, h)
         bend = (w[:, None] * cubics(s, h, 2)).T @ cubics(s, h, 2)
 
-        def assembled(element, elements):
-            index = 2 * np.arange(elements)[:, None] + np.arange(4)
-            rows, columns = np.repeat(index, 4, axis=1), np.tile(index, (1, 4))
-            values = np.tile(element.ravel(), (elements, 1))
-            size = 2 * elements + 2
-            return csr_matrix(
-                coo_matrix((values.ravel(), (rows.ravel(), columns.ravel())), (size, size))
-            )
+        number, size = np.arange(total), 2 * total + 2
+        rail = 2 * number[:, None] + np.arange(4)
+        piece = (number >= before) * 2 + (number >= before + own) * 2
+        sleepers = size + rail + piece[:, None]
+        first = 2 * size + 4  # unknown of the beam
+        beam, above = first + rail[:own], sleepers[before : before + own]
+        ground = np.delete(sleepers, np.s_[before : before + own], axis=0)
+        unknowns = first + 2 * own + 2
 
-        one, curved = assembled(unit, total), assembled(bend, total)
-        under, bent = assembled(unit, own), assembled(bend, own)
-        shift = csr_matrix(
-            (np.ones(2 * own + 2), (np.arange(2 * own + 2), 2 * before + np.arange(2 * own + 2))),
-            (2 * own + 2, 2 * total + 2),
-        )
-        couple = under @ shift  # of beam and sleepers above it
+        def put(element, index):
+            rows, columns = np.repeat(index, index.shape[1], 1), np.tile(index, index.shape[1])
+            values = np.tile(element.ravel(), len(index))
+            places = rows.ravel(), columns.ravel()
+            return csr_matrix(coo_matrix((values, places), (unknowns, unknowns)))
+
+        stretch = np.kron([[1, -1], [-1, 1]], unit)
+        of_pads = put(stretch, np.hstack([rail, sleepers]))
+        of_ballast = put(stretch, np.hstack([above, beam])) + put(unit, ground)
         springs = [
-            bmat(
-                [
-                    [p * one, -p * one, None],
-                    [-p * one, (p + b) * one, -b * couple.T],
-                    [None, -b * couple, b * under],
-                ]
-            )
-            for p, b in zip(self.pads, self.ballast, strict=True)
+            p * of_pads + b * of_ballast for p, b in zip(self.pads, self.ballast, strict=True)
         ]
         rigidity, density = self.beam
-        first = np.pi**2 / self.length**2 * np.sqrt(rigidity / density)
-        alpha, beta = 2 * self.ratio * first * 4 / 5, 2 * self.ratio / (5 * first)
-        zero = csr_matrix(one.shape)
-        stiffness = springs[0] + bmat(
-            [[self.rail[0] * curved, None, None], [None, zero, None], [None, None, rigidity * bent]]
-        )
-        mass = bmat(
-            [
-                [self.rail[1] * one, None, None],
-                [None, self.sleepers * one, None],
-                [None, None, density * under],
-            ]
-        )
-        damping = springs[1] + bmat(
-            [
-                [zero, None, None],
-                [None, zero, None],
-                [None, None, alpha * density * under + beta * rigidity * bent],
-            ]
-        )
-        size = 2 * total + 2
-        held = [0, 2 * total, size, size + 2 * total, 2 * size, 2 * size + 2 * own]
-        free = np.setdiff1d(np.arange(2 * size + 2 * own + 2), held)
+        lowest = np.pi**2 / self.length**2 * np.sqrt(rigidity / density)
+        alpha, beta = 2 * self.ratio * lowest * 4 / 5, 2 * self.ratio / (5 * lowest)
+        bent, heavy = rigidity * put(bend, beam), density * put(unit, beam)
+        stiffness = springs[0] + self.rail[0] * put(bend, rail) + bent
+        mass = self.rail[1] * put(unit, rail) + self.sleepers * put(unit, sleepers) + heavy
+        damping = springs[1] + alpha * heavy + beta * bent
+        ends = [first, unknowns - 2]
+        if self.bearings is not None:
+            at_ends = np.isin(np.arange(unknowns), ends)
+            stiffness = stiffness + diags(self.bearings * at_ends)
+            ends = []
+        held = [0, 2 * total, size, 2 * size + 2, *ends]
+        free = np.setdiff1d(np.arange(unknowns), held)
         parts = [csc_matrix(each)[free][:, free] for each in (mass, damping, stiffness)]
 
         def row(x, part):
             """Row of the deflection of the rail (0) or beam (2) at x (m) on the beam."""
-            start, x = (0, x + self.approach) if part == 0 else (2 * size, x)
+            start, x = (0, x + self.approach) if part == 0 else (first, x)
             count = total if part == 0 else own
             element = min(int(x / h), count - 1)
-            found = np.zeros(2 * size + 2 * own + 2)
+            found = np.zeros(unknowns)
             found[start + 2 * element + np.arange(4)] = cubics(x / h - element, h)
             return found[free]
 

@@ -8,9 +8,10 @@ sleeper and the stiffnesses of its pads and ballast over the sleeper spacing. Th
 b (s - w). Forces F of wheels act on the rail.
 
 Rail and sleepers are sums of sin(n pi (x + a) / l) over the length l = L + 2 a of the rail, half as
-many as the case has modes; the beam is that of its own Ritz expansion. Undamped modes of all
-together have the damping of their dampers, and that of the beam by its share of their strain
-energy; damping between different modes is left out.
+many as the case has modes; the beam is that of its own Ritz expansion. At an end that moves, where
+the sleepers jump from the beam to the ground, they have a ramp over the beam besides. Undamped
+modes of all together have the damping of their dampers, and that of the beam by its share of their
+strain energy; damping between different modes is left out.
 
 It is the track of Zhai, Wang and Lin (2004) with two of its layers, even along it.
 """
@@ -22,7 +23,7 @@ from numpy.polynomial import chebyshev, legendre
 from jaxbeam.case.case import Case
 from jaxbeam.model.layout import Layout
 from jaxbeam.model.spread import to_series
-from jaxbeam.runtime.arrays import Array, xp
+from jaxbeam.runtime.arrays import Array, block_diag, xp
 from jaxbeam.runtime.module import Module
 
 SINES_PER_PIECE, PIECE_TERMS = 6, 32  # of the series of the rail: exact to rounding
@@ -33,12 +34,13 @@ class Layers(Module):
     """Rail and sleepers of a case, and springs between them and the beam, in beam units.
 
     Unknowns are those of the beam, then of the rail, then of the sleepers. `pad` and `ballast` are
-    the stiffness matrices of unit springs per length; `rail_stiffness` and `masses` are diagonals.
+    the stiffness matrices of unit springs per length; `rail_stiffness` is a diagonal, `masses` the
+    matrix of rail and sleepers.
     """
 
     rail_stiffness: Float[Array, " unknown"]
-    masses: Float[Array, " unknown"]
-    pad: Float[np.ndarray, "unknown unknown"]
+    masses: Float[Array, "unknown unknown"]
+    pad: Float[Array, "unknown unknown"]
     ballast: Float[Array, "unknown unknown"]
     springs: tuple[Float[Array, ""], Float[Array, ""]]
 
@@ -51,7 +53,7 @@ class Layers(Module):
         stiffness, mass = (xp.pad(each, (0, more)) for each in (stiffness, mass))
         stiffness = stiffness + xp.diag(self.rail_stiffness)
         stiffness = stiffness + of_pads * self.pad + of_ballast * self.ballast
-        return stiffness, mass + xp.diag(self.masses)
+        return stiffness, mass + self.masses
 
     def damping(
         self,
@@ -79,15 +81,14 @@ class Layers(Module):
         return share * of_beam + per_mass * dampers
 
     def rail(
-        self, case: Case, vectors: Float[Array, "unknown mode"], unit: Float[Array, ""]
+        self, case: Case, vectors: Float[Array, "rail_and_sleeper mode"], unit: Float[Array, ""]
     ) -> tuple[Float[Array, " node"], Float[Array, "piece term mode"]]:
         """Nodes (m) of the rail, and series of its mode shapes (kg^-1/2) between them."""
         count, length = sine_count(case), case.beam.length
         approach = case.track.ground
         pieces = -(-count // SINES_PER_PIECE)
         nodes = -approach + (length + 2 * approach) * np.linspace(0.0, 1.0, pieces + 1)
-        first = vectors.shape[0] - 2 * count
-        amplitudes = vectors[first : first + count] / unit
+        amplitudes = vectors[:count] / unit
 
         def shapes(x):
             return _sines(case, x / length) @ amplitudes
@@ -121,31 +122,43 @@ def layers(
     length = 1.0 + 2 * track.ground / beam.length
     waves = (np.pi * np.arange(1, count + 1) / length) ** 4
     rail = track.rail_rigidity / beam.bending_stiffness * waves
-    identity = np.eye(own + 2 * count)
-    stretch = identity[own : own + count] - identity[own + count :]
+    jumps = [i for i, end in enumerate((0, -1)) if not layout.constrained[end][0]]
     points, weights = legendre.leggauss(max(layout.degrees) + count + FURTHER_POINTS)
     table = chebyshev.chebvander(points, series.shape[1] - 1)
-    squares, products = xp.zeros((own, own)), xp.zeros((own, count))
+    sleepers = count + len(jumps)
+    squares, products = xp.zeros((own, own)), xp.zeros((own, sleepers))
+    of_ramps = xp.zeros((len(jumps), sleepers))
     for i in range(len(layout.degrees)):
         half = (nodes[i + 1] - nodes[i]) / 2
-        values = table @ series[i]
+        x, values = nodes[i] + half * (points + 1), table @ series[i]
+        ramps = xp.stack([1.0 - x, x], -1)[:, jumps]
+        functions = xp.concatenate([_sines(case, x), ramps], axis=1)
         weighted = (half * weights)[:, None] * values
         squares = squares + weighted.T @ values
-        products = products + weighted.T @ _sines(case, nodes[i] + half * (points + 1))
-    none = np.zeros((own, count))
+        products = products + weighted.T @ functions
+        of_ramps = of_ramps + ((half * weights)[:, None] * ramps).T @ functions
+    of_sines = xp.concatenate([np.eye(count), of_ramps[:, :count].T], axis=1)
+    gram = xp.concatenate([of_sines, of_ramps])
+    no_rail, no_beam = np.zeros((own, count)), np.zeros((count, own))
     ballast = [
-        xp.concatenate([squares, none, -products], axis=1),
-        np.zeros((count, own + 2 * count)),
-        xp.concatenate([-products.T, np.zeros((count, count)), np.eye(count)], axis=1),
+        [squares, no_rail, -products],
+        [no_beam, np.zeros((count, count + sleepers))],
+        [-products.T, np.zeros((sleepers, count)), gram],
     ]
+    pad = block_diag(
+        np.zeros((own, own)), xp.block([[np.eye(count), -of_sines], [-of_sines.T, gram]])
+    )
     spread = track.sleeper_spacing * beam.linear_density
-    parts = np.zeros(own), track.rail_mass / beam.linear_density, track.sleeper_mass / spread
-    masses = xp.concatenate([parts[0], *(xp.broadcast_to(part, count) for part in parts[1:])])
+    masses = block_diag(
+        np.zeros((own, own)),
+        track.rail_mass / beam.linear_density * np.eye(count),
+        track.sleeper_mass / spread * gram,
+    )
     unit = beam.length**4 / (beam.bending_stiffness * track.sleeper_spacing)
     return Layers(
-        xp.concatenate([np.zeros(own), rail, np.zeros(count)]),
+        xp.concatenate([np.zeros(own), rail, np.zeros(sleepers)]),
         masses,
-        stretch.T @ stretch,
-        xp.concatenate(ballast),
+        pad,
+        xp.block(ballast),
         (track.pad_stiffness * unit, track.ballast_stiffness * unit),
     )
