@@ -216,3 +216,10 @@ def test_a_track_of_layers_in_a_case_file(tmp_path):
     with pytest.raises(ValueError, match="several damping ratios"):
         beam = dataclasses.replace(case.beam, damping_ratio=np.full(12, 0.01))
         jb.simulate(dataclasses.replace(case, beam=beam))
+
+
+def test_a_load_that_stops_is_told_where():
+    stops = jb.MovingForce(force=1e5, speed=-40.0, deceleration=20.0)
+    (sentence,) = jb.check(bridge(stops, duration=6.0)).warnings
+    # From 42 m it rolls 40 m; to the far end of the rail it would roll 60 m.
+    assert "at 2 m; less than 13.3 m/s^2 let it leave" in sentence

@@ -70,6 +70,31 @@ def parsed(text: str) -> jb.Case:
 
 
 BASES = {
+    "track": """
+        [beam]
+        length = 24.0
+        flexural_rigidity = 20e9
+        mass_per_length = 9e3
+        damping_ratio = 0.01
+        modes = 90
+        [track]
+        rail_rigidity = 13.25e6
+        rail_mass = 121.3
+        pad_stiffness = 65e6
+        pad_damping = 75e3
+        sleeper_mass = 251.0
+        ballast_stiffness = 137.75e6
+        ballast_damping = 58.8e3
+        approach = 30.0
+        [[sensors]]
+        position = 12.0
+        [[loads]]
+        kind = "mass"
+        mass = 10e3
+        speed = 40.0
+        [run]
+        duration = 3.0
+        """,
     "bridge": """
         [beam]
         length = 25.0
@@ -563,6 +588,20 @@ MISTAKES = [
         ".point_heights",
         "in m, not in mm",
     ),
+    # Track of layers
+    ("track", "track.sleeper_spacing", 600.0, "", "in m, not in mm"),
+    ("track", "track.sleeper_mass", 0.251, "", "in kg, not in t"),
+    (
+        "track",
+        "track.rail_mass",
+        0.1213,
+        "track.sleeper_mass",
+        "track.rail_mass in kg/m, not in t/m",
+    ),
+    ("track", "track.pad_stiffness", 65e3, "", "in N/m, not in kN/m"),
+    ("track", "track.ballast_stiffness", 137.75, "", "in N/m, not in kN/m or MN/m"),
+    ("track", "track.pad_damping", 75.0, "", "in N s/m, not in kN s/m"),
+    ("track", "track.ballast_damping", 58.8, "", "in N s/m, not in kN s/m"),
     # Actuators
     ("rig", "actuators.0.d33", 400.0, "", "in m/V, not in pm/V"),
     ("rig", "actuators.0.modulus", 30.0, "", "in Pa, not in GPa"),

@@ -326,6 +326,45 @@ ABSORBERS = (
     ),
 )
 
+TRACK = (
+    Range(
+        of_parts("track", "sleeper_spacing"),
+        1e-3,
+        3.0,
+        "sleepers are {value:.3g} m apart",
+        "is it in m?",
+        "is it in m, not in mm?",
+        cause="track",
+    ),
+    Range(
+        values.sleepers_over_rail,
+        0.02,
+        100.0,
+        "the sleepers have {value:.3g} times the mass of the rail",
+        "is it in kg, not in t, and is track.rail_mass in kg/m?",
+        "is it in kg, and is track.rail_mass in kg/m, not in t/m?",
+        cause="track",
+    ),
+    Range(
+        values.sinking_of_rail,
+        0.0,
+        0.03,
+        "the rail sinks by {value:.3g} m under a wheel",
+        above="are pads and ballast of one sleeper in N/m, not in kN/m or MN/m?",
+        cause="track",
+        unless=("weight",),
+    ),
+    Range(
+        values.damping_of_sleepers,
+        1e-3,
+        10.0,
+        "the damping ratio of a sleeper on its springs is {value:.2g}",
+        "is it in N s/m, not in kN s/m?",
+        "is it in N s/m, and is track.sleeper_mass in kg?",
+        unless=("track",),
+    ),
+)
+
 ACTUATORS = (
     Range(
         values.influence_of_actuator,
@@ -844,4 +883,4 @@ ADVICE = (  # on what commands report
     ),
 )
 
-RANGES = (*MATERIAL, *WEIGHTS, *BEAM, *ABSORBERS, *ACTUATORS, *LOADS, *OTHERS)
+RANGES = (*MATERIAL, *WEIGHTS, *BEAM, *ABSORBERS, *TRACK, *ACTUATORS, *LOADS, *OTHERS)

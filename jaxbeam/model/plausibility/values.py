@@ -651,6 +651,43 @@ def sag_on_foundation(facts):
             yield Value(name, sag * decay, {"sag": sag, "wave": 1 / decay})
 
 
+# The track of layers
+
+
+def _layers(facts):
+    return [one for _, one in _parts(facts, "track") if one.layered]
+
+
+def sinking_of_rail(facts):
+    """Deflection (m) of a long rail on its springs under the heaviest wheel, by the softer ones.
+
+    Under P it is P (4 B k^3)^(-1/4) / 2: Hetenyi (1946), as for `sag_on_foundation`.
+    """
+    heaviest = max((float(loads.max(initial=0.0)) for loads in facts.static_loads), default=0.0)
+    for track in _layers(facts):
+        pads, ballast = float(track.pad_stiffness), float(track.ballast_stiffness)
+        k = 1.0 / (1.0 / pads + 1.0 / ballast) / float(track.sleeper_spacing)
+        sunk = heaviest / 2 / (4 * float(track.rail_rigidity) * k**3) ** 0.25
+        yield Value(f"track.{'pad' if pads <= ballast else 'ballast'}_stiffness", sunk)
+
+
+def sleepers_over_rail(facts):
+    """Mass of the sleepers over that of the rail."""
+    for track in _layers(facts):
+        of_sleepers = float(track.sleeper_mass) / float(track.sleeper_spacing)
+        yield Value("track.sleeper_mass", of_sleepers / float(track.rail_mass))
+
+
+def damping_of_sleepers(facts):
+    """Damping ratio of a sleeper between its springs by either damper, unless that is 0."""
+    for track in _layers(facts):
+        stiffness = float(track.pad_stiffness) + float(track.ballast_stiffness)
+        critical = 2 * math.sqrt(stiffness * float(track.sleeper_mass))
+        for name in ("pad_damping", "ballast_damping"):
+            if damper := float(getattr(track, name)):
+                yield Value(f"track.{name}", damper / critical)
+
+
 # Loads: their travel
 
 
@@ -693,11 +730,12 @@ def braking_to_stop(facts):
         speed, braking = float(load.speed), float(load.deceleration)
         if float(load.entry_time) + abs(speed) / braking > float(facts.case.run.duration):
             continue
-        start = facts.length if speed < 0 else 0.0
-        start = start if load.start_position is None else float(load.start_position)
+        track = facts.case.track
+        lowest, highest = (0.0, 0.0) if track is None else map(float, track.ends())
+        start = float(facts.case.trajectory(load).kinematics(float(load.entry_time))[0])
         rolled = speed * abs(speed) / 2 / braking
         behind = float(np.max(facts.behind(load)))
-        way = (facts.length - start if speed > 0 else start) + behind
+        way = (facts.length - lowest - start if speed > 0 else start + highest) + behind
         words = {"braking": braking, "x": start + rolled, "need": speed**2 / 2 / way}
         yield Value(f"{address}.deceleration", 1.0, words)
 
