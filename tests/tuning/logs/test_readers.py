@@ -17,6 +17,7 @@ from scipy.signal import lfilter
 from tuning import Log, read_log, read_logs
 from tuning.logs import align_logs, find_faults, readers
 from tuning.logs.log import LogWarning, even_records
+from tuning.logs.readers.mdf import read_mdf
 
 TIMES = np.arange(40) / 500
 D1, D2 = np.sin(20 * TIMES), np.cos(30 * TIMES) - 1  # mm
@@ -60,6 +61,22 @@ def test_groups_of_a_measurement_file_are_joined_by_their_times(tmp_path):
     mdf(tmp_path / "uneven.mf4", [(uneven, {"d1": D1}), (slow, {"d2": slow})])
     with pytest.raises(ValueError, match=r"uneven.mf4: the times of d1 are uneven, and other"):
         read_log(tmp_path / "uneven.mf4")
+
+
+def test_a_channel_of_times_and_invalid_samples_of_a_measurement_file(tmp_path):
+    """A channel named time is no clock; what is invalid keeps its place."""
+    asammdf = pytest.importorskip("asammdf")
+    uneven, file = np.append(TIMES[:-1], 1.0), asammdf.MDF(version="4.10")
+    for name, values, at in (("d1", D1, 3), ("d2", D2, 7)):
+        bits = np.arange(TIMES.size) == at
+        signal = asammdf.Signal(values, uneven, name=name, unit="mm", invalidation_bits=bits)
+        file.append([signal, asammdf.Signal(7 * D1, uneven, name="Time", unit="V")])
+    file.save(tmp_path / "run.mf4", overwrite=True)
+    table = read_mdf(tmp_path / "run.mf4")[""]
+    assert table.names == ("time", "d1", "Time of group 0", "d2", "Time of group 1")
+    exact = np.column_stack([uneven, D1, 7 * D1, D2, 7 * D1])
+    exact[3, 1] = exact[7, 3] = np.nan
+    np.testing.assert_array_equal(table.values, exact)
 
 
 def test_a_measurement_file_that_is_cut_off(tmp_path, capfd):

@@ -14,6 +14,8 @@ from tuning.logs.readers.table import (
     LogFormat,
     LogTable,
     damaged_file_error,
+    is_time_name,
+    parse_heading,
     read_bytes,
     table_of,
 )
@@ -27,7 +29,8 @@ def read_mdf(path: Path) -> dict[str, LogTable]:
 
     Channels of one group have its times. Those of several groups, as at other rates, are joined by
     the start and step of each, with a warning. Channels of text are left out; a name that several
-    groups have is told apart by the number of the group.
+    groups have, or that is one of times, is told apart by the number of the group. Samples that
+    the file marks as invalid are NaN.
 
     Raises ValueError for a damaged file, and for several groups of which one has uneven times;
     ImportError without asammdf.
@@ -40,13 +43,16 @@ def read_mdf(path: Path) -> dict[str, LogTable]:
     except Exception as error:  # asammdf raises many types for damaged files
         raise damaged_file_error(path, error) from None
     arrays, units, clocks = {}, {}, {}
-    for number, channels in groups.items():
+    for number, (times, channels) in groups.items():
         for signal in channels:
-            name = signal.name if signal.name not in arrays else f"{signal.name} of group {number}"
-            arrays[name], units[name] = signal.samples, signal.unit or None
-            clocks[name] = signal.timestamps
-    if len(groups) < 2:
-        arrays = {"time": next(iter(clocks.values()), np.zeros(0)), **arrays}
+            name = signal.name
+            if name in arrays or is_time_name(parse_heading(name)[0]):
+                name = f"{name} of group {number}"
+            arrays[name], units[name] = _samples(signal, times), signal.unit or None
+            clocks[name] = times
+    first = next(iter(clocks.values()), np.zeros(0))
+    if all(np.array_equal(times, first) for times in clocks.values()):
+        arrays = {"time": first, **arrays}
         return {"": table_of(str(path), arrays, units | {"time": "s"})} if clocks else {}
     return {"": table_of(str(path), arrays, units, {n: _clock(path, n, clocks[n]) for n in clocks})}
 
@@ -65,18 +71,27 @@ def _silenced():
         logger.setLevel(level)
 
 
-def _groups(asammdf, content) -> dict[int, list]:
-    """Signals of numbers of each group that has any, without its times."""
+def _samples(signal, times: np.ndarray) -> np.ndarray:
+    """Samples of a signal at the times (s) of its group; NaN at those that it lacks as invalid."""
+    if len(signal.samples) == times.size:
+        return signal.samples
+    found = np.full((times.size, *signal.samples.shape[1:]), np.nan)
+    found[np.searchsorted(times, signal.timestamps)] = signal.samples
+    return found
+
+
+def _groups(asammdf, content) -> dict[int, tuple[np.ndarray, list]]:
+    """Times (s) and signals of numbers of each group that has any."""
     problem = None
     try:
         with asammdf.MDF(content) as file:
             found = {}
             for number, group in enumerate(file.groups):
-                times = file.masters_db.get(number)
-                index = [i for i in range(len(group.channels)) if i != times]
+                master = file.masters_db.get(number)
+                index = [i for i in range(len(group.channels)) if i != master]
                 signals = [file.get(group=number, index=i) for i in index]
                 signals = [s for s in signals if s.samples.dtype.kind in "iuf" and s.samples.size]
-                found |= {number: signals} if signals else {}
+                found |= {number: (file.get_master(number), signals)} if signals else {}
             return found
     except Exception as error:
         problem = f"{type(error).__name__}: {error}"
