@@ -283,7 +283,7 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
         beam, values, coupling, nodes, shapes(to_series), layout, found, rotation, span, twist, rail
     )
     if track is not None:
-        damping = track.damping(case, every, undamped.damping, own, stiffness)
+        damping = track.damping(case, every, undamped.damping, own, stiffness, mass)
         return eqx.tree_at(lambda m: m.damping, undamped, damping)
     if found is None or not has_lossy_segments(beam):
         return undamped

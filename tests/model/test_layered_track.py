@@ -76,6 +76,20 @@ def test_a_beam_on_bearings_whose_ends_move(elements):
     np.testing.assert_allclose(record.reactions[-1], ends, rtol=1e-3)
 
 
+def test_rayleigh_damping_of_the_mass_of_the_beam_alone(elements):
+    """At resonance a force on the beam moves it as the finite elements with all damping tell."""
+    (mass, damping, stiffness), row = elements.matrices()
+    frequencies, place = np.linspace(3.8, 4.0, 21), row(LENGTH / 2, 2)
+    exact = [
+        place @ spsolve((stiffness - w**2 * mass + 1j * w * damping).tocsc(), place)
+        for w in 2 * np.pi * frequencies
+    ]
+    found = jb.frequency_response(
+        bridge(jb.MovingForce(force=1.0, speed=1.0), modes=120), frequencies
+    ).values[:, 0]
+    assert np.max(np.abs(found)) == pytest.approx(np.max(np.abs(exact)), rel=0.01)
+
+
 @pytest.mark.parametrize("body", [None, (2e4, 2e6, 4e4)], ids=["force", "oscillator"])
 def test_crossings_agree_with_finite_elements_of_all_damping(elements, body):
     """The modes leave out damping between them: half a per cent of deflections at 90 modes."""

@@ -11,7 +11,8 @@ Rail and sleepers are sums of sin(n pi (x + a) / l) over the length l = L + 2 a 
 many as the case has modes; the beam is that of its own Ritz expansion. At an end that moves, where
 the sleepers jump from the beam to the ground, they have a ramp over the beam besides. Undamped
 modes of all together have the damping of their dampers, and that of the beam by its share of their
-strain energy; damping between different modes is left out.
+strain energy, or of their kinetic energy where it is proportional to mass; damping between
+different modes is left out.
 
 It is the track of Zhai, Wang and Lin (2004) with two of its layers, even along it.
 """
@@ -62,11 +63,12 @@ class Layers(Module):
         of_beam: Float[Array, " mode"],
         values: Float[Array, " mode"],
         stiffness: Float[Array, "own own"],
+        mass: Float[Array, "own own"],
     ) -> Float[Array, " mode"]:
         """Damping of the modes (1/s) of these vectors and values, in beam units.
 
-        `of_beam` is what the beam's damping would be, if all energy were its own; `stiffness` is
-        its matrix.
+        `of_beam` is what the beam's damping would be, if all energy were its own; `stiffness` and
+        `mass` are its matrices.
         """
         track, beam = case.track, case.beam
         per_mass = 1.0 / (track.sleeper_spacing * beam.linear_density)
@@ -78,7 +80,9 @@ class Layers(Module):
         energy = xp.sum(own * (stiffness @ own), axis=0) / xp.where(elastic, values, 1.0)
         share = xp.where(elastic, energy, 1.0)
         dampers = track.pad_damping * of_pads + track.ballast_damping * of_ballast
-        return share * of_beam + per_mass * dampers
+        of_mass = 0.0 if beam.rayleigh_damping is None else beam.rayleigh_damping[0]
+        moving = xp.sum(own * (mass @ own), axis=0)
+        return share * (of_beam - of_mass) + moving * of_mass + per_mass * dampers
 
     def rail(
         self, case: Case, vectors: Float[Array, "rail_and_sleeper mode"], unit: Float[Array, ""]
