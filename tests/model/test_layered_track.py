@@ -232,6 +232,11 @@ def test_a_track_of_layers_in_a_case_file(tmp_path):
         jb.simulate(dataclasses.replace(case, beam=beam))
 
 
+def test_sleepers_may_be_damped_more_than_a_beam():
+    beam = jb.Beam(LENGTH, RIGIDITY, MASS, material="steel", modes=90)
+    assert jb.check(bridge(jb.MovingForce(force=1e5, speed=50.0), beam=beam)).warnings == ()
+
+
 def test_a_load_that_stops_is_told_where():
     stops = jb.MovingForce(force=1e5, speed=-40.0, deceleration=20.0)
     (sentence,) = jb.check(bridge(stops, duration=6.0)).warnings

@@ -162,8 +162,9 @@ def first_frequency(facts):
 
 
 def damping_ratio(facts):
-    """Largest modal damping ratio, however it is given."""
-    beam, ratios, name = facts.case.beam, facts.modes.damping_ratios, "beam.loss_factor"
+    """Largest modal damping ratio, however it is given; on a track of layers that of the first."""
+    beam, name = facts.case.beam, "beam.loss_factor"
+    ratios = facts.modes.damping_ratios[: 1 if _layers(facts) else None]
     if beam.rayleigh_damping is not None:
         ratios, name = ratios[:1], "beam.rayleigh_damping"
     elif np.any(beam.damping_ratio):
