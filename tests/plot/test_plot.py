@@ -303,7 +303,8 @@ def shown_boxes(figure):
     texts = figure.findobj(lambda artist: isinstance(artist, Text) and artist.get_visible())
     ticks = {id(text) for axes in figure.axes for text in axes.get_xticklabels()}
     ticks |= {id(text) for axes in figure.axes for text in axes.get_yticklabels()}
-    return [t.get_window_extent() for t in texts if t.get_text() and id(t) not in ticks]
+    own = Text.get_window_extent  # that of an annotation has its line in it
+    return [own(t) for t in texts if t.get_text() and id(t) not in ticks]
 
 
 def test_many_loads_and_sensors_are_readable():

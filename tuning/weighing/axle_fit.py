@@ -116,7 +116,7 @@ def dynamic_errors(
     """Errors of parameters that were fitted by least squares with `weights` of the readings.
 
     `noise` is the standard deviation of white noise of each sensor; weights are zero for samples
-    that do not count.
+    that do not count. The error of a parameter on which no reading depends is infinite.
     """
 
     def stacked(table):
@@ -125,7 +125,9 @@ def dynamic_errors(
     J, B = stacked(jacobian), stacked(waves)
     r = (residuals * weights).T.ravel()
     white = (weights * noise).T.ravel()
-    sizes = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    sizes = np.linalg.norm(J, axis=0)
+    unseen = sizes == 0
+    sizes = np.where(unseen, 1.0, sizes)
     basis, triangle = np.linalg.qr(J / sizes)
     inside, outside = basis.T @ B, B - basis @ (basis.T @ B)
     squares = outside @ outside.T
@@ -136,6 +138,7 @@ def dynamic_errors(
     middle = of_noise + excess * inside @ inside.T
     inverse = np.linalg.pinv(triangle)
     covariance = inverse @ middle @ inverse.T / np.outer(sizes, sizes)
+    covariance[np.diag(unseen)] = np.inf
     freedom = power**2 / max(float(np.sum(squares**2)), 1e-300)
     samples = float(np.sum(weights > 0)) - J.shape[1]
     dominated = excess * power > noise_power
@@ -247,8 +250,13 @@ def axle_groups(offsets: Float[np.ndarray, " axle"]) -> list[list[int]]:
 
 
 def unlikeliness(rows: int, offsets, forces) -> float:
-    """What a number of axles adds to the deviance of so many rows in `AxleFit.criterion`."""
+    """What a number of axles adds to the deviance of so many rows in `AxleFit.criterion`.
+
+    Infinity for axles without force.
+    """
     axles, groups = forces.size, len(axle_groups(offsets))
+    if not np.any(forces > 0):
+        return np.inf
     logs = np.log(np.maximum(forces, 1e-3 * forces.sum()))
     unlike = np.sum(((logs - logs.mean()) / LOAD_SPREAD) ** 2)
     return float((groups + axles) * np.log(rows) + unlike)

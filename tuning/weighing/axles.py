@@ -36,17 +36,17 @@ class AxleWeighing:
     >>> import jaxbeam as jb
     >>> import tuning
     >>> case = jb.Case(
-    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
-    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
-    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
-    ...     run=jb.Run(0.4, sample_rate=50.0),
+    ...     jb.Beam(20.0, 8e9, 12e3, damping_ratio=0.02, modes=1),
+    ...     sensors=[jb.Sensor(10.0, noise=2e-5)],
+    ...     loads=[jb.MovingForce(force=1e5, speed=20.0)],
+    ...     run=jb.Run(1.6, sample_rate=50.0),
     ... )
     >>> record = jb.simulate(case)
     >>> columns = ("w",), ("deflection",), ("m",), "log", (0,)
     >>> log = tuning.Log(record.times, record.measured, *columns)
-    >>> found = tuning.weighing.weigh_axles(case, log, (1.0, 3.0), axles=1)
-    >>> print(f"{found.fit.gross_weight[0]:.1f} N")
-    4.0 N
+    >>> found = tuning.weighing.weigh_axles(case, log, (10.0, 30.0), axles=1)
+    >>> print(f"{found.fit.gross_weight[0] / 1e3:.0f} kN")
+    100 kN
     """
 
     case: Case
@@ -156,7 +156,8 @@ def weigh_axles(
     both directions; `axles` is their number, by default the most likely one, at most 9. All steps
     use the `influence_lines`, by default those of the case (see `calibrate_influence_lines`).
     Loads and profile of case and log are not used. An axle has at least a twenty-fifth of the gross
-    weight, unless no others explain the readings.
+    weight, unless no others explain the readings. Distances and weights are sought as road and rail
+    vehicles have them: on a rig of a laboratory use `tuning.identify`.
 
     Raises ValueError if speeds are not 0 < low < high, there is no axle, a sensor measures velocity
     or acceleration, the influence lines are of other sensors, or nothing crosses in the log.
@@ -164,17 +165,17 @@ def weigh_axles(
     >>> import jaxbeam as jb
     >>> import tuning
     >>> case = jb.Case(
-    ...     jb.Beam(0.6, 12.0, 0.5, damping_ratio=0.02, modes=1),
-    ...     sensors=[jb.Sensor(0.3, noise=1e-5)],
-    ...     loads=[jb.MovingForce(force=4.0, speed=2.0)],
-    ...     run=jb.Run(0.4, sample_rate=50.0),
+    ...     jb.Beam(20.0, 8e9, 12e3, damping_ratio=0.02, modes=1),
+    ...     sensors=[jb.Sensor(10.0, noise=2e-5)],
+    ...     loads=[jb.MovingForce(force=1e5, speed=20.0)],
+    ...     run=jb.Run(1.6, sample_rate=50.0),
     ... )
     >>> record = jb.simulate(case)
     >>> columns = ("w",), ("deflection",), ("m",), "log", (0,)
     >>> log = tuning.Log(record.times, record.measured, *columns)
-    >>> found = tuning.weighing.weigh_axles(case, log, (1.0, 3.0), axles=1)
-    >>> print(f"{found.load.forces[0]:.1f} N at {found.load.speed:.1f} m/s")
-    4.0 N at 2.0 m/s
+    >>> found = tuning.weighing.weigh_axles(case, log, (10.0, 30.0), axles=1)
+    >>> print(f"{found.load.forces[0] / 1e3:.0f} kN at {found.load.speed:.1f} m/s")
+    100 kN at 20.0 m/s
     """
     low, high = speeds
     if not 0 < low < high:

@@ -29,9 +29,9 @@ from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines
 
 SPEED_STEP, SINGLE_STEP = 0.01, 0.04  # of the speeds tried, relative; with a single sensor
 NEAR = 0.97, 0.985, 1.0, 1.015, 1.03  # times this speed, tried by combs
-SPACING = 0.35  # m, between the forces of combs
+SPACING, SPACING_SHARE = 0.35, 0.05  # m, between the forces of combs; of a beam at most
 MOST_AXLES = 9  # of a comb: the heaviest
-JOINED = 0.75  # m, between forces of one axle
+JOINED = 15 / 7  # times that, between forces of one axle: 0.75 m
 LEAST_SHARE = 0.1  # of the heaviest axle of a comb, in the others
 ROUNDS = 2  # of fewer and of more axles
 LEAST_GAIN = 1.0  # of the criterion, by other axles
@@ -68,7 +68,7 @@ def find_axles(
     comb = _best_comb(lines, log, speeds, both_ways)
     fit, fits, tried = None, {}, {}
     for _ in range(COMBS):  # at the weights of the fit before
-        places, forces = _axles_of(comb)
+        places, forces = _axles_of(comb, _spacing(lines))
         if places.size == 0:
             return {}, {}
         speed = abs(comb.speed)
@@ -177,12 +177,12 @@ def _best_comb(lines: InfluenceLines, log: CrossingLog, speeds, both_ways: bool)
     """The comb of the best speed."""
     stride = max(log.times.size * log.readings.shape[1] // MAX_ROWS, 1)
     times, readings = log.times[::stride], log.readings[::stride]
-    scale = np.maximum(readings.std(axis=0), 1e-300)
+    scale, spacing = np.maximum(readings.std(axis=0), 1e-300), _spacing(lines)
     target = ((readings - readings.mean(axis=0)) / scale).T.ravel()
 
     def comb(speed) -> _Comb:
         low, high = log.places(speed, lines.length)
-        places = np.arange(low, high + SPACING, SPACING)
+        places = np.arange(low, high + spacing, spacing)
         table = lines.crossing(AxleGeometry(speed, 0.0, places, lines.length), times) / scale
         rows = (table - table.mean(axis=0)).transpose(2, 0, 1).reshape(target.size, -1)
         forces, misfit = scipy.optimize.nnls(rows, target)
@@ -208,11 +208,11 @@ def _best_comb(lines: InfluenceLines, log: CrossingLog, speeds, both_ways: bool)
 def _weighted_comb(fit: AxleFit, log: CrossingLog) -> _Comb:
     """The comb of the best speed near that of a fit, with its weights."""
     shifts, target = fit.weights(log.shifts), fit.weights(log.target)
-    basis = np.linalg.qr(shifts)[0]
+    basis, spacing = np.linalg.qr(shifts)[0], _spacing(fit.lines)
 
     def comb(speed) -> _Comb:
         low, high = log.places(speed, fit.lines.length)
-        places = np.arange(low, high + SPACING, SPACING)
+        places = np.arange(low, high + spacing, spacing)
         at = AxleGeometry(speed, 0.0, places, fit.lines.length)
         rows = fit.weights(log.rows(fit.lines.crossing(at, log.times)))
         rows, own = rows - basis @ (basis.T @ rows), target - basis @ (basis.T @ target)
@@ -236,11 +236,16 @@ def _cross_relation(lines: InfluenceLines, times, readings, speed: float) -> flo
     return float(np.sum(np.abs(unlike) ** 2) / max(2 * terms, 1e-300))
 
 
-def _axles_of(comb: _Comb) -> tuple[np.ndarray, np.ndarray]:
+def _spacing(lines: InfluenceLines) -> float:
+    """Distance (m) of the forces of combs on a beam."""
+    return min(SPACING, SPACING_SHARE * float(lines.length))
+
+
+def _axles_of(comb: _Comb, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Places and forces of the axles of a comb: of neighbours the centre, the heaviest of all."""
     if comb.places.size == 0:
         return comb.places, comb.forces
-    parts = np.flatnonzero(np.diff(comb.places) > JOINED) + 1
+    parts = np.flatnonzero(np.diff(comb.places) > JOINED * spacing) + 1
     groups = np.split(np.arange(comb.places.size), parts)
     forces = np.array([comb.forces[own].sum() for own in groups])
     places = np.array([np.average(comb.places[own], weights=comb.forces[own]) for own in groups])
