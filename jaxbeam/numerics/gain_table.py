@@ -20,6 +20,7 @@ from jaxbeam.runtime.arrays import Array, take, xp
 from jaxbeam.runtime.module import Module
 
 END_OFFSET = 1e-9  # of an interval: ends are evaluated so far inside, as the plant may jump there
+ROUNDING = 1e-12  # of the time span, of fractions at breakpoints
 
 # State matrix A and input matrix B at a time (s).
 PlantMatrices = Callable[[Float[Array, ""]], tuple[Float[Array, "..."], Float[Array, "..."]]]
@@ -36,7 +37,7 @@ class GainTable(Module):
 
         At a breakpoint, where gains may jump, that after it, even if rounding is before it.
         """
-        i = xp.searchsorted(self.breakpoints, fraction + END_OFFSET, side="right") - 1
+        i = xp.searchsorted(self.breakpoints, fraction + ROUNDING, side="right") - 1
         i = xp.clip(i, 0, self.coefficients.shape[0] - 1)
         start = take(self.breakpoints, i)
         length = take(self.breakpoints, i + 1) - start
