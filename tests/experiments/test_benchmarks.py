@@ -76,8 +76,8 @@ def test_sweeps_of_the_table_are_right_and_fully_measured(kind):
     assert row["error"] < 1e-6 and row["scipy_error"] < 1e-6
     assert ("diffrax" in row) == (kind[1:] == ("open", "peaks"))
     assert row.get("diffrax_error", 0.0) < 1e-6
-    times = [row[name] for name in ("run", "compile", "scipy")]
-    assert all(np.isfinite(time) and time > 0 for time in times)
+    assert row["run"] > 0 and row["scipy"] > 0
+    assert np.isfinite(row["compile"])  # a first run less another one: about 0 if none compiles
     assert row["memory"] > 50  # MiB; JAX alone takes as much
 
 
