@@ -183,6 +183,11 @@ class Case(Module):
         return load.trajectory(self.beam.length)
 
     @property
+    def on_rail(self) -> bool:
+        """Whether wheels run on a rail, that of a track of layers."""
+        return self.track is not None and self.track.layered
+
+    @property
     def lifts(self) -> bool:
         """Whether the wheels of loads leave the beam where they would have to pull."""
         return self.contact is not None and self.contact.lifts and bool(self.loads)

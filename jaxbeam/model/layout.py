@@ -170,8 +170,8 @@ def find_layout(case: Case) -> Layout:
         for middle in midpoints
     )
     # A wave of wavenumber k over a length l needs a little more than k l / 2 terms.
-    layered = case.track is not None and case.track.layered  # half of its waves are of the rail
-    count = case.beam.modes // 2 if layered else case.beam.modes
+    # Half of those on a track of layers are of the rail.
+    count = case.beam.modes // 2 if case.on_rail else case.beam.modes
     phases = np.pi / 2 * (count + len(nodes)) * np.diff(places)
     constrained = tuple(node_conditions(node) for node in nodes)
     all_nodes = tuple(map(tuple, nodes))

@@ -260,7 +260,7 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
         values, vectors, of_twist, coupling = _with_torsion(beam.modes, stiffness, mass, torsion)
     else:
         matrices = stiffness, mass
-        if case.track is not None and case.track.layered:
+        if case.on_rail:
             track = layers(case, layout, nodes, to_series)
             matrices = track.with_beam(stiffness, mass)
         values, vectors, coupling = (part[..., : beam.modes] for part in eigen(*matrices))

@@ -207,7 +207,7 @@ def is_supported(case: Case, layout: Layout) -> bool:
 
     If traced, held by the kind of its holds.
     """
-    if case.track is not None and case.track.layered:
+    if case.on_rail:
         return False
     unloaded = Case(case.beam, case.supports, case.actuators)
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(unloaded)):

@@ -133,7 +133,7 @@ def static_peak(
     layout = validated_layout(case, layout, x=x)
     if not case.loads:
         return xp.zeros(x.shape)
-    if case.track is not None and case.track.layered:
+    if case.on_rail:
         case = dataclasses.replace(case, track=None)  # its axles press on the beam as points
     return _static_peak(case, layout, x, kind, *parameters, intervals_of_waves(case))
 

@@ -85,8 +85,7 @@ def warn_of_truncation(case: Case) -> None:
     if not uncorrected or is_corrected(case):
         return
     names = ", ".join(f"sensors.{i} ({case.sensors[i].quantity})" for i in uncorrected)
-    layered = case.track is not None and case.track.layered
-    reason = "wheels run on a rail" if layered else "the beam can move as a rigid body"
+    reason = "wheels run on a rail" if case.on_rail else "the beam can move as a rigid body"
     warnings.warn(
         f"peaks of {names} are sums of {case.beam.modes} modes and not statically corrected, as"
         f" {reason}: keep more modes (beam.modes), and compare",

@@ -12,6 +12,7 @@ from jaxbeam import vehicles
 from jaxbeam.control.design_model import DesignModel
 from jaxbeam.control.load_identification import LoadIdentification
 from tests.c_code.cases import LATE, PERIOD
+from tests.model.test_layered_track import RIG
 from tests.strategies.examples import CONTROLLED, LOADS, PROFILES
 
 RUN = jb.Run(0.3, sample_rate=217.3)  # no sample is at an event
@@ -232,17 +233,7 @@ OF_TRACKS = {
     "layered": rig(
         [changed("oscillator", entry_time=0.0231)],
         beam=jb.Beam(0.6, 11.68, 0.535, 0.03, modes=10),
-        track=jb.Track(
-            rail_rigidity=0.5,
-            rail_mass=0.1,
-            pad_stiffness=2e3,
-            pad_damping=0.5,
-            sleeper_mass=2e-3,
-            ballast_stiffness=2e3,
-            ballast_damping=0.3,
-            sleeper_spacing=0.05,
-            approach=0.2,
-        ),
+        track=jb.Track(**RIG),
     ),
     "uneven": rig(
         SPREAD, track=jb.Track(spread_offsets=[-0.03, 0.01, 0.05], spread_shares=[0.5, 1.0, 0.7])

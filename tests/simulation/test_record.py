@@ -1,6 +1,7 @@
 """Records: shapes, quantities, verdicts, datasets and netCDF files."""
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -11,8 +12,10 @@ import xarray
 from numpy.testing import assert_allclose, assert_array_equal
 
 import jaxbeam as jb
+from jaxbeam.case.fields import PACKAGES, import_modules
 from jaxbeam.case.quantities import QUANTITIES
 from jaxbeam.simulation.stored_record import record_from_xarray
+from tests.simulation.test_every_number import subclasses
 
 CASE = jb.Case(
     jb.Beam(1.2, 11.68, 0.535, 0.02, modes=3),
@@ -56,6 +59,18 @@ def test_reading_what_a_record_derives_leaves_its_tree():
     structure = jax.tree.structure(fresh)
     assert fresh.loads.weight.shape[0] == 2 and fresh.bodies == [] and fresh.verdict
     assert jax.tree.structure(fresh) == structure
+
+
+def test_no_class_of_trees_keeps_what_it_derives():
+    for package in PACKAGES:
+        import_modules(package)
+    kept = [
+        f"{one.__name__}.{name}"
+        for one in subclasses(eqx.Module)
+        for name, value in vars(one).items()
+        if isinstance(value, functools.cached_property)
+    ]
+    assert kept == []
 
 
 def test_quantities_at_any_position(record):

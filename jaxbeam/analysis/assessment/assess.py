@@ -108,7 +108,7 @@ def assess(
     if spread is not None:
         given = spread if isinstance(spread, Track) else track_of(spread)
         case = dataclasses.replace(case, track=given)
-    if case.track is not None and case.track.layered:
+    if case.on_rail:
         raise ValueError(
             "track.rail_rigidity: the trains of the code are forces on the beam; spread them by a"
             f" rule, as track.spread = {THREE_SLEEPERS!r}, or leave the track out"

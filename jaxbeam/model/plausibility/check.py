@@ -119,8 +119,9 @@ def _checked(
 
 def _with_few_modes(case: Case) -> Case:
     """The case with modes enough to judge it: hundreds would take seconds."""
-    layered = case.track is not None and case.track.layered
-    enough = max(MOST_MODES, case.track.least_modes(case.beam.length) if layered else 0)
+    enough = MOST_MODES
+    if case.on_rail:
+        enough = max(enough, case.track.least_modes(case.beam.length))
     count, ratios = min(case.beam.modes, enough), case.beam.damping_ratio
     ratios = ratios[:count] if np.ndim(ratios) else ratios
     beam = dataclasses.replace(case.beam, modes=count, damping_ratio=ratios)
