@@ -94,7 +94,7 @@ def _groups(asammdf, content) -> dict[int, tuple[np.ndarray, list]]:
                 found |= {number: (file.get_master(number), signals)} if signals else {}
             return found
     except Exception as error:
-        problem = f"{type(error).__name__}: {error}"
+        problem = str(error).replace(f"'{content}'", "it") or type(error).__name__
     gc.collect()  # of the broken file, while what it prints is suppressed
     raise ValueError(problem)
 
