@@ -150,6 +150,8 @@ def locate_peak(
 ) -> tuple[Float[Array, " *rest"], Float[Array, " *rest"]]:
     """Position in [-1, 1] of the largest magnitude of the polynomial through samples, and it."""
     curve = _interpolate(samples, points)
+    if not is_jax(samples):  # NumPy takes long for powers
+        curve = Curve(*map(list, curve))
     # The start points are candidates too: Newton's method may leave an end for a lower extremum.
     starts = np.linspace(-1.0, 1.0, START_POINTS).reshape(-1, *(1,) * (samples.ndim - 1))
     starts = xp.broadcast_to(starts.astype(samples.dtype), (START_POINTS, *samples.shape[1:]))
