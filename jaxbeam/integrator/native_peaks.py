@@ -1,7 +1,7 @@
 """Peaks of many runs by the C integrator (`integrate_peaks.c`), of the wheel or of a C compiler.
 
 XLA splits a step into some forty loops over the runs of a batch; in C it is one, and so are all
-steps of all tasks. It serves sweeps of peaks of all quantities (not of histories), without a
+steps of all tasks. It serves sweeps of peaks of all quantities and of histories, without a
 controller or with one that acts at samples, in double precision, on CPUs. Where the wheel has none
 the first large sweep compiles it, once for a machine, in 1.2 s of processor time. Each new
 structure regains 3 s, as XLA has less to compile, or nothing (two spans, benchmark `first_answer`),
@@ -101,8 +101,9 @@ class NativeInputs(NamedTuple):
     """Arguments of the C integrator after the mask, in the order of `workspace.h`.
 
     Their first axis are the tasks, of length one where all share them. Tasks are batches of runs
-    without commands. None stands for an array without numbers: what a program returns takes 20
-    microseconds each.
+    without commands. With a history `samples` are the numbers of those at the boundaries of panels,
+    -1 for none, and `history_rows` are those from the state to its outputs. None stands for an
+    array without numbers: what a program returns takes 20 microseconds each.
     """
 
     state_matrix: Float[Array, "task block state state"]
@@ -134,14 +135,17 @@ class NativeInputs(NamedTuple):
     events: Int[Array, "task panel"] | None = None
     memory: Float[Array, "task memory"] | None = None
     loop_numbers: Int[Array, "task address"] | None = None
+    samples: Int[Array, "task boundary"] | None = None
+    history_rows: Float[Array, "task row state"] | None = None
 
 
 class NativeLoop(NamedTuple):
     """A sampled loop in C: its function, numbers of commands, and place of the failures.
 
-    The last four of the `NativeInputs` are those of a loop: the index of the length of the steps
-    of each panel, and of the event at its start, -1 for none; the memory of the loop at the start,
-    and the addresses of its numbers. Commands are states that do not change between events.
+    Of the `NativeInputs` `lengths_of_panels`, which panels of histories share too, and the three
+    after it are those of a loop: the index of the length of the steps of each panel, and of the
+    event at its start, -1 for none; the memory of the loop at the start, and the addresses of its
+    numbers. Commands are states that do not change between events.
     """
 
     process: Any
@@ -187,13 +191,18 @@ def model_inputs(
 
 
 def loop_model_inputs(
-    model: ModalModel, outputs: OutputRows, correction: StaticCorrection | None
+    model: ModalModel,
+    outputs: OutputRows,
+    correction: StaticCorrection | None,
+    history_rows: Float[np.ndarray, "row state"] | None = None,
 ) -> dict[str, Any]:
     """`model_inputs` of a model of one block with held commands, as states of each of its blocks.
 
-    Modes that nothing couples are blocks of their own then.
+    Modes that nothing couples are blocks of their own then. With the `history_rows` of the states
+    of the model those of the blocks are among the inputs.
     """
     found = model_inputs(model, outputs, correction)
+    history = np.zeros((0, model.state_count)) if history_rows is None else history_rows
     corrected = None if correction is None else correction.rows
     direct = commands_at_once(outputs, model.command_matrix[model.rate_index], corrected)
     matrix, side = model.state_matrix[0], 2
@@ -202,15 +211,18 @@ def loop_model_inputs(
         side = len(matrix)
     blocks, commands = len(matrix) // side, model.command_matrix.shape[1]
     of_blocks = np.zeros((blocks, side + commands, side + commands))
-    rows = np.zeros((len(outputs.time_derivatives), blocks, side + commands))
+    given, count = np.concatenate([found["output_rows"], history]), len(outputs.time_derivatives)
+    rows = np.zeros((len(given), blocks, side + commands))
     for b in range(blocks):
         own = np.s_[b * side : (b + 1) * side]
         of_blocks[b, :side, :side] = matrix[own, own]
         of_blocks[b, :side, side:] = model.command_matrix[own]
-        rows[:, b, :side] = found["output_rows"][:, own]
-    rows[:, 0, side:] = direct
-    found |= {"state_matrix": of_blocks, "output_rows": rows.reshape(len(rows), -1)}
-    return found | {"output_bounds": np.zeros((len(rows), blocks))}
+        rows[:, b, :side] = given[:, own]
+    rows[:count, 0, side:] = direct
+    rows = rows.reshape(len(rows), -1)
+    found |= {"state_matrix": of_blocks, "output_rows": rows[:count]}
+    found |= {"history_rows": None if history_rows is None else rows[count:]}
+    return found | {"output_bounds": np.zeros((count, blocks))}
 
 
 def batch_inputs(
@@ -309,10 +321,23 @@ def integrate_peaks(max_loads: int, mask: Bool[np.ndarray, " task"], inputs: Nat
     return integrate_loops(max_loads, mask, inputs, None)[0]
 
 
+class Integrated(NamedTuple):
+    """What the C integrator returns of all tasks.
+
+    Peaks, failures of the law of a loop, its largest amplitudes up to each of `growth_marks`, and
+    histories.
+    """
+
+    peaks: Peaks
+    failures: Float[np.ndarray, "task run"]
+    amplitudes: Float[np.ndarray, "task run mark"]
+    history: Float[np.ndarray, "task run sample row"]
+
+
 def integrate_loops(
     max_loads: int, mask: Bool[np.ndarray, " task"], inputs: NativeInputs, loop: NativeLoop | None
-) -> tuple[Peaks, Float[np.ndarray, "task run"], Float[np.ndarray, "task run mark"]]:
-    """Peaks of tasks, failures of the law, and largest amplitudes up to each of `growth_marks`.
+) -> Integrated:
+    """Peaks of tasks, with histories at samples if the inputs have any.
 
     Only where C is `available`. Other threads of Python run meanwhile.
 
@@ -328,16 +353,21 @@ def integrate_loops(
         *((array.ctypes.data, (*array.shape, 1, 1, 1)[:4]) for array in arrays)
     )
     failures, amplitudes = np.zeros((tasks, runs)), np.zeros((tasks, runs, MARK_COUNT))
-    outcomes = (*peaks, failures, amplitudes)
+    samples = rows = 0
+    if inputs.samples is not None and inputs.history_rows is not None:
+        samples, rows = int(np.max(inputs.samples)) + 1, inputs.history_rows.shape[1]
+    history = np.zeros((tasks, runs, samples, rows))
+    outcomes = (*peaks, failures, amplitudes, history)
     found = (ctypes.c_void_p * len(outcomes))(*(part.ctypes.data for part in outcomes))
     given_loop = None
     if loop is not None:
         address = ctypes.cast(loop.process, ctypes.c_void_p)
         given_loop = ctypes.byref(_Loop(address, loop.commands, MARK_COUNT, loop.failures))
-    if LIBRARY.load().integrate_peaks(ctypes.c_int64(max_loads), arguments, found, given_loop):
+    sizes = ctypes.c_int64(max_loads), ctypes.c_int64(samples)
+    if LIBRARY.load().integrate_peaks(*sizes, arguments, found, given_loop):
         raise MemoryError("there is no memory for the matrices of all steps of a sweep")
     amplitudes = np.sqrt(np.maximum.accumulate(amplitudes[..., ::-1], axis=-1)[..., ::-1])
-    return peaks, failures, amplitudes
+    return Integrated(peaks, failures, amplitudes, history)
 
 
 def _constants() -> tuple[np.ndarray, ...]:

@@ -224,7 +224,7 @@ def run_sizes(
     if histories:
         samples = len(sample_times(case))
         steps = 2 * samples + of_crossings
-    given_steps = of_crossings if native_peaks.has_courses(case) else 0
+    given_steps = max(of_crossings, steps) if native_peaks.has_courses(case) else 0
     states = 2 * modes + 4 * len(case.actuators)
     places = len(layout.degrees) + pieces
     return RunSizes(

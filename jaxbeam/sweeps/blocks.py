@@ -214,7 +214,9 @@ class Runner:
             program = self.program._replace(case=concrete_case(self.case))
             given = self.known_model, self._path_times.load_events, self.batches
             with contextlib.suppress(NotVectorisedError):
-                return NativeBatches(program, *given, self.batches_per_block, most_inputs)
+                sizes = self.batches_per_block, most_inputs
+                schedule = self.schedule if self.histories else None
+                return NativeBatches(program, *given, *sizes, schedule)
         if native_peaks.has_courses(self.case) or self.case.controller is not None:
             self.program = self._make_program(native=False)
         return None

@@ -26,7 +26,12 @@ from jaxbeam.integrator import native_peaks
 from jaxbeam.integrator.growth import growth_limit, load_amplitude
 from jaxbeam.integrator.inputs import StepInfo
 from jaxbeam.integrator.peaks import Peaks
-from jaxbeam.integrator.time_grid import event_places, grid_between_events, grid_by_schedule
+from jaxbeam.integrator.time_grid import (
+    EventSchedule,
+    event_places,
+    grid_between_events,
+    grid_by_schedule,
+)
 from jaxbeam.model.load_set import LoadSet, WheelSet, load_set
 from jaxbeam.model.modal_model import ModalModel, has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
@@ -183,42 +188,17 @@ class NativeLoops:
             [[array.ctypes.data for array in one.inputs] for one in self.translations], np.int64
         )
 
-    def model_inputs(self) -> dict[str, Any]:
+    def model_inputs(self, histories: bool) -> dict[str, Any]:
         """Those of the `NativeInputs` that the model of the loop determines, which all share."""
-        policy = self._policy(0)
-        return native_peaks.loop_model_inputs(
-            policy.model, *outputs_of(self.program.case, policy.model)
-        )
+        case, model = self.program.case, self._policy(0).model
+        rows = history_rows(case, model) if histories else None
+        return native_peaks.loop_model_inputs(model, *outputs_of(case, model), rows)
 
-    def of_batches(
-        self, batch_indices, max_steps, extra_steps, events, loads
-    ) -> dict[str, np.ndarray | None]:
-        """Those of the `NativeInputs` that differ between batches; see `NativeBatches.of_batches`.
-
-        From the times of the load events, and from cubics and wheels of the loads.
-        """
-        rows, schedule = [], self.program.schedule
-        windows, times = events
-        cubics, wheels = loads
-        for row, batch in enumerate(batch_indices):
-            case = self.program.case_with(self.batches.shared_values[batch])
-            longest = schedule.lengths.max()
-            substeps = int(np.ceil(longest / max_steps[row])) + int(extra_steps[row])
-            own = windows[row], times[row]
-            grid = grid_by_schedule(
-                case, self._policy(0).model, schedule, substeps, known_events=own
-            )
-            paths = jax.tree.map(lambda part, row=row: part[row], (cubics, wheels))
-            of_batch = native_peaks.batch_inputs(grid, *paths)
-            of_batch |= {"lengths_of_panels": grid.length_index, "events": grid.event}
-            rows.append(of_batch)
+    def of_designs(self, batch_indices: Int[np.ndarray, " path"]) -> dict[str, np.ndarray]:
+        """Those of the `NativeInputs` that the laws of batches determine."""
         design = np.zeros(len(batch_indices), int) if self.shared else batch_indices
         starts = np.stack([self.translations[i].memory for i in design])
-        found = {
-            name: None if part is None else np.stack([one[name] for one in rows])
-            for name, part in rows[0].items()
-        }
-        return found | {"memory": starts, "loop_numbers": self.addresses[design]}
+        return {"memory": starts, "loop_numbers": self.addresses[design]}
 
     def integrate(
         self,
@@ -229,7 +209,7 @@ class NativeLoops:
     ) -> dict[str, np.ndarray]:
         """Results by name; those of runs that diverge are NaN."""
         found = native_peaks.integrate_loops(max_loads, mask, inputs, self.loop)
-        peaks, failures, amplitudes = found
+        peaks, failures, amplitudes, history = found
         for row in np.flatnonzero(mask):
             grown = np.moveaxis(amplitudes[row], -1, 0)
             if not np.isfinite(growth_limit(grown, np.zeros(grown.shape[1]))).any():
@@ -238,7 +218,7 @@ class NativeLoops:
             failed = grown[0] > growth_limit(grown, least)
             for part in peaks:
                 part[row, failed] = np.nan
-        return Peaks(*peaks)._asdict() | {"controller_failures": failures}
+        return Peaks(*peaks)._asdict() | {"controller_failures": failures, "deflection": history}
 
     def _least_amplitude(self, batch: int) -> Float[np.ndarray, " run"]:
         """Amplitudes from which growth is divergence, of the runs of a batch."""
@@ -262,6 +242,14 @@ class NativeLoops:
         if controller.design_depends_on_loads or controller.design_depends_on_paths:
             return len(self.batches.shared_values) == 1
         return not any(name.startswith("controller.") for name in self.batches.shared_addresses)
+
+
+def history_rows(case: Case, model: ModalModel) -> Float[np.ndarray, "sensor state"]:
+    """Rows from the state of a model to the deflections (m) at the sensors of a case."""
+    rows = np.zeros((len(case.sensors), model.state_count))
+    modes = slice(0, 2 * case.beam.modes, 2)
+    rows[:, modes] = model.shapes(case.sensor_positions, (0,))[0]
+    return rows
 
 
 class KnownModel(NamedTuple):
@@ -292,8 +280,9 @@ def _model_of(structure: Case) -> KnownModel:
 class NativeBatches:
     """Batches of known numbers that share a model and outputs, integrated in C.
 
-    `events` are those of all paths. Inputs are made for at most `most_at_once` batches, unless a
-    block has more. Raises NotVectorisedError where loads cannot be vectorised.
+    `events` are those of all paths. Histories are at the samples of a `schedule`. Inputs are made
+    for at most `most_at_once` batches, unless a block has more. Raises NotVectorisedError where
+    loads cannot be vectorised.
     """
 
     def __init__(
@@ -304,8 +293,9 @@ class NativeBatches:
         batches: Batches,
         block_size: int,
         most_at_once: int,
+        schedule: EventSchedule | None,
     ):
-        self.program, self.batches = program, batches
+        self.program, self.batches, self.schedule = program, batches, schedule
         self.block_size, self.most_at_once = block_size, most_at_once
         self.known, self.loops = known, None
         self._load_set = functools.cache(self._load_set_of)
@@ -313,9 +303,11 @@ class NativeBatches:
         with np.errstate(all="ignore"):  # as in compiled code
             if program.schedule is None:
                 of_model = native_peaks.model_inputs(known.model, *known.outputs)
+                if schedule is not None:
+                    of_model["history_rows"] = history_rows(program.case, known.model)
             else:
                 self.loops = NativeLoops(program, batches)
-                of_model = self.loops.model_inputs()
+                of_model = self.loops.model_inputs(schedule is not None)
         self.of_model = {
             name: None if part is None else part[None] for name, part in of_model.items()
         }
@@ -330,8 +322,12 @@ class NativeBatches:
         batch_indices: Int[np.ndarray, " task"],
         max_steps: Float[np.ndarray, " task"],
         extra_steps: Int[np.ndarray, " task"],
+        substeps: int | None = None,
     ) -> native_peaks.NativeInputs:
-        """Inputs of some batches, with steps (s) at most and extra steps in each panel."""
+        """Inputs of some batches, with steps (s) at most and extra steps in each panel.
+
+        With `substeps` between the events of the schedule, with histories.
+        """
 
         def of_batch(events, duration, max_step, extra_steps, *loads):
             grid = grid_between_events(events, duration, max_step, extra_steps)
@@ -340,11 +336,14 @@ class NativeBatches:
         events = jax.tree.map(lambda part: part[batch_indices], self.events)
         with np.errstate(all="ignore"):
             loads = self._loads(batch_indices)
-            if self.loops is None:
+            if self.program.schedule is None and substeps is None:
                 found = vectorised(of_batch)(*events, max_steps, extra_steps, *loads)
             else:
-                stepping = max_steps, extra_steps, events[0]
-                found = self.loops.of_batches(batch_indices, *stepping, loads)
+                found = self._scheduled(
+                    batch_indices, max_steps, extra_steps, events[0], loads, substeps
+                )
+            if self.loops is not None:
+                found |= self.loops.of_designs(batch_indices)
         found |= native_peaks.shared_vehicles(found)
         if native_peaks.has_courses(self.program.case):
             found |= self._over_time(batch_indices, loads[1], found)
@@ -358,12 +357,42 @@ class NativeBatches:
             batches.append(dataclasses.replace(self._load_set(int(batch)), wheels=own))
         names = "panel_starts", "step_counts", "step_lengths"
         starts, counts, lengths = (found[name] for name in names)
-        if self.loops is not None:
+        if "lengths_of_panels" in found:
             lengths = np.take_along_axis(lengths, found["lengths_of_panels"], axis=1)
         panels = starts, counts, lengths
         swept = any(name.startswith("profile.") for name in self.batches.shared_addresses)
         one_profile = not (swept or self.program.profiles)
         return native_peaks.inputs_over_time(batches, *panels, one_profile)
+
+    def _scheduled(
+        self, batch_indices, max_steps, extra_steps, events, loads, substeps: int | None
+    ) -> dict[str, np.ndarray | None]:
+        """Those of the `NativeInputs` that differ between batches whose steps end at a schedule's.
+
+        From the times of the load events, and from cubics and wheels of the loads.
+        """
+        rows, schedule = [], self.program.schedule if substeps is None else self.schedule
+        assert schedule is not None
+        for row, batch in enumerate(batch_indices):
+            case = self.program.case_with(self.batches.shared_values[batch])
+            own, paths = (
+                jax.tree.map(lambda part, row=row: part[row], one) for one in (events, loads)
+            )
+            count = np.ceil(schedule.lengths.max() / max_steps[row]) + extra_steps[row]
+            model, parts = self.known.model, int(count) if substeps is None else substeps
+            grid = grid_by_schedule(case, model, schedule, parts, known_events=own)
+            of_batch = native_peaks.batch_inputs(grid, *paths)
+            of_batch |= {"lengths_of_panels": grid.length_index, "events": grid.event}
+            if substeps is not None:
+                samples = np.full(grid.boundaries.size, -1)
+                sampled = grid.event_panels[schedule.sample_events]
+                samples[sampled] = np.arange(sampled.size)
+                of_batch["samples"] = samples
+            rows.append(of_batch)
+        return {
+            name: None if part is None else np.stack([one[name] for one in rows])
+            for name, part in rows[0].items()
+        }
 
     def _load_set_of(self, batch: int) -> LoadSet:
         """Loads of a batch, with the profiles of its runs."""
@@ -393,7 +422,9 @@ class NativeBatches:
         if self.loops is not None:
             return None
         few, sizes = with_few_runs(self.batches, most), (self.block_size, self.most_at_once)
-        return NativeBatches(self.program, self.known, self.events[0], few, *sizes)
+        return NativeBatches(
+            self.program, self.known, self.events[0], few, *sizes, schedule=self.schedule
+        )
 
     def block_integrator(
         self, batches_of: Callable, steps, extra_steps, substeps: int | None, single: bool
@@ -403,7 +434,7 @@ class NativeBatches:
         `batches_of` a block are its batches, `steps` (s) and `extra_steps` those of all. Inputs are
         made for several blocks at once.
         """
-        del substeps, single
+        del single
         count, runs = self.batches.run_index.shape
         most = max(1, min(GROUP_RUNS // runs, self.most_at_once) // self.block_size)
         blocks = min(-(-count // self.block_size), most)
@@ -414,7 +445,8 @@ class NativeBatches:
         @functools.lru_cache(maxsize=4)  # blocks are taken in their order, by few threads
         def of_group(group: int) -> native_peaks.NativeInputs:
             batch_indices = np.arange(group * group_size, (group + 1) * group_size) % count
-            return self.of_batches(batch_indices, steps[batch_indices], extra_steps[batch_indices])
+            given = steps[batch_indices], extra_steps[batch_indices], substeps
+            return self.of_batches(batch_indices, *given)
 
         def integrate_block(block, mask):
             group, place = divmod(block, blocks)
@@ -428,9 +460,14 @@ class NativeBatches:
     def integrate(self, batch_indices, mask, inputs: native_peaks.NativeInputs):
         """Results (path, batch, ...) by name of batches with these inputs."""
         max_loads = self.program.shapes.max_loads
-        if self.loops is None:
-            return native_peaks.integrate_peaks(max_loads, mask, inputs)._asdict()
-        return self.loops.integrate(batch_indices, max_loads, mask, inputs)
+        if self.loops is not None:
+            found = self.loops.integrate(batch_indices, max_loads, mask, inputs)
+        else:
+            integrated = native_peaks.integrate_loops(max_loads, mask, inputs, None)
+            found = integrated.peaks._asdict() | {"deflection": integrated.history}
+        if inputs.samples is None:
+            del found["deflection"]
+        return found
 
     def _loads(self, batch_indices):
         """Cubics and wheels of the loads of some batches."""

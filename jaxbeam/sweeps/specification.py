@@ -207,11 +207,10 @@ class SweepSpecification:
 
     def uses_c(self) -> bool:
         """Whether a new sweep takes its steps in C (see `native_peaks.chosen_for`)."""
-        peaks_in_double = not (self.histories or self.single)
-        if self._force_runner is not None:
+        if self._force_runner is not None or self.single:
             return False
         count = max(self.count, MIN_RUNS_TO_COMPILE) if self.profiles else self.count
-        return peaks_in_double and native_peaks.chosen_for(self.case, count)
+        return native_peaks.chosen_for(self.case, count)
 
     @functools.cached_property
     def case_dict(self) -> dict[str, Any]:

@@ -99,6 +99,12 @@ MEASURED = dataclasses.replace(
     ],
     run=jb.Run(0.7),
 )
+CONTROLLED = dataclasses.replace(
+    PLAIN,
+    actuators=[jb.Patch(0.1, 0.2, moment_per_volt=1e-4)],
+    controller=jb.PD(gains=[300.0], rate_gains=[3.0], lag=[0.002], period=0.004),
+    sensors=SENSORS[:1],
+)
 FEW = {"loads.0.mass": [0.1, 0.5], "loads.2.speed": [0.8, 1.2]}
 GRID = {"loads.0.mass": np.linspace(0.05, 1.0, 13), "loads.0.speed": [1.0, 2.0, 7.0]}
 
@@ -279,23 +285,51 @@ def specification_of(case, histories=False, precision="double"):
     return sweep_specification(case, GRID, False, histories, 1e-7, precision)
 
 
-def test_sweeps_of_peaks_in_double_precision_use_c():
+def test_sweeps_in_double_precision_use_c():
     assert specification_of(PLAIN).uses_c()
-    assert not specification_of(PLAIN, histories=True).uses_c()
+    assert specification_of(PLAIN, histories=True).uses_c()
     assert not specification_of(PLAIN, precision="single").uses_c()
-    controlled = dataclasses.replace(
-        PLAIN,
-        actuators=[jb.Patch(0.1, 0.2, moment_per_volt=1e-4)],
-        controller=jb.PD(gains=[300.0], rate_gains=[3.0], lag=[0.002], period=0.004),
-        sensors=SENSORS[:1],
-    )
-    assert specification_of(controlled).uses_c()
-    continuous = dataclasses.replace(controlled.controller, period=None)
-    assert not specification_of(dataclasses.replace(controlled, controller=continuous)).uses_c()
+    assert specification_of(CONTROLLED).uses_c()
+    continuous = dataclasses.replace(CONTROLLED.controller, period=None)
+    assert not specification_of(dataclasses.replace(CONTROLLED, controller=continuous)).uses_c()
     moments = dataclasses.replace(PLAIN, sensors=[jb.Sensor(0.2, "moment")])
     assert specification_of(moments).uses_c()
     sheared = dataclasses.replace(BEAM, shear_stiffness=1e5)
     assert not specification_of(dataclasses.replace(moments, beam=sheared)).uses_c()
+
+
+@pytest.mark.parametrize(
+    ("case", "share", "mass"),
+    [
+        pytest.param(PLAIN, 1.0, 0.5, id="plain"),
+        pytest.param(COUPLED, 0.4, 0.5, id="coupled, ends on the beam"),
+        pytest.param(STREAM, 0.5, 0.5, id="stream"),
+        pytest.param(ROUGH, 0.3, 0.5, id="rough"),
+        pytest.param(MEASURED, 0.3, 0.5, id="measured"),
+        pytest.param(LOST_CONTACT, 1.0, 60.0, id="lost contact"),
+        pytest.param(CONTROLLED, 0.5, 0.5, id="controlled"),
+    ],
+)
+def test_histories_equal_those_of_numpy(case, share, mass):
+    run = jb.Run(share * float(case.run.duration), sample_rate=130.0)
+    case, over = dataclasses.replace(case, run=run), {"loads.0.mass": [0.1, mass]}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(native_peaks, "MIN_RUNS_OF_LOOPS", 1)
+        assert native_peaks.chosen_for(case, 2)
+        first, choose = [], blocks.Runner.choose_step_sizes
+
+        def chosen(runner):
+            first[:] = first or [choose(runner)]
+            return first[0]
+
+        patch.setattr(blocks.Runner, "choose_step_sizes", chosen)
+        native = jb.sweep(case, over, progress=False, histories=True)
+        patch.setattr(native_peaks, "available", lambda: False)
+        known = jb.sweep(case, over, progress=False, histories=True)
+    compared = "deflection", f"peak_{case.sensors[0].quantity}", "lowest_contact_force"
+    for name in compared:
+        largest = float(np.nanmax(np.abs(known[name])))
+        assert_allclose(native[name], known[name], rtol=0, atol=1e-10 * largest)
 
 
 @pytest.mark.parametrize("begun_in_c", [True, False])

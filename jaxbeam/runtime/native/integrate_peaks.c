@@ -12,6 +12,7 @@
 static void reset(Workspace *w) {
     const size_t batch_size = (size_t)w->batch_size, sampled = (size_t)w->positions * batch_size;
     memset(w->state, 0, 8 * (size_t)w->states * batch_size);
+    w->peaks_final = 0;
     const size_t vehicle_bytes = 8 * (size_t)w->vehicle_states * batch_size;
     if (w->has_initial) memcpy(w->vehicle_state, w->inputs[INITIAL_VEHICLES], vehicle_bytes);
     else memset(w->vehicle_state, 0, vehicle_bytes);
@@ -42,18 +43,20 @@ static int next_chunk(Workspace *w, int *panel, int64_t *done, int64_t before) {
         step->number = before + count++;
         step->panel = *panel, step->kind = length_of_panel(w, *panel);
         step->length = w->inputs[STEP_LENGTHS][step->kind];
-        step->event = -1, step->mark = 0;
+        step->event = step->sample = -1, step->mark = 0;
         if (w->loop && *done == 0) step->event = ((const int64_t *)w->inputs[EVENTS])[*panel];
+        if (*done == 0) step->sample = sample_of_panel(w, *panel);
         step->start = w->inputs[PANEL_STARTS][*panel] + (double)(*done)++ * step->length;
         double mark = w->inputs[PANEL_STARTS][w->panels] / 2; /* the end, half of it, and so on */
         while (step->mark + 1 < w->marks && step->start <= mark) step->mark++, mark /= 2;
         step->transition = w->transition + (size_t)step->kind * transition_size(w);
         step->loads = 0;
         const uint8_t *active = (const uint8_t *)w->inputs[LOADS_ON_BEAM] + *panel * w->loads;
-        for (int l = 0; l < w->loads && step->loads < w->max_loads; l++)
+        const int loads = w->peaks_final ? 0 : w->loads; /* all have left, but for rounding */
+        for (int l = 0; l < loads && step->loads < w->max_loads; l++)
             if (active[l]) step->load_numbers[step->loads++] = l;
         step->rows = step->loads * NODES, step->ends = w->influence_terms ? 2 * step->loads : 0;
-        prepare_step(w, step);
+        if (!w->peaks_final) prepare_step(w, step);
     }
     return count;
 }
@@ -84,9 +87,11 @@ static void integrate_task(Workspace *w) {
         }
         const Step *last = w->steps + steps - 1;
         if (w->loop) continue; /* commands may raise a peak later */
-        if (last->start + last->length >= exit_time && peaks_final(w)) break;
+        if (w->peaks_final || last->start + last->length < exit_time || !peaks_final(w)) continue;
+        if (!w->history_rows) break;
+        w->peaks_final = 1; /* only the history goes on */
     }
-    if (w->loop) end_amplitudes(w);
+    if (w->loop || w->history_rows) end_runs(w);
 }
 
 /* Outputs of a task, (run, position) and (run, load). */
@@ -139,8 +144,8 @@ static void end_slopes(Workspace *w) {
 
 /* Integrate the tasks, and write their outputs, (task, run, position) or (task, run, load); 1 if
  * there is no memory for it. */
-EXPORTED int integrate_peaks(int64_t max_loads, const Array *arguments, double *const *outputs,
-                             const Loop *loop) {
+EXPORTED int integrate_peaks(int64_t max_loads, int64_t samples, const Array *arguments,
+                             double *const *outputs, const Loop *loop) {
     const int64_t *sizes[ARGUMENT_COUNT];
     for (int i = 0; i < ARGUMENT_COUNT; i++) sizes[i] = arguments[i].sizes;
     Workspace workspace = {.panels = (int)sizes[STEP_COUNTS][1],
@@ -165,6 +170,9 @@ EXPORTED int integrate_peaks(int64_t max_loads, const Array *arguments, double *
                            .forced_runs = sizes[LOAD_FORCES][3],
                            .surface_runs = sizes[SURFACE][3],
                            .vehicle_runs = sizes[VEHICLE_STATE_MATRIX][2],
+                           .shares_lengths = sizes[LENGTHS_OF_PANELS][1] > 0,
+                           .history_rows = samples ? (int)sizes[HISTORY_ROWS][1] : 0,
+                           .samples = samples,
                            .loop = loop,
                            .memory_size = (int)sizes[MEMORY][1],
                            .outputs = outputs};
@@ -174,6 +182,7 @@ EXPORTED int integrate_peaks(int64_t max_loads, const Array *arguments, double *
     if (!memory) return 1;
     partition_workspace(w, ((uintptr_t)memory + sizeof(Register) - 1) & -sizeof(Register));
     for (int64_t task = 0; task < sizes[MASK][0]; task++) {
+        w->task = task;
         set_inputs(w, arguments, task);
         if (task == 0) end_slopes(w);
         if (*(const uint8_t *)w->inputs[MASK]) integrate_task(w);

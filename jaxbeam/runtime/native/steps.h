@@ -37,6 +37,19 @@ static void process_event(const Workspace *w, const Step *step, const Group *g) 
                (size_t)w->commands * sizeof(Register));
 }
 
+/* Outputs of the history at a sample, of the states of a group of runs. */
+static void write_sample(const Workspace *w, int64_t sample, const Group *g) {
+    const ptrdiff_t of_run = w->samples * w->history_rows;
+    double *history = w->outputs[HISTORY] + (w->task * w->batch_size + g->first) * of_run;
+    const double *weights = w->inputs[HISTORY_ROWS];
+    for (int row = 0; row < w->history_rows; row++) {
+        Register value = {0};
+        for (int i = 0; i < w->states; i++) value += *weights++ * g->state[i];
+        double *to = history + sample * w->history_rows + row;
+        for (int l = 0; l < g->count; l++, to += of_run) *to = value[l];
+    }
+}
+
 /* Deflections at the peak nodes of a step, the largest of them, and a bound of those between; from
  * the state before the step. */
 static void sample_positions(const Workspace *w, int t, const Step *step, const Group *g) {
@@ -142,6 +155,8 @@ static void advance_chunk(Workspace *w, int steps, Group *groups, int group_coun
                     maximum(squared_amplitude(w, g->state), g->amplitudes[step->mark]);
                 if (step->event >= 0) process_event(w, step, g);
             }
+        if (step->sample >= 0)
+            for (const Group *g = groups; g < end; g++) write_sample(w, step->sample, g);
         if (vehicles)
             for (const Group *g = groups; g < end; g++) prepare_vehicles(w, step, g);
         if (step->loads) {
@@ -154,10 +169,11 @@ static void advance_chunk(Workspace *w, int steps, Group *groups, int group_coun
         }
         if (step->ends)
             for (const Group *g = groups; g < end; g++) end_forces(w, step, g);
-        for (const Group *g = groups; g < end; g++) sample_positions(w, t, step, g);
+        for (const Group *g = groups; g < end && !w->peaks_final; g++)
+            sample_positions(w, t, step, g);
     }
     for (const Group *g = groups; g < end; g++) {
-        for (int position = 0; position < w->positions; position++)
+        for (int position = 0; position < w->positions && !w->peaks_final; position++)
             update_peaks(w, steps, g, position);
         for (int i = 0; i < w->vehicle_states; i++)
             store(w->vehicle_state + i * w->batch_size + g->first, g->vehicle_state[i], g->count);
@@ -175,12 +191,15 @@ static void advance_chunk(Workspace *w, int steps, Group *groups, int group_coun
     }
 }
 
-/* Amplitudes at the end of a run. */
-static void end_amplitudes(Workspace *w) {
+/* What is known at the end of a run: amplitudes of a loop, and the last sample of a history. */
+static void end_runs(Workspace *w) {
     Group *g = w->groups;
+    const int64_t sample = sample_of_panel(w, w->panels);
     for (g->first = 0; g->first < w->batch_size; g->first += REGISTER_WIDTH) {
         g->count = runs_from(w, g->first);
         load_states(w, g);
+        if (sample >= 0) write_sample(w, sample, g);
+        if (!w->loop) continue;
         const Register largest = maximum(squared_amplitude(w, g->state), g->amplitudes[0]);
         store(w->amplitudes + g->first, largest, g->count);
     }

@@ -54,6 +54,8 @@ enum {
     EVENTS,
     MEMORY,
     LOOP_NUMBERS,
+    SAMPLES,
+    HISTORY_ROWS,
     GAUSS_NODES,
     LAGRANGE_COEFFICIENTS,
     INTERPOLATION,
@@ -62,7 +64,16 @@ enum {
     FORCE_WEIGHTS,
     ARGUMENT_COUNT
 };
-enum { PEAK, PEAK_TIME, LOWEST_FORCE, CONTACT_LOSS_TIME, FAILURES, AMPLITUDES, RESULT_COUNT };
+enum {
+    PEAK,
+    PEAK_TIME,
+    LOWEST_FORCE,
+    CONTACT_LOSS_TIME,
+    FAILURES,
+    AMPLITUDES,
+    HISTORY,
+    RESULT_COUNT
+};
 
 /* A sampled loop: what happens at an event, to the memory of the runs of a group and their commands
  * (sweeps/native_integration.py); numbers of commands and of marks in time up to which amplitudes
@@ -90,8 +101,8 @@ enum { HEIGHT, HEIGHT_RATE, HEIGHT_SECOND_RATE, SURFACE_MOTIONS };
  * those at the ends of the step, too, two for each load: end response (end, state, load) and
  * compliance (end, load, load). */
 typedef struct {
-    int64_t number; /* among all steps of the task */
-    int64_t event;  /* at its start, -1 for none */
+    int64_t number;        /* among all steps of the task */
+    int64_t event, sample; /* at its start, -1 for none */
     int panel, kind, mark, loads, rows, ends;
     double start, length;
     const double *transition;
@@ -127,6 +138,9 @@ typedef struct {
     const Loop *loop;
     int commands, marks, memory_size;
     int has_surface, has_forces, has_initial;
+    /* Panels share step lengths; outputs of a history; no later step can raise a peak. */
+    int shares_lengths, history_rows, peaks_final;
+    int64_t task, samples; /* number of the task; samples of its history */
     /* Runs with forces over time, a surface, vehicles of their own: all, or one for all. */
     int64_t forced_runs, surface_runs, vehicle_runs;
     ptrdiff_t batch_size;
@@ -309,13 +323,18 @@ static void set_inputs(Workspace *w, const Array *arguments, int64_t task) {
     }
 }
 
+/* Number of the sample at the start of a panel, or at the end of the last; -1 for none. */
+static int64_t sample_of_panel(const Workspace *w, int panel) {
+    return w->history_rows ? ((const int64_t *)w->inputs[SAMPLES])[panel] : -1;
+}
+
 static int64_t panel_steps(const Workspace *w, int panel) {
     return ((const int64_t *)w->inputs[STEP_COUNTS])[panel];
 }
 
 /* Index of the length of the steps of a panel: each has its own, or they share some. */
 static int length_of_panel(const Workspace *w, int panel) {
-    return w->loop ? (int)((const int64_t *)w->inputs[LENGTHS_OF_PANELS])[panel] : panel;
+    return w->shares_lengths ? (int)((const int64_t *)w->inputs[LENGTHS_OF_PANELS])[panel] : panel;
 }
 
 /* Numbers of a group of runs, from those of all runs, or of one for all. */
