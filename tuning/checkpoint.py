@@ -78,7 +78,7 @@ def save(
 
     Raises FileExistsError if the file exists, without `overwrite`.
     """
-    with whole_file(path, overwrite) as beside, open(beside, "wb") as file:
+    with whole_file(path, overwrite) as partial, open(partial, "wb") as file:
         np.savez(file, fingerprint=np.array(digest), **arrays)
         file.flush()
         os.fsync(file.fileno())

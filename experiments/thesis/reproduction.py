@@ -128,8 +128,8 @@ def _write(folder: Path, runs: Sequence[ExperimentRun]) -> None:
     write_report(
         folder, report.TITLE, report.sections(runs), style=report.VERDICT_STYLE, overwrite=True
     )
-    with whole_file(folder / REPORT_FILES[-1], overwrite=True) as beside:
-        beside.write_text(json.dumps(as_dict(runs), indent=2), encoding="utf-8")
+    with whole_file(folder / REPORT_FILES[-1], overwrite=True) as partial:
+        partial.write_text(json.dumps(as_dict(runs), indent=2), encoding="utf-8")
 
 
 def _run_all(

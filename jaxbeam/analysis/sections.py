@@ -17,7 +17,13 @@ from jaxbeam.case.fields import OUTSIDE, concrete, refuse_traced, refuses_traced
 from jaxbeam.case.quantities import QUANTITIES, quantity_of
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.integrator.integrate import integrate_peaks
-from jaxbeam.model.along_beam import LEFT_SHARE, moving_with, positions_along, refined, sections
+from jaxbeam.model.along_beam import (
+    LEFT_DISTANCE,
+    moving_positions,
+    positions_along,
+    refined,
+    sections,
+)
 from jaxbeam.model.load_set import load_set
 from jaxbeam.model.static_correction import bending_moment, shear_force
 from jaxbeam.model.statics import (
@@ -134,7 +140,7 @@ def envelope(
         known = concrete_case(case), None, tolerance
         found = envelope(*known, quantity=quantity, **jax.tree.map(concrete, parameters))
         own = np.asarray(found.positions)
-        x, moving = moving_with(case, own)
+        x, moving = moving_positions(case, own)
         if moving.any():  # apart: steps end where a load passes them, so that derivatives take long
             parts = at(xp.asarray(own[~moving])), at(x[moving])
             order = np.argsort(np.concatenate([own[~moving], own[moving]]), kind="stable")
@@ -304,7 +310,7 @@ def influence_table(
         length = float(concrete(case.beam.length))
         own = np.array([place for _, _, place in lines])
         beside = [
-            min(p + LEFT_SHARE * length, length)
+            min(p + LEFT_DISTANCE * length, length)
             for q, _, p in lines
             if q in QUANTITIES and QUANTITIES[q].jumps
         ]

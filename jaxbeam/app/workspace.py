@@ -227,8 +227,8 @@ class Workspace:
                 f"{name} has been changed by someone else, or is another file: save under another"
                 " name, or open it again"
             )
-        with whole_file(path, overwrite=True) as beside:
-            beside.write_bytes(text.encode("utf-8"))
+        with whole_file(path, overwrite=True) as partial:
+            partial.write_bytes(text.encode("utf-8"))
         return {"name": name, "mark": _mark(text)}
 
     def library(self) -> list[dict[str, Any]]:

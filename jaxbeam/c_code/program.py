@@ -129,8 +129,8 @@ def write_c(program: CProgram, folder: str | os.PathLike, overwrite: bool = Fals
         if path.exists() and not overwrite:
             raise FileExistsError(f"{path} exists already; choose another name, or overwrite it")
     for path, text in zip(paths, program.files.values(), strict=True):
-        with whole_file(path, overwrite) as beside:
-            beside.write_text(text, encoding="utf-8")
+        with whole_file(path, overwrite) as partial:
+            partial.write_text(text, encoding="utf-8")
     return paths
 
 

@@ -228,8 +228,8 @@ class DrawingOptions:
         if size is not None:
             whole.set_size_inches(size)
         options = PNG_OPTIONS if path.suffix.lower() == ".png" else {}
-        with whole_file(path, overwrite=True) as beside:  # refused before, where it is not asked
-            whole.savefig(beside, dpi=self.dpi, **options)
+        with whole_file(path, overwrite=True) as partial:  # refused before, where it is not asked
+            whole.savefig(partial, dpi=self.dpi, **options)
 
 
 @Parameter(name="*")

@@ -195,8 +195,8 @@ def save_case(case: Case, path: str | os.PathLike, overwrite: bool = False) -> N
     length = 25.0  # m
     """
     text = _as_toml(case)
-    with whole_file(path, overwrite) as beside:
-        beside.write_text(text, encoding="utf-8")
+    with whole_file(path, overwrite) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def case_from_dict(content: dict[str, Any]) -> Case:

@@ -42,13 +42,13 @@ def write_state_space(system: StateSpace, path: str | os.PathLike, overwrite: bo
         system.to_mat(path, overwrite)
         return
     content = matrices_of(system)
-    with whole_file(path, overwrite) as beside:
+    with whole_file(path, overwrite) as partial:
         if path.suffix == ".npz":
-            np.savez(beside, **{name: np.asarray(part) for name, part in content.items()})
+            np.savez(partial, **{name: np.asarray(part) for name, part in content.items()})
         elif path.suffix == ".json":
-            beside.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+            partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
         else:
-            _write_csv(system, beside)
+            _write_csv(system, partial)
 
 
 def _write_csv(system: StateSpace, path: Path) -> None:

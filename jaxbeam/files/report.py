@@ -91,12 +91,12 @@ def write_report(
     for section in sections:
         for part in section.parts:
             if isinstance(part, ReportFigure) and part.figure is not None and not part.embedded:
-                with whole_file(folder / f"{part.name}.png", overwrite) as beside:
-                    part.figure.savefig(beside)
+                with whole_file(folder / f"{part.name}.png", overwrite) as partial:
+                    part.figure.savefig(partial)
     pages = {"report.md": markdown(title, sections), "report.html": html(title, sections, style)}
     for name, text in pages.items():
-        with whole_file(folder / name, overwrite) as beside:
-            beside.write_text(text, encoding="utf-8")
+        with whole_file(folder / name, overwrite) as partial:
+            partial.write_text(text, encoding="utf-8")
 
 
 def markdown(title: str, sections: Sequence[ReportSection]) -> str:

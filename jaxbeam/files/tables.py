@@ -102,8 +102,8 @@ def write_dataset(
 ) -> None:
     """Write a labelled dataset to .nc or .zarr; see `save` for what is raised."""
     check_ending(path, "a dataset", DATASETS)
-    with whole_file(path, overwrite) as beside:
-        _write_dataset(beside, dataset)
+    with whole_file(path, overwrite) as partial:
+        _write_dataset(partial, dataset)
 
 
 def write_table(path: str | os.PathLike, columns: Columns, overwrite: bool = False) -> None:
@@ -119,8 +119,8 @@ def write_table(path: str | os.PathLike, columns: Columns, overwrite: bool = Fal
     lengths = {column.size for column in plain.values()}
     if len(lengths) > 1:
         raise ValueError(f"the columns of a table must be equally long, not {sorted(lengths)}")
-    with whole_file(path, overwrite) as beside:
-        WRITERS[beside.suffix](beside, plain)
+    with whole_file(path, overwrite) as partial:
+        WRITERS[partial.suffix](partial, plain)
 
 
 def _plain(column) -> np.ndarray:
@@ -129,12 +129,12 @@ def _plain(column) -> np.ndarray:
     return column.astype(object) if column.dtype.kind in "UO" else column.astype(float)
 
 
-def _write_dataset(beside: Path, dataset: "xarray.Dataset") -> None:
+def _write_dataset(partial: Path, dataset: "xarray.Dataset") -> None:
     # Empty dimensions would become unlimited ones in a file.
     empty = [name for name in dataset.variables if dataset[name].size == 0]
     dataset = dataset.drop_vars(empty)
-    if beside.suffix == ".nc":
-        dataset.to_netcdf(beside, engine="scipy")
+    if partial.suffix == ".nc":
+        dataset.to_netcdf(partial, engine="scipy")
         return
     # Zarr specifies strings of variable length, not of fixed length.
     texts = {
@@ -142,13 +142,13 @@ def _write_dataset(beside: Path, dataset: "xarray.Dataset") -> None:
         for name, values in dataset.variables.items()
         if values.dtype.kind == "U"
     }
-    dataset.assign(texts).to_zarr(beside, mode="w", consolidated=False, zarr_format=3)
+    dataset.assign(texts).to_zarr(partial, mode="w", consolidated=False, zarr_format=3)
 
 
-def _write_csv(beside: Path, columns: Columns) -> None:
+def _write_csv(partial: Path, columns: Columns) -> None:
     import csv
 
-    with beside.open("w", encoding="utf-8", newline="") as file:
+    with partial.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(map(as_text_cell, columns))
         writer.writerows(_rows(columns))
@@ -167,7 +167,7 @@ def _text_or_number(cell: Any) -> Any:
     return as_text_cell(cell) if isinstance(cell, str) else cell
 
 
-def _write_excel(beside: Path, columns: Columns) -> None:
+def _write_excel(partial: Path, columns: Columns) -> None:
     import openpyxl
     from openpyxl.writer.excel import ExcelWriter
 
@@ -181,7 +181,7 @@ def _write_excel(beside: Path, columns: Columns) -> None:
     for row in itertools.chain([map(as_text_cell, columns)], _rows(columns)):
         sheet.append([_excel_cell(cell) for cell in row])
     # `book.save` leaves a file open that it cannot write.
-    with zipfile.ZipFile(beside, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as archive:
         ExcelWriter(book, archive).save()
 
 
@@ -192,7 +192,7 @@ def _excel_cell(cell: Any) -> Any:
     return cell if np.isfinite(cell) else None
 
 
-def _write_matlab(beside: Path, columns: Columns) -> None:
+def _write_matlab(partial: Path, columns: Columns) -> None:
     import scipy.io
 
     texts = {head: column for head, column in columns.items() if column.dtype == object}
@@ -204,13 +204,13 @@ def _write_matlab(beside: Path, columns: Columns) -> None:
     if texts:
         content["text_columns"] = np.array(list(texts), dtype=object)
         content["texts"] = np.stack(list(texts.values()), axis=-1)
-    scipy.io.savemat(beside, content)
+    scipy.io.savemat(partial, content)
 
 
-def _write_parquet(beside: Path, columns: Columns) -> None:
+def _write_parquet(partial: Path, columns: Columns) -> None:
     import pyarrow.parquet
 
-    pyarrow.parquet.write_table(pyarrow.table(dict(columns)), beside)
+    pyarrow.parquet.write_table(pyarrow.table(dict(columns)), partial)
 
 
 WRITERS: dict[str, Callable[[Path, Columns], None]] = {

@@ -105,6 +105,6 @@ def write_fmu(case: Case, path: str | os.PathLike, part: str = "beam", overwrite
         with open(script, "w", encoding="utf-8") as file:
             file.write(text)
         built = FmuBuilder.build_FMU(script, scratch / "out", [scratch / "case.toml"])
-        with whole_file(path, overwrite) as beside:
-            shutil.copy(built, beside)
+        with whole_file(path, overwrite) as partial:
+            shutil.copy(built, partial)
     return path

@@ -1,8 +1,8 @@
 """Where along the beam a quantity is taken: the positions, their sides, and extremes between them.
 
-Ends, supports, hinges, changes of section, actuators, sensors and loads that stand are positions
-beside a grid. What jumps there, as shear forces and moments, is taken on both sides. Between
-positions the extremes are refined until they no longer change.
+Positions are those of a grid, of ends, supports, hinges, changes of section, actuators, sensors and
+stationary loads. A quantity that jumps there, as a shear force or a moment, is taken on both sides.
+Between positions the extremes are refined until they no longer change.
 """
 
 from collections.abc import Callable
@@ -22,13 +22,13 @@ from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime.arrays import Array, any_traced, set_at, xp
 
 GRID = 101  # equally spaced positions
-LEFT_SHARE = 1e-7  # of the length, from a position to the section left of it: steps end at both
+LEFT_DISTANCE = 1e-7  # from a position to the section left of it, over the length
 SETTLED = 1e-4  # change of an extreme, relative to it, at which positions are dense enough
 LEAST_SIZE = 1e-3  # of the largest value, below which an extreme need not settle
 MAX_ROUNDS = 8
-SETTLED_ROUNDS = 2  # without a change; where a curve jumps, its fall beside a peak says nothing
+SETTLED_ROUNDS = 2  # without a change; where a curve jumps, its fall next to a peak says nothing
 CANDIDATES = 6  # peaks along the beam that are refined at a time
-INNER = np.array([0.2, 0.4, 0.6, 0.8])  # of an interval beside a peak
+INNER = np.array([0.2, 0.4, 0.6, 0.8])  # of an interval next to a peak
 
 
 def special_positions(case: Case) -> Float[Array, " place"]:
@@ -56,28 +56,30 @@ def _kink_places(case: Case) -> list:
     return [*places, *standing]
 
 
-def moving_with(case: Case, x, beside=()) -> tuple[Float[Array, " position"], np.ndarray]:
-    """Known positions x (m) that move with what is there, and which do.
+def moving_positions(case: Case, x, load_places=()) -> tuple[Float[Array, " position"], np.ndarray]:
+    """Positions x (m) with the derivatives of the part of the case at each, and which have any.
 
-    Of what is at one place the first of `special_positions` counts, after them the places `beside`
-    the positions, of loads at the times of extremes there. Sensors, and what is known, do not move.
+    Concrete positions x become those of ends, supports, hinges, edges, actuators and stationary
+    loads within rounding of them, and of loads at the times of extremes (`load_places`), so that
+    they move with these when differentiated. The first of `special_positions` at a place counts.
+    Sensors and parts of concrete numbers do not move.
     """
     tolerance = NODE_TOLERANCE * float(concrete(case.beam.length))
-    known, moving = x, np.zeros(x.size, bool)
-    for place in (*beside, *reversed(_kink_places(case))):
-        near = np.abs(concrete(place) - known) <= tolerance
+    given, moving = x, np.zeros(x.size, bool)
+    for place in (*load_places, *reversed(_kink_places(case))):
+        near = np.abs(concrete(place) - given) <= tolerance
         if near.any():
             moving = np.where(near, any_traced(place), moving)
-            x = xp.where(near, place if any_traced(place) else known, x)
-    return (x if moving.any() else known), moving
+            x = xp.where(near, place if any_traced(place) else given, x)
+    return (x if moving.any() else given), moving
 
 
 def positions_along(
     case: Case, count: int = GRID, places: Float[np.ndarray, " place"] | tuple = ()
 ) -> Float[Array, " position"]:
-    """Ascending positions (m): `count` equally spaced ones, the special ones and known `places`.
+    """Ascending positions (m): `count` equally spaced ones, the special ones and concrete `places`.
 
-    Grid points that are special ones but for rounding are left out, where the numbers are known.
+    Grid points within rounding of special positions are left out, where numbers are concrete.
     """
     special, grid = special_positions(case), case.beam.length * np.linspace(0.0, 1.0, count)
     if not is_concrete(special):
@@ -88,16 +90,17 @@ def positions_along(
 
 
 def _is_among(case: Case, x, places) -> np.ndarray:
-    """Whether known positions are among some ascending places."""
+    """Whether concrete positions x (m) are within rounding of one of the ascending places (m)."""
     after = np.clip(np.searchsorted(places, x), 1, len(places) - 1)
     distance = np.minimum(np.abs(x - places[after - 1]), np.abs(x - places[after]))
     return distance <= NODE_TOLERANCE * float(concrete(case.beam.length))
 
 
 class EnvelopeSections(NamedTuple):
-    """Points (m) at which a quantity is computed for positions: them, then those left of some.
+    """Points (m) at which a quantity is computed: the positions, then sections left of some.
 
-    A quantity that jumps at a position has its value to the right of it there.
+    `left_of` has the indices of the positions with such a section. At a position itself a quantity
+    that jumps has its value to the right.
     """
 
     points: Float[Array, " point"]
@@ -119,7 +122,7 @@ class EnvelopeSections(NamedTuple):
 
 
 def sections(case: Case, x: Float[Array, " position"], quantity: str) -> EnvelopeSections:
-    """EnvelopeSections at which a quantity is computed for positions x (m) of an envelope.
+    """Points at which a quantity is computed for the positions x (m) of an envelope.
 
     Shear forces and torques are taken on both sides of all positions, as a load may be at any;
     moments and other derivatives of the deflection on both sides of the special ones.
@@ -140,7 +143,7 @@ def left_of(case: Case, x) -> Float[Array, "*position"]:
     Further away than a wheel moves in the shortest step: there a shear force jumps between steps.
     """
     length = case.beam.length
-    return xp.clip(xp.asarray(x, float) - LEFT_SHARE * length, 0.0, length)
+    return xp.clip(xp.asarray(x, float) - LEFT_DISTANCE * length, 0.0, length)
 
 
 def refined(
@@ -149,12 +152,13 @@ def refined(
     curves: Callable[[Any], tuple],
     x: Float[Array, " position"] | None = None,
 ) -> tuple[Float[Array, " refined"], Any]:
-    """Positions x (m), by default `positions_along`, further ones at extremes, and what is there.
+    """Positions x (m) with further ones at extremes, and what `evaluate` returns at all of them.
 
+    x are `positions_along` by default.
     `evaluate` returns a tree of arrays with an axis of positions first, of which `curves` gives the
-    values (position, curve) whose maxima are refined, the size of each curve, and known places (m),
-    of loads, near maxima. A maximum that SETTLED_ROUNDS leave as it is has settled. Traced numbers
-    are not refined.
+    values (position, curve) whose maxima are refined, the size of each curve, and concrete places
+    (m) of loads near maxima. A maximum unchanged by SETTLED_ROUNDS has settled. Traced numbers are
+    not refined.
     """
     x = positions_along(case) if x is None else x
     found = evaluate(x)
@@ -181,7 +185,7 @@ def refined(
 
 
 def _beside_peaks(x, values, size, near) -> Float[np.ndarray, " added"]:
-    """Positions in the intervals beside the peaks of a curve that may exceed its largest value.
+    """Positions in the intervals next to the peaks of a curve that may exceed its largest value.
 
     By more than a settled part of it, unless that is next to nothing of its size: between a peak
     and its neighbours a curve rises by half of what it falls to them, at most about.

@@ -70,7 +70,7 @@ def shaker_channels(index: int) -> tuple[tuple[str, str], ...]:
 
 
 def common_pairs(case: Case) -> tuple[tuple[str, str], ...]:
-    """Pairs of each command and each sensor, and those along electrodynamic shakers.
+    """Default pairs (input, output): each command with each sensor, and `shaker_channels`.
 
     Without commands, a force at each sensor and that sensor. Raises ValueError if a case has
     neither.
@@ -93,7 +93,10 @@ def common_pairs(case: Case) -> tuple[tuple[str, str], ...]:
 
 
 def check_pairs(case: Case, pairs: Iterable[Sequence[str]]) -> tuple[ChannelPair, ...]:
-    """Pairs with their units. Raises ValueError for channels that the case does not have."""
+    """Pairs (input, output) of a case with their units.
+
+    Raises ValueError for channels that the case does not have.
+    """
     checked = []
     for source, output in pairs:
         output_unit, input_unit = _output_unit(case, output), _input_unit(case, source)

@@ -45,7 +45,7 @@ from jaxbeam.runtime.arrays import (
 )
 from jaxbeam.runtime.module import Module
 
-KNOWN_BLOCK = 2**14  # instants times wheels at once: fifty for 30 s take 0.1 GiB, not 0.9
+CONCRETE_BLOCK = 2**14  # instants times wheels at once: fifty for 30 s take 0.1 GiB, not 0.9
 
 
 class SurfaceRows(Module):
@@ -72,8 +72,9 @@ def surface_rows(
     inertia=True,
     eccentricity=None,
 ) -> SurfaceRows:
-    """Rows at wheels; velocity and deflection with `springs`, acceleration with `inertia` only.
+    """Rows from modal states to the motion of the beam under wheels.
 
+    Velocity and deflection are computed with `springs` only, accelerations with `inertia` only.
     Position (m), speed (m/s), acceleration (m/s^2) and `active` (on the beam) of the wheels all
     have the shape (*wheel,), to which that of the `eccentricity` (m) is broadcast.
     """
@@ -116,7 +117,8 @@ def surface_rows(
 class ContactState(Module):
     """Contact forces f (N, upwards on the beam) and accelerations at instants.
 
-    Of the coordinates q, and of the degrees of freedom of the vehicles of each load (m/s^2).
+    Accelerations of the coordinates q, and of the degrees of freedom of the vehicles of each load
+    (m/s^2 or rad/s^2).
     """
 
     force: Float[Array, "*time wheel batch"]
@@ -131,11 +133,11 @@ def contact_at(
     states: Float[Array, "*time state batch"],
     commands: Float[Array, "*time actuator batch"] | None = None,
 ) -> ContactState:
-    """Contact forces and accelerations at instants (s), with the states of model and vehicles.
+    """Contact forces and accelerations at times (s), from the states of model and vehicles.
 
-    At the instant at which a wheel enters or leaves, those just after it.
+    At the instant at which a wheel enters or leaves, the values just after it.
     """
-    count = KNOWN_BLOCK // max(loads.wheel_count, 1)
+    count = CONCRETE_BLOCK // max(loads.wheel_count, 1)
     if times.ndim != 1 or times.size <= count or any_jax(model, loads, times, states, commands):
         return _contact_at(model, loads, times, states, commands)
     blocks = []
@@ -198,9 +200,10 @@ def _pressing_forces(
     mass: Float[Array, "*time load batch"],
     free_force: Float[Array, "*time load batch"],
 ) -> Float[Array, "*time load batch"]:
-    """Contact forces f of (1 + m S S') f = -W - s - m (acceleration row) . z, the free force.
+    """Contact forces f (N), solved from (1 + m S S') f = free force, with S the mode shapes.
 
-    Or by the generalised forces Q = S' f of (1 + S' m S) Q = S' (free force), if they are fewer.
+    The free force is -W - s - m (acceleration row) . z. Where modes are fewer than loads, the
+    generalised forces Q = S' f are solved first: (1 + S' m S) Q = S' (free force).
     """
     loads, modes = shape.shape[-2:]
     if loads <= modes:
@@ -213,9 +216,9 @@ def _pressing_forces(
 
 
 def split_states(state_count: int, loads: LoadSet, states: Float[Array, "*time state batch"]):
-    """States of the model, `state_count`, and of the vehicles of each load after them.
+    """States of the modal model, and those of the vehicles of each load, of all `states`.
 
-    Those are (*time, vehicle, state, batch).
+    The first `state_count` are those of the model; each load's are (*time, vehicle, state, batch).
     """
     first, vehicle_states = state_count, []
     for group in loads.wheels.vehicles:
@@ -226,7 +229,10 @@ def split_states(state_count: int, loads: LoadSet, states: Float[Array, "*time s
 
 
 def forces_of_wheels(loads: LoadSet, spring_forces, like, axis: int = -2):
-    """Forces of the springs of all wheels, along an axis; zero for those without springs."""
+    """Spring forces (N) of all wheels along an axis, from those of the vehicles of each load.
+
+    Zero for wheels without springs; `like` is an array of the shape that a wheel without has.
+    """
     parts, first = [], 0
     for group, force in zip(loads.wheels.vehicles, spring_forces, strict=True):
         parts += [xp.zeros_like(slice_in_dim(like, first, group.first_wheel, axis)), force]
@@ -237,7 +243,7 @@ def forces_of_wheels(loads: LoadSet, spring_forces, like, axis: int = -2):
 def solve_at_instants(
     matrix: Float[Array, "*time load load batch"], right: Float[Array, "*time load batch"]
 ) -> Float[Array, "*time load batch"]:
-    """Solutions of small systems, with instants and batch as one batch axis."""
+    """Solutions x of small systems matrix x = right, one for each instant and run of a batch."""
     loads = right.shape[-2]
     columns = xp.moveaxis(right, -2, 0)
     systems = math.prod(columns.shape[1:])
@@ -305,9 +311,10 @@ def _solve_contact_forces_jvp(primals, tangents):
 
 
 class ContactRows(Module):
-    """S, m (kg; zero off the beam), V and Y at some times; see the module. Y has no vehicle part.
+    """Matrices of the contact law at some times: shape S, mass m, force V and surface Y.
 
-    Without vehicles Y is None.
+    The law stands at the head of this file. Masses (kg) are zero off the beam; Y has no columns of
+    vehicle states, and is None without vehicles.
     """
 
     shape: Float[Array, "*time wheel mode"]
@@ -317,7 +324,7 @@ class ContactRows(Module):
 
 
 def contact_rows(model: ModalModel, loads: LoadSet, times: Float[Array, "*time"]) -> ContactRows:
-    """Contact law at times (s); at those of entry and exit, that just after."""
+    """Matrices of the contact law at times (s): just after a wheel that enters or leaves then."""
     kinematics = (*loads.kinematics(times), loads.on_beam(times))
     position, speed, acceleration, active = (xp.moveaxis(part, 0, -1) for part in kinematics)
     wheels, springs = loads.wheels, bool(loads.wheels.vehicles)
@@ -341,7 +348,7 @@ def mass_contact_rows(
     active: Bool[Array, "*time wheel"],
     mass: Float[Array, "*time wheel"],
 ) -> ContactRows:
-    """Contact law of masses (kg) at positions (m) that travel at constant speeds (m/s).
+    """Matrices of the contact law of masses (kg) at positions (m) with constant speeds (m/s).
 
     `active` ones are on the beam.
     """
@@ -351,7 +358,7 @@ def mass_contact_rows(
 def _mass_rows(
     model, motion, inertia, springs, eccentricity=None
 ) -> tuple[ContactRows, SurfaceRows]:
-    """Contact law of the masses (kg) alone, and the rows of the surface under the wheels."""
+    """Matrices of the contact law without springs, and the rows of the surface under the wheels."""
     position, speed, acceleration, active = motion
     kinematics = position, speed, acceleration
     rows = surface_rows(model, *kinematics, active, springs, eccentricity=eccentricity)
@@ -368,7 +375,11 @@ def vehicle_system(
     Float[Array, "vehicle_state wheel"],
     Float[Array, "wheel vehicle_state"],
 ]:
-    """A, B and H of all vehicles as one system, z' = A z + B q, pressing with q - H z; one run."""
+    """Matrices A, B and H of all vehicles of one run as a single linear system.
+
+    z' = A z + B q with the forces q = k y + c y' of the surface under the wheels; the springs press
+    on the beam with q - H z (see `VehicleGroup`).
+    """
     states, wheels = loads.vehicle_states, loads.wheel_count
     blocks, B, H, first = [], xp.zeros((states, wheels)), xp.zeros((wheels, states)), 0
     for group in loads.wheels.vehicles:
@@ -385,15 +396,15 @@ def vehicle_system(
     return (block_diag(*blocks) if blocks else xp.zeros((0, 0))), B, H
 
 
-def has_known_disturbance(loads: LoadSet) -> bool:
-    """Whether anything but the static loads disturbs the beam: a profile, forces over time."""
+def has_prescribed_disturbance(loads: LoadSet) -> bool:
+    """Whether a profile or forces over time disturb the beam in addition to the static loads."""
     return loads.profile is not None or bool(loads.wheels.histories)
 
 
-def known_disturbance(
+def prescribed_disturbance(
     loads: LoadSet, times: Float[Array, "*time"]
 ) -> tuple[Float[Array, "*time wheel"], Float[Array, "*time wheel"]]:
-    """What profile and forces over time add to the weights W and to the forces q (N).
+    """Forces (N) of profile and force histories at times (s): added to the weights W, and to q.
 
     Before the start of a run vehicles stand where they are at t = 0.
     """

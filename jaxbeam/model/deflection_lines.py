@@ -36,14 +36,15 @@ from jaxbeam.runtime.module import Module
 # Positions on an interval between events that determine the deflection exactly there: eleven for a
 # cubic (flexibility) of a cubic (trajectory) times a table of forces, a polynomial of degree ten.
 # Half a period of a sine is interpolated to 1e-7 of its amplitude.
-PEAK_POSITIONS = tuple(float(share) for share in np.linspace(0, 1, 11))
+PEAK_POSITIONS = tuple(float(fraction) for fraction in np.linspace(0, 1, 11))
 BLOCK = 4_000_000  # values of lines under all wheels at a time
-END_SHARE = 1e-5  # of an interval, by which its ends are left out
-# Of all times: shorter intervals lie between a place and the section beside it, and are left out.
+END_FRACTION = 1e-5  # of an interval: width left out at each of its ends
+# Of the span of all times: shorter intervals, between a place and the section next to it, are left
+# out.
 SHORTEST = 1e-9
-# Positions from the middle at which samples are taken, and what takes them to PEAK_POSITIONS: the
-# first two terms of the Taylor series of their polynomial.
-WITHIN = (1 - 2 * END_SHARE) * (np.array(PEAK_POSITIONS) - 0.5)
+# Samples are taken at the positions WITHIN, from the middle of the interval, and extrapolated to
+# PEAK_POSITIONS by the matrix TO_ENDS: two terms of the Taylor series of their polynomial.
+WITHIN = (1 - 2 * END_FRACTION) * (np.array(PEAK_POSITIONS) - 0.5)
 
 
 def _to_ends() -> Float[np.ndarray, "point point"]:
@@ -51,7 +52,7 @@ def _to_ends() -> Float[np.ndarray, "point point"]:
     powers = np.arange(x.size)
     slopes = powers * x[:, None] ** np.maximum(powers - 1, 0)
     derivative = slopes @ np.linalg.inv(x[:, None] ** powers)
-    step = (2 * END_SHARE * x)[:, None]
+    step = (2 * END_FRACTION * x)[:, None]
     return step * derivative + step**2 / 2 * (derivative @ derivative)
 
 
@@ -73,9 +74,9 @@ def influence_functions(case: Case, layout: Layout, x: Float[Array, " position"]
 
 @compiled_if_traced
 def unchecked_influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
-    """`influence_line` of a case and positions (arrays) that are known to be valid.
+    """`influence_line` without checks of the case and of the positions (arrays).
 
-    Of an order TWIST or TWIST_RATE that under 1 N at 1 m left of the axis.
+    For the orders TWIST and TWIST_RATE the force of 1 N acts 1 m left of the axis.
     """
     greens = influence_functions(case, layout, x.reshape(-1), derivative)
     length = case.beam.length
@@ -250,7 +251,9 @@ def _intervals(case: Case, loads: LoadSet, breaks, wave_intervals: int):
 
 
 def intervals_of_waves(case: Case) -> int:
-    """Half periods of the fastest wave of a force of the case from its first event on; 0 without.
+    """Number of half periods of the fastest force wave of a case; 0 without waves.
+
+    Counted from the first event.
 
     Waves last until the end of the run, or the last event if that is later. Raises ValueError where
     there is a wave and a number of the loads or the run is traced.
@@ -261,11 +264,12 @@ def intervals_of_waves(case: Case) -> int:
         return 0
     if not all(map(is_concrete, jax.tree.leaves((case.loads, case.run, case.beam.length)))):
         raise ValueError(
-            "the static peak under a force with waves needs known numbers of loads, run and length:"
+            "the static peak under a force with waves needs concrete numbers of loads, run and"
+            " length:"
             " leave them out of what jax.jit or jax.grad traces"
         )
-    known = concrete_case(case)
-    _, times = _intervals(known, load_set(known), np.zeros(0), 1)
+    case = concrete_case(case)
+    _, times = _intervals(case, load_set(case), np.zeros(0), 1)
     fastest = max(float(np.max(np.abs(concrete(one)))) for one in frequencies)
     return int(np.ceil(2 * fastest * float(times[-1] - times[0]))) + 1
 
@@ -291,7 +295,9 @@ PARTS, PART_TERMS = 8, 24  # in which influence functions that are no cubics are
 
 
 class LoadInfluence(Module):
-    """Static influence of a force on outputs, less that of the modes, over its position.
+    """Influence line of the modes left out: static outputs per newton over the force's position.
+
+    The static influence of a force less that of the modes kept.
 
     Chebyshev `series` of the outputs per newton upwards between the `breaks` (m): nodes of the
     beam, and the outputs, at which moments have kinks and shear forces jump. `mirrored` outputs are
@@ -334,7 +340,7 @@ class LoadInfluence(Module):
         return xp.concatenate([influence, -influence], -1) if self.mirrored else influence
 
     def spread(self, kernel: Kernel) -> "LoadInfluence":
-        """Influence of loads that a track spreads."""
+        """Influence per newton of an axle, whose force the track's `kernel` spreads."""
         nodes, series = spread_series(kernel, self.breaks, self.series)
         twist = self.twist
         if twist is not None:
@@ -360,7 +366,7 @@ class LoadInfluence(Module):
         return dataclasses.replace(self, series=self.twist, twist=None)
 
     def on_line(self, eccentricity) -> "LoadInfluence":
-        """Influence of forces that are all at one eccentricity (m)."""
+        """Influence per newton of forces at one eccentricity (m): bending plus twist."""
         series = self.series if self.twist is None else self.series + eccentricity * self.twist
         return dataclasses.replace(self, series=series, twist=None)
 
@@ -371,7 +377,7 @@ def load_influence(
     on_modes: Float[Array, "mode output"],
     greens: Sequence[tuple[Greens, Float[Array, " _"], Sequence[int]]],
 ) -> LoadInfluence:
-    """Influence of forces on outputs, from influence functions less that of the modes.
+    """Influence line of the modes left out, from exact influence functions of the outputs.
 
     `greens` are influence functions, factors from them to the quantities, and the indices of their
     outputs; the amplitudes of the modes have the influence `on_modes`. Between the breaks both are
@@ -401,9 +407,9 @@ def load_influence(
 
 
 def residual_influence(case: Case, model: ModalModel, x, order: int) -> LoadInfluence:
-    """Influence of forces of loads on the x-derivative of an order of the deflection at x (m).
+    """Influence of loads on an x-derivative of the deflection at x (m), less that of the modes.
 
-    Less that of the modes of a model; filtered by the track of the case.
+    The derivative is of this `order`; forces are spread by the track of the case.
     """
     rows = model.fields(x.reshape(-1), (order,))[0]
     on_modes = solve(model.stiffness(), rows.T)
@@ -418,9 +424,10 @@ def residual_influence(case: Case, model: ModalModel, x, order: int) -> LoadInfl
 def spread_line(
     case: Case, line: Callable, breaks: Float[Array, " break"]
 ) -> tuple[Callable, Float[Array, " _"]]:
-    """Line (*position) -> (*position, x) of a force over its position (m), filtered by the track.
+    """Influence line of an axle whose force the track spreads, and its breaks (m).
 
-    And the positions between which it is smooth; `breaks` are those of the line.
+    `line` is that of a point force over its position, (*position) -> (*position, x), smooth between
+    its `breaks`; without a track both are returned as they are.
     """
     if case.track is None:
         return line, breaks

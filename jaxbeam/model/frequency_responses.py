@@ -127,8 +127,8 @@ class FrequencyResponse(TableViews, Module):
 
         Raises FileExistsError if the file exists and `overwrite` is not set.
         """
-        with whole_file(path, overwrite) as beside:
-            self.to_xarray().to_netcdf(beside, engine="scipy")
+        with whole_file(path, overwrite) as partial:
+            self.to_xarray().to_netcdf(partial, engine="scipy")
 
 
 def frequency_response(

@@ -102,7 +102,7 @@ class StateSpace(Module):
             signals = getattr(self, kind)
             content[kind] = np.array([signal.name for signal in signals], dtype=object)
             content[f"{kind}_units"] = np.array([signal.unit for signal in signals], dtype=object)
-        with whole_file(path, overwrite) as beside, open(beside, "wb") as file:
+        with whole_file(path, overwrite) as partial, open(partial, "wb") as file:
             scipy.io.savemat(file, content)
 
 
@@ -147,6 +147,6 @@ def zeros(
 
 
 def _sort_by_magnitude(values):
-    """In order of magnitude; of conjugates, equal up to rounding, the negative frequency first."""
+    """Complex values in order of magnitude; of a conjugate pair the negative frequency first."""
     sizes = np.array([float(f"{size:.9g}") for size in np.abs(values)])
     return values[np.lexsort((values.imag, sizes))]

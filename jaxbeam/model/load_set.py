@@ -87,7 +87,7 @@ class VehicleGroup(Module):
 
 
 class WheelSet(Module):
-    """Numbers of the wheels, which may differ between the runs of a batch.
+    """Masses, weights, springs and vehicles of all wheels; the runs of a batch may differ in them.
 
     Inertia (kg) and weight (N, the static load), contact stiffness (N/m) and damping (N s/m) of the
     springs between surface and vehicle, and the vehicles. Without vehicles there are no springs.
@@ -103,7 +103,7 @@ class WheelSet(Module):
 
     @property
     def massless(self) -> bool:
-        """Whether all wheels are known to have no inertia or springs: their forces are weights."""
+        """Whether all wheels certainly have no inertia or springs: forces are weights."""
         return not self.vehicles and is_known(self.inertia) and not np.any(self.inertia)
 
     def scaled(self, factor: Float[Array, ""]) -> "WheelSet":
@@ -185,7 +185,7 @@ class LoadSet(Module):
         return sum(group.state_count for group in self.wheels.vehicles)
 
     def _paths(self):
-        """Pairs of trajectory and distances behind it."""
+        """Pairs of a load's trajectory and the distances (m) of its wheels behind the first."""
         return zip(self.trajectories, self.behind, strict=True)
 
     def kinematics(self, times: Float[Array, "*time"]) -> tuple[Float[Array, "wheel *time"], ...]:
@@ -213,7 +213,7 @@ class LoadSet(Module):
         if self.profile is None:
             return None
         height, slope, curvature = self.profile.heights(position)
-        if xp.ndim(height) > xp.ndim(position):  # many known numbers, which are changed in place
+        if xp.ndim(height) > xp.ndim(position):  # concrete profiles of many runs: changed in place
             curvature *= speed[..., None] ** 2
             if np.any(acceleration):
                 curvature += acceleration[..., None] * slope
@@ -249,7 +249,7 @@ class LoadSet(Module):
 
     @property
     def massless(self) -> bool:
-        """Whether all wheels are known to have no inertia or springs: their forces are weights."""
+        """Whether all wheels certainly have no inertia or springs: forces are weights."""
         return self.wheels.massless
 
     def entry_exit_times(self) -> Float[Array, "wheel 2"]:
@@ -287,9 +287,10 @@ class LoadSet(Module):
         return xp.concatenate([xp.zeros(0), *rest])
 
     def passage_times(self, positions: Float[Array, " position"]) -> Float[Array, " time"]:
-        """Times (s) at which wheels pass positions (m), and of jumps in speed or acceleration.
+        """Times (s) at which the motion or force of a wheel is not smooth, in no order.
 
-        And those of the tables of forces, at which these have kinks.
+        Wheels pass the positions (m), jump in speed or acceleration, or have a kink in their table
+        of forces.
         """
         times = [path.passage_times(positions, behind) for path, behind in self._paths()]
         times += [history.times[:, 0] for history in self.wheels.histories.values()]
@@ -320,7 +321,7 @@ def load_set(case: Case, layout: Layout | None = None) -> LoadSet:
 
 
 def _eccentricities(case: Case, vehicles: Sequence[VehicleModel]) -> Float[Array, " wheel"] | None:
-    """Distances (m) of all wheels left of the axis; None where no load has one."""
+    """Eccentricity (m, left of the axis) of each wheel; None where no load has one."""
     arms = [getattr(load, "eccentricity", None) for load in case.carried]
     if all(arm is None for arm in arms):
         return None
@@ -337,7 +338,7 @@ def wheel_set(case: Case) -> WheelSet:
 
 
 def _wheels(loads: Sequence[AbstractLoad | Absorber], vehicles: Sequence[VehicleModel]) -> WheelSet:
-    """The same of loads whose vehicles are known."""
+    """`wheel_set`, given the vehicle model of each load."""
     counts = [load.spacings().shape[0] for load in loads]
 
     def of_all_wheels(name):
@@ -359,7 +360,7 @@ def _wheels(loads: Sequence[AbstractLoad | Absorber], vehicles: Sequence[Vehicle
 
 
 def _vehicle_group(vehicle: VehicleModel, first_wheel: int, count: int) -> VehicleGroup:
-    """Vehicles as linear systems, as a batch of one run."""
+    """State matrices of the `count` equal vehicles of one load, as a batch of one run."""
     dofs, wheel_map = vehicle.mass.shape[0], vehicle.wheel_map
     right = -vehicle.full_stiffness, -vehicle.full_damping, wheel_map.T
     rates = xp.linalg.solve(vehicle.mass, xp.concatenate(right, axis=1))

@@ -96,7 +96,7 @@ class ModalModel(Module):
 
     @property
     def load_breaks(self) -> Float[Array, " break"]:
-        """Those of the `load_nodes` at which the mode shapes under a wheel are not smooth (m)."""
+        """Positions of a wheel (m) at which its mode shapes are not smooth, of the `load_nodes`."""
         return self.load_nodes[1:-1] if self.modes.rail_series is None else xp.zeros(0)
 
     @property
@@ -110,7 +110,7 @@ class ModalModel(Module):
         return self.modes.twist_series if self.spread is None else self.spread.twist
 
     def load_places(self, places: Float[Array, " place"]) -> Float[Array, " wheel_place"]:
-        """Positions of a wheel (m) at which its force, or a share of it, is at places (m)."""
+        """Positions of a wheel (m) at which its force, or a spread part of it, is at places (m)."""
         if self.spread is None:
             return places
         return (places[:, None] - self.spread.offsets).reshape(-1)
@@ -150,7 +150,7 @@ _compiled = compiled_if_traced(modal_model)
 
 
 def compiled_modal_model(case: Case, layout: Layout | None = None) -> ModalModel:
-    """Modal model of a case; traced, by one program that cases of other controllers share."""
+    """`modal_model`, compiled once for traced cases that differ only in their controllers."""
     layout = mesh_layout(case) if layout is None else layout
     uncontrolled_case = eqx.tree_at(
         lambda c: c.controller, case, None, is_leaf=lambda leaf: leaf is None

@@ -55,12 +55,12 @@ if TYPE_CHECKING:
     import xarray  # imported where it is used, as it takes as long as all of JAX
 
 MAX_LISTED = 12  # modes in the text of all
-ROUNDING_SHARE = 4e-15  # of the largest coefficient of a shape: smaller ones are rounding errors
+ROUNDING_LEVEL = 4e-15  # of the largest coefficient of a shape: smaller ones are rounding errors
 
 
 @functools.cache
 def _reference_element(degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`bending_basis` as Chebyshev series (degree, function), its mass and bending matrices."""
+    """Chebyshev series (degree, function) of `bending_basis`, and its mass and bending matrices."""
     basis = bending_basis(degree)
     weights = 2 / (2 * np.arange(degree + 1) + 1)
     mass = basis.T @ (weights[:, None] * basis)
@@ -293,7 +293,10 @@ def modes(case: Case, layout: Layout | None = None) -> Modes:
 
 
 def _with_torsion(count: int, stiffness, mass, torsion: TorsionMatrices):
-    """Lowest values of bending and torsion, vectors of both, and coupling (see `eigen`)."""
+    """Lowest `count` eigenvalues of bending and torsion together, eigenvectors and coupling.
+
+    The coupling is that of `eigen`.
+    """
     first, second = stiffness.shape[0], torsion.stiffness.shape[0]
     if torsion.coupling is not None:
         blocks = [[mass, torsion.coupling], [torsion.coupling.T, torsion.mass]]
@@ -316,12 +319,12 @@ def _with_torsion(count: int, stiffness, mass, torsion: TorsionMatrices):
 
 
 def _without_rounding(series):
-    """Series with the coefficients zero that are rounding errors; their derivatives stay.
+    """Series whose coefficients below rounding are set to zero; derivatives of these stay.
 
     A third derivative, hence a shear force, multiplies that of degree n by up to n^6 / 15.
     """
     largest = xp.max(xp.abs(series), axis=1, keepdims=True)
-    noise = xp.where(xp.abs(series) < ROUNDING_SHARE * largest, series, 0.0)
+    noise = xp.where(xp.abs(series) < ROUNDING_LEVEL * largest, series, 0.0)
     return series - stop_gradient(noise)
 
 

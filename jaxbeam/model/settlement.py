@@ -126,7 +126,7 @@ def settled_beam(case: Case, layout: Layout | None = None, settlements=None) -> 
     supports prescribe move the others by K_ff d_f = -K_fh d_h + k s. `layout` (from `mesh_layout`)
     is needed where numbers of the case are traced.
 
-    Raises ValueError for a beam that is not held in place, of known numbers.
+    Raises ValueError for a beam of concrete numbers that is not held in place.
     """
     layout = find_layout(case) if layout is None else layout
     if settlements is None:
@@ -155,16 +155,16 @@ def settled_beam(case: Case, layout: Layout | None = None, settlements=None) -> 
             held.append(w)
     free = np.setdiff1d(np.arange(size), held)
     stiffness = system.stiffness[np.ix_(free, free)]
-    known = free.size > 0 and is_concrete(stiffness)
-    if known and np.linalg.eigvalsh(concrete(stiffness))[0] <= LEAST_STIFFNESS:
+    checked = free.size > 0 and is_concrete(stiffness)
+    if checked and np.linalg.eigvalsh(concrete(stiffness))[0] <= LEAST_STIFFNESS:
         raise ValueError(
             "supports settle, but do not hold the beam in place: clamp an end, or add supports"
         )
     right = force[free] - system.stiffness[np.ix_(free, held)] @ displacement[np.array(held, int)]
     displacement = set_at(displacement, free, solve(stiffness, right))
     padded = xp.concatenate([displacement, xp.zeros(1)])  # -1: no displacement
-    of_parts = padded[system.unknowns]
-    left, over = of_parts[:, :2, None], of_parts[:, 2:, None]
+    unknowns = padded[system.unknowns]
+    left, over = unknowns[:, :2, None], unknowns[:, 2:, None]
     across = system.transfer.across()
     forces = system.force_of_deflection @ (over - across[:, :2, :2] @ left)
     states = xp.concatenate([left, forces], axis=1)[..., 0]
@@ -179,7 +179,7 @@ def settlement_response(
     `settlements` (support,) in m, positive downwards, are those of the `supports` of the case,
     rigid or elastic, in place of their own; an end settles as a rigid support at its position.
     `derivative` is that of `influence_line`: with 2, times the bending stiffness, it is a bending
-    moment. Differentiable in settlements and stiffnesses; the positions of supports must be known.
+    moment. Differentiable in settlements and stiffnesses; positions of supports must be concrete.
 
     Raises ValueError as `influence_line` does, and for a number of settlements other than that of
     the supports.

@@ -23,7 +23,7 @@ from jaxbeam.runtime.module import Module
 class SpreadShapes(Module):
     """Series of filtered mode shapes (kg^-1/2) between nodes (m), over the position of an axle.
 
-    And of those of the twist, of a beam that has it.
+    `offsets` (m) are those of the track's kernel; `twist` is the series of the twist, if any.
     """
 
     nodes: Float[Array, " node"]
@@ -51,9 +51,9 @@ def _integration_matrix(terms: int) -> np.ndarray:
 def spread_series(
     kernel: Kernel, nodes: Float[Array, " node"], series: Float[Array, "segment term column"]
 ) -> tuple[Float[Array, " break"], Float[Array, "piece _ column"]]:
-    """Series of a function between its nodes (m), zero beyond, as the filter of a track makes it.
+    """Breaks (m), and series between them, of a function filtered by the kernel of a track.
 
-    And the breaks (m) between which they are.
+    The function is given by its `series` between `nodes` (m) and is zero beyond.
     """
     last = 0.0
     if kernel.integrated:

@@ -22,9 +22,9 @@ from jaxbeam.case.validation import check_plant
 from jaxbeam.model.contact import (
     ContactRows,
     contact_rows,
-    has_known_disturbance,
+    has_prescribed_disturbance,
     initial_vehicle_states,
-    known_disturbance,
+    prescribed_disturbance,
     vehicle_signals,
     vehicle_system,
 )
@@ -81,7 +81,7 @@ class Plant(Module):
         """States that `augmented` adds to those of the beam, at the start of a run."""
         start = initial_vehicle_states(self.loads)
         vehicles = xp.zeros(0) if start is None else start[:, 0]
-        one = xp.ones(int(has_known_disturbance(self.loads)))
+        one = xp.ones(int(has_prescribed_disturbance(self.loads)))
         return xp.concatenate([vehicles, self.weights, one])
 
     @property
@@ -145,8 +145,8 @@ class Plant(Module):
         frozen_system, commands = self.at(t), self.commands
         columns = frozen_system.B[..., commands:], frozen_system.D[..., commands:]
         constants = frozen_system.inputs[commands:]
-        if has_known_disturbance(self.loads):
-            weight, surface = known_disturbance(self.loads, xp.asarray(t, float))
+        if has_prescribed_disturbance(self.loads):
+            weight, surface = prescribed_disturbance(self.loads, xp.asarray(t, float))
             lead, weight = [(0, 0)] * (surface.ndim - 1), weight[..., None]
             vehicle_rates = surface @ vehicle_system(self.loads)[1].T
             vehicle_rates = xp.pad(vehicle_rates, [*lead, (len(self.states), 0)])[..., None]

@@ -77,7 +77,7 @@ def residual_flexibility(
 
 
 def _residual_flexibility(case: Case, x, load_positions, derivative: int, layout: Layout):
-    """The same of a case and positions that are known to be valid."""
+    """`residual_flexibility` without checks of the case and of the positions."""
     x, load_positions = xp.asarray(x, float), xp.asarray(load_positions, float)
     exact = unchecked_influence_line(case, layout, x, load_positions, derivative)
     return exact - modal_influence_line(case, layout, x, load_positions, derivative)
@@ -85,7 +85,7 @@ def _residual_flexibility(case: Case, x, load_positions, derivative: int, layout
 
 @compiled_if_traced
 def modal_influence_line(case: Case, layout: Layout, x, load_positions, derivative: int):
-    """The part of the modes in `unchecked_influence_line`."""
+    """Part of `unchecked_influence_line` that the modes represent."""
     model = modal_model(case, layout)
     of_load = derivative if derivative in OF_TWIST else 0
     load_shapes = model.fields(load_positions.reshape(-1), (TWIST if of_load else 0,))[0]
@@ -203,9 +203,9 @@ def port_forces(
 
 
 def is_supported(case: Case, layout: Layout) -> bool:
-    """Whether exact statics corrects sums of modes: the beam is held and has no track of layers.
+    """Whether sums of modes are statically corrected: the beam is held, without a track of layers.
 
-    If traced, held by the kind of its holds.
+    A traced beam counts as held by the kinds of its supports.
     """
     if case.on_rail:
         return False

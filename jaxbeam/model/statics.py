@@ -25,7 +25,7 @@ from jaxbeam.model.deflection_lines import (
     validated_layout,
 )
 from jaxbeam.model.layout import Layout, is_uniform
-from jaxbeam.model.sensing.output_rows import SIDE_SHARE, beside, quantity_factor
+from jaxbeam.model.sensing.output_rows import SIDE_DISTANCE, at_side, quantity_factor
 from jaxbeam.model.settlement import settlement_response
 from jaxbeam.model.static_correction import section_stiffness
 from jaxbeam.runtime.arrays import Array, xp
@@ -68,7 +68,7 @@ def influence_line(
     For the deflection, `derivative` (up to 3) gives that x-derivative instead, in
     m^(1-derivative)/N, and by reciprocity the line is the deflected shape under 1 N at x.
     Differentiable in every number. Inside `jit`, pass the `layout` found outside by
-    `model.modes.mesh_layout(case)`, and positions of reactions that are known.
+    `model.modes.mesh_layout(case)`, and concrete positions of reactions.
 
     Raises ValueError for an invalid case, a position off the beam, a beam that can move as a rigid
     body, an unknown quantity or side, or a reaction where nothing holds the deflection.
@@ -112,7 +112,7 @@ def static_peak(
     Quantities, `derivative` of the deflection, and `side` are those of `influence_line`. The
     maximum is exact where the beam is uniform and forces have no waves: between the events of a
     crossing the value is a polynomial in time. Differentiable in every number where the maximum is
-    unique. Inside `jit`, pass the `layout`; the numbers of loads with waves must be known. Raises
+    unique. Inside `jit`, pass the `layout`; numbers of loads with waves must be concrete. Raises
     ValueError as `influence_line` does.
 
     >>> import jaxbeam as jb
@@ -148,8 +148,8 @@ class _Kind(NamedTuple):
 
 def _checked_kind(case: Case, x, kind: _Kind) -> _Kind:
     if kind.quantity not in STATIC_QUANTITIES:
-        known = suggestion(kind.quantity, STATIC_QUANTITIES)
-        raise ValueError(f"no influence line of {kind.quantity!r}; {known}")
+        advice = suggestion(kind.quantity, STATIC_QUANTITIES)
+        raise ValueError(f"no influence line of {kind.quantity!r}; {advice}")
     if kind.side not in SIDES:
         raise ValueError(f"side must be 'left' or 'right' of x, not {kind.side!r}")
     if kind.derivative and kind.quantity != "deflection":
@@ -184,9 +184,10 @@ def _static_peak(
 
 
 def _line(case: Case, layout: Layout, x, kind: _Kind, fibre_distance, section_modulus):
-    """Influence line at positions x (m) as a function (position...) -> (position..., x) in m.
+    """Influence line of x (m) as a function of the force's position, and its breaks (m).
 
-    And the positions (m) between which it is smooth.
+    The function maps positions (position...) to values (position..., x); it is smooth between the
+    breaks.
     """
     length, rigidity = case.beam.length, case.beam.bending_stiffness
 
@@ -200,7 +201,7 @@ def _line(case: Case, layout: Layout, x, kind: _Kind, fibre_distance, section_mo
     if kind.quantity == "deflection":
         return field(x, kind.derivative)
     entry = quantity_of(kind.quantity, fibre_distance, section_modulus)
-    at = beside(case, x, kind.side) if entry.x_derivative else x
+    at = at_side(case, x, kind.side) if entry.x_derivative else x
     line, breaks = field(at, 1 if entry.of_axis and is_uniform(case) else entry.field)
     factor = quantity_factor(case, at, entry, fibre_distance, section_modulus)
     return (lambda y: factor * line(y)), breaks
@@ -209,9 +210,9 @@ def _line(case: Case, layout: Layout, x, kind: _Kind, fibre_distance, section_mo
 def _reaction_line(case: Case, x, field):
     """Reactions in N per newton: jumps of the force V - T w', and the load on the support."""
     length, sides, breaks = case.beam.length, [], []
-    outer = x < length * SIDE_SHARE, x > length * (1 - SIDE_SHARE)
+    outer = x < length * SIDE_DISTANCE, x > length * (1 - SIDE_DISTANCE)
     for side, sign, beyond in zip(SIDES, (-1.0, 1.0), outer, strict=True):
-        at = beside(case, x, side)
+        at = at_side(case, x, side)
         third, own = field(at, 3)
         slope = None if case.beam.axial_force is None else field(at, SLOPE)[0]
         share = xp.where(beyond, 0.0, sign)
@@ -219,7 +220,7 @@ def _reaction_line(case: Case, x, field):
         breaks.append(own)
 
     def line(y):
-        total = xp.where(xp.abs(y[..., None] - x) <= SIDE_SHARE * length, 1.0, 0.0)
+        total = xp.where(xp.abs(y[..., None] - x) <= SIDE_DISTANCE * length, 1.0, 0.0)
         for third, slope, stiffness, share in sides:
             total = total + stiffness * third(y)
             if slope is not None:
@@ -241,7 +242,7 @@ def _check_held(case: Case, x) -> None:
     places, step = held_positions(case), 1e-9 * float(concrete(case.beam.length))
     for one in np.atleast_1d(concrete(x)).ravel():
         if not np.any(np.abs(places - one) <= step):
-            known = ", ".join(f"{place:g}" for place in places) or "none"
+            held = ", ".join(f"{place:g}" for place in places) or "none"
             raise ValueError(
-                f"there is no reaction at {one:g} m; the deflection is held at (m): {known}"
+                f"there is no reaction at {one:g} m; the deflection is held at (m): {held}"
             )

@@ -39,23 +39,23 @@ def whole_file(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Pat
     place = Path(os.path.realpath(path))  # a link stays a link
     _refuse_existing(place, path, overwrite)
     # The ending is that of the name, which decides the format, and not that of the file behind.
-    beside = place.with_name(f".{place.stem}.{os.getpid()}{Path(path).suffix}")
+    partial = place.with_name(f".{place.stem}.{os.getpid()}{Path(path).suffix}")
     try:
         with naming_file(path):
             if not place.parent.is_dir():
                 raise FileNotFoundError(None, f"there is no folder {Path(path).parent}")
             if place.exists() and not (place.is_file() or place.is_dir()):
                 raise OSError(None, "it is a device or a pipe, not a regular file")
-            yield beside
+            yield partial
             _refuse_existing(place, path, overwrite)  # of another process meanwhile
             if place.is_dir():
                 shutil.rmtree(place)
-            os.replace(beside, place)
+            os.replace(partial, place)
     finally:
         with contextlib.suppress(OSError):
-            if beside.is_dir():
-                shutil.rmtree(beside)
-            beside.unlink(missing_ok=True)
+            if partial.is_dir():
+                shutil.rmtree(partial)
+            partial.unlink(missing_ok=True)
     if (written := WRITTEN.get()) is not None:
         written.append(os.fspath(path))
 

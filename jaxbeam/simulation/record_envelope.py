@@ -10,7 +10,7 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.fields import concrete, is_concrete, refuses_traced
 from jaxbeam.case.quantities import QUANTITIES
-from jaxbeam.model.along_beam import moving_with, refined, sections
+from jaxbeam.model.along_beam import moving_positions, refined, sections
 from jaxbeam.model.modes import Modes
 from jaxbeam.model.static_correction import Motion
 from jaxbeam.runtime.arrays import Array, any_traced, known, take, xp
@@ -131,8 +131,8 @@ def record_envelope(
             motion.load_position[np.searchsorted(own_times, time)]
             for time in (found.smallest_time, found.largest_time)
         ]
-        beside = xp.concatenate(at_extremes, axis=1).T
-        positions, _ = moving_with(case, np.asarray(found.positions), list(beside))
+        load_places = xp.concatenate(at_extremes, axis=1).T
+        positions, _ = moving_positions(case, np.asarray(found.positions), list(load_places))
     if positions is not None:
         return at(xp.asarray(positions, float))
     return refined(case, at, curves)[1]
@@ -140,7 +140,7 @@ def record_envelope(
 
 def _envelope_at(case, modes, motion, times, x, quantity, coincident, parameters):
     """Envelope at positions x (m), in blocks of samples."""
-    points, beside = sections(case, x, quantity), sections(case, x, coincident or quantity)
+    points, at_coincident = sections(case, x, quantity), sections(case, x, coincident or quantity)
     size = max(1, len(case.loads), motion.load_position.shape[1])
     size *= points.points.shape[0] + motion.coordinates.shape[1]
     count = -(-times.shape[0] * size // MAX_ENTRIES)
@@ -150,8 +150,8 @@ def _envelope_at(case, modes, motion, times, x, quantity, coincident, parameters
         values = history(case, modes, own, points.points, quantity, *parameters)
         other = None
         if coincident:
-            every = history(case, modes, own, beside.points, coincident, *parameters)
-            most, least = beside.largest(every), beside.smallest(every)
+            every = history(case, modes, own, at_coincident.points, coincident, *parameters)
+            most, least = at_coincident.largest(every), at_coincident.smallest(every)
             other = xp.where(xp.abs(most) >= xp.abs(least), most, least)
         for sign, curve in ((-1.0, -points.smallest(values)), (1.0, points.largest(values))):
             new = _extremes(curve, times[block], own, other)

@@ -12,7 +12,12 @@ from jaxtyping import Float
 from jaxbeam.case.case import Case
 from jaxbeam.case.quantities import SIDES, SLOPE, quantity_of
 from jaxbeam.model.modes import Modes
-from jaxbeam.model.sensing.output_rows import SIDE_SHARE, beside, quantity_factor, quantity_history
+from jaxbeam.model.sensing.output_rows import (
+    SIDE_DISTANCE,
+    at_side,
+    quantity_factor,
+    quantity_history,
+)
 from jaxbeam.model.settlement import has_settlement, settled_beam
 from jaxbeam.model.static_correction import (
     Motion,
@@ -41,7 +46,7 @@ def history(
     changes = quantity_history(case, modes, motion, x, name, *parameters, side=side)
     if not (quantity_of(name, *parameters).section_force and has_settlement(case)):
         return changes
-    return changes + locked_in(case, modes, beside(case, x, side or "right"), name, *parameters)
+    return changes + locked_in(case, modes, at_side(case, x, side or "right"), name, *parameters)
 
 
 def locked_in(
@@ -91,7 +96,7 @@ def reactions(case: Case, modes: Modes, motion: Motion) -> Float[Array, "time su
     T, and the contact forces F of loads that stand on the support. The mass of a bearing is part of
     it: the reaction is that on the ground.
     """
-    nodes, step = _support_nodes(case, modes), SIDE_SHARE * case.beam.length
+    nodes, step = _support_nodes(case, modes), SIDE_DISTANCE * case.beam.length
     x = modes.nodes[nodes]
     first, last = nodes == 0, nodes == modes.nodes.shape[0] - 1
     right, left = (_vertical_force(case, modes, motion, x, side) for side in ("right", "left"))
@@ -133,7 +138,7 @@ def _vertical_force(case: Case, modes: Modes, motion: Motion, x, side: str):
     shear = shear_force(case, modes, motion, x, side)
     if case.beam.axial_force is None:
         return shear
-    x = beside(case, x, side)
+    x = at_side(case, x, side)
     slope = corrected_history(case, modes, motion, x, SLOPE)
     if has_settlement(case):
         slope = slope + settled_beam(case, modes.layout).field(x, SLOPE)

@@ -282,13 +282,13 @@ class RecordViews(TableViews, Module):
         """
         check_ending(path, "an interactive figure", (".html",))
         page = interactive_page(_head(self.case, self.times), self.verdict, self.columns)
-        with whole_file(path, overwrite) as beside:
-            beside.write_text(page, encoding="utf-8")
+        with whole_file(path, overwrite) as partial:
+            partial.write_text(page, encoding="utf-8")
 
     def to_netcdf(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write the labelled dataset to a netCDF file.
 
         Raises FileExistsError if the file exists, without `overwrite`.
         """
-        with whole_file(path, overwrite) as beside:
-            write_netcdf(beside, *self._dataset_parts())
+        with whole_file(path, overwrite) as partial:
+            write_netcdf(partial, *self._dataset_parts())

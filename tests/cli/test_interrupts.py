@@ -108,8 +108,8 @@ def test_experiments_that_are_done_are_kept(folder):
 
 def test_status_and_sentence_within_a_process(folder, capfd, monkeypatch):
     def stopped(*_, **__):
-        with whole_file("a.csv") as beside:
-            beside.write_text("1")
+        with whole_file("a.csv") as partial:
+            partial.write_text("1")
         with kept_in(folder / "none.npz"), keeping(lambda: "inner"), keeping(lambda: ""):
             raise KeyboardInterrupt
 
@@ -133,8 +133,8 @@ def test_checkpoints_are_named(tmp_path, capfd):
     (tmp_path / "search.npz").touch()
     search, other = tmp_path / "search.npz", tmp_path / "b"
     ends = pytest.raises(SystemExit)
-    with ends, interruptible(False), kept_in(search, None), whole_file(other) as beside:
-        beside.touch()
+    with ends, interruptible(False), kept_in(search, None), whole_file(other) as partial:
+        partial.touch()
         raise KeyboardInterrupt
     said = f"the search is kept in {tmp_path / 'search.npz'}: resume it, with --resume"
     assert capfd.readouterr().err == f"jaxbeam: interrupted; {said}\n"

@@ -110,7 +110,7 @@ def test_a_sine_profile_presses_by_springs_dampers_and_inertia():
     moves = times >= 0
     height, speed = 5e-3 * np.sin(angle), 5e-3 * rate * np.cos(angle) * moves
     loads = load_set(jb.Case(CASE.beam, loads=[mass, CAR], profile=PROFILE, run=jb.Run(1.0)))
-    weight, surface = contact.known_disturbance(loads, times)
+    weight, surface = contact.prescribed_disturbance(loads, times)
     tyre = 3e6 * height + 8e3 * speed
     assert_allclose(surface, np.stack([0 * tyre, tyre], axis=-1), rtol=1e-9, atol=1e-9)
     inertia = -5e3 * rate**2 * height * moves

@@ -488,7 +488,7 @@ def test_traced_waves_are_refused_and_constant_forces_are_not():
     assert_allclose(jax.grad(constant)(1e5), central(lambda f: constant(f[0]), [1e5], 1.0)[0])
     assert_allclose(jax.jit(constant)(1e5), 1e5 * moment_line(12.0), rtol=1e-9)
     waves = jb.VaryingForce(force=1e5, frequencies=[1.0], amplitudes=[1.0], position=12.0)
-    with pytest.raises(ValueError, match="waves needs known numbers of loads, run and length"):
+    with pytest.raises(ValueError, match="waves needs concrete numbers of loads, run and length"):
         jax.jit(of_force(waves))(1e5)
 
 

@@ -283,8 +283,8 @@ def test_no_other_module_opens_files_to_read():
 def test_a_write_that_stops_leaves_what_was_there(tmp_path):
     path = tmp_path / "fit.npz"
     path.write_text("precious")
-    with pytest.raises(ZeroDivisionError), whole_file(path, overwrite=True) as beside:
-        beside.write_text("half")
+    with pytest.raises(ZeroDivisionError), whole_file(path, overwrite=True) as partial:
+        partial.write_text("half")
         raise ZeroDivisionError
     assert path.read_text() == "precious" and list(tmp_path.iterdir()) == [path]
 
@@ -292,8 +292,8 @@ def test_a_write_that_stops_leaves_what_was_there(tmp_path):
 def test_what_is_there_is_refused_before_and_after(tmp_path):
     path = tmp_path / "case.toml"
     refused = pytest.raises(FileExistsError, match=r"case.toml exists already")
-    with refused, whole_file(path) as beside:
-        beside.write_text("ours")
+    with refused, whole_file(path) as partial:
+        partial.write_text("ours")
         path.write_text("of another process")
     with pytest.raises(FileExistsError), whole_file(path):
         pytest.fail("nothing is computed")
@@ -305,9 +305,9 @@ def test_a_folder_takes_the_place_of_a_folder_and_links_stay(tmp_path):
     place.mkdir()
     (place / "old").touch()
     link.symlink_to(place)
-    with whole_file(link, overwrite=True) as beside:
-        beside.mkdir()
-        (beside / "new").touch()
+    with whole_file(link, overwrite=True) as partial:
+        partial.mkdir()
+        (partial / "new").touch()
     assert link.is_symlink() and [path.name for path in place.iterdir()] == ["new"]
 
 
@@ -342,8 +342,8 @@ def test_no_file_takes_the_place_of_a_pipe_or_a_device(tmp_path):
 )
 def test_an_error_names_the_file_that_the_user_gave(tmp_path, monkeypatch, error, said):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(OSError) as raised, whole_file("x.csv") as beside:
-        beside.write_text("half")
+    with pytest.raises(OSError) as raised, whole_file("x.csv") as partial:
+        partial.write_text("half")
         raise error
     assert str(raised.value) == f"cannot write x.csv: {said}" and raised.value.errno == error.errno
     assert list(tmp_path.iterdir()) == []

@@ -132,8 +132,8 @@ class ModalFit(ModalEstimates):
 
         check_ending(path, "an interactive figure", (".html",))
         page = diagram_page(self)
-        with whole_file(path, overwrite) as beside:
-            beside.write_text(page, encoding="utf-8")
+        with whole_file(path, overwrite) as partial:
+            partial.write_text(page, encoding="utf-8")
 
     def plot(self, path=None, length: float | None = None):
         """Figure of log, spectrum with stabilisation diagram, fit, and shapes on the beam.

@@ -91,8 +91,8 @@ def plot_modal_fit(fit, path: str | Path | None = None, length: float | None = N
         draw_shapes(rows[-1], fit, length)
     figure.suptitle(f"{Path(fit.log.source).name}: modes from {_kind_text(fit)}")
     if path is not None:
-        with whole_file(path, overwrite=True) as beside:
-            figure.savefig(beside)
+        with whole_file(path, overwrite=True) as partial:
+            figure.savefig(partial)
     return figure
 
 
@@ -241,8 +241,8 @@ def plot_responses(responses, path: str | Path | None = None) -> Figure:
         f"{Path(responses.source).name}: {responses.estimator} of {responses.averages} averages"
     )
     if path is not None:
-        with whole_file(path, overwrite=True) as beside:
-            figure.savefig(beside)
+        with whole_file(path, overwrite=True) as partial:
+            figure.savefig(partial)
     return figure
 
 
@@ -268,8 +268,8 @@ def plot_setups(fit, path: str | Path | None = None, length: float | None = None
     draw_shapes(axes["shapes"], fit, length)
     figure.suptitle(f"modes of {len(fit.setups)} setups")
     if path is not None:
-        with whole_file(path, overwrite=True) as beside:
-            figure.savefig(beside)
+        with whole_file(path, overwrite=True) as partial:
+            figure.savefig(partial)
     return figure
 
 

@@ -108,8 +108,8 @@ class ModeHistory:
         """Write the history to a JSON file, in place of what was there, whole or not at all."""
         content = {"format": FORMAT, "settings": dict(self.settings)}
         content["entries"] = [entry.to_dict() for entry in self.entries]
-        with whole_file(path, overwrite=True) as beside:
-            beside.write_text(json.dumps(content), encoding="utf-8")
+        with whole_file(path, overwrite=True) as partial:
+            partial.write_text(json.dumps(content), encoding="utf-8")
 
 
 def read_history(path: str | os.PathLike) -> ModeHistory:

@@ -53,6 +53,6 @@ def plot_monitoring(
         own.legend(ncols=3, fontsize=7)
     axes[-1].set_xlabel("log")
     if path is not None:
-        with whole_file(path, overwrite=True) as beside:
-            figure.savefig(beside)
+        with whole_file(path, overwrite=True) as partial:
+            figure.savefig(partial)
     return figure

@@ -326,8 +326,8 @@ class Assessment(TableViews):
 
     def save(self, path: str | os.PathLike, overwrite: bool = False) -> None:
         """Write the report as Markdown. Raises FileExistsError unless `overwrite`."""
-        with whole_file(path, overwrite) as beside:
-            beside.write_text(self.to_markdown(), encoding="utf-8")
+        with whole_file(path, overwrite) as partial:
+            partial.write_text(self.to_markdown(), encoding="utf-8")
 
 
 def _listed(items: Iterable[str]) -> list[str]:

@@ -19,7 +19,7 @@ from jaxbeam.library.published import trains as library
 from jaxbeam.model.modal_model import modal_model
 from jaxbeam.model.modes import modes
 from jaxbeam.model.sensing.output_rows import (
-    SIDE_SHARE,
+    SIDE_DISTANCE,
     LinearOutputs,
     linear_outputs,
     sensor_rows,
@@ -126,7 +126,7 @@ def reaction_peaks(
     train. None where poles of the beam are repeated.
     """
     length, model = float(concrete(case.beam.length)), modal_model(case)
-    step, sensors, weights = 4 * SIDE_SHARE * length, [], []
+    step, sensors, weights = 4 * SIDE_DISTANCE * length, [], []
     for number, x in enumerate(positions):
         for place, sign, beyond in ((x - step, -1.0, x == 0), (x, 1.0, x == length)):
             if not beyond:

@@ -29,8 +29,8 @@ def new(kind: str, /, *, output: Output = None, options: OutputOptions = OutputO
     path = output or Path(f"{kind}.toml")
     options.check_outputs(path)
     starter = resources.files("jaxbeam") / "files" / "starters" / f"{kind}.toml"
-    with whole_file(path, options.overwrite) as beside:
-        beside.write_text(starter.read_text(encoding="utf-8"), encoding="utf-8")
+    with whole_file(path, options.overwrite) as partial:
+        partial.write_text(starter.read_text(encoding="utf-8"), encoding="utf-8")
     title = read_toml(path)["title"]
     lines = [f"written: {path}", f"{title}; run it: jaxbeam simulate {path} --plot"]
     options.report({"path": str(path), "title": title}, lines)
@@ -48,7 +48,7 @@ def schema(*, output: Output = None, options: OutputOptions = OutputOptions()) -
     options.check_outputs(path)
     from jaxbeam.files.json_schema import json_schema
 
-    with whole_file(path, options.overwrite) as beside:
-        beside.write_text(json.dumps(json_schema(), indent=1) + "\n", encoding="utf-8")
+    with whole_file(path, options.overwrite) as partial:
+        partial.write_text(json.dumps(json_schema(), indent=1) + "\n", encoding="utf-8")
     line = f"written: {path}; begin a case file with the line: #:schema {path}"
     options.report({"path": str(path)}, [line])

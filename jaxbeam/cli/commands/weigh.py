@@ -113,8 +113,8 @@ def calibrate(
 
     lines = _lines_of(options.read(case), logs, reading)
     if output:
-        with whole_file(output, options.overwrite) as beside:
-            beside.write_text(json.dumps(lines.to_dict()))
+        with whole_file(output, options.overwrite) as partial:
+            partial.write_text(json.dumps(lines.to_dict()))
     options.report(lines.to_dict(), [str(lines)], output)
 
 

@@ -30,8 +30,8 @@ from jaxbeam.control.load_identification import AbstractLoadSource
 from jaxbeam.control.state_controller import AbstractStateLaw
 from jaxbeam.model.contact import (
     contact_rows,
-    has_known_disturbance,
-    known_disturbance,
+    has_prescribed_disturbance,
+    prescribed_disturbance,
     vehicle_system,
 )
 from jaxbeam.model.load_set import LoadSet, load_set
@@ -150,7 +150,7 @@ def crossing_plant(plant: Plant, with_weights: bool) -> tuple[ConstantPlant, Cou
     """
     modal_model, load_count = plant.modal_model, plant.weights.shape[0]
     states, vehicles = modal_model.state_count, plant.vehicle_states
-    disturbed = with_weights and has_known_disturbance(plant.loads)
+    disturbed = with_weights and has_prescribed_disturbance(plant.loads)
     constants = load_count + disturbed if with_weights else 0
     rates = modal_model.rate_index
     unloaded, added = plant.unloaded, vehicles + constants
@@ -176,7 +176,7 @@ def crossing_plant(plant: Plant, with_weights: bool) -> tuple[ConstantPlant, Cou
         constant_columns = xp.broadcast_to(
             constant_columns, (*times.shape, *constant_columns.shape)
         )
-        known = known_disturbance(plant.loads, times) if disturbed else None
+        known = prescribed_disturbance(plant.loads, times) if disturbed else None
         if known is not None:
             constant_columns = set_at(constant_columns, np.s_[..., -1], -known[0])
         distribution = xp.swapaxes(shape, -1, -2)

@@ -36,8 +36,8 @@ def write_gains(gains: Gains, path: str | os.PathLike, overwrite: bool = False) 
     if path.suffix not in WRITERS:
         raise ValueError(f"{path}: gains are written to {', '.join(WRITERS)}")
     content = WRITERS[path.suffix](gains)
-    with whole_file(path, overwrite) as beside:
-        beside.write_bytes(content)
+    with whole_file(path, overwrite) as partial:
+        partial.write_bytes(content)
 
 
 def read_gains(path: str | os.PathLike) -> Gains:

@@ -43,7 +43,7 @@ class PlausibilityWarning(UserWarning):
 
 @refuses_traced("a check")
 def check(case: Case) -> Plausibility:
-    """Numbers by which the plausibility of a case is seen, with warnings of what looks wrong.
+    """Characteristic numbers of a case, with warnings of implausible ones.
 
     Each warning names an address, what follows from the number there, and the likely mistake.
     Nothing is simulated; it takes a few milliseconds. Raises ValueError for an invalid case, and
@@ -67,11 +67,12 @@ def check(case: Case) -> Plausibility:
 
 
 def warn_if_implausible(case: Case, found: Modes | None = None) -> None:
-    """Warn of what looks wrong in a case, whose modes may be `found`; if it is traced, of nothing.
+    """Warn of implausible numbers of a concrete case; its modes, if given, are `found`.
 
     Python shows each sentence once in a process, as all come from one place. An invalid case, or
-    one that has no modes, is left to the work that follows; a case whose numbers are of the sizes
-    of one without a warning is not judged again, so that a loop over runs does not pay for it.
+    one without modes, gets its error from the function that uses it. A case whose numbers have the
+    signs and powers of two of a recent one without warnings is not checked again, so that a loop
+    over runs does not pay for it.
     """
     if _SHOWN.get() or not known_numbers(case):
         return
@@ -93,7 +94,7 @@ def warn_if_implausible(case: Case, found: Modes | None = None) -> None:
 
 
 def leave_warnings_to_caller() -> None:
-    """Let functions in this context not warn: who calls them shows what `check` finds."""
+    """Silence `warn_if_implausible` in this context, whose caller shows the warnings of `check`."""
     _SHOWN.set(True)
 
 
@@ -118,7 +119,7 @@ def _checked(
 
 
 def _with_few_modes(case: Case) -> Case:
-    """The case with modes enough to judge it: hundreds would take seconds."""
+    """The case with at most MOST_MODES modes, or what its track needs: hundreds take seconds."""
     enough = MOST_MODES
     if case.on_rail:
         enough = max(enough, case.track.least_modes(case.beam.length))

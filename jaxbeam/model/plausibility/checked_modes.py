@@ -11,7 +11,7 @@ from jaxbeam.model.plausibility.check import warn_if_implausible
 
 @functools.wraps(beam_modes.modes)
 def modes(case: Case, layout: Layout | None = None) -> Modes:
-    """Natural modes, as `jaxbeam.model.modes.modes`, whose documentation takes this place."""
+    """`jaxbeam.model.modes.modes`, with warnings of implausible numbers; documented there."""
     found = beam_modes.modes(case, layout)
     warn_if_implausible(structure_of(case), found)
     return found

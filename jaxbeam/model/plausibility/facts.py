@@ -1,4 +1,4 @@
-"""Facts of a case from which plausible numbers follow."""
+"""Characteristic numbers of a concrete case, from its modes and loads, by which it is checked."""
 
 import dataclasses
 import functools
@@ -27,7 +27,7 @@ GRAVITY = 9.81  # m/s^2, of weights where a case has none
 
 @dataclasses.dataclass(frozen=True)
 class Plausibility:
-    """Numbers by which a case is judged (SI units), and warnings; None where one has no meaning.
+    """Characteristic numbers of a case (SI units), and warnings; None for a number without meaning.
 
     `span` is the longest distance between held points, `deflection` the largest static one under
     the loads on their way (both in m) and `own_deflection` that under the beam's own weight;
@@ -83,7 +83,7 @@ class Plausibility:
 
 
 def plausible_numbers(case: Case, found: Modes) -> Plausibility:
-    """The numbers of a case of known numbers with its modes, without warnings."""
+    """Characteristic numbers of a concrete case with its modes, without warnings."""
     frequencies = found.frequencies[found.stiffness > 1e-9 * found.stiffness_unit]
     first = float(frequencies[0]) if frequencies.size else None
     span = _longest_span(case)
@@ -183,7 +183,7 @@ class SuspensionStage(NamedTuple):
 
 
 def stages(address: str, load: AbstractLoad) -> Iterator[SuspensionStage]:
-    """Stages of a vehicle at an address, from below; none of loads without springs."""
+    """Suspension stages of a vehicle at an address, from below; none of loads without springs."""
     vehicle: Any = load
     match load.kind:
         case "oscillator":
@@ -260,7 +260,7 @@ LEAST_BRIDGE = 3.0  # m: shorter beams are rigs, of other sizes and speeds
 
 @dataclasses.dataclass(frozen=True)
 class Facts:
-    """A case of known numbers, its modes and `Plausibility`, and what follows from them."""
+    """A concrete case, its modes and `Plausibility`, and quantities derived from them."""
 
     case: Case
     modes: Modes
@@ -319,7 +319,7 @@ class Facts:
         return [np.abs(load.vehicle(gravity).static_loads) for load in self.case.loads]
 
     def held(self) -> Iterator[tuple[float, float, str]]:
-        """Position (m), stiffness (N/m) and address of what holds the deflection of the beam."""
+        """Position (m), stiffness (N/m) and address of each end and support of the deflection."""
         beam = self.case.beam
         ends = (0.0, beam.left_end, "the left end"), (self.length, beam.right_end, "the right end")
         for x, end, name in ends:
@@ -330,9 +330,9 @@ class Facts:
 
     @functools.cached_property
     def jumps(self) -> dict[Any, list[tuple[float, str]]]:
-        """Positions (m) and names of where derivatives of the deflection jump, by their order.
+        """Positions (m) at which a derivative of the deflection jumps, and names, by its order.
 
-        As "bend" those where only the curvature does, not the moment.
+        The key "bend" has those at which only the curvature jumps, not the moment.
         """
         beam, found = self.case.beam, {0: [], 1: [], 2: [], 3: [], "bend": []}
         for i, hinge in enumerate(beam.hinges):
@@ -362,12 +362,12 @@ class Facts:
         return np.sum(parts, axis=0)
 
     def sag_per_command(self, actuator: Any) -> float:
-        """Largest static deflection (m) by a steady command of 1, of its unit."""
+        """Largest static deflection (m) under a steady command of 1 of its unit (1 V or 1 N)."""
         bend = self.shapes @ (compliance(self.modes) * self.influence(actuator.displacement_map()))
         return abs(float(actuator.attachment().static_gain)) * float(np.max(np.abs(bend)))
 
     def sag_of_command(self, actuator: Any) -> float | None:
-        """Largest static deflection (m) by the largest command; None without limits."""
+        """Largest static deflection (m) under the largest command; None without limits."""
         limits = actuator.command_limits()
         return (
             None
@@ -376,7 +376,7 @@ class Facts:
         )
 
     def reading(self, sensor: Any) -> float | None:
-        """Size of the readings of a sensor by the static deflection and the first frequency.
+        """Estimated size of the readings of a sensor, from static deflection and first frequency.
 
         Readings per metre of deflection are those of the first sine wave over the longest span.
         """
@@ -398,7 +398,7 @@ class Facts:
 
     @functools.cached_property
     def profile(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions on the beam, and as far before and behind, and heights of the profile (m)."""
+        """Positions (m), from one length before to one behind the beam, and profile heights (m)."""
         x = np.linspace(-self.length, 2 * self.length, PROFILE_POSITIONS)
         return x, np.asarray(self.case.profile.heights(x)[0])
 

@@ -9,17 +9,17 @@ import math
 from typing import NamedTuple
 
 from jaxbeam.model.plausibility import values
-from jaxbeam.model.plausibility.values import Values, of_beam, of_parts
+from jaxbeam.model.plausibility.values import Values, beam_numbers, part_numbers
 
 INF = math.inf
 
 
 class Range(NamedTuple):
-    """Row of the table: values of a case, their range, and what is likely wrong outside.
+    """Row of the table: a quantity of a case, its plausible range, and the likely mistake outside.
 
-    `says` is what the value means, in words with the value in it; the bound follows in the `unit`,
-    if there is one. Of rows of one `cause` only the first that finds something speaks, of each part
-    of a list; none speaks where one of the causes in `unless` has spoken, from which it may follow.
+    `says` states the value in words; the bound follows in the `unit`, if there is one. Of the rows
+    of one `cause` only the first with a value out of range warns, for each part of a list; a row
+    does not warn where a row of a cause in `unless` has, from which its value may follow.
     """
 
     values: Values
@@ -37,7 +37,7 @@ STEEL = "Steel has 210e9 Pa and 7850 kg/m^3"
 
 MATERIAL = (
     Range(
-        of_beam("youngs_modulus"),
+        beam_numbers("youngs_modulus"),
         1e6,
         2e12,
         "it is {value:.3g} Pa",
@@ -46,7 +46,7 @@ MATERIAL = (
         cause="stiffness",
     ),
     Range(
-        of_beam("density"),
+        beam_numbers("density"),
         10.0,
         30e3,
         "it is {value:.3g} kg/m^3",
@@ -55,7 +55,7 @@ MATERIAL = (
         cause="stiffness",
     ),
     Range(
-        of_beam("height", "width", over=values.length),
+        beam_numbers("height", "width", over=values.length),
         1e-5,
         1.0,
         "it is {value:.3g} times the length of the beam",
@@ -102,7 +102,7 @@ WEIGHTS = (
         cause="weight",
     ),
     Range(
-        of_parts("loads", "weight", kinds=("pedestrian", "crowd")),
+        part_numbers("loads", "weight", kinds=("pedestrian", "crowd")),
         100.0,
         3000.0,
         "a person weighs {value:.3g} N",
@@ -155,7 +155,7 @@ BEAM = (
         values.sag_of_loads,
         50.0,
         INF,
-        "the beam sags by {sag:.4g} m under its loads, {share}",
+        "the beam sags by {sag:.4g} m under its loads, {size}",
         "is it in {unit}, and are masses of loads in kg, forces in N?",
         cause="stiffness",
     ),
@@ -163,7 +163,7 @@ BEAM = (
         values.rise_of_loads,
         0.0,
         1e6,
-        "the beam sags by only {sag:.3g} m under its loads, {share}",
+        "the beam sags by only {sag:.3g} m under its loads, {size}",
         above="are masses in kg, not in t, forces in N, not in kN, and is {stiffness} in {unit}?",
         cause="stiffness",
         unless=("weight",),
@@ -172,13 +172,13 @@ BEAM = (
         values.sag_of_beam,
         10.0,
         INF,
-        "the beam sags by {sag:.4g} m under its own weight, {share}",
+        "the beam sags by {sag:.4g} m under its own weight, {size}",
         "is it in {unit}, and is {mass}?",
         cause="stiffness",
         unless=("weight",),
     ),
     Range(
-        of_parts("supports", "mass", over=values.mass),
+        part_numbers("supports", "mass", over=values.mass),
         0.0,
         5.0,
         "it is {value:.3g} times the mass of the beam",
@@ -249,7 +249,7 @@ BEAM = (
 
 ABSORBERS = (
     Range(
-        of_parts("absorbers", "mass", "inertance", over=values.mass),
+        part_numbers("absorbers", "mass", "inertance", over=values.mass),
         0.0,
         2.0,
         "it is {value:.3g} times the mass of the beam",
@@ -284,7 +284,7 @@ ABSORBERS = (
         unless=("stiffness", "weight"),
     ),
     Range(
-        of_parts("absorbers", "max_stroke", over=values.length),
+        part_numbers("absorbers", "max_stroke", over=values.length),
         1e-7,
         0.03,
         "it is {value:.2g} times the length of the beam",
@@ -328,7 +328,7 @@ ABSORBERS = (
 
 TRACK = (
     Range(
-        of_parts("track", "sleeper_spacing"),
+        part_numbers("track", "sleeper_spacing"),
         1e-3,
         3.0,
         "sleepers are {value:.3g} m apart",
@@ -382,7 +382,7 @@ ACTUATORS = (
         above="are they the smallest and the largest command, as [-{size:.4g}, {size:.4g}]?",
     ),
     Range(
-        of_parts("actuators", "d33"),
+        part_numbers("actuators", "d33"),
         1e-13,
         1e-8,
         "it is {value:.3g} m/V",
@@ -391,7 +391,7 @@ ACTUATORS = (
         cause="command",
     ),
     Range(
-        of_parts("actuators", "modulus"),
+        part_numbers("actuators", "modulus"),
         1e8,
         1e12,
         "Young's modulus of the patch is {value:.3g} Pa",
@@ -400,7 +400,7 @@ ACTUATORS = (
         cause="command",
     ),
     Range(
-        of_parts("actuators", "electrode_spacing"),
+        part_numbers("actuators", "electrode_spacing"),
         1e-6,
         0.02,
         "electrodes are {value:.3g} m apart",
@@ -409,7 +409,7 @@ ACTUATORS = (
         cause="command",
     ),
     Range(
-        of_parts("actuators", "beam_height", "patch_height", "patch_width", over=values.length),
+        part_numbers("actuators", "beam_height", "patch_height", "patch_width", over=values.length),
         1e-7,
         0.3,
         "it is {value:.3g} times the length of the beam",
@@ -418,7 +418,7 @@ ACTUATORS = (
         cause="command",
     ),
     Range(
-        of_parts("actuators", "correction"),
+        part_numbers("actuators", "correction"),
         0.01,
         3.0,
         "{value:.3g} times the moment of the patch reaches the beam",
@@ -472,7 +472,7 @@ ACTUATORS = (
         unless=("stiffness",),
     ),
     Range(
-        of_parts("actuators", "added_rigidity", over=values.rigidity),
+        part_numbers("actuators", "added_rigidity", over=values.rigidity),
         0.0,
         30.0,
         "the patch is {value:.3g} times as stiff as the beam",
@@ -487,14 +487,14 @@ ACTUATORS = (
         unless=("stiffness", "command"),
     ),
     Range(
-        of_parts("actuators", "mass", over=values.mass),
+        part_numbers("actuators", "mass", over=values.mass),
         0.0,
         5.0,
         "its moving mass is {value:.3g} times that of the beam",
         above="is it in kg, not in g?",
     ),
     Range(
-        of_parts("actuators", "added_mass", over=values.density),
+        part_numbers("actuators", "added_mass", over=values.density),
         0.0,
         30.0,
         "it is {value:.3g} times the mass per length of the beam",
@@ -596,7 +596,7 @@ LOADS = (
         above="are they in kg, the unsprung part, and are forces in N, not in kN?",
     ),
     Range(
-        of_parts("loads", "pace", kinds=("pedestrian", "crowd")),
+        part_numbers("loads", "pace", kinds=("pedestrian", "crowd")),
         0.5,
         5.0,
         "a person takes {value:.3g} steps a second",
@@ -604,7 +604,7 @@ LOADS = (
         "is it in Hz, not in rad/s or steps a minute?",
     ),
     Range(
-        of_parts("loads", "speed", kinds=("pedestrian", "crowd")),
+        part_numbers("loads", "speed", kinds=("pedestrian", "crowd")),
         0.2,
         12.0,
         "a person moves at {value:.3g} m/s",
@@ -613,14 +613,14 @@ LOADS = (
         cause="speed",
     ),
     Range(
-        of_parts("loads", "factors", kinds=("pedestrian", "crowd")),
+        part_numbers("loads", "factors", kinds=("pedestrian", "crowd")),
         0.0,
         3.0,
         "it is {value:.3g} times the weight",
         above="it is a fraction, 0.4 for 40 per cent",
     ),
     Range(
-        of_parts("loads", "start_position", over=values.length),
+        part_numbers("loads", "start_position", over=values.length),
         0.0,
         1000.0,
         "it starts {value:.3g} lengths of the beam away from it",
@@ -722,7 +722,7 @@ OTHERS = (
         cause="profile",
     ),
     Range(
-        of_parts("profile", "contact_length", over=values.length),
+        part_numbers("profile", "contact_length", over=values.length),
         0.0,
         1.0,
         "it is {value:.3g} times the length of the beam",
@@ -752,7 +752,7 @@ OTHERS = (
         "is it in Hz, not in kHz?",
     ),
     Range(
-        of_parts("sensors", "fibre_distance", over=values.length),
+        part_numbers("sensors", "fibre_distance", over=values.length),
         1e-5,
         0.25,
         "the gauge is {value:.3g} lengths of the beam off its axis",
@@ -800,7 +800,7 @@ OTHERS = (
         unless=("stiffness",),
     ),
     Range(
-        of_parts("controller", "damping_ratio", "notch_damping"),
+        part_numbers("controller", "damping_ratio", "notch_damping"),
         0.0,
         5.0,
         "the damping ratio is {value:.3g}",
@@ -815,7 +815,7 @@ OTHERS = (
         unless=("stiffness",),
     ),
     Range(
-        of_parts("controller", "period"),
+        part_numbers("controller", "period"),
         1e-5,
         INF,
         "the controller acts every {value:.2g} s",

@@ -1,4 +1,4 @@
-"""What is judged of a case: derived quantities, each with the address of what it follows from."""
+"""Quantities of a case that are checked, each with the address of the number it follows from."""
 
 import itertools
 import math
@@ -27,7 +27,7 @@ SMALL_UNITS = {"m": "mm", "m/s": "mm/s", "m/s^2": "mm/s^2", "1": "1e-6", "Pa": "
 
 
 class Value(NamedTuple):
-    """Value at the address of what it follows from, and words for its sentence."""
+    """Value of a quantity, the address of the number it follows from, and words of its sentence."""
 
     address: str
     value: float
@@ -39,7 +39,7 @@ Size = Callable[[Facts], float]
 
 
 def _numbers(part: Any, address: str, *names: str) -> Iterator[tuple[str, float]]:
-    """Numbers in some fields of a part, where it has them, with their addresses."""
+    """Numbers in the fields `names` of a part that has them, with their addresses."""
     for name in names:
         value = getattr(part, name, None)
         if value is not None:
@@ -55,8 +55,11 @@ def _parts(facts: Facts, key: str) -> list[tuple[str, Any]]:
     return [] if found is None else [(key, found)]
 
 
-def of_parts(key: str, *names: str, over: Size | None = None, kinds: tuple = ()) -> Values:
-    """Sizes of some fields of the parts at a key, of some kinds or all, over a number."""
+def part_numbers(key: str, *names: str, over: Size | None = None, kinds: tuple = ()) -> Values:
+    """Quantity: absolute numbers in fields of the parts at a key, divided by `over`.
+
+    `kinds` restricts it to parts of these kinds.
+    """
 
     def values(facts):
         for address, part in _parts(facts, key):
@@ -67,9 +70,9 @@ def of_parts(key: str, *names: str, over: Size | None = None, kinds: tuple = ())
     return values
 
 
-def of_beam(*names: str, over: Size | None = None) -> Values:
-    """Sizes of some fields of the beam over a number."""
-    return of_parts("beam", *names, over=over)
+def beam_numbers(*names: str, over: Size | None = None) -> Values:
+    """Quantity: absolute numbers in fields of the beam, divided by `over`."""
+    return part_numbers("beam", *names, over=over)
 
 
 def length(facts: Facts) -> float:
@@ -96,7 +99,7 @@ def mass(facts: Facts) -> float:
 
 
 def _stiffness(facts: Facts) -> tuple[str, dict[str, Any]]:
-    """Address of what lets the beam sag, and words for its unit and that of the mass."""
+    """Address of the stiffness that lets the beam sag, and words of its unit and of the mass."""
     beam, held = facts.case.beam, list(facts.held())
     springs = [name for _, k, name in held if k < INF]
     words = {"mass": "beam.mass_per_length in kg/m"}
@@ -123,9 +126,9 @@ def _sag(facts, sag):
     if sag:
         address, words = _stiffness(facts)
         span = facts.numbers.span
-        share = f"1/{span / sag:.2g} of its span of {span:.4g} m"
-        share = "more than its length" if sag > facts.length else share
-        words |= {"sag": sag, "share": share, "stiffness": address}
+        size = f"1/{span / sag:.2g} of its span of {span:.4g} m"
+        size = "more than its length" if sag > facts.length else size
+        words |= {"sag": sag, "size": size, "stiffness": address}
         yield Value(address, span / sag, words)
 
 
@@ -135,7 +138,7 @@ def sag_of_loads(facts):
 
 
 def rise_of_loads(facts):
-    """The same at the address of the heaviest load, which weighs too little."""
+    """Span over static deflection, at the address of the heaviest load, if that is too light."""
     for value in sag_of_loads(facts):
         if facts.numbers.deflection < 1e-12 * facts.length:
             return  # they stand on supports
@@ -143,7 +146,7 @@ def rise_of_loads(facts):
 
 
 def _heaviest(facts) -> str:
-    """Address of what decides the weight of the heaviest load."""
+    """Address of the number that decides the weight of the heaviest load."""
     sizes = [static.max(initial=0.0) for static in facts.static_loads]
     heaviest = int(np.argmax(sizes))
     return f"loads.{heaviest}{_mass_field(facts.case.loads[heaviest])}"
@@ -238,17 +241,17 @@ def clamping_distance(facts):
 
 
 def influence_of_actuator(facts):
-    """Largest influence on any mode over that at the best place; of patches none."""
+    """Largest influence of an actuator on a mode over that at the best place; none of patches."""
     for address, actuator in _parts(facts, "actuators"):
         terms = actuator.displacement_map()
         if all(order == 0 for _, order, _ in terms):
             best = np.abs(facts.shapes).max(axis=0)
-            share = np.max(np.abs(facts.influence(terms)) / best)
-            yield Value(f"{address}.position", float(share), {"x": float(terms[0][0])})
+            ratio = np.max(np.abs(facts.influence(terms)) / best)
+            yield Value(f"{address}.position", float(ratio), {"x": float(terms[0][0])})
 
 
 def least_command(facts):
-    """Distance of 0 from the commands that an actuator takes."""
+    """Distance of 0 from the range of commands of an actuator."""
     for address, actuator in _parts(facts, "actuators"):
         limits = actuator.command_limits()
         if limits is not None and actuator.command_unit != "1":
@@ -287,7 +290,7 @@ def reach_of_command(facts):
 
 
 def gain_in_decibels(facts):
-    """Share of what a patch bears that is used, where the gain of its amplifier fits as dB only."""
+    """Largest command of a patch over the voltage that it bears, if its gain fits as dB only."""
     for address, patch in _parts(facts, "actuators"):
         if patch.kind == "patch" and patch.limits is not None:
             gain = float(patch.amplifier_gain)
@@ -428,8 +431,8 @@ def unsprung_over_sprung(facts):
         bodies = sum(float(body.mass) for body in load.bodies)
         for i, axle in enumerate(load.axles):
             if axle.mass > 0 and bodies > 0:
-                share = float(axle.mass) * len(load.axles) / bodies
-                yield Value(f"{address}.axles.{i}.mass", share, {"upper": f"{address}.bodies"})
+                ratio = float(axle.mass) * len(load.axles) / bodies
+                yield Value(f"{address}.axles.{i}.mass", ratio, {"upper": f"{address}.bodies"})
 
 
 def gyration_over_wheelbase(facts):
@@ -507,8 +510,8 @@ def weight_over_force(facts):
     """Weight of the masses of axles over the forces with which they press."""
     for address, load in facts.loads("axles"):
         if load.masses is not None and load.forces is not None and float(facts.case.run.gravity):
-            shares = np.asarray(load.masses) * GRAVITY / np.where(load.forces > 0, load.forces, INF)
-            yield Value(f"{address}.masses", float(np.max(shares)))
+            ratios = np.asarray(load.masses) * GRAVITY / np.where(load.forces > 0, load.forces, INF)
+            yield Value(f"{address}.masses", float(np.max(ratios)))
 
 
 def amplitude_of_forces(facts):
@@ -800,8 +803,8 @@ def rise_of_waves(facts):
     """Rise (m) of a sine, bump or step of the surface of a bridge, whose height is one number."""
     for address, profile in _parts(facts, "profile"):
         if facts.is_bridge and profile.kind in WAVES:
-            name, share = WAVES[profile.kind]
-            yield Value(f"{address}.{name}", share * abs(float(getattr(profile, name))))
+            name, rise = WAVES[profile.kind]
+            yield Value(f"{address}.{name}", rise * abs(float(getattr(profile, name))))
 
 
 def slope_of_profile(facts):
@@ -820,7 +823,7 @@ def _profile_unit(name: str) -> str:
 
 def length_of_waves(facts):
     """Wavelengths, and distances of the points of a table, over the length of the beam."""
-    yield from of_parts("profile", "wavelength", over=length)(facts)
+    yield from part_numbers("profile", "wavelength", over=length)(facts)
     for address, profile in _parts(facts, "profile"):
         if profile.kind == "table":
             apart = float(np.min(np.diff(profile.positions), initial=INF))
@@ -833,8 +836,8 @@ def acceleration_of_waves(facts):
     for address, profile in _parts(facts, "profile"):
         if profile.kind == "sine" and speed and float(profile.wavelength) > facts.length:
             rate = 2 * math.pi * speed / float(profile.wavelength)
-            share = abs(float(profile.amplitude)) * rate**2 / GRAVITY
-            yield Value(f"{address}.wavelength", share or 1.0)
+            ratio = abs(float(profile.amplitude)) * rate**2 / GRAVITY
+            yield Value(f"{address}.wavelength", ratio or 1.0)
 
 
 def bump_under_loads(facts):
@@ -857,7 +860,7 @@ def cutoff_over_crossing(facts):
 
 def size_of_section_modulus(facts):
     """Side of a cube as large as a section modulus, over the length."""
-    for name, modulus, _ in of_parts("sensors", "section_modulus")(facts):
+    for name, modulus, _ in part_numbers("sensors", "section_modulus")(facts):
         side = modulus ** (1 / 3)
         yield Value(name, side / facts.length, {"side": side})
 
@@ -959,16 +962,16 @@ def step_of_commands(facts):
 
     That is a command by which the beam bends as under the loads.
     """
-    shares, step = [], getattr(facts.case.controller, "resolution", None)
+    ratios, step = [], getattr(facts.case.controller, "resolution", None)
     for actuator in () if step is None else facts.case.driven:
         limits, sag = actuator.command_limits(), facts.sag_per_command(actuator)
         reach = (facts.numbers.deflection or 0.0) / sag if sag else 0.0
         if limits is not None or reach:
             reach = reach if limits is None else float(np.ptp(limits))
-            shares.append((float(step) / reach, actuator.command_unit))
-    if shares:
-        share, unit = max(shares)
-        yield Value("controller.resolution", share, {"unit": unit, "step": float(step)})
+            ratios.append((float(step) / reach, actuator.command_unit))
+    if ratios:
+        ratio, unit = max(ratios)
+        yield Value("controller.resolution", ratio, {"unit": unit, "step": float(step)})
 
 
 def _controlled_modes(facts) -> int:

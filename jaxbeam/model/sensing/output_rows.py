@@ -1,15 +1,13 @@
-"""Rows of what sensors measure, in the band of modes that counts, statically corrected.
+"""Output rows of sensors on the modal states, within a band of modes, statically corrected.
 
     y_i = row_i . d^n q / dt^n,    row_i = d^k psi / dx^k at x_i, times -z_i for a fibre,
 
 where k and n are the orders of derivation of `case.quantities`; section forces have the factor E I
 too. Deflection and velocity follow from the states; an acceleration follows from their rates, hence
 also from contact forces and commands. Rows are those of the modes; histories of curvature, strain
-and section forces are statically corrected.
-
-Corrected rows of section forces are linear outputs.
-For deck accelerations of railway bridges: frequencies up to the largest of 30 Hz, 1.5 f_1 and f_3.
-
+and section forces are statically corrected, and so are the `linear_outputs` of section forces. The
+band "en1990", for deck accelerations of railway bridges, has the frequencies up to the largest of
+30 Hz, 1.5 f_1 and f_3.
 The residual of the modes responds to the forces on the beam at once (see `static_correction`):
 
     y = row . q + sum_l (G(x, x_l) - row . K^-1 psi(x_l)) F_l + (residual of dampers and actuators),
@@ -84,7 +82,7 @@ def banded_fields(model: ModalModel, band: str):
 # `ModalModel.fields` and `Modes.fields`.
 Fields = Callable[..., Float[Array, "order *position mode"]]
 
-SIDE_SHARE = 1e-12  # of the length: distance from a position to a section beside it
+SIDE_DISTANCE = 1e-12  # from a position to the section next to it, over the length
 
 
 def modal_row(
@@ -191,7 +189,7 @@ def sensor_rows(model: ModalModel, case: Case, sensors: Sequence[Sensor]) -> Out
             for field in ("position", "fibre_distance", "section_modulus")
         )
         quantity = quantity_of(name, fibre_distance, section_modulus)
-        x = beside(case, x, side) if side else x
+        x = at_side(case, x, side) if side else x
         fields = banded_fields(model, band)
         found = modal_row(fields, case, x, name, fibre_distance, section_modulus)
         arms = [sensors[i].eccentricity for i in index]
@@ -247,7 +245,7 @@ def quantity_history(
     parameters = fibre_distance, section_modulus
     quantity = quantity_of(name, *parameters)
     jumps = quantity.bends or (side and quantity.x_derivative)
-    x = beside(case, x, side or "right") if jumps else x
+    x = at_side(case, x, side or "right") if jumps else x
     if not quantity.bends:
         rows = modal_row(modes.fields, case, x, name, *parameters) * band_weights(modes, mode_band)
         amplitudes = (motion.coordinates, motion.rates, motion.accelerations)
@@ -275,18 +273,18 @@ def sensor_history(
 
 
 def place_of(case: Case, sensor: Sensor) -> Float[Array, ""]:
-    """Position (m) at which the quantity of a sensor is taken, beside its own where it may jump."""
+    """Position (m) at which a sensor's quantity is taken: next to its own where it may jump."""
     if sensor.side or sensor.bends:
-        return beside(case, sensor.position, sensor.side or "right")
+        return at_side(case, sensor.position, sensor.side or "right")
     return sensor.position
 
 
-def beside(case: Case, x, side: str = "right") -> Float[Array, "*position"]:
+def at_side(case: Case, x, side: str = "right") -> Float[Array, "*position"]:
     """Positions just right or left of x (m), by SIDE_SHARE of the length, within the beam.
 
     Third derivatives jump at loads and supports, curvatures at the ends of patches.
     """
-    step = SIDE_SHARE * case.beam.length
+    step = SIDE_DISTANCE * case.beam.length
     shifted = xp.asarray(x, float) + (step if side == "right" else -step)
     return xp.clip(shifted, step, case.beam.length - step)
 

@@ -1,4 +1,4 @@
-"""Signals of sensors of beam and vehicles: noise, filters, sampling, and what is lost.
+"""Signals of sensors of beam and vehicles: noise, filters, sampling, delays and lost readings.
 
 In this order: analogue filter; sampling of the signal `delay` and a random delay before; offset and
 noise; range and resolution; loss; digital filter of the samples that are not lost.
@@ -67,7 +67,7 @@ def refuse_derivatives(part: Any) -> None:
 def sent_readings(
     seed: int, number: int, part: Any, count: int
 ) -> tuple[Bool[Array, " sample"] | None, Float[Array, " sample"] | None]:
-    """Which of the first readings of a sensor are lost, and their random delays (s); None for none.
+    """Losses and random delays (s) of the first `count` readings of a sensor; None for none.
 
     `part` has `dropout` and `jitter`: a sensor of this number, or a controller for its COMMANDS.
     Derivatives by the dropout raise ValueError.

@@ -1,4 +1,4 @@
-"""Damping of modes: ratios, Rayleigh damping, and loss factors by shares of strain energy."""
+"""Damping of modes: ratios, Rayleigh damping, and loss factors by fractions of strain energy."""
 
 from collections.abc import Callable
 
@@ -22,10 +22,10 @@ def safe_sqrt(square):
 
 
 def modal_damping(beam: Beam, values, coupling, span) -> Damping:
-    """Modal damping (1/s) of a beam, and that between repeated modes; without lossy segments.
+    """Modal damping (1/s) of a beam without lossy segments, and that between repeated modes.
 
-    Of modes of the stiffness `values` and `coupling` (1/s^2); `span` (m) is the longest of a bridge
-    of a material. Rayleigh damping is a + b K.
+    `values` and `coupling` (1/s^2) are the stiffness of the modes, `span` (m) the longest span, by
+    which the damping ratio of a bridge of a `material` is looked up. Rayleigh damping is a + b K.
     """
     if beam.rayleigh_damping is not None:
         mass_factor, stiffness_factor = beam.rayleigh_damping
@@ -87,5 +87,5 @@ def ratios_of_segments(
             energy = energy + shear
         lost = lost + loss * half * length * xp.sum(weights[:, None] * energy, axis=0)
     elastic = stiffness > 0
-    shares = lost * beam.bending_stiffness / xp.where(elastic, stiffness, 1.0)
-    return xp.where(elastic, shares / 2, 0.0)
+    fractions = lost * beam.bending_stiffness / xp.where(elastic, stiffness, 1.0)
+    return xp.where(elastic, fractions / 2, 0.0)

@@ -1,4 +1,4 @@
-"""Track of layers: a rail on pads, sleepers and ballast, on the beam and on the ground beside it.
+"""Track of layers: a rail on pads, sleepers and ballast, on the beam and on the ground around it.
 
     B r'''' + mu r_tt + p (r - s) = F,    sigma s_tt - p (r - s) + b (s - w) = 0,
 
@@ -65,10 +65,10 @@ class Layers(Module):
         stiffness: Float[Array, "own own"],
         mass: Float[Array, "own own"],
     ) -> Float[Array, " mode"]:
-        """Damping of the modes (1/s) of these vectors and values, in beam units.
+        """Modal damping (1/s) of beam and track, from eigenvectors and eigenvalues in beam units.
 
-        `of_beam` is what the beam's damping would be, if all energy were its own; `stiffness` and
-        `mass` are its matrices.
+        `of_beam` is the damping of a mode whose energy is all in the beam; `stiffness` and `mass`
+        are the matrices of the beam.
         """
         track, beam = case.track, case.beam
         per_mass = 1.0 / (track.sleeper_spacing * beam.linear_density)
@@ -78,11 +78,11 @@ class Layers(Module):
         own = vectors[: stiffness.shape[0]]
         elastic = values > 0
         energy = xp.sum(own * (stiffness @ own), axis=0) / xp.where(elastic, values, 1.0)
-        share = xp.where(elastic, energy, 1.0)
+        fraction = xp.where(elastic, energy, 1.0)
         dampers = track.pad_damping * of_pads + track.ballast_damping * of_ballast
         of_mass = 0.0 if beam.rayleigh_damping is None else beam.rayleigh_damping[0]
         moving = xp.sum(own * (mass @ own), axis=0)
-        return share * (of_beam - of_mass) + moving * of_mass + per_mass * dampers
+        return fraction * (of_beam - of_mass) + moving * of_mass + per_mass * dampers
 
     def rail(
         self, case: Case, vectors: Float[Array, "rail_and_sleeper mode"], unit: Float[Array, ""]

@@ -64,7 +64,7 @@ class Transfer(Module):
         return xp.sum(self.series, axis=1).reshape(-1, 4, 4)
 
     def section(self, x) -> "Section":
-        """Coefficients at positions x."""
+        """Stiffness, shear flexibility and axial force of the sections at positions x (in L)."""
         values = self.sections.at(x)
         shear = 1 / values[..., SHEAR] if self.sections.shear_flexible else xp.zeros(x.shape)
         return Section(values[..., RIGIDITY], shear, self.sections.axial_force)
@@ -111,7 +111,10 @@ class Section(NamedTuple):
 
 @functools.cache
 def _integration() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points; integrals from -1 as values there, and as Chebyshev coefficients, from values."""
+    """Chebyshev points, and matrices of integration from -1 of a function given there.
+
+    The first takes values to the integral at the points, the second to its Chebyshev series.
+    """
     points = chebyshev.chebpts1(POINTS)
     to_series = np.linalg.inv(chebyshev.chebvander(points, POINTS - 1))
     integral = chebyshev.chebint(to_series, lbnd=-1)
@@ -122,8 +125,8 @@ def transfer(sections: Sections, layout: Layout) -> Transfer:
     """Transfer matrices of a beam: s(x) = s_0 + int A s, at the points of the collocation."""
     nodes = []
     for i, parts in enumerate(layout.parts):
-        shares = np.arange(parts) / parts
-        nodes.append(sections.nodes[i] + shares * (sections.nodes[i + 1] - sections.nodes[i]))
+        fractions = np.arange(parts) / parts
+        nodes.append(sections.nodes[i] + fractions * (sections.nodes[i + 1] - sections.nodes[i]))
     nodes = xp.concatenate([*nodes, sections.nodes[-1:]])
     points, values, integral = _integration()
     half_lengths = xp.diff(nodes) / 2
@@ -244,7 +247,7 @@ class SectionFlexibility(Module):
 
 
 def _started(transfer: Transfer, positions, jumps) -> Float[Array, "source 4"]:
-    """States at the left nodes that would become the jumps at their positions: Phi^-1 jump."""
+    """States at the left nodes that the transfer matrices carry to the jumps: Phi^-1 jump."""
     inverse = SYMPLECTIC.T @ xp.swapaxes(transfer.to(positions), -1, -2) @ SYMPLECTIC
     return (inverse @ jumps[..., None])[..., 0]
 

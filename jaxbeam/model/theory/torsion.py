@@ -34,7 +34,7 @@ def twists(case: Case) -> bool:
 
 
 def _holds(case: Case, layout: Layout) -> tuple[list[bool], list[tuple[int, Array]]]:
-    """Whether the twist of each node is held, and nodes with springs against it (N m/rad)."""
+    """Whether the twist of each node is held, and pairs of a node and a spring on it (N m/rad)."""
     held, springs = [], []
     for i, (node, (deflection, _)) in enumerate(zip(layout.nodes, layout.constrained, strict=True)):
         here = [case.supports[k - 2] for k in node if 2 <= k < 2 + len(case.supports)]
@@ -47,9 +47,9 @@ def _holds(case: Case, layout: Layout) -> tuple[list[bool], list[tuple[int, Arra
 
 @functools.cache
 def _element(degree: int):
-    """Chebyshev series of the functions of an element, their mass and stiffness matrices.
+    """Chebyshev series of the shape functions of an element, their mass and stiffness matrices.
 
-    Two linear ones, then integrals of Legendre polynomials, which vanish at both ends.
+    Two linear functions, then integrals of Legendre polynomials, which vanish at both ends.
     """
     basis = np.zeros((degree + 1, degree + 1))
     basis[:2, :2] = [[0.5, 0.5], [-0.5, 0.5]]
@@ -77,7 +77,7 @@ class TorsionMatrices(NamedTuple):
 def torsion_matrices(
     case: Case, layout: Layout, nodes, bending_series: Float[Array, "segment degree bending"], mass
 ) -> TorsionMatrices:
-    """Matrices of the twist with the nodes (in L) and the series of the unknowns of bending.
+    """Stiffness, mass and coupling of the twist on the nodes (in L) of the bending elements.
 
     `mass` is a function of an element and of positions in it (-1 to 1): the mass per length over
     its mean.
@@ -143,9 +143,9 @@ class TwistFlexibility(Module):
         nodes, inner = self.nodes, self.nodes[1:-1]
         element = xp.sum(y[..., None] >= inner, axis=-1)
         left, right = take(nodes, element), take(nodes, element + 1)
-        share = ((y - left) / (right - left))[..., None]
+        fraction = ((y - left) / (right - left))[..., None]
         table = self.at_nodes.T
-        linear = (1 - share) * take(table, element) + share * take(table, element + 1)
+        linear = (1 - fraction) * take(table, element) + fraction * take(table, element + 1)
         of_points = xp.sum(self.points[:, None] >= inner, axis=-1)
         y, left, right = y[..., None], left[..., None], right[..., None]
         if self.order == TWIST:
@@ -181,8 +181,8 @@ def twist_flexibility(
     points, free = x / beam.length, np.flatnonzero(~np.array(held))
     element = xp.sum(points[:, None] >= nodes[1:-1], axis=-1)
     width = take(nodes, element + 1) - take(nodes, element)
-    share = (points - take(nodes, element)) / width
-    at_ends = (1 - share, share) if order == TWIST else (-1 / width, 1 / width)
+    fraction = (points - take(nodes, element)) / width
+    at_ends = (1 - fraction, fraction) if order == TWIST else (-1 / width, 1 / width)
     rows = xp.zeros((x.shape[0], count))
     for end, values in enumerate(at_ends):
         hit = (element[:, None] + end) == np.arange(count)

@@ -149,8 +149,8 @@ def write_film(path: str | os.PathLike, frames: Sequence[Image.Image], rate: int
     Raises OSError if ffmpeg fails.
     """
     write = _write_mp4 if Path(path).suffix == ".mp4" else _write_gif
-    with whole_file(path, overwrite=True) as beside:
-        write(beside, frames, rate)
+    with whole_file(path, overwrite=True) as partial:
+        write(partial, frames, rate)
 
 
 def _write_gif(path: Path, frames: Sequence[Image.Image], rate) -> None:
