@@ -123,15 +123,15 @@ class Absorber(ReprWithUnits):
         )
 
     def trajectory(self, length: Float[Array, ""]) -> StandingTrajectory:
-        """It stays at its position from the start of a run."""
+        """Trajectory of the absorber, at its position from the start of a run."""
         return StandingTrajectory(self.position, np.zeros(()), length)
 
     def spacings(self) -> Float[Array, " vehicle"]:
-        """Zero: one absorber."""
+        """Distances (m) of the absorbers of the row behind the first: 0, as it is one."""
         return xp.zeros(1)
 
     def force_histories(self) -> dict[int, ForceHistory]:
-        """None."""
+        """Forces over time by index of the wheel: no entries."""
         return {}
 
     def dynamic_stiffness(self, s) -> Array:

@@ -351,7 +351,7 @@ class Beam(ReprWithUnits):
     Damping is modal: one `damping_ratio` for all modes or one for each; or, when
     `rayleigh_damping` is given, proportional to mass and stiffness, D = a M + b K. A `loss_factor`
     eta of hysteretic damping is taken as the equivalent ratio eta / 2 of every mode; those of
-    `segments` count by their shares of the strain energy of each mode. A `material` has the ratio
+    `segments` count by their fraction of the strain energy of each mode. A `material` has the ratio
     of EN 1991-2, table 6.6, for the longest span of the beam.
 
     With a `torsional_rigidity` G J and a `polar_inertia` it twists, too, by St Venant's law; both
@@ -437,7 +437,7 @@ class Beam(ReprWithUnits):
 
     @property
     def is_uniform(self) -> bool:
-        """Whether it has a uniform section, rigid in shear, without anything that this excludes."""
+        """Whether it is rigid in shear, without segments, hinges, axial force and foundation."""
         others = (self.axial_force, *(getattr(self, name) for name in OPTIONAL))
         return not (self.segments or self.hinges) and all(value is None for value in others)
 

@@ -42,7 +42,7 @@ ALL = "*"
 
 
 def each_address(address: str, counts: Mapping[str, int]) -> list[str]:
-    """Addresses for which one stands: itself, or with `*` that of each part of the list.
+    """Addresses that an address stands for: itself, or with `*` that of each part of the list.
 
     `counts` has the number of parts at the keys of a case that hold lists.
 
@@ -63,7 +63,7 @@ def each_address(address: str, counts: Mapping[str, int]) -> list[str]:
 
 
 def overlap(addresses: Iterable[str], counts: Mapping[str, int]) -> str | None:
-    """The first address for which two of some addresses stand, or None."""
+    """First address that two of the given addresses both stand for, or None."""
     seen = set()
     for address in addresses:
         for one in each_address(address, counts):
@@ -171,7 +171,7 @@ class Case(Module):
 
     @property
     def carried(self) -> tuple[AbstractLoad | Absorber, ...]:
-        """What presses on the beam, in the order of its wheels: loads, then absorbers."""
+        """Loads, then absorbers: the parts with wheels, in the order of the wheels."""
         return (*self.loads, *self.absorbers)
 
     def trajectory(self, load: AbstractLoad | Absorber) -> AbstractPiecewiseTrajectory:
@@ -294,7 +294,7 @@ def unknown_address_error(case: Case, address: str) -> ValueError:
 
 
 def _is_left_out(case: Case, address: str) -> bool:
-    """Whether the address is that of a number which may be left out, and is."""
+    """Whether the optional number at the address is None."""
     part: Any = case
     *parents, name = address.split(".")
     for key in parents:
@@ -309,9 +309,9 @@ def list_sizes(case: Case) -> dict[str, int]:
 
 
 def own_addresses(case: Case, address: str) -> list[str]:
-    """Addresses of the numbers of a case for which one stands, in present words.
+    """Addresses of the numbers that an address stands for, in present words.
 
-    It is one number, or that of every load for `loads.*.speed`, say.
+    One number, or for `loads.*.speed`, say, that of every load.
 
     Raises ValueError, with the nearest address of the case, if one of them has no number.
     """
@@ -345,10 +345,10 @@ def value_at(case: Case, address: str) -> Float[Array, "..."]:
         parent, entry = _parent_and_entry(one, leaves)
         values.append(leaves[parent][entry] if entry else leaves[parent])
     if len(values) > 1 and all(map(is_concrete, values)):
-        known = [concrete(value) for value in values]
-        if not all(np.array_equal(value, known[0]) for value in known):
+        numbers = [concrete(value) for value in values]
+        if not all(np.array_equal(number, numbers[0]) for number in numbers):
             raise ValueError(
-                f"{address} stands for numbers that differ, {', '.join(map(str, known))}: set"
+                f"{address} stands for numbers that differ, {', '.join(map(str, numbers))}: set"
                 " them to one value first, or name one of them"
             )
     return values[0]
@@ -387,9 +387,9 @@ def replace(case: Case, values: dict[str, Any]) -> Case:
     """
     leaves, structure = jax.tree.flatten(case)
     index = {address: i for i, address in enumerate(_addresses_of(structure))}
-    known = dict(zip(index, leaves, strict=True))
+    numbers = dict(zip(index, leaves, strict=True))
     each = [
-        (one, value) for key, value in values.items() for one in _own_addresses(case, key, known)
+        (one, value) for key, value in values.items() for one in _own_addresses(case, key, numbers)
     ]
     for address, value in each:
         if isinstance(value, str | list | tuple):
@@ -441,7 +441,7 @@ def concrete_case(case: Case) -> Case:
 
 
 def structure_of(case: Case) -> Case:
-    """All of a case but its loads, profile, contact, controller and run."""
+    """The case without its loads, profile, contact, controller and run."""
     parts = case.beam, case.supports, case.actuators, case.sensors
     return Case(*parts, absorbers=case.absorbers, track=case.track)
 
@@ -470,7 +470,7 @@ SINGULARS = {"bodies": "body", "masses": "mass"}
 
 
 def address_words(case: Case, address: str) -> str:
-    """What a number or word of a case is: "speed of the load", "stiffness of support 1".
+    """Words for a number or word of a case: "speed of the load", "stiffness of support 1".
 
     A part that is the only one of its list has no number; a sensor with a name has its name. A
     train of the library is called so.

@@ -26,9 +26,9 @@ from jaxbeam.runtime.arrays import Number
 from jaxbeam.runtime.module import Module
 
 ONE_RUN = (
-    "contact.kind 'unilateral' is for one run of known numbers by jaxbeam.simulate, without plan,"
-    " controller, transformation or derivative, as wheels leave and land at times that only the run"
-    " tells: run such cases one by one, or leave the contact out, which is then bilateral"
+    "contact.kind 'unilateral' is for one run of concrete numbers by jaxbeam.simulate, without"
+    " plan, controller, transformation or derivative, as wheels leave and land at times that only"
+    " the run tells: run such cases one by one, or leave the contact out, which is then bilateral"
 )
 HERTZ_POWER = 1.5  # of the compression, in the force of a ball or a crowned wheel
 
@@ -49,7 +49,7 @@ class AbstractContact(ReprWithUnits, Module):
 
 
 class BilateralContact(AbstractContact):
-    """Wheels stay on the surface, and pull where they must: what a case without `contact` has.
+    """Bilateral contact: wheels stay on the surface and pull where they must; the default.
 
     >>> import jaxbeam as jb
     >>> print(jb.BilateralContact().lifts)
@@ -64,7 +64,7 @@ class BilateralContact(AbstractContact):
 
 
 class UnilateralContact(AbstractContact):
-    """Wheels press or fly: they leave where they would have to pull, and land.
+    """Unilateral contact: wheels leave the surface where they would have to pull, and land.
 
     Wheels with mass are rigid, and impacts inelastic, unless one of the springs is given. That
     spring is between each wheel with mass and the surface, compressed by the static load as a run

@@ -82,9 +82,9 @@ class AbstractSampledLaw(Module):
         """Command, in the units of the actuators, and next state at a sample at t (s)."""
 
     def tabulated(self, times: Float[Array, " sample"]) -> "AbstractSampledLaw":
-        """The law with tables, at all samples of a run (s), of what changes with time alone.
+        """The law with its time-dependent matrices tabulated at the sampling `times` of a run (s).
 
-        They are computed at once, in NumPy many times as fast as at each sample.
+        In NumPy, all of them at once take a small part of the time of one after the other.
         """
         return self
 
@@ -127,7 +127,7 @@ class AbstractStaticLaw(AbstractSampledLaw, AbstractContinuousLaw):
 
 
 class LawOfCommanded(AbstractSampledLaw, AbstractContinuousLaw):
-    """A law of the `active` actuators among `count`; the others receive no command."""
+    """Control law of the `active` ones of `count` actuators; the others receive no command."""
 
     law: Any
     active: tuple[int, ...] = eqx.field(static=True)

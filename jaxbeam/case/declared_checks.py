@@ -136,7 +136,7 @@ def validate_direct_or_derived(
     """Error of a property that is not given by exactly one of two ways, or None.
 
     The property is given by the field `direct`, or derived from all of the sources.
-    `shared_sources` serve other properties too, so they may stand beside `direct`.
+    `shared_sources` serve other properties too, so they may be given together with `direct`.
     """
     if getattr(part, direct) is not None:
         for name in exclusive_sources:
@@ -203,7 +203,7 @@ def _check_number(address: str, value: Any, field: dataclasses.Field) -> None:
 
 
 def _all_allowed(numbers: np.ndarray, constraint: str) -> bool:
-    """Whether no number of a list is wrong; to name the first that is takes a loop in Python."""
+    """Whether all numbers of a list satisfy a constraint and are not too large."""
     if not np.all(np.abs(numbers) <= LARGEST):  # also not if one is NaN
         return False
     if constraint == POSITIVE:
@@ -232,7 +232,7 @@ def _unit_suffix(field: dataclasses.Field) -> str:
 
 
 def in_unit(field: dataclasses.Field) -> str:
-    """Words " in N/m" behind the meaning of a number, none where it has no unit."""
+    """Unit of a field in words, such as " in N/m"; empty where it has none."""
     return f" in{_unit_suffix(field)}" if _unit_suffix(field) else ""
 
 

@@ -26,7 +26,7 @@ UNPREFIXED = re.compile(r"kg\b|\w+\^")
 
 
 class UnitScale(NamedTuple):
-    """Values divided by `factor` are in `unit`."""
+    """Unit with a prefix: values in the SI unit divided by `factor` are in `unit`."""
 
     factor: float
     unit: str

@@ -54,7 +54,7 @@ class AbstractSampledFilter(Module):
         """Estimate at a sample at t (s), and the next state of the filter."""
 
     def tabulated(self, times: Float[Array, " sample"]) -> "AbstractSampledFilter":
-        """As `jaxbeam.case.controller.AbstractSampledLaw.tabulated`."""
+        """The filter with its time-dependent matrices tabulated at the `times` of a run (s)."""
         return self
 
 

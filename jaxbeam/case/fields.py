@@ -114,7 +114,7 @@ def describe_shape(field) -> str:
 
 
 def is_concrete(value) -> bool:
-    """True unless `value` is traced by `jit` or `vmap`; a traced value has no numbers yet."""
+    """Whether a value has numbers: it is not traced by `jit` or `vmap`."""
     if not isinstance(value, jax.core.Tracer):
         return True
     try:
@@ -125,9 +125,9 @@ def is_concrete(value) -> bool:
 
 
 def deciding(value, what: str):
-    """A number with which something is compared at the samples of a law. Its derivative is refused.
+    """A number by which a law decides at samples; its derivatives raise an error.
 
-    It would be zero, but for jumps where a sample comes to be decided otherwise.
+    They would be zero, except for jumps where a sample comes to be decided otherwise.
     """
     reason = (
         f"{what} decides at samples, so that commands jump with it and it has no derivative:"
@@ -137,11 +137,11 @@ def deciding(value, what: str):
 
 
 class TracedNumberError(jax.errors.ConcretizationTypeError):
-    """A number must be known, but is traced by a transformation, in one sentence."""
+    """Error of a number that must be concrete but is traced by a transformation."""
 
     def __init__(self, what: str, why: str):
         sentence = (
-            f"{what} is traced by jax.jit, vmap or another transformation and must be a known"
+            f"{what} is traced by jax.jit, vmap or another transformation and must be a concrete"
             f" number: {why}"
         )
         TypeError.__init__(self, sentence)
@@ -151,10 +151,10 @@ OUTSIDE = "call it outside jit, vmap and grad"
 
 
 def refuse_traced(what: str, instead: str, *trees) -> None:
-    """Raises ValueError, in one sentence, if numbers of some trees are traced by JAX.
+    """Raises ValueError if numbers of some trees are traced by JAX.
 
-    `what` computes with NumPy, so that its derivatives would be zero; said is what to do `instead`.
-    Data classes that are no trees are searched, too.
+    The sentence says that `what` can be neither differentiated nor compiled, as it computes with
+    NumPy, and what to do `instead`. Data classes that are no trees are searched, too.
     """
     if any_traced(trees) or any(map(_holds_traced, jax.tree.leaves(trees))):
         raise ValueError(f"{what} can be neither differentiated nor compiled: {instead}")
@@ -168,15 +168,15 @@ def _holds_traced(leaf) -> bool:
 
 
 def refuses_traced(what: str, instead: str = OUTSIDE) -> Callable[[F], F]:
-    """Decorator of functions whose arguments must be known, for `what` they return."""
+    """Decorator that refuses traced arguments; its error names `what` the function returns."""
 
     def decorated(function: F) -> F:
         @functools.wraps(function)
-        def of_known(*args, **kwargs):
+        def refusing(*args, **kwargs):
             refuse_traced(what, instead, args, kwargs)
             return function(*args, **kwargs)
 
-        return typing.cast(F, of_known)
+        return typing.cast(F, refusing)
 
     return decorated
 
@@ -186,8 +186,8 @@ def concrete(
 ) -> np.ndarray:
     """A value as an array of floats, also while it is differentiated (`grad`, `jvp`).
 
-    Raises TracedNumberError if it is traced by `jit` or `vmap`: `what` it is, and `why` it must be
-    known.
+    Raises TracedNumberError if it is traced by `jit` or `vmap`; the error names `what` it is, and
+    `why` it must be concrete.
     """
     if isinstance(value, jax.core.Tracer):
         try:
@@ -218,7 +218,7 @@ def import_modules(package_name: str) -> None:
 def _modules_by_kind() -> dict[str, list[str]]:
     """Modules of PACKAGES by the kinds that their sources declare.
 
-    A module without a source is imported, so that its classes are known.
+    A module without a source is imported, so that its classes exist.
     """
     modules: dict[str, list[str]] = {}
     for name in (name for package in PACKAGES for name in module_names(package)):
@@ -233,7 +233,7 @@ def _modules_by_kind() -> dict[str, list[str]]:
 
 
 def kind_of(part_class: type) -> str | None:
-    """The kind that a class declares itself, or None; a kind is not inherited."""
+    """The `kind` that a class itself declares, or None; a kind is not inherited."""
     kind = vars(part_class).get("kind")
     return kind if isinstance(kind, str) else None
 

@@ -44,7 +44,7 @@ class Quantity(NamedTuple):
 
     @property
     def bends(self) -> bool:
-        """Whether it is a curvature, a derivative of it, twist or torque: sums are corrected."""
+        """Whether it is a curvature, a derivative of one, twist or torque: statically corrected."""
         return (self.x_derivative >= 2 or self.of_twist) and self.time_derivative == 0
 
     @property

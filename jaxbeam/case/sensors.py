@@ -124,7 +124,7 @@ class Sensor(ReprWithUnits, Module):
         return self.filter is not None and self.filter.realisation == "digital"
 
     def sampled_features(self, address: str) -> Iterator[str]:
-        """What of it exists at samples only, each as the subject of an error message."""
+        """Features that a sensor has at samples only, each as the subject of an error message."""
         if self.has_digital_filter:
             yield f"{address}.filter, which is digital,"
         for name in ("sampling_period", "delay", "noise", "resolution", "dropout", "jitter"):

@@ -1,6 +1,6 @@
 """Track between wheels and beam: it spreads the force of each axle, or moves with beam and wheels.
 
-An axle at x presses with shares w_k at x + o_k: on three sleepers, at any offsets, or evenly over a
+An axle at x presses with fractions w_k at x + o_k: on three sleepers, at any offsets, or over a
 length. What is off the beam then rests on the ground. A force on the modes psi is thus that of the
 filtered shapes sum_k w_k psi(x + o_k) (see `jaxbeam.model.deflection_lines`). A track of layers,
 rail, pads, sleepers and ballast, has modes with the beam (see `jaxbeam.model.theory.layers`).
@@ -27,15 +27,15 @@ from jaxbeam.case.trajectory import AbstractTrajectory
 from jaxbeam.runtime.arrays import Array, Number, xp
 
 THREE_SLEEPERS = "3 sleepers"
-SHARES = (0.25, 0.5, 0.25)  # of the rail supports under and beside an axle
+SLEEPER_FRACTIONS = (0.25, 0.5, 0.25)  # of an axle, on the sleepers before, under and behind it
 APPROACH = 20.0  # m, of a rail on the ground
 LAYERS = "rail_mass", "pad_stiffness", "sleeper_mass", "ballast_stiffness"
 
 
 class Kernel(NamedTuple):
-    """Filter of a function of the position of a load: sum of weights times values at offsets (m).
+    """Kernel that spreads an axle: sum of weights times values of a function at offsets (m).
 
-    If it is `integrated`, values of the integral of the function from the left end.
+    If `integrated`, of values of the function's integral from the left end.
     """
 
     offsets: Float[Array, " share"]
@@ -58,8 +58,8 @@ class Track(ReprWithUnits):
     The modes of the case are then those of beam and track together, and `beam.modes` must reach the
     frequencies of interest of both.
 
-    A load without a `start_position` starts where its first share enters the beam, or at the end of
-    the rail.
+    A load without a `start_position` starts where its first point force enters the beam, or at the
+    end of the rail.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -81,10 +81,10 @@ class Track(ReprWithUnits):
         "m", "length over which an axle is even", POSITIVE, default=None
     )
     spread_offsets: Float[Number, " share"] | None = number(
-        "m", "places of the shares right of the axle", INCREASING, default=None
+        "m", "places of the point forces right of the axle", INCREASING, default=None
     )
     spread_shares: Float[Number, " share"] | None = number(
-        "1", "proportions of the shares of an axle", NOT_NEGATIVE, default=None
+        "1", "proportions of the point forces of an axle", NOT_NEGATIVE, default=None
     )
 
     rail_rigidity: Float[Number, ""] | None = number(
@@ -165,7 +165,7 @@ class Track(ReprWithUnits):
             )
         if (self.spread_offsets is None) != (self.spread_shares is None):
             absent = "spread_shares" if self.spread_shares is None else "spread_offsets"
-            return f"{address}.{absent} is missing; each offset has its share"
+            return f"{address}.{absent} is missing; each offset has its fraction of the axle"
         if self.spread_shares is None or self.spread_offsets is None:
             return None
         offsets, shares = np.shape(self.spread_offsets)[0], np.shape(self.spread_shares)[0]
@@ -181,12 +181,12 @@ class Track(ReprWithUnits):
         return None
 
     def kernel(self) -> Kernel:
-        """Filter of what depends on the position of a load; that of layers leaves it as it is."""
+        """Kernel that spreads the force of an axle; of layers one that does not."""
         if self.layered:
             return Kernel(np.zeros(1), np.ones(1), False)
         if self.spread:
             offsets = self.sleeper_spacing * np.array([-1.0, 0.0, 1.0])
-            return Kernel(offsets, xp.asarray(SHARES), False)
+            return Kernel(offsets, xp.asarray(SLEEPER_FRACTIONS), False)
         if self.spread_length is not None:
             ends = np.array([-0.5, 0.5])
             return Kernel(self.spread_length * ends, 2 * ends / self.spread_length, True)
@@ -200,13 +200,13 @@ class Track(ReprWithUnits):
         return offsets[0], offsets[-1]
 
     def start(self, speed: Float[Array, "*run"], length: Float[Array, ""]) -> Float[Array, "*run"]:
-        """Position (m) of a load of a speed (m/s) whose first share is at its end of the beam."""
+        """Position (m) of a load at a speed (m/s) whose first force is at its end of the beam."""
         lowest, highest = self.ends()
         return xp.where(speed < 0, length - lowest, -highest)
 
 
 def track_of(text: str) -> Track:
-    """Track of a spread in words: the name of a rule, or a length with or without its unit.
+    """Track of a spreading rule in words: its name, or a length with or without unit.
 
     Raises ValueError for other words.
     """
@@ -225,8 +225,8 @@ def windows(
 ) -> tuple[Float[Array, " wheel"], Float[Array, " wheel"]]:
     """Times (s) at which wheels `behind` the first (m) enter the beam and leave it.
 
-    With a track, at which the first of their shares enters, and the last one leaves; or at which
-    they come to the rail and leave it.
+    With a track that spreads axles, the entry of the first point force and the exit of the last;
+    with a rail, entry and exit of the rail.
     """
     if track is None:
         return path.entry_exit_times(behind)

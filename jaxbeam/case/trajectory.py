@@ -20,7 +20,7 @@ from jaxbeam.runtime.module import Module
 
 NEVER = 1e30  # s, beyond any run; finite, also in single precision, so that derivatives exist
 SAME_TIME = 1e-12  # of a time: a sample that is earlier by less is at it
-SAME_SHARE = 1e-9  # of a crossing, likewise
+SAME_FRACTION = 1e-9  # of a crossing, likewise
 SAME_SAMPLE = 3e-7  # of a time, likewise in single precision
 
 
@@ -153,7 +153,10 @@ class BrakingTrajectory(AbstractPiecewiseTrajectory):
 
 
 class StandingTrajectory(AbstractPiecewiseTrajectory):
-    """A place on the beam at which a load acts from `entry_time` (s) on; wheels off it do not."""
+    """Trajectory of a stationary load, at a place on the beam from `entry_time` (s) on.
+
+    Wheels off the beam do not act.
+    """
 
     position: Float[Array, ""]
     entry_time: Float[Array, ""]

@@ -29,7 +29,7 @@ from jaxbeam.case.limits import MAX_WHEELS, check_length
 from jaxbeam.case.loads.base import (
     AbstractLoad,
     VehicleModel,
-    known_numbers,
+    all_concrete,
     wheel_distances,
 )
 from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSensor
@@ -68,7 +68,7 @@ def check_case(case: Case) -> None:
 
 
 def check_plant(case: Case) -> None:
-    """Validate a case but for what its controller decides: its design, and sampled sensors.
+    """Validate a case without its controller: neither its design, nor sensors that it samples.
 
     Raises ValueError as `check_case`.
     """
@@ -184,7 +184,7 @@ def _check_track(case: Case) -> None:
 
 
 def _check_layers(case: Case) -> None:
-    """Validate that nothing is beside a track of layers that its modes do not have."""
+    """Validate that a case with a track of layers has nothing that its modes leave out."""
     beam = case.beam
     ratios = beam.damping_ratio is not None and np.ndim(beam.damping_ratio) > 0
     others = {
@@ -202,7 +202,7 @@ def _check_layers(case: Case) -> None:
                 f"track.rail_rigidity and {name} cannot be together: the modes of beam and track"
                 " do not have it; leave one of them out"
             )
-    if known_numbers(case.track) and is_concrete(beam.length):
+    if all_concrete(case.track) and is_concrete(beam.length):
         least = case.track.least_modes(beam.length)
         if beam.modes < least:
             raise ValueError(
@@ -268,13 +268,13 @@ def _check_torsion(case: Case) -> None:
 
 
 def _check_start(address: str, load: AbstractLoad, case: Case) -> None:
-    """Validate that no share of a load is on the beam before the run."""
+    """Validate that no point force of a load is on the beam before the run."""
     start, speed = load.start_position, load.speed
-    if start is None or speed is None or not all(map(known_numbers, (case.track, load))):
+    if start is None or speed is None or not all(map(all_concrete, (case.track, load))):
         return
     first = float(concrete(case.track.start(speed, case.beam.length)))
     if (concrete(start) - first) * concrete(speed) > POSITION_TOLERANCE * abs(concrete(speed)):
-        where = "a share of the axle is on the beam already; the first one enters at"
+        where = "part of the axle is on the beam already; the first force enters at"
         if case.track.layered:
             where = "the load is on the rail already, which begins at"
         raise ValueError(
@@ -283,7 +283,7 @@ def _check_start(address: str, load: AbstractLoad, case: Case) -> None:
 
 
 def _wheel_count(load: AbstractLoad) -> int:
-    """About how many wheels a load has, without its vehicles, which may take long to make."""
+    """Estimated number of wheels of a load, without building its vehicles, which may take long."""
     lists = (getattr(load, name, None) for name in ("axles", "offsets", "coaches"))
     of_vehicle = max(1, *(0 if one is None else len(one) for one in lists))
     return of_vehicle * getattr(load, "count", 1) * getattr(load, "people", 1)
@@ -297,7 +297,7 @@ def _check_kinks(case: Case) -> None:
     if not (beam.hinges or sheared or in_profile):
         return
     for i, load in enumerate(case.loads):
-        if load.positions is None or not all(map(known_numbers, (load, case.run))):
+        if load.positions is None or not all(map(all_concrete, (load, case.run))):
             continue
         steps = np.diff(concrete(load.positions))
         turns = np.any(steps > 0) and np.any(steps < 0)
@@ -310,13 +310,13 @@ def _check_kinks(case: Case) -> None:
 
 
 def _check_profile(case: Case) -> None:
-    """Validate that wheels can follow the profile, and that it is known wherever they travel."""
+    """Validate that wheels can follow the profile, and that it is defined wherever they travel."""
     profile = case.profile
     if profile is None or not case.loads:
         return
     ends = [(0.0, case.beam.length)]
     for load in case.loads:
-        if not all(map(known_numbers, (load, case.run, case.beam))):
+        if not all(map(all_concrete, (load, case.run, case.beam))):
             continue
         vehicle = load.vehicle(case.run.gravity)
         if vehicle.names:
@@ -388,7 +388,7 @@ def _check_vehicle_sensor(address: str, sensor: VehicleSensor, case: Case) -> No
 
 
 def _check_absorber_sensor(address: str, sensor: VehicleSensor, case: Case) -> None:
-    """Validate that the absorber of a sensor is there, and that nothing names a vehicle beside."""
+    """Validate that the absorber of a sensor exists, and that the sensor names no vehicle."""
     if sensor.absorber >= len(case.absorbers):
         raise ValueError(
             f"{address}.absorber is {sensor.absorber}, but the case has {len(case.absorbers)}"
@@ -467,7 +467,7 @@ def _check_controller(case: Case) -> None:
 
 
 def _check_outside_patches(address: str, sensor: Sensor, case: Case) -> None:
-    """No controller reads a moment or stress to which its own command adds at once."""
+    """Validate that no controller reads a moment or stress in a section that its patch bends."""
     for i, actuator in enumerate(case.actuators):
         ends = [place for place, order, _ in actuator.displacement_map() if order == 1]
         if ends and all(is_concrete(x) for x in (sensor.position, *ends)):
@@ -481,7 +481,7 @@ def _check_outside_patches(address: str, sensor: Sensor, case: Case) -> None:
 
 
 def _sampled_features(case: Case) -> Iterator[str]:
-    """What a controller in continuous time cannot have, nor its actuators and sensors."""
+    """Features of controller, actuators and sensors that exist at samples only, as in messages."""
     for name in ("delay", "resolution", "dropout", "jitter"):
         if getattr(case.controller, name) is not None:
             yield f"controller.{name}"

@@ -27,7 +27,7 @@ from jaxbeam.case.fields import (
     number,
 )
 from jaxbeam.case.loads.base import trajectory
-from jaxbeam.case.trajectory import NEVER, SAME_SAMPLE, SAME_SHARE, SAME_TIME, has_come
+from jaxbeam.case.trajectory import NEVER, SAME_FRACTION, SAME_SAMPLE, SAME_TIME, has_come
 from jaxbeam.runtime.arrays import Array, Number, xp
 
 
@@ -235,7 +235,7 @@ class FeedforwardLaw(AbstractSampledLaw):
     def table_commands(self, t) -> Float[Array, "actuator load"]:
         """Commands of the table for each load at t (s), read ahead by the lead."""
         shares = self.distances(t + self.lead) / self.length
-        return _tabulated(self.shares, self.values, shares, SAME_SHARE)
+        return _tabulated(self.shares, self.values, shares, SAME_FRACTION)
 
 
 class ConfirmedFeedforwardLaw(FeedforwardLaw):
@@ -261,7 +261,7 @@ class ConfirmedFeedforwardLaw(FeedforwardLaw):
             readings = xp.where(measurement.present[own], readings, 0.0)
         lowest = xp.min(readings)
         passed = has_come(self.gate_times[:, 1], t)
-        early = self.distances(t) <= (CONFIRMATION_SHARE + SAME_SHARE) * self.length
+        early = self.distances(t) <= (CONFIRMATION_SHARE + SAME_FRACTION) * self.length
         confirmed = state | (passed & early & (lowest <= -self.confirmation))
         commands = xp.where(confirmed, self.table_commands(t), 0.0)
         return ControlStep(xp.sum(commands, axis=1), confirmed)

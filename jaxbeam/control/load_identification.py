@@ -19,7 +19,7 @@ from jaxbeam.case.controller import Measurement, Time
 from jaxbeam.case.display import ReprWithUnits
 from jaxbeam.case.fields import POSITIVE, concrete, deciding, is_concrete, number
 from jaxbeam.case.loads.base import AbstractLoad
-from jaxbeam.case.trajectory import SAME_SHARE, has_come
+from jaxbeam.case.trajectory import SAME_FRACTION, has_come
 from jaxbeam.estimation.observability import deflection_outputs
 from jaxbeam.estimation.observer import sensor_offsets
 from jaxbeam.model.modes import mesh_layout
@@ -161,7 +161,7 @@ class GateIdentifier(AbstractLoadIdentifier):
 
     def estimate(self, sums, t):
         speed_identified = has_come(self.gate_times[1], t)
-        until = self.until - SAME_SHARE
+        until = self.until - SAME_FRACTION
         mass_identified = speed_identified & (self.crossing_share(t) >= until)
         mass = self.fitted_mass(*sums)
         return LoadEstimate(mass, self.speed, self.entry_time, speed_identified, mass_identified)

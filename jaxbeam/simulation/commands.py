@@ -110,7 +110,7 @@ class CommandOperator(Module):
         at_once = self.hysteresis.output(plays)
         if self.creep is None:
             return at_once
-        of_command, of_lags = self.creep.shares(self.period)
+        of_command, of_lags = self.creep.mean_factors(self.period)
         return of_command * at_once + xp.tensordot(of_lags, lags, axes=1)
 
     def inverse(self) -> "InverseOperator":
@@ -144,7 +144,7 @@ class InverseOperator(Module):
         count = self.hysteresis.thresholds.shape[0]
         # The first threshold is zero: its play is the last command that acted at once.
         lags = self.creep.after(state[count:], state[0], self.period)
-        of_command, of_lags = self.creep.shares(self.period)
+        of_command, of_lags = self.creep.mean_factors(self.period)
         at_once = (wanted - xp.tensordot(of_lags, lags, axes=1)) / of_command
         return xp.concatenate([self.hysteresis.follow(state[:count], at_once), lags])
 

@@ -48,7 +48,7 @@ def test_quantities_in_si(text, unit, expected):
 WRONG = [
     ("25 kg", "m", "beam.x must be in m, or a unit of the same kind, not '25 kg'"),
     ("30 kN m", "N m^2", "must be in N m^2, or a unit of the same kind, not '30 kN m'"),
-    ("3 apples", "m", "must be in m; '3 apples' has no unit that is known"),
+    ("3 apples", "m", "must be in m; '3 apples' has an unknown unit"),
     ("3 m", "1", "must be a plain number"),
     ("30 tons", "kg", "a ton may be metric or not"),
     ("10 rad/s", "Hz", "cycles and radians differ by 2 pi"),

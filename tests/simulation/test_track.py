@@ -14,7 +14,7 @@ from jaxbeam.analysis.assessment.static_checks import (
     largest_under_train,
     tabulated_line,
 )
-from jaxbeam.case.track import SHARES
+from jaxbeam.case.track import SLEEPER_FRACTIONS
 from jaxbeam.library import published
 from jaxbeam.numerics.polynomials import gauss_nodes, gauss_weights
 from tests.differences import central
@@ -284,7 +284,7 @@ def test_derivatives(track, address):
 
 
 def test_shares_of_the_rule():
-    assert sum(SHARES) == 1.0
+    assert sum(SLEEPER_FRACTIONS) == 1.0
 
 
 @pytest.mark.parametrize(

@@ -310,7 +310,7 @@ def test_impulses_of_several_wheels():
 
 def test_one_run_only():
     case = lifting_case("two masses")
-    sentence = "one run of known numbers"
+    sentence = "one run of concrete numbers"
     with pytest.raises(ValueError, match=sentence):
         jb.sweep(case, {"loads.0.speed": [1.0, 2.0]}, progress=False)
     with pytest.raises(ValueError, match=sentence):

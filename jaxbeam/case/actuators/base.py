@@ -60,22 +60,22 @@ class AbstractActuator(ReprWithUnits, Module):
 
     @property
     def hysteresis(self) -> Hysteresis | None:
-        """Operator from the commands to those that act; None if they act as they are."""
+        """Hysteresis from commands to the commands that act; None if there is none."""
         return None
 
     @property
     def compensation(self) -> Hysteresis | None:
-        """Operator whose inverse is applied to the commands of a controller; None if none is."""
+        """Hysteresis whose inverse is applied to the commands of a controller; None without one."""
         return None
 
     @property
     def creep(self) -> Creep | None:
-        """Drift of the commands that act, behind the hysteresis; None if there is none."""
+        """Creep of the commands that act, behind the hysteresis; None if there is none."""
         return None
 
     @property
     def creep_compensation(self) -> Creep | None:
-        """Creep whose inverse is applied to the commands of a controller; None if none is."""
+        """Creep whose inverse is applied to the commands of a controller; None without one."""
         return None
 
     @abc.abstractmethod

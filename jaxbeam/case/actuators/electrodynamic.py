@@ -22,7 +22,7 @@ from jaxbeam.runtime.arrays import Array, Number, xp
 
 
 class Coil(NamedTuple):
-    """Numbers of the coil (ohm, H, N/A, V s/m) and of its moving mass (kg, N s/m, N/m)."""
+    """Constants of a coil (ohm, H, N/A, V s/m) and of its moving mass (kg, N s/m, N/m)."""
 
     resistance: Float[Array, ""]
     inductance: Float[Array, ""]
@@ -84,7 +84,8 @@ class CurrentLoop(AbstractInnerLoop):
     the pole of the coil: I = command b / (p + b) with the coil at rest, while a velocity s' of the
     beam leaves the current -K_v p s' / ((L p + R)(p + b)), p the variable of Laplace. So the
     damping by the back-EMF vanishes as the bandwidth grows, and the shaker becomes a point force
-    K_f times the command. Without `integral` a share R / (R + P) of a steady command is missing.
+    K_f times the command. Without `integral` the fraction R / (R + P) of a steady command is
+    missing.
 
     >>> import jaxbeam as jb
     >>> shaker = jb.Electrodynamic(
@@ -181,7 +182,10 @@ def coil_alone(coil: Coil) -> LoopPort:
 
 
 def _gains(loop: AbstractInnerLoop, inductance, resistance) -> tuple[Array, Array | None]:
-    """Gains P and Q, given or from the bandwidth; the numbers of the coil are over its output."""
+    """Gains P and Q of a loop, given or from its bandwidth.
+
+    `inductance` and `resistance` are those of the coil per unit of the output that is fed back.
+    """
     if loop.bandwidth is None:
         return xp.asarray(loop.proportional), loop.integral
     return inductance * loop.bandwidth, resistance * loop.bandwidth
@@ -223,7 +227,7 @@ def _port(coil: Coil, matrix, commands, columns, voltage: PortSignal) -> LoopPor
 
     An attachment depends on s' alone. With z = y + a s + b s', a = -matrix^-1 columns_s and
     b = columns_s'', so does y' = matrix y + commands u + (columns_s' + matrix b - a) s'; what is
-    left of s and s' is a share of its stiffness and damping. At y = 0 the loop is at rest with s.
+    left of s and s' adds to its stiffness and damping. At y = 0 the loop is at rest with s.
     """
     on_s, on_rate, on_acceleration = columns.T
     shift = -xp.linalg.solve(matrix, on_s)

@@ -48,16 +48,16 @@ class Hysteresis(ReprWithUnits):
     weights: Float[Number, " play"] = number("1", "weights of the plays")
 
     def follow(self, plays: Plays, command: Float[Array, "*batch"]) -> Plays:
-        """Plays after a command."""
+        """States of the plays after a command."""
         r = self.thresholds.reshape(-1, *[1] * xp.ndim(command))
         return xp.maximum(command - r, xp.minimum(command + r, plays))
 
     def output(self, plays: Plays) -> Float[Array, "*batch"]:
-        """Command that acts."""
+        """Command that acts, the weighted sum of the states of the plays."""
         return xp.tensordot(self.weights, plays, axes=1)
 
     def outputs(self, commands: ArrayLike) -> Float[np.ndarray, " time"]:
-        """Commands that act for commands (time,) in turn, from rest."""
+        """Commands that act (time,) for a history of commands (time,), from rest."""
         plays, found = xp.zeros_like(self.thresholds), []
         for command in np.asarray(commands, float):
             plays = self.follow(plays, command)
@@ -71,9 +71,9 @@ class Hysteresis(ReprWithUnits):
         return self.output(self.follow(plays, command))
 
     def inverse(self) -> "Hysteresis":
-        """Operator that gives the command with which a wanted one acts.
+        """Inverse operator: from the command that is to act to the command to give.
 
-        Its thresholds are the first outputs at those of this operator.
+        Its thresholds are the first outputs at the thresholds of this operator.
         """
         sums = xp.cumsum(self.weights)
         later = -self.weights[1:] / (sums[1:] * sums[:-1])
@@ -115,27 +115,29 @@ class Creep(ReprWithUnits):
 
     @property
     def final_gain(self) -> Float[Array, ""]:
-        """What acts in the end over a steady command; no command makes more act."""
+        """Command that acts in the end per steady command: the largest gain."""
         return 1 + xp.sum(self.weights)
 
     def after(
         self, lags: Lags, command: Float[Array, "*batch"], duration: Float[Array, ""]
     ) -> Lags:
-        """Lags after a command that was held for a time (s)."""
+        """States of the lags after a command held for a `duration` (s)."""
         left = self._column(xp.exp(-self.rates * duration), command)
         return command + (lags - command) * left
 
-    def shares(self, period: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, " lag"]]:
-        """Factors of a held command and of the lags at its start in its mean output over a period.
+    def mean_factors(
+        self, period: Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, " lag"]]:
+        """Factors of the held command, and of the lags at its start, in the mean output.
 
-        The mean of z over the period is v + (z_0 - v) (1 - exp(-a T)) / (a T).
+        The mean of a lag z over the `period` (s) is v + (z_0 - v) (1 - exp(-a T)) / (a T).
         """
         decay = self.rates * period
         kept = -xp.expm1(-decay) / decay
         return 1 + xp.sum(self.weights * (1 - kept)), self.weights * kept
 
     def outputs(self, commands, period: float) -> Float[np.ndarray, " time"]:
-        """What acts at the start of each command, held for a period (s), from rest."""
+        """Commands that act at the start of each command, held for a period (s), from rest."""
         lags, found = xp.zeros_like(self.rates), []
         for command in np.asarray(commands, float):
             found.append(command + self.weights @ lags)

@@ -69,7 +69,7 @@ class Patch(AbstractActuator):
         "N m/V", "moment per volt at the patch", default=None
     )
     correction: Float[Number, ""] = number(
-        "1", "share of the moment that reaches the beam", default=1.0
+        "1", "fraction of the moment that reaches the beam", default=1.0
     )
     amplifier_gain: Float[Number, ""] = number(
         "1", "patch volts per volt of command", POSITIVE, default=1.0

@@ -104,7 +104,7 @@ class Axles(AbstractRowLoad):
     def _list_error(self, address: str) -> str | None:
         if self.offsets is None and self.times is not None:
             return (
-                f"{address}.offsets is missing; beside a table of times and positions give the"
+                f"{address}.offsets is missing; with a table of times and positions give the"
                 " distances of the axles behind the first one"
             )
         if self.offsets is None:

@@ -38,7 +38,7 @@ _LOAD_TOLERANCE = 1e-9  # of the mean wheel load: a smaller one carries nothing
 
 
 class ForceHistory(Module):
-    """Force (N, positive downwards) over time, in addition to a constant one.
+    """History of a force (N, positive downwards) in addition to a constant one.
 
     The sum of A sin(2 pi f t + phase) and of a table of forces at times, with straight lines
     between them, constant before and after; t in s. Runs of a batch differ along a last axis.
@@ -65,7 +65,7 @@ class ForceHistory(Module):
 
 
 class VehicleModel(Module):
-    """Matrices of one vehicle: equations of motion, and what its wheels do to the surface.
+    """Matrices of one vehicle: its equations of motion, and the forces of its wheels.
 
     `offsets` are the distances (m) of the wheels behind the first one. Wheels have static loads P
     (N), unsprung masses m (kg), and k (N/m) and c (N s/m) of the springs between surface and
@@ -114,7 +114,7 @@ def plain_wheels(
     masses: Float[Array, "*wheel"],
     offsets: Float[Array, " wheel"] | None = None,
 ) -> VehicleModel:
-    """Wheels without a vehicle above them: forces (N) and masses (kg) that follow the surface."""
+    """Vehicle model of bare wheels: forces (N) and masses (kg) that follow the surface."""
     static_loads, masses = xp.reshape(static_loads, -1), xp.reshape(masses, -1)
     wheels = static_loads.shape[0]
     none, nothing = xp.zeros(wheels), np.zeros((0, 0))
@@ -161,9 +161,9 @@ class AbstractLoad(ReprWithUnits):
         return xp.zeros(1)
 
     def by_numbers(self) -> "AbstractLoad":
-        """The same load with numbers in place of the names of a library, where they mean the same.
+        """The same load with the numbers of the library in place of names, where these are equal.
 
-        Loads of equal structure share compiled programs.
+        Loads of equal structure use the same compiled programs.
         """
         return self
 
@@ -294,8 +294,8 @@ class AbstractRowLoad(AbstractVehicleLoad):
         )
 
 
-def known_numbers(part: Any) -> bool:
-    """Whether no number of a part is traced by `jit` or `vmap`."""
+def all_concrete(part: Any) -> bool:
+    """Whether all numbers of a part are concrete, not traced by `jit` or `vmap`."""
     return all(is_concrete(leaf) for leaf in jax.tree.leaves(part))
 
 
@@ -356,6 +356,6 @@ def static_load_error(address: str, vehicle: VehicleModel) -> str | None:
 
 
 def _loose(vehicle: VehicleModel) -> str:
-    """Degrees of freedom that move most where no spring resists."""
+    """Names of the degrees of freedom that move most in a motion without spring resistance."""
     values, vectors = np.linalg.eigh(concrete(vehicle.full_stiffness))
     return repr(vehicle.names[int(np.argmax(np.abs(vectors[:, 0])))])

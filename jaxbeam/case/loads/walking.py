@@ -3,7 +3,7 @@
     F(t) = G (1 + sum over i of a_i sin(2 pi i f (t - t_0) + phase_i))
 
 with the weight G (N), the pace f (Hz, steps a second), the time t_0 of a step, and the dynamic load
-factors a_i, the amplitudes as shares of the weight.
+factors a_i, the amplitudes as fractions of the weight.
 
 Walking: the design factors of Young (2001) and CCIP-016, as coded in StructuralDesignKit_Holz,
 Vibrations - Legacy.cs (github.com/knippershelbig, commit 3b7def4):
@@ -85,7 +85,7 @@ class AbstractWalkingLoad(AbstractVehicleLoad):
     activity: str = choice("how people move", "walking", "jogging", default="walking", kw_only=True)
     factors: Float[Number, " harmonic"] | None = number(
         "1",
-        "amplitudes of the harmonics of the pace, as shares of the weight",
+        "amplitudes of the harmonics of the pace, as fractions of the weight",
         NOT_NEGATIVE,
         default=None,
         kw_only=True,
@@ -224,7 +224,7 @@ class Crowd(AbstractWalkingLoad):
         return self.factors is None and self.activity == "walking"
 
     def _draws(self):
-        """Places and steps of all people as shares from 0 to 1, and deviates of the paces."""
+        """Random places and step times of all people (0 to 1), and deviates of their paces."""
         random = np.random.default_rng(self.seed)
         places = np.append(0.0, np.sort(random.uniform(size=self.people - 1)))
         return places, random.uniform(size=self.people), random.standard_normal(self.people)

@@ -35,9 +35,9 @@ class AbstractProfile(ReprWithUnits, Module):
         """
 
     def by_numbers(self) -> "AbstractProfile":
-        """The same profile with numbers in place of what is static, as a seed.
+        """The same profile with its waves in place of static fields such as a seed.
 
-        Profiles of equal structure share compiled programs.
+        Profiles of equal structure use the same compiled programs.
         """
         return self
 
@@ -46,7 +46,7 @@ class AbstractProfile(ReprWithUnits, Module):
         return xp.zeros(0)
 
     def slope_kinks(self) -> tuple[Float[Array, " kink"], Float[Array, " kink"]]:
-        """Those of the `kinks` (m) at which r' jumps, and by how much (1), from left to right.
+        """Positions (m) at which r' jumps, and the jumps of r' (1), from left to right.
 
         There the velocity of a wheel with mass and no tyre jumps, and the beam takes an impulse.
         """
@@ -57,7 +57,7 @@ class AbstractProfile(ReprWithUnits, Module):
         return None
 
     def validate_travel(self, address: str, start, end) -> str | None:
-        """Error message if it is not known over a travel from start to end (m), or None."""
+        """Error message if it is not defined over a travel from start to end (m), or None."""
         return None
 
 

@@ -28,12 +28,12 @@ from jaxbeam.runtime.arrays import Array, Number, checkpoint, is_known, scan, xp
 from jaxbeam.runtime.module import Module
 
 DIRECT_SIZE = 100_000  # cosines that are computed at once; more than these wave by wave
-BLOCK = 16  # waves at once then: memory does not grow with their number
-# Of known numbers the sum is interpolated on panels of so many rad of its shortest wave, with so
-# many Chebyshev points each: their series of a cosine ends at J_24(4) = 2e-17.
+BLOCK = 16  # waves computed together then: memory does not grow with their number
+# With concrete numbers the sum is interpolated on panels of PANEL_PHASE rad of its shortest wave,
+# at PANEL_POINTS Chebyshev points each: their series of a cosine ends at J_24(4) = 2e-17.
 PANEL_PHASE, PANEL_POINTS = 8.0, 24
 PANELS_AT_ONCE = 64  # a call for each panel takes longer than its sum
-LEAST_INTERPOLATED, LEAST_POSITIONS = 50_000, 4  # cosines in all, positions a panel
+LEAST_INTERPOLATED, LEAST_POSITIONS = 50_000, 4  # cosines in all, positions in a panel
 
 
 class AbstractSpectralProfile(AbstractProfile):
@@ -113,7 +113,7 @@ def sum_of_cosines(
 
 
 def _sum_at_once(x, wavenumbers, amplitudes, phases) -> Heights:
-    """The same with an array of positions by waves."""
+    """`sum_of_cosines` by one array of cosines (position, wave)."""
     k = 2 * np.pi * wavenumbers
     angles = x[..., None] * k + phases
     even = xp.cos(angles) @ xp.stack([amplitudes, -amplitudes * k**2], axis=1)
@@ -121,7 +121,7 @@ def _sum_at_once(x, wavenumbers, amplitudes, phases) -> Heights:
 
 
 def _interpolated_sum(x: np.ndarray, waves, half: float) -> Heights:
-    """The same at many known positions, interpolated on panels of a `half` length (m).
+    """`sum_of_cosines` at many concrete positions, interpolated on panels of a `half` length (m).
 
     The waves at the Chebyshev points of all panels are products of those at their centres and of
     those at the points of one: few cosines, and products of matrices. Amplitudes and phases of
@@ -167,7 +167,7 @@ def _interpolated_sum(x: np.ndarray, waves, half: float) -> Heights:
 def _switched(x, switch_on, heights) -> Heights:
     """Product of a profile and the quintic from 0 to 1 between two positions.
 
-    Known heights may have a last axis of runs.
+    Concrete heights may have a last axis of runs.
     """
     length = switch_on[1] - switch_on[0]
     if is_known(x) and is_known(switch_on) and all(map(is_known, heights)):
@@ -294,9 +294,9 @@ class SpectrumProfile(AbstractSpectralProfile):
 
 
 class ProfilesOfRuns(Module):
-    """Profiles of the runs of a batch, whose waves differ in amplitudes and phases only.
+    """Concrete profiles of a batch of runs, whose waves differ in amplitudes and phases only.
 
-    Of known numbers. Its heights, slopes and curvatures have a last axis of runs.
+    Its heights, slopes and curvatures have a last axis of runs.
     """
 
     first: SpectrumProfile
@@ -313,7 +313,7 @@ class ProfilesOfRuns(Module):
 
 
 def profiles_of_runs(profiles: Sequence[AbstractProfile | None]) -> ProfilesOfRuns | None:
-    """Profiles of runs together; None unless they are waves of the same wavenumbers."""
+    """Batch of the profiles of runs; None unless they are waves of the same wavenumbers."""
     first, same = profiles[0], ("wavenumbers", "switch_on", "contact_length")
     given = [one for one in profiles if isinstance(one, SpectrumProfile)]
     if len(given) < len(profiles) or not isinstance(first, SpectrumProfile):

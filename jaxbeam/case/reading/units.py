@@ -86,7 +86,7 @@ def _number_in_si(text: str, unit: str, name: str) -> float:
         quantity = units.Quantity(1.0, given)
     except Exception:  # whatever a parser may raise
         raise ValueError(
-            f"{name} must be {wanted}; {text!r} has no unit that is known: write powers and"
+            f"{name} must be {wanted}; {text!r} has an unknown unit: write powers and"
             " products as in 'kN m^2'"
         ) from None
     if not quantity.is_compatible_with(target):

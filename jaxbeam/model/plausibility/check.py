@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.fields import concrete, refuses_traced
-from jaxbeam.case.loads.base import known_numbers
+from jaxbeam.case.loads.base import all_concrete
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import Modes, modes
 from jaxbeam.model.plausibility.facts import Facts, Plausibility, plausible_numbers
@@ -74,7 +74,7 @@ def warn_if_implausible(case: Case, found: Modes | None = None) -> None:
     signs and powers of two of a recent one without warnings is not checked again, so that a loop
     over runs does not pay for it.
     """
-    if _SHOWN.get() or not known_numbers(case):
+    if _SHOWN.get() or not all_concrete(case):
         return
     sizes = _sizes(case)
     if sizes in _PLAUSIBLE:

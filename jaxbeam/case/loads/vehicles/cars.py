@@ -9,7 +9,7 @@ from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, concrete, is_concrete, n
 from jaxbeam.case.loads.base import (
     AbstractRowLoad,
     AbstractVehicleLoad,
-    known_numbers,
+    all_concrete,
     length_error,
     positive_error,
     static_load_error,
@@ -175,7 +175,7 @@ class HalfCar(AbstractVehicleLoad):
         springs = ("suspension_stiffness", "tyre_stiffness")
         reason = "without its spring the axle carries nothing; leave the axle out"
         error = error or positive_error(address, self, springs, reason) or self._order(address)
-        if error is None and known_numbers(self):
+        if error is None and all_concrete(self):
             error = static_load_error(address, self.vehicle(np.ones(())))
         return error or super().validate(address)
 

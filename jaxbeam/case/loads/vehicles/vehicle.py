@@ -26,7 +26,7 @@ from jaxbeam.case.loads.base import (
     AbstractRowLoad,
     AbstractVehicleLoad,
     VehicleModel,
-    known_numbers,
+    all_concrete,
     static_load_error,
 )
 from jaxbeam.case.loads.vehicles.assembly import Bodies, Hinges, Links, Wheels, assemble
@@ -69,7 +69,7 @@ class PlanarVehicle(Module):
         prefix = f"{address}." if address else ""
         described = self.bodies, self.springs, self.hinges, self.axles
         error = next(description_errors(prefix, *described), None)
-        if error is None and known_numbers(self):
+        if error is None and all_concrete(self):
             error = static_load_error(address or "the vehicle", self.model(np.ones(())))
         return error
 
@@ -284,7 +284,7 @@ class TrainLoad(AbstractVehicleLoad):
 
 
 def _coupled(models: list[VehicleModel], behind) -> VehicleModel:
-    """Vehicles one behind the other as one; names begin with the number of each, from 1."""
+    """One vehicle model of several in a row; names begin with the vehicle's number, from 1."""
     names = tuple(f"coach {i + 1} {name}" for i, one in enumerate(models) for name in one.names)
     rows, column = [], 0
     for one in models:
@@ -307,8 +307,8 @@ class VehicleLoad(AbstractRowLoad):
     """Vehicle of the library, of a vehicle file, or of tables in the case; `count` in a row.
 
     `model` is a name of the library or the path of a vehicle file (see `planar.files`), whose
-    numbers become those of the load: `loads.0.bodies.0.mass`. Tables beside a model replace those
-    of the model. The load of a file keeps the numbers, not the path.
+    numbers become those of the load: `loads.0.bodies.0.mass`. Tables given with a model replace
+    those of the model. The load of a file keeps the numbers, not the path.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(

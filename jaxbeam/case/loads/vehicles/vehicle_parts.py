@@ -68,7 +68,7 @@ class VehicleBody(ReprWithUnits):
 class VehicleSpring(ReprWithUnits):
     """Vertical spring and damper between two bodies at a position, and those between their pitches.
 
-    A vertical force acts on both bodies along one line, so that they share the position.
+    A vertical force acts on both bodies along one line, hence at the same position.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -202,7 +202,7 @@ Hinges = tuple[VehicleHinge, ...]
 def description_errors(
     prefix: str, bodies: Bodies, springs: tuple[VehicleSpring, ...], hinges: Hinges, axles: Axles
 ) -> Iterator[str]:
-    """Errors in the description of a vehicle as messages; the first one may cause the others.
+    """Error messages of a vehicle's description; the first error may cause the others.
 
     `prefix` begins the addresses of its parts.
     """
