@@ -82,7 +82,7 @@ class SampledProgram(Module):
         present = (measurements >= low) & (measurements <= high)
         last = state.law.readings
         readings = xp.where(present, measurements, last) if low.size else last
-        known_command = self.path.known_to_law(state.commands)[:, 0]
+        known_command = self.path.assumed_commands(state.commands)[:, 0]
         measurement = Measurement(readings, plant_state, known_command, present)
         law = with_settings(self.law, state.settings)
         found = law.step(state.law, measurement, t)

@@ -124,6 +124,11 @@ def is_concrete(value) -> bool:
     return True
 
 
+def all_concrete(tree) -> bool:
+    """Whether all numbers of a tree are concrete, not traced by `jit` or `vmap`."""
+    return all(map(is_concrete, jax.tree.leaves(tree)))
+
+
 def deciding(value, what: str):
     """A number by which a law decides at samples; its derivatives raise an error.
 

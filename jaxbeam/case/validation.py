@@ -23,13 +23,12 @@ from jaxbeam.case.declared_checks import (
     check_on_beam,
     describe_value,
 )
-from jaxbeam.case.fields import ON_BEAM, concrete, is_concrete
+from jaxbeam.case.fields import ON_BEAM, all_concrete, concrete, is_concrete
 from jaxbeam.case.filters import nyquist_error
 from jaxbeam.case.limits import MAX_WHEELS, check_length
 from jaxbeam.case.loads.base import (
     AbstractLoad,
     VehicleModel,
-    all_concrete,
     wheel_distances,
 )
 from jaxbeam.case.loads.vehicles.vehicle_parts import VehicleSensor

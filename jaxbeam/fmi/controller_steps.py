@@ -95,7 +95,7 @@ class ControllerSteps:
             self._readings[i], self._filters[i] = filtered_reading(
                 self._sensors[i], self._sections[i], self._filters[i], readings[i]
             )
-        known_commands = self._path.known_to_law(self._memory)[:, 0]
+        known_commands = self._path.assumed_commands(self._memory)[:, 0]
         measurement = Measurement(self._readings.copy(), self._unknown, known_commands, present)
         found = self._law.step(self._state, measurement, np.asarray(due))
         self._state, command = found.state, np.asarray(found.command)

@@ -43,7 +43,7 @@ from jaxbeam.simulation.commands import command_path
 from jaxbeam.simulation.continuous_loop import ContinuousLoop
 from jaxbeam.simulation.sampled_loop import SampledLoop
 
-SAME_TIME_SHARE = 1e-9  # of a period
+SAME_TIME_FRACTION = 1e-9  # of a period
 MOVING = "period", "delay", "sampling_period", "jitter", "times"  # numbers that move events
 FIXED = (
     "periods, delays and times of samples are fixed by a plan made without tracing them:"
@@ -130,7 +130,7 @@ def moved_schedule(
 
 
 def moves_events(case: Case, times=None) -> bool:
-    """Whether the times of a controlled run are traced, perhaps for a derivative by them."""
+    """Whether times of events of a controlled run are traced, so that they have derivatives."""
     controller = case.controller
     numbers = [case.run.duration, case.run.sample_rate, times]
     if controller.open_loop and controller.period is None:
@@ -146,14 +146,14 @@ def _sampled_sensors(case: Case) -> tuple:
 
 
 def with_fixed_losses(case: Case) -> Case:
-    """The case, of which derivatives by a `dropout` raise ValueError."""
+    """The case; derivatives of its results by a `dropout` raise ValueError."""
     return _fixed(case, LOST, "dropout")
 
 
 def with_fixed_events(case: Case, times) -> tuple[Case, Any]:
-    """The case and the times of its samples, without derivatives by what moves events.
+    """The case and the times of its samples, whose events have no derivatives.
 
-    Differentiating by these raises ValueError.
+    Differentiating by numbers that move events, such as periods and delays, raises ValueError.
     """
     if not moves_events(case, times):
         return case, times
@@ -166,7 +166,7 @@ def with_fixed_events(case: Case, times) -> tuple[Case, Any]:
 
 
 def _fixed(case: Case, reason: str, *names: str) -> Case:
-    """The case, of which derivatives by numbers of controller and sensors raise ValueError."""
+    """The case; derivatives by these fields of controller and sensors raise ValueError."""
 
     def fixed(part):
         values = {name: getattr(part, name, None) for name in names}
@@ -179,9 +179,9 @@ def _fixed(case: Case, reason: str, *names: str) -> Case:
 
 
 def command_lag(case: Case) -> int:
-    """Samples from the one of a command to the first at which it acts already."""
+    """Number of sampling periods from the sample of a command to the first at which it acts."""
     delay = 0.0 if case.controller.delay is None else float(concrete(case.controller.delay))
-    return math.floor(delay / float(concrete(case.controller.period)) + SAME_TIME_SHARE) + 1
+    return math.floor(delay / float(concrete(case.controller.period)) + SAME_TIME_FRACTION) + 1
 
 
 def closed_loop(
@@ -239,15 +239,20 @@ def closed_loop(
 
 
 @compiled_if_traced
-def known_loop(case: Case, layout: Layout, schedule: EventSchedule) -> SampledLoop | ContinuousLoop:
-    """`closed_loop` of a case of known numbers."""
+def loop_of_case(
+    case: Case, layout: Layout, schedule: EventSchedule
+) -> SampledLoop | ContinuousLoop:
+    """`closed_loop` with the loads of the case, computed in NumPy if its numbers are concrete."""
     return closed_loop(case, layout, load_set(case, layout), schedule)
 
 
 def _with_controller_states(
     model: ModalModel, output_rows: Float[Array, "sensor state"], count: int
 ) -> tuple[ModalModel, Float[Array, "sensor all"]]:
-    """Model with more states, whose rates are its last commands and which no output contains."""
+    """Model with `count` states added for a controller, whose rates are its last commands.
+
+    Also `output_rows` on the larger state; no output contains the states added.
+    """
     if count == 0:
         return model, output_rows
     state_matrix = xp.pad(model.state_matrix, ((0, 0), (0, count), (0, count)))

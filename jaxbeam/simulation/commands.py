@@ -1,4 +1,4 @@
-"""Commands on their way from the law to the beam: inverse operator, limits, delay, operator."""
+"""Commands from law to beam: compensation, limits, delay, then hysteresis and creep."""
 
 import dataclasses
 from typing import NamedTuple
@@ -32,7 +32,7 @@ def acting_ranges(case: Case) -> CommandRanges:
     creeps = xp.stack([xp.ones(()) if a.creep is None else a.creep.final_gain for a in actuators])
 
     def acts(ends):
-        """Commands that act in the end at these ends of the ranges."""
+        """Commands that act in the end under steady commands at these ends of the ranges."""
         return creeps * xp.stack(
             [
                 end
@@ -80,7 +80,7 @@ Command = Float[Array, " batch"]
 
 
 class CommandOperator(Module):
-    """Hysteresis, then creep, under commands held for a period (s): from a command to what acts.
+    """Hysteresis, then creep: operator from commands held for a period (s) to commands that act.
 
     The state has the plays, the first of which is the command itself, and the lags at the start of
     the period.
@@ -96,7 +96,7 @@ class CommandOperator(Module):
         return xp.zeros((self.hysteresis.thresholds.shape[0] + lags, batch_size))
 
     def follow(self, state: State, command: Command) -> State:
-        """State in the period of a command, after that of the last."""
+        """State in the period of a new command, from the state in the period before."""
         plays, lags = self._parts(state)
         followed = self.hysteresis.follow(plays, command)
         if self.creep is None:
@@ -105,7 +105,7 @@ class CommandOperator(Module):
         return xp.concatenate([followed, lags])
 
     def output(self, state: State) -> Command:
-        """What acts, its mean over the period."""
+        """Command that acts, its mean over the period."""
         plays, lags = self._parts(state)
         at_once = self.hysteresis.output(plays)
         if self.creep is None:
@@ -114,7 +114,7 @@ class CommandOperator(Module):
         return of_command * at_once + xp.tensordot(of_lags, lags, axes=1)
 
     def inverse(self) -> "InverseOperator":
-        """Operator that gives the command with which a wanted one acts."""
+        """Inverse operator: from the command that is to act to the command to send."""
         return InverseOperator(self.hysteresis.inverse(), self.creep, self.period)
 
     def _parts(self, state):
@@ -138,7 +138,7 @@ class InverseOperator(Module):
         return CommandOperator(self.hysteresis, self.creep, self.period).start(batch_size)
 
     def follow(self, state: State, wanted: Command) -> State:
-        """State in the period of a wanted command, after that of the last."""
+        """State in the period of a new wanted command, from the state in the period before."""
         if self.creep is None:
             return self.hysteresis.follow(state, wanted)
         count = self.hysteresis.thresholds.shape[0]
@@ -186,7 +186,7 @@ class CommandMemory(NamedTuple):
 
 
 class CommandPath(Module):
-    """Operators of the actuators and the ranges of their commands."""
+    """Path of the commands of a case: compensations, ranges, and operators of the actuators."""
 
     case: Case
     ranges: CommandRanges
@@ -217,17 +217,18 @@ class CommandPath(Module):
         """Commands that act on the beam."""
         return _outputs(self.operators, memory.states, memory.command)
 
-    def known_to_law(self, memory: CommandMemory, age=None) -> Commands:
-        """Present commands as a law of linear actuators knows them.
+    def assumed_commands(self, memory: CommandMemory, age=None) -> Commands:
+        """Commands that act according to the compensations, as a law for linear actuators assumes.
 
-        With an `age`, those made so many commands ago, whether they arrived or not.
+        The present ones; with an `age`, those sent so many commands ago, whether they arrived or
+        not.
         """
         if age is not None:
             return take(memory.queue if memory.assumed is None else memory.assumed_queue, age)
         return memory.command if memory.assumed is None else memory.assumed
 
     def send(self, memory: CommandMemory, wanted: Commands) -> CommandMemory:
-        """Memory with the command for a wanted one in the queue."""
+        """Memory with the compensated and limited command for a wanted one in the queue."""
         states = _follow(self.inverses, memory.inverse_states, wanted)
         command = _outputs(self.inverses, states, wanted)
         command = limit_commands(self.case, command, memory.queue[0], self.ranges)
@@ -262,7 +263,7 @@ class CommandPath(Module):
 
 
 def command_path(case: Case) -> CommandPath:
-    """Way of the commands of a case."""
+    """Path of the commands of a case from law to beam."""
     period = case.controller.period
     operators = tuple(command_operator(a.hysteresis, a.creep, period) for a in case.actuators)
     compensations = tuple(
@@ -273,7 +274,7 @@ def command_path(case: Case) -> CommandPath:
 
 
 def with_exact_compensation(case: Case) -> Case:
-    """The case whose hystereses and creep are compensated exactly, so that wanted commands act."""
+    """The case with its hysteresis and creep compensated exactly, so that wanted commands act."""
     actuators = tuple(
         actuator
         if actuator.hysteresis is None and actuator.creep is None

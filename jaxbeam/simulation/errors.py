@@ -1,4 +1,4 @@
-"""Errors of what the sensors of a run measure: of time steps, of peaks, of the modes left out."""
+"""Errors of the sensors' quantities in a run: of time steps, of peaks, of the modes left out."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -42,7 +42,7 @@ def monitored_sensors(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
 
 
 def own_outputs(sensors: Sequence[Sensor]) -> Int[np.ndarray, " sensor"]:
-    """Index of the quantity of each sensor among those of `monitored_sensors`."""
+    """Index of each sensor's own quantity among the quantities of `monitored_sensors`."""
     others = np.array([sensor.quantity != "deflection" for sensor in sensors], int)
     return np.where(others, len(sensors) + np.cumsum(others) - 1, np.arange(len(sensors)))
 
@@ -89,8 +89,8 @@ def step_errors(case: Case, model: ModalModel, trial: StepTrial) -> Float[Array,
     )
     errors = []
     for sensor in case.sensors:
-        known, better = (sensor_history(case, model.modes, m, sensor) for m in (coarse, fine))
-        change = UNSAMPLED * xp.max(xp.abs(better - known))
+        former, better = (sensor_history(case, model.modes, m, sensor) for m in (coarse, fine))
+        change = UNSAMPLED * xp.max(xp.abs(better - former))
         errors.append(_ratio(change, xp.max(xp.abs(better))))
     return xp.array(errors).reshape(-1)
 
@@ -209,5 +209,5 @@ def _highest_modes(
 
 
 def _ratio(change, largest):
-    """Change relative to the largest value; zero where that is."""
+    """Ratio of a change to the largest value; zero where that is zero."""
     return xp.where(largest == 0, 0.0, change / xp.where(largest == 0, 1.0, largest))

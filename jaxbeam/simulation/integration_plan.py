@@ -1,4 +1,4 @@
-"""Integration plan: what compiled code fixes of a run, and the case and times that it is for.
+"""Integration plan: static shapes and number of steps of a run, and the case that it is for.
 
 A plan fixes the number of loads on the beam, the steps between samples and the events of control.
 It is computed from concrete numbers and is static in the compiled code, which then holds for all
@@ -47,7 +47,7 @@ from jaxbeam.model.modal_model import modal_model
 from jaxbeam.runtime.arrays import Array, any_jax, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.runtime.module import Module
-from jaxbeam.simulation.closed_loop import closed_loop, known_loop, loop_schedule, moves_events
+from jaxbeam.simulation.closed_loop import closed_loop, loop_of_case, loop_schedule, moves_events
 from jaxbeam.simulation.errors import step_errors
 
 # Errors of a plan, relative to the largest deflection, beyond which it is not followed by a case of
@@ -69,7 +69,7 @@ class PlanOrigin:
 
 
 def common_origin(origins: Sequence[PlanOrigin | None]) -> PlanOrigin | None:
-    """Origin of a plan for several cases, which differ in numbers or times; None without one."""
+    """Origin of a plan for several cases, with NaN for numbers that differ; None without one."""
     first, *others = origins
     if first is None:
         return None
@@ -92,7 +92,7 @@ def check_origin(
     steps_per_limit: float,
     error: float,
 ) -> bool:
-    """Whether a plan for cases like its `origin` is one of exactly this case, as far as is known.
+    """Whether a plan is for exactly this case, as far as its numbers are concrete.
 
     `steps_per_limit` is the longest step of the plan over the stability limit of its origin,
     `error` that of the plan.
@@ -154,9 +154,9 @@ def check_origin(
 
 
 def check_same_events(planned: EventSchedule, own: EventSchedule) -> None:
-    """Raises ValueError unless a controlled run has the events of control that a plan has.
+    """Raises ValueError unless the control events of a run are those of its plan.
 
-    Those of a moving plan may be at other times, in the same order.
+    Events of a moving plan may be at other times, in the same order.
     """
     moving = planned.source is not None
     if moving and len(own.times) == len(planned.times):
@@ -195,13 +195,13 @@ def _words(times: Float[np.ndarray, " time"]) -> str:
 
 TOLERANCE = 1e-7  # relative to the largest deflection
 MAX_STEPS_PER_SAMPLE = 10**5  # time steps between samples of a controlled run
-MAX_KNOWN_EVENTS = 10000  # of a run without compilation, which would take less time beyond
-# Errors of a closed loop over those under its commands, at most: predictive control, whose programs
-# are ill-conditioned, raised them 5000 times.
+MAX_UNCOMPILED_EVENTS = 10000  # of a concrete run; with more, compilation takes less time
+# Bound on closed-loop over open-loop step error; largest seen: 5000, of predictive control, whose
+# programs are ill-conditioned.
 AMPLIFICATION = 1e4
-# Steps between samples over those of the trials, which begin at load events: where forces change
-# sharply, errors were up to fourteen times as large with steps that begin elsewhere.
-SHARE_OF_TRIAL_STEP = 0.8
+# Step length between samples over that of the trials, which begin at load events: where forces
+# change sharply, errors were up to fourteen times as large with steps that begin elsewhere.
+TRIAL_STEP_FRACTION = 0.8
 SPACING_TOLERANCE = 1e-6  # largest deviation of equally spaced samples, relative to the spacing
 
 
@@ -211,7 +211,7 @@ class IntegrationPlan(Module):
     Valid for cases that differ in numbers only, if these keep the order of supports and loads and
     change frequencies little. `substeps` is the number of steps from sample to sample (with a
     controller from event to event), `error` relative to the largest deflection, `sensor_errors`
-    to the largest value of what each sensor measures (empty where they are not known).
+    to the largest value of what each sensor measures (empty where they are not estimated).
     `lead_samples` are added before the first sample, back to the start of the run. The run ends
     with the last sample, or `to_duration` at the duration of the case. With a controller the
     `schedule` holds its events, the samples and the end. The `origin` is what the plan was made
@@ -231,11 +231,11 @@ class IntegrationPlan(Module):
     of_peaks: bool = eqx.field(static=True, default=False)
 
     def without_statements(self) -> "IntegrationPlan":
-        """The plan without errors and origin: static data of programs that other runs share."""
+        """The plan without errors and origin, so that runs that differ in these use one program."""
         return dataclasses.replace(self, error=0.0, sensor_errors=(), origin=None)
 
 
-# A run by a plan under an input policy: its states at all events, as `beam_and_vehicles`, and its
+# Function of a plan and an input policy: states of a run at all events, as `beam_and_vehicles`, and
 # commands there.
 FirstRun = Callable[[IntegrationPlan, AbstractInputPolicy], tuple[Array, Array]]
 
@@ -291,18 +291,18 @@ def integration_plan(
     lead_samples = int(np.ceil(samples[0] / intervals.mean() - SPACING_TOLERANCE))
     schedule = run_schedule(case, samples, equally_spaced, lead_samples, to_duration)
     step, error, trial = choose_step_size(case, shapes, tolerance, schedule)
-    substeps, share = trial.substeps, 1.0
+    substeps, error_ratio = trial.substeps, 1.0
     if not substeps:
-        substeps, share = _substeps_and_share(trial, step, intervals.max())
+        substeps, error_ratio = _substeps_and_error_ratio(trial, step, intervals.max())
         check_step_count(float(samples.size * substeps), intervals.max() / substeps)
     return IntegrationPlan(
         shapes,
         substeps,
         lead_samples,
         equally_spaced,
-        share * error,
+        error_ratio * error,
         to_duration=to_duration,
-        sensor_errors=tuple(share * each for each in _sensor_errors(case, shapes, trial)),
+        sensor_errors=tuple(error_ratio * each for each in _sensor_errors(case, shapes, trial)),
         origin=origin,
     )
 
@@ -352,18 +352,18 @@ def check_times(times) -> None:
         )
 
 
-def _substeps_and_share(trial: StepTrial, step: float, interval: float) -> tuple[int, float]:
-    """Steps in each interval (s) between samples, and their error over that of a trial.
+def _substeps_and_error_ratio(trial: StepTrial, step: float, interval: float) -> tuple[int, float]:
+    """Number of steps in an interval (s) between samples, and their error over that of the trial.
 
-    Steps of the trial are at most a `step` (s). Those of the run are SHARE_OF_TRIAL_STEP of them or
-    shorter, but where there is only one between two load events: that may be the same in both.
+    Steps of the trial are at most a `step` (s); those of the run are at most TRIAL_STEP_FRACTION of
+    them. A single step between two load events may be as long as that of the trial.
     """
     times, steps = trial.panels
     several = steps < times
-    longest = SHARE_OF_TRIAL_STEP * np.min(steps[several], initial=step)
+    longest = TRIAL_STEP_FRACTION * np.min(steps[several], initial=step)
     substeps = steps_per_interval(interval, longest)
     of_run = np.minimum(times, interval) / substeps
-    ratios = np.minimum(of_run / (SHARE_OF_TRIAL_STEP * steps), 1.0)
+    ratios = np.minimum(of_run / (TRIAL_STEP_FRACTION * steps), 1.0)
     return substeps, float(np.max(ratios, initial=0.0)) ** CONVERGENCE_ORDER
 
 
@@ -453,9 +453,10 @@ def _choose_substeps(
 ) -> tuple[int, float, StepTrial | None]:
     """Number of steps between events of a schedule, relative error of the deflection, and trial.
 
-    A `first_run` takes the smallest number of steps. If steps half as long change its response
-    to the same commands so little that a law could not amplify it to the tolerance, no further run
-    closes the loop; stated is the amplified error. There is no trial of a run that diverges.
+    A `first_run` takes the smallest number of steps. If its response to the same commands in steps
+    half as long differs so little that the loop could not amplify the difference to the tolerance,
+    these steps are taken, and the error is the amplified difference. The trial of a run that
+    diverges is None.
     """
     step, interval = longest_trial_step(case, shapes), float(schedule.lengths.max())
     if interval / step > MAX_STEPS_PER_SAMPLE:
@@ -468,8 +469,8 @@ def _choose_substeps(
     min_substeps = steps_per_interval(interval, step)
 
     is_compiled = runs_compiled(schedule)
-    trial_run = _compiled_trial_run if is_compiled else _known_trial_run
-    policy = None if is_compiled else known_loop(case, shapes.layout, schedule)
+    trial_run = _compiled_trial_run if is_compiled else _trial_run
+    policy = None if is_compiled else loop_of_case(case, shapes.layout, schedule)
 
     model = modal_model(case, shapes.layout, shapes.coupled)
     least = rounding_deflection(case, model, load_set(case))
@@ -522,17 +523,17 @@ def _sensor_errors(case: Case, shapes: StaticShapes, trial: StepTrial | None) ->
 
 
 def runs_compiled(schedule: EventSchedule) -> bool:
-    """Whether runs of a controlled case are compiled although its numbers are known.
+    """Whether runs of a controlled case are compiled although its numbers are concrete.
 
     In NumPy each event takes a fraction of a millisecond, in a program a hundredth of that.
     """
-    return schedule.times.shape[0] > MAX_KNOWN_EVENTS
+    return schedule.times.shape[0] > MAX_UNCOMPILED_EVENTS
 
 
 def beam_and_vehicles(
     case: Case, shapes: StaticShapes, policy: AbstractInputPolicy, states
 ) -> Float[Array, "event state batch"]:
-    """The states of a controlled run without those of filters and of the controller."""
+    """States of beam and vehicles of a controlled run, without those of filters and controller."""
     own = modal_model(case, shapes.layout, shapes.coupled).state_count
     return xp.concatenate([states[:, :own], states[:, policy.model.state_count :]], axis=1)
 
@@ -551,7 +552,7 @@ def _closed_loop_trial_run(case, shapes, schedule, substeps, policy):
     return beam_and_vehicles(case, shapes, policy, states[: schedule.times.shape[0]])
 
 
-_known_trial_run = compiled_if_traced(_closed_loop_trial_run)
+_trial_run = compiled_if_traced(_closed_loop_trial_run)
 _compiled_trial_run = compiled(_closed_loop_trial_run)
 
 
@@ -561,10 +562,10 @@ def _halve_until_converged(
     tolerance: float,
     max_halvings: int,
 ) -> tuple[int, float]:
-    """Number of halvings of a step until the error by one more is within a tolerance, and it.
+    """Number of halvings of a step after which one more changes the states within a tolerance.
 
-    By the `states` after so many halvings, and the error by their `change`. Raises RuntimeError if
-    no number up to `max_halvings` suffices.
+    And the `change` of the states by that one more; `states` returns those after a number of
+    halvings. Raises RuntimeError if no number up to `max_halvings` suffices.
     """
     coarse, floor = states(0), ErrorFloor(tolerance)
     for halvings in range(max_halvings):

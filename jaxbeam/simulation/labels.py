@@ -29,7 +29,7 @@ def wheel_labels(loads: LoadSet) -> np.ndarray:
 
 
 def contact_sentence(case: Case, loads: LoadSet, lost_times, lost_positions, lowest_forces) -> str:
-    """Where and when (s, m) wheels of the loads would first have to pull, and least forces (N).
+    """Sentence on lost contact: when (s), where (m) and how hard (N) wheels would have to pull.
 
     Times are NaN for wheels that press on the beam throughout. The first of many wheels are listed.
     Prescribed forces may be negative: these pull because they were given so.
@@ -78,7 +78,7 @@ class Flights(Module):
 
 
 def flights_sentence(case: Case, loads: LoadSet, flights: Flights) -> str:
-    """When and where wheels leave the beam and land, how high they fly, how hard they land.
+    """Sentence on the flights of wheels: when and where they lift and land, gap and impulse.
 
     The first flight of each of the first wheels, and how many more there are.
     """
@@ -114,7 +114,7 @@ def _given_forces(loads: LoadSet) -> Float[np.ndarray, " wheel"]:
 
 
 def _pressing_sentence(case: Case, loads: LoadSet, lowest_forces) -> str:
-    """Which wheels press on the beam throughout, where none pulls: none without weight, say."""
+    """Sentence on a run without lost contact: which wheels press on the beam throughout."""
     if not case.loads:
         return "the case has no loads"
     labels = wheel_labels(loads)

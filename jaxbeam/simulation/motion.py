@@ -68,7 +68,7 @@ def motion_of(
     contact: ContactState,
     commands: Float[Array, "time command"] | None = None,
 ) -> tuple[Motion, VehicleMotion]:
-    """`motion_at` with known contact forces and accelerations."""
+    """`motion_at`, given the contact forces and accelerations."""
     vehicles = _vehicle_motion(model, loads, states, contact.vehicle_acceleration)
     force, accelerations = contact.force[..., 0], contact.modal_acceleration[..., 0]
     count = 2 * accelerations.shape[1]
@@ -87,7 +87,7 @@ def motion_of(
 def _with_absorbers(
     case: Case, model: ModalModel, motion: Motion, vehicles: VehicleMotion
 ) -> VehicleMotion:
-    """The motion of the bodies, those of absorbers in place of their equivalent oscillators.
+    """Motion of the bodies, with absorbers themselves in place of their equivalent oscillators.
 
     u = r z + (1 - r) y; see `jaxbeam.case.absorbers`.
     """
@@ -120,9 +120,10 @@ def _vehicle_motion(model: ModalModel, loads: LoadSet, states, accelerations) ->
 def motion_of_forces(
     case: Case, model: ModalModel, loads: LoadSet, times: Float[np.ndarray, " time"]
 ) -> Motion | None:
-    """Motion of a run without controller at times (s); None if it is not of the kind.
+    """Motion of a run at times (s) in closed form; None where there is no closed form.
 
-    All loads have to be forces that move at constant speeds, and the poles of the beam distinct.
+    All loads have to be forces at constant speeds, without a controller, and the poles of the beam
+    distinct.
     Forces off the beam are left out of the motion.
     """
     if not constant_speeds(loads):

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 class Result(enum.IntFlag):
-    """What is wrong with a run: none or several, as one number that programs can return.
+    """Flags of what is wrong with a run, combined in one number that programs can return.
 
     `CONTACT_LOST`: a contact force is tensile, at which the load would lift off. `STEPS_TOO_LONG`:
     the error estimate is above the tolerance. `DIVERGED`: the closed loop has grown beyond all
@@ -195,7 +195,7 @@ class Record(RecordViews):
         By default positions are ends, supports, hinges, changes of section, actuators, sensors,
         loads that stand, 100 equal steps, and as many more as it takes for the smallest and the
         largest value along the beam to change by less than 1e-4 (of these there are none under
-        `jit` and `vmap`, where their number is not known). The quantities are those of `at`; a
+        `jit` and `vmap`, as their number must be concrete). The quantities are those of `at`; a
         moment has its peak as a load passes, so that a load should move by a small part of the
         length between samples. With each value is that of another, `coincident` quantity at the
         same place and time, if one is named. Raises ValueError as `at` does.
@@ -222,11 +222,11 @@ class Record(RecordViews):
 
     @property
     def truncation_errors(self) -> Float[Array, " sensor"]:
-        """What the modes left out change, relative to the largest value at each sensor, about.
+        """Estimated effect of the modes left out, relative to the largest value at each sensor.
 
         See `jaxbeam.simulation.errors`: of deflections the static correction, of others the
         dynamic part of the three highest modes, from up to 400 samples. `step_errors` are
-        those of the time steps. NaN where it is not known.
+        those of the time steps. NaN where there is no estimate.
         """
         chosen = chosen_samples(self.times.shape[0])
         motion = Motion(*(part[chosen] for part in self.motion))
@@ -346,7 +346,7 @@ class Record(RecordViews):
         return xp.where(xp.any(diverged), self.times[xp.argmax(diverged)], xp.nan)
 
     def _stroke_sentences(self) -> list[str]:
-        """Which absorbers move further than they may."""
+        """Sentences on absorbers whose stroke exceeds the largest allowed."""
         strokes, found = np.abs(np.asarray(concrete(self.stroke))).max(axis=0, initial=0.0), []
         for i, (absorber, stroke) in enumerate(zip(self.case.absorbers, strokes, strict=True)):
             largest = absorber.max_stroke
@@ -355,7 +355,7 @@ class Record(RecordViews):
         return found
 
     def _size_sentences(self) -> list[str]:
-        """How large a deflection is that no beam has; the loop may be unstable, but is bounded."""
+        """Sentences on deflections larger than any beam can have, as of an unstable loop."""
         largest = np.abs(np.asarray(concrete(self.deflection))).max(initial=0.0)
         ratio = float(largest / concrete(self.case.beam.length))
         if not ratio > 1:
@@ -369,7 +369,7 @@ class Record(RecordViews):
     @property
     def verdict(self) -> str:
         """Sentence on divergence, size, contact, steps of the controller that failed, and error."""
-        if not is_concrete(self.coordinates):  # it is known while a run is differentiated
+        if not is_concrete(self.coordinates):  # numbers that `grad` traces are concrete
             refuse_traced("a verdict", "read it outside jit and vmap", self)
         diverged = float(concrete(self.diverged_time))
         if np.isfinite(diverged):
@@ -389,7 +389,7 @@ class Record(RecordViews):
             parts.append(f"the controller found no solution in {failures} of its steps")
         error = float(concrete(self.error_estimate))
         parts.append(
-            "the error of the steps is not known, as the plan is of other numbers"
+            "the error of the steps is unknown, as the plan is of other numbers"
             if np.isnan(error)
             else f"estimated error of the steps {error:.1e} of the largest deflection"
         )

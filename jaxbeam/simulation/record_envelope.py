@@ -122,7 +122,7 @@ def record_envelope(
     numbers = case, modes, motion, times, parameters
     leaves = jax.tree.leaves(numbers)
     if positions is None and any_traced(leaves) and all(map(is_concrete, leaves)):
-        # Those of the known numbers, where the extremes are differentiated.
+        # Positions of the extremes of the concrete numbers, where the values are differentiated.
         plain = jax.tree.map(lambda n: concrete(n) if any_traced(n) else n, numbers)
         own_case, own_modes, own_motion, own_times, (fibre, modulus) = plain
         run = own_case, own_modes, own_motion, own_times
@@ -178,7 +178,7 @@ def _extremes(values, times, motion: Motion, other) -> tuple:
 
 
 def _larger(one: tuple, other: tuple) -> tuple:
-    """Of two results of `_extremes` the one with the larger value, at each position."""
+    """The larger of two results of `_extremes`, at each position."""
     is_larger = other[0] > one[0]
     return tuple(
         xp.where(is_larger[:, None] if a.ndim == 2 else is_larger, b, a)

@@ -40,7 +40,7 @@ class LoopMemory(NamedTuple):
 
 
 class SampledLoop(AbstractInputPolicy):
-    """Input policy of a sampled law; runs of a batch share the law, each has its own memory.
+    """Input policy of a sampled law: one law for all runs of a batch, a memory for each.
 
     The model includes the analogue filters of the sensors; `filter_sections` are those of the
     digital ones. `measured_rows` are those of the quantities, of which accelerations follow from
@@ -109,7 +109,7 @@ class SampledLoop(AbstractInputPolicy):
         def step(inputs):
             law_state, commands, failures = inputs
             available = self._available_readings(readings, event)
-            acting = self.path.known_to_law(commands, schedule.assumed_age)
+            acting = self.path.assumed_commands(commands, schedule.assumed_age)
             command, law_state, solved = self._step_law(law_state, available, state, acting, info)
             return law_state, self.path.send(commands, command), failures + ~solved
 

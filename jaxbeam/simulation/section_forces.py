@@ -52,7 +52,7 @@ def history(
 def locked_in(
     case: Case, modes: Modes, x, name: str, fibre_distance=None, section_modulus=None
 ) -> Float[Array, "*position"]:
-    """Moment, shear force or stress of settled supports at positions x (m), in its SI unit."""
+    """Moment, shear force or stress due to settled supports at positions x (m), in its SI unit."""
     parameters = fibre_distance, section_modulus
     quantity = quantity_of(name, *parameters)
     field = settled_beam(case, modes.layout).field(x, quantity.x_derivative)
@@ -103,11 +103,11 @@ def reactions(case: Case, modes: Modes, motion: Motion) -> Float[Array, "time su
     reaction = xp.where(last, 0.0, right) - xp.where(first, 0.0, left)
     # Loads between the sections on both sides.
     low, high = xp.where(first, -xp.inf, x - step), xp.where(last, xp.inf, x + step)
-    for offset, share in _shares(case):
+    for offset, fraction in _spread_forces(case):
         position = motion.load_position[..., None] + offset
         on_beam = (position >= -step) & (position <= case.beam.length + step)
         stands_there = on_beam & (position > low) & (position <= high)
-        force = xp.where(stands_there, share * motion.contact_force[..., None], 0.0)
+        force = xp.where(stands_there, fraction * motion.contact_force[..., None], 0.0)
         reaction = reaction + xp.sum(force, axis=1)
     for actuator, force in zip(case.actuators, port_forces(case, modes, motion, True), strict=True):
         for place, order, factor in actuator.displacement_map():
@@ -123,8 +123,8 @@ def reactions(case: Case, modes: Modes, motion: Motion) -> Float[Array, "time su
     return reaction
 
 
-def _shares(case: Case) -> list[tuple[Any, Any]]:
-    """Offsets (m) and shares of the point forces in which a load acts."""
+def _spread_forces(case: Case) -> list[tuple[Any, Any]]:
+    """Offset (m), and fraction of the load, of each point force in which a track spreads a load."""
     if case.track is None:
         return [(0.0, 1.0)]
     kernel = case.track.kernel()

@@ -5,14 +5,13 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxbeam.case.case import Case, concrete_case
 from jaxbeam.case.contact import ONE_RUN
 from jaxbeam.case.controller import AbstractController
-from jaxbeam.case.fields import concrete, is_concrete
+from jaxbeam.case.fields import all_concrete, concrete, is_concrete
 from jaxbeam.case.sensors import Sensor
 from jaxbeam.case.validation import check_case
 from jaxbeam.integrator.discrete_model import DiscreteModel, discrete_model, signed_both_ways
@@ -41,7 +40,7 @@ from jaxbeam.runtime.arrays import Array, any_jax, put, xp
 from jaxbeam.runtime.compiling import compiled, compiled_if_traced
 from jaxbeam.simulation.closed_loop import (
     closed_loop,
-    known_loop,
+    loop_of_case,
     loop_schedule,
     moved_schedule,
     moves_events,
@@ -68,8 +67,8 @@ from jaxbeam.simulation.motion import motion_at
 from jaxbeam.simulation.record import Record, Result
 from jaxbeam.simulation.varied_plan import traced_ranges, varied_plan, within
 
-MAX_SHORTENINGS = 3  # of steps whose peaks are not exact enough,
-LARGEST_SHORTENING = 4.0  # each by so much at most
+MAX_SHORTENINGS = 3  # of steps whose peaks are not exact enough
+LARGEST_SHORTENING = 4.0  # largest factor of one of them
 
 
 class ContactLossWarning(UserWarning):
@@ -89,10 +88,10 @@ def simulate(
     collocation. Samples are at the sample rate of the run, which ends at its duration, or at
     ascending `times` (s), with the last of which it then ends. Samples do not depend on the time
     step, peaks not on the sample rate. Differentiable in every number of the case, forward and in
-    reverse. Inside `jit`, `vmap` and other transformations steps are chosen from what is known:
-    from the values that `vmap` and `grad` have; under `jit` for masses up to that of the beam,
-    forces, and speeds up to four times the slowest that crosses. For other traced numbers prepare a
-    `jaxbeam.Simulator`, with their ranges. `record.result` then tells what is wrong with a run. A
+    reverse. Inside `jit`, `vmap` and other transformations steps are chosen from the values that
+    `vmap` and `grad` have; under `jit` for masses up to that of the beam, forces, and speeds up to
+    four times the slowest that crosses. For other traced numbers prepare a `jaxbeam.Simulator`,
+    with their ranges. `record.result` then tells what is wrong with a run. A
     `plan` is for the times and the parts of one case, and for other numbers near those of it; the
     error that it states is for its own.
 
@@ -112,9 +111,9 @@ def simulate(
     if times is not None:
         check_times(times)
     sampling = case.run.duration, case.run.sample_rate
-    if not is_concrete_tree(sampling if times is None else () if plan else times):
+    if not all_concrete(sampling if times is None else () if plan else times):
         raise ValueError(
-            "times, or run.duration and run.sample_rate without them, must be known numbers, not"
+            "times, or run.duration and run.sample_rate without them, must be concrete numbers, not"
             " traced by jax.jit or vmap: they fix the number of samples"
         )
     inside = np.ones((), bool)
@@ -128,9 +127,9 @@ def simulate(
             )
         samples = sample_times(case) if times is None else times
         plan = check_plan(case, plan, xp.asarray(samples, float))
-    elif is_concrete_tree(case):
+    elif all_concrete(case):
         warn_if_implausible(case if times is None else _until(case, times))
-        record, plan = _known_run(case, times, tolerance)
+        record, plan = _concrete_run(case, times, tolerance)
         if record is not None and not any_jax(case, times):
             return _with_warning(record)
     else:
@@ -141,7 +140,7 @@ def simulate(
 
 
 def _simulate_lifting(case: Case, times, plan: IntegrationPlan | None, tolerance: float) -> Record:
-    """Record of a run whose wheels press or fly, in steps halved until two runs agree.
+    """Record of a run with unilateral contact, in steps halved until two runs agree.
 
     Raises ValueError for a run that is traced or has a `plan`, RuntimeError if no runs agree.
     """
@@ -167,7 +166,7 @@ def _simulate_lifting(case: Case, times, plan: IntegrationPlan | None, tolerance
 
 
 def _lifting_run(case: Case, held: Case, plan: IntegrationPlan, times) -> "Integration":
-    """A run of a case by a plan for the same case with bilateral contact, which is `held`."""
+    """Unilateral run of a case by a plan for `held`, the case with bilateral contact."""
     from jaxbeam.simulation.unilateral import run_unilateral
     from jaxbeam.simulation.unilateral_record import motion_at_samples, peaks_of_run
 
@@ -183,27 +182,25 @@ def _lifting_run(case: Case, held: Case, plan: IntegrationPlan, times) -> "Integ
     return Integration(*parts, flights=run.flights)
 
 
-def is_concrete_tree(tree) -> bool:
-    """Whether no number of a tree is traced by `jit` or `vmap`; numbers of `grad` are known."""
-    return all(map(is_concrete, jax.tree.leaves(tree)))
-
-
 def simulate_planned(case: Case, plan: IntegrationPlan, times, tolerance: float, inside) -> Record:
-    """Record of a run by a plan, whose error is added; whether its numbers are `inside` ranges."""
-    # Their number, so that a program of a traced run has its two numbers, not all times.
+    """Record of a run by a plan, with the error of the plan added to its own.
+
+    `inside` says whether the numbers of the case are within the ranges of the plan.
+    """
+    # Default times by their number: a compiled run computes them from two numbers of the case.
     times = sample_count(case) if times is None else xp.asarray(times, float)
     return _with_warning(_run(case, plan, times, tolerance, inside))
 
 
 def plan_of_peaks(case: Case, times, tolerance: float) -> IntegrationPlan:
-    """Plan of a run of known numbers, of whose peaks it has the errors, too."""
-    return _known_run(case, times, tolerance)[1]
+    """Plan of a run of concrete numbers, with the errors of its peaks."""
+    return _concrete_run(case, times, tolerance)[1]
 
 
-def _known_run(case: Case, times, tolerance: float) -> tuple[Record | None, IntegrationPlan]:
-    """Record of the known numbers of a case, as `grad` has them, and a plan of as exact peaks.
+def _concrete_run(case: Case, times, tolerance: float) -> tuple[Record | None, IntegrationPlan]:
+    """Record of the concrete numbers of a case, under `grad` too, and the plan with exact peaks.
 
-    Of a derivative of a run that is compiled there is no record: it would take another program.
+    No record (None) where a run that is compiled is differentiated: it would take another program.
     """
     if not isinstance(case.controller, AbstractController | None):
         check_case(case)  # which the first run does, too
@@ -224,7 +221,7 @@ def _known_run(case: Case, times, tolerance: float) -> tuple[Record | None, Inte
 def _refined(
     case: Case, plan: IntegrationPlan, times, tolerance: float, first: "_FirstRun"
 ) -> tuple[Record, IntegrationPlan]:
-    """Record of known numbers, with steps that are shortened until its peaks are exact enough.
+    """Record of concrete numbers, with steps shortened until its peaks meet the tolerance.
 
     The plan that is returned has these steps, and the errors of the record.
     """
@@ -245,7 +242,7 @@ def _refined(
 
 
 def _errors_of(case: Case, plan: IntegrationPlan) -> Float[np.ndarray, " all"]:
-    """Errors of the steps of a plan: of the deflection, then of what each sensor measures."""
+    """Errors that a plan states: of the deflection, then of the quantity of each sensor."""
     return np.array([plan.error, *(plan.sensor_errors or (np.nan,) * len(case.sensors))])
 
 
@@ -269,7 +266,7 @@ def _with_result(record: Record, errors, tolerance: float, inside) -> Record:
 
 
 def _with_warning(record: Record) -> Record:
-    """The same record; warns of loads that lose contact, if their numbers are known."""
+    """The same record, after a warning if loads lose contact and numbers are concrete."""
     if is_concrete(record.contact_lost_time):
         lost = np.isfinite(concrete(record.contact_lost_time)) & ~record.loads.prescribed
         if lost.any() and np.isnan(concrete(record.diverged_time)):
@@ -284,14 +281,14 @@ def _until(case: Case, times) -> Case:
 
 
 def _run(case: Case, plan: IntegrationPlan, times, tolerance: float, inside, policy=None) -> Record:
-    """Record of a planned run; plans that differ in their errors only share compiled programs.
+    """Record of a planned run; plans that differ only in their errors use one compiled program.
 
     The input `policy` is that of the case if it is None.
     """
     is_compiled = plan.schedule is not None and runs_compiled(plan.schedule)
     simulate_record = _simulate_compiled if is_compiled else _simulate
     if policy is None and not (plan.schedule is None or is_compiled or any_jax(case, times)):
-        policy = known_loop(case, plan.shapes.layout, plan.schedule)
+        policy = loop_of_case(case, plan.shapes.layout, plan.schedule)
     errors = _errors_of(case, plan)
     plan = plan.without_statements()
     return simulate_record(case, plan, times, errors, tolerance, inside, policy)
@@ -310,9 +307,9 @@ def _substeps_for_peaks(record: Record, plan: IntegrationPlan, tolerance: float)
 
 
 class _FirstRun:
-    """Run that keeps its input policy, and its record, which has so many steps between events.
+    """First trial run of a plan, which keeps its input policy, record and number of steps.
 
-    So the last trial run is that of the result, wherever the longest steps suffice.
+    It is the run of the result too, wherever the longest steps suffice.
     """
 
     def __init__(self, case: Case, times):
@@ -354,7 +351,7 @@ def _simulate_record(
 
 
 def _record(case: Case, integration: "Integration", times) -> Record:
-    """Record of a run, whose errors are those of its peaks only, and which has no result yet."""
+    """Record of an integration, with the errors of its peaks only and without a `Result`."""
     outputs = integration.outputs
     peaks = Peaks(*(part[0] for part in integration.running_peaks.peaks()))
     heights = peaks.peak_deflection
@@ -468,10 +465,10 @@ def simulate_histories(
 
 
 class IntegrationSetup(NamedTuple):
-    """Input of one integration: discrete model, loads, input policy (None without controller).
+    """Inputs of one integration: discrete model, loads, input policy (None without controller).
 
     `sample_steps` are the indices of the steps that start at the samples, `steps` is the number of
-    steps; `on_grid` makes the same model on another grid.
+    steps; `on_grid` returns the discrete model on another grid.
     """
 
     model: DiscreteModel
@@ -525,11 +522,12 @@ def integration_setup(
 
 
 class Integration(NamedTuple):
-    """Running peaks, outputs at the sample times, model, grid, states (boundary, state, batch).
+    """Result of one integration: running peaks, outputs at the sample times, states, commands.
 
-    `sampled_states` (time, state) are those at the sample times, `commands` (step, command, batch)
-    those at the nodes of each step. `of_halves` are the `peaks_of_halves` of a known run; none are
-    needed where the errors of the plan hold those of peaks.
+    `states` (boundary, state, batch) are at the boundaries of the steps, `sampled_states` (time,
+    state) at the sample times, `commands` (step, command, batch) at the nodes of each step.
+    `of_halves` are the `peaks_of_halves` of a run of concrete numbers; none are needed where the
+    errors of the plan hold those of peaks.
     """
 
     running_peaks: Any
@@ -554,9 +552,10 @@ def run_integration(
     policy=None,
     in_chunks: bool = False,
 ):
-    """An integration as planned, under the input policy of the case unless one is given.
+    """Integrate a case as planned, under its own input policy unless one is given.
 
-    Of a traced case `in_chunks` of a few steps, whose matrices are made one chunk after the other.
+    A traced case may be integrated `in_chunks` of a few steps, whose matrices are assembled chunk
+    by chunk.
     """
     discrete, loads, policy, sample_steps, steps, on_grid = integration_setup(
         case, plan, times, monitored, noisy, policy
@@ -609,7 +608,8 @@ def _commands_at_steps(case: Case, commands, steps):
 class Outputs(NamedTuple):
     """Motion of beam and vehicles at the samples; readings and failures of a controller, if any.
 
-    `sent` are its commands where they act through hysteresis or creep; those in the motion act.
+    `sent` are the commands of the controller where they act through hysteresis or creep; the
+    commands in the motion are those that act.
     """
 
     motion: Motion

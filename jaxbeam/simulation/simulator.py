@@ -1,4 +1,4 @@
-"""A run that is prepared once and simulated for many values of some of its numbers."""
+"""Simulator of one case, prepared once and called with many values of some of its numbers."""
 
 from collections.abc import Mapping
 from typing import Any

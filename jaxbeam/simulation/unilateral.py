@@ -1,4 +1,4 @@
-"""Runs with unilateral contact: wheels press, leave where they would have to pull, fly, and land.
+"""Integration with unilateral contact: wheels lift where they would have to pull, fly, and land.
 
 Between these events the set of wheels that press is fixed; steps are those of
 `jaxbeam.integrator.lifting_steps`. An event is the zero of a contact force (or of the compression
@@ -51,9 +51,10 @@ OF_POINTS = FORCE_FRACTIONS[:, None] ** np.arange(POINTS.size) @ _OF_POINTS
 
 
 class UnilateralRun(NamedTuple):
-    """Pieces of a run one after the other, the piece that begins at each step, and the flights.
+    """Integrated run: its pieces in order, the first piece of each step, and the flights.
 
-    `last` is the state of beam and vehicles at the end, with the wheels that press there.
+    Steps are cut into pieces at events of contact. `last` is the state of beam and vehicles at the
+    end, with the wheels in contact there.
     """
 
     pieces: list[Piece]
@@ -86,7 +87,10 @@ def law_of(case: Case, loads: LoadSet) -> ContactLaw:
 
 
 class _LiftingRun:
-    """A run: the state of beam, heights and vehicles, what presses or flies, and what has been."""
+    """State of a run while it is integrated: beam, vehicles, wheels in contact and in flight.
+
+    And the pieces integrated so far.
+    """
 
     def __init__(self, case: Case, model: ModalModel, loads: LoadSet):
         self.model, self.loads, self.law = model, loads, law_of(case, loads)
@@ -106,7 +110,7 @@ class _LiftingRun:
         self.force_scale, self.gap_scale, self.rate_scale = self.scales(case)
 
     def scales(self, case: Case) -> tuple[float, float, float]:
-        """What is rounding of forces (N), gaps (m) and velocities (m/s)."""
+        """Rounding errors of forces (N), gaps (m) and velocities (m/s)."""
         length = float(concrete(case.beam.length))
         weight = np.abs(np.asarray(self.loads.weight)[:, 0])
         stiffness = np.asarray(self.model.modes.stiffness)
@@ -123,7 +127,7 @@ class _LiftingRun:
         return force, gap, RATES * gap * max(float(frequency), LEAST)
 
     def over(self, grid: TimeGrid, events) -> UnilateralRun:
-        """The run over the steps of a grid."""
+        """Integrate over the steps of a grid and return the run."""
         index = np.arange(int(grid.step_count))
         panel, start, kind = map(np.asarray, grid.locate_steps(index))
         length, on_beam = np.asarray(grid.lengths)[kind], np.asarray(grid.loads_on_beam)[panel]
@@ -153,17 +157,17 @@ class _LiftingRun:
         return UnilateralRun(self.pieces, first_piece, self.flights(), end, self.law)
 
     def prepare(self, start, length, on_beam) -> Steps:
-        """Steps of given starts and lengths (s)."""
+        """Step matrices for given starts and lengths (s), with the wheels `on_beam`."""
         return prepare(self.model, self.loads, self.law, start, length, on_beam)
 
     def follow(self, height, rate, wheels) -> None:
-        """Put wheels with a height of their own on the surface, with its height and velocity."""
+        """Set the heights and velocities of the `wheels` to those of the surface."""
         for index, value in ((self.law.height_index, height), (self.law.rate_index, rate)):
             own = wheels & (index >= 0)
             self.e[index[own]] = value[own]
 
     def cross(self, steps: Steps, i: int) -> None:
-        """Pass a step, cut at every event of contact inside."""
+        """Integrate one step, cut at every event of contact inside."""
         end, on_beam = float(steps.start[i] + steps.length[i]), steps.at.on_beam[i, 0]
         while True:
             piece = advance(self.law, steps, i, self.pressing, self.state, self.e)
@@ -184,7 +188,7 @@ class _LiftingRun:
             steps, i = self.prepare(np.array([now]), np.array([end - now]), on_beam[None]), 0
 
     def keep(self, piece: Piece, steps: Steps, i: int) -> None:
-        """Go to the end of a piece; wheels that press are on the surface there."""
+        """Append a piece and take over its final state; wheels in contact are on the surface."""
         self.pieces.append(piece)
         self.state, self.e = piece.states[-1].copy(), piece.heights[-1].copy()
         for wheel, flight in self.flying.items():
@@ -198,9 +202,9 @@ class _LiftingRun:
         return steps.at.rows[i, point, :2] @ self.state + steps.at.profile[i, point, :2]
 
     def first_event(self, piece: Piece, steps: Steps, i: int):
-        """First wheel that leaves or lands in a step, and the piece until then with its steps.
+        """First wheel that lifts or lands in a step, and the piece until then with its steps.
 
-        Those are None if that is at the start. None without any event.
+        The piece is None for an event at the start; None in all without an event.
         """
         by_force = piece.pressing & ~self.law.sprung
         sign = np.where(piece.pressing, -1.0, 1.0)[:, None] / self.gap_scale
@@ -210,8 +214,8 @@ class _LiftingRun:
         for fraction in np.flatnonzero(below.any(axis=0)):
             found = []
             for wheel in np.flatnonzero(below[:, fraction]).tolist():
-                # The start is known from the states, better than by extrapolation.
-                if fraction <= 1 and self.value(piece, steps, i, 0, wheel) < -1.0:
+                # At the start the states give the value, more exactly than extrapolation.
+                if fraction <= 1 and self.event_function(piece, steps, i, 0, wheel) < -1.0:
                     return wheel, None
                 if fraction:
                     ends = FORCE_FRACTIONS[fraction - 1], FORCE_FRACTIONS[fraction]
@@ -222,8 +226,8 @@ class _LiftingRun:
                 return wheel, cut if cut[0].length > SAME_TIME * self.duration else None
         return None
 
-    def value(self, piece: Piece, steps: Steps, i: int, point: int, wheel: int) -> float:
-        """What is positive until a wheel leaves or lands, at an end of a piece, from the states."""
+    def event_function(self, piece: Piece, steps: Steps, i: int, point: int, wheel: int) -> float:
+        """Scaled contact force or gap of a wheel at an end of a piece: positive until its event."""
         gap = float(piece.gap[wheel, point]) / self.gap_scale
         if not piece.pressing[wheel]:
             return gap
@@ -234,16 +238,16 @@ class _LiftingRun:
         return float(at.forces(self.law, *parts)[wheel]) / self.force_scale
 
     def cut(self, piece: Piece, wheel: int, ends, near):
-        """The piece until an event of a wheel between two fractions, with its steps; None if none.
+        """The piece until a wheel's event between two fractions of it, with its steps.
 
-        What is positive until then is `near` two values at the `ends`.
+        `near` are estimates of the event function at these `ends`; None if there is no event.
         """
 
         def until(fraction):
             length = np.array([fraction * piece.length])
             steps = self.prepare(np.array([piece.start]), length, piece.on_beam[None])
             part = advance(self.law, steps, 0, piece.pressing, self.state, self.e)
-            return (part, steps), self.value(part, steps, 0, -1, wheel)
+            return (part, steps), self.event_function(part, steps, 0, -1, wheel)
 
         low, high = ends
         best, value = until(high)
@@ -267,9 +271,9 @@ class _LiftingRun:
         return best
 
     def switch(self, wheel: int, steps: Steps, i: int, point: int) -> None:
-        """A wheel that presses leaves, or one that flies lands, at an end of a step.
+        """Change a wheel from contact to flight, or back, at an end of a step.
 
-        Raises RuntimeError if that happens too often.
+        Raises RuntimeError if events are too many.
         """
         self.switches += 1
         if self.switches > MAX_EVENTS:
@@ -296,12 +300,12 @@ class _LiftingRun:
         self.landed.append(self.flying.pop(wheel) | landing)
 
     def lift(self, wheel: int, steps: Steps, i: int, point: int) -> None:
-        """A wheel leaves at an end of a step."""
+        """Change a wheel from contact to flight at an end of a step."""
         time, position = self.place(wheel, steps, i, point)
         self.pressing[wheel] = False
         names = [field.name for field in dataclasses.fields(Flights)]
-        known = {"wheel": wheel, "lift_time": time, "lift_position": position, "gap": 0.0}
-        self.flying[wheel] = dict.fromkeys(names, np.nan) | known
+        lift = {"wheel": wheel, "lift_time": time, "lift_position": position, "gap": 0.0}
+        self.flying[wheel] = dict.fromkeys(names, np.nan) | lift
 
     def place(self, wheel: int, steps: Steps, i: int, point: int) -> tuple[float, float]:
         """Time (s) of an end of a step, and position (m) of a wheel."""
@@ -309,7 +313,7 @@ class _LiftingRun:
         return time, float(np.asarray(self.loads.kinematics(np.asarray(time))[0])[wheel])
 
     def jump(self, steps: Steps, i: int) -> None:
-        """Start of a step at which the surface may rise, fall or change its velocity at once."""
+        """Contact after a jump of the surface, in height or velocity, at the start of a step."""
         law, (height, rate) = self.law, self.surface(steps, i, 0)
         rigid = np.flatnonzero(law.rigid & ~law.held)
         gap = self.e[law.height_index[rigid]] - height[rigid]
@@ -324,9 +328,9 @@ class _LiftingRun:
             self.impact(steps, i, 0)
 
     def impact(self, steps: Steps, i: int, point: int) -> Float[np.ndarray, " wheel"]:
-        """Impulses (N s) by which rigid wheels that touch the surface press on it at once.
+        """Impulses (N s) of an inelastic impact of the rigid wheels that touch the surface.
 
-        They change the velocities of wheels and beam; wheels that none holds back leave.
+        They change the velocities of wheels and beam; wheels without an impulse lift.
         """
         law, touching = self.law, self.law.rigid & self.pressing
         index, impulses = np.flatnonzero(touching), np.zeros(self.count)
@@ -362,9 +366,10 @@ def impulses_of(
     relative: Float[np.ndarray, " wheel"],
     held: Bool[np.ndarray, " wheel"],
 ) -> Float[np.ndarray, " wheel"]:
-    """Impulses p (N s): relative + mobility p >= 0, p >= 0, one of both zero; held: equal to zero.
+    """Impulses p (N s) of an impact: relative + mobility p >= 0, p >= 0, one of both zero.
 
-    `relative` are the velocities (m/s) of wheels away from the surface, `mobility` in 1/kg.
+    `relative` are the velocities (m/s) of wheels away from the surface, `mobility` is in 1/kg. For
+    `held` wheels relative + mobility p = 0.
     """
     from scipy.optimize import nnls  # late: it takes long to import
 

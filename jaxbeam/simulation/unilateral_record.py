@@ -34,13 +34,13 @@ NO_LANDING = (
 
 
 def with_short_steps(case: Case, plan: IntegrationPlan, times) -> IntegrationPlan:
-    """The plan with steps that are short enough for wheels in flight and springs of contact too."""
+    """The plan with steps short enough for wheels in flight and contact springs too."""
     steps = np.max(np.diff(times)) * law_of(case, load_set(case)).norm() / LARGEST_STEP_NORM
     return dataclasses.replace(plan, substeps=max(plan.substeps, int(np.ceil(steps))))
 
 
 def change_of_runs(case: Case, model: ModalModel, coarse: Motion, fine: Motion) -> np.ndarray:
-    """Errors of a run by its change as steps are halved: of the deflection, then of each sensor."""
+    """Error of a run, its change as steps are halved: of the deflection, then of each sensor."""
     shapes = np.asarray(model.modes.shapes(trial_positions(case)))
     least, both = rounding_deflection(case, model, load_set(case)), (coarse, fine)
     pairs = [

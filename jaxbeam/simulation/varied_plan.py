@@ -1,4 +1,4 @@
-"""Plans of runs whose numbers vary: from their ranges, as declared, given, or assumed.
+"""Integration plans for ranges of the numbers of a case: declared, traced, or assumed.
 
 Steps are chosen for the ends of each range. Of a traced number the range is that of its values, if
 `vmap` or `grad` has them; under `jit`, `scan` and `lax.map` it is assumed for those few on which
@@ -82,17 +82,16 @@ def declared_ranges(case: Case, vary) -> dict[str, Range]:
 
 
 def traced_ranges(case: Case) -> tuple[Case, dict[str, Range]]:
-    """A known case in the middle of the ranges of the traced numbers of a case, and the ranges.
+    """Concrete case in the middle of the ranges of a traced case's numbers, and the ranges.
 
-    Raises ValueError for a traced number on whose unknown value steps depend.
+    Raises ValueError for a traced number without values on which steps depend.
     """
     structure, by_address = jax.tree.structure(case), leaves_by_address(case)
     names, leaves = by_address.keys(), by_address.values()
     found: dict[str, Range] = {}
     for name, leaf in zip(names, leaves, strict=True):
         if isinstance(leaf, jax.core.Tracer):
-            known = _values_of(leaf)
-            found[name] = known or _assumed_range(case, name)
+            found[name] = _values_of(leaf) or _assumed_range(case, name)
     middle = [
         sum(found[name]) / 2 if name in found else np.asarray(leaf, float)
         for name, leaf in zip(names, leaves, strict=True)
@@ -115,7 +114,7 @@ def _values_of(value: Any) -> Range | None:
 
 
 def _assumed_range(case: Case, address: str) -> Range:
-    """Range of a number of unknown value on which steps depend little."""
+    """Assumed range of a traced number without values, on which steps depend little."""
     shape = np.shape(value_at(case, address))
     beam = case.beam
 

@@ -152,7 +152,7 @@ def record_text(case: Case, times, verdict: str, extremes: Extremes) -> str:
 
 
 def record_html(case: Case, times, verdict: str, extremes: Extremes) -> str:
-    """What `record_text` tells, as a table in HTML and a paragraph below it."""
+    """`record_text` as a table in HTML with a paragraph below it."""
     rows = _sensor_rows(case, extremes)
     table = html_table(HEADER, rows[:MAX_SENSORS], _head(case, times))
     return f"{table}<p>{escape('; '.join([verdict, *_left_out(rows)]))}</p>"
@@ -186,7 +186,7 @@ def _sensor_rows(case: Case, extremes: Extremes) -> list[tuple[str, ...]]:
 
 
 class RecordViews(TableViews, Module):
-    """Base of records: what others see of one."""
+    """Base of records: their text, tables, datasets, figures and files."""
 
     case: eqx.AbstractVar[Case]
     modes: eqx.AbstractVar[Modes]
@@ -216,17 +216,17 @@ class RecordViews(TableViews, Module):
         """True quantity of each sensor."""
 
     def __repr__(self) -> str:
-        if not self._is_one_known_run:
+        if not self._is_one_concrete_run:
             return f"Record of {self.case.title!r}, traced or of several runs"
         return record_text(self.case, self.times, self.verdict, self.extremes)
 
     def _repr_html_(self) -> str | None:  # in notebooks; None leaves it to the text
-        if not self._is_one_known_run:
+        if not self._is_one_concrete_run:
             return None
         return record_html(self.case, self.times, self.verdict, self.extremes)
 
     @property
-    def _is_one_known_run(self) -> bool:
+    def _is_one_concrete_run(self) -> bool:
         return not any_traced(self) and self.times.ndim == 1
 
     def _dataset_parts(self) -> tuple[dict, dict, dict]:

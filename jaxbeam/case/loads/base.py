@@ -18,7 +18,6 @@ import abc
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -292,11 +291,6 @@ class AbstractRowLoad(AbstractVehicleLoad):
             f"{address}.spacing must exceed the wheelbase of the {name},"
             f" {concrete(wheelbase):g} m; it is {concrete(spacing):g} m: give a larger one"
         )
-
-
-def all_concrete(part: Any) -> bool:
-    """Whether all numbers of a part are concrete, not traced by `jit` or `vmap`."""
-    return all(is_concrete(leaf) for leaf in jax.tree.leaves(part))
 
 
 def positive_error(address: str, part: Any, names: tuple[str, ...], reason: str) -> str | None:

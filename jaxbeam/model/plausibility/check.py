@@ -15,8 +15,7 @@ import jax
 import numpy as np
 
 from jaxbeam.case.case import Case, concrete_case
-from jaxbeam.case.fields import concrete, refuses_traced
-from jaxbeam.case.loads.base import all_concrete
+from jaxbeam.case.fields import all_concrete, concrete, refuses_traced
 from jaxbeam.case.validation import check_case
 from jaxbeam.model.modes import Modes, modes
 from jaxbeam.model.plausibility.facts import Facts, Plausibility, plausible_numbers

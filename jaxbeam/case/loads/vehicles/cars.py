@@ -5,11 +5,10 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, concrete, is_concrete, number
+from jaxbeam.case.fields import NOT_NEGATIVE, POSITIVE, all_concrete, concrete, is_concrete, number
 from jaxbeam.case.loads.base import (
     AbstractRowLoad,
     AbstractVehicleLoad,
-    all_concrete,
     length_error,
     positive_error,
     static_load_error,

@@ -16,6 +16,7 @@ from jaxbeam.case import fields
 from jaxbeam.case.declared_checks import check_fields, suggestion
 from jaxbeam.case.fields import (
     POSITIVE,
+    all_concrete,
     choice,
     concrete,
     is_concrete,
@@ -26,7 +27,6 @@ from jaxbeam.case.loads.base import (
     AbstractRowLoad,
     AbstractVehicleLoad,
     VehicleModel,
-    all_concrete,
     static_load_error,
 )
 from jaxbeam.case.loads.vehicles.assembly import Bodies, Hinges, Links, Wheels, assemble
