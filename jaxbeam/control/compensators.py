@@ -228,7 +228,10 @@ def _reading_filter(
 
 
 def _bilinear_transform(coefficients: Polynomials, factor) -> Float[Array, "3 actuator"]:
-    """Coefficients in 1/z of (1 + 1/z)^degree times a polynomial at s = c (z - 1) / (z + 1)."""
+    """Bilinear transform of polynomials in s: coefficients in 1/z, with s = c (z - 1) / (z + 1).
+
+    The factor (1 + 1/z)^degree that clears the denominator is included.
+    """
     degree = coefficients.shape[0] - 1
     powers = np.arange(degree + 1)
     terms = np.stack(

@@ -34,7 +34,7 @@ class DesignModel(Module):
         "N s/m", "damping of suspensions", NOT_NEGATIVE, default=None
     )
     correction: Float[Number, " *actuator"] | None = number(
-        "1", "share of the moment of patches that reaches the beam", default=None
+        "1", "fraction of the moment of patches that reaches the beam", default=None
     )
     mass: Float[Number, " *load"] | None = number(
         "kg", "masses of loads", NOT_NEGATIVE, default=None

@@ -33,7 +33,7 @@ from jaxbeam.runtime.arrays import Array, Number, take, xp
 
 
 def pairing_error(gains: Float[Array, " actuator"], case) -> str | None:
-    """Error unless each actuator has one gain and a sensor of the same index, or None."""
+    """Error message unless each actuator has one gain and a sensor of the same index, or None."""
     loops, actuators = gains.shape[0], len(case.driven)
     if loops != actuators:
         return f"gains must list one gain for each of {actuators} actuators, not {loops}"

@@ -116,18 +116,18 @@ class Prescribed(AbstractStaticController):
         return self.times
 
 
-CONFIRMATION_SHARE = 0.25  # of the crossing, within which a load must show
+CONFIRMATION_FRACTION = 0.25  # of the crossing, within which a sensor must detect the load
 
 
 class Feedforward(AbstractController):
     """Commands tabulated over the relative position of a load, extrapolated from two gate times.
 
-    The commands at the `shares` of the crossing (0 at the end where the load enters, 1 at the
-    other) are interpolated linearly and zero outside; those of several loads are added. Gates may
-    lie before the beam (at a negative position if loads enter at the left). A load is assumed to
-    keep the speed that it has between them; commands begin when it has passed the second gate. The
-    table is read `lead` seconds ahead of the load, to compensate delay and hold. No sensor of the
-    beam and no mass is used, so that no loop is closed that could become unstable.
+    The commands at the `shares` (fractions) of the crossing, 0 at the end where the load enters and
+    1 at the other, are interpolated linearly and zero outside; those of several loads are added.
+    Gates may lie before the beam (at a negative position if loads enter at the left). A load is
+    assumed to keep the speed that it has between them; commands begin when it has passed the second
+    gate. The table is read `lead` seconds ahead of the load, to compensate delay and hold. No
+    sensor of the beam and no mass is used, so that no loop is closed that could become unstable.
 
     Gates that fire without a load would lift the beam. With a `confirmation` (m) commands begin
     when a deflection sensor has gone down by that much after the second gate, and within the first
@@ -153,7 +153,7 @@ class Feedforward(AbstractController):
     open_loop: ClassVar[bool] = True
 
     gates: Float[Number, "2"] = number("m", "positions of the gates, in the order of passage")
-    shares: Float[Number, " breakpoint"] = number("1", "shares of the crossing", INCREASING)
+    shares: Float[Number, " breakpoint"] = number("1", "fractions of the crossing", INCREASING)
     values: Float[Number, "actuator breakpoint"] = number(
         "unit of a command", "commands of the table, a row for each actuator"
     )
@@ -234,16 +234,16 @@ class FeedforwardLaw(AbstractSampledLaw):
 
     def table_commands(self, t) -> Float[Array, "actuator load"]:
         """Commands of the table for each load at t (s), read ahead by the lead."""
-        shares = self.distances(t + self.lead) / self.length
-        return _tabulated(self.shares, self.values, shares, SAME_FRACTION)
+        fractions = self.distances(t + self.lead) / self.length
+        return _tabulated(self.shares, self.values, fractions, SAME_FRACTION)
 
 
 class ConfirmedFeedforwardLaw(FeedforwardLaw):
-    """The law with commands for those loads alone that a sensor has shown.
+    """Feedforward law whose commands begin only for loads that a deflection sensor has detected.
 
-    Its state says of each load whether a deflection sensor has read less than -`confirmation` (m)
-    since its second gate, within the first CONFIRMATION_SHARE of its crossing; a missing reading
-    shows nothing.
+    Its state says for each load whether a sensor has read less than -`confirmation` (m) since the
+    second gate, within the first CONFIRMATION_FRACTION of the crossing; a missing reading detects
+    nothing.
     """
 
     without_reading: ClassVar[str] = "It shows no load."
@@ -261,19 +261,19 @@ class ConfirmedFeedforwardLaw(FeedforwardLaw):
             readings = xp.where(measurement.present[own], readings, 0.0)
         lowest = xp.min(readings)
         passed = has_come(self.gate_times[:, 1], t)
-        early = self.distances(t) <= (CONFIRMATION_SHARE + SAME_FRACTION) * self.length
+        early = self.distances(t) <= (CONFIRMATION_FRACTION + SAME_FRACTION) * self.length
         confirmed = state | (passed & early & (lowest <= -self.confirmation))
         commands = xp.where(confirmed, self.table_commands(t), 0.0)
         return ControlStep(xp.sum(commands, axis=1), confirmed)
 
 
 def _deflection_sensors(sensors) -> tuple[int, ...]:
-    """Places of the sensors that read a deflection."""
+    """Indices of the sensors of deflection."""
     return tuple(i for i, sensor in enumerate(sensors) if sensor.quantity == "deflection")
 
 
 def _tabulated(breakpoints, rows, x, rounding) -> Float[Array, "row ..."]:
-    """Rows of a table at x, zero beyond its ends, past which x may be by rounding."""
+    """Rows of a table interpolated at x, zero where x is beyond the ends by more than rounding."""
     inside = (x >= breakpoints[0] - rounding) & (x <= breakpoints[-1] + rounding)
     values = xp.stack([xp.interp(x, breakpoints, row) for row in rows])
     return xp.where(inside, values, 0.0)

@@ -29,13 +29,14 @@ from jaxbeam.runtime.module import Module
 
 
 class InternalModel(AbstractController):
-    """Feedback of the deflection due to the load at each actuator's own sensor, u = f(y - c H u).
+    """Internal-model control at each actuator's own sensor: u = f(y - c H u).
 
-    The first actuator is fed by the first sensor, the second by the second, and so on. H u is the
-    static deflection due to the present commands, behind the filters of the sensors, and c the
-    `compensation`. f is a table: the `values` at the `readings` are interpolated linearly, and held
-    beyond the ends. Where the table is flat the loop is open, so a load that deflects the beam
-    beyond its last reading opens the loop. Mass, speed and position of the load are not used.
+    y - c H u is the deflection due to the load. The first actuator is fed by the first sensor, the
+    second by the second, and so on. H u is the static deflection due to the present commands,
+    behind the filters of the sensors, and c the `compensation`. f is a table: the `values` at the
+    `readings` are interpolated linearly, and held beyond the ends. Where the table is flat the loop
+    is open, so a load that deflects the beam beyond its last reading opens the loop. Mass, speed
+    and position of the load are not used.
 
     The static lift lacks the vibration of the beam. Where the filters of the sensors pass it,
     `notches` remove it from y - c H u: each is (s^2 + w^2) / (s^2 + 2 zeta w s + w^2), which delays
@@ -61,7 +62,9 @@ class InternalModel(AbstractController):
         "unit of a command", "commands of the table, a row for each actuator"
     )
     compensation: Float[Number, ""] = number(
-        "1", "share of the lift of the commands that is subtracted from the readings", default=1.0
+        "1",
+        "fraction of the lift of the commands that is subtracted from the readings",
+        default=1.0,
     )
     notches: Float[Number, " notch"] | None = number(
         "Hz", "frequencies of the notches", POSITIVE, default=None
@@ -174,7 +177,7 @@ class InternalModelLaw(AbstractSampledLaw):
 SHARES = (-0.6, -0.3, -0.15, 0.0, 0.15, 0.3, 0.6, 0.9, 1.2, 1.6, 2.2)
 VALUES = (-0.97, -0.5, -0.17, 0.0, 0.28, 0.38, 0.6, 0.74, 0.84, 0.96, 1.0)
 REFERENCE, ORDER = 0.4, 4
-FAST = 0.4  # of the sampling frequency: cutoff of what the reference has beyond its own order
+FAST = 0.4  # of the sampling frequency: cutoff of sections of the reference beyond its own order
 
 
 class ScheduledInternalModel(AbstractController):
@@ -184,8 +187,8 @@ class ScheduledInternalModel(AbstractController):
     deflection due to the load is the reading less the static lift of the acting commands, both
     behind a reference filter: Butterworth of the `order`, with a cutoff at `reference` times the
     lowest natural frequency. What a digital filter of a sensor has removed below that cutoff is
-    restored, and the reading of a fast filter is slowed down to the same. Filters must be known and
-    digital: noise that enters behind an analogue one would be amplified as well.
+    restored, and the reading of a fast filter is slowed down to the same. Filters must be digital:
+    noise that enters behind an analogue one would be amplified as well.
 
     Commands follow from a table. `shares` are deflections due to the load, downwards positive, over
     the lift of the full command of the actuator; `values` are the commands for them over the full
@@ -303,14 +306,14 @@ class ScheduledInternalModel(AbstractController):
         return xp.concatenate([sections, second_order_sections(fast, self.period)])
 
     def _periods_late(self, sensor) -> int:
-        """Number of commands by which the one that a reading shows is older than the acting one."""
+        """Number of periods by which the command seen in a reading is older than the acting one."""
         if sensor.delay is None:
             return 0
         needed = [sensor.delay, self.period] + ([] if self.delay is None else [self.delay])
         if not all(is_concrete(value) for value in needed):
             raise ValueError(
-                "controller of kind 'internal-model-scheduled' needs known delays: leave period and"
-                " delays out of what is traced"
+                "controller of kind 'internal-model-scheduled' needs concrete delays: leave period"
+                " and delays out of what is traced"
             )
         late, period, *delay = (float(concrete(value)) for value in needed)
         before = (delay[0] if delay else 0.0) / period
@@ -320,7 +323,7 @@ class ScheduledInternalModel(AbstractController):
 def equaliser(
     sections: Float[Array, "section 6"], order: int, reference: Float[Array, "reference 6"]
 ) -> Float[Array, "reference 6"]:
-    """Sections of R / F for a Butterworth filter F of an order and a reference of as many sections.
+    """Sections of the equaliser R / F from a Butterworth filter F of an `order` to a reference R.
 
     Both have their zeros at half the sampling frequency, where those of F cancel. The static gain
     of each section is one.
@@ -383,7 +386,7 @@ class ScheduledInternalModelLaw(AbstractSampledLaw):
             reading, equaliser_state = filter_step(sections, state.equalisers[i], reading)
             equalised.append(reading)
             equaliser_states.append(equaliser_state)
-        shares = (lift - xp.stack(equalised)) / self.own_lift
-        values = xp.interp(shares, self.shares, self.values)
+        ratios = (lift - xp.stack(equalised)) / self.own_lift
+        values = xp.interp(ratios, self.shares, self.values)
         command = xp.where(values > 0, values * self.full, -values * self.opposite)
         return ControlStep(command, LawState(tuple(equaliser_states), reference_state, commands))

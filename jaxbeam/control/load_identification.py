@@ -28,9 +28,9 @@ from jaxbeam.runtime.arrays import Array, Number, scan, take, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.runtime.module import Module
 
-# A line through identified positions is accepted when these scatter by this share of the distance
-# over which they are identified, and their weights add up to this many of the largest weight: at
-# first the beam lags, and identified positions stand still or jump.
+# A line through identified positions is accepted when their scatter is at most this fraction of the
+# distance over which they are identified, and their weights add up to this many times the largest
+# weight: at first the beam lags, and identified positions stand still or jump.
 MIN_TRAVEL_SPREAD, MIN_EFFECTIVE_SAMPLES = 0.1, 8
 INFLUENCE_ROUNDING = 1e-20  # of the largest squared influence; smaller ones are rounding errors
 
@@ -73,9 +73,10 @@ class GivenLoad(AbstractLoadSource):
 
 
 def given_load(load: AbstractLoad, gravity: Float[Array, ""]) -> GivenLoad:
-    """Load of a case as given; speed and entry time are NaN for a table of positions.
+    """Load of a case as its own source: mass, speed and entry time as given there.
 
-    That of a vehicle is its total mass, entering with its first wheel.
+    A vehicle has its total mass and enters with its first wheel; speed and entry time are NaN for a
+    table of positions.
     """
     numbers = load.total_mass(gravity), load.speed, load.entry_time
     return GivenLoad(*(xp.asarray(xp.nan if x is None else x) for x in numbers))
@@ -155,26 +156,26 @@ class GateIdentifier(AbstractLoadIdentifier):
         start = xp.where(self.speed < 0, self.length, 0.0)
         return self.gate_times[1] + (start - self.gates[1]) / self.speed
 
-    def crossing_share(self, t: Time) -> Float[Array, ""]:
-        """Share of the crossing that is completed at t (s)."""
+    def crossed_fraction(self, t: Time) -> Float[Array, ""]:
+        """Fraction of the crossing that is completed at t (s)."""
         return (t - self.entry_time) * xp.abs(self.speed) / self.length
 
     def estimate(self, sums, t):
         speed_identified = has_come(self.gate_times[1], t)
         until = self.until - SAME_FRACTION
-        mass_identified = speed_identified & (self.crossing_share(t) >= until)
+        mass_identified = speed_identified & (self.crossed_fraction(t) >= until)
         mass = self.fitted_mass(*sums)
         return LoadEstimate(mass, self.speed, self.entry_time, speed_identified, mass_identified)
 
     def increments(self, sums, deflections, t):
-        share = self.crossing_share(t)
+        crossed = self.crossed_fraction(t)
         *_, speed_identified, mass_identified = self.estimate(sums, t)
-        relative_position = xp.where(self.speed < 0, 1 - share, share)
+        relative_position = xp.where(self.speed < 0, 1 - crossed, crossed)
         positions = np.linspace(0, 1, self.influence_lines.shape[1])
         influence = xp.stack(
             [xp.interp(relative_position, positions, line) for line in self.influence_lines]
         )
-        active = speed_identified & ~mass_identified & (share > 0)
+        active = speed_identified & ~mass_identified & (crossed > 0)
         return xp.where(active, xp.stack([influence @ deflections, influence @ influence]), 0.0)
 
 
@@ -218,7 +219,7 @@ class DeflectionIdentifier(AbstractLoadIdentifier):
         """
         squares = xp.sum(self.influence_lines**2, axis=0)
         products = deflections @ self.influence_lines
-        # At a support the lines are zero but for rounding, whose ratio may fit any deflections.
+        # At a support the lines are zero apart from rounding, whose ratio may fit any deflections.
         observable = squares > INFLUENCE_ROUNDING * xp.max(squares)
         explained = xp.where(observable, products**2 / xp.where(observable, squares, 1.0), 0.0)
         best = xp.clip(xp.argmax(explained), 1, squares.shape[0] - 2)
@@ -231,9 +232,9 @@ class DeflectionIdentifier(AbstractLoadIdentifier):
         return position, take(products, best), take(squares, best)
 
     def _fitted_line(self, sums):
-        """Speed (m/s) and entry time (s) of the fitted line, and whether they are determined.
+        """Speed (m/s) and entry time (s) of the fitted line, and whether the samples determine it.
 
-        Until they are determined: one beam length per second, and zero.
+        Until they do: one beam length per second, and zero.
         """
         total, t, square, x, product = sums[:5]
         time_variance = total * square - t**2
@@ -287,7 +288,7 @@ class LoadIdentification(ReprWithUnits):
         "m", "positions of the gates, in the order of passage", default=None
     )
     until: Float[Number, ""] = number(
-        "1", "share of the crossing after which the mass is identified", POSITIVE, default=0.3
+        "1", "fraction of the crossing after which the mass is identified", POSITIVE, default=0.3
     )
     threshold: Float[Number, ""] | None = number(
         "m", "deflection above which a load is on the beam, without gates", POSITIVE, default=None

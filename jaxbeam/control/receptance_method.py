@@ -152,7 +152,7 @@ def receptance_gains(
     kept_poles: ArrayLike = (),
     actuator: int = 0,
 ) -> ReceptanceFeedback:
-    """Feedback that makes `poles` (1/s) poles of the loop, and keeps others.
+    """Feedback that assigns `poles` (1/s) to the closed loop and keeps other poles.
 
     `assigned` (pole, sensor) are the receptances at the poles, one of each conjugate pair. The
     modes of the open-loop poles `kept_poles` (1/s) with deflections `kept` (pole, sensor) at the
@@ -315,7 +315,7 @@ def _oscillating_modes(case: Case):
 
 
 def _starts(A, loop, delay: float, wanted: int):
-    """Rightmost estimates (s, z) of z' = A z + loop z(t - delay), collocated over the delay."""
+    """Estimates (s, z) of the rightmost poles and vectors of z' = A z + loop z(t - delay)."""
     count, states = COLLOCATION_NODES, len(A)
     nodes = np.cos(np.pi * np.arange(count + 1) / count)
     weights = np.r_[2.0, np.ones(count - 1), 2.0] * (-1.0) ** np.arange(count + 1)

@@ -1,4 +1,4 @@
-"""Semi-active dampers: the force that a law desires, as far as a damper of variable rate gives it.
+"""Semi-active dampers: the forces of a law, clipped to those of a damper of variable rate.
 
 A damper between beam and ground whose rate c is set between two limits gives the force
 
@@ -101,8 +101,9 @@ class SemiActive(AbstractController):
             if k >= len(sensors):
                 return f"kind needs a sensor of velocity at each damper, one for actuators.{i} too"
             own = case.sensors[sensors[k]].position
-            known = is_concrete(own) and is_concrete(place) and is_concrete(case.beam.length)
-            if known and abs(concrete(own - place)) > NEAR * concrete(case.beam.length):
+            if all(map(is_concrete, (own, place, case.beam.length))) and (
+                abs(concrete(own - place)) > NEAR * concrete(case.beam.length)
+            ):
                 return (
                     f"kind needs sensors of velocity at the dampers, in their order:"
                     f" sensors.{sensors[k]} is at {float(concrete(own)):g} m,"
@@ -164,7 +165,7 @@ class SemiActiveLaw(AbstractSampledLaw, AbstractContinuousLaw):
         return self.desired.rates(state, measurement, command, t)
 
     def _given(self, desired, measurement):
-        """Forces of the dampers for desired ones."""
+        """Forces (N) of the dampers for desired forces, by rates within their limits."""
         velocity = measurement.readings[np.array(self.sensors)]
         most, least = -self.max_damping * velocity, -self.min_damping * velocity
         if self.on_off:

@@ -147,7 +147,7 @@ def _without_lags(plant):
 
 
 def _check_effect(effect, rows, input_rows) -> None:
-    """Check that the commands can move each surface on its own, where their effect is known.
+    """Check that the commands can move each surface independently, if numbers are concrete.
 
     Raises ValueError if they cannot.
     """
@@ -155,8 +155,8 @@ def _check_effect(effect, rows, input_rows) -> None:
         return
     effect, rows, input_rows = (concrete(part) for part in (effect, rows, input_rows))
     largest = np.linalg.norm(rows, axis=1)[:, None] * np.linalg.norm(input_rows, axis=0)
-    shares = np.linalg.svd(effect / np.where(largest > 0, largest, 1.0), compute_uv=False)
-    if shares[-1] < SMALLEST_EFFECT:
+    singular = np.linalg.svd(effect / np.where(largest > 0, largest, 1.0), compute_uv=False)
+    if singular[-1] < SMALLEST_EFFECT:
         raise ValueError(
             "controller.positions: no commands hold each of the deflections there apart from the"
             " others; take positions near the actuators"

@@ -59,7 +59,7 @@ class AbstractStateLaw(Module):
         """Command for an estimate at t (s), and the next state of the law."""
 
     def tabulated(self, times: Float[Array, " sample"]) -> "AbstractStateLaw":
-        """As `AbstractSampledLaw.tabulated`."""
+        """The law with its time-dependent matrices tabulated at the `times` of a run (s)."""
         return self
 
 
@@ -145,7 +145,7 @@ class AbstractStateController(AbstractController):
     differ; its states are those of `state_space` in the chosen coordinates. Without an `estimator`
     the law receives the true state, of which a design with fewer modes receives the first ones.
     States of vehicles, where a law needs them, are those of an estimator that has them, or else
-    simulated from the state of the beam and the known vehicles.
+    simulated from the state of the beam and the vehicles of the case.
     """
 
     coordinates: str = choice(
@@ -195,7 +195,7 @@ class AbstractStateController(AbstractController):
         return SampledStateLaw(law, filter)
 
     def breakpoints(self, case):
-        """Entry and exit times of the design loads, kinks in the gain of a continuous filter."""
+        """Entry and exit times (s) of the design loads, at which a continuous gain has kinks."""
         if self.period is not None or self.estimator is None:
             return None
         design_case = eqx.tree_at(lambda c: c.loads, case, self.design_loads(case))
@@ -234,9 +234,9 @@ class AbstractStateController(AbstractController):
         return None if error is None else f"estimator.{error}"
 
     def design_error(self, design_plant: Plant) -> str | None:
-        """Error of these settings for a design plant of known numbers, as "key must ...", or None.
+        """Error of these settings for a design plant, as "key must ...", or None.
 
-        The numbers of these settings are known, too.
+        All numbers are concrete.
         """
         return None
 

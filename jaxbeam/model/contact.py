@@ -20,7 +20,7 @@ the law of `contact` is
 
 for contact forces r (upwards on the beam), the mode shapes S at the wheels, the modal accelerations
 q_u'' of the commands, and the forces q = k y + c y' that the beam exerts on springs of vehicles.
-The profile and forces that vary in time add to W and q what `known_disturbance` returns.
+The profile and forces that vary in time add to W and q what `prescribed_disturbance` returns.
 """
 
 import math

@@ -196,7 +196,7 @@ def test_instants_in_blocks_are_those_all_at_once(monkeypatch):
     states = random.normal(size=(101, model.state_count + loads.vehicle_states, 1))
     commands = random.normal(size=(101, model.command_matrix.shape[1], 1))
     whole = contact_at(model, loads, times, states, commands)
-    monkeypatch.setattr(contact, "KNOWN_BLOCK", 7 * loads.wheel_count)
+    monkeypatch.setattr(contact, "CONCRETE_BLOCK", 7 * loads.wheel_count)
     in_blocks = contact_at(model, loads, times, states, commands)
     for one, other in zip(jax.tree.leaves(whole), jax.tree.leaves(in_blocks), strict=True):
         assert one.shape == other.shape

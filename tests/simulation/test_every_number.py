@@ -35,7 +35,7 @@ JUMPS = {
     "stepped masses": DECIDES,
 }
 # Those of an internal model that is scheduled, which counts the commands on their way.
-COUNTS = "needs known delays: leave period and delays out of what is traced"
+COUNTS = "needs concrete delays: leave period and delays out of what is traced"
 STEP, TOLERANCE = 4e-6, 1e-4  # of numbers; of the largest derivative of an output
 # Where runs repeat less exactly, as numbers pass equations of Riccati. The disagreement falls as
 # the step grows, so that it is rounding of the differences: that by the attenuation is 13, 1.1, 0.9

@@ -227,7 +227,7 @@ def largest_real_part(case: jb.Case) -> float:
     law, plant = case.controller, jb.state_space(case, "sine")
     shares = np.linspace(0.0, 1.0, LOAD_POSITIONS)[1:-1]
     table = law.gain_table(law.design.design_plant(plant, "sine"))
-    gains = np.stack([np.asarray(table(share)) for share in shares]) * law.feedback_shares
+    gains = np.stack([np.asarray(table(share)) for share in shares]) * law.feedback_fractions
     systems = plant.at(shares * float(case.beam.length / case.loads[0].speed))
     command_columns = np.asarray(systems.B)[..., : gains.shape[1]]  # loads follow
     poles = np.linalg.eigvals(np.asarray(systems.A) - command_columns @ gains)

@@ -1,4 +1,4 @@
-"""Finite-horizon gains of several masses and speeds, read by one load or by several.
+"""Gain tables over a crossing, for several masses and speeds, scheduled by one load or several.
 
 A table holds designs k(m, v) of single loads. The law of section 5.3 of the thesis follows one
 load, given or identified. Chapter 8 leaves open how such gains serve several loads, and cars of
@@ -57,8 +57,8 @@ class GainSchedule(AbstractStateLaw):
 
     The final gain decays with a time constant `fade_time` (s), or stays if that is None. After
     the states of the beam x has the `vehicle_states` and, with `load_feedforward`, the weights of
-    the loads (N), estimated ones or `load_weights`, with 1 for other known disturbances, if there
-    are any; else `load_weights` is empty.
+    the loads (N), estimated ones or `load_weights`, with 1 for profile and forces over time, if
+    there are any; else `load_weights` is empty.
     """
 
     table: GainTable
@@ -76,18 +76,18 @@ class GainSchedule(AbstractStateLaw):
 
     def gain(self, t: Float[Array, ""]) -> Float[Array, "actuator column"]:
         """Gain at a time (s); zero before the start."""
-        crossing_share = (t - self.start) / (self.end - self.start)
+        fraction = (t - self.start) / (self.end - self.start)
         final_gain = self.final_gain
         if self.fade_time is not None:
             final_gain = final_gain * xp.exp(-xp.maximum(t - self.end, 0.0) / self.fade_time)
-        gain = xp.where(has_come(self.end, t), final_gain, self.table(crossing_share))
+        gain = xp.where(has_come(self.end, t), final_gain, self.table(fraction))
         return xp.where(has_come(self.start, t), gain, 0.0)
 
     def step(self, state, estimate, measurement, t):
         load_weights = self.load_weights
         if self.load_feedforward and estimate.weights is not None:
-            known = load_weights[estimate.weights.shape[0] :]
-            load_weights = xp.concatenate([estimate.weights, known])
+            constant = load_weights[estimate.weights.shape[0] :]
+            load_weights = xp.concatenate([estimate.weights, constant])
         vehicles = estimate.vehicles if self.vehicle_states else xp.zeros(0)
         x = xp.concatenate([estimate.state, vehicles, load_weights])
         return ControlStep(-self.gain(t) @ x, state)
@@ -145,7 +145,7 @@ def crossing_plant(plant: Plant, with_weights: bool) -> tuple[ConstantPlant, Cou
 
     These are the contact forces r and, with vehicles, the forces q of the surface on their springs;
     the states are those of beam and vehicles. With `with_weights` the weights W of the loads, and
-    one for what else is known to disturb, are further, constant states, as in `Plant.augmented`.
+    one for profile and forces over time, are further, constant states, as in `Plant.augmented`.
     The law is that of `contact_rows`.
     """
     modal_model, load_count = plant.modal_model, plant.weights.shape[0]
@@ -176,9 +176,9 @@ def crossing_plant(plant: Plant, with_weights: bool) -> tuple[ConstantPlant, Cou
         constant_columns = xp.broadcast_to(
             constant_columns, (*times.shape, *constant_columns.shape)
         )
-        known = prescribed_disturbance(plant.loads, times) if disturbed else None
-        if known is not None:
-            constant_columns = set_at(constant_columns, np.s_[..., -1], -known[0])
+        prescribed = prescribed_disturbance(plant.loads, times) if disturbed else None
+        if prescribed is not None:
+            constant_columns = set_at(constant_columns, np.s_[..., -1], -prescribed[0])
         distribution = xp.swapaxes(shape, -1, -2)
         coupling = Coupling(
             force_distribution=distribution,
@@ -191,8 +191,8 @@ def crossing_plant(plant: Plant, with_weights: bool) -> tuple[ConstantPlant, Cou
         assert contact.surface is not None
         surface_rows = contact.surface[..., sprung, :] @ to_modal
         surface_rows = xp.pad(surface_rows, [(0, 0)] * (surface_rows.ndim - 1) + [(0, added)])
-        if known is not None:
-            surface_rows = set_at(surface_rows, np.s_[..., -1], known[1][..., sprung])
+        if prescribed is not None:
+            surface_rows = set_at(surface_rows, np.s_[..., -1], prescribed[1][..., sprung])
         return _with_springs(coupling, surface_rows)
 
     return unloaded_plant, contact_coupling
@@ -204,9 +204,9 @@ def _with_springs(coupling: Coupling, surface_rows) -> Coupling:
     identity = xp.broadcast_to(xp.eye(count), (*surface_rows.shape[:-2], count, count))
     wheels = coupling.force_distribution.shape[-1]
     below = xp.pad(identity, [*lead, (0, 0), (wheels, 0)])
-    beside = xp.pad(coupling.force_distribution, [*lead, (0, 0), (0, count)])
+    contact = xp.pad(coupling.force_distribution, [*lead, (0, 0), (0, count)])
     return Coupling(
-        force_distribution=xp.concatenate([beside, below], axis=-2),
+        force_distribution=xp.concatenate([contact, below], axis=-2),
         force_state_rows=xp.concatenate([coupling.force_state_rows, surface_rows], axis=-2),
         command_feedthrough=xp.pad(coupling.command_feedthrough, [*lead, (0, count), (0, 0)]),
         force_feedthrough=xp.pad(coupling.force_feedthrough, [*lead, (0, count), (0, count)]),
@@ -225,7 +225,7 @@ def designs_of(
     masses: Float[Array, " mass"],
     speeds: Float[Array, " speed"],
 ) -> GainSchedule:
-    """Gain schedules (mass, speed) of a design plant whose load has other masses and speeds."""
+    """Gain schedules (mass, speed) of a design plant, one for each mass and speed of its load."""
 
     def design(mass, speed):
         return schedule(with_crossing_load(plant, mass, speed))
@@ -235,7 +235,7 @@ def designs_of(
 
 
 def with_crossing_load(plant: Plant, mass, speed) -> Plant:
-    """Plant with another mass (kg) at another constant speed (m/s), in the same direction.
+    """Plant whose load has another mass (kg) and constant speed (m/s), in the same direction.
 
     A vehicle of another mass is a similar one, of the same frequencies.
     """
@@ -285,7 +285,7 @@ class ScheduledGainLaw(AbstractStateLaw):
         mass = xp.where(load.mass_identified, load.mass, self.masses[0])
         speed, entry = xp.abs(load.speed), load.entry_time
         end = entry + self.length / speed
-        # In proportion to the mass between the designs, which differ in it alone.
+        # Interpolated in proportion to the mass between designs that differ in it alone.
         clamped_mass = xp.clip(mass, self.masses[0], self.masses[-1])
         lightest = self.schedules.load_weights[0, 0]
         constant = xp.arange(lightest.shape[0]) >= self.weight_count
@@ -298,8 +298,8 @@ class ScheduledGainLaw(AbstractStateLaw):
             return stretched.step((), estimate, measurement, t).command
 
         commands = vmap(vmap(command_of))(self.schedules)
-        shares = self._interpolation(self.masses, mass), self._interpolation(self.speeds, speed)
-        command = xp.einsum("m,v,mva->a", *shares, commands)
+        weights = self._interpolation(self.masses, mass), self._interpolation(self.speeds, speed)
+        command = xp.einsum("m,v,mva->a", *weights, commands)
         return ControlStep(xp.where(load.speed_identified, command, 0.0), state)
 
     def _interpolation(self, grid, value) -> Float[Array, " design"]:
@@ -311,10 +311,10 @@ class ScheduledGainLaw(AbstractStateLaw):
 
 
 class ReadLoads(NamedTuple):
-    """Loads that read the tables: their clocks, speeds (m/s), masses (kg) and weights (N).
+    """Loads that schedule the gains: their clocks, speeds (m/s), masses (kg) and weights (N).
 
-    The clock is negative before entry, the share of the beam travelled on it, and 1 plus the time
-    since the exit (s) after.
+    The clock is negative before entry, the fraction of the beam travelled on it, and 1 plus the
+    time since the exit (s) after.
     """
 
     clock: Float[Array, " load"]
@@ -325,7 +325,7 @@ class ReadLoads(NamedTuple):
 
 
 class PositionGainLaw(AbstractStateLaw):
-    """Gain schedules (mass, speed) of single loads, and the loads that read them.
+    """Law whose gains are scheduled by the positions of the loads, from designs for single loads.
 
     `load_masses` (kg) and `load_weights` (N) are those of the loads, whose positions are those of
     `load_set`; loads of an estimate take their place.
@@ -343,31 +343,32 @@ class PositionGainLaw(AbstractStateLaw):
         positions, speeds, _ = self.load_set.kinematics(t)
         entry, leave = self.load_set.entry_exit_times().T
         entered, left = has_come(entry, t), has_come(leave, t)
-        share, since_exit = xp.clip(self._share(positions), 0.0, 1.0), xp.maximum(t - leave, 0.0)
-        clock = xp.where(entered, xp.where(left, 1.0 + since_exit, share), -1.0)
+        travelled = xp.clip(self._travelled(positions), 0.0, 1.0)
+        since_exit = xp.maximum(t - leave, 0.0)
+        clock = xp.where(entered, xp.where(left, 1.0 + since_exit, travelled), -1.0)
         on_beam = entered & ~left
         return ReadLoads(clock, xp.abs(speeds), on_beam, self.load_masses, self.load_weights)
 
     def estimated_loads(self, loads: EstimatedLoads) -> ReadLoads:
-        """The loads as an estimator follows them; they have left at their present speed."""
-        share, speeds = self._share(loads.positions), xp.abs(loads.speeds)
+        """The loads of an estimate; those that have left did so at their present speed."""
+        travelled, speeds = self._travelled(loads.positions), xp.abs(loads.speeds)
         length = self.load_set.trajectories[0].length
-        since_exit = xp.maximum(share - 1.0, 0.0) * length
+        since_exit = xp.maximum(travelled - 1.0, 0.0) * length
         moving = speeds > 0
         since_exit = xp.where(moving, since_exit / xp.where(moving, speeds, 1.0), 0.0)
-        clock = xp.where(share < 0, -1.0, xp.minimum(share, 1.0) + since_exit)
-        on_beam = (share >= 0) & (share < 1)
+        clock = xp.where(travelled < 0, -1.0, xp.minimum(travelled, 1.0) + since_exit)
+        on_beam = (travelled >= 0) & (travelled < 1)
         weights = loads.masses * self.load_weights / self.load_masses
         return ReadLoads(clock, speeds, on_beam, loads.masses, weights)
 
-    def _share(self, positions):
-        """Share of the beam that loads at positions (m) have travelled."""
+    def _travelled(self, positions):
+        """Fraction of the beam that loads at positions (m) have travelled."""
         path = self.load_set.trajectories[0]
-        share = positions / path.length
-        return xp.where(path.direction() < 0, 1.0 - share, share)
+        from_left = positions / path.length
+        return xp.where(path.direction() < 0, 1.0 - from_left, from_left)
 
     def load_gains(self, loads: ReadLoads) -> Float[Array, "load actuator column"]:
-        """Gain that each load reads, as if it were alone."""
+        """Gain of each load, as if it were alone."""
 
         def of_load(clock, mass, speed):
             def gain(schedule):
@@ -375,25 +376,25 @@ class PositionGainLaw(AbstractStateLaw):
                 return dataclasses.replace(schedule, start=start, end=end).gain(clock)
 
             gains = vmap(vmap(gain))(self.schedules)
-            shares = _hat_weights(self.masses, mass), _hat_weights(self.speeds, speed)
-            return xp.einsum("m,v,mvac->ac", *shares, gains)
+            weights = _hat_weights(self.masses, mass), _hat_weights(self.speeds, speed)
+            return xp.einsum("m,v,mvac->ac", *weights, gains)
 
         return vmap(of_load)(loads.clock, loads.masses, loads.speeds)
 
     def combined(
         self, loads: ReadLoads
     ) -> tuple[Float[Array, "actuator state"], Float[Array, " actuator"]]:
-        """Gain of the state, and commands that are fed forward, for some loads."""
+        """Gain of the state for the loads together, and commands fed forward for their weights."""
         gains, on_beam = self.load_gains(loads), loads.on_beam
         counted = xp.where(xp.any(on_beam), on_beam, loads.clock >= 1)
-        shares = xp.where(counted, loads.masses, 0.0)
-        total = xp.sum(shares)
-        shares = shares / xp.where(total > 0, total, 1.0)
+        weights = xp.where(counted, loads.masses, 0.0)
+        total = xp.sum(weights)
+        weights = weights / xp.where(total > 0, total, 1.0)
         states = gains.shape[-1] - self.schedules.load_weights.shape[-1]
         forward = xp.zeros(gains.shape[1])
         if self.schedules.load_feedforward:
             forward = -xp.where(on_beam, loads.weights, 0.0) @ gains[..., states]
-        return xp.einsum("l,lac->ac", shares, gains[..., :states]), forward
+        return xp.einsum("l,lac->ac", weights, gains[..., :states]), forward
 
     def step(self, state, estimate, measurement, t):
         followed = estimate.loads

@@ -33,7 +33,7 @@ ROUNDING = 1e-9  # of an eigenvalue that may be zero, relative to the largest
 
 
 class Game(NamedTuple):
-    """Matrices of the plant and its costs; see the module."""
+    """H-infinity problem: matrices of the plant and weights of its costs; see the module."""
 
     A: Square
     B: InputMatrix
@@ -54,7 +54,7 @@ class MinimaxLaw(NamedTuple):
 
 
 def minimax_law(game: Game, level: Float[Array, ""]) -> MinimaxLaw:
-    """Law that keeps the worst gain below a level; nan where there is none. Differentiable."""
+    """Law with a worst-case gain below a level; nan where there is none. Differentiable."""
     A, B, C, _, Q, R, N = game
     M, spread = values(game, level)
     informed = C.T @ solve(N, C)
@@ -84,7 +84,7 @@ def values(game: Game, level: Float[Array, ""]) -> tuple[Square, Square]:
 
 
 def is_attained(game: Game, level: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether some law keeps the worst gain below a level."""
+    """Whether some law has a worst-case gain below a level."""
     M, spread = values(game, level)
     finite = xp.all(xp.isfinite(M)) & xp.all(xp.isfinite(spread))
     M, spread = (xp.where(finite, part, xp.zeros_like(part)) for part in (M, spread))
@@ -105,7 +105,7 @@ def is_attained(game: Game, level: Float[Array, ""]) -> Bool[Array, ""]:
 
 
 def least_level(game: Game) -> Float[Array, ""]:
-    """Least level that a law attains, within 1e-9 of it.
+    """Least worst-case gain of any law, to a relative 1e-9.
 
     Its derivative is that of the level at which the largest eigenvalue of S M is its square.
     Raises ValueError if there is none; under `jit` and `vmap` it is nan.
@@ -131,9 +131,9 @@ def least_level(game: Game) -> Float[Array, ""]:
 
 
 def _change(game: Game, fixed: Game, level):
-    """Zero, with the derivative of the level at which 1 - S M / level^2 is singular.
+    """Zero, whose derivatives are those of the level at which 1 - S M / level^2 is singular.
 
-    With its null vectors l and r, l' d(matrix) r = 0.
+    By its null vectors l and r: l' d(matrix) r = 0.
     """
 
     def coupled(game, level):
@@ -150,7 +150,7 @@ def _change(game: Game, fixed: Game, level):
 
 
 def _opposed(game: Game, level) -> Square:
-    """B R^-1 B' - E E' / level^2."""
+    """Matrix B R^-1 B' - E E' / level^2 of commands against disturbances."""
     return symmetric_part(game.B @ solve(game.R, game.B.T) - game.E @ game.E.T / level**2)
 
 
@@ -323,7 +323,7 @@ class HInfinity(AbstractController):
 
 
 class PredictedState(NamedTuple):
-    """State x as predicted up to the last command, which is not known as limited until later."""
+    """Predicted state x, before the effect of the last command, whose limited value comes later."""
 
     state: Float[Array, " state"]
 

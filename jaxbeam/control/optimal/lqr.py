@@ -74,7 +74,7 @@ class LQR(AbstractStateController):
     """Linear-quadratic regulator.
 
     `state_weight` is the diagonal of Q, `command_weight` that of R. Deflections at `positions` are
-    weighted too, eq. (3.2) of the thesis. `feedback` is the share of each state that is fed back
+    weighted too, eq. (3.2) of the thesis. `feedback` is the fraction of each state that is fed back
     (1 or 0; all if left out); the gain is designed for all of them.
 
     **Horizon.** "infinite": a constant gain for the plant without loads, eq. (5.7) of the thesis.
@@ -100,8 +100,8 @@ class LQR(AbstractStateController):
     the reference, whatever constant load acts, while the commands are within their limits; beyond
     them e stands still.
 
-    **Gains over a crossing** are tabulated over its share, from the first entry to the last exit:
-    share of time, hence of the distance only while a single load keeps its speed. Where the design
+    **Gains over a crossing** are tabulated over the fraction of its time, from the first entry to
+    the last exit; this is one of distance too while a single load keeps its speed. Where the design
     model has another speed, the table is stretched. After the crossing the command is "none", or
     the last gain is on "hold", or it decays ("fade", with the time constant `fade_time`), or the
     "time-invariant" regulator takes over. A table has `points` intervals, or some more, between
@@ -114,8 +114,8 @@ class LQR(AbstractStateController):
     interval lasted nine of its time constants, 1e-8 with four.
 
     **Augmented** by "loads", eq. (5.8) of the thesis, the weights of the loads are constant states:
-    the command responds to loads on the beam and, as their entry times are known or predicted, to
-    later ones. With a profile or forces that vary in time, which are known too, a further constant
+    the command responds to loads on the beam and, as their entry times are given or predicted, to
+    later ones. With a profile or forces that vary in time, which are given too, a further constant
     state is 1.
 
     **Schedule.** "load", section 5.3 of the thesis: a design for each of the `masses` and `speeds`
@@ -164,7 +164,7 @@ class LQR(AbstractStateController):
         "1/m^2", "weight of the deflection at each position", NOT_NEGATIVE, default=None
     )
     feedback: Float[Number, " state"] | None = number(
-        "1", "share of each state that is fed back", default=None
+        "1", "fraction of each state that is fed back", default=None
     )
     horizon: str = choice(
         "time over which the cost is taken",
@@ -261,8 +261,8 @@ class LQR(AbstractStateController):
         return held and (self.delay is not None or self.input_rate_weight is not None)
 
     @property
-    def feedback_shares(self) -> Float[Array, " state"]:
-        """Share of each state that is fed back."""
+    def feedback_fractions(self) -> Float[Array, " state"]:
+        """Fraction of each state that is fed back."""
         return xp.ones_like(self.state_weight) if self.feedback is None else self.feedback
 
     def weights(self, plant: Plant) -> tuple[Float[Array, "state state"], Float[Array, "..."]]:
@@ -299,22 +299,22 @@ class LQR(AbstractStateController):
 
     def gain_schedule(self, plant: Plant, design_plant: Plant) -> GainSchedule:
         """Schedule designed for one plant, for the times of entry and exit of the other."""
-        table, shares = self.gain_table(design_plant), self.feedback_shares
+        table, fractions = self.gain_table(design_plant), self.feedback_fractions
         vehicle_states, augmented = design_plant.vehicle_states, self.augmented == "loads"
         load_weights = design_plant.augmented_start[vehicle_states:] if augmented else xp.zeros(0)
         last_gain = table(xp.ones(()))
         if self.after == "time-invariant":
             last_gain = self.time_invariant_gain(design_plant)
-        states = shares.shape[0]
+        states = fractions.shape[0]
         further = vehicle_states + load_weights.shape[0]
         final_gain = xp.zeros((last_gain.shape[0], states + further))
         if self.after != "none":
             final_gain = set_at(final_gain, np.s_[:, :states], last_gain[:, :states])
-        shares = xp.concatenate([shares, xp.ones(further)])
+        fractions = xp.concatenate([fractions, xp.ones(further)])
         events = crossing_events(design_plant if self.entries == "predicted" else plant)
         return GainSchedule(
-            GainTable(table.breakpoints, table.coefficients * shares),
-            final_gain * shares,
+            GainTable(table.breakpoints, table.coefficients * fractions),
+            final_gain * fractions,
             load_weights,
             events[0],
             events[-1],
@@ -332,13 +332,13 @@ class LQR(AbstractStateController):
             return self.gain_schedule(plant, design_plant)
         gain = self.time_invariant_gain(design_plant)
         if self.reference is None:
-            further = xp.ones(gain.shape[1] - self.feedback_shares.shape[0])
-            shares = xp.concatenate([self.feedback_shares, further])
-            return GainLaw(gain * shares, self.feeds_back_command)
+            further = xp.ones(gain.shape[1] - self.feedback_fractions.shape[0])
+            fractions = xp.concatenate([self.feedback_fractions, further])
+            return GainLaw(gain * fractions, self.feeds_back_command)
         limits = [actuator.command_limits() for actuator in plant.case.driven]
         unlimited = np.array([-np.inf, np.inf])
         limits = xp.stack([unlimited if one is None else one for one in limits])
-        settings = self.feedback_shares, self.reference, self.period
+        settings = self.feedback_fractions, self.reference, self.period
         return IntegralLaw(gain, *settings, limits, self.feeds_back_command)
 
     def _load_schedule(self, plant: Plant, design_plant: Plant) -> ScheduledGainLaw:
@@ -377,9 +377,10 @@ class LQR(AbstractStateController):
         return np.sort(np.ravel(crossing_times(case)))
 
     def breakpoints(self, case):
-        """Also, in continuous time, predicted entries and exits, at which the gain jumps.
+        """Times (s) of the design loads, and of jumps and boundary layers of a continuous gain.
 
-        And the start of the boundary layer of optimal gains before each event.
+        In continuous time the gain jumps at predicted entries and exits, and optimal gains have a
+        boundary layer before each.
         """
         times = super().breakpoints(case)
         if self.period is not None or not self.varies:
@@ -406,7 +407,7 @@ class LQR(AbstractStateController):
         )
 
     def _size_error(self, case: Case) -> str | None:
-        """Error of the length of a list."""
+        """Error message of a list of the wrong length, or None."""
         states, commands = self.state_count(case), len(case.driven)
         sizes = dict.fromkeys(("state_weight", "feedback", "terminal_weight"), states)
         sizes |= dict.fromkeys(("command_weight", "input_rate_weight"), commands)
@@ -423,7 +424,7 @@ class LQR(AbstractStateController):
         return None
 
     def _option_error(self) -> str | None:
-        """Error of a setting that would have no effect, or is missing, with the words of others."""
+        """Error message of a setting that is missing, or that others make useless, or None."""
         defaults = {field.name: field.default for field in dataclasses.fields(self)}
         for name, (option, words) in _NEEDED.items():
             value, word = getattr(self, name), getattr(self, option)
@@ -453,8 +454,8 @@ class LQR(AbstractStateController):
             return (
                 "period must be given: sampling = 'exact' is designed for commands held that long"
             )
-        known = self.delay is not None and is_concrete(self.delay) and is_concrete(self.period)
-        if known and concrete(self.delay) >= concrete(self.period):
+        timed = self.delay is not None and is_concrete(self.delay) and is_concrete(self.period)
+        if timed and concrete(self.delay) >= concrete(self.period):
             return "delay must be less than the period: the design allows for one pending command"
         if self.reference is None:
             return None
@@ -561,7 +562,7 @@ def _decays(vehicle: VehicleModel) -> bool:
 
 @compiled
 def _gain_table(law: LQR, plant: Plant) -> GainTable:
-    """Gains over the crossing, by a loop that takes longer in NumPy than its program to compile."""
+    """Gains over the crossing, always compiled: in NumPy its loop takes longer than compilation."""
     if law.horizon == "frozen":
         return frozen_gains(plant, law.points, *law.weights(plant))
     return law.crossing_gains(plant)[0]

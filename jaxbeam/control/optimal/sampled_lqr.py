@@ -1,4 +1,4 @@
-"""Regulators for commands that are held between samples, and what sampling loses.
+"""Regulators for commands held between samples, and the controllability that sampling leaves.
 
 A mode with poles a +- i omega is uncontrollable at periods k pi / omega: in each of them its phase
 advances by a multiple of pi, so that all commands move its state along one line.
@@ -114,12 +114,12 @@ def discrete_lq_problem(
 class IntegralLaw(AbstractStateLaw):
     """u = -K (x, last command, e) with the integrals e of the errors as the state of the law.
 
-    `limits` (actuator, 2) are those of the commands, within which e goes on; `shares` those of the
-    states that are fed back.
+    `limits` (actuator, 2) are those of the commands, within which e goes on; `fractions` are those
+    of the states that are fed back.
     """
 
     gain: Float[Array, "actuator column"]
-    shares: Float[Array, " state"]
+    fractions: Float[Array, " state"]
     reference: Float[Array, " output"]
     period: Float[Array, ""]
     limits: Float[Array, "actuator 2"]
@@ -130,7 +130,7 @@ class IntegralLaw(AbstractStateLaw):
 
     def step(self, state, estimate, measurement, t):
         last = measurement.command if self.feeds_back_command else xp.zeros(0)
-        command = -self.gain @ xp.concatenate([self.shares * estimate.state, last, state])
+        command = -self.gain @ xp.concatenate([self.fractions * estimate.state, last, state])
         within = xp.all((command >= self.limits[:, 0]) & (command <= self.limits[:, 1]))
         error = measurement.readings[: self.reference.shape[0]] - self.reference
         return ControlStep(command, state + xp.where(within, self.period, 0.0) * error)
@@ -141,7 +141,7 @@ UNCONTROLLABLE = 1e-9  # of the largest possible modal input; below, a mode is u
 
 
 class SamplingWarning(UserWarning):
-    """A mode of the design is hardly controllable at the sampling period."""
+    """Warning of a mode of the design that is hardly controllable at the sampling period."""
 
 
 def sampling_limit(case: Case) -> Float[Array, " mode"]:
@@ -175,13 +175,13 @@ def warn_slow_sampling(system: StateSpace, period: float, memory_time: float) ->
 
     `memory_time` (s) is as in `sampled_reachability`.
     """
-    share, pole = sampled_reachability(system, period, memory_time)
-    if share >= MIN_REACHABILITY:
+    ratio, pole = sampled_reachability(system, period, memory_time)
+    if ratio >= MIN_REACHABILITY:
         return
     warnings.warn(
         f"the mode at {pole / (2 * np.pi):.4g} Hz is hardly controllable at a period of"
-        f" {period:.4g} s: its sampling limit is pi / omega = {np.pi / pole:.4g} s, and the share"
-        f" {share:.2g} of its controllability is left; sample faster, or design for fewer modes",
+        f" {period:.4g} s: its sampling limit is pi / omega = {np.pi / pole:.4g} s, and a fraction"
+        f" {ratio:.2g} of its controllability is left; sample faster, or design for fewer modes",
         SamplingWarning,
         stacklevel=2,
     )
@@ -190,7 +190,7 @@ def warn_slow_sampling(system: StateSpace, period: float, memory_time: float) ->
 def sampled_reachability(
     system: StateSpace, period: float, memory_time: float
 ) -> tuple[float, float]:
-    """Smallest ratio of sampled to continuous controllability over the modes; omega of that mode.
+    """Smallest ratio of sampled to continuous controllability of any mode, and omega of that mode.
 
     Controllability is the Gramian of a mode: the states that commands of unit energy attain, with
     forgetting over a `memory_time` (s), which keeps that of undamped modes finite. The ratio is the
@@ -202,14 +202,14 @@ def sampled_reachability(
     modal_inputs = rows @ concrete(system.B)
     max_input = np.linalg.norm(rows, axis=1) * np.linalg.norm(concrete(system.B))
     controllable = np.linalg.norm(modal_inputs, axis=1) > UNCONTROLLABLE * max_input
-    shares = [
+    ratios = [
         _mode_reachability(*mode, period, memory_time)
         for mode in zip(poles[controllable], modal_inputs[controllable], strict=True)
     ]
-    if not shares:
+    if not ratios:
         return 1.0, 0.0
-    worst = int(np.argmin(shares))
-    return shares[worst], float(poles[controllable][worst].imag)
+    worst = int(np.argmin(ratios))
+    return ratios[worst], float(poles[controllable][worst].imag)
 
 
 def _mode_reachability(

@@ -57,7 +57,10 @@ class PolynomialModel(NamedTuple):
 
 
 class PredictiveGains(NamedTuple):
-    """u(k) = reference_command - sum of H_i y(k - i) - sum of K_i u(k - 1 - i), i = 0, 1, ..."""
+    """Gains of the law u(k) = reference_command - sum H_i y(k - i) - sum K_i u(k - 1 - i).
+
+    i = 0, 1, ...; H are the `reading_gains`, K the `command_gains`.
+    """
 
     reading_gains: Float[Array, "past actuator output"]
     command_gains: Float[Array, "power actuator actuator"]
@@ -69,7 +72,7 @@ def polynomial_model(
     B: Float[Array, "state actuator"],
     C: Float[Array, "output state"],
 ) -> PolynomialModel:
-    """Polynomials of x(k+1) = A x(k) + B u(k), y = C x, by the recursion of Faddeev and LeVerrier.
+    """Polynomial model of x(k+1) = A x(k) + B u(k), y = C x, by Faddeev and LeVerrier.
 
     With M_1 = 1, the numerators are C M_i B, a_i = -tr(A M_i) / i, and M_(i+1) = A M_i + a_i.
     """
@@ -90,19 +93,19 @@ def predicted_outputs(
     Float[Array, "horizon output before actuator"],
     Float[Array, "horizon output move actuator"],
 ]:
-    """Outputs y(k+1) ... y(k+horizon) as sums over what is known and the moves to come.
+    """Matrices that predict the outputs y(k+1) ... y(k+horizon) from readings and moves.
 
-    The first factor is that of the readings y(k), y(k-1), ..., the second that of the last moves
-    du(k-1), du(k-2), ..., the third that of du(k), du(k+1), ...: the step response.
+    The first multiplies the readings y(k), y(k-1), ..., the second the past moves du(k-1),
+    du(k-2), ..., the third, the step response, the future moves du(k), du(k+1), ...
     """
     a = xp.concatenate([xp.ones(1), model.denominator])
     powers, outputs, actuators = model.numerators.shape
     one = xp.concatenate([a, xp.zeros(1)]) - xp.concatenate([xp.zeros(1), a])  # A (1 - q)
     past, before = powers + 1, powers - 1
     columns = past * outputs + (before + moves) * actuators
-    # Rows of the known and unknown numbers themselves: readings back from k, moves from k - before.
+    # Rows of past and future numbers themselves: readings back from k, moves from k - before.
     identity = xp.eye(columns)
-    known = [identity[i * outputs : (i + 1) * outputs] for i in range(past)][::-1]
+    readings = [identity[i * outputs : (i + 1) * outputs] for i in range(past)][::-1]
     steps = [
         identity[past * outputs + i * actuators : past * outputs + (i + 1) * actuators]
         for i in [*range(before)[::-1], *range(before, before + moves)]
@@ -111,12 +114,12 @@ def predicted_outputs(
     for j in range(1, horizon + 1):
         row = xp.zeros((outputs, columns))
         for i in range(1, past + 1):
-            row = row - one[i] * known[-i]
+            row = row - one[i] * readings[-i]
         for i in range(1, powers + 1):
             index = before + j - i  # of du(k + j - i)
             if 0 <= index < before + moves:
                 row = row + model.numerators[i - 1] @ steps[index]
-        known.append(row)
+        readings.append(row)
         predictions.append(row)
     stacked = xp.stack(predictions)
     shapes = (past, outputs), (before, actuators), (moves, actuators)
@@ -256,7 +259,7 @@ class GPC(AbstractController):
 
 
 class GPCLaw(AbstractSampledLaw):
-    """Law of `PredictiveGains`; its state are the readings and commands before the last ones."""
+    """Law of `PredictiveGains`; its state is the readings and commands before the last ones."""
 
     reading_gains: Float[Array, "past actuator output"]
     command_gains: Float[Array, "power actuator actuator"]

@@ -48,7 +48,7 @@ MAX_TERMINAL_WEIGHT = 3.0  # beyond it crossings were worse than without a termi
 
 
 class TerminalSetWarning(UserWarning):
-    """A terminal set outweighs the deflections where loads put it out of reach."""
+    """Warning of a terminal set that outweighs the deflections where loads put it out of reach."""
 
 
 class MPC(AbstractStateController):
@@ -261,7 +261,7 @@ class MPC(AbstractStateController):
             terminal = dual_mode_terminal(
                 regulator, self.terminal_periods, self.terminal_weight, states
             )
-        # After the last of plain moves commands stay, and with them the limits are kept.
+        # After the last unit move commands stay, so that limits kept until then are kept.
         limited_periods = self.horizon if self.laguerre_pole is not None else self.moves
         return MPCLaw(
             sampled_plant=sampled,
@@ -282,7 +282,7 @@ class MPC(AbstractStateController):
         )
 
     def _sampled(self, design_plant: Plant):
-        """Unloaded plant over a period, rows of its controlled deflections, and their weights."""
+        """Sampled unloaded plant, rows of its controlled deflections, and their weights."""
         system = design_plant.unloaded
         sampled = sampled_plant(
             system.A, system.B, xp.zeros((system.A.shape[0], 0)), self.period, self.delay

@@ -39,7 +39,7 @@ class MPCLaw(AbstractStateLaw):
 
     `sampled_plant` and `prediction` are those of the unloaded plant; with a `preview` both are
     computed at each sample, with the loads on their way, without their weights if not
-    `known_weights`; or a `table` has both for all samples, the predictions with the known inputs as
+    `known_weights`; or a `table` has both for all samples, the predictions with the load inputs as
     the last initial conditions. The states are those of the beam, then those of the vehicles of the
     preview, and with a delay the last commands. `output_weights` are those of squared deflections
     in each period, `move_weights` those of squared moves.
@@ -101,9 +101,9 @@ class MPCLaw(AbstractStateLaw):
         return prediction, initial, state
 
     def _predict(self, t, estimate):
-        """Plant over the last period, prediction from t (s), and the known inputs in it.
+        """Sampled plant of the last period, prediction from t (s), and the load inputs in both.
 
-        These are the weights of the loads, and one for other known disturbances.
+        These are the weights of the loads, and 1 for profile and forces over time.
         """
         if self.preview is None:
             return self.sampled_plant, self.prediction, xp.zeros(0)
@@ -112,8 +112,8 @@ class MPCLaw(AbstractStateLaw):
         if not self.known_weights:
             weights = xp.zeros_like(weights)
         elif estimate.weights is not None:
-            known = weights[estimate.weights.shape[0] :]
-            weights = xp.concatenate([estimate.weights, known])
+            constant = weights[estimate.weights.shape[0] :]
+            weights = xp.concatenate([estimate.weights, constant])
         if self.table is not None:
             sample = self.preview.sample_at(t)
             past, prediction = jax.tree.map(lambda part: take(part, sample), self.table)
@@ -140,9 +140,9 @@ class MPCLaw(AbstractStateLaw):
         return dataclasses.replace(self, table=in_blocks(block, len(times)))
 
     def quadratic_program(self, prediction: Prediction, initial, previous_command):
-        """Quadratic program of a sample, in the moves, and in the excesses over soft limits.
+        """Quadratic program of a sample, in the moves and in the excesses over soft limits.
 
-        Those over soft limits of deflections come first, then that over a soft terminal set.
+        Excesses over soft limits of deflections come first, then that over a soft terminal set.
         `initial` are the initial conditions of `Prediction`: the state, its unexplained change, the
         previous command u(k-1), and 1.
         """
@@ -174,14 +174,14 @@ class MPCLaw(AbstractStateLaw):
         return weighted.T @ maps.reshape(-1, maps.shape[2])
 
     def of_moves(self, H, f, previous_command) -> QuadraticProgram:
-        """Program of a cost x'H x + 2 f'x of the moves, within limits of the commands."""
+        """Quadratic program of a cost x'H x + 2 f'x of the moves, within limits of the commands."""
         gamma = self.limits.limits - self.limits.command_rows @ previous_command
         return QuadraticProgram(2 * H, 2 * f, self.limits.rows, gamma)
 
     def limited(
-        self, program: QuadraticProgram, prediction: Prediction, initial, share: float = 1.0
+        self, program: QuadraticProgram, prediction: Prediction, initial, factor: float = 1.0
     ) -> QuadraticProgram:
-        """Program within the limits of what is predicted; a `share` of the cost of excesses."""
+        """The program with limits of predicted deflections; costs of excesses times a `factor`."""
         free_response, Phi = prediction.F @ initial, prediction.Phi
         if self.hard_limit is not None:
             program = program.within(*rows_within(Phi, free_response, self.hard_limit))
@@ -196,11 +196,11 @@ class MPCLaw(AbstractStateLaw):
         if self.soft_limit is not None:
             horizon, outputs, _ = Phi.shape
             excess = xp.tile(xp.eye(outputs), (2 * horizon, 1))
-            costs = xp.full(outputs, share * self.soft_weight)
+            costs = xp.full(outputs, factor * self.soft_weight)
             soft_rows = rows_within(Phi, free_response, self.soft_limit)
             program = program.softly_within(*soft_rows, excess, costs)
         if rows is not None and weight is not None:
-            cost = share * weight
+            cost = factor * weight
             program = program.softly_within(rows, sides, xp.ones((rows.shape[0], 1)), cost[None])
             # The linear cost is one of the initial condition 1, of which the program is linear.
             program = program._replace(f=add_at(program.f, -1, cost * initial[-1]))

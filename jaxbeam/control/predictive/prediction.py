@@ -1,4 +1,4 @@
-"""Predictions over a horizon, of the model and of the loads that are known ahead.
+"""Predictions over a horizon, with a preview of the loads to come.
 
 Everywhere  x(k+1) = A_k x(k) + B_k u(k) + E_k W + w,  y(k) = C x(k),  with commands u held over a
 period, weights W of the loads, and w the unexplained change of the state, assumed to persist.
@@ -13,7 +13,7 @@ such cells are computed once.
 What predictive control assumes after its horizon: a cost, and a set of states.
 
 Dual-mode control (Rawlings, Mayne and Diehl, Model Predictive Control, 2nd edition, 2017, section
-2.4): from the end of the horizon on a regulator acts, whose cost is known, from a set of states in
+2.4): from the end of the horizon on a regulator of given cost acts, from a set of states in
 which it keeps all limits for ever. The set is the maximal output-admissible one (Gilbert and Tan,
 IEEE Trans. Automatic Control 36, 1991): the rows E of the limits, of the next periods,
 
@@ -58,7 +58,7 @@ from jaxbeam.runtime.module import Module
 
 
 class SampledPlant(NamedTuple):
-    """A plant over a period, or over several along a first axis; see the module.
+    """Discrete-time plant of a period, or of several along a first axis; see the module.
 
     With a delay the previous commands are further states.
     """
@@ -99,7 +99,7 @@ def sampled_plant(
     period: Float[Array, ""],
     delay: Float[Array, ""] | None = None,
 ) -> SampledPlant:
-    """Plant z' = A z + B u + B_f W over a period (s) with held inputs. Exact.
+    """Discrete-time plant of z' = A z + B u + B_f W over a period (s) with held inputs; exact.
 
     With a `delay` (s), at most the period, commands begin that much later.
     """
@@ -221,13 +221,13 @@ def repeat_plant(plant: SampledPlant, periods: int) -> SampledPlant:
     return jax.tree.map(lambda part: xp.broadcast_to(part, (periods, *part.shape)), plant)
 
 
-# Cells of a period, or of each part before and after a delayed command begins, at most; and phase
-# of the fastest mode, or of a vehicle, in one, with which fewer have maps exact to about 1e-9.
+# Largest number of cells of a period, or of each part before and after a delayed command begins;
+# and largest phase of the fastest mode, or of a vehicle, in a cell, exact to about 1e-9.
 CELLS, MAX_PHASE_PER_CELL = 8, 1.7
 
 
 class Preview(Module):
-    """Plant under its loads, and what its maps have in common at all samples.
+    """Plant under its loads, with the parts of its discrete-time maps that all samples have.
 
     `edges` (s) are the ends of the cells of a period. `responses` are those of the constant part
     over cells before, and after, a delayed command begins. Cells that contain load events have the
@@ -244,9 +244,9 @@ class Preview(Module):
     event_maps: Float[Array, "event all all_and_command"]
 
     def sampled_plants(self, t: Float[Array, ""], first: int, count: int) -> SampledPlant:
-        """Plants over `count` periods, the `first` one so many periods after the sample at t (s).
+        """Discrete-time plants of `count` periods, from `first` periods after the sample at t (s).
 
-        Known inputs are the constants of `Plant.augmented`.
+        Their load inputs are the constants of `Plant.augmented`.
         """
         constant_plant, coupling_at = crossing_plant(self.plant, with_weights=True)
         explicit, cells = self.plant.loads.massless, self.edges.shape[0] - 1
@@ -275,7 +275,7 @@ class Preview(Module):
         return xp.floor(t / self.period + 0.5).astype(int)
 
     def _compose(self, maps: Float[Array, "period cell all all_and_command"]) -> SampledPlant:
-        """Plants over periods from the maps of their cells."""
+        """Discrete-time plants of periods from the maps of their cells."""
         size, commands = maps.shape[2], maps.shape[3] - maps.shape[2]
         states = self.plant.modal_model.state_count + self.plant.vehicle_states
         delayed = self.delay is not None
@@ -313,10 +313,10 @@ def preview(plant: Plant, period: Float[Array, ""], delay: Float[Array, ""] | No
     """Preview of a plant with its loads for commands held over a period, after a delay (s)."""
     constant_plant, coupling_at = crossing_plant(plant, with_weights=True)
     explicit, per_part = plant.loads.massless, _cell_count(plant, period)
-    shares = np.arange(per_part) / per_part
+    fractions = np.arange(per_part) / per_part
     marks = [xp.zeros(()), *([] if delay is None else [delay]), period]
     parts = list(zip(marks[:-1], marks[1:], strict=True))
-    edges = [start + (end - start) * shares for start, end in parts]
+    edges = [start + (end - start) * fractions for start, end in parts]
     edges = xp.concatenate([*edges, xp.reshape(period, 1)])
     responses = tuple(_response(constant_plant, (end - start) / per_part) for start, end in parts)
 
@@ -356,7 +356,7 @@ def preview(plant: Plant, period: Float[Array, ""], delay: Float[Array, ""] | No
 
 
 def _cell_count(plant: Plant, period: Float[Array, ""]) -> int:
-    """Cells of a period (s), or of each of its two parts."""
+    """Number of cells of a period (s), or of each of its two parts."""
     rates = plant.modal_model.modes.angular_frequencies
     if any_jax(plant, period):
         return CELLS
@@ -383,7 +383,7 @@ def cell_maps(
 
 
 def _response(plant: ConstantPlant, length: Float[Array, ""]) -> StageResponse:
-    """Response of the constant part over a length (s), without cost."""
+    """Stage response of the plant without loads over a length (s), without cost."""
     states = plant.A.shape[0]
     all_lengths = stage_responses(plant, xp.zeros((states, states)), length, MAX_HALVINGS)
     return jax.tree.map(lambda part: part[0], all_lengths)
@@ -488,9 +488,9 @@ def limits_error(actuators: Sequence[Any]) -> str | None:
 
 
 def periods_needed(regulator: TerminalRegulator, at_least: int = 1) -> int | None:
-    """Periods, `at_least` or more, after which limits of all later ones follow; None if too many.
+    """Number of periods whose limits imply those of all later periods; None if too many.
 
-    By linear programs; the numbers must be known.
+    `at_least` so many. By linear programs; numbers must be concrete.
     """
 
     def enough(periods):
@@ -542,7 +542,7 @@ def dual_mode_terminal(
 
 
 def unseen_modes(regulator: TerminalRegulator, modes: int) -> Int[np.ndarray, " mode"]:
-    """Numbers, from 1, of modes whose coordinates have no cost but rounding; numbers are known.
+    """Numbers, from 1, of the modes whose coordinates have no cost; numbers must be concrete.
 
     By them the cost of a limit has no scale (`limit_cost`). Coordinates are the first states.
     """

@@ -168,19 +168,19 @@ class ScenarioLaw(AbstractStateLaw):
         return ControlStep(command + xp.where(solved, move, 0.0), after, solved)
 
     def quadratic_program(self, parts, command) -> QuadraticProgram:
-        """One program from the law, the prediction and the initial conditions of each scenario."""
-        first, share = self.laws[0], 1 / len(parts)
+        """Quadratic program of all scenarios, from the law, prediction and conditions of each."""
+        first, weight = self.laws[0], 1 / len(parts)
         if self.worst:
             H = first.move_cost()
             program = first.of_moves(H, xp.zeros(H.shape[0]), command)
         else:
             merits = [law.merit(prediction, initial) for law, prediction, initial in parts]
-            H, f = (share * sum(terms[1:], terms[0]) for terms in zip(*merits, strict=True))
+            H, f = (weight * sum(terms[1:], terms[0]) for terms in zip(*merits, strict=True))
             program = first.of_moves(H, f, command)
         if first.solver == "unconstrained":
             return program._replace(M=program.M[:0], gamma=program.gamma[:0])
         for law, prediction, initial in parts:
-            program = law.limited(program, prediction, initial, share)
+            program = law.limited(program, prediction, initial, weight)
         if not self.worst:
             return program
         rows, sides = [], []

@@ -280,7 +280,7 @@ def place_of(case: Case, sensor: Sensor) -> Float[Array, ""]:
 
 
 def at_side(case: Case, x, side: str = "right") -> Float[Array, "*position"]:
-    """Positions just right or left of x (m), by SIDE_SHARE of the length, within the beam.
+    """Positions just right or left of x (m), by SIDE_DISTANCE of the length, within the beam.
 
     Third derivatives jump at loads and supports, curvatures at the ends of patches.
     """
