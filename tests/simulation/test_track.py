@@ -301,7 +301,7 @@ def test_shares_of_the_rule():
         ({"loads": [jb.MovingMass(mass=100.0, speed=10.0)]}, "loads.0 has mass"),
         (
             {"loads": [jb.MovingForce(force=1e3, speed=10.0, start_position=-0.3)]},
-            "first one enters at -0.6 m",
+            "first force enters at -0.6 m",
         ),
         (
             {"absorbers": [jb.Absorber(7.5, mass=1e3, frequency=6.0, damping_ratio=0.1)]},

@@ -446,12 +446,12 @@ def test_positions_of_axles_are_their_offsets():
     np.testing.assert_array_equal(vehicle.wheel_masses, 0.0)
 
 
-def test_axles_beside_a_table_of_times():
+def test_axles_with_a_table_of_times():
     table = {"times": [0.0, 2.0], "positions": [0.0, 30.0]}
     case = case_with("axles", table, without=["speed"])
     check_case(case)
     np.testing.assert_array_equal(case.loads[0].vehicle(np.float64(9.81)).offsets, [0.0, 3.0])
-    with pytest.raises(ValueError, match="loads.0.offsets is missing; beside a table"):
+    with pytest.raises(ValueError, match="loads.0.offsets is missing; with a table"):
         check_case(case_with("axles", table, without=["speed", "offsets"]))
 
 
