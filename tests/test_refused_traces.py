@@ -176,7 +176,7 @@ def test_times_of_ride_measures_are_known(measure, transformed):
     def function(share):
         return getattr(jb.ride, measure)(share * times, np.sin(50 * times))
 
-    with pytest.raises(ValueError, match="times of ride measures must be known numbers"):
+    with pytest.raises(ValueError, match="times of ride measures must be concrete numbers"):
         TRANSFORMED[transformed](function)
 
 

@@ -81,7 +81,7 @@ def tuned_absorber(
 
 
 def _is_node(found: Modes, mode: int, shape: float) -> bool:
-    """Whether a value of the shape of a mode is zero but for rounding."""
+    """Whether a value of the shape of a mode is zero within rounding."""
     nodes = concrete(found.nodes)
     shapes = concrete(found.shapes(np.linspace(nodes[0], nodes[-1], 201)))[:, mode - 1]
     return bool(abs(shape) <= NODE * np.max(np.abs(shapes)))

@@ -32,7 +32,7 @@ from jaxbeam.runtime.printer import TableViews
 
 Extremes = tuple[Float[np.ndarray, " position"], Float[np.ndarray, " position"]]
 Factors = float | Sequence[float] | Sequence[int]
-SOURCES = "uniform", "model", "loads"  # one of which an action has
+SOURCES = "uniform", "model", "loads"  # an action has one of these
 SELF_WEIGHT, OWN = "self-weight", "case"
 OPTIONS = {  # of each source, with the units of those that are numbers
     "uniform": {},
@@ -115,7 +115,7 @@ def action_extremes(
     wrong = [key for key in action if key not in allowed]
     if source is None or wrong:
         raise ValueError(
-            f"{where or 'an action'} has one of {', '.join(SOURCES)}, and beside a model speed,"
+            f"{where or 'an action'} has one of {', '.join(SOURCES)}, and with a model speed,"
             f" lane or impact; not {', '.join(map(str, action)) or 'nothing'}"
         )
     if source == "uniform":

@@ -31,9 +31,9 @@ class PerformanceMetrics(NamedTuple):
     Deflections are those at the sensors, the largest of all: `peak` (m) in continuous time, `rms`
     (m) over the samples of the run, `after_exit` (m) the largest after the last load has left, NaN
     if the run ends before. For each actuator `effort` is the integral of the squared command over
-    the run (command^2 s), `saturated` the share of samples at a limit. `share` is that of the
-    attainable reduction of the peak (see `Bound.share`), `stability_margin` the margin along the
-    crossing, `limit_cycles` the oscillation of each command.
+    the run (command^2 s), `saturated` the fraction of samples at a limit. `share` is the fraction
+    of the attainable reduction of the peak (see `Bound.share`), `stability_margin` the margin along
+    the crossing, `limit_cycles` the oscillation of each command.
     """
 
     peak: float
@@ -107,8 +107,8 @@ class Comparison(TableViews, Module):
         metrics = self.metrics[name]
         parts = []
         if metrics.saturated.any():
-            shares = ", ".join(f"{share:.1%}" for share in metrics.saturated)
-            parts.append(f"at the limits {shares} of the run")
+            fractions = ", ".join(f"{fraction:.1%}" for fraction in metrics.saturated)
+            parts.append(f"at the limits {fractions} of the run")
         if metrics.stability_margin.unstable is not None:
             parts.append(str(metrics.stability_margin))
         for i, oscillation in enumerate(metrics.limit_cycles):
@@ -156,9 +156,9 @@ def compare(
 class MetricsOverCases(NamedTuple):
     """Performance metrics of a controller over several load cases.
 
-    `peak` (m), `after_exit` (m, NaN if a run ends before the last exit) and `saturated` (share of a
-    run that an actuator is at a limit) are the largest of all cases, `worst_share` and
-    `mean_share` the least and the mean share of the attainable reduction.
+    `peak` (m), `after_exit` (m, NaN if a run ends before the last exit) and `saturated` (fraction
+    of a run that an actuator is at a limit) are the largest of all cases, `worst_share` and
+    `mean_share` the least and the mean fraction of the attainable reduction.
     """
 
     peak: float
@@ -187,9 +187,9 @@ def metrics_over_cases(comparisons: Sequence[Comparison]) -> dict[str, MetricsOv
 
 
 def worst_comparison(comparisons: Sequence[Comparison], name: str) -> int:
-    """Number of the comparison with the least share of a controller; none is less than divergence.
+    """Index of the comparison in which a controller achieves the least of the attainable reduction.
 
-    Runs in which nothing can be attained count last.
+    Divergence is less than any; runs in which nothing can be attained count last.
     """
     metrics = [comparison.metrics[name] for comparison in comparisons]
     shares = [-np.inf if np.isnan(one.peak) else one.share for one in metrics]

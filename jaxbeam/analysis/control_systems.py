@@ -38,7 +38,7 @@ def to_control(
     mass, schedules have the gains of the time at which the first load is there.
 
     Raises ValueError for an invalid case, a mass without a position, a position off the beam, and a
-    mass that is negative or not known; ImportError, saying what to install, if python-control is
+    mass that is negative or missing; ImportError, saying what to install, if python-control is
     missing.
 
     >>> import jaxbeam as jb

@@ -10,11 +10,11 @@ from jaxbeam.case.loads.base import wheel_distances
 from jaxbeam.model.modes import modes
 
 SAME_DISTANCE = 1e-3  # m: distances of wheels that are equal
-LEAST_REPEATS = 3  # pairs of wheels a spacing apart, from which on it is regular
+LEAST_REPEATS = 3  # pairs of wheels at a distance that make it a regular spacing
 
 
 class CriticalSpeed(NamedTuple):
-    """Speed (m/s) at which something happens to a mode, counted from 1, and its order."""
+    """Resonance or cancellation speed (m/s) of a mode, counted from 1, and its order."""
 
     speed: float
     mode: int

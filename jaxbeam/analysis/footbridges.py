@@ -27,7 +27,7 @@ from jaxbeam.runtime.printer import TableViews
 DENSITIES = {"TC2": 0.2, "TC3": 0.5, "TC4": 1.0, "TC5": 1.5}  # people/m^2 of traffic classes
 COMFORT = {"CL1": 0.5, "CL2": 1.0, "CL3": 2.5}  # m/s^2, largest vertical acceleration of a class
 FORCE = 280.0  # N, first harmonic of a person: 0.4 of 700 N
-DENSE = 1.0  # people/m^2, from which on paces are no longer free
+DENSE = 1.0  # people/m^2: density from which on paces are no longer free
 POINTS = 2001  # along the beam, of the integral of a shape
 
 
@@ -74,7 +74,7 @@ def stream_response(
     """Accelerations of the modes of a footbridge under a stream of people on the whole deck.
 
     `density` is one of `DENSITIES`, or people/m^2; `width` that of the deck (m). `reduction`, one
-    number or one for each mode, is the share of `force` (N) at its frequency, for paces that are
+    number or one for each mode, is the fraction of `force` (N) at its frequency, for paces that are
     rare; 0 leaves a mode out. Each mode is taken by itself, in resonance. Raises ValueError for an
     unknown class and for numbers that are not positive.
 

@@ -44,16 +44,16 @@ AFFINE_ROUNDING = 1e-9  # relative
 
 
 class NotAffineError(ValueError):
-    """A function of known numbers is not affine, so that its derivatives need JAX."""
+    """Error of a function that is not affine, so that its derivatives need JAX."""
 
 
 def affine_jacobian(
     function: Callable, point: Float[Array, " argument"]
 ) -> Float[Array, "value argument"]:
-    """Derivatives of a function (argument,) -> (value,) by its argument.
+    """Jacobian of a function (argument,) -> (value,) at a point, without JAX if it is affine.
 
-    Where it is traced those at the point, by JAX. Of known numbers, differences, which are exact
-    for an affine function. Raises NotAffineError for any other, and for one that computes with JAX.
+    At a traced point by JAX. At a concrete one by differences, which are exact for an affine
+    function. Raises NotAffineError for any other function, and for one that computes with JAX.
     """
     start = function(np.zeros(point.shape))
     if any_jax(point, start):
@@ -78,9 +78,9 @@ def is_affine(
     start: Float[np.ndarray, " value"],
     scale: float = 1.0,
 ) -> bool:
-    """Whether a function of known numbers is start + matrix @ argument at a random argument.
+    """Whether a function is the affine one start + matrix @ argument, tried at a random argument.
 
-    Two affine functions agree there if and only if, but for rounding, they are the same.
+    Two affine functions that agree there are the same, within rounding.
     """
     trial = scale * random_argument(matrix.shape[1])
     terms = np.abs(matrix) @ np.abs(trial) + np.abs(start)
@@ -89,7 +89,7 @@ def is_affine(
 
 @functools.cache
 def random_argument(size: int) -> Float[np.ndarray, " argument"]:
-    """Numbers of a normal distribution, always the same."""
+    """Random argument from a normal distribution, of a fixed seed."""
     return np.random.default_rng(0).standard_normal(size)
 
 
@@ -160,10 +160,10 @@ class LoopDynamics(Module):
         return eqx.tree_at(lambda loop: loop.augmented_plant.loads, self, frozen)
 
     def continuous_dynamics(self, t, system: StateSpace | None = None):
-        """A, B, rates due to the weights, and the commands as a function of the state, at t (s).
+        """A, B, rates due to the weights, and the function from state to commands, at t (s).
 
         The last states are those of the law, about their values at the start of a run. `system` is
-        the augmented plant at that time, if known.
+        the augmented plant at that time, computed if left out.
         """
         system = self.augmented_plant.at(t) if system is None else system
         command_count = len(self.plant.case.actuators)
@@ -224,10 +224,10 @@ class LoopDynamics(Module):
     def plant_transitions(
         self, timing: LoopTiming, t, substeps: int | None = None, weights: bool = True
     ) -> list:
-        """Matrices from state, commands and weights to the state, over intervals of a period.
+        """Transition matrices from state, commands and weights to the state, for parts of a period.
 
         The period begins at t (s), one time or several. Loads are frozen there, or move, in
-        `substeps` of each interval. Those of deviations are without `weights`.
+        `substeps` of each part. Matrices of deviations have no `weights`.
         """
         system = self.augmented_plant.at(t)
         states, commands = system.A.shape[-1], len(self.plant.case.actuators)
@@ -248,7 +248,7 @@ class LoopDynamics(Module):
         ]
 
     def sampling_step(self, timing: LoopTiming, state, t, transitions, command_given=None):
-        """State just before the next sample, from that just before a sample at t (s); commands.
+        """State just before the next sample, from that just before a sample at t (s), and commands.
 
         `transitions` are those of the plant over the period, of its state and inputs, or of its
         deviations, without the weights. `command_given` replaces the commands of the law. All may
@@ -256,7 +256,7 @@ class LoopDynamics(Module):
         """
         plant_state, filters, signal_history, law_state, command_queue = state
         case, signal_history, states, readings = self.plant.case, list(signal_history), [], []
-        whole_periods, share, _ = _split_delay(timing.delay / timing.period)
+        whole_periods, fraction, _ = _split_delay(timing.delay / timing.period)
         signals = self._sensor_inputs(plant_state, command_queue[whole_periods], t)
         delayed_samples = {}
         for i, sensor in enumerate(case.sensors):
@@ -280,7 +280,7 @@ class LoopDynamics(Module):
             [(controller_command if command_given is None else command_given)[None], command_queue]
         )
         # Within the period the command changes once, and delayed sensors take their samples.
-        change = share * timing.period
+        change = fraction * timing.period
         for (_, end), transition in zip(_intervals(timing), transitions, strict=True):
             command = command_queue[whole_periods + (end <= change)]
             inputs = self._inputs(command)[: transition.shape[-1] - plant_state.shape[0]]
@@ -328,7 +328,7 @@ def loop_dynamics(case: Case, layout: Layout) -> LoopDynamics:
     """Loop dynamics of a case that has a controller; may be traced and batched."""
     controller = case.controller
     continuous = controller.period is None and not controller.open_loop
-    build = _compiled_dynamics if continuous else _known_dynamics
+    build = _compiled_dynamics if continuous else _direct_dynamics
     return known(build(case, compiled_modal_model(case, layout)))
 
 
@@ -341,7 +341,7 @@ def _loop_dynamics(case, model):
     return LoopDynamics(plant, augmented_plant, output_rows, law)
 
 
-_compiled_dynamics, _known_dynamics = compiled(_loop_dynamics), compiled_if_traced(_loop_dynamics)
+_compiled_dynamics, _direct_dynamics = compiled(_loop_dynamics), compiled_if_traced(_loop_dynamics)
 
 
 def frozen_loads(loads: LoadSet, length, t) -> LoadSet:
@@ -357,10 +357,11 @@ def frozen_loads(loads: LoadSet, length, t) -> LoadSet:
 
 def _intervals(timing: LoopTiming) -> list[tuple[float, float]]:
     """Start and end (s) of the intervals of a period with a constant command, between samples."""
-    share = _split_delay(timing.delay / timing.period)[1]
+    fraction = _split_delay(timing.delay / timing.period)[1]
     remainders = (_split_delay(lag / timing.period)[1] for lag in timing.sensor_delays)
     samples = ((1 - remainder) * timing.period for remainder in remainders if remainder)
-    return list(itertools.pairwise(sorted({0.0, share * timing.period, *samples, timing.period})))
+    changes = {0.0, fraction * timing.period, *samples, timing.period}
+    return list(itertools.pairwise(sorted(changes)))
 
 
 def _split_delay(periods: float) -> tuple[int, float, int]:

@@ -54,7 +54,10 @@ def count_oscillations(
     saturated: Bool[np.ndarray, " time"],
     deflection: Float[np.ndarray, " time"],
 ) -> CommandOscillation:
-    """Oscillation of a command, `saturated` where at a limit, beside an uncontrolled deflection."""
+    """Oscillation of a command, compared with an uncontrolled deflection.
+
+    `saturated` is where the command is at a limit.
+    """
     command_turns, deflection_turns = turning_points(command), turning_points(deflection)
     gaps = np.diff(times[command_turns])
     frequency = float(1 / (2 * np.median(gaps))) if gaps.size else np.nan

@@ -48,10 +48,10 @@ from jaxbeam.runtime.module import Module
 
 
 class LinearLaw(AbstractSampledLaw):
-    """Deviations of an affine law: (commands, next state) = matrix @ (state, y, x, u).
+    """Linear law of the deviations of an affine one: (commands, next state) = matrix @ inputs.
 
-    The state of the law, the readings y, the state x of the plant, and the last commands u, one
-    after the other; columns of them for one matrix for each time (see `apply`).
+    Inputs are the state of the law, the readings y, the state x of the plant and the last commands
+    u, one after the other; with a matrix for each time, columns of them (see `apply`).
     """
 
     matrix: Float[Array, "*time after before"]
@@ -67,7 +67,7 @@ class LinearLaw(AbstractSampledLaw):
 
 
 def linear_loop(loop: LoopDynamics, times: Float[np.ndarray, " time"]) -> LoopDynamics:
-    """Deviations of a sampled loop of known numbers from any of its states, at several times (s).
+    """Linear loop of the deviations of a concrete, affine sampled loop, at several times (s).
 
     Raises NotAffineError for a law that is not affine, or that computes with JAX.
     """
@@ -111,7 +111,7 @@ def sampled_matrices(
     Float[np.ndarray, "time state actuator"],
     Float[np.ndarray, "time actuator state"],
 ]:
-    """Matrices A, B and K of a `linear_loop` over periods from its times (s), open at the commands.
+    """Matrices A, B and K of a `linear_loop` opened at the commands, over a period from each time.
 
     `transitions` are those of its plant.
     """
@@ -251,7 +251,7 @@ def loop_timing(case: Case) -> LoopTiming | None:
 
 
 class _Derivatives(NamedTuple):
-    """Change of a state (per s, or from sample to sample), and its derivatives; see the module."""
+    """Change of a state (per s, or from sample to sample), and its Jacobians; see the module."""
 
     change: Float[Array, " state"]
     A: Float[Array, "state state"]
@@ -260,7 +260,7 @@ class _Derivatives(NamedTuple):
 
 
 def linearise(loop: LoopDynamics, timing: LoopTiming | None, t) -> LinearisedLoop:
-    """Loop with loads frozen at t (s), linearised about the equilibrium under their weights."""
+    """Linearised loop with loads frozen at t (s), about the equilibrium under their weights."""
     if any_traced(loop, t):
         return _linearise_compiled(_derivatives, loop, timing, t)
     try:
@@ -272,9 +272,9 @@ def linearise(loop: LoopDynamics, timing: LoopTiming | None, t) -> LinearisedLoo
 def affine_linearisations(
     loop: LoopDynamics, timing: LoopTiming | None, times
 ) -> list[LinearisedLoop]:
-    """Loops of known numbers with loads frozen at times (s), each the same about all its states.
+    """Linear loops with loads frozen at times (s), for a concrete loop that is affine.
 
-    Raises NotAffineError if they are not.
+    Each holds about all states. Raises NotAffineError if the loop is not affine.
     """
     times, parts = np.asarray(times, float), []
     if timing is None:
@@ -293,7 +293,7 @@ def affine_linearisations(
 
 
 def linearise_each(loop: LoopDynamics, timing: LoopTiming | None, times) -> list[LinearisedLoop]:
-    """Loops with loads frozen at each of some known times (s); see `linearise`."""
+    """Linearised loops with loads frozen at each of some concrete times (s); see `linearise`."""
     try:
         return affine_linearisations(loop, timing, times)
     except NotAffineError:
@@ -326,9 +326,9 @@ _derivatives_compiled = compiled(_derivatives, **LOW_OPTIMISATION)
 
 
 def _linearise(derivatives, loop: LoopDynamics, timing, t) -> LinearisedLoop:
-    """Loop linearised about its equilibrium, found by Newton's method; by `derivatives` of states.
+    """Loop linearised about its equilibrium, which Newton's method finds by `derivatives`.
 
-    About rest, the start, if it does not converge.
+    Linearised about rest if it does not converge.
     """
     plant = loop.augmented_plant
     size = plant.modal_model.state_count + plant.vehicle_states

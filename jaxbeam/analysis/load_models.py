@@ -21,7 +21,7 @@ from jaxbeam.model.along_beam import positions_along, sections
 from jaxbeam.model.modes import modes
 from jaxbeam.model.statics import REACTION, held_positions, influence_line
 
-POSITIONS = 41  # along the beam by default, beside the special ones
+POSITIONS = 41  # along the beam by default, in addition to the special ones
 LINE_POINTS = 2001  # along the beam, between which influence lines are linear
 SPACINGS = 25  # values of a varied spacing, searched again between the neighbours of the best
 COARSE = 20  # points of a line between those at which an axle is tried first
@@ -36,19 +36,19 @@ def load_model(name: str) -> LoadModel:
         return load_models()[name]
     train = trains().get(name)
     if train is not None and train.forces is None:
-        raise ValueError(f"{name} is known by masses of its axles, not forces; take another train")
+        raise ValueError(f"{name} has masses of its axles, not forces; take another train")
     if train is None:
-        known = [
+        names = [
             *load_models(),
             *(one for one, train in trains().items() if train.forces is not None),
         ]
-        raise ValueError(f"there is no load model {name!r}; {suggestion(name, known)}")
+        raise ValueError(f"there is no load model {name!r}; {suggestion(name, names)}")
     spacings = np.diff(train.offsets)
     return LoadModel((ModelVehicle(name, spacings, train.forces, 0.0, None, None, ()),), 0.0)
 
 
 class WorstPlace(NamedTuple):
-    """Place of a vehicle: name, offsets (m) of its axles behind the first, and that one's x (m).
+    """Worst place of a vehicle: name, offsets (m) of axles behind the first, x (m) of the first.
 
     Offsets are negative for a vehicle that goes to the left. Without a `vehicle` there is none.
     """
@@ -190,7 +190,7 @@ class TabulatedLine(NamedTuple):
         return np.interp(x, self.positions, self.values, left=0.0, right=0.0)
 
     def spread(self, kernel: Kernel) -> "TabulatedLine":
-        """Line of axles that a track spreads; beyond the ends of the beam by their shares on it.
+        """Influence line of axles that a track spreads; off the beam, of the part of them on it.
 
         Between positions, of which an even spread has a curve, it is linear.
         """
@@ -214,9 +214,9 @@ class TabulatedLine(NamedTuple):
         # Of an interval in which the line crosses zero a triangle counts.
         highest, lowest = np.maximum(a, b), np.minimum(a, b)
         crosses = (highest > 0) & (lowest < 0)
-        share = np.where(crosses, highest / np.where(crosses, highest - lowest, 1.0), 1.0)
+        fraction = np.where(crosses, highest / np.where(crosses, highest - lowest, 1.0), 1.0)
         heights = np.where(crosses, highest, np.maximum(a, 0.0) + np.maximum(b, 0.0))
-        return float(np.sum(np.diff(self.positions) * share * heights / 2))
+        return float(np.sum(np.diff(self.positions) * fraction * heights / 2))
 
 
 @refuses_traced("a table of influences")
@@ -227,8 +227,8 @@ def influence_at(
     length = float(concrete(case.beam.length))
     places = np.linspace(0.0, length, points)
     # Shear forces jump at the section: a point on both sides of it.
-    beside = x + 1e-9 * length * np.array([-1.0, 0.0, 1.0])
-    kinks = np.concatenate([np.clip(beside, 0.0, length), held_positions(case)])
+    around = x + 1e-9 * length * np.array([-1.0, 0.0, 1.0])
+    kinks = np.concatenate([np.clip(around, 0.0, length), held_positions(case)])
     places = np.union1d(places, kinks)
     line = influence_line(case, x, places, quantity=quantity, side=side)
     return TabulatedLine(places, np.asarray(line), kinks)

@@ -27,7 +27,7 @@ class FaultedPeak(NamedTuple):
     """Worst run of a law under a fault.
 
     `peak` is the largest deflection at the sensors (m), NaN of a run that diverges, `uncontrolled`
-    that of the same beam without control, `share` the share of the attainable reduction (see
+    that of the same beam without control, `share` the fraction of the attainable reduction (see
     `Bound.share`), negative where the law is worse than none. `at` names the run if a fault has
     several: "sensor 1", "seed 3".
     """
@@ -44,9 +44,10 @@ class FaultedPeak(NamedTuple):
 
 
 class LoopFault(NamedTuple):
-    """A fault: cases that have it, by name, from a case with a law and its uncontrolled run.
+    """A fault of a loop: `variants` returns the cases with it, by name.
 
-    A `sampled` fault is one of samples, which laws in continuous time do not have.
+    From a case with a law and its uncontrolled run. A `sampled` fault is one of samples, which laws
+    in continuous time do not have.
     """
 
     name: str
@@ -55,7 +56,7 @@ class LoopFault(NamedTuple):
 
 
 def _with_at_least(part: Any, **least: float) -> Any:
-    """A sensor or controller with some numbers, where its own are not larger."""
+    """A sensor or controller whose fields `least` are at least these numbers."""
     own = {name: float(concrete(getattr(part, name) or 0.0)) for name in least}
     return dataclasses.replace(part, **{name: max(own[name], least[name]) for name in least})
 
@@ -76,14 +77,14 @@ def _lost(fraction: float) -> Callable[[Case, Record], dict[str, Case]]:
 
 
 def _late(case: Case, uncontrolled: Record) -> dict[str, Case]:
-    """Readings and commands up to a fifth of the period later."""
+    """Case with readings and commands up to a fifth of the period later, for each seed."""
     late = float(concrete(case.controller.period)) / 5
     law = _with_at_least(case.controller, jitter=late)
     return _of_seeds(dataclasses.replace(_of_sensors(case, jitter=late), controller=law))
 
 
 def _stuck(case: Case, uncontrolled: Record) -> dict[str, Case]:
-    """Each sensor in turn stays at what it reads before the first load."""
+    """Cases in each of which one sensor is stuck at its reading before the first load."""
     found = {}
     readings = np.asarray(uncontrolled.measured)
     for i, sensor in enumerate(case.sensors):
@@ -96,7 +97,10 @@ def _stuck(case: Case, uncontrolled: Record) -> dict[str, Case]:
 
 
 def _coarse(case: Case, uncontrolled: Record) -> dict[str, Case]:
-    """Readings over their range, or twice the uncontrolled ones, and commands over their limits."""
+    """Case with readings and commands quantised by converters over their ranges.
+
+    The range of a sensor without one is twice its uncontrolled readings.
+    """
     sensors = []
     readings = np.abs(np.asarray(uncontrolled.measured)).max(axis=0)
     for sensor, largest in zip(case.sensors, readings, strict=True):
@@ -138,7 +142,7 @@ def compare_under_faults(
 ) -> tuple[dict[str, dict[str, FaultedPeak | None]], Bound]:
     """Worst peaks of controllers under each fault, by name and fault, and the case's bound.
 
-    Laws do not know of a fault: they are designed for the case as it is. A run's share is that of
+    Laws are designed for the case without the fault. The attainable reduction of a run is that by
     the bound of its own beam, with commands held over `period` (s), by default the shortest period
     of the controllers or 0.01 s. Random faults are run with five seeds from that of the case. None
     stands for faults of samples of a law in continuous time.
@@ -194,7 +198,7 @@ def compare_under_faults(
 
 
 def _with_fixed_design(case: Case) -> Case:
-    """The case with a law that is designed for it, whatever happens to its beam and sensors."""
+    """The case with its law designed for it now, so that later faults do not change the design."""
     if case.controller.nominal_plant is not None:
         return case
     law = dataclasses.replace(case.controller, nominal_plant=state_space(case))

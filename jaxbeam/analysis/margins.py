@@ -22,7 +22,7 @@ from jaxbeam.estimation.kalman import Kalman
 POINTS_PER_POLE = 400  # frequencies around each pole
 MAX_CONDITION = 1e12  # condition of the eigenvectors above which the matrix counts as defective
 BISECTIONS = 50  # of the intervals between frequencies, down to rounding
-REFINEMENTS, REFINED_POINTS = 8, 21  # of the frequencies beside the smallest distance
+REFINEMENTS, REFINED_POINTS = 8, 21  # of the frequencies around the smallest distance
 LOWEST_FREQUENCY = 1e-3  # lowest frequency of the grid, relative to that of the lowest pole
 
 
@@ -136,7 +136,7 @@ def _frequency_grid(poles, period) -> np.ndarray:
         np.geomspace(min(LOWEST_FREQUENCY * size.min(), highest / 2), highest, 4 * POINTS_PER_POLE)
     ]
     for pole in poles:
-        # Densest within its half-width.
+        # Densest within the half-width of the peak.
         grid.append(pole.imag + abs(pole.real) * np.sinh(np.linspace(-6, 6, POINTS_PER_POLE)))
     omega = np.unique(np.concatenate(grid))
     return omega[(omega > 0) & (omega <= highest)]

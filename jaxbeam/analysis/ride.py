@@ -34,7 +34,7 @@ MEMORY = 15.0  # s, after which the slowest of the filters has forgotten all but
 
 # Sperling's index: band (Hz) and exponent of `sperling.m` in janiex/SimulinkMatlab on GitHub.
 SPERLING_BAND, SPERLING_EXPONENT = (0.5, 30.0), 1 / 6.67
-UNKNOWN = "must be known numbers"
+UNKNOWN = "must be concrete numbers"
 CENTIMETRES = 100.0  # of a metre: the index is defined for cm/s^2
 
 
@@ -176,11 +176,11 @@ def sperling_index(
 
 
 def wheel_unloading(record: Record) -> Float[Array, " load"]:
-    """Largest share dQ/Q by which the contact force of each wheel falls below its static load.
+    """Largest fraction dQ/Q by which the contact force of each wheel falls below its static load.
 
     On the beam in continuous time, for vehicles on the ground before and behind it at the samples.
-    1 means that a wheel just lifts; above 1 it would have to pull. NaN for wheels that are never
-    seen and for those without static load.
+    1 means that a wheel just lifts; above 1 it would have to pull. NaN for wheels that never press
+    on the beam, and for those without static load.
 
     >>> import jaxbeam as jb
     >>> beam = jb.Beam(length=0.6, flexural_rigidity=11.68, mass_per_length=0.535)
@@ -198,8 +198,9 @@ def wheel_unloading(record: Record) -> Float[Array, " load"]:
     seen = ~xp.isnan(record.load_position) | loads.on_ground
     sampled = xp.min(xp.where(seen, record.contact_force, xp.inf), axis=0, initial=xp.inf)
     least = xp.where(crosses, xp.minimum(sampled, record.lowest_contact_force), sampled)
-    known = xp.isfinite(least) & (static > 0)
-    return xp.where(known, 1 - xp.where(known, least, 0.0) / xp.where(known, static, 1.0), xp.nan)
+    defined = xp.isfinite(least) & (static > 0)
+    least, static = xp.where(defined, least, 0.0), xp.where(defined, static, 1.0)
+    return xp.where(defined, 1 - least / static, xp.nan)
 
 
 class RideMeasures(NamedTuple):
@@ -256,7 +257,7 @@ def ride_measures(record: Record) -> RideMeasures:
 
 
 def _time_step(times, highest_frequency: float) -> float:
-    """Spacing (s) of known times that resolve frequencies up to the highest one (Hz)."""
+    """Spacing (s) of concrete times that resolve frequencies up to the highest one (Hz)."""
     if not is_concrete(times):
         raise ValueError(f"times of ride measures {UNKNOWN}, not traced ones")
     not_differentiated(times, f"times of ride measures {UNKNOWN}: there are no derivatives by them")

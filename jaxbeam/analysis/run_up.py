@@ -1,7 +1,7 @@
-"""Run-up on a rough track: how far before the bridge bodies of vehicles begin, to forget how.
+"""Run-up on a rough track: distance before the bridge in which initial motion of vehicles decays.
 
 The free motion of a vehicle on a rigid surface decays as exp(-sigma t), with sigma the least decay
-rate of its modes. At speed v a share e of it is left after the distance v ln(1 / e) / sigma.
+rate of its modes. At speed v a fraction e of it is left after the distance v ln(1 / e) / sigma.
 """
 
 import dataclasses
@@ -15,7 +15,7 @@ from jaxbeam.case.fields import concrete
 from jaxbeam.case.loads.base import AbstractVehicleLoad
 from jaxbeam.model.load_set import load_set
 
-SHARE = 0.01  # of the free motion of a vehicle that is left when it enters the bridge
+SHARE = 0.01  # fraction of the free motion of a vehicle that is left when it enters the bridge
 SWITCH = 10.0  # m, over which a profile grows from a level surface
 
 
@@ -35,11 +35,11 @@ def decay_rates(case: Case) -> list[float]:
 
 
 def run_up(case: Case, share: float = SHARE, speeds: Sequence[float] = ()) -> list[float]:
-    """Distance (m) before the bridge at which the vehicles of each load have to be on the track.
+    """Run-up (m) of each load: distance before the bridge in which its free motion decays.
 
-    So far that a `share` of their free motion is left when they enter; at the fastest of some
-    `speeds` (m/s), by default at its own. Zero for loads without springs, and by a table of times.
-    Raises ValueError for a share not between 0 and 1, and for a vehicle without damping.
+    A fraction `share` of the motion is left at entry; at the fastest of some `speeds` (m/s), by
+    default at its own. Zero for loads without springs, and by a table of times. Raises ValueError
+    for a share not between 0 and 1, and for a vehicle without damping.
 
     >>> import jaxbeam as jb
     >>> from jaxbeam.analysis.run_up import run_up
@@ -66,7 +66,7 @@ def run_up(case: Case, share: float = SHARE, speeds: Sequence[float] = ()) -> li
 
 
 def with_run_up(case: Case, share: float = SHARE, speeds: Sequence[float] = ()) -> Case:
-    """The case with its vehicles so far before the bridge that they have forgotten their start.
+    """The case with its vehicles far enough before the bridge for their free motion to decay.
 
     Those with springs that travel start on a level surface, from which the profile grows over 10 m,
     the largest `run_up` of all loads before the bridge; the run lasts as much longer, at the

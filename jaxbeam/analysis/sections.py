@@ -136,9 +136,9 @@ def envelope(
 
     if x is None and not any_jax(case):
         return refined(case, at, curves)[1]
-    if x is None:  # those of the known case, where the extremes are differentiated
-        known = concrete_case(case), None, tolerance
-        found = envelope(*known, quantity=quantity, **jax.tree.map(concrete, parameters))
+    if x is None:  # positions of the concrete case, where the extremes are differentiated
+        arguments = concrete_case(case), None, tolerance
+        found = envelope(*arguments, quantity=quantity, **jax.tree.map(concrete, parameters))
         own = np.asarray(found.positions)
         x, moving = moving_positions(case, own)
         if moving.any():  # apart: steps end where a load passes them, so that derivatives take long
@@ -234,8 +234,8 @@ def characteristic_points(case: Case) -> list[CharacteristicPoint]:
     length, held = float(concrete(case.beam.length)), set(held_positions(case).tolist())
     points = [CharacteristicPoint(f"support {i}", x) for i, x in enumerate(sorted(held), 1)]
     for i, (a, b) in enumerate(spans(case), 1):
-        for name, share in (("quarter", 0.25), ("midspan", 0.5), ("three quarters", 0.75)):
-            points.append(CharacteristicPoint(f"{name} {i}", a + share * (b - a)))
+        for name, fraction in (("quarter", 0.25), ("midspan", 0.5), ("three quarters", 0.75)):
+            points.append(CharacteristicPoint(f"{name} {i}", a + fraction * (b - a)))
     hinges = sorted(float(concrete(hinge.position)) for hinge in case.beam.hinges)
     points += [CharacteristicPoint(f"hinge {i}", x) for i, x in enumerate(hinges, 1)]
     for name, x in (("left end", 0.0), ("right end", length)):
@@ -309,12 +309,12 @@ def influence_table(
         # A shear force jumps by the load as it passes the section: a position on each side.
         length = float(concrete(case.beam.length))
         own = np.array([place for _, _, place in lines])
-        beside = [
+        right_of_sections = [
             min(p + LEFT_DISTANCE * length, length)
             for q, _, p in lines
             if q in QUANTITIES and QUANTITIES[q].jumps
         ]
-        start = positions_along(case, places=np.concatenate([own, beside]))
+        start = positions_along(case, places=np.concatenate([own, right_of_sections]))
         found_at, found = refined(case, at, curves, start)
         positions = np.asarray(found_at)
     else:
@@ -357,7 +357,7 @@ def _sections(case: Case, quantities, x) -> list[tuple[str, str, float]]:
 
 
 MAX_WHEELS = 400  # of a record with amplification, as its static peaks take about 2 ms a wheel
-NEGLIGIBLE = 1e-6  # share of the largest static value of a quantity that counts as none
+NEGLIGIBLE = 1e-6  # fraction of the largest static value of a quantity that counts as none
 
 
 @np.errstate(all="ignore")  # of extreme numbers
@@ -365,8 +365,8 @@ def record_amplification(record: Record) -> list[float | None]:
     """Largest absolute over largest static value of the quantity of each sensor of a record.
 
     None at sensors of velocities and accelerations, where the static value vanishes, with a
-    controller, for more wheels than MAX_WHEELS, and for beams whose static deflections are
-    not known (see `static_peak`).
+    controller, for more wheels than MAX_WHEELS, and for beams without static deflections (see
+    `static_peak`).
     """
     case = record.case
     refuse_traced("an amplification", OUTSIDE, case)
@@ -385,7 +385,7 @@ def record_amplification(record: Record) -> list[float | None]:
 
 
 def _static(case: Case, sensor: Sensor) -> float | None:
-    """Largest static value at a sensor; None where it is not known."""
+    """Largest static value at a sensor; None where `static_peak` has none."""
     if sensor.quantity not in AMPLIFIED:
         return None
     channel = {

@@ -194,7 +194,7 @@ def _transition_matrices(
 
 
 def _affine_transitions(loop: LoopDynamics, timing: LoopTiming, times, substeps: int):
-    """Transition matrices of a sampled loop of known numbers; raises NotAffineError if not affine.
+    """Transition matrices of a concrete, affine sampled loop; raises NotAffineError for another.
 
     The law may change from sample to sample.
     """

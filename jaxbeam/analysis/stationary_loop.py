@@ -35,7 +35,7 @@ from jaxbeam.runtime.arrays import Array, xp
 
 
 class SettledFilter(AbstractSampledFilter):
-    """A filter of crossing loads with a constant `gain` and the `model` of one sample, at t (s)."""
+    """Filter of crossing loads, settled at t (s): a constant `gain`, the `model` of one sample."""
 
     filter: CrossingFilter
     model: SampleModel
@@ -57,7 +57,7 @@ class SettledFilter(AbstractSampledFilter):
 
 
 def settled_law(law: Any, t: Any, stationary: Any) -> Any:
-    """The law whose filter of crossing loads has settled with its loads stationary as at t (s).
+    """The law with its filter of crossing loads settled, under loads that stay as at t (s).
 
     `stationary` maps a set of loads to one that rests at its positions of t. A law without such a
     filter is returned as it is. Raises ValueError if the filter does not settle.
@@ -125,7 +125,7 @@ def loop_with_mass_at(case: Case, position: float, mass: float) -> LinearisedLoo
 
 
 def standing_mass(case: Case, position: float, mass: float) -> LoadSet:
-    """A stationary mass (kg) at a position (m) in place of the loads of a case.
+    """Load set of a stationary mass (kg) at a position (m) in place of the loads of a case.
 
     Raises ValueError for a position off the beam, and a mass that is negative or not finite.
     """

@@ -17,7 +17,7 @@ from jaxbeam.runtime.arrays import Array
 
 
 class AbstractLinearFilter(AbstractContinuousFilter):
-    """x' = A(t) x + B u + L(t) (y - C x - D u - offset) from x = `initial`.
+    """Linear filter x' = A(t) x + B u + L(t) (y - C x - D u - offset), from x = `initial`.
 
     The states that are integrated are x - `initial`. The first `plant_states` states x are those of
     the plant; states of analogue filters may follow.

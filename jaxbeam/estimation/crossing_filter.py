@@ -1,4 +1,4 @@
-"""Filters of plants that vary while loads cross, of known loads and of loads that they follow."""
+"""Kalman filters of plants that vary while loads cross, of given and of estimated loads."""
 
 import dataclasses
 from typing import ClassVar, NamedTuple
@@ -50,7 +50,7 @@ class CrossingFilter(AbstractSampledFilter):
     """Time-varying Kalman filter; its covariance is propagated during the run.
 
     A missing reading corrects nothing; covariance and gains stay those of complete readings, so
-    that they are known before a run.
+    that they can be computed before a run.
 
     The first `plant_states` states x are those of the plant; those of analogue filters follow, of
     the vehicles, the weights of the loads, and those of the sensors (see `sensor_chain`). `scale`
@@ -146,9 +146,9 @@ def corrected(
     C: Float[Array, "sensor state"],
     noise_covariance: Float[Array, "sensor sensor"],
 ) -> tuple[Float[Array, "state sensor"], Square]:
-    """Gain for a prediction of this covariance, and the covariance after its correction.
+    """Gain for a prediction of a covariance, and the covariance after correction by readings.
 
-    By readings C x with noise of a covariance.
+    Readings are C x with noise of `noise_covariance`.
     """
     gain = filter_gain(covariance, C, noise_covariance)
     # Joseph's form: symmetric and positive semidefinite in spite of rounding.
@@ -176,9 +176,9 @@ class LoadFollowingFilter(AbstractSampledFilter):
     positions (m), speeds (m/s) and masses (kg) of the loads, and the states of the sensors. Given
     the numbers of the loads the plant is linear, and its transition that of `SampleTiming`: loads
     travel at their speeds through a period. Derivatives by these numbers are central differences
-    over `steps`. `output_rows` are those of the plant; a share `inertia_share` of each mass follows
-    the beam: 1, or 0 for a force. `scale` and `noise_intensity` are those of the states before the
-    sensors.
+    over `steps`. `output_rows` are those of the plant; a fraction `inertia_fraction` of each mass
+    follows the beam: 1, or 0 for a force. `scale` and `noise_intensity` are those of the states
+    before the sensors.
     """
 
     without_reading: ClassVar[str] = (
@@ -194,7 +194,7 @@ class LoadFollowingFilter(AbstractSampledFilter):
     initial: Float[Array, " state"]
     initial_covariance: Square
     steps: Float[Array, " number"]
-    inertia_share: Float[Array, " load"]
+    inertia_fraction: Float[Array, " load"]
     plant_states: int = eqx.field(static=True)
 
     def initial_state(self):
@@ -267,7 +267,7 @@ class LoadFollowingFilter(AbstractSampledFilter):
         plant = self.filtered.plant
         speed, mass = (xp.broadcast_to(part, position.shape) for part in (speed, mass))
         on_beam = (position >= 0) & (position <= plant.case.beam.length)
-        inertia = self.inertia_share * xp.maximum(mass, 0.0)
+        inertia = self.inertia_fraction * xp.maximum(mass, 0.0)
         contact = mass_contact_rows(plant.modal_model, position, speed, on_beam, inertia)
         system, commands = plant.with_contact(contact, self.output_rows), plant.commands
         times, loads, gravity = position.shape[:-1], position.shape[-1], plant.case.run.gravity

@@ -30,8 +30,8 @@ class ExtendedKalman(AbstractKalmanEstimator):
     sample (e.g. Simon, Optimal State Estimation, 2006, section 13.2). Masses, speeds and positions
     start from those of the design (`controller.design` may give it others than the case has), with
     standard deviations `mass_deviation`, `speed_deviation` and `position_deviation`; the speed
-    changes by a white acceleration of intensity `acceleration_noise`. What is known has deviation
-    zero. Laws whose tables are read by the positions of the loads, as `lqr` with schedule
+    changes by a white acceleration of intensity `acceleration_noise`. Exact numbers have deviation
+    zero. Laws whose gains are scheduled by the positions of the loads, as `lqr` with schedule
     "positions", take those of the estimate; laws that feed forward weights take the estimated ones.
 
     With an uncertain entry and nearly exact readings the filter is too sure of its linearisation,

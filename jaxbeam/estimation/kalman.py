@@ -29,7 +29,7 @@ from jaxbeam.runtime.compiling import compiled
 
 
 class AbstractKalmanEstimator(AbstractEstimator):
-    """Settings that Kalman filters share: noise of plant and readings, and delays of sensors."""
+    """Settings common to Kalman filters: noise of plant and readings, and delays of sensors."""
 
     process_noise: Float[Number, " *mode"] = number(
         "N^2 s/kg", "intensity of the white force on each mode", POSITIVE
@@ -116,7 +116,7 @@ class Kalman(AbstractKalmanEstimator):
     white noise of standard deviation `measurement_noise`. The `loads` are "ignored", and the
     filter is time-invariant; or "known": plant and gain vary as they cross; or their weights are
     "estimated" too, starting from those of the design with the standard deviation
-    `weight_deviation`. Times, speeds, inertia, vehicles and profile of the crossing are known; the
+    `weight_deviation`. Times, speeds, inertia, vehicles and profile of the crossing are given; the
     states of vehicles are estimated, and each of their wheels has a weight of its own.
 
     Filters of the sensors and their delays of up to `max_delay_periods` periods are part of the
@@ -176,7 +176,7 @@ class Kalman(AbstractKalmanEstimator):
         filtered_model = filtered.plant
         intensity = modal_noise_intensity(filtered_model, self.process_noise)
         states, start = intensity.shape[0], plant.augmented_start
-        loads = start.shape[0]  # states of vehicles, weights, and one for what else is known
+        loads = start.shape[0]  # states of vehicles, weights, and one for profile and histories
         variance = reading_variance(plant, self.measurement_noise)
         scale = balance(filtered_model.unloaded.A)
         plant_states = plant.modal_model.state_count
@@ -232,7 +232,7 @@ class Kalman(AbstractKalmanEstimator):
     def load_variance(self, plant: Plant) -> Float[Array, " added"]:
         """Variance of the states that `Plant.augmented` adds, at the start: that of the weights.
 
-        In N^2; zero where they are known, as of absorbers, and for states of vehicles. The
+        In N^2; zero where weights are certain, as of absorbers, and for states of vehicles. The
         deviation of a load is that of each of its wheels.
         """
         variance, count = xp.zeros_like(plant.augmented_start), plant.weights.shape[0]
@@ -290,7 +290,7 @@ class Kalman(AbstractKalmanEstimator):
 def _dual_gains(filtered, end, points: int, Q, noise, initial_covariance) -> GainTable:
     """Gains of a filtered plant over the time to the end (s), those of the dual regulator.
 
-    By a loop that takes longer in NumPy than its program takes to compile.
+    Always compiled: in NumPy its loop takes longer than compilation.
     """
 
     def dual_system(time_to_end):

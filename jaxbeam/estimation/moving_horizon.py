@@ -44,7 +44,7 @@ class WindowState(NamedTuple):
 
 
 class BoundFactor(NamedTuple):
-    """Bounded numbers c = mean + `size` `root` z from independent standard normal numbers z.
+    """Factor of the covariance of the bounded numbers: c = mean + `size` `root` z, z white.
 
     The states and earlier deflections are mean + `columns` z where they depend on c. Numbers that
     are `certain` have no variance.
@@ -157,7 +157,7 @@ class WindowFilter(AbstractSampledFilter):
         return xp.concatenate([deflections, weights]), lowest, highest
 
     def factor(self, covariance: Joint) -> BoundFactor:
-        """Bounded numbers from independent ones, by their covariance."""
+        """Factor by which bounded numbers follow from independent ones, of their covariance."""
         rows, _, _ = self.bounds()
         count, common = rows.shape[0], rows @ covariance
         variance = xp.diagonal(common @ rows.T)
@@ -181,7 +181,7 @@ class WindowFilter(AbstractSampledFilter):
         sides = xp.concatenate(
             [(highest - numbers) / factor.size, (numbers - lowest) / factor.size]
         )
-        # A number that is known, as at the start, is no matter of bounds.
+        # A number without variance, as at the start, cannot be moved into its bounds.
         free = xp.concatenate([factor.certain, factor.certain]) | ~xp.isfinite(sides)
         M, sides = xp.where(free[:, None], 0.0, M), xp.where(free, 1.0, sides)
         found = solve_qp(np.eye(count), xp.zeros(count), M, sides)

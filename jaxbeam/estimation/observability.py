@@ -13,11 +13,11 @@ UNOBSERVABLE = 1e-9  # relative to the most observable mode; below, a mode is un
 
 
 class ConditioningWarning(UserWarning):
-    """Mode shapes at the sensors are ill-conditioned."""
+    """Warning of ill-conditioned mode shapes at the sensors."""
 
 
 class DetectabilityWarning(UserWarning):
-    """No sensor observes a mode, which decays by itself."""
+    """Warning of a mode that no sensor observes, and which decays by itself."""
 
 
 def mode_count(system: StateSpace) -> int:

@@ -19,7 +19,9 @@ from jaxbeam.runtime.arrays import Array, Number, set_at, solve, xp
 
 
 class ConstantGainFilter(AbstractSampledFilter):
-    """x = prediction + gain (y - C prediction - D u - offset), with the `transition` of a period.
+    """Filter x = prediction + gain (y - C prediction - D u - offset) of constant gain.
+
+    The prediction is by the `transition` of a period.
 
     A missing reading corrects nothing.
 
@@ -87,13 +89,13 @@ def filter_gain(covariance: Square, C: Rows, R: Outputs) -> Float[Array, "state 
 
 
 def placed_gain(A: Square, C: Rows, desired: Square) -> Float[Array, "state output"]:
-    """L with which A - L C has the eigenvalues of the matrix `desired`; differentiable.
+    """Gain L by which A - L C has the eigenvalues of the matrix `desired`; differentiable.
 
     From A'X - X desired = C'C and L' = C X^-1 (Bhattacharyya and de Souza, Systems & Control
     Letters 1, 1982). A and `desired` must have no common eigenvalue, and both be observable through
     C; otherwise the result is NaN or meaningless.
     """
-    scale = differentiable_balance(A)  # the share of each of several outputs depends on it
+    scale = differentiable_balance(A)  # the weight of each of several outputs depends on it
     A, desired = A * scale / scale[:, None], desired * scale / scale[:, None]
     rows = C * scale
     row_norms = xp.sqrt(xp.sum(rows**2, axis=1))
@@ -195,7 +197,7 @@ class Observer(AbstractEstimator):
 
 
 def _modal_placed_gain(A, C, desired) -> Float[Array, "state sensor"]:
-    """Gain with which the error of the first states, those of the beam, has a desired matrix."""
+    """Gain by which the error of the first states, those of the beam, has the matrix `desired`."""
     modal = desired.shape[0]
     gain = placed_gain(A[:modal, :modal], C[:, :modal], desired)
     return set_at(xp.zeros((A.shape[0], C.shape[0])), np.s_[:modal], gain)

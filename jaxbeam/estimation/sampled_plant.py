@@ -130,10 +130,10 @@ def sample_timing(controller: AbstractController) -> SampleTiming:
 
 
 def in_blocks(function: Callable[[int, int], Any], count: int) -> Any:
-    """Arrays that a function of a first sample and a number of samples returns, for `count` ones.
+    """Arrays of `count` samples, computed block by block to save memory.
 
-    Computed block by block: intermediate results of all samples at once would need more room. The
-    first axis of the arrays is that of the samples.
+    `function` returns those of a block, given its first sample and its number of samples; the first
+    axis of the arrays is that of the samples.
     """
     starts = range(0, count, BLOCK)
     parts = [function(first, min(BLOCK, count - first)) for first in starts]

@@ -21,7 +21,7 @@ from jaxbeam.runtime.arrays import Array, set_at, xp
 from jaxbeam.runtime.module import Module
 
 # Noise that a digital filter is assumed to add to its output, relative to that of its samples.
-# Without it the filter would be inverted exactly, and attenuated components count as known.
+# Without it the filter would be inverted exactly, as if attenuated components were measured.
 FILTER_NOISE_RATIO = 1e-3
 
 # The plant at a time (s); its outputs are the inputs of the sensors.
@@ -136,7 +136,7 @@ class SensorChain(Module):
         )
 
     def _sampling_update(self, sensor, row, feedthrough, is_sampled, before_command) -> Transition:
-        """Transition at a sample of a sensor, if `is_sampled`: the newest of its samples h."""
+        """Transition at a sample of a sensor, which renews its newest sample h if `is_sampled`."""
         index = self._state_layout()[0][sensor]
         samples, own = row.shape[:-1], np.s_[..., index, :]
         identity = xp.broadcast_to(xp.eye(self.state_count), (*samples, *(self.state_count,) * 2))

@@ -1,6 +1,6 @@
-"""States of vehicles, simulated beside a filter that does not estimate them.
+"""States of vehicles, simulated along with a filter that does not estimate them.
 
-The vehicles, their weights, trajectories and the profile are known; they are driven by the
+The vehicles, their weights, trajectories and the profile are given; they are driven by the
 estimated motion of the beam, so that no sensor in a vehicle is needed. (Filters that estimate
 weights estimate vehicles, too.)
 """

@@ -152,7 +152,7 @@ def test_trains_of_the_library_are_load_models():
         load_model_envelope(SPAN, "LM1", [10.0], allowance=np.inf)
     with pytest.raises(ValueError, match="a crossing must be above 0 m/s, not 0"):
         crossing_envelope(SPAN, "LM1", 0.0, [10.0])
-    with pytest.raises(ValueError, match="EN15528-D2 is known by masses of its axles"):
+    with pytest.raises(ValueError, match="EN15528-D2 has masses of its axles"):
         load_model("EN15528-D2")
 
 

@@ -191,5 +191,5 @@ def test_bad_times_are_refused():
         jb.ride.vibration_dose(np.arange(9) / 100, np.zeros(9))
     with pytest.raises(ValueError, match="at least 60 a second"):
         jb.ride.sperling_index(np.arange(9) / 50, np.zeros(9))
-    with pytest.raises(ValueError, match="must be known numbers"):
+    with pytest.raises(ValueError, match="must be concrete numbers"):
         jax.jit(lambda t: jb.ride.weighted_rms(t, np.zeros(9)))(np.arange(9) / 200)

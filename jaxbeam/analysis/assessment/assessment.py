@@ -206,7 +206,7 @@ class Assessment(TableViews):
 
     @property
     def governed_by_trains(self) -> tuple[str, ...]:
-        """Effects for which trains govern the design in place of LM71: a finding, no failure."""
+        """Names of effects for which trains govern the design in place of LM71, no failure."""
         return tuple(
             check.subject.partition(", ")[2]
             for check in self.checks
@@ -215,7 +215,7 @@ class Assessment(TableViews):
 
     @property
     def verdict(self) -> str:
-        """What the checks say together; never a certificate."""
+        """Sentence that sums up the checks; never a certificate."""
         if self.failed:
             subjects = ", ".join(check.subject for check in self.failed)
             found = f"not satisfied: {subjects}"

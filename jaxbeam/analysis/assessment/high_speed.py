@@ -30,20 +30,20 @@ from jaxbeam.sweeps.force_runner import PHASE
 from jaxbeam.sweeps.quality import failure_sentence
 from jaxbeam.sweeps.specification import sweep_specification
 
-# Ratio of speeds: N axles at a spacing build up resonance of order i over a share 2 / (N i) of the
-# speed, 3 % for the longest trains at third order, with at least one speed within.
+# Ratio of speeds: N axles at a spacing build up resonance of order i over a fraction 2 / (N i) of
+# the speed, 3 % for the longest trains at third order, with at least one speed within.
 SPEED_RATIO = 1.02
 SETTLED = 0.01  # change of the largest response, relative, at which speeds are fine enough
-NEAR_LARGEST = 0.8  # share of the largest response from which on a peak over speed is refined
+NEAR_LARGEST = 0.8  # fraction of the largest response from which on a peak over speed is refined
 MAX_ROUNDS = 4
 TOLERANCE = 1e-4  # of peaks
-NEAR = 1e-6  # m, from a support to a sensor beside it
+NEAR = 1e-6  # m, from a support to a sensor next to it
 RUNS_AT_ONCE = 8  # whose reactions are computed together
 FREE_PERIODS = 2.0  # of the first mode, simulated after a train has left
 
 
 class TrainResponse(NamedTuple):
-    """Peaks of sensors over the speeds (m/s) of one train, and how far they may still grow.
+    """Peaks of sensors over the speeds (m/s) of one train, and their change by the refinement.
 
     `change` is the relative growth of the largest peak of each quantity in the last refinement.
     """
@@ -166,18 +166,18 @@ def _largest(peaks, quantities) -> Float[np.ndarray, " quantity"]:
 
 
 def _between(speeds, peaks, quantities, count: int) -> Float[np.ndarray, " added"]:
-    """Speeds (`count`) in the intervals beside the peaks over speed that are near the largest."""
-    beside = np.zeros(speeds.size - 1, bool)
+    """Speeds (`count`) in the intervals next to the peaks over speed that are near the largest."""
+    next_to_peak = np.zeros(speeds.size - 1, bool)
     for quantity in np.unique(quantities):
         largest = peaks[:, quantities == quantity].max(axis=1)
         padded = np.concatenate([[-np.inf], largest, [-np.inf]])
         is_peak = (largest >= padded[:-2]) & (largest >= padded[2:])
         for i in np.flatnonzero(is_peak & (largest >= NEAR_LARGEST * largest.max())):
-            beside[max(i - 1, 0) : i + 1] = True
-    intervals = np.flatnonzero(beside)
-    shares = np.diff(np.linspace(0, count, intervals.size + 1).astype(int))
+            next_to_peak[max(i - 1, 0) : i + 1] = True
+    intervals = np.flatnonzero(next_to_peak)
+    counts = np.diff(np.linspace(0, count, intervals.size + 1).astype(int))
     added = [
-        np.linspace(speeds[i], speeds[i + 1], share + 2)[1:-1]
-        for i, share in zip(intervals, shares, strict=True)
+        np.linspace(speeds[i], speeds[i + 1], added + 2)[1:-1]
+        for i, added in zip(intervals, counts, strict=True)
     ]
     return np.concatenate(added)

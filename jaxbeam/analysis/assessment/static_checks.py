@@ -28,9 +28,9 @@ SPAN_POSITIONS = 11  # of a span, between which its largest moment is searched
 
 
 class CheckedSection(NamedTuple):
-    """Place (m) along the beam where a quantity is compared, and its name there.
+    """Section of the beam at which an effect is compared: name, quantity and position x (m).
 
-    Of a shear force also on which `side` of the place, "left" or "right".
+    `side`, "left" or "right" of x, counts for shear forces.
     """
 
     name: str
@@ -109,7 +109,7 @@ def largest_under_lm71(line: TabulatedLine) -> float:
 
 
 def frequency_check(case: Case, length: float, frequency: float) -> CodeCheck:
-    """First natural frequency (Hz) beside its limits at a determinant length (m)."""
+    """Check of the first natural frequency (Hz) against its limits at a determinant length (m)."""
     numbers = code_numbers()["frequency_limits"]
     lower, upper = frequency_limits(length)
     within = lower <= frequency <= upper and length <= numbers["longest_span"]
@@ -129,7 +129,7 @@ def frequency_check(case: Case, length: float, frequency: float) -> CodeCheck:
 
 
 def analysis_check(length: float, frequency: float, speed: float) -> CodeCheck:
-    """Whether a dynamic analysis is required, as far as the flow chart is open."""
+    """Check whether a dynamic analysis is required, by the public part of the flow chart."""
     numbers, limits = code_numbers()["line_speed"], frequency_limits(length)
     fast = 3.6 * speed > numbers["static_limit_kmh"] * (1 + 1e-9)
     longest = code_numbers()["frequency_limits"]["longest_span"]
@@ -154,7 +154,7 @@ def analysis_check(length: float, frequency: float, speed: float) -> CodeCheck:
 
 
 def damping_checks(case: Case, added: float) -> list[CodeCheck]:
-    """Damping ratios of the analysis, against table 6.6 if a material was named."""
+    """Checks of the damping ratios, against table 6.6 if a material was named."""
     ratios = np.atleast_1d(concrete(case.beam.damping_ratio))
     remark = f"{added:g} of it added by 6.4.6.4" if added else "nothing added by 6.4.6.4"
     span = np.float64(max(b - a for a, b in spans(case)))
@@ -174,19 +174,21 @@ def damping_checks(case: Case, added: float) -> list[CodeCheck]:
 
 
 def factor_checks(length, frequency, speed, track: str) -> list[CodeCheck]:
-    """Dynamic factors at the line speed (m/s), of real trains and of LM71."""
+    """Dynamic factors at the line speed (m/s), of real trains and of LM71, as checks."""
     annex, factors = code_numbers()["annex_c"], code_numbers()["dynamic_factors"]
     first = float(running_factor(speed, length, frequency))
     second = float(irregularity_factor(speed, length, frequency))
     own = factors[track]
-    share = own["track_irregularity"]
+    fraction = own["track_irregularity"]
     static = float(static_dynamic_factor(length, track))
-    remark = f"phi' = {first:.4g}, phi'' = {second:.4g}, of which {share:g} for the {track} track"
+    remark = (
+        f"phi' = {first:.4g}, phi'' = {second:.4g}, of which {fraction:g} for the {track} track"
+    )
     return [
         CodeCheck(
             "1 + phi' + phi'' of real trains at line speed",
             annex["clause"],
-            1 + first + share * second,
+            1 + first + fraction * second,
             None,
             "1",
             INFORMATION,

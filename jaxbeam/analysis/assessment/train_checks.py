@@ -35,7 +35,7 @@ from jaxbeam.model.statics import REACTION
 
 
 class TrackState(NamedTuple):
-    """What the factors of the code depend on: L_phi (m), n0 (Hz), state of the track, alpha."""
+    """Inputs of the factors of the code: L_phi (m), n0 (Hz), state of the track, alpha."""
 
     length: float
     frequency: float
@@ -46,9 +46,10 @@ class TrackState(NamedTuple):
 def train_checks(
     case: Case, trains: Sequence[str], speeds: tuple[float, float], deck: str, state: TrackState
 ) -> tuple[list[CodeCheck], TrainEffects]:
-    """Deck acceleration, each section force, reaction and displacement against LM71; all curves.
+    """Checks of the effects of trains between two speeds (m/s), and the curves of all effects.
 
-    Between two speeds (m/s). Calculated values are multiplied by the factor for the track.
+    Deck acceleration against its limit; each section force, reaction and displacement against
+    LM71. Calculated values are multiplied by the factor for the track.
     """
     decks = [p for p in characteristic_points(case) if not p.name.startswith("support")]
     sections = checked_sections(case)
@@ -118,7 +119,7 @@ def _unit(section: CheckedSection) -> str:
 
 
 def _largest(effects: TrainEffects, columns: Sequence[int]) -> tuple[int, int, int]:
-    """Numbers of curve, speed and effect of the largest value of some effects."""
+    """Indices of curve, speed and effect of the largest value among some columns of effects."""
     curve = int(np.argmax(effects.largest()[:, columns].max(axis=1)))
     values = effects.curves[curve].values[:, columns]
     speed, column = np.unravel_index(np.argmax(values), values.shape)
@@ -170,7 +171,7 @@ def _section_check(
     responses: list[TrainResponse],
     state: TrackState,
 ) -> CodeCheck:
-    """The largest effect of the trains at a section, against alpha Phi LM71: which governs."""
+    """Check of the largest effect of the trains at a section against alpha Phi LM71."""
     curve, at, _ = _largest(effects, [column])
     worst = effects.curves[curve]
     value, speed, limit = float(worst.values[at, column]), worst.speeds[at], effects.limits[column]

@@ -82,7 +82,7 @@ class Bound(Module):
 
     @property
     def reduction(self) -> float:
-        """Attainable reduction as a share of the uncontrolled peak, 0 to 1."""
+        """Attainable reduction as a fraction of the uncontrolled peak, 0 to 1."""
         return 1 - self.peak / self.uncontrolled
 
     @property
@@ -94,7 +94,7 @@ class Bound(Module):
         )
 
     def share(self, record: Record) -> float:
-        """Share of the attainable reduction that a run achieves: 0 without control, 1 at best.
+        """Fraction of the attainable reduction that a run achieves: 0 without control, 1 at best.
 
         Negative for a peak above the uncontrolled one, NaN for a run that diverges. The peak of the
         run is that at the positions of the bound, over its samples if these are not the sensors.

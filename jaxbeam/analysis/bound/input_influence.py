@@ -117,8 +117,8 @@ def input_influence(
     step, *_ = choose_step_size(uncontrolled_case, shapes, TOLERANCE)
     schedule = controller_schedule(times, Transmission(hold_times, hold_times), [], np.zeros(0))
     substeps = steps_per_interval(np.diff(times).max(), step)
-    # Runs with hold -1 (the unforced one) or a hold after the end (padding) have no command; those
-    # of a first one after the end are disturbed by the profile alone, as all with a command are.
+    # Runs with hold -1 (the unforced one) or a hold after the end (padding) have no command; of
+    # these the padding is disturbed by the profile alone, as all runs with a command are.
     hold_index = np.append([-1, count], np.repeat(np.arange(count), actuators))
     actuator_index = np.append([0, 0], np.tile(np.arange(actuators), count))
     run_bytes = 8.0 * COPIES * times.size * substeps * 2 * case.beam.modes

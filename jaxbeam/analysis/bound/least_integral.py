@@ -34,8 +34,8 @@ class LeastIntegral(Module):
     `integral` (m^2 s) is that of the `commands`, which start at `times` (s) and are held over
     `period` (s); no commands within the limits make it smaller than `proven`. `uncontrolled` is the
     integral without commands, at the `positions` (m) with the `weights`, by the trapezoidal rule at
-    times at most `spacing` (s) apart. `share_at_limits` is that of the commands at a limit: all but
-    a few, "bang-bang", where limits are tight; the `driven` actuators are those that take any.
+    times at most `spacing` (s) apart. `share_at_limits` is the fraction of commands at a limit: all
+    but a few, "bang-bang", where limits are tight; `driven` actuators are those that take any.
     """
 
     integral: float
@@ -52,7 +52,7 @@ class LeastIntegral(Module):
 
     @property
     def reduction(self) -> float:
-        """Attainable reduction as a share of the integral without commands, 0 to 1."""
+        """Attainable reduction as a fraction of the integral without commands, 0 to 1."""
         return 1 - self.integral / self.uncontrolled
 
     def of_record(self, record: Record) -> float:
@@ -137,7 +137,7 @@ def least_integral(
 
 
 def _quadratic(influence: InputInfluence, weights):
-    """H, f and c of the integral u'H u + 2 f'u + c, of the commands in one row."""
+    """H, f and c of the integral as a quadratic form u'H u + 2 f'u + c of the commands u."""
     intervals = np.diff(influence.times)
     trapezoid = (np.append(intervals, 0.0) + np.append(0.0, intervals)) / 2
     size = int(np.prod(influence.response.shape[2:]))
@@ -184,7 +184,7 @@ def _solve(H, f, low, high, change, shape) -> Float[np.ndarray, "hold actuator"]
 
 
 def _gap(gradient, commands, low, high, change) -> float:
-    """How much smaller a convex function may be elsewhere: -min of gradient'(v - u) over the v."""
+    """Duality gap of convex minimisation: -min of gradient'(v - u) over the commands v allowed."""
     holds, actuators = commands.shape
     gradient = gradient.reshape(commands.shape)
     least = np.where(gradient > 0, low, high)
