@@ -30,7 +30,7 @@ PLANT_PREFIXES = ("beam.", "supports.", "actuators.", "sensors.")
 
 @dataclasses.dataclass(frozen=True)
 class LoadCases:
-    """Values of the case, by address, that differ from run to run: loads, plants, anything.
+    """Training and held-out runs: values of the case by address, which differ from run to run.
 
     Vehicles and profiles are numbers like others, `loads.0.body_mass`; `profile.seed` is another
     realisation of a random profile.

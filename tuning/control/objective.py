@@ -20,7 +20,7 @@ from jaxbeam.simulation.simulate import Histories
 def with_fixed_design(case: Case, nominal: Mapping[str, Any], layout: Layout) -> Case:
     """Case whose control law is designed for the plant with `nominal` values at some addresses.
 
-    Without that a law is designed for the plant of its case, hence for each uncertain plant anew.
+    Otherwise a law is designed for the plant of its case, hence for each uncertain plant anew.
     `layout` is the order of positions along the beam, the same for both.
     """
     if not nominal or case.controller is None:
@@ -54,7 +54,7 @@ class Objective:
     Metrics, each a ratio (no unit):
 
     - `peak`: largest deflection over that of the same run without control;
-    - `shortfall`: share of the attainable reduction of the peak that is missed, 0 at the least
+    - `shortfall`: fraction of the attainable reduction of the peak that is missed, 0 at the least
       achievable peak and 1 without control;
     - `rms`: RMS deflection over that without control;
     - `after_exit`: largest deflection after the last exit over the peak without control;

@@ -1,4 +1,4 @@
-"""Optimisation of an objective from several points: its course and its methods.
+"""Optimisation of an objective from several starts: the search and its methods.
 
 All share the one program that simulates, and their evaluations are counted alike.
 
@@ -35,7 +35,7 @@ METHODS = ("adam", "lbfgs", "bfgs")
 ADAM_STEP = 0.1  # first step of Adam, in search variables, which are of order one
 MAX_FIRST_STEP = 0.5  # longest first step of a line search, root mean square of the variables
 BACKTRACKING_FACTOR = 0.5  # on a step that led to an unstable loop or decreased too little
-SUFFICIENT_DECREASE = 1e-4  # share of the decrease predicted by the slope (Armijo condition)
+SUFFICIENT_DECREASE = 1e-4  # fraction of the decrease predicted by the slope (Armijo condition)
 SHARPNESS_STAGES = 5  # stages of sharper maxima, for methods whose curvatures jump with sharpness
 
 Point = Float[Array, " parameter"]
@@ -210,7 +210,7 @@ def optimiser(name: str, steps: int) -> AbstractOptimiser:
 
 
 SHARPNESS = (30.0, 1000.0)  # of smooth maxima, at the first step and at the last
-SHARPENING_SHARE = 0.7  # of the steps in which sharpness rises, for optimisers with stages
+SHARPENING_FRACTION = 0.7  # of the steps in which sharpness rises, for optimisers with stages
 CHECKPOINT_STEPS = 5  # steps between checkpoints
 
 
@@ -247,7 +247,7 @@ class OptimisationState:
 
 
 def _without_start(parameter: FreeParameter) -> FreeParameter:
-    """A free parameter without its start: searches from other starts share compiled programs."""
+    """The parameter without its start, so that searches from other starts use the same program."""
     return dataclasses.replace(parameter, start=0.0, typical_size=1.0)
 
 
@@ -287,7 +287,7 @@ class Optimisation:
         self.start_point = to_unbounded(parameters, [p.start for p in parameters])
         self.run_count = len(run_set.runs)
         # Compiled programs must not depend on the names of the runs. A least peak that is not
-        # known has no weight, but NaN would spoil the gradient.
+        # computed has no weight, but NaN would spoil the gradient.
         least = np.nan_to_num(run_set.uncontrolled["least"])
         uncontrolled = run_set.uncontrolled | {"least": least}
         self.run_set = dataclasses.replace(run_set, runs=(), uncontrolled=uncontrolled)
@@ -301,7 +301,10 @@ class Optimisation:
     def start_points(
         self, starts: int, seed: int, start_point=None
     ) -> Float[np.ndarray, "start parameter"]:
-        """A point (the case's own if left out), and random ones within bounds or a factor of 3."""
+        """Start points: `start_point` (the case's own if left out), then random ones.
+
+        Random ones are within bounds, or a factor of 3 of the first.
+        """
         start_point = self.start_point if start_point is None else start_point
         rng = np.random.default_rng(seed)
         spread = [
@@ -316,7 +319,7 @@ class Optimisation:
     def compile(
         self, target: WeightsAndLimits, points: Float[np.ndarray, "start parameter"]
     ) -> None:
-        """Compile the program of the steps ahead of the first."""
+        """Compile the program of the steps, before the first step needs it."""
         arguments = self._step_arguments(points, SHARPNESS[0], self._batch_runs(0, 0), target)
         values_and_gradients.precompile(*arguments)()
 
@@ -437,7 +440,7 @@ class Optimisation:
         """Sharpness of smooth maxima at a step, and whether it has changed with the step."""
         low, high = SHARPNESS
         staged = self.method.sharpness_stages is not None
-        rising = max(round(SHARPENING_SHARE * self.steps), 1) if staged else self.steps
+        rising = max(round(SHARPENING_FRACTION * self.steps), 1) if staged else self.steps
         stages = min(self.method.sharpness_stages or rising, rising)
         stage, before = (min(stages * k // rising, stages - 1) for k in (step, step - 1))
         share = stage / max(stages - 1, 1)

@@ -34,7 +34,7 @@ class ParetoFront:
     tuned: tuple[TuningResult, ...]
 
     def points(self, held_out: bool = False) -> np.ndarray:
-        """Merit and objective for each limit (limit, 2), on training or held-out runs."""
+        """Metric and objective for each limit (limit, 2), on training or held-out runs."""
         run_sets = [found.run_sets[-1 if held_out else 0] for found in self.tuned]
         return np.array([[one.metrics[self.metric], one.objective[1]] for one in run_sets])
 
@@ -76,9 +76,9 @@ def pareto(
 ) -> ParetoFront:
     """Pareto front: tunings for an objective under each limit on a metric (see `Objective`).
 
-    From the loosest limit to the tightest, each search starts where the one before ended; all share
-    compiled programs. Other arguments are those of `tune`; a line search meets limits more exactly
-    than Adam.
+    From the loosest limit to the tightest, each search starts where the one before ended, with the
+    same compiled programs. Other arguments are those of `tune`; a line search meets limits more
+    exactly than Adam.
 
     Raises ValueError as `tune` does, and for an unknown metric or a limit that is not positive.
 
@@ -129,7 +129,7 @@ def lexicographic(
 ) -> tuple[TuningResult, ...]:
     """Tune for metrics in order of rank: each is minimised subject to limits on those before it.
 
-    The limit on a metric is its minimum plus the share `slack` of it. There is one result for each
+    The limit on a metric is its minimum times 1 + `slack`. There is one result for each
     metric; the last one is that for all. `aggregation` is that of an
     `Objective`, over the runs. Other arguments are those of `tune`.
 
@@ -303,16 +303,16 @@ def _is_dataclass_instance(part) -> bool:
 
 
 FEEDBACK_ADDRESS = "controller.feedback"
-SHARE_PENALTY = 10.0  # added to the objective if the sum of the shares is off by one
+SUM_PENALTY = 10.0  # added to the objective if the sum of the fractions is off by one
 CANDIDATE_COUNT = 3  # states tried as the last one to be fed back
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ReducedFeedback:
-    """Indices of the states that are fed back, and all `shares` of the relaxed search.
+    """Result of `tune_reduced`: states fed back, and their fractions (`shares`) before rounding.
 
-    `relaxed` is the result with these shares, `tuned` that with the shares rounded and the other
-    parameters tuned again.
+    `relaxed` is the result with these fractions, `tuned` that with the fractions rounded and the
+    other parameters tuned again.
     """
 
     fed_back: tuple[int, ...]
@@ -347,10 +347,10 @@ def tune_reduced(
 ) -> ReducedFeedback:
     """Tune a regulator that feeds back `keep` of its states only, and select these.
 
-    First the share of each state (the controller's `feedback`) is a free parameter from 0 to 1,
-    with a penalty that keeps their sum at `keep`. Then the largest shares become 1, the others 0,
-    and the parameters in `free` are tuned again from their last values; for the last state the next
-    largest shares are tried as well, and the best on training runs is the result. `options` are
+    First the fraction of each state (the controller's `feedback`) is a free parameter from 0 to 1,
+    with a penalty that keeps their sum at `keep`. Then the largest become 1, the others 0, and the
+    parameters in `free` are tuned again from their last values; for the last state the next largest
+    fractions are tried as well, and the best on training runs is the result. `options` are
     those of `tune`, without a checkpoint.
 
     Raises ValueError for a controller that is no regulator, for more states than it has, and as
@@ -385,9 +385,9 @@ def tune_reduced(
     shared = dict.fromkeys(names, (0.0, 1.0))
 
     def penalty(values):
-        # On both sides: weights can compensate shares that are all too small.
+        # On both sides: weights can compensate fractions that are all too small.
         total = jnp.sum(jnp.stack([values[name] for name in names]))
-        return SHARE_PENALTY * (total - keep) ** 2
+        return SUM_PENALTY * (total - keep) ** 2
 
     relaxed = tune(
         _with_feedback(case, np.full(states, keep / states)),
@@ -401,7 +401,7 @@ def tune_reduced(
     found = {parameter.address: value for parameter, value in pairs}
     shares = np.array([found[name] for name in names])
     order = np.argsort(-shares, kind="stable")
-    # The best relaxed shares need not be the best when rounded.
+    # The best relaxed fractions need not be the best when rounded.
     candidates = [
         np.append(order[: keep - 1], last) for last in order[keep - 1 :][:CANDIDATE_COUNT]
     ]
@@ -419,6 +419,6 @@ def tune_reduced(
 
 
 def _with_feedback(case: Case, shares: Float[np.ndarray, " state"]) -> Case:
-    """The case with other shares of its controller's states fed back."""
+    """The case whose controller feeds back these fractions (`shares`) of the states."""
     controller = dataclasses.replace(case.controller, feedback=shares)
     return dataclasses.replace(case, controller=controller)

@@ -24,14 +24,15 @@ STABILITY_PENALTY_SLOPE = 1.0  # added to the objective for each 1/s of violatio
 
 @dataclasses.dataclass(frozen=True)
 class StabilityConstraint:
-    """Real parts of the frozen poles of all training runs are at most `max_real_part` (1/s).
+    """Constraint on the frozen poles of all training runs: real parts up to `max_real_part` (1/s).
 
     Poles are computed without loads and at a number of `instants` along the crossing of the first
-    load of each run; also with each parameter in `parameter_tolerance` (address: share) changed by
-    its share up and down and, for a sampled controller, with an `extra_delay` (s). As poles cost
-    more than runs, `crossings` (values by address, like load cases) may replace the training runs.
+    load of each run; also with each parameter in `parameter_tolerance` (address: fraction) changed
+    by its fraction up and down and, for a sampled controller, with an `extra_delay` (s). As poles
+    cost more than runs, `crossings` (values by address, like load cases) may replace the training
+    runs.
 
-    Raises ValueError for a negative delay, less than one instant and shares outside 0 to 1.
+    Raises ValueError for a negative delay, less than one instant and fractions outside 0 to 1.
 
     >>> import tuning
     >>> stable = tuning.StabilityConstraint(max_real_part=-1.0, extra_delay=0.001)
@@ -48,8 +49,8 @@ class StabilityConstraint:
     def __post_init__(self):
         if self.extra_delay < 0 or self.instants < 1:
             raise ValueError("stable needs a delay that is not negative, and at least one instant")
-        if any(not 0 < share < 1 for share in self.parameter_tolerance.values()):
-            raise ValueError("parameter tolerances are shares between 0 and 1")
+        if any(not 0 < fraction < 1 for fraction in self.parameter_tolerance.values()):
+            raise ValueError("parameter tolerances are fractions between 0 and 1")
 
     def violation_of_runs(self, case: Case, run_set: RunSet):
         """`violation_function` for a case, along the crossings or all runs of its run set."""
@@ -76,8 +77,8 @@ class StabilityConstraint:
         stacked = jax.tree.map(jnp.asarray, stack_cases(cases))
         instants = jnp.asarray(np.array([self._evaluation_times(case) for case in cases]))
         # One row with the nominal values, and two for each parameter with a tolerance.
-        shares = np.diag(list(self.parameter_tolerance.values()))
-        factors = 1 + np.concatenate([np.zeros((1, len(shares))), shares, -shares])
+        changes = np.diag(list(self.parameter_tolerance.values()))
+        factors = 1 + np.concatenate([np.zeros((1, len(changes))), changes, -changes])
 
         def growth_rates(values, case, factor, times):
             """Growth rates (1/s) by loop timing and time, with parameters multiplied by factors."""
@@ -115,8 +116,8 @@ class StabilityConstraint:
         """A time (s) before the first load, and others evenly along its crossing."""
         entry, leave = crossing_times(case)[0]
         leave = min(leave, float(case.run.duration))
-        shares = (np.arange(self.instants) + 0.5) / self.instants
-        return np.append(entry - 1.0, entry + (leave - entry) * shares)
+        fractions = (np.arange(self.instants) + 0.5) / self.instants
+        return np.append(entry - 1.0, entry + (leave - entry) * fractions)
 
 
 # Up to so many parameters gradients are computed forward, which takes less time to compile.
@@ -127,7 +128,7 @@ MAX_FORWARD_PARAMETERS = 4
 class PenalisedObjective:
     """Objective of a run set, with a penalty, as a function of the search variables.
 
-    It is static data of compiled programs: what it holds is compiled into them.
+    It is static data of compiled programs: its fields are compiled into them.
     """
 
     parameters: tuple[FreeParameter, ...]

@@ -121,9 +121,9 @@ def _plant_values(addresses: list[str], row) -> AddressValues:
 
 
 PEAK_TOLERANCE = 1e-4  # of the largest deflection
-# Runs without control of a batch that is not compiled: each takes 0.03 to 0.14 s (3 and 6 modes), a
-# program of them 5 s to compile.
-MAX_KNOWN_RUNS = 60
+# Largest number of runs without control that are not compiled: each takes 0.03 to 0.14 s (3 and 6
+# modes), their program 5 s to compile.
+MAX_UNCOMPILED_RUNS = 60
 STATE_COPIES = 4  # of the states of all steps of a run, while its history is computed
 
 
@@ -292,8 +292,8 @@ def _uncontrolled_histories(cases: list[Case], times, positions, quantities) -> 
     without_controller = [uncontrolled(case) for case in cases]
     plan = _integration_plan(without_controller).without_statements()
     wanted = times, plan, positions, quantities
-    if len(cases) <= MAX_KNOWN_RUNS:
-        found = [_known_histories(case, *wanted) for case in without_controller]
+    if len(cases) <= MAX_UNCOMPILED_RUNS:
+        found = [_direct_histories(case, *wanted) for case in without_controller]
         return jax.tree.map(lambda *runs: np.stack(runs), *found)
     at_once = runs_at_once(without_controller[0], times, plan)
     parts = [without_controller[first : first + at_once] for first in range(0, len(cases), at_once)]
@@ -308,7 +308,7 @@ def runs_at_once(case: Case, times, plan: IntegrationPlan) -> int:
     return max(1, int(block_memory() / run_bytes))
 
 
-_known_histories = compiled_if_traced(simulate_histories)
+_direct_histories = compiled_if_traced(simulate_histories)
 
 
 @compiled

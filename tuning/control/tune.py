@@ -210,7 +210,7 @@ class TuningProblem:
 
     @functools.cached_property
     def held_out_runs(self) -> RunSet:
-        """Run set of the held-out cases, of which there must be some."""
+        """Run set of the held-out cases; there must be at least one."""
         settings = self.positions, self.least_peaks, self.objective.quantities
         return make_run_set(self.case, self.cases.held_out, *settings)
 
@@ -271,15 +271,17 @@ def _run_set_result(name, run_set: RunSet, objective, before, after) -> RunSetRe
         peaks_before=peaks[0],
         peaks_after=peaks[1],
         least_peaks=run_set.uncontrolled["least"],
-        saturated_share=np.array([_share(np.asarray(record.saturated)) for record in pairs[1]]),
+        saturated_share=np.array(
+            [_saturated_fraction(np.asarray(record.saturated)) for record in pairs[1]]
+        ),
         objective=[float(objective.aggregate(own)) for own in values],
         metrics=metrics_after,
         metrics_before=metrics_before,
     )
 
 
-def _share(saturated: Bool[np.ndarray, "time actuator"]) -> float:
-    """Share of the time at a limit, over all actuators; 0 without any."""
+def _saturated_fraction(saturated: Bool[np.ndarray, "time actuator"]) -> float:
+    """Fraction of the time at a limit, over all actuators; 0 without any."""
     return float(saturated.mean()) if saturated.size else 0.0
 
 

@@ -25,7 +25,7 @@ from tuning.control.load_cases import PLANT_PREFIXES, AddressValues, run_case, v
 from tuning.control.objective import Objective, with_fixed_design
 from tuning.parameters.free import FreeParameter
 
-LIMIT_TOLERANCE = 0.01  # share of a limit by which it may be exceeded without a remark
+LIMIT_TOLERANCE = 0.01  # fraction of a limit by which it may be exceeded without a remark
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class RunSetResult:
     """Runs of a run set before and after tuning.
 
     Peaks are in m; `least_peaks` are the least achievable ones, NaN if not computed.
-    `saturated_share` is the share of the time after tuning in which a command is at a limit;
+    `saturated_share` is the fraction of the time after tuning in which a command is at a limit;
     `objective` has the values before and after; `metrics` are those after tuning, aggregated, and
     `metrics_before` those before it.
     """
@@ -50,7 +50,7 @@ class RunSetResult:
     metrics_before: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def attained_shares(self, peaks: Float[np.ndarray, " run"]) -> Float[np.ndarray, " run"]:
-        """Shares of the attainable reduction that some peaks (m) attain, by run."""
+        """Fraction of the attainable reduction that peaks (m) attain, by run."""
         return (self.uncontrolled_peaks - peaks) / (self.uncontrolled_peaks - self.least_peaks)
 
 
@@ -128,8 +128,8 @@ class TuningResult(TableViews):
         if not math.isfinite(last.peaks_after.max()):
             return f"{sentence}; a {last.name} run diverges: not fit for use"
         sentence += (
-            f"; worst {last.name} run: peak {beside_no_control(reductions[worst])}"
-            f" ({beside_no_control(before, reductions[worst])} before tuning)"
+            f"; worst {last.name} run: peak {against_no_control(reductions[worst])}"
+            f" ({against_no_control(before, reductions[worst])} before tuning)"
         )
         if np.isfinite(last.least_peaks).all():
             shares = last.attained_shares(last.peaks_after)
@@ -236,8 +236,11 @@ class TuningResult(TableViews):
         return plot_tuning(panels, self.history, title=self.case.title)
 
 
-def beside_no_control(reduction: float, other: float = -math.inf) -> str:
-    """A share of the peak without control, below or above it; short where another says as much."""
+def against_no_control(reduction: float, other: float = -math.inf) -> str:
+    """A reduction in words, as "20% below no control".
+
+    Without the words where an `other` reduction before it has them.
+    """
     side = "below" if reduction >= 0 else "above"
     same_side = (reduction >= 0) == (other >= 0) and math.isfinite(other)
     return f"{abs(reduction):.1%}" if same_side else f"{abs(reduction):.1%} {side} no control"
@@ -249,8 +252,7 @@ def _metric_table(objective: Objective, run_sets: list[RunSetResult]) -> list[st
     for outcome in run_sets:
         header += [f"{outcome.name} before", "after"]
     for name in dict.fromkeys([*objective.weights, *objective.limits]):
-        known = [o for o in run_sets if name in o.metrics and name in o.metrics_before]
-        if len(known) < len(run_sets):
+        if not all(name in o.metrics and name in o.metrics_before for o in run_sets):
             return []
         values = [v for o in run_sets for v in (o.metrics_before[name], o.metrics[name])]
         chosen = (objective.weights.get(name), objective.limits.get(name))
@@ -323,7 +325,7 @@ def compare_runs(
     runs: Sequence[AddressValues],
     period: float | None = None,
 ) -> list[Comparison]:
-    """Controllers on each of some runs, beside a law drawn by hand, no control, and the bound.
+    """Controllers on each of some runs, compared with a hand-drawn law, no control and the bound.
 
     Runs are values by address, as `tuning.latin_hypercube` draws them. Values of the beam, its
     supports, actuators and sensors are unknown to the laws, which are designed for the `case`;
@@ -375,12 +377,12 @@ def hand_drawn_peaks(case: Case, runs: Sequence[AddressValues]) -> Float[np.ndar
     return np.array([float(np.max(record.peak_deflection)) for record in records])
 
 
-def beside_hand_drawn(outcome: RunSetResult, peaks: Float[np.ndarray, " run"]) -> str:
+def hand_drawn_sentence(outcome: RunSetResult, peaks: Float[np.ndarray, " run"]) -> str:
     """Sentence on the peaks (m) under the law drawn by hand in the runs of a tuning."""
     reductions = 1 - peaks / outcome.uncontrolled_peaks
     words = (
         f"drawn by hand, with no number tuned: worst {outcome.name} run: peak"
-        f" {beside_no_control(reductions.min())}"
+        f" {against_no_control(reductions.min())}"
     )
     if np.isfinite(outcome.least_peaks).all():
         shares = outcome.attained_shares(peaks)

@@ -24,7 +24,7 @@ SIMULATION_TOLERANCE = 1e-5  # of the largest deflection, below the resolution o
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """Logs with the case of each, alike in structure, so that they share one compiled simulation.
+    """Logs with the case of each, alike in structure, so that one compiled simulation serves all.
 
     Logs are padded to the longest with equally spaced times; `mask` is 1 for measured samples and
     0 for padding. Samples are (log, time, channel). With a controller, or commands from a log,
@@ -69,12 +69,12 @@ class Dataset:
 def make_dataset(case: Case, logs: list[Log]) -> Dataset:
     """Dataset of logs, checked against the case.
 
-    Raises ValueError, naming the log, if its channels do not match the sensors, no load is known,
+    Raises ValueError, naming the log, if its channels do not match the sensors, it has no load,
     it ends before the first load has crossed, or logs differ in structure.
     """
     if not logs:
         raise ValueError("give at least one log")
-    # Loads, and with them sensors on vehicles, may be known from the logs only.
+    # Loads, and with them sensors on vehicles, may be described with the logs only.
     check_case(case if case.loads else dataclasses.replace(case, vehicle_sensors=()))
     for log in logs:
         check_times(log)
@@ -210,12 +210,12 @@ def channel_residuals(
 
 
 def coloured(channels: Sequence[ChannelResiduals]) -> list[ChannelResiduals]:
-    """Those whose residuals are no white noise, at a level that counts how many were looked at."""
+    """Channels whose residuals are not white, by a test corrected for the number of channels."""
     return [one for one in channels if one.p_value < WHITENESS_SIGNIFICANCE / len(channels)]
 
 
 def explained(channels: Sequence[ChannelResiduals]) -> str:
-    """Whether a model explains logs that leave these residuals, in words."""
+    """Sentence on whether the model explains the logs, from the residuals of all channels."""
     found = coloured(channels)
     if not found:
         return "the model explains the logs: residuals are white noise"

@@ -28,11 +28,11 @@ START_COUNT = 5  # of the search, as there may be several local minima
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ExperimentDesign:
-    """Values of the chosen numbers, and standard errors of the free parameters (SI units).
+    """Designed experiment: values of the chosen numbers, and standard errors of free parameters.
 
-    Both are given before and after; `error_sensitivities` (parameter, choice) are derivatives of
-    the logarithm of each error with respect to each choice, before. Errors are infinite for
-    parameters that are not identifiable. `case` has the chosen values.
+    Both are in SI units, before and after the design; `error_sensitivities` (parameter, choice) are
+    derivatives of the logarithm of each error with respect to each choice, before. Errors are
+    infinite for parameters that are not identifiable. `case` has the chosen values.
     """
 
     choices: list[str]
@@ -125,8 +125,8 @@ def design_experiment(
     def bound_with_gradient(choice, plan):
         return cramer_rao(choice, plan), jax.jacfwd(cramer_rao)(choice, plan)
 
-    def objective(share):
-        choice = jnp.asarray(low + (high - low) * share)
+    def objective(fraction):
+        choice = jnp.asarray(low + (high - low) * fraction)
         (errors, volume), (slopes, volume_slope) = bound_with_gradient(choice, plan)
         if target is None:
             return float(volume), np.asarray(volume_slope) * (high - low)
@@ -158,7 +158,7 @@ def _integration_plan(case: Case) -> IntegrationPlan:
 
 
 def _minimise(objective, start: Float[np.ndarray, " choice"]) -> Float[np.ndarray, " choice"]:
-    """Best of several searches, one of them from `start` (shares of the distance of the bounds)."""
+    """Best of several searches between 0 and 1 (the bounds), one of them from `start`."""
     others = np.random.default_rng(0).random((START_COUNT - 1, start.size))
     if start.size == 1:
         others = (np.arange(START_COUNT - 1)[:, None] + 0.5) / (START_COUNT - 1)

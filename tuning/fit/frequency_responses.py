@@ -4,7 +4,7 @@
     fit = identify_responses(case, measured, ["beam.flexural_rigidity", "beam.damping_ratio"])
 
 Compared are logarithms of the complex responses, ln |H| + i arg H, because errors of measured
-responses are relative, at resonances as well as beside them.
+responses are relative, at resonances as well as away from them.
 """
 
 import dataclasses
@@ -204,7 +204,7 @@ class ResponseFit:
 
     def __str__(self) -> str:
         lines = parameter_table(self.parameters, self.values, self.intervals)
-        errors = ", ".join(f"{100 * share:.2g} %" for share in self.relative_misfit)
+        errors = ", ".join(f"{100 * misfit:.2g} %" for misfit in self.relative_misfit)
         return "\n".join([*lines, f"responses are off by {errors}", self.verdict])
 
 

@@ -14,10 +14,10 @@ DEFAULT_PLAYS = 8  # thresholds, evenly spaced up to the largest command
 
 @dataclasses.dataclass(frozen=True)
 class HysteresisFit:
-    """Fitted operator, so scaled that the first excursion to the largest command is unchanged.
+    """Fitted hysteresis, scaled so that the first excursion to the largest command is unchanged.
 
-    Readings are `offset` + `gain` H[u], with the standard deviation `residual` of what is left and
-    `linear_residual` of what a line through the commands leaves, in units of the reading.
+    Readings are `offset` + `gain` H[u]; `residual` is the standard deviation of their residuals,
+    `linear_residual` that after a fitted line in the commands, in units of the reading.
     """
 
     hysteresis: Hysteresis
@@ -104,13 +104,13 @@ def checked_thresholds(thresholds, commands) -> Float[np.ndarray, " play"]:
 
 
 def spread_after_line(commands, readings) -> float:
-    """Standard deviation of what a line through the commands leaves of the readings."""
+    """Standard deviation of the residuals of readings after a fitted line in the commands."""
     line = np.polynomial.Polynomial.fit(commands, readings, 1)(commands)
     return float(np.std(readings - line))
 
 
 def plays_of(thresholds, commands) -> Float[np.ndarray, "time play"]:
-    """Plays of unit weight at each sample, from rest."""
+    """States of plays of unit weight at each sample, from rest."""
     operator, plays, found = Hysteresis(thresholds, np.ones(thresholds.size)), thresholds * 0, []
     for one in commands:
         plays = operator.follow(plays, np.asarray(one))

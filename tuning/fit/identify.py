@@ -102,7 +102,7 @@ def identify(
 
 @contextlib.contextmanager
 def _bar(shown: bool) -> Iterator[None]:
-    """A bar of the points that searches try within this context."""
+    """Progress bar of the points that searches try within this context, if `shown`."""
     with ProgressBar(None, "point", shown=shown, desc="fit", delay=BAR_DELAY) as bar:
 
         def on_point(point: SearchPoint) -> None:
@@ -116,7 +116,7 @@ def _bar(shown: bool) -> Iterator[None]:
 def _stage_mask(
     parameters: list[FreeParameter], stage: Sequence[str]
 ) -> Bool[np.ndarray, " parameter"]:
-    """Which parameters move in a stage; an address with `logs.*` in front is that of every log."""
+    """Mask of the parameters that are free in a stage; `logs.*` in front stands for every log."""
     addresses = [parameter.address for parameter in parameters]
     of_every_log = [LOG_ADDRESS.sub(r"logs.*.\2", address) for address in addresses]
     for address in stage:

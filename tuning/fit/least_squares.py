@@ -49,9 +49,10 @@ def robust_residual(loss: str, residual: Float[Array, "*any"]) -> Float[Array, "
 
 
 def robust_slope(loss: str, residual: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-    """Derivative of `robust_residual` of known residuals.
+    """Derivative of `robust_residual` by the residual, in NumPy.
 
-    That of the loss over f: r / sqrt(1 + r^2) for soft-l1, k sign(r) beyond k for Huber.
+    It is psi(r) / f with psi the derivative of the loss: r / sqrt(1 + r^2) for soft-l1, k sign(r)
+    beyond k for Huber.
     """
     size = np.abs(robust_residual(loss, residual))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -79,10 +80,10 @@ def variance_factor(loss: str, residuals: Float[np.ndarray, " sample"]) -> float
     return float(np.mean(influence**2) / np.mean(stiffness) ** 2)
 
 
-ACCEPTED_SHARE = 0.01  # of the predicted decrease, from which a step is accepted
-GOOD_SHARE = 0.99  # of the predicted decrease, above which the next step is damped less
-# Of the sum of squares, a predicted decrease too small to be told from rounding of the residuals.
-NEGLIGIBLE_SHARE = 1e-11
+# Least decrease, over the predicted one, of an accepted step, and of one after which damping falls.
+ACCEPTED_DECREASE, GOOD_DECREASE = 0.01, 0.99
+# Predicted decrease, over the sum of squares, that may be rounding of the residuals.
+NEGLIGIBLE_DECREASE = 1e-11
 LESS_DAMPING, MORE_DAMPING = 1 / 3.5, 4.0  # factors of the damping after good and rejected steps
 
 
@@ -106,7 +107,7 @@ def levenberg_marquardt(
     A step d minimises |r + J d|^2 + damping |d|^2, the damping is 1 at first; with a trust region
     as Gould et al. (4OR 3, 2005) chose it for it. Converged once an accepted step changes no
     variable and no residual by more than atol + rtol times its size, or the next promises a
-    decrease by less than a share of NEGLIGIBLE_SHARE. Points at which residuals are not finite are
+    relative decrease below NEGLIGIBLE_DECREASE. Points at which residuals are not finite are
     rejected.
     """
     point, damping = start, 1.0
@@ -118,15 +119,15 @@ def levenberg_marquardt(
             break
         change = _damped_step(factor, damping)
         predicted = (np.sum((factor @ np.append(change, 1.0)) ** 2) - _squares(factor)) / 2
-        if damping <= 1 and -predicted <= NEGLIGIBLE_SHARE * _squares(factor):
+        if damping <= 1 and -predicted <= NEGLIGIBLE_DECREASE * _squares(factor):
             return Minimum(point, True)
         trial_residuals, jacobian = linearised(point + change)
         trial_factor = _factor(trial_residuals, jacobian)
         decrease = (_squares(trial_factor) - _squares(factor)) / 2
-        if not decrease <= ACCEPTED_SHARE * predicted:
+        if not decrease <= ACCEPTED_DECREASE * predicted:
             damping *= MORE_DAMPING
             continue
-        if decrease < GOOD_SHARE * predicted and predicted < 0:
+        if decrease < GOOD_DECREASE * predicted and predicted < 0:
             damping *= LESS_DAMPING
         point, factor = point + change, trial_factor
         moved = np.abs(change) / (atol + rtol * np.abs(point))
@@ -138,7 +139,7 @@ def levenberg_marquardt(
 
 
 def _factor(residuals, jacobian):
-    """Triangular factor of derivatives and residuals side by side; not finite if they are not."""
+    """Triangular factor of the matrix (derivatives, residuals); not finite if they are not."""
     both = np.column_stack([jacobian, residuals])
     if not np.all(np.isfinite(both)):
         return np.full((both.shape[1],) * 2, np.nan)
@@ -160,7 +161,7 @@ def _damped_step(factor, damping):
 NOISE_ITERATIONS = 2  # fits, each with the noise levels that the one before has estimated
 MAX_STEPS = 60  # steps of one fit
 RTOL, ATOL = 1e-8, 1e-6  # of search variables and residuals, at which a fit has converged
-KEPT_POINTS = 3  # whose samples and derivatives are kept
+KEPT_POINTS = 3  # number of points whose samples and derivatives are cached
 WEAK_PRIOR_WIDTH = 2.0  # standard deviation in search variables: e^2, or two typical sizes
 
 
@@ -216,8 +217,8 @@ class SearchPoint(NamedTuple):
 class LeastSquares:
     """Least-squares problem in the free parameters of a dataset, compiled once for any samples.
 
-    Priors of the parameters count as further residuals. `loss` is one of the losses above. Who is
-    `following` (jaxbeam.runtime.progress) is given each `SearchPoint`.
+    Priors of the parameters count as further residuals. `loss` is one of the losses above. Each
+    `SearchPoint` is reported to those `following` (jaxbeam.runtime.progress).
 
     Raises ValueError if there are more parameters than samples, or for an unknown loss.
     """
@@ -382,7 +383,7 @@ class LeastSquares:
         start = point / scale
 
         def linearised(z):
-            # At the start exactly the point, where samples are already known.
+            # At the start exactly the point, whose samples are already computed.
             y = point if z is start else np.where(free, z * scale, point)
             values, slopes = self.values_at(y), self._slopes(y) * np.where(free, scale, 0.0)
             samples, jacobian = self.linearised(values)
@@ -449,9 +450,9 @@ class LeastSquares:
         own = np.sqrt(np.mean(residuals**2, axis=1))
         return np.maximum(np.where(unused, own, noise), self._noise_floor(1e-9))
 
-    def _noise_floor(self, share: float) -> Float[np.ndarray, " channel"]:
-        """Lower limit of the noise: a share of each channel's range, so that weights are finite."""
-        return np.maximum(share * np.ptp(self.data.measured, axis=(0, 1)), 1e-300)
+    def _noise_floor(self, fraction: float) -> Float[np.ndarray, " channel"]:
+        """Lower limit of the noise, a fraction of each channel's range: weights stay finite."""
+        return np.maximum(fraction * np.ptp(self.data.measured, axis=(0, 1)), 1e-300)
 
     def _autocorrelation_factors(self, residuals) -> Float[np.ndarray, "log channel"]:
         mask = self.data.mask > 0
@@ -492,14 +493,14 @@ def draw_start_points(
     own = np.array([[p.to_unbounded(p.start) for p in parameters]])
     if count == 1:
         return own
-    shares = qmc.LatinHypercube(len(parameters), rng=np.random.default_rng(seed)).random(count - 1)
+    draws = qmc.LatinHypercube(len(parameters), rng=np.random.default_rng(seed)).random(count - 1)
     columns = []
     for i, parameter in enumerate(parameters):
         if np.isfinite(parameter.high - parameter.low):
-            columns.append(parameter.unbounded_at_share(np.clip(shares[:, i], 1e-3, 1 - 1e-3)))
+            columns.append(parameter.unbounded_at_fraction(np.clip(draws[:, i], 1e-3, 1 - 1e-3)))
         else:
             width = WEAK_PRIOR_WIDTH / 2 * parameter.unbounded_size
-            columns.append(own[0, i] + width * norm.ppf(shares[:, i]))
+            columns.append(own[0, i] + width * norm.ppf(draws[:, i]))
     return np.concatenate([own, np.stack(columns, axis=1)])
 
 
@@ -545,7 +546,7 @@ def multi_start(
 
 
 def _distinct_minima(least_squares: LeastSquares, measured, noise, found) -> list[LocalMinimum]:
-    """Ends of searches, those at the same values taken together."""
+    """Local minima of the ends of searches; ends at the same values are one minimum."""
     sizes = np.array([parameter.typical_size for parameter in least_squares.parameters])
     values = [least_squares.values_at(point) for point in found["points"]]
     costs = np.array([least_squares.cost(value, noise, measured) for value in values])

@@ -187,7 +187,7 @@ def identify_from_modes(
 
 
 def _places(case: Case, identified: ModalEstimates) -> Float[np.ndarray, " channel"] | None:
-    """Positions (m) of the channels; None if not known, or not of one quantity of motion."""
+    """Positions (m) of the channels; None if not given, or not of one quantity of motion."""
     channels, places = identified.channels, []
     for i, position in enumerate(channels.positions):
         sensor = channels.sensors[i]
@@ -212,7 +212,10 @@ def _paired(identified: ModalEstimates, frequencies, shapes, has_shapes) -> tupl
 
 
 def _solve(identified, pairs, solved, parameters, y, has_shapes, with_damping):
-    """Least squares from search variables: those, values, residuals and Jacobian by values."""
+    """Least-squares solution: search variables, values, residuals, and Jacobian by the values.
+
+    The search begins at the search variables y.
+    """
     chosen = np.array([other for _, other, _ in pairs])
     measured = [identified.modes[mine] for mine, _, _ in pairs]
     f = np.array([mode.frequency for mode in measured])
@@ -232,8 +235,8 @@ def _solve(identified, pairs, solved, parameters, y, has_shapes, with_damping):
         if has_shapes:
             for i, mode in enumerate(measured):
                 own = shapes[:, chosen[i]] / shapes[largest[i], chosen[i]]
-                known = np.nan_to_num(mode.shape.real) / mode.shape.real[largest[i]]
-                parts.append(whitening[i] @ (own - known))
+                given = np.nan_to_num(mode.shape.real) / mode.shape.real[largest[i]]
+                parts.append(whitening[i] @ (own - given))
         parts.append(jnp.stack([p.prior.prior_residual(values[i])
                                 for i, p in enumerate(parameters)]))  # fmt: skip
         return jnp.concatenate(parts)
@@ -243,7 +246,7 @@ def _solve(identified, pairs, solved, parameters, y, has_shapes, with_damping):
 
     both = jax.jit(lambda point: (residual(values_at(point)),
                                   jax.jacfwd(lambda p: residual(values_at(p)))(point)))  # fmt: skip
-    # A weak prior around the start bounds what the modes do not tell; errors leave it out.
+    # A weak prior around the start bounds directions that the modes leave free; not in the errors.
     widths = WEAK_PRIOR_WIDTH * np.array([p.unbounded_size for p in parameters])
     found = scipy.optimize.least_squares(
         lambda point: np.concatenate([np.asarray(both(point)[0]), (point - y) / widths]),
@@ -262,9 +265,9 @@ def _solve(identified, pairs, solved, parameters, y, has_shapes, with_damping):
 
 
 def _whitening(mode, largest: int) -> Float[np.ndarray, "row channel"]:
-    """Matrix that makes the real parts of a shape of unit covariance.
+    """Matrix that whitens the real parts of a mode shape, to unit covariance.
 
-    The component that is one has no row, and neither have those that were not measured.
+    The `largest` component, which is scaled to 1, has no row, nor have those not measured.
     """
     others = [i for i in np.flatnonzero(np.isfinite(mode.shape)) if i != largest]
     covariance = mode.shape_covariance[np.ix_(others, others)]

@@ -120,7 +120,7 @@ def cross_validate(fit: Fit) -> list[HeldOutPrediction]:
     """Leave-one-out cross-validation: each log predicted by a fit to all others.
 
     Parameters of the log left out (its speed and entry time, say) stay at their starts, so its
-    prediction is as good as these are known. Nothing is compiled anew.
+    prediction is only as good as these. Nothing is compiled anew.
 
     Raises ValueError for a single log.
 

@@ -1,4 +1,4 @@
-"""Result of an identification: values with standard errors, residuals, and what to doubt.
+"""Result of an identification: values with standard errors, residuals, and remarks on both.
 
 Fits on disk: the parameters found, with the case and the logs, in one file.
 """

@@ -25,7 +25,7 @@ class Prior:
     `mean` and `deviation` (SI units) are those of a normal prior or, on the scale "log", of a
     log-normal one with the mean as median and deviation / mean as standard deviation of the
     logarithm. The fit is then the maximum a posteriori. The scales "log" and "logit" need two
-    bounds: starts are drawn evenly in the logarithm, or in the log-odds of the share between them.
+    bounds: starts are drawn evenly in the logarithm, or in the log-odds of the place between them.
 
     Raises ValueError for an unknown scale, a prior without mean or deviation, a deviation that is
     not positive, and a scale or prior that does not fit the bounds.
@@ -122,21 +122,25 @@ class FreeParameter:
             if self.prior.scale == "log":
                 least = min(least, BOUND_MARGIN * self.low)
             inside = np.clip(value, self.low + least, self.high - least)
-            return float(self.unbounded_at_share(np.asarray(self._share_between_bounds(inside))))
+            return float(
+                self.unbounded_at_fraction(np.asarray(self._fraction_between_bounds(inside)))
+            )
         if np.isfinite(self.low):
             return float(np.log(max(value - self.low, least)))
         if np.isfinite(self.high):
             return float(-np.log(max(self.high - value, least)))
         return value
 
-    def unbounded_at_share(self, share: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-        """Search variable at a share (0 to 1) of the distance between two bounds, on the scale."""
+    def unbounded_at_fraction(
+        self, fraction: Float[np.ndarray, "*any"]
+    ) -> Float[np.ndarray, "*any"]:
+        """Search variable at a fraction (0 to 1) of the way between two bounds, on the scale."""
         if self.prior.scale == "logit":
-            return np.asarray(np.log(share / (1 - share)))
-        return np.asarray(np.arcsin(2 * share - 1))
+            return np.asarray(np.log(fraction / (1 - fraction)))
+        return np.asarray(np.arcsin(2 * fraction - 1))
 
-    def _share_between_bounds(self, value: float) -> float:
-        """Share of the distance between both bounds (of logarithms, on the scale "log")."""
+    def _fraction_between_bounds(self, value: float) -> float:
+        """Fraction of the distance between both bounds (of logarithms, on the scale "log")."""
         if self.prior.scale == "log":
             return np.log(value / self.low) / np.log(self.high / self.low)
         return (value - self.low) / (self.high - self.low)
@@ -163,12 +167,12 @@ class FreeParameter:
     def from_unbounded(self, unbounded: Float[Array, ""]) -> Float[Array, ""]:
         """Value of a search variable."""
         if np.isfinite(self.high - self.low):
-            share = (1 + xp.sin(unbounded)) / 2
+            fraction = (1 + xp.sin(unbounded)) / 2
             if self.prior.scale == "log":
-                return self.low * (self.high / self.low) ** share
+                return self.low * (self.high / self.low) ** fraction
             if self.prior.scale == "logit":
-                share = (1 + xp.tanh(unbounded / 2)) / 2
-            return self.low + (self.high - self.low) * share
+                fraction = (1 + xp.tanh(unbounded / 2)) / 2
+            return self.low + (self.high - self.low) * fraction
         if np.isfinite(self.low):
             return self.low + xp.exp(unbounded)
         if np.isfinite(self.high):
@@ -180,11 +184,11 @@ class FreeParameter:
         if np.isfinite(self.high - self.low):
             if self.prior.scale == "logit":
                 return (self.high - self.low) / 4 / np.cosh(unbounded / 2) ** 2
-            share_slope = np.cos(unbounded) / 2
+            fraction_slope = np.cos(unbounded) / 2
             if self.prior.scale == "log":
                 value = float(self.from_unbounded(np.float64(unbounded)))
-                return value * np.log(self.high / self.low) * share_slope
-            return (self.high - self.low) * share_slope
+                return value * np.log(self.high / self.low) * fraction_slope
+            return (self.high - self.low) * fraction_slope
         if np.isfinite(self.low):
             return np.exp(unbounded)
         return np.exp(-unbounded) if np.isfinite(self.high) else 1.0

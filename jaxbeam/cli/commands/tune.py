@@ -227,7 +227,7 @@ def _write_and_print(result, tuned, files, picture, pictures, options: CaseOptio
         drawn = result if hasattr(result, "plot") else tuned[0]
         pictures.save(pictures.titled(drawn.plot()), picture)
     from jaxbeam.analysis.margins import stability_margin
-    from tuning.control.tuning_result import beside_hand_drawn
+    from tuning.control.tuning_result import hand_drawn_sentence
 
     summaries, closed = [one.to_dict() for one in tuned], []
     for one, summary in zip(tuned, summaries, strict=True):
@@ -241,7 +241,7 @@ def _write_and_print(result, tuned, files, picture, pictures, options: CaseOptio
     drawn_by_hand = _hand_drawn(tuned)
     if drawn_by_hand is not None:
         index, outcome, peaks = drawn_by_hand
-        by_hand = [beside_hand_drawn(outcome, peaks)]
+        by_hand = [hand_drawn_sentence(outcome, peaks)]
         summaries[index]["runs"][outcome.name]["peak_drawn_by_hand"] = peaks.tolist()
     options.report(
         summaries[0] if len(summaries) == 1 else {"front": summaries},

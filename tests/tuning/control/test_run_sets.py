@@ -129,7 +129,7 @@ def test_runs_in_groups_have_the_same_histories(monkeypatch):
     monkeypatch.setattr(run_set, "block_memory", lambda: 2.5 * run_bytes)
     assert run_set.runs_at_once(cases[0], wanted[0], plan) == 2
     assert run_set.runs_at_once(cases[0], np.arange(1e5), plan) == 1
-    monkeypatch.setattr(run_set, "MAX_KNOWN_RUNS", 0)
+    monkeypatch.setattr(run_set, "MAX_UNCOMPILED_RUNS", 0)
     found = run_set._uncontrolled_histories(cases, *wanted)
     assert found.deflection.shape == expected.deflection.shape == (3, 80, 2)
     assert_allclose(found.deflection, expected.deflection, atol=1e-12)

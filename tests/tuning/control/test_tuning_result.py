@@ -20,9 +20,9 @@ from tuning.control.tuning_result import (
     HAND_DRAWN,
     RunSetResult,
     TuningResult,
-    beside_hand_drawn,
     compare_runs,
     hand_drawn_peaks,
+    hand_drawn_sentence,
 )
 
 
@@ -216,7 +216,7 @@ def test_law_by_hand_beside_a_tuning():
     assert_allclose(peaks, found, rtol=1e-9)
     none = np.full(2, np.nan)
     outcome = RunSetResult("held-out", runs, 2 * peaks, none, none, peaks / 2, none, [1.0, 1.0])
-    assert beside_hand_drawn(outcome, peaks) == (
+    assert hand_drawn_sentence(outcome, peaks) == (
         "drawn by hand, with no number tuned: worst held-out run: peak 50.0% below no control; of"
         " the attainable reduction at least 66.7%, 66.7% in the mean"
     )

@@ -137,7 +137,7 @@ def test_scales(scale):
 
     for value in (0.15, 1.0, 3.0, 99.0):
         assert value_at(parameter.to_unbounded(value)) == pytest.approx(value)
-    shares = parameter.unbounded_at_share(np.array([0.25, 0.5, 0.75]))
+    shares = parameter.unbounded_at_fraction(np.array([0.25, 0.5, 0.75]))
     expected = [0.1, 1.0, 10.0] if scale == "log" else [25.0075, 50.005, 75.0025]
     np.testing.assert_allclose([value_at(y) for y in shares], expected, rtol=1e-9)
 

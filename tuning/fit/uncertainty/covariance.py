@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import t as student
 
-# In typical sizes of the parameters, as all of these but the share:
+# All but LEAST_PARTICIPATION are in typical sizes of the parameters.
 UNIDENTIFIABLE_SD = 0.5  # standard error beyond which a direction counts as unidentifiable
-PARTICIPATION_SHARE = 0.1  # of an unidentifiable direction: addresses with more are part of it
+LEAST_PARTICIPATION = 0.1  # component of a unit direction above which an address is part of it
 UNBOUNDED_SD = 1e4  # standard error given to a direction without any effect
 REPORTED_CHANGE = 0.1  # largest change with which an unidentifiable direction is reported
 
@@ -97,7 +97,7 @@ def uncertainty(
     correlation = covariance / np.outer(errors, errors)
     unidentifiable = spread > UNIDENTIFIABLE_SD
     participates = unidentifiable[:, None] & (
-        (np.abs(directions) > PARTICIPATION_SHARE) | (deviations > UNIDENTIFIABLE_SD)
+        (np.abs(directions) > LEAST_PARTICIPATION) | (deviations > UNIDENTIFIABLE_SD)
     )
     without_error = participates.any(axis=0) | (errors > UNIDENTIFIABLE_SD)
     changes = []

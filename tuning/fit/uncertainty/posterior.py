@@ -32,7 +32,7 @@ MIN_EFFECTIVE_DRAWS = 100  # below it intervals are not reliable
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Posterior(TableViews):
-    """Draws (chain, draw, parameter) of the free parameters in SI units, with diagnostics.
+    """Posterior draws (chain, draw, parameter) of the free parameters (SI units), with diagnostics.
 
     `r_hat` is the ratio of the spread between chains to that within (1 for chains that have mixed),
     `effective_draws` the number of independent draws; `divergences` counts divergent steps.

@@ -13,7 +13,7 @@ from tuning.fit.result import Fit
 from tuning.fit.uncertainty.covariance import t_quantile
 from tuning.fit.uncertainty.posterior import Posterior
 
-LINEAR_AGREEMENT = 0.25  # share of its half width by which an interval may differ to be alike
+LINEAR_AGREEMENT = 0.25  # relative difference of half widths below which intervals agree
 MAX_STEPS_PER_SIDE = 12  # steps to each side, each at most twice as long as the one before
 
 
