@@ -21,7 +21,7 @@ MIN_CORRELATION = 0.3
 
 
 def align_logs(logs: Sequence[Log]) -> Log:
-    """One log with the channels of several, at the sampling rate of the first, over common times.
+    """Join several logs to one: all channels, at the sampling rate of the first, over common times.
 
     A reading of one node is in phase or in antiphase with that of another in each mode, so that the
     largest absolute value of the correlation counts. `notes` give the offset and rate of each clock
@@ -128,7 +128,7 @@ def _clock(times, reference, own, values, source) -> tuple[float, float, float]:
 
 
 def _signal(values: Float[np.ndarray, "time channel"]) -> Float[np.ndarray, " time"]:
-    """The channel of a node with most energy, whitened so that one mode does not rule."""
+    """The channel of a node with most energy, whitened so that no single mode dominates."""
     levels = detrend(values, axis=0)
     signal = levels[:, np.argmax(np.var(levels, axis=0))]
     spectrum = np.fft.rfft(signal * np.hanning(signal.size))
@@ -138,7 +138,7 @@ def _signal(values: Float[np.ndarray, "time channel"]) -> Float[np.ndarray, " ti
 
 
 def _lag(a, b) -> tuple[float, float, bool]:
-    """Samples by which b is later in a, the correlation there, and whether it is significant."""
+    """Lag of b in a (samples), the correlation at it, and whether that is significant."""
     products = correlate(a, b, mode="full", method="fft")
     lags = np.arange(-b.size + 1, a.size)
     energy_a = np.concatenate([[0.0], np.cumsum(a**2)])

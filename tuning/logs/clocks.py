@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-# Names, in small letters, of numbers beside the channels that stand for their times.
+# Names, in small letters, of numbers stored with the channels that define their times.
 RATES = ("sample_rate", "sampling_rate", "samplerate", "fs", "rate")  # Hz
 STEPS = ("dt", "time_step", "wf_increment")  # s
 STARTS = ("start_time", "t0", "wf_start_offset")  # s
-SAME = 0.01  # of a step: start times that are rounded to microseconds differ by so much
+SAME = 0.01  # of a step: largest difference of equal start times, rounded to microseconds
 
 
 class Clock(NamedTuple):
@@ -25,7 +25,7 @@ def join_channels(
     channels: Mapping[str, np.ndarray],
     clocks: Mapping[str, Clock],
 ) -> tuple[Float[np.ndarray, " time"], dict[str, np.ndarray], list[str]]:
-    """Common times (s) of channels of one run, their values at these, and what was done.
+    """Common times (s) of the channels of one run, their values at these, and notes.
 
     Times are those of the channel with the shortest step, over the time that all have in common,
     from the start of the earliest. Others are interpolated (cubic spline) unless their samples are
@@ -85,7 +85,7 @@ def _shortened(text: str) -> str:
 def clocks_of(
     names: Sequence[str], starts: Mapping[str, float], steps: Mapping[str, float]
 ) -> dict[str, Clock]:
-    """Clocks of channels; one without a step has that of the first that has one."""
+    """Clocks of channels; a channel without a step has the step of the first that has one."""
     step = next(iter(steps.values()))
     return {name: Clock(starts.get(name, 0.0), steps.get(name, step)) for name in names}
 
@@ -93,7 +93,7 @@ def clocks_of(
 def clocks_by_numbers(
     source: str, numbers: Mapping[str, Mapping[str, float]], names: Sequence[str]
 ) -> dict[str, Clock] | None:
-    """Clocks of channels by numbers that stand beside them, as `fs`; None without a rate.
+    """Clocks of channels by numbers stored with them, as `fs`; None without a rate.
 
     Raises ValueError for a rate that is not positive, and for a rate and a step that contradict
     each other.

@@ -73,7 +73,7 @@ class LogDescription:
 
 
 def read_description(log: Path) -> LogDescription:
-    """Description in the TOML file beside a log, empty if there is none.
+    """Description of a log from the TOML file of the same stem; empty if there is none.
 
     Raises ValueError, naming file and key, for invalid TOML, unknown keys (with the nearest known
     one) and values of the wrong type.

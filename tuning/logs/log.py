@@ -24,12 +24,12 @@ MAX_GRID_DEVIATION_STEPS = 0.25  # steps between times and an even grid, for rou
 MAX_SIZE = 1e30  # of a sample in its SI unit; bytes in the wrong order are larger
 # Steps (s) of a log of vibrations: slower and faster ones are times in another unit than is said.
 PLAUSIBLE_STEPS = (1.5e-5, 0.11)
-MIN_SAMPLES = 8  # of a log whose steps tell something
-USUAL_STEPS = (2e-4, 0.02)  # that a likely unit would give
+MIN_SAMPLES = 8  # of a log whose steps are checked
+USUAL_STEPS = (2e-4, 0.02)  # steps (s) that the likely unit would give
 SCALES = {"ms": 1e-3, "us": 1e-6, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
-# Times in minutes that are read as seconds look like those of fast loggers. These have rates (Hz)
-# of series: powers of two, and some numbers times powers of two or of ten.
-FAST_RATE = 2500.0  # Hz, from which on times are compared with these series
+# Times in minutes that are read as seconds look like those of fast loggers. Rates (Hz) of fast
+# loggers belong to series: powers of two, and some numbers times powers of two or of ten.
+FAST_RATE = 2500.0  # Hz: rates from which on are compared with these series
 DOUBLED = (1.0, 25.0, 75.0)  # 12 800, 25 600, 51 200 and 1200, 2400, 4800 Hz, say
 DECIMAL = (1.0, 2.0, 2.5, 4.0, 5.0, 8.0)
 OTHERS = (22050.0, 44100.0, 96000.0, 192000.0)  # of sound cards
@@ -37,7 +37,7 @@ RATE_TOLERANCE = 1e-3  # of a rate: times are rounded
 
 
 class LogWarning(UserWarning):
-    """What a user must know of how a log was read, or of its times."""
+    """Warning about the way in which a log was read, or about its times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,10 +175,10 @@ def doubts(
     time_unit: str = "s",
     time_unit_is_sure: bool = False,
 ) -> Iterator[str]:
-    """Sentences on what looks wrong with a log: jumps and scale of its times, equal channels.
+    """Sentences on likely faults of a log: jumps and scale of its times, equal channels.
 
-    `lines` are the line numbers of the samples in the file, `time_unit` what it says of times; that
-    is sure where its format defines it or the user has given it.
+    `lines` are the line numbers of the samples in the file, `time_unit` is its unit of times, which
+    is sure where the format defines it or the user has given it.
     """
     steps = np.diff(times)
     usual = float(np.median(steps))
@@ -215,7 +215,7 @@ def doubts(
 
 
 def _is_of_series(rate: float) -> bool:
-    """Whether a rate (Hz) is one that loggers have."""
+    """Whether a rate (Hz) belongs to the series of rates of loggers."""
     doubled = np.outer(DOUBLED, 2.0 ** np.arange(21))
     decimal = np.outer(DECIMAL, 10.0 ** np.arange(7))
     series = np.concatenate([doubled.ravel(), decimal.ravel(), OTHERS])
@@ -233,7 +233,7 @@ class EvenRecord(NamedTuple):
 
 
 def even_records(log: Log) -> tuple[float, tuple[EvenRecord, ...], tuple[str, ...]]:
-    """Sampling rate (Hz), the records of a log between its gaps, and notes on what was done.
+    """Sampling rate (Hz), the evenly sampled records of a log between its gaps, and notes.
 
     All records have one rate, that of the usual step. Times off an even grid by more than rounding
     are interpolated (cubic spline) to the grid.
@@ -291,7 +291,7 @@ def between_gaps(times: Float[np.ndarray, " time"]) -> tuple[float, list[tuple[i
     return step, list(zip(edges[:-1], edges[1:], strict=True))
 
 
-SKIPPED = "-"  # name of a column that is not needed
+SKIPPED = "-"  # name that leaves a column out
 
 
 def with_named_columns(

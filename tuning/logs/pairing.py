@@ -24,7 +24,7 @@ def case_of_log(case: Case, log: Log, times: Float[np.ndarray, " time"]) -> Case
 
     Commands are linear from sample to sample. One that stays for two samples or more is held by its
     converter, and is weighted with its neighbours so that its steps are where they are in the log:
-    half a sample early, they would take k dt / 2 from the damping beside a spring k.
+    half a sample early, they would take k dt / 2 from the damping of a spring k.
     `times` (s) are those of the log and of its padding, in which the last commands stay. Raises
     ValueError, naming the log, for a command that no actuator of the case accepts.
     """
@@ -42,7 +42,7 @@ def case_of_log(case: Case, log: Log, times: Float[np.ndarray, " time"]) -> Case
 
 
 def _acting(command: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
-    """The command, or values whose lines act as it does where it is held over several samples.
+    """The command, or if its samples are held, values that act alike when joined by lines.
 
     Held from sample to sample it is sinc(x) exp(-i x) of its samples, x = omega dt / 2, and lines
     are sinc(x)^2: these weights make up for exp(-i x) / sinc(x) up to x^4.
@@ -54,9 +54,9 @@ def _acting(command: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
 
 
 def pad_cases(cases: list[Case], times: list[Float[np.ndarray, " time"]]) -> list[Case]:
-    """The cases, all with one structure: zero commands, and loads that enter after the end, added.
+    """The cases padded to one structure, by zero commands and by loads that enter after the end.
 
-    Thus a crossing without commands and a shaken beam without loads are alike.
+    Thus a crossing without commands and a shaken beam without loads have the same structure.
     """
     prescribed = any(isinstance(case.controller, Prescribed) for case in cases)
     longest = max((case.loads for case in cases), key=len)
@@ -70,7 +70,7 @@ def pad_cases(cases: list[Case], times: list[Float[np.ndarray, " time"]]) -> lis
 
 
 def _prescribing(case: Case, times, commands: Float[np.ndarray, "actuator time"]) -> Case:
-    """The case under a table of commands, of which springs and dampers take none."""
+    """The case with a table of commands for its actuators but springs and dampers."""
     values = commands[np.array(commanded(case.actuators), int)]
     controller = Prescribed(offsets=np.zeros(len(values)), times=times, values=values)
     return dataclasses.replace(case, controller=controller)
@@ -192,7 +192,7 @@ def check_times(log: Log) -> None:
 
 
 def check_loads(log: Log, case: Case) -> None:
-    """Raises ValueError unless a load is known and has crossed before the log ends."""
+    """Raises ValueError unless the log has a load, which has crossed before the log ends."""
     if case.controller is not None and not case.loads:
         return
     if not case.loads:

@@ -21,7 +21,7 @@ from tuning.logs.units import STANDARD_GRAVITY
 
 SPIKE_SD = 12.0  # robust standard deviations between a spike and its neighbours
 SPIKE_WINDOW_SAMPLES = 31  # samples around a spike, for that standard deviation
-MIN_SPIKE_RANGE_SHARE = 0.02  # height of a spike over the range of its channel
+MIN_SPIKE_HEIGHT = 0.02  # height of a spike over the range of its channel
 MIN_CLIPPED_READINGS = 4  # equal readings at an extreme value that are clipped
 MIN_STUCK_SAMPLES = 12  # equal samples in a channel that otherwise never repeats a value
 GRAVITY_TOLERANCE = 0.1  # of standard gravity, for the mean of an accelerometer that feels it
@@ -31,7 +31,7 @@ MAX_CLOCK_DRIFT_STEPS = 0.5  # steps between times and an even grid, at mid-log
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fault:
-    """A fault of a channel (None: of the times), and the samples that it concerns."""
+    """A fault of a channel (None: of the times), and the mask of the samples with it."""
 
     kind: str
     channel: str | None
@@ -156,9 +156,7 @@ def _spikes(values: Float[np.ndarray, " time"]) -> Bool[np.ndarray, " time"]:
     # A spike stands out on both sides; a jump, or a neighbour of a spike, does not.
     rise, fall = here - left, here - right
     prominence = np.minimum(np.abs(rise), np.abs(fall)) * (rise * fall > 0)
-    least = np.maximum(
-        SPIKE_SD * noise_level, MIN_SPIKE_RANGE_SHARE * np.ptp(np.sort(values)[1:-1])
-    )
+    least = np.maximum(SPIKE_SD * noise_level, MIN_SPIKE_HEIGHT * np.ptp(np.sort(values)[1:-1]))
     spikes[2:-2] = (prominence > deviation / 2) & (deviation > least)
     return spikes
 

@@ -1,9 +1,9 @@
-"""Logs read from files, with the descriptions beside them.
+"""Logs read from files, with their descriptions.
 
     log = read_log("run7.csv")                        # units in the headings: time [s], d1 [mm]
     log = read_log("run7.csv", units={"time": "s", "d1": "mm"}, columns=["d1"])
 
-A TOML file of the same stem beside a log describes it (all entries are optional):
+A TOML file of the same stem and folder describes a log (all entries are optional):
 
     time = "t"                                        # column of times
     [columns]                                         # only these are read
@@ -41,9 +41,9 @@ from tuning.logs.readers import LogTable, is_time_name, read_tables
 from tuning.logs.readers.table import shown
 from tuning.logs.units import UNITS, UNITS_OF_CONDITIONS, is_unit, transducer_unit, unit
 
-EPOCH, LATEST = 3e8, 1e10  # s since 1970: times of so much are dates, from 1979 on
+EPOCH, LATEST = 3e8, 1e10  # s since 1970: times between these are dates, from 1979 on
 EPOCH_START, WORKBOOK_DAYS = datetime(1970, 1, 1, tzinfo=UTC), 25569  # days from 1899-12-30 to it
-EPOCHS = {"ns": 3e17, "us": 3e14, "ms": 3e11, "s": EPOCH}  # likewise, in the unit that it tells
+EPOCHS = {"ns": 3e17, "us": 3e14, "ms": 3e11, "s": EPOCH}  # least such time, by its unit
 MAX_TEXT = 120  # characters of the name or the unit of a column, as messages quote it
 
 
@@ -119,7 +119,7 @@ def read_logs(
     tables = {}
     for name, table in read_tables(path).items():
         _check_texts(path, table)
-        table = _told_apart(table)
+        table = _with_distinct_names(table)
         table, channels, declared = with_named_columns(path, table, columns)
         table = with_times(path, table, rate, time)
         for part, rows in _split_runs(name, table).items():
@@ -162,7 +162,7 @@ def _split_runs(name: str, table: LogTable) -> dict[str, LogTable]:
 def _make_log(
     path, run, table: LogTable, description: LogDescription, columns, units, time, missing
 ) -> tuple[Log, list[str]]:
-    """Log of one run, in SI units, and what its user must know."""
+    """Log of one run, in SI units, and sentences of which its user is warned."""
     table = _without_repeats(table)
     names = _check_names(path, table.names)
     time_column = _time_column(path, table, time or description.time)
@@ -248,8 +248,8 @@ def _make_log(
     return log, said
 
 
-def _told_apart(table: LogTable) -> LogTable:
-    """The table with columns of one name told apart, as a1 and a1 (2), with a warning."""
+def _with_distinct_names(table: LogTable) -> LogTable:
+    """The table with columns of equal names renamed, as a1 and a1 (2), with a warning."""
     if len(set(table.names)) == len(table.names):
         return table
     names: list[str] = []
@@ -260,12 +260,12 @@ def _told_apart(table: LogTable) -> LogTable:
             own = f"{name} ({count})"
         names.append(own)
     new = ", ".join(name for name in names if name not in table.names)
-    said = f"columns of one name are told apart: {new}"
+    said = f"columns of equal names are renamed: {new}"
     return dataclasses.replace(table, names=tuple(names), warnings=(*table.warnings, said))
 
 
 def _without_repeats(table: LogTable) -> LogTable:
-    """The table without rows that are those before once more, with a warning."""
+    """The table without rows that repeat earlier ones, with a warning."""
     values = table.values
     same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
     again = np.flatnonzero(same.all(axis=1)) + 1
@@ -273,7 +273,7 @@ def _without_repeats(table: LogTable) -> LogTable:
         return table
     lines = None if table.lines is None else np.delete(table.lines, again)
     where = "" if table.lines is None else f", the first in line {table.lines[again[0]]}"
-    said = f"{again.size} rows are those before them once more and left out{where}"
+    said = f"{again.size} rows repeat the one before and are left out{where}"
     return dataclasses.replace(
         table, values=np.delete(values, again, axis=0), lines=lines,
         warnings=(*table.warnings, said),
@@ -283,10 +283,10 @@ def _without_repeats(table: LogTable) -> LogTable:
 def _no_channels(
     table: LogTable, channels: Sequence[str], description: LogDescription
 ) -> list[str]:
-    """Columns whose units are unknown, as those of temperatures, and of no description.
+    """Columns that are no channels: units that are no SI quantity, as of temperatures.
 
-    Columns without a unit are none as well, where others have one. None where no channel would be
-    left: then a unit is misspelt.
+    And not in the description of the log. Columns without a unit belong to them where others have
+    one. Empty where no channel would be left: then a unit is misspelt.
     """
     units = dict(zip(table.names, table.units, strict=True))
     unknown = [
@@ -298,7 +298,7 @@ def _no_channels(
 
 
 def _left_out(table: LogTable, names: Sequence[str]) -> Iterator[str]:
-    """Sentences on columns that are no channels, of units that are not those of conditions."""
+    """Sentences on columns that are neither channels nor conditions such as temperatures."""
     for name in names:
         text = table.units[table.names.index(name)]
         if not text:
@@ -384,7 +384,7 @@ def _unit_of(
     if not text and is_time_name(name):
         first = float(table.values[0, table.names.index(name)]) if len(table.values) else 0.0
         text = next((u for u, least in EPOCHS.items() if first > least), None)
-        # As variables of numerical programs have it; `doubts` looks at the steps.
+        # Variables of numerical programs have no unit of time; `doubts` checks the steps.
         text = text or ("s" if table.lines is None else None)
     if not text:
         raise ValueError(

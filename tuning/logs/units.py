@@ -100,7 +100,7 @@ def unit(text: str) -> Unit:
     return UNITS[name]
 
 
-# Of columns beside the channels: temperature, humidity, pressure, light, wind, speed, current.
+# Of columns that are no channels: temperature, humidity, pressure, light, wind, speed, current.
 UNITS_OF_CONDITIONS = frozenset(
     ["°C", "ºC", "℃", "degC", "DegC", "Deg C", "deg C", "C", "Celsius", "°F", "degF", "Deg F"]
     + ["K", "%", "%RH", "hPa", "mbar", "bar", "kPa", "lx", "lux", "W/m^2", "W/m²", "km/h", "mph"]

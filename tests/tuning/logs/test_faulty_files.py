@@ -263,12 +263,12 @@ def test_times_that_go_back_or_stand_are_refused(tmp_path, times, said):
         read_log(csv(tmp_path / "run.csv", times, form="{:.6f},{:.12f}\n"))
 
 
-def test_columns_of_one_name_are_told_apart(tmp_path):
+def test_columns_of_equal_names_are_renamed(tmp_path):
     rows = "".join(f"{t:.6f},{signal(t):.6f},{2 * signal(t):.6f}\n" for t in TIMES)
     (tmp_path / "run.csv").write_text(f"time [s],w [mm],w [mm]\n{rows}")
-    log = read_warned(tmp_path / "run.csv", "columns of one name are told apart: w .2.")
+    log = read_warned(tmp_path / "run.csv", "columns of equal names are renamed: w .2.")
     assert log.names == ("w", "w (2)")
-    log = read_warned(tmp_path / "run.csv", "told apart", columns="w (2)")
+    log = read_warned(tmp_path / "run.csv", "renamed", columns="w (2)")
     np.testing.assert_allclose(1e3 * log.values[:, 0], 2 * signal(TIMES), atol=1e-6)
 
 

@@ -41,7 +41,7 @@ _ZONE = rf"(?P<zone>{'|'.join(_ZONES)}|[-+]\d{{2}}:?\d{{2}})?"
 _STAMP = re.compile(rf"{_DATE}[T ]\s*{_CLOCK}\s*{_ZONE}")
 _DAY, _TIME_OF_DAY = re.compile(_DATE), re.compile(_CLOCK)
 DAY, HOUR = 86400.0, 3600.0  # s
-LEAST_SECONDS = 4  # of stamps without fractions, from which the samples in one are counted
+LEAST_SECONDS = 4  # number of stamps without fractions from which the samples in one are counted
 
 
 def is_day(cell: str) -> bool:
@@ -57,7 +57,7 @@ def is_stamp(cell: str) -> bool:
 
 
 class Stamps(NamedTuple):
-    """Seconds from the first stamp, that stamp (ISO 8601, or the time of day), what was done."""
+    """Seconds from the first stamp, that stamp (ISO 8601, or the time of day), and notes."""
 
     seconds: list[float]
     start: str
@@ -77,11 +77,11 @@ def seconds_of(path: Path, column: str, cells: Sequence[str], lines: Sequence[in
     """Seconds from the first stamp of a column.
 
     After midnight times of day go on, and so do local times when the clock is set by an hour.
-    Stamps of whole seconds that repeat evenly are samples of so many a second. Of day and month
-    that is the first with which stamps are nearer to each other.
+    Stamps of whole seconds that repeat evenly are samples of so many a second. Where day and month
+    are ambiguous, the order is the one in which stamps are nearer to each other.
 
     Raises ValueError, naming the line, for a cell that is no stamp like the first, and dates whose
-    day and month cannot be told apart.
+    day and month are ambiguous.
     """
 
     def place(line):
@@ -152,7 +152,7 @@ def epoch_seconds(stamp: str) -> float:
 def _moments(found: Sequence[re.Match]) -> list[datetime]:
     """Dates and times of stamps.
 
-    Raises ValueError if day and month cannot be told apart.
+    Raises ValueError if day and month are ambiguous.
     """
     order = _order(found)
     if order is not None:
@@ -161,19 +161,19 @@ def _moments(found: Sequence[re.Match]) -> list[datetime]:
     even = [moments for moments in tried if _is_even(moments)]
     if len(even) != 1:
         raise ValueError(
-            "whether the day or the month comes first cannot be told; write 2024-05-14 09:30:00"
+            "whether the day or the month comes first is ambiguous; write 2024-05-14 09:30:00"
         )
     return even[0]
 
 
 def _is_even(moments: Sequence[datetime]) -> bool:
-    """Whether some moments, three or more, have no step of a day and more than others."""
+    """Whether three or more times ascend in steps that differ by less than half a day."""
     steps = [(b - a).total_seconds() for a, b in itertools.pairwise(moments)]
     return len(steps) > 1 and min(steps) >= 0 and max(steps) < min(steps) + DAY / 2
 
 
 def _order(found: Sequence[re.Match]) -> str | None:
-    """Order of year, month and day in dates; None if it cannot be told."""
+    """Order of year, month and day in dates; None if it is ambiguous."""
     if len(found[0]["a"]) == 4:
         return "ymd"
     if found[0]["mark"] == "." or any(_number(one["a"]) > 12 for one in found):
@@ -186,7 +186,7 @@ def _order(found: Sequence[re.Match]) -> str | None:
 
 
 def _number(part: str) -> int:
-    """Number of a day, month or year; ValueError for no month's name."""
+    """Number of a day, month or year; ValueError for a word that is not the name of a month."""
     return int(part) if part.isdecimal() else _MONTHS.index(part[:3].lower()) + 1
 
 
@@ -266,7 +266,7 @@ def find_headings(rows: Sequence[Sequence[str]]) -> Headings:
     if first < len(rows) and not any(_is_number(cell) for row in rows[after:first] for cell in row):
         after = first
     skipped = after - 1 - has_unit_row
-    notes = (f"{skipped} lines beside the headings are skipped",) if skipped else ()
+    notes = (f"{skipped} lines other than the headings are skipped",) if skipped else ()
     return Headings(names, units, after, notes)
 
 
@@ -279,7 +279,7 @@ def is_numeric(row: Sequence[str]) -> bool:
 
 
 def _is_number(cell: str) -> bool:
-    """Whether a cell is a number, or nan, and no word that stands for a sample that is missing."""
+    """Whether a cell is a number or nan; not so words for a missing sample."""
     found = number_of(cell)
     return found is not None and (not np.isnan(found) or "nan" in cell.lower())
 

@@ -131,7 +131,7 @@ def read_mat(path: Path) -> dict[str, LogTable]:
     """Tables of a MATLAB file: a run of its variables, and one for each struct of vectors.
 
     A struct `units` within a run has the units of its variables. Without a variable of times, one
-    number `fs` (Hz) or `dt` (s) beside them says how they are sampled. The entries of an array of
+    number `fs` (Hz) or `dt` (s) among them says how they are sampled. The entries of an array of
     structs are runs `name.0`, `name.1`, ... Other scalars and text are left out.
 
     Raises ValueError for a damaged file, or one that holds objects only (such as a timetable).

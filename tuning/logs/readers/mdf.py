@@ -29,7 +29,7 @@ def read_mdf(path: Path) -> dict[str, LogTable]:
 
     Channels of one group have its times. Those of several groups, as at other rates, are joined by
     the start and step of each, with a warning. Channels of text are left out; a name that several
-    groups have, or that is one of times, is told apart by the number of the group. Samples that
+    groups have, or that is one of times, gets the number of the group. Samples that
     the file marks as invalid are NaN.
 
     Raises ValueError for a damaged file, and for several groups of which one has uneven times;

@@ -24,7 +24,7 @@ _NO_SAMPLE = frozenset(
     + ["#n/a", "n/a", "na", "null", "none", "#num!", "#value!", "missing", "---", "--", "*****"]
 )
 MAX_SHOWN = 40  # characters of a cell in a message
-MIN_CHANNEL_SHARE = 0.1  # of the samples: shorter arrays are no channels, and may be left out
+MIN_CHANNEL_LENGTH = 0.1  # of the samples: shorter arrays are no channels, and may be left out
 CHECKED_ROWS = 200  # at the end of a file, with which its last one is compared
 TIME_NAMES = ("time", "t", "zeit", "temps", "x_value", "timestamp")
 
@@ -115,7 +115,7 @@ def table_of(
     for label, array in arrays.items():
         if length not in array.shape or array.ndim > 2:
             left_out.append(f"{label} ({' x '.join(map(str, array.shape))})")
-            lost |= max(array.shape, default=0) > MIN_CHANNEL_SHARE * length
+            lost |= max(array.shape, default=0) > MIN_CHANNEL_LENGTH * length
             lost |= label in (clocks or ()) and not has_times
             continue
         name, unit = parse_heading(label)
@@ -138,7 +138,7 @@ def table_of(
 
 
 def upright(array: np.ndarray) -> np.ndarray:
-    """An array with time along its first axis: channels that stand in rows are few."""
+    """The array with time along its first axis, which is the longer one."""
     return array.T if array.ndim == 2 and array.shape[0] < array.shape[1] else array
 
 

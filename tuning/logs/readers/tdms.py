@@ -34,7 +34,7 @@ def read_tdms(path: Path) -> dict[str, LogTable]:
     nptdms = import_extra("nptdms", "tdms")
     try:
         with _silenced(nptdms):
-            with open(path, "rb") as opened:  # by name, an old .tdms_index beside it would be read
+            with open(path, "rb") as opened:  # by name, an old .tdms_index of it would be read
                 file = nptdms.TdmsFile.read(opened)
             groups = {group.name: _channels(group) for group in file.groups()}
     except Exception as error:  # npTDMS raises many types for damaged files

@@ -1,4 +1,4 @@
-"""Sound files (.wav), as data loggers write them, too: shares of a range that the user tells."""
+"""Sound files (.wav), as data loggers write them, too: fractions of a range that the user gives."""
 
 import io
 import warnings
@@ -15,7 +15,7 @@ MAGICS = b"RIFF", b"RIFX", b"RF64"
 def read_wav(path: Path) -> dict[str, LogTable]:
     """Table of the channels of a sound file, called channel 1, channel 2, ...
 
-    Whole numbers become shares of the range, between -1 and 1; others stay as they are.
+    Whole numbers become fractions of the range, between -1 and 1; others stay as they are.
 
     Raises ValueError for a damaged file.
     """
