@@ -15,7 +15,7 @@ from scipy.stats import norm, t as student
 from tuning.modal.likelihood.refine import Start, refine_modes
 from tuning.modal.preprocessing import Prepared, check_length, prepare
 from tuning.modal.result import (
-    MIN_ENERGY_SHARE,
+    MIN_ENERGY,
     SAME_MAC,
     IdentifiedMode,
     frequency_and_damping,
@@ -35,7 +35,7 @@ from tuning.modal.subspace import (
 
 MAX_ORDER = 60  # of models in a stabilisation diagram, by default
 MAX_BAND_RATIO = 8.0  # upper over lower end of the bands that are identified one by one
-BAND_OVERLAP = 1.1  # by which such bands exceed their part
+BAND_OVERLAP = 1.1  # factor by which such bands extend beyond their part
 RECORD_OVER_ROWS = 4  # samples of a record over block rows, for covariances of all lags
 MIN_LENGTH = RECORD_OVER_ROWS * MIN_BLOCK_ROWS
 DUPLICATE_SDS = 2.0  # standard deviations within which two poles are one
@@ -139,18 +139,18 @@ def _modes_of_band(prepared: Prepared, whole, data_driven, order, refine):
     ]
     reasons = [rejection_reason(mode, duration, whole) for mode in modes]
     if refine:
-        doubtful = [one or _beside(k, modes, reasons) for k, one in enumerate(reasons)]
+        doubtful = [one or _overlap_words(k, modes, reasons) for k, one in enumerate(reasons)]
         if any(doubtful):
             refined = _decided(modes, doubtful, records, prepared.rate, scale, duration, whole)
-            modes, reasons = _known(modes, reasons, *refined)
+            modes, reasons = _after_refinement(modes, reasons, *refined)
     candidates = [Candidate(*found) for found in zip(modes, reasons, lengths, strict=True)]
     return candidates, diagram
 
 
-def _beside(k, modes, reasons) -> str:
-    """Words for an accepted mode of one channel that intervals cannot tell from another.
+def _overlap_words(k, modes, reasons) -> str:
+    """Words for an accepted mode of one channel whose interval overlaps that of another mode.
 
-    Of several channels the shapes tell whether there is another (`_is_same`).
+    With several channels the shapes decide whether two poles are one mode (`_is_same`).
     """
     if modes[k].shape.size > 1:
         return ""
@@ -162,8 +162,8 @@ def _beside(k, modes, reasons) -> str:
     return f"not told from {near[0]:.4g} Hz" if near else ""
 
 
-def _known(modes, reasons, refined, decided):
-    """Refined modes and reasons; accepted modes that are at none of their places stay as before."""
+def _after_refinement(modes, reasons, refined, decided):
+    """Modes and reasons after refinement; accepted modes that were not refined stay."""
     accepted = [mode for mode, reason in zip(refined, decided, strict=True) if not reason]
     for k, mode in enumerate(modes):
         if decided[k] and not reasons[k] and not any(_is_same(mode, one) for one in accepted):
@@ -172,12 +172,12 @@ def _known(modes, reasons, refined, decided):
 
 
 def _decided(modes, reasons, records, rate, scale, duration, whole):
-    """Modes and reasons with those rejected modes accepted that the likelihood needs.
+    """Modes and reasons after the likelihood has accepted the rejected modes that it needs.
 
     Modes without energy would not be accepted.
     """
     order = sorted(
-        (k for k, mode in enumerate(modes) if mode.energy_share > MIN_ENERGY_SHARE),
+        (k for k, mode in enumerate(modes) if mode.energy_share > MIN_ENERGY),
         key=lambda k: (bool(reasons[k]), modes[k].damping_sd / modes[k].damping_ratio),
     )
     start = Start(
@@ -248,12 +248,12 @@ def mode_of_chain(poles: Poles, chain: Chain, found: dict[int, Spread], scale) -
 def with_usual_spread(
     mode: IdentifiedMode, poles: Poles, chain: Chain, found: dict[int, Spread]
 ) -> IdentifiedMode:
-    """The mode with the uncertainty of the lower eighth of its chain, and that of the order.
+    """The mode with the usual uncertainty of its chain, and the scatter over model orders.
 
-    That the uncertainty of a pole is the least of a chain makes it too small by chance. A model of
-    low order, in which close or weak modes are one, has poles that vary little from block to block,
-    and are biased: what the less uncertain half of the chain differs from the pole adds to its
-    variance.
+    The least uncertainty of a chain is too small by chance, so that its lower eighth is taken. A
+    model of low order, in which close or weak modes are one, has biased poles that vary little from
+    block to block: the mean square distance of the less uncertain half of the chain from the pole
+    adds to its variance.
     """
     ranked = sorted(chain.members.tolist(), key=lambda k: np.linalg.det(found[k].covariance))
     usual, least = (np.diag(found[k].covariance) for k in (ranked[len(ranked) // 8], ranked[0]))
@@ -270,7 +270,7 @@ def with_usual_spread(
 
 
 def _rescaled(shape, covariance, scale, largest):
-    """Covariance of a shape in other units, with another component equal to one."""
+    """Covariance of a shape after a change of units and of the component that is one."""
     count = shape.size
     unit = shape * scale / (shape[largest] * scale[largest])
     # d unit = S (d shape - shape d shape_L / shape_L) / (shape_L s_L), complex linear.
@@ -293,7 +293,7 @@ def without_duplicates(found: list[Candidate]) -> tuple[Candidate, ...]:
 
 
 def _is_same(a: IdentifiedMode, b: IdentifiedMode) -> bool:
-    """Whether two poles stand for one mode: alike in shape, and not told apart in frequency.
+    """Whether two poles stand for one mode: similar in shape, and indistinguishable in frequency.
 
     They agree in frequency and damping within two standard deviations of the difference; or their
     95 % intervals of frequency overlap and the frequencies differ by less than half of the smaller

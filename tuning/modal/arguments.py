@@ -15,7 +15,7 @@ METHODS = (DECAY, "covariance", "data", "plscf")  # the last is for measured for
 
 @dataclass(frozen=True)
 class ModalSettings:
-    """What `identify_modes` is told beside the log, its part, and the method.
+    """Settings of `identify_modes`, apart from the part of the log and the method.
 
     `count` modes are kept, those with most energy. `exclude` are frequencies (Hz) that are no
     modes. The modes nearest to the frequencies `choose` (Hz) are kept, also those that are not well
@@ -27,7 +27,7 @@ class ModalSettings:
     sensor has answered interpolated, but with samples `as_logged`.
 
     Raises ValueError for a count below one, an order below four, frequencies to choose that are not
-    positive, and a choice beside a count or excluded frequencies, as all modes are chosen then.
+    positive, and a choice with a count or excluded frequencies, as it chooses all modes.
 
         >>> ModalSettings(count=3, exclude=[50.0]).count
         3
@@ -80,7 +80,7 @@ def check_band(log: Log, rate: float, band: tuple[float, float] | None) -> None:
 def check_force(settings: ModalSettings, kind: str | None, method: str | None) -> None:
     """Check that a measured force, or its window, is used.
 
-    Raises ValueError for either beside a kind, or with a method that does not use it.
+    Raises ValueError for either with a kind, or with a method that does not use it.
     """
     if settings.force is None and settings.force_window is None:
         return
@@ -118,7 +118,7 @@ def check_method(kind: str | None, method: str | None) -> None:
         raise ValueError("method 'decay' fits free decays; for kind 'ambient' leave the method out")
 
 
-MAX_DISTANCE = 0.02  # of a frequency, of the mode that is chosen by it
+MAX_DISTANCE = 0.02  # relative distance of a mode from the frequency that chooses it
 
 Judged = tuple[IdentifiedMode, str]  # a mode and the reason for rejecting it, or none
 
@@ -126,7 +126,7 @@ Judged = tuple[IdentifiedMode, str]  # a mode and the reason for rejecting it, o
 def chosen_modes(
     judged: Sequence[Judged], frequencies: Sequence[float], source: str
 ) -> tuple[list[Judged], list[Judged], list[str]]:
-    """The modes nearest to frequencies (Hz), the others, and what speaks against chosen ones.
+    """The modes nearest to frequencies (Hz), the others, and warnings about chosen ones.
 
     Raises ValueError for a frequency without a mode within 2 %, and for two that choose one mode.
     """

@@ -1,4 +1,4 @@
-"""Modes identified from a log, with all that was chosen on the way."""
+"""Modes identified from a log, with the automatic choices that were made."""
 
 import os
 from dataclasses import dataclass
@@ -62,7 +62,7 @@ class ModalFit(ModalEstimates):
 
     @property
     def window(self) -> tuple[float, float]:
-        """Start and end (s) of all that was used of the log."""
+        """Start and end (s) of the part of the log that was used."""
         return self.windows[0][0], self.windows[-1][1]
 
     @property
@@ -99,7 +99,7 @@ class ModalFit(ModalEstimates):
         return "\n".join(lines)
 
     def to_dict(self) -> dict:
-        """Plain numbers for JSON: modes with 95 % intervals and shapes, and what was chosen."""
+        """Plain numbers for JSON: modes with 95 % intervals and shapes, and automatic choices."""
         return {
             "kind": self.kind,
             "method": self.method,

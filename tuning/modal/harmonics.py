@@ -30,12 +30,12 @@ RAYLEIGH_RATIO = 0.5227  # deviation over mean of the envelope of a random vibra
 RATIO_SD, DOUBTFUL_SDS, STEADY_SDS = 0.43, 2.3, 3.3
 STEADY_RATIO = 0.35  # of the envelope of a line in noise of a tenth of its power
 HALF_POWER_WIDTHS = 4.0  # half width of the filter around a pole
-MAX_LINES = 100  # the strongest
+MAX_LINES = 100  # largest number of lines, the strongest ones
 MIN_SERIES = 3  # lines that are multiples of one frequency
 
 
 class Line(NamedTuple):
-    """A harmonic line: frequency (Hz) and its share of the variance of the record.
+    """A harmonic line: frequency (Hz) and its fraction (`share`) of the variance of the record.
 
     `pole` (1/s) is that of a line that wanders and was taken for a mode; other lines are subtracted
     before modes are sought.
@@ -109,7 +109,7 @@ def is_multiple(frequency: float, tolerance: float, speed: float | None) -> bool
 
 
 def share_of(record: Float[np.ndarray, "time channel"], rate: float, frequency: float) -> float:
-    """Share of a sinusoid (Hz) in the variance of a record, on average over channels."""
+    """Fraction of the variance of a record in a sinusoid (Hz), on average over channels."""
     amplitude = _amplitudes(record, rate, frequency, 1)[0]
     return float(np.mean(np.abs(amplitude) ** 2 / 2 / np.maximum(record.var(axis=0), 1e-300)))
 
@@ -164,7 +164,7 @@ def _falls(sizes):
 def steadiness(
     record: Float[np.ndarray, "time channel"], rate: float, frequency: float, damping_ratio: float
 ) -> float:
-    """By how many standard deviations the vibration at a pole is steadier than a resonance.
+    """Steadiness of the vibration at a pole compared with a resonance, in standard deviations.
 
     The envelope of a resonance under random excitation has Rayleigh's distribution, with a ratio of
     deviation to mean of 0.52 (a kurtosis of 3 of the vibration; Jacobsen, Andersen and Brincker
@@ -245,7 +245,7 @@ def band_of(
 
 
 def lines_besides(lines: tuple[Line, ...], modes: Sequence[IdentifiedMode]) -> tuple[Line, ...]:
-    """Lines that are no modes of free decays.
+    """Harmonic lines without those that are modes of free decays.
 
     After impacts at equal intervals a mode of little damping may look like a line.
     """

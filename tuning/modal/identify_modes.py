@@ -56,7 +56,7 @@ from tuning.modal.stabilisation import Diagram
 
 FORCED = "measured force"
 NARROW = 0.005  # damping ratio of a mode below which it may be a harmonic
-TRANSIENT_SHARE = 0.01  # excited samples of a log with transients of crossing loads
+MIN_TRANSIENT_SAMPLES = 0.01  # excited samples of a log with transients of crossing loads
 
 
 @refuses_traced("a modal fit")
@@ -78,8 +78,8 @@ def identify_modes(
     decided from the log; `method` is "decay" (poles of free decays), "covariance" or "data"
     (subspace identification), which take a log for the response to broadband excitation; where
     forces were measured, "plscf" (poly-reference least-squares complex frequency) fits the
-    responses to them, and is the default. `channels` are the names of those to use. `settings` tell
-    what else may be chosen. `progress` is called with a few words on what is being done.
+    responses to them, and is the default. `channels` are the names of those to use. `settings` has
+    further choices. `progress` is called with a few words on what is being done.
 
     Raises ValueError for a log without evenly sampled records, or too short, a window outside the
     log, a band above half the sampling rate, unknown channels, kinds and methods, a kind or forces
@@ -115,7 +115,7 @@ def identify_modes(
         )
     samples = samples_of(logs, window).with_notes(dead)
     check_band(logs[0], samples.rate, band)
-    choices = _together(logs)
+    choices = _joint_analysis(logs)
     derivatives = tuple(time_derivative(name) for name in logs[0].quantities)
     if forces:
         used_band = band or energy_band(samples.records, samples.rate, derivatives)
@@ -145,11 +145,11 @@ def identify_modes(
     excited = find_excited(samples, derivatives, used_band)
     kind = "free decay" if method == DECAY else kind
     how = {"kind": kind, "whole": window is not None, "order": order}
-    told, may_decay = None, kind != "ambient" and method in (None, DECAY)
+    of_decays, may_decay = None, kind != "ambient" and method in (None, DECAY)
     if may_decay:
         bands, narrow = (used_band, wide), band is None
-        told = modes_of_decays(samples, excited, derivatives, bands, narrow, how)
-    found, used_band = (_Found(*told[:3]), told.band) if told else (None, wide)
+        of_decays = modes_of_decays(samples, excited, derivatives, bands, narrow, how)
+    found, used_band = (_Found(*of_decays[:3]), of_decays.band) if of_decays else (None, wide)
     if kind == "free decay" and found is None:
         raise ValueError(f"{logs[0].source}: no free decay found; give its window, or kind ambient")
     used_method = method or "covariance"
@@ -190,8 +190,8 @@ def identify_modes(
     return _result(logs, samples, found, used_band, lines, choices, used_method, settings)
 
 
-def _together(logs: Sequence[Log]) -> list[Choice]:
-    """That several logs are used together."""
+def _joint_analysis(logs: Sequence[Log]) -> list[Choice]:
+    """Choice to analyse several logs jointly; none for a single log."""
     if len(logs) == 1:
         return []
     text = f"{len(logs)} logs of the same channels, used together"
@@ -199,14 +199,14 @@ def _together(logs: Sequence[Log]) -> list[Choice]:
 
 
 def _band_choice(band, used: tuple[float, float]) -> list[Choice]:
-    """The band that was used, if it was chosen."""
+    """Choice of the band that was used; none if the user gave it."""
     if band is not None:
         return []
     return [Choice(f"band {used[0]:.3g} Hz to {used[1]:.4g} Hz", "--band LOW:HIGH")]
 
 
 class _Found(NamedTuple):
-    """Candidates, diagrams, decays that were fitted if any, and kind."""
+    """Result of a method: candidates, diagrams, fitted decays if any, and kind of excitation."""
 
     candidates: tuple[Candidate, ...]
     diagrams: tuple[Diagram, ...]
@@ -221,14 +221,14 @@ def _add_order(choices, order, found: _Found) -> None:
 
 
 def _forced(samples: Samples, driving, band, order, progress) -> tuple[_Found, float]:
-    """Modes of the responses to forces, and the share of the responses that these explain."""
+    """Modes of the responses to measured forces, and the fraction of these that they explain."""
     arguments = (samples.records, driving, samples.rate, band)
     found = forced_modes(*arguments, order=order, progress=progress)
     return _Found(found.candidates, found.diagrams, None, kind=FORCED), found.explained
 
 
 def _ambient_modes(cleaned, samples: Samples, band, method, order, progress) -> _Found:
-    """What a method for ambient excitation finds in records without harmonic lines."""
+    """Modes that a method for ambient excitation finds in records without harmonic lines."""
     arguments = (cleaned, samples.starts, samples.rate, band)
     data_driven = method == "data"
     found = subspace_modes(*arguments, data_driven=data_driven, order=order, progress=progress)
@@ -244,7 +244,7 @@ def _kind_words(found: _Found, excited, lines) -> str:
         )  # fmt: skip
     if sum(line.share for line in lines) > 0.5:
         return "excitation: steady shaking, whose harmonic lines are no modes, and ambient"
-    if np.mean(np.concatenate(excited)) > TRANSIENT_SHARE:
+    if np.mean(np.concatenate(excited)) > MIN_TRANSIENT_SAMPLES:
         return "excitation: transients (crossing loads or impacts) without a clear free decay"
     return "excitation: ambient"
 

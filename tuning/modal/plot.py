@@ -157,7 +157,7 @@ def _draw_spectrum(axes, fit, channel, unit):
 
 
 def _name_modes(axes, fit):
-    """Frequency and damping ratio beside the line of each mode, on top of all else.
+    """Write frequency and damping ratio next to the line of each mode, on top of all else.
 
     Each is in the highest row that has room for it.
     """
@@ -246,7 +246,7 @@ def plot_responses(responses, path: str | Path | None = None) -> Figure:
     return figure
 
 
-WIDTH = 0.7  # of the space of a mode in which the setups stand beside each other
+WIDTH = 0.7  # of the space of a mode in which the setups stand next to each other
 
 
 @use_style
@@ -274,7 +274,7 @@ def plot_setups(fit, path: str | Path | None = None, length: float | None = None
 
 
 def _deviation_of_frequency(mode, mean: float):
-    """Frequency of a mode beside the mean, and half of its interval, in %."""
+    """Frequency of a mode relative to the mean, and half of its interval, in %."""
     return 100 * (mode.frequency / mean - 1), 100 * mode.quantile * mode.frequency_sd / mean
 
 
@@ -284,7 +284,7 @@ def _damping_in_percent(mode, _: float):
 
 
 def _draw(axes, fit, value_of) -> None:
-    """Values of each setup, mode by mode, over those merged with their intervals."""
+    """Draw the values of each setup, mode by mode, over the merged ones with their intervals."""
     count, means = len(fit.setups), fit.frequencies
     step = WIDTH / max(count, 1)
     for place, (merged, mean) in enumerate(zip(fit.modes, means, strict=True)):

@@ -24,7 +24,7 @@ MIN_SEGMENTS = 8  # segments averaged for the spectrum that decides the band
 BACKGROUND_OCTAVES = 1.0  # width of the running quantile that is the background of resonances
 BACKGROUND_PERCENT = 25  # below the peaks of a pair of modes, however much of an octave they fill
 RESONANCE_RATIO = 6.0  # of the spectrum over its background: 8 dB
-BAND_ENERGY_SHARE = 0.99  # of the energy of resonances, below the upper end of the band
+BAND_ENERGY = 0.99  # fraction of the energy of resonances below the upper end of the band
 HALF_POWER = 2.0  # dip between resonances of the band in which decays are sought again
 MAX_RESONANCES = 12  # in the band: the lowest, which a model of the structure has
 BAND_MARGIN = 1.3  # of the ends of the band beyond the outermost resonances
@@ -57,9 +57,9 @@ def kinetic_band(
 
     Resonances are where the spectrum exceeds its background (lower quartile over an octave) by
     8 dB; their excess is converted to velocities by `derivatives`, the order of each channel as a
-    time derivative. Drift and noise, however strong, are background. Its share in the power of a
-    channel, averaged over channels, is what counts, as a sensor near a node shows little of one
-    mode and much of another. Without resonances the band is all that the log can show.
+    time derivative. Drift and noise, however strong, are background. The excess counts as a
+    fraction of the power of a channel, averaged over channels, as a sensor near a node shows little
+    of one mode and much of another. Without resonances the band is all that the log can show.
     """
     return _band_of_resonances(records, rate, (derivatives,), dip)
 
@@ -69,7 +69,7 @@ def energy_band(
     rate: float,
     derivatives: tuple[int, ...],
 ) -> tuple[float, float]:
-    """Band (Hz) as `kinetic_band`, in which resonances also have the energy of the readings.
+    """Band (Hz) as `kinetic_band`, extended by resonances that have energy in the readings.
 
     A mode that dominates accelerations counts then, however little it moves.
     """
@@ -105,9 +105,9 @@ def _ends_of_energy(bins, excess, power, derivatives) -> tuple[float, float]:
     weights = (2 * np.pi * bins[:, None]) ** (2.0 * (1 - np.asarray(derivatives)))
     whole = np.sum(power * weights, axis=0)
     energy = np.mean(excess * weights / np.where(whole > 0, whole, 1.0), axis=1)
-    share = np.cumsum(energy) / energy.sum()
-    last = min(int(np.searchsorted(share, BAND_ENERGY_SHARE)), bins.size - 1)
-    return bins[np.searchsorted(share, 1 - BAND_ENERGY_SHARE)], bins[last]
+    fraction = np.cumsum(energy) / energy.sum()
+    last = min(int(np.searchsorted(fraction, BAND_ENERGY)), bins.size - 1)
+    return bins[np.searchsorted(fraction, 1 - BAND_ENERGY)], bins[last]
 
 
 def strongest_frequency(
@@ -213,14 +213,14 @@ def check_length(prepared: Prepared, least: int, what: str) -> None:
 
 
 MIN_STUCK_SAMPLES = 12  # equal samples at the start of a channel that is saturated
-MAX_SHARE = 0.5  # of a record that is left out
+MAX_LEFT_OUT = 0.5  # of a record
 
 
 def settled_from(values: Float[np.ndarray, "time channel"]) -> int:
     """First sample from which all channels have settled; 0 if none starts at one stuck value.
 
-    Of a channel that starts stuck, the samples left out are those that make the standard error of
-    the mean of the others least (White, An effective truncation heuristic for bias reduction in
+    In a channel that starts stuck, so many samples are left out that the standard error of the mean
+    of the others is least (White, An effective truncation heuristic for bias reduction in
     simulation output, 1997), half of them at most.
     """
     starts = [_settled(column) for column in values.T if _is_stuck(column)]
@@ -240,7 +240,7 @@ def _settled(column) -> int:
     count = np.arange(1, column.size + 1)
     squares = np.cumsum(backwards**2) - np.cumsum(backwards) ** 2 / count
     left_out = column.size - count
-    error = np.where(left_out <= MAX_SHARE * column.size, squares / count**2, np.inf)
+    error = np.where(left_out <= MAX_LEFT_OUT * column.size, squares / count**2, np.inf)
     return int(left_out[np.argmin(error)])
 
 
@@ -351,7 +351,7 @@ def with_channels(log: Log, channels: Sequence[str] | None) -> Log:
 
 
 def without_constant(logs: Sequence[Log]) -> tuple[list[Log], tuple[str, ...]]:
-    """Logs of the same channels without those that stay at one value in all, and notes on these.
+    """Logs without the channels that are constant in all of them, and notes on these.
 
     Raises ValueError if no channel is left.
     """

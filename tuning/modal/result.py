@@ -54,19 +54,19 @@ MIN_STRUCTURAL_DAMPING = 1e-3
 MAX_DAMPING_RATIO = 0.2  # of a mode of a structure
 SAME_MAC = 0.9  # of shapes that may be one (Allemang 2003 has the criterion)
 MIN_CYCLES = 4.0  # cycles of a mode in the window
-MIN_ENERGY_SHARE = 0.002  # of the energy of the log in the mode's part of the band
+MIN_ENERGY = 0.002  # of the energy of the log in the mode's part of the band
 MIN_COLLINEARITY = 0.5  # modal phase collinearity, of three channels or more
-MAX_BAND_SHARE = 0.98  # of the upper end of the band; a mode above may be the flank of another
+MAX_IN_BAND = 0.98  # of the upper end of the band; a mode above may be the flank of another
 
 
 class IdentifiedMode(NamedTuple):
     """A mode: undamped natural frequency (Hz) and damping ratio, with standard deviations.
 
-    `energy_share` is its share of the energy of a channel in its part of the band, three octaves at
-    most, on average over channels: how strong another part is does not matter. Close modes cancel
-    in part, so that estimates may be less than 0 or more than 1; results have the nearer end.
-    `shape` has a largest component of one; `shape_covariance` is that of its real parts, then its
-    imaginary parts.
+    `energy_share` is its fraction of the energy of a channel in its part of the band, three octaves
+    at most, on average over channels: how strong another part is does not matter. Close modes
+    cancel in part, so that estimates may be less than 0 or more than 1; results have the nearer
+    end. `shape` has a largest component of one; `shape_covariance` is that of its real parts, then
+    its imaginary parts.
     """
 
     frequency: float
@@ -108,7 +108,7 @@ class IdentifiedMode(NamedTuple):
 
 
 def _numbers(values) -> list[float | None]:
-    """Numbers for JSON, None for those that are not known."""
+    """Numbers for JSON, None for those that are not finite."""
     return [value if np.isfinite(value) else None for value in values.tolist()]
 
 
@@ -135,7 +135,7 @@ class ModalEstimates(TableViews):
 
     @property
     def headline(self) -> str:
-        """What the modes are those of."""
+        """Title of the modes, with the name of their source."""
         return f"{len(self.modes)} mode{'s' * (len(self.modes) != 1)} of {self.source}"
 
     @property
@@ -220,7 +220,7 @@ def frequency_and_damping(
 def is_at_edge(mode: IdentifiedMode, band: tuple[float, float]) -> bool:
     """Whether a mode, with its half-power bandwidth, is not well within a band (Hz)."""
     half_width = max(mode.damping_ratio, 0.0) * mode.frequency
-    highest = min(MAX_BAND_SHARE * band[1], band[1] - half_width)
+    highest = min(MAX_IN_BAND * band[1], band[1] - half_width)
     return not band[0] + half_width <= mode.frequency <= highest
 
 
@@ -245,7 +245,7 @@ def rejection_reason(
         return "too few cycles in the window"
     if mode.frequency_sd > MAX_RELATIVE_FREQUENCY_SD * mode.frequency:
         return f"frequency uncertain by {100 * mode.frequency_sd / mode.frequency:.1f} %"
-    if mode.energy_share < MIN_ENERGY_SHARE:
+    if mode.energy_share < MIN_ENERGY:
         return f"{100 * mode.energy_share:.2f} % of the energy"
     if mode.shape.size >= 3 and mode.collinearity < min_collinearity:
         return f"a complex shape (modal phase collinearity {mode.collinearity:.2f})"

@@ -19,7 +19,7 @@ MAX_FREQUENCY_CHANGE = 0.01  # relative, between neighbouring orders
 MAX_DAMPING_CHANGE = 0.5  # relative to the larger damping ratio
 DAMPING_FLOOR = 0.002  # damping ratio added to it
 MAX_SKIPPED_ORDERS = 3  # orders in which a chain may lack a pole
-MIN_CHAIN_SHARE = 0.4  # of the orders from its first on
+MIN_CHAIN_FRACTION = 0.4  # of the orders from its first on
 MIN_CHAIN_ORDERS = 6  # likewise
 
 
@@ -40,7 +40,7 @@ class Diagram(NamedTuple):
 
 
 def possible(poles: Poles, band: tuple[float, float]) -> Bool[np.ndarray, " pole"]:
-    """Poles that a mode may have: damped, by less than 20 %, and in the band (Hz)."""
+    """Mask of the poles that may be modes: damped, by less than 20 %, and in the band (Hz)."""
     damping, frequency = poles.damping_ratios, poles.frequencies
     return (
         (damping > 0)
@@ -72,7 +72,7 @@ def stabilise(poles: Poles, band: tuple[float, float]) -> Diagram:
     for chain in chains:
         members = np.array(chain)
         after = np.sum(orders >= poles.orders[members[0]])
-        if members.size >= max(MIN_CHAIN_ORDERS, MIN_CHAIN_SHARE * after):
+        if members.size >= max(MIN_CHAIN_ORDERS, MIN_CHAIN_FRACTION * after):
             found.append(Chain(members, _representative(poles, members)))
     found.sort(key=lambda chain: poles.frequencies[chain.best])
     stable = np.zeros(poles.poles.size, bool)

@@ -100,9 +100,9 @@ def block_covariances(
     In each record the sums of all lags are over the same instants t.
     """
     usable = np.array([max(len(record) - lags, 0) for record in records], float)
-    shares = np.maximum(np.round(blocks * usable / usable.sum()), usable > 0).astype(int)
+    counts = np.maximum(np.round(blocks * usable / usable.sum()), usable > 0).astype(int)
     sums, counts = [], []
-    for record, parts, count in zip(records, shares, usable.astype(int), strict=True):
+    for record, parts, count in zip(records, counts, usable.astype(int), strict=True):
         if parts == 0:
             continue
         size = count // parts
@@ -271,7 +271,7 @@ def _times(real, complex_matrix):
 
 
 def _energies(subspace: Subspace, order, eigenvalues, modes, lefts):
-    """Share of each mode in the variance of the outputs, from R_0 = sum_k 2 Re(C m l G / p)."""
+    """Fraction of each mode in the variance of outputs, from R_0 = sum_k 2 Re(C m l G / p)."""
     c = subspace.channels
     observed = subspace.left[:c, :order] @ modes
     controlled = lefts @ (subspace.values[:order, None] * subspace.right[:c, :order].T)

@@ -427,7 +427,7 @@ def two_impacts(first=3.0, second=6.0):
     ("second", "starts", "said"),
     [
         (6.0, (302, 602), ""),
-        (6.0, (602,), "is left out: what follows it is not the free decay that tells most"),
+        (6.0, (602,), "is left out: what follows it is not the free decay with most information"),
         (4.5, (452,), "is left out: the next impact comes 1.5 s later"),
     ],
 )

@@ -11,7 +11,7 @@ from tuning.modal.ambient import Candidate
 from tuning.modal.decay.free_end import free_end
 from tuning.modal.decay.leaving import (
     PARTS,
-    growing_share,
+    growing_fraction,
     has_split,
     undisturbed,
     without_excitation,
@@ -78,7 +78,7 @@ def test_share_of_what_grows(damping, found):
     """At 2 Hz in 20 s: a quarter of a neper, and half of that."""
     growing = mode(2.0, (1.0, 0.6))._replace(damping_ratio=damping)
     modes = [growing, mode(4.0, (1.0, -0.6))]
-    assert growing_share(tuple(Candidate(one, "", 1) for one in modes), 20.0) == found
+    assert growing_fraction(tuple(Candidate(one, "", 1) for one in modes), 20.0) == found
 
 
 def test_many_close_poles_are_made_by_forces():

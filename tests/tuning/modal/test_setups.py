@@ -175,7 +175,7 @@ def test_a_mode_that_one_setup_lacks():
     only = dataclasses.replace(one, modes=(*one.modes, alone))
     fit = merge_setups([only, other])
     assert "20 Hz: not found in two.csv" in str(fit)
-    assert "20 Hz: the shape is not known at e" in str(fit)
+    assert "20 Hz: the shape is unknown at e" in str(fit)
     assert np.isnan(fit.shapes[2][3]) and np.isfinite(fit.mac).all()
     assert fit.modes[2].collinearity == pytest.approx(1.0)
     assert (

@@ -33,15 +33,15 @@ from tuning.modal.result import (
 
 MIN_BINS = 8  # bins of a spectrum to find poles in
 MAX_POLE_SHIFT_SD = 4.0  # standard deviations by which a pole may differ in a shorter window
-SHORTER_WINDOW_CUT = 0.2  # share of the window that is cut off for a shorter one
-MIN_ENERGY_LEFT = 0.1  # share of the energy of a mode in a shorter window that tells about it
-WEAK_ENERGY_SHARE = 0.2  # of the strongest mode's energy; below it poles must be reproduced
+SHORTER_WINDOW_CUT = 0.2  # fraction of the window that is cut off for a shorter one
+MIN_ENERGY_LEFT = 0.1  # fraction of a mode's energy that a shorter window must hold to count
+WEAK_ENERGY = 0.2  # of the strongest mode's energy; below it poles must be reproduced
 
 
 class DecayFit(NamedTuple):
     """Modes of free decays, and the fit in the band.
 
-    `energies` are sums of squared samples of each mode in each column; `gone` tells which modes are
+    `energies` are sums of squared samples of each mode in each column; `gone` marks modes that are
     not reproduced in shorter windows; `measured` and `fitted` have a column for each channel of
     each decay, `fitted` with drift and leakage into the band.
     """
@@ -78,8 +78,8 @@ def fit_decay(
     # Of a mode that decays within its first fifth, the rest of a window says nothing.
     lasting = np.exp(2 * found.poles.real * cut / rate) > MIN_ENERGY_LEFT
     shorter = [
-        (_refit(found, spectrum, band_spectrum(values[first:last], rate, band)), told)
-        for first, last, told in ((cut, count, lasting), (0, count - cut, lasting | True))
+        (_refit(found, spectrum, band_spectrum(values[first:last], rate, band)), counts)
+        for first, last, counts in ((cut, count, lasting), (0, count - cut, lasting | True))
     ]
     fewer = refine(found.poles, spectrum, found.noise, leakage_order=FEWER_LEAKAGE_ORDER)
     outside = (pole_parameters(fewer.poles) - pole_parameters(found.poles)) ** 2
@@ -104,19 +104,19 @@ def inverse_transform(values, spectrum: Spectrum):
 
 
 def _not_reproduced(found: PoleFit, others, spectrum: Spectrum):
-    """Which weak poles differ in shorter windows (mode,).
+    """Mask of weak poles that differ in shorter windows (mode,).
 
-    A weak pole beside a strong one often stands for the nonlinearity of the strong one: it stays in
+    A weak pole near a strong one often stands for the nonlinearity of the strong one: it stays in
     the fit, but is no mode.
     """
     moved = np.zeros(found.poles.size)
-    for other, told in others:
+    for other, counts in others:
         deviation = np.sqrt(np.diag(found.covariance) + np.diag(other.covariance))
         change = np.abs(pole_parameters(other.poles) - pole_parameters(found.poles)) / deviation
         change = np.where(other.poles.real > 0, np.inf, np.max(change.reshape(-1, 2), axis=1))
-        moved = np.maximum(moved, np.where(told, change, 0.0))
-    share = np.sum(_energies(found, spectrum), axis=1)
-    return (moved > MAX_POLE_SHIFT_SD) & (share < WEAK_ENERGY_SHARE * np.max(share, initial=0.0))
+        moved = np.maximum(moved, np.where(counts, change, 0.0))
+    energy = np.sum(_energies(found, spectrum), axis=1)
+    return (moved > MAX_POLE_SHIFT_SD) & (energy < WEAK_ENERGY * np.max(energy, initial=0.0))
 
 
 def _refit(found: PoleFit, spectrum: Spectrum, other: Spectrum) -> PoleFit:
@@ -131,12 +131,12 @@ def _nonstationary_variance(found: PoleFit, others):
     For a uniform distribution over the range seen: a third of the square of half the range.
     """
     extra = np.zeros(2 * found.poles.size)
-    compared = np.sum([told for _, told in others], axis=0)
-    for other, told in others:
+    compared = np.sum([counts for _, counts in others], axis=0)
+    for other, counts in others:
         expected = np.maximum(np.diag(other.covariance) - np.diag(found.covariance), 0)
         change = (pole_parameters(other.poles) - pole_parameters(found.poles)) ** 2
         beyond = np.where(change > 4 * expected, change - expected, 0)
-        extra += np.repeat(told / np.maximum(compared, 1), 2) * beyond / 3
+        extra += np.repeat(counts / np.maximum(compared, 1), 2) * beyond / 3
     return extra
 
 
@@ -166,7 +166,7 @@ def _identified_modes(
                 frequency_sd=frequency_sd,
                 damping_ratio=damping_ratio,
                 damping_sd=damping_sd,
-                energy_share=math.nan,  # told by `energies`
+                energy_share=math.nan,  # computed from `energies` by the caller
                 shape=shape,
                 shape_covariance=shape_covariance,
                 quantile=quantiles[k],
@@ -196,11 +196,12 @@ def _shape(found: PoleFit, mode: int, channels: int):
 
 NOT_REPRODUCED = "not the same in parts of the window"
 NONLINEARITY = "what nonlinearity adds to the mode of"
-NONLINEAR_DECAY = 2.5, 4.5  # decay rates over that of a mode, of what its nonlinearity adds to it
+NONLINEAR_DECAY = 2.5, 4.5  # decay rate of a mode's nonlinear part over that of the mode
 SKIRT_BANDWIDTHS = 4.0  # half widths of a peak, to where its amplitude has fallen to a quarter
-NONLINEAR_MAC = 0.95  # of a mode and what its nonlinearity adds to it
-# Over that of the mode. Its phase moves by k in all, so that k^2 / 3 of its energy is that of the
-# first such term; fits of more than two terms that Duffing's equation asks for give up to four.
+NONLINEAR_MAC = 0.95  # least MAC of a mode and its nonlinear part
+# Energy of a mode's nonlinear part over that of the mode. The phase of the mode moves by k in all,
+# so that the first nonlinear term has k^2 / 3 of its energy; fits of Duffing's equation with more
+# than two terms give up to four.
 MAX_CUBE_ENERGY = 4.0
 MAX_CUBE_SPREAD = 3.0  # of energies of several decays over what they would be of cubes
 
@@ -215,7 +216,7 @@ def decay_candidates(
     band: tuple[float, float],
     is_free: bool = False,
 ) -> tuple[Candidate, ...]:
-    """Modes of each part of the band, with their shares in its energy of the channels.
+    """Candidate modes of all parts of the band, with their fractions of its energy.
 
     In decays that are free for sure (`is_free`) a shape may be complex, and frequency and damping
     depend on amplitude, which widens their intervals: no force makes it so.
@@ -234,8 +235,7 @@ def decay_candidates(
         changing = fit.gone
         if is_free:
             changing = tuple(
-                gone and _is_beside_stronger(k, fit.modes, shares)
-                for k, gone in enumerate(fit.gone)
+                gone and _is_near_stronger(k, fit.modes, shares) for k, gone in enumerate(fit.gone)
             )
         for mode, share, gone, energy in zip(
             fit.modes, shares.tolist(), changing, energies, strict=True
@@ -250,8 +250,8 @@ def decay_candidates(
     return without_duplicates(_without_nonlinearity(found, by_decay))
 
 
-def _is_beside_stronger(k, modes, shares) -> bool:
-    """Whether a mode may stand for what nonlinearity makes of a stronger one about its peak."""
+def _is_near_stronger(k, modes, shares) -> bool:
+    """Whether a mode lies in the peak of a stronger one, whose nonlinearity it may stand for."""
     return any(
         shares[j] > shares[k]
         and abs(one.frequency - modes[k].frequency)
@@ -261,7 +261,7 @@ def _is_beside_stronger(k, modes, shares) -> bool:
 
 
 def share_of_modes(found: tuple[Candidate, ...], fits: BandFits, duration: float) -> float:
-    """Share of identified modes in the energy at the beginning of decays, beside rejected ones.
+    """Fraction of the energy at the beginning of decays in identified modes, not in rejected ones.
 
     What nonlinearity adds to a mode is a part of it.
 
@@ -287,7 +287,7 @@ def share_of_modes(found: tuple[Candidate, ...], fits: BandFits, duration: float
 
 
 def _without_nonlinearity(found: list[Candidate], by_decay) -> list[Candidate]:
-    """Candidates; those that a nonlinear restoring force makes of others are rejected.
+    """Candidates, with those rejected that are the cube of another mode by a nonlinear spring.
 
     The cube of a decaying vibration has its frequency and shape, three times its decay rate, and
     less energy, as what it adds is a correction; of several decays, it grows as the cube of theirs.
@@ -303,7 +303,7 @@ def _without_nonlinearity(found: list[Candidate], by_decay) -> list[Candidate]:
 
 
 def _is_cube(mode: IdentifiedMode, other: IdentifiedMode) -> bool:
-    """Whether a mode decays as the cube of another does, within its half-power bandwidth."""
+    """Whether a mode decays like the cube of another mode, within its half-power bandwidth."""
     rate = mode.pole.real / other.pole.real
     near = abs(mode.frequency - other.frequency) < mode.damping_ratio * mode.frequency
     alike = mac_matrix(mode.shape[None], other.shape[None])[0, 0] > NONLINEAR_MAC
@@ -320,7 +320,7 @@ def _grows_as_cube(energies, others) -> bool:
 def information_of_modes(found: tuple[Candidate, ...]) -> float:
     """Logarithm of the determinant of the information on damping ratios of modes (D-optimality).
 
-    Each counts by how much narrower than itself its 95 % interval is, and rejected ones not at all.
+    A mode counts by the ratio of its damping to its 95 % interval; a rejected one does not count.
     """
     modes = [one.mode for one in found if not one.reason]
     return float(

@@ -1,4 +1,4 @@
-"""Where the free end of a record begins: a load has left, and what is left decays.
+"""Start of the free end of a record: a load has left, and the vibration decays.
 
 From an instant t_0 on the record is a sum of few decaying vibrations and of steady noise,
 
@@ -8,7 +8,7 @@ Earlier instants are tried one after another, from the end of the record backwar
 force acts after t_0, errors of the fit are as large as those of the ends before, and no larger at
 its beginning. Poles are those of the signal subspace of the record's Hankel matrix (Kung 1978),
 their number is that of least BIC. Errors of prediction (`leaving`) miss a load whose forces are
-small beside the noise within a sample; over a decay, their effect adds up.
+small against the noise within a sample; over a decay, their effect adds up.
 """
 
 from typing import NamedTuple
@@ -32,15 +32,15 @@ MAX_DAMPING = 0.15  # ratio of a vibration
 # cycles late, or clear ones.
 MAX_REFUSED, CLEAR_MISFIT = 14, 2.3
 GOOD_FIT = 0.9  # misfit of an end without forces: errors a fifth more than noise, at most
-MARGIN_CYCLES = 1.5  # by which the end begins later, as forces just before it show little
+MARGIN_CYCLES = 1.5  # delay of the end, as forces just before it have little effect
 MAX_UNEXPLAINED = 0.15  # of the energy of the first part
 MIN_FALL = 1.0  # nepers, of the energy that is explained, from the first part to the last
-SAME_RATE = 0.5  # of the slope of the energy, to be as before it
+SAME_RATE = 0.5  # least ratio of slopes of the energy that count as equal
 MAX_LEVEL_AT_END = 0.5  # of the record's mean energy; more is no decay after a load
 
 
 class _End(NamedTuple):
-    """Fit of an end: where it begins, and squares of its errors and of the samples."""
+    """Fitted end of a record: first sample, and squares of its errors and of the samples."""
 
     start: int
     errors: Float[np.ndarray, " sample"]
@@ -49,13 +49,13 @@ class _End(NamedTuple):
 
     @property
     def explained(self) -> Float[np.ndarray, " part"]:
-        """Mean energy of each part that is explained."""
+        """Mean energy of each part of the end that the fit explains."""
         explained = np.maximum(_of_parts(self.energy) - _of_parts(self.errors), 0.0)
         return explained + 1e-6 * explained.max() + 1e-300
 
     @property
     def is_decay(self) -> bool:
-        """Whether the beginning is explained, and falls."""
+        """Whether the fit explains the beginning of the end, and its energy falls."""
         begins = _of_parts(self.errors)[0] < MAX_UNEXPLAINED * _of_parts(self.energy)[0]
         return bool(begins and np.log(self.explained[0] / self.explained[-1]) > MIN_FALL)
 
@@ -74,9 +74,9 @@ def free_end(
 ) -> int | None:
     """Sample from which on a record decays freely; None where that is not clear.
 
-    `cycle` is that of the strongest vibration in samples, `independent` the share of samples that
-    are, in the band of the record. The end is one of the part `since` a sample, after the last
-    impact; if it begins soon after that, nothing but the impact is known to excite the structure.
+    `cycle` is that of the strongest vibration in samples, `independent` the fraction of samples
+    that are, in the band of the record. The end is one of the part `since` a sample, after the last
+    impact; if it begins soon after that, nothing but the impact excites the structure.
     """
     values = record / np.maximum(record.std(axis=0), 1e-300)
     count, channels = values.shape
@@ -105,8 +105,8 @@ def free_end(
         previous = misfit
     if not refused:
         return None
-    # Forces that end within a step show little: the end begins one step after the earliest, or
-    # earlier, where an end has the errors of noise.
+    # Forces that end within a step have little effect: the end begins one step after the earliest,
+    # or earlier, where an end has the errors of noise.
     compared = ends.fit(min(later.start + 2 * step, starts[0]))
     least = min(end.variance for end in (compared, later, accepted))
     compared = compared._replace(variance=least)  # a short end may be fitted badly
@@ -153,7 +153,7 @@ class _Ends:
 
     def product(self, start: int):
         """Product of the Hankel matrix of an end with itself, from that of a shorter one."""
-        later = min(known for known in self.products if known >= start)
+        later = min(computed for computed in self.products if computed >= start)
         part = self.rows[start:later]
         self.products[start] = self.products[later] + part.T @ part
         return self.products[start]
@@ -184,9 +184,9 @@ class _Ends:
         return _End(start, squares, energy, float(squares.sum() / freedom))
 
     def misfit(self, end: _End, shorter: _End) -> float:
-        """How much larger the errors of an end are than those of a shorter one, over the limit.
+        """Ratio of the errors of an end to those of a shorter one, over the limit of that ratio.
 
-        In the samples before the shorter end, in the first part, and in all.
+        The largest in the samples before the shorter end, in the first part, and in all.
         """
         before, first = (
             end.errors[:size] for size in (shorter.start - end.start, len(end.errors) // PARTS)

@@ -1,4 +1,4 @@
-"""Impacts that samples beyond prediction mark, and whether the decay of the hardest is used."""
+"""Impacts in logs, at samples that cannot be predicted, and whether decays follow the hardest."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from tuning.modal.decay.stretches import MIN_DECAY_CYCLES, Stretch
 from tuning.modal.preprocessing import Samples, prepare
 
 MAX_CONTACT = 40  # samples that an impact marks; more are a lasting excitation
-APART_CYCLES = 2.0  # of the lowest frequency, by which an impact is no rebound of another
+APART_CYCLES = 2.0  # of the lowest frequency, after which an impact is no rebound of another
 AFTER_CYCLES = 2.0  # of the lowest frequency, in which an impact's energy is compared
 
 
@@ -43,7 +43,7 @@ def marked_impacts(
 
 
 def _apart(rate, band) -> int:
-    """Samples by which impacts must be apart, to be told from each other."""
+    """Least distance of two impacts in samples."""
     return int(APART_CYCLES * rate / band[0]) + 1
 
 
@@ -80,7 +80,7 @@ def impacts_left_out(
         return []
     start = samples.starts[hardest.record] + hardest.sample / samples.rate
     wait = (min(later) - hardest.sample) / samples.rate if later else np.inf
-    why = "what follows it is not the free decay that tells most"
+    why = "what follows it is not the free decay with most information"
     if wait * band[0] < MIN_DECAY_CYCLES:
         why = f"the next impact comes {wait:.3g} s later"
     return [f"the hardest impact, at {start:.4g} s, is left out: {why}"]

@@ -1,4 +1,4 @@
-"""Decays in which something still excites the structure, told by what their fit leaves.
+"""Decays during which the structure is still excited, found by the residuals of their fit.
 
 A load that excites little while it leaves shows in the fit: it explains forces by several modes
 where there is one, or by vibrations that grow; of several decays it leaves more of those in which
@@ -17,7 +17,7 @@ MIN_RATIO = 2.5  # of errors of a decay to the least of others
 SPLIT_RATIO, SPLIT_MAC = 1.1, 0.9  # of three frequencies, and of the shapes of modes of one
 SPLIT_POLES = 4  # within the same ratio
 MIN_GROWTH = 0.2  # nepers of a vibration over the decay
-MIN_GROWING_SHARE = 0.01  # of the energy
+MIN_GROWING_ENERGY = 0.01  # of the energy
 MIN_UNEXPLAINED = 0.05  # of the energy of a decay; less may be nonlinearity
 
 
@@ -31,8 +31,9 @@ def without_excitation(
     rate: float,
     after_impact: bool,
 ) -> tuple[Stretch, ...]:
-    """Those of several fitted decays that are undisturbed, or one without its first part; all if
-    nothing is disturbed.
+    """Fitted decays without those that are disturbed by an excitation; all if none is.
+
+    Of a single decay the first part is cut off instead.
 
     Columns are the `channels` of each decay, at a `rate` (Hz). `candidates` are the modes of the
     fit; `after_impact` says that nothing acts from the beginning.
@@ -40,15 +41,15 @@ def without_excitation(
     first, *others = decays
     split = has_split(candidates)
     if others:
-        grows = growing_share(candidates, len(measured) / rate) > MIN_GROWING_SHARE
+        grows = growing_fraction(candidates, len(measured) / rate) > MIN_GROWING_ENERGY
         least = 0.0 if grows or split else MIN_UNEXPLAINED
         return undisturbed(decays, measured, fitted, channels, least)
     cut = len(measured) // PARTS if split and not after_impact else 0
     return (first._replace(start=first.start + cut),)
 
 
-def growing_share(candidates: tuple[Candidate, ...], duration: float) -> float:
-    """Largest share in the energy of a fit, of some `duration` (s), of a vibration that grows.
+def growing_fraction(candidates: tuple[Candidate, ...], duration: float) -> float:
+    """Largest fraction of the energy of a fit over a `duration` (s) in a vibration that grows.
 
     Forces make vibrations grow; steady hum does not. Of 100 decays without forces (60 s, planted
     structures) none has one of more than a hundredth.
@@ -62,7 +63,7 @@ def growing_share(candidates: tuple[Candidate, ...], duration: float) -> float:
 
 
 def has_split(candidates: tuple[Candidate, ...]) -> bool:
-    """Whether the fit makes several modes of one, as where forces act.
+    """Whether the fit splits one mode into several, as where forces act.
 
     Three modes are then close and alike, or four poles are close, whether modes or not, or three in
     two places: of 100 decays without forces of planted structures, with pairs of modes, one has
@@ -99,11 +100,11 @@ def undisturbed(
     channels: int,
     least: float = MIN_UNEXPLAINED,
 ) -> tuple[Stretch, ...]:
-    """Those of several fitted decays that have no more errors than others.
+    """Fitted decays without those whose errors are larger than those of others.
 
-    Noise is the same in all, however hard the impacts were; errors of less than a share `least` of
-    the energy may be nonlinearity. Columns are the channels of each decay; if they are combinations
-    of decays, all are returned.
+    Noise is the same in all, however hard the impacts were; errors of less than a fraction `least`
+    of the energy may be nonlinearity. Columns are the channels of each decay; if they are
+    combinations of decays, all are returned.
     """
     if measured.shape[1] != len(decays) * channels:
         return decays

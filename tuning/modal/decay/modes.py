@@ -46,14 +46,14 @@ from tuning.modal.preprocessing import (
 from tuning.modal.result import is_at_edge
 from tuning.modal.stabilisation import Diagram
 
-MAX_RESIDUAL_ENERGY = 0.25  # share of the energy that the modes of a free decay do not explain
-MIN_SHARE_OF_MODES = 0.5  # of the energy at the beginning of decays
+MAX_RESIDUAL_ENERGY = 0.25  # fraction of the energy that the modes of a free decay do not explain
+MIN_ENERGY_OF_MODES = 0.5  # of the energy at the beginning of decays
 MIN_LEVEL_AT_START = 3.0  # energy of the first part of such a decay over the mean
-SHORTER_PARTS = 0.6, 0.35  # of an impact's decay, that may tell more than all of it
+SHORTER_PARTS = 0.6, 0.35  # of an impact's decay, which may have more information than all of it
 MAX_CUTS = 3  # of a decay in which the structure is found to be excited
 MAX_RESIDUAL_OF_WINDOW = 0.05  # the same for a window that the user gives and that falls little
-# The same after impacts that only the energy tells of: those of three planted logs left 0.003 at
-# most, what falls in fifteen short records of ambient vibration 0.01 at least.
+# The same after impacts that only the energy shows: those of three planted logs left 0.003 at most,
+# falls of the energy in fifteen short records of ambient vibration 0.01 at least.
 MAX_RESIDUAL_AFTER_SOFT_IMPACTS = 0.007
 
 
@@ -82,11 +82,11 @@ def modes_of_decays(
     may_narrow: bool,
     how: dict,
 ) -> DecayModes | None:
-    """Modes of the decays of a log in two bands (Hz), the latter as wide or wider; None without.
+    """Modes of the free decays of a log in two bands (Hz), the second as wide or wider; or None.
 
-    `excited` are samples excited in the former, `derivatives` the orders of the channels as time
-    derivatives, `how` what else `free_decay_modes` takes. A decay is sought in a narrower band,
-    too, if it `may_narrow`: it drowns sooner in the noise of a wide one.
+    `excited` are samples excited in the first, `derivatives` the orders of the channels as time
+    derivatives, `how` further arguments of `free_decay_modes`. A decay is also sought in a narrower
+    band if it `may_narrow`: in a wide one it reaches the noise sooner. None without decays.
     """
     band, wide = bands
     found = _in_band(samples, excited, derivatives, band, may_narrow, how)
@@ -104,9 +104,9 @@ def _in_band(samples, excited, derivatives, band, may_narrow, how) -> DecayModes
         displacements = tuple(order + 1 for order in derivatives)
         narrower = kinetic_band(samples.records, samples.rate, displacements)
         marks = find_excited(samples, derivatives, narrower)
-        told = free_decay_modes(samples, marks, derivatives, narrower, **how)
-        if told is not None:
-            return DecayModes(*told, narrower)
+        found = free_decay_modes(samples, marks, derivatives, narrower, **how)
+        if found is not None:
+            return DecayModes(*found, narrower)
     found = free_decay_modes(samples, excited, derivatives, band, **how)
     if found is None and may_narrow:
         lower = kinetic_band(samples.records, samples.rate, derivatives, HALF_POWER)
@@ -120,9 +120,9 @@ def _in_band(samples, excited, derivatives, band, may_narrow, how) -> DecayModes
 
 
 def _with_others(found: DecayModes, more, wide: tuple[float, float]) -> DecayModes:
-    """Modes of decays in a band, with those (`more`) of a wider one outside it.
+    """Modes of decays in a band, and those of a wider band (`more`) outside it.
 
-    In the wider band alone, what decays fast would end decays before slow modes are certain.
+    In the wider band alone, modes that decay fast would end decays before slow modes are certain.
     """
     others = [
         one
@@ -139,7 +139,7 @@ def find_excited(
 ) -> tuple[Bool[np.ndarray, " time"], ...]:
     """Samples of each record at which the structure is excited, at the rate of the log.
 
-    They are those of impacts, and all until a crossing load has left (`free_end`).
+    These are impacts, and all samples before a crossing load has left (`free_end`).
 
     Below half the band (Hz) drift is removed; above it all frequencies count.
     """
@@ -157,7 +157,7 @@ def find_excited(
         last = int(np.flatnonzero(marks)[-1] * len(end) / marks.size) + 1 if marks.any() else 0
         start = free_end(end, cycle, independent, last)
         if start is not None:
-            # Decays before it, between impacts, are told from others by their errors.
+            # Decays before it, between impacts, are distinguished from others by their errors.
             decayed = until_soft_impact(end[last:start], max(int(2 * cycle), 4)) if last else 0
             first = last + (decayed if decayed < start - last else 0)
             places = np.arange(marks.size) * len(end) / marks.size
@@ -171,7 +171,7 @@ def band_of_ends(
 ) -> tuple[float, float]:
     """Band (Hz), within another, of the resonances in the second halves of records.
 
-    What a load excites while it crosses may be of higher frequencies than what it leaves.
+    While a load crosses, it may excite higher frequencies than those of the free vibration after.
     """
     halves = tuple(record[len(record) // 2 :] for record in samples.records)
     low, high = kinetic_band(halves, samples.rate, derivatives, HALF_POWER)
@@ -185,7 +185,7 @@ def follow_impacts(
     derivatives: tuple[int, ...],
     band: tuple[float, float],
 ) -> bool:
-    """Whether the free decays in a band are impacts' own."""
+    """Whether the free decays in a band are those right after impacts."""
     decays = _decays_in_band(samples, excited, derivatives, band)[2]
     return bool(decays) and all(one.from_rest for one in decays)
 
@@ -207,10 +207,10 @@ def free_decay_modes(
     whole: bool = False,
     order: int | None = None,
 ) -> tuple[tuple[Candidate, ...], tuple[Diagram, ...], Decays] | None:
-    """Modes of the free decays between excited samples; None without any that stand for the log.
+    """Modes of the free decays between excited samples; None without decays that represent the log.
 
-    `derivatives` are the orders of the channels as time derivatives. Of a log in which none is
-    found, all is one decay if it is said to be (`kind`) or may be (`whole`, of a window that the
+    `derivatives` are the orders of the channels as time derivatives. A log without a decay is one
+    decay as a whole if it is declared one (`kind`) or may be one (`whole`, of a window that the
     user gives).
     """
     prepared, frequency, decays = _decays_in_band(samples, excited, derivatives, band)
@@ -229,7 +229,7 @@ def free_decay_modes(
     if one is None:
         return None
     if all(one.from_rest for one in decays):
-        return _told(_of_best_length(one, samples, band, order), samples)
+        return _of_fit(_of_best_length(one, samples, band, order), samples)
     for _ in range(MAX_CUTS):
         rest = one.used if given else _rest(one, samples, excited, band, cycle)
         if rest == one.used:
@@ -247,14 +247,14 @@ def free_decay_modes(
         explained = explained and (given or _has_few_others(one.candidates))
     else:
         explained = _unexplained_of_decay(one.measured, one.fitted) < MAX_RESIDUAL_ENERGY
-    damped = one.share_of_modes > MIN_SHARE_OF_MODES
+    damped = one.share_of_modes > MIN_ENERGY_OF_MODES
     if kind is None and not (damped and explained):
         return None
-    return _told(one, samples)
+    return _of_fit(one, samples)
 
 
 class _Fitted(NamedTuple):
-    """Fits of decays of one length (s) side by side, in each part of a band, and of all of it."""
+    """Joint fit of decays of one length (s), in each part of a band and in all of it."""
 
     used: tuple[Stretch, ...]
     duration: float
@@ -266,11 +266,11 @@ class _Fitted(NamedTuple):
 
     @property
     def share_of_modes(self) -> float:
-        """Share of the modes in the energy at the beginning."""
+        """Fraction of the energy at the beginning that the modes have."""
         return share_of_modes(self.candidates, self.fits, self.duration)
 
 
-def _told(one: _Fitted, samples: Samples):
+def _of_fit(one: _Fitted, samples: Samples):
     """Candidates, diagrams and decays of a fit."""
     channels = samples.records[0].shape[1]
     first = Decays(one.used, one.measured[:, :channels], one.fitted[:, :channels])
@@ -278,14 +278,14 @@ def _told(one: _Fitted, samples: Samples):
 
 
 def _of_best_length(whole: _Fitted, samples: Samples, band, order) -> _Fitted:
-    """The fit of an impact's decay, or of its first part if that tells more of its modes.
+    """The fit of an impact's decay, or of its first part if that has more information on modes.
 
-    Noise that is not steady and frequencies that depend on amplitude make the latter parts of a
-    decay tell less than the beginning.
+    Unsteady noise and frequencies that depend on amplitude may make the later parts of a decay
+    worse than none.
     """
     length, fits = len(whole.measured), [whole]
-    for share in SHORTER_PARTS:
-        part = tuple(one._replace(stop=one.start + int(share * length)) for one in whole.used)
+    for fraction in SHORTER_PARTS:
+        part = tuple(one._replace(stop=one.start + int(fraction * length)) for one in whole.used)
         fits.append(_fitted(part, samples, band, order) or whole)
     return max(fits, key=lambda one: information_of_modes(one.candidates))
 
@@ -320,13 +320,13 @@ def _fitted(decays, samples: Samples, band, order) -> _Fitted | None:
 
 
 def _has_few_others(candidates: tuple[Candidate, ...]) -> bool:
-    """Whether no more candidates are rejected than are modes."""
+    """Whether the rejected candidates are not more than the modes."""
     rejected = sum(bool(one.reason) for one in candidates)
     return 2 * rejected <= len(candidates)
 
 
 def _rest(one: _Fitted, samples: Samples, excited, band, cycle) -> tuple[Stretch, ...]:
-    """Fitted decays, or what is left of them, in which nothing excites the structure."""
+    """Fitted decays, or the parts of them, during which nothing excites the structure."""
     return without_excitation(
         one.used,
         one.measured,
@@ -339,14 +339,14 @@ def _rest(one: _Fitted, samples: Samples, excited, band, cycle) -> tuple[Stretch
 
 
 def _unexplained(measured, fitted) -> float:
-    """Share of the energy of decays that their fit does not explain."""
+    """Fraction of the energy of decays that their fit does not explain."""
     return float(np.sum((measured - fitted) ** 2) / max(np.sum(measured**2), 1e-300))
 
 
 def _unexplained_of_decay(measured, fitted) -> float:
-    """The same of a decay, or of its beginning, if most of its energy is there.
+    """`_unexplained` of a decay, or of its beginning if most of its energy is there.
 
-    Of the rest of a long window noise may have most.
+    The rest of a long window may be mostly noise.
     """
     first = max(len(measured) // PARTS, 1)
     whole = _unexplained(measured, fitted)

@@ -26,9 +26,9 @@ MAX_MODES = 24  # of a decay, in three octaves
 CLEAR_GAIN = 20.0  # least gains in likelihood of a mode that is not tried to be left out
 MAX_ADDED_MODES = 6  # to those that a subspace method has found
 FALSE_ALARM_PROBABILITY = 1e-4  # of a mode found in noise, over all bins
-# No structure is exactly linear: the misfit of a strong mode looks like weak ones beside it. What
-# is below this share of the amplitudes nearby is not taken for a mode.
-NONLINEARITY_SHARE = 0.03
+# No structure is exactly linear: the misfit of a strong mode looks like weak ones near it. Peaks
+# below this fraction of the amplitudes nearby are not taken for modes.
+NONLINEAR_AMPLITUDE = 0.03
 NEARBY_BINS = 2  # bins on either side that count as nearby
 COARSE_TOLERANCE = 1e-3  # of the refinement while modes are counted
 MAX_POLE_SHIFT_BINS = 1.5  # bins by which a pole may move in one refinement
@@ -121,13 +121,13 @@ def find_poles(
 
 
 def _misfit_level(spectrum: Spectrum):
-    """Squares of what no linear structure explains of strong modes nearby."""
+    """Squared amplitudes at each bin that nonlinearity of strong modes nearby may cause."""
     nearby = _smooth(np.abs(spectrum.values) ** 2, NEARBY_BINS) / (2 * NEARBY_BINS + 1)
-    return NONLINEARITY_SHARE**2 * nearby
+    return NONLINEAR_AMPLITUDE**2 * nearby
 
 
 def _prune_poles(best: PoleFit, spectrum: Spectrum, misfit_level, min_gain: float) -> PoleFit:
-    """Remove poles, weakest first, that are not significant beside the others."""
+    """The fit without poles that are not significant given the others, removed weakest first."""
     level = _robust_level(best.residual) + misfit_level
     best = refine(best.poles, spectrum, level)
     # What a mode well apart from others explains; a fit without it is tried only if that is little.
@@ -168,8 +168,8 @@ def _robust_level(residual):
 def _initial_pole(spectrum: Spectrum, residual, level) -> complex:
     """The pole that alone explains most of a residual, among candidates near its highest peaks."""
     ratio = np.sum(np.abs(residual) ** 2 / level, axis=1, keepdims=True)
-    shares = [_smooth(ratio, width)[:, 0] / np.sqrt(2 * width + 1) for width in (0, 2, 8)]
-    peaks = spectrum.bins[[int(np.argmax(share)) for share in shares]]
+    curves = [_smooth(ratio, width)[:, 0] / np.sqrt(2 * width + 1) for width in (0, 2, 8)]
+    peaks = spectrum.bins[[int(np.argmax(curve)) for curve in curves]]
     spacing = 1 / spectrum.duration
     frequencies = np.add.outer(peaks, spacing * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])).ravel()
     rates = spacing * np.array([0.1, 0.5, 1.5, 4.0, 10.0, 30.0])
@@ -230,7 +230,7 @@ def _real_over_imag(columns):
 
 
 def _project_amplitudes(poles, spectrum: Spectrum, weights, nuisance):
-    """Weighted residual with the best amplitudes, its Jacobian, amplitudes, model and leverages."""
+    """Weighted residual of the best amplitudes, its Jacobian, amplitudes, model and leverages."""
     columns, slopes = _modal_columns(poles, spectrum)
     bins, count = columns.shape[0], poles.size
     design = np.concatenate([columns.reshape(bins, 2 * count), nuisance], axis=1)
@@ -271,7 +271,7 @@ def refine(
 ) -> PoleFit:
     """Poles refined together by least squares, weighted by the noise level, in the order given.
 
-    The search ends when a step reduces the squares by less than the share `accuracy`.
+    The search ends when a step reduces the squares by less than the fraction `accuracy`.
     `leakage_order` is that of the polynomial for modes outside the band.
     """
     nuisance = _nuisance_columns(spectrum, leakage_order)
@@ -307,7 +307,7 @@ def refine(
 
 
 def with_one_more(fit: PoleFit, spectrum: Spectrum) -> PoleFit:
-    """Poles of a fit of a spectrum, refined beside one that explains most of its residual."""
+    """Poles of a fit with one more, which explains most of its residual, refined together."""
     level = _robust_level(fit.residual) + _misfit_level(spectrum)
     guess = _initial_pole(spectrum, fit.residual, level)
     return refine(np.append(fit.poles, guess), spectrum, level, COARSE_TOLERANCE)
@@ -330,8 +330,8 @@ def _fit_amplitudes(poles, spectrum: Spectrum, level, nuisance) -> PoleFit:
     residual_share = np.maximum(2 - leverage, 0.02) / 2
     count = _smooth(residual_share, NOISE_SMOOTHING_BINS)
     # The residual is averaged without weights, which would keep the shape of the assumed level.
-    # Channels share disturbances, so their noise is correlated: the score covariance comes from
-    # local cross-spectra of the residual, the covariance from the sandwich formula.
+    # Channels have disturbances in common, so their noise is correlated: the score covariance is
+    # from local cross-spectra of the residual, the covariance from the sandwich formula.
     residual = weighted * np.sqrt(level)
     cross = _smooth(np.einsum("jc,jd->jcd", residual, residual.conj()), NOISE_SMOOTHING_BINS)
     cross = cross / np.sqrt(count[:, :, None] * count[:, None, :])
@@ -356,7 +356,7 @@ def _fit_amplitudes(poles, spectrum: Spectrum, level, nuisance) -> PoleFit:
 
 
 def _amplitude_variance(poles, spectrum: Spectrum, noise):
-    """Variance of each amplitude (mode, channel) beside modes that are well apart."""
+    """Variance of each amplitude (mode, channel), as of modes that are well apart."""
     columns = _modal_columns(poles, spectrum)[0]  # bin, mode, 2
     energy = np.sum(np.abs(columns) ** 2, axis=2)
     return 2 / np.maximum(np.einsum("jk,jc->kc", energy / 2, 1 / noise), 1e-300)

@@ -1,11 +1,11 @@
 """Free decays in a log: stretches after impacts, or after a load has left, without excitation.
 
 Between impacts the samples are predicted by the past ones, but for noise. An autoregressive model
-of each channel tells excitation by its prediction errors: an impact is an error far beyond those of
-the quietest parts of the log, and beyond those before it or not small beside the signal itself. The
-model is that of the log at its own rate, whose highest frequencies show a contact best, whatever
-the band in which modes are sought. Impacts too soft, or in too much noise, for that are told by the
-energy, which rises at once. The last functions say whether decays stand for a log.
+of each channel shows excitation by its prediction errors: an impact is an error far beyond those of
+the quietest parts of the log, and beyond those before it or not small against the signal itself.
+The model is that of the log at its own rate, whose highest frequencies show a contact best,
+whatever the band in which modes are sought. Impacts too soft, or in too much noise, for that are
+found by the energy, which rises at once. The last functions say whether decays stand for a log.
 """
 
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ MAX_HARDER = 10.0  # energy after the hardest impact over that after the softest
 def vibration_energy(
     record: Float[np.ndarray, "sample channel"], width: int
 ) -> Float[np.ndarray, " sample"]:
-    """Energy of a record around each sample, each channel relative to its own."""
+    """Energy of a record around each sample, with each channel relative to its mean energy."""
     scaled = record / np.maximum(record.std(axis=0), 1e-300)
     return moving_mean(np.sum(scaled**2, axis=1), width)
 
@@ -39,7 +39,7 @@ def moving_mean(values: Float[np.ndarray, " sample"], width: int) -> Float[np.nd
 
 
 def until_soft_impact(record: Float[np.ndarray, "sample channel"], width: int) -> int:
-    """Samples of a record before an impact too soft to be found by its errors, or all.
+    """Number of samples of a record before an impact too soft for prediction errors, or all.
 
     `width` are two cycles of the strongest vibration in samples.
     """
@@ -68,20 +68,20 @@ def between_soft_impacts(
 
 
 def _highest_after(energy, rise, width) -> int:
-    """Sample of most energy after an impact, where nothing acts any longer."""
+    """Sample of most energy after an impact, from which on nothing acts."""
     return rise + int(np.argmax(energy[rise : rise + 4 * width]))
 
 
 def until_impact(energy: Float[np.ndarray, " sample"], width: int) -> int:
-    """Samples before an impact too soft to be found by its errors.
+    """Number of samples before an impact too soft to be found by prediction errors.
 
-    Close modes make the energy rise, too, but not above what it was as long before its least.
+    Close modes make the energy rise, too, but not above its value as long before its least.
     """
     return _until_rise(energy, width, RISE_WIDTHS * width, MIN_ENERGY_RISE)
 
 
 def _until_rise(energy, width, past, ratio) -> int:
-    """Samples before the energy rises within `width` above a multiple of all in the `past`."""
+    """Number of samples before the energy rises, within `width`, above `ratio` times its `past`."""
     if energy.size < past + 2 * width:
         return energy.size
     before = sliding_window_view(energy, past).max(axis=-1)[: -2 * width]
@@ -94,40 +94,40 @@ AR_ITERATIONS = 6  # of reweighting
 AR_ROWS = 20_000  # equations from which its coefficients are found
 QUIET_QUANTILE = 0.2  # of the blocks, by their prediction errors
 IMPACT_SD = 10.0  # prediction errors of quiet blocks, beyond which the structure is excited
-IMPACT_SIGNAL_SHARE = 0.25  # of the rms of the signal around, likewise
+IMPACT_OVER_SIGNAL = 0.25  # prediction errors over the rms of the signal around, likewise
 IMPACT_LOCAL_SD = 8.0  # or of the errors before it; normal errors reach six in a day of samples
 CONTACT_SAMPLES = 4  # within which past and future fail after an impact
 MIN_DECAY_CYCLES = 5.0  # of the strongest vibration
 MIN_FALL_NEPERS = 1.0  # of the energy over a decay
-MIN_LINEARITY = 0.6  # share of the variance of the log energy that a straight line explains
+MIN_LINEARITY = 0.6  # fraction of the variance of the log energy that a straight line explains
 MAX_COLUMNS = 24  # channels times decays that are fitted together
-# Of the information of one long decay, below which those side by side are not taken: intervals
-# would be ten times as wide. Impacts at random have a tenth or more (24 planted logs).
-LITTLE_SIDE_BY_SIDE = 0.01
-# Of a record's energy, in decays after impacts that the energy alone tells of. Ambient vibration
-# rises and falls, too: what falls held as much in one of eight short records of one mode.
+# Least information of stacked decays over that of one long decay alone; below it intervals would be
+# ten times as wide. Impacts at random have a tenth or more (24 planted logs).
+LEAST_STACKED_INFORMATION = 0.01
+# Least energy in decays after impacts that the energy alone shows, over that of the record. Ambient
+# vibration rises and falls, too: its falls held as much in one of eight short records of one mode.
 MIN_ENERGY_AFTER_SOFT_IMPACTS = 0.7
-FALL_PARTS = 10  # parts of a decay whose mean energies tell its fall
+FALL_PARTS = 10  # parts of a decay, from whose mean energies its fall is computed
 NOISE_QUANTILE = 0.25  # of the energy of a stretch: that of the noise, if the decay has ended
 CORES_BEFORE_NOISE = 8  # times that of 95 % of the energy above noise: 12 decay times of one mode
-CORE, WHOLE = 0.95, 0.999  # shares of the energy of a decay: for its fall, and for its end
+CORE, WHOLE = 0.95, 0.999  # fractions of the energy of a decay: for its fall, and for its end
 
 
-# Of the information of an impact's own decay, that other decays must have to be taken instead:
-# with less than a tenth, their intervals are more than three times as wide.
-LITTLE_INFORMATION = 0.1
+# Least information of other decays over that of the decay right after an impact, if they are taken
+# instead: with less than a tenth, their intervals are more than three times as wide.
+LEAST_INFORMATION = 0.1
 CONTACT_CYCLES = 0.5  # of the strongest vibration, in which marks are those of the impact itself
-# Nepers after which the instants of the fall of the energy are compared. One exponential needs half
-# of the time to the second for the first, several need less. What a load shakes that crosses stays
+# Falls of the energy in nepers, the times of which are compared. One exponential needs half of the
+# time to the second fall for the first, several need less. Under a crossing load the energy stays
 # up until it has left: the first neper takes most of the time to the second.
 FALLS = 1.0, 2.0
-MAX_FIRST_SHARE = 0.6  # of the time to the second, for the first
+MAX_FIRST_FALL = 0.6  # time of the first fall over that of the second
 
 
 class Stretch(NamedTuple):
     """Samples (start, stop) of a record between excitations, and the fall of energy in nepers.
 
-    `from_rest` says that it is the own decay of an impact on a structure at rest.
+    `from_rest` marks the decay right after an impact on a structure at rest.
     """
 
     record: int
@@ -140,11 +140,12 @@ class Stretch(NamedTuple):
 def excited_samples(
     record: Float[np.ndarray, "time channel"], rate: float, cycle: float
 ) -> Bool[np.ndarray, " time"]:
-    """Samples at which the structure is excited; `cycle` (s) is that of its strongest vibration.
+    """Mask of samples at which the structure is excited, as neither past nor future predicts them.
 
-    Neither the past samples predict them nor the coming ones: after an impact the past fails for as
-    many samples as the model has coefficients, before it the future. Two models must fail, one of
-    errors relative to the signal around, one of absolute errors, in which the loud parts count.
+    `cycle` (s) is that of the strongest vibration. After an impact prediction from the past fails
+    for as many samples as the model has coefficients, before it prediction from the future. Two
+    models must fail, one of errors relative to the signal around, one of absolute errors, in which
+    the loud parts count.
     """
     span = max(int(2 * cycle * rate), 16)
     excited = np.zeros(len(record), bool)
@@ -162,15 +163,15 @@ def excited_samples(
 
 
 def _is_large(error, around, span):
-    """Errors beyond those of the quietest blocks, and not small beside the signal."""
+    """Mask of errors beyond those of the quietest blocks, and not small against the signal."""
     size, found = max(span, 32), np.abs(error)
     if error.size < 2 * size:
-        return found > IMPACT_SIGNAL_SHARE * around
+        return found > IMPACT_OVER_SIGNAL * around
     blocks = found[: error.size // size * size].reshape(-1, size)
     quiet = np.sqrt(np.quantile(np.mean(blocks**2, axis=1), QUIET_QUANTILE))
     local = _level_before(error, max(span // 4, 16))
     return (found > IMPACT_SD * quiet) & (
-        (found > IMPACT_SIGNAL_SHARE * around) | (found > IMPACT_LOCAL_SD * local)
+        (found > IMPACT_OVER_SIGNAL * around) | (found > IMPACT_LOCAL_SD * local)
     )
 
 
@@ -186,7 +187,7 @@ def _level_before(error, size):
 
 
 def _widened(samples):
-    """Samples and their neighbours within `CONTACT_SAMPLES` on either side."""
+    """Mask of samples widened by `CONTACT_SAMPLES` neighbours on either side."""
     return np.convolve(samples, np.ones(2 * CONTACT_SAMPLES + 1), "same") > 0.5
 
 
@@ -228,11 +229,11 @@ def free_decays(
     the least has passed, or sooner if a long rest is noise. A record may begin right after an
     impact: its energy is then far above that at its end, though close modes make it rise and fall
     on the way. What is at rest before a first impact that was not found does not count. In a record
-    without a lasting excitation the energy also tells of impacts too soft, or in too much noise, to
+    without a lasting excitation the energy also shows impacts too soft, or in too much noise, to
     be found by their errors, down to a tenth of the highest energy.
 
-    The own decay of an impact on a structure at rest takes their place in its record where they
-    tell far less than it.
+    The decay right after an impact on a structure at rest takes their place in its record where
+    they have far less information.
     """
     shortest = int(np.ceil(MIN_DECAY_CYCLES * rate / frequency))
     width = max(int(2 * rate / frequency), 4)
@@ -249,8 +250,8 @@ def _decay_of_impact(number, marks, energy, shortest, width) -> Stretch | None:
     """The decay right after the strongest impact, if that strikes a structure at rest.
 
     A hammer leaves the structure after milliseconds. Friction, rattling parts and frequencies that
-    depend on amplitude make samples stand out in the decay that nothing has excited, and no linear
-    model explains it: it is known by the energy, which rises at once and falls from then on.
+    depend on amplitude cause prediction errors in the decay without any excitation, and no linear
+    model explains it: it is found by the energy, which rises at once and falls from then on.
     """
     ratio = marks.size / len(energy)
     highest = int(np.argmax(energy))
@@ -280,13 +281,14 @@ def _falls_at_once(energy) -> bool:
     """Whether energy falls from its beginning, as in a free decay."""
     level = np.log(np.maximum(energy, 1e-300))
     first, second = (np.flatnonzero(level < level[0] - fall) for fall in FALLS)
-    return bool(second.size and first[0] <= MAX_FIRST_SHARE * second[0])
+    return bool(second.size and first[0] <= MAX_FIRST_FALL * second[0])
 
 
 def _tell_enough(decays, own: Stretch, marks, energy) -> bool:
-    """Whether decays have not far less information than an impact's own: energy times nepers.
+    """Whether decays have enough information compared with the decay right after an impact.
 
-    The energy is that above the noise, which is the usual one of the record.
+    Information is energy times nepers; the energy is that above the noise, the usual energy of the
+    record.
     """
     ratio, noise = marks.size / len(energy), np.median(energy)
 
@@ -294,13 +296,13 @@ def _tell_enough(decays, own: Stretch, marks, energy) -> bool:
         part = energy[int(one.start / ratio) : int(one.stop / ratio)] - noise
         return one.fall * np.maximum(part, 0.0).sum()
 
-    return bool(sum(map(information, decays)) > LITTLE_INFORMATION * information(own))
+    return bool(sum(map(information, decays)) > LEAST_INFORMATION * information(own))
 
 
 def _decays_of_record(number, marks, energy, shortest, width) -> list[Stretch]:
     """Decays between the excited samples of a record, from the energy of its vibration.
 
-    Without excited samples the energy may tell of impacts, if the decays hold most of it.
+    Without excited samples the energy may show impacts, if the decays hold most of it.
     """
     ratio = marks.size / len(energy)
     only_impacts = _longest_run(marks) < shortest * ratio
@@ -315,7 +317,7 @@ def _decays_of_record(number, marks, energy, shortest, width) -> list[Stretch]:
 
 
 def _decays_between(number, marks, energy, shortest, width, only_impacts: bool) -> list[Stretch]:
-    """Decays between excited samples, and soft impacts if nothing but impacts excites it."""
+    """Decays between excited samples, also split at soft impacts if only impacts excite."""
     ratio, highest = marks.size / len(energy), energy.max()
     found, excited_from = [], 0
     for start, stop in _free_stretches(marks, shortest * ratio):
@@ -328,7 +330,7 @@ def _decays_between(number, marks, energy, shortest, width, only_impacts: bool) 
         parts = _parts(energy, (first, last), start == 0, only_impacts, shortest, width)
         for begins, ends in parts:
             part, after_soft_impact = energy[begins:ends], begins > parts[0][0]
-            # Noise rises and falls, too, but little beside the hardest impact.
+            # Noise rises and falls, too, but little against the hardest impact.
             if part.size < shortest or (after_soft_impact and MAX_HARDER * part[0] < highest):
                 continue
             raised = impact or after_soft_impact or (start == 0 and _begins_high(part))
@@ -369,7 +371,7 @@ def _parts(energy, stretch, is_first, only_impacts, shortest, width) -> list[tup
 
 
 def _longest_run(marks) -> int:
-    """Most samples one after another that are marked."""
+    """Length of the longest run of marked samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], marks, [False]])))
     return int(np.diff(edges)[::2].max(initial=0))
 
@@ -381,7 +383,7 @@ def _begins_high(energy):
 
 
 def _at_rest(energy, width):
-    """Samples of the beginning of a record before an impact that was not found by its errors.
+    """Number of samples at the beginning of a record before an impact not found by its errors.
 
     The least energy of its first cycles is then a tenth of the most in the record, or less, and it
     does not begin with much energy, as a fast decay does.
@@ -410,20 +412,20 @@ def _fall_of_decay(energy, impact):
 
 
 def _until_noise(energy):
-    """Samples that hold nearly all energy above the least, without a long rest of noise.
+    """Number of samples that hold nearly all energy above the least, without a long rest of noise.
 
-    Noise has the usual energy of the second half, if it has all of that. Weak modes may last longer
-    than what holds most of the energy above it.
+    The level of noise is the usual energy of the second half, if that is all noise. Weak modes may
+    last longer than the part with most of the energy above it.
     """
     above = np.cumsum(energy - np.median(energy[energy.size // 2 :]))
     core = int(np.argmax(above >= CORE * above.max())) + 1
     return min(_length(energy, WHOLE), CORES_BEFORE_NOISE * core)
 
 
-def _length(energy, share):
-    """Samples that hold a share of the energy above its least."""
+def _length(energy, fraction):
+    """Number of samples that hold a fraction of the energy above its least."""
     total = np.cumsum(energy - energy.min())
-    return int(np.searchsorted(total, share * total[-1])) + 1
+    return int(np.searchsorted(total, fraction * total[-1])) + 1
 
 
 def _fall(energy):
@@ -441,11 +443,11 @@ def _fall(energy):
 def stacked(
     records: tuple[Float[np.ndarray, "time channel"], ...], decays: tuple[Stretch, ...]
 ) -> tuple[Float[np.ndarray, "sample column"], tuple[Stretch, ...]]:
-    """Decays of one length side by side, channels of the first before those of the second ...
+    """Decays of one length stacked as columns: channels of the first, then of the second, ...
 
     The common length is the median; decays of less than half of it are left out, and those between
-    shorten it. One long decay is taken alone where it tells a hundred times as much. Of more than
-    24 columns in all, the principal combinations of the decays are returned: weighted sums, of
+    shorten it. One long decay is taken alone where it has a hundred times the information. Of more
+    than 24 columns in all, the principal combinations of the decays are returned: weighted sums, of
     orthonormal weights, that hold most energy. They have the poles and shapes of the decays, and as
     much noise as one of them.
     """
@@ -454,10 +456,10 @@ def stacked(
         one for one, length in zip(decays, lengths, strict=True) if 2 * length >= np.median(lengths)
     )
     length = min(int(np.median(lengths)), min(one.stop - one.start for one in used))
-    known = _information(records, decays)
-    longest = int(np.argmax([one[-1] for one in known]))
-    together = sum(one[length - 1] for one in known if one.size >= length)
-    if together < LITTLE_SIDE_BY_SIDE * known[longest][-1]:
+    each = _information(records, decays)
+    longest = int(np.argmax([one[-1] for one in each]))
+    together = sum(one[length - 1] for one in each if one.size >= length)
+    if together < LEAST_STACKED_INFORMATION * each[longest][-1]:
         used, length = (decays[longest],), int(lengths[longest])
     parts = np.stack([records[one.record][one.start : one.start + length] for one in used])
     most = max(MAX_COLUMNS // records[0].shape[1], 1)
@@ -482,7 +484,7 @@ def _information(records, decays) -> list[Float[np.ndarray, " sample"]]:
     return [np.cumsum(np.arange(one.size) ** 2 * (one - noise)) for one in energies]
 
 
-MIN_DECAY_ENERGY = 0.3  # share of the energy of a log in its decays, if they are to stand for it
+MIN_DECAY_ENERGY = 0.3  # fraction of the energy of a log in its decays, if they represent it
 LONG_FALL_NEPERS = 1.5  # or fall of the energy; 95 % of that of an exponential falls by 3
 MIN_START_LEVEL = 0.2  # energy at the start of such a decay over the mean energy of the log
 
@@ -494,13 +496,12 @@ def dominate(
     ratio: float,
     cycle: float,
 ) -> bool:
-    """Whether decays hold much of the energy of a log, or one falls far, or follows a load.
+    """Whether decays represent a log: hold much of its energy, fall far, or follow a load.
 
     `excited` are samples of the log, `ratio` those of `records` over these; `cycle` is that of the
     strongest vibration in samples of `records`. A decay that begins far below the level of the log,
-    long after impacts, lacks the modes that were gone by then; one that begins where a lasting
-    excitation ends has them all, however much stronger the excitation was, and how far it falls is
-    of no matter.
+    long after impacts, lacks the modes that have decayed by then; one that begins where a lasting
+    excitation ends has them all, however much stronger the excitation was and however far it falls.
     """
     inside = sum(
         np.sum(records[d.record][int(d.start * ratio) : int(d.stop * ratio)] ** 2) for d in decays

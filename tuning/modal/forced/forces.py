@@ -73,7 +73,7 @@ def force_records(
     found = []
     for log in logs:
         own = [name for name in names if name in log.names]
-        # Without a force the responses tell the instants.
+        # Without a force the instants are those of the responses.
         rate, records, _ = even_records(part_of_window(with_channels(log, own or None), window))
         for record in records:
             values = np.zeros((len(record.values), len(names)))
@@ -90,8 +90,8 @@ def force_records(
     return tuple(matched)
 
 
-IMPACT_SHARE = 0.1  # of the largest force, above which there is an impact
-MAX_IMPACT_SHARE = 0.05  # of the samples of a log of impacts
+IMPACT_LEVEL = 0.1  # of the largest force, above which there is an impact
+MAX_IMPACT_TIME = 0.05  # fraction of the samples of a log of impacts with an impact
 BEFORE = 8  # samples before an impact that belong to it: ringing of an anti-alias filter
 
 
@@ -103,7 +103,7 @@ class Windows(NamedTuple):
 
     @property
     def decay_rate(self) -> float:
-        """What the exponential window adds to decay rates (1/s)."""
+        """Decay rate (1/s) that the exponential window adds to that of each mode."""
         return 0.0 if self.exponential is None else 1 / self.exponential
 
 
@@ -123,8 +123,8 @@ def find_impacts(force: Float[np.ndarray, "time force"]) -> Int[np.ndarray, " im
     A hammer's force is above a tenth of its largest value for a twentieth of the time at most.
     """
     size = np.max(np.abs(force) / np.maximum(np.abs(force).max(axis=0), 1e-300), axis=1)
-    excited = size > IMPACT_SHARE
-    if not excited.any() or excited.mean() > MAX_IMPACT_SHARE:
+    excited = size > IMPACT_LEVEL
+    if not excited.any() or excited.mean() > MAX_IMPACT_TIME:
         return np.zeros(0, int)
     begins = np.flatnonzero(excited & ~np.concatenate([[False], excited[:-1]]))
     # Rebounds and ringing filters cross the level again at once.

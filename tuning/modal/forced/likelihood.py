@@ -8,8 +8,9 @@ are the residues by least squares (LSFD), of rank one: shape times participation
 
 Errors of different lines of a spectrum are independent, and their variance changes little from line
 to line. A lightly damped mode has few lines, which its residues follow, so that the errors left at
-these tell little: at each line the variance is the mean over its neighbours, of errors divided by
-what the model leaves free of them (leverage; MacKinnon and White 1985 for single errors).
+these have little information: at each line the variance is the mean over its neighbours, of errors
+divided by what the model leaves free of them (leverage; MacKinnon and White 1985 for single
+errors).
 """
 
 from collections.abc import Iterator
@@ -21,12 +22,12 @@ from scipy.ndimage import uniform_filter1d
 
 from tuning.modal.forced.measured_responses import Lines
 
-NEIGHBOURS = 5  # lines on either side whose errors tell the variance of a line
+NEIGHBOURS = 5  # lines on either side from whose errors the variance of a line is estimated
 BLOCKS = 48  # of lines, every 48th in one
 
 
 class FreeErrors(NamedTuple):
-    """Errors of rows (real parts of all lines, then imaginary), and shares that were free."""
+    """Errors of rows (real parts of all lines, then imaginary), and one minus their leverage."""
 
     errors: Float[np.ndarray, "row output"]
     free: Float[np.ndarray, "row output"]
@@ -57,7 +58,7 @@ def free_errors(
     normal: Float[np.ndarray, "part part"],
     weight: Float[np.ndarray, " output"],
 ) -> FreeErrors:
-    """Errors with one minus their leverage.
+    """Errors of a fit with one minus their leverage.
 
     The leverage is that of the columns, linear for each output, and of the slopes by poles.
     """
@@ -70,9 +71,9 @@ def free_errors(
 
 
 def replicates(found: FreeErrors) -> Iterator[tuple[Float[np.ndarray, "row output"], float]]:
-    """Errors that could have been, with their weights in a covariance.
+    """Replicates of the errors, with their weights in a covariance.
 
-    Those of each neighbour in the place of a line, also turned by a quarter of a period.
+    The errors of each neighbour in the place of a line, also turned by a quarter of a period.
     """
     count = len(found.errors) // 2
     complex_errors = found.errors[:count] + 1j * found.errors[count:]
@@ -133,7 +134,7 @@ def both_parts(values: Complex[np.ndarray, "line column"]) -> Float[np.ndarray, 
 def resonances_of(
     lines: Lines, poles: Complex[np.ndarray, " mode"]
 ) -> tuple[Complex[np.ndarray, "line mode"], Complex[np.ndarray, "line mode"]]:
-    """1 / (i w - p) and the same of the conjugate poles (line, mode)."""
+    """Resonances 1 / (i w - p), and those of the conjugate poles (line, mode)."""
     s = 1j * np.angle(lines.z) / lines.step
     return (1 / (s - poles[:, None])).T, (1 / (s - poles.conj()[:, None])).T
 
@@ -141,7 +142,7 @@ def resonances_of(
 def transients_of(
     lines: Lines, poles: Complex[np.ndarray, " mode"]
 ) -> tuple[Complex[np.ndarray, "line mode"], Complex[np.ndarray, "line mode"]]:
-    """1 / (z - exp(p T)) and the same of the conjugate poles (line, mode)."""
+    """Transients 1 / (z - exp(p T)), and those of the conjugate poles (line, mode)."""
     roots = np.exp(poles * lines.step)
     return (1 / (lines.z - roots[:, None])).T, (1 / (lines.z - roots.conj()[:, None])).T
 
@@ -149,7 +150,7 @@ def transients_of(
 def times_signals(
     terms: Complex[np.ndarray, "line term"], signals: Shaped[np.ndarray, "line signal"]
 ) -> Complex[np.ndarray, "line column"]:
-    """Products of all terms and signals, the signals of a term side by side."""
+    """Products of all terms and signals, (line, term and signal); signals vary fastest."""
     return (terms.T[:, None, :] * signals.T[None, :, :]).reshape(-1, len(terms)).T
 
 
@@ -218,14 +219,14 @@ def pole_directions(
 REST_POWERS = (-2, -1, 0, 1, 2)  # of z, for modes above the band and those not found
 FEWER_REST_POWERS = (0, 1)  # with which poles are compared
 STEPS = 12  # of Gauss and Newton, at most
-WIDE = 16  # lines on either side whose errors tell the level of a line
+WIDE = 16  # lines on either side from whose errors the level of a line is estimated
 MIN_SPREAD = 1e-3  # of errors, over that of all lines
 # of Cholesky's factor, whose relative errors are those of rounding over its square
 MIN_PIVOT = 1e-4
 MAX_STEP = 0.5  # of a pole, over its width
 CONVERGED = 1e-4  # step over the decay rate; what is left after it is of the order of its square
 MAX_SHIFT = 3.0  # from the start, over the width; beyond, a pole is none of the data
-MIN_WIDTH = 0.5  # of a pole, over the distance of lines: less is not told from nothing
+MIN_WIDTH = 0.5  # of a pole, over the distance of lines: less has no effect on the lines
 
 
 class LinearFit(NamedTuple):
@@ -247,7 +248,7 @@ class LinearFit(NamedTuple):
 
 
 class FittedModel(NamedTuple):
-    """Poles that fit the lines of a band best, and what tests and uncertainties need.
+    """Modal model fitted to the lines of a band, with matrices for tests and uncertainties.
 
     `plain` are the lines as they are, `lines` those with errors of one level; poles with indices
     `moving` were refined. Slopes are those of the responses and of the coefficients by the poles,
@@ -325,8 +326,8 @@ def fit_modal_model(
 def _normal(gram, directions, weight):
     """Matrix of the normal equations of the poles.
 
-    Slopes by the poles are columns in some `directions`; `gram` has their products, less what
-    residues make up for.
+    Slopes by the poles are columns in some `directions`; `gram` has the products of their parts
+    that residues cannot represent.
     """
     return np.einsum("cko,cd,dlo,o->kl", directions, gram, directions, weight, optimize=True)
 
@@ -361,11 +362,11 @@ def refined_poles(
 
 
 def _reduced(lines: Lines, poles, moving, powers):
-    """What a step of Gauss-Newton needs of all lines.
+    """Sums over all lines for a step of Gauss-Newton.
 
-    These are the coefficients (column, output), the products of the columns of the moving poles,
-    less what residues make up for, their products with the errors (column, output), and the sums of
-    squared errors. All follow from the triangular factor of the columns and outputs side by side.
+    These are the coefficients (column, output), the products of the columns of the moving poles
+    after projection on the residues' complement, their products with the errors (column, output),
+    and the sums of squared errors. All follow from the triangular factor of columns and outputs.
     """
     columns, slopes = columns_of_model(lines, poles, powers), columns_of_poles(lines, poles[moving])
     factor = triangular_factor(np.concatenate([columns, slopes, lines.outputs], axis=1))
@@ -382,7 +383,8 @@ def triangular_factor(
     """Upper triangular R of the QR decomposition of real and imaginary parts of columns.
 
     It is Cholesky's factor of the products of all columns, which costs half as much, unless columns
-    of unit size depend on those before them but for MIN_PIVOT: products lose their difference.
+    of unit size differ from combinations of those before them by less than MIN_PIVOT: products lose
+    that difference.
     """
     rows = np.ascontiguousarray(columns.T).view(float)
     products = rows @ rows.T

@@ -46,8 +46,8 @@ class MeasuredResponses:
     """Frequency responses of the channels of a log to the forces measured in it.
 
     `values` are complex, in SI units of each channel per N; `coherence` is that of each output with
-    all forces together, NaN of a single average, which tells none; `averages` is the number of
-    segments or impacts. `decay_rate` (1/s) is what an exponential window added to that of each
+    all forces together, NaN for a single average, which has none; `averages` is the number of
+    segments or impacts. `decay_rate` (1/s) is that of the exponential window, added to that of each
     mode.
 
     >>> import numpy as np
@@ -83,7 +83,7 @@ class MeasuredResponses:
         return np.sqrt((1 - coherence) / (2 * self.averages * coherence))
 
     def true_damping_ratio(self, frequency: float, damping_ratio: float) -> float:
-        """Damping ratio without the exponential window, z - a / w, of one that is read from these.
+        """Damping ratio of a mode corrected for the exponential window: z - a / w.
 
         `frequency` is the natural frequency (Hz).
         """
@@ -112,7 +112,7 @@ def measured_responses(
 
     With spectra S averaged over segments, H1 = S_yf S_ff^-1 is free of the bias of noise in the
     responses, H2 = S_yy / S_fy of that of noise in the force, Hv = sqrt(S_yy / S_ff) with the phase
-    of H1 shares it between both (Rocklin, Crowley and Vold 1985); the last two are for one force.
+    of H1 divides it between both (Rocklin, Crowley and Vold 1985); the last two are for one force.
     Of a hammer a segment is the time from one impact to the next, all as long as the shortest; else
     segments of `segment` s (an eighth of the log) have a window of Hann and overlap by half.
     `exponential` (s) is the time constant of a window on impacts and responses, `force_window` (s)
@@ -163,7 +163,7 @@ def measured_responses(
     size = min(len(piece[0]) for piece in pieces)
     if len(pieces) < len(names):
         raise ValueError(
-            f"{logs[0].source}: {len(pieces)} segments do not tell {len(names)} forces apart"
+            f"{logs[0].source}: {len(pieces)} segments do not separate {len(names)} forces"
         )
     values, coherence = _estimate(pieces, size, taper, estimator)
     bins = np.fft.rfftfreq(size, 1 / samples.rate)
@@ -218,9 +218,9 @@ def _estimate(pieces, size, taper, estimator):
 HIGHEST_LINE = 1.15  # of transforms, over the upper end of a band
 MAX_ANGLE = 2.8  # of z on the circle, of a band from 0
 PART_LINES = 4096  # lines whose products are formed at once
-# Products of driving signals over the largest, below which they are none: a thousandth of the
-# signals, less than noise. Early impacts are nearly powers of z; a shape would be a difference of
-# large gains of them and of the transient, whatever their sum fits.
+# Least product of driving signals, over the largest: a thousandth of the signals, less than noise.
+# Early impacts are nearly powers of z; a shape would be a difference of large gains of them and of
+# the transient, whatever their sum fits.
 MIN_DRIVING = 1e-6
 
 
@@ -327,8 +327,8 @@ def products(
 def fit_common_denominator(system: Products, degree: int) -> CommonDenominator:
     """Polynomials of a degree, at most that of the products.
 
-    A shape is what all numerators at a root make of the signals at the line nearest to it: how much
-    is forced and how much free, which one impact leaves open, does not matter.
+    A shape is the response of all numerators at a root to the signals at the line nearest to it.
+    How much of it is forced and how much free, which one impact leaves open, does not matter.
     """
     size, outputs = degree + 1, system.outputs
     part = system.gram[:, :size, :, :size]

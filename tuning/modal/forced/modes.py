@@ -66,26 +66,26 @@ def _blocks(rows: Float[np.ndarray, "row *more"]) -> Float[np.ndarray, "block pl
 
 
 def _steps(model: FittedModel) -> list[Float[np.ndarray, "block part"]]:
-    """Changes of real and imaginary parts of moving poles for errors that could have been.
+    """Changes of real and imaginary parts of moving poles for replicates of the errors.
 
-    They are those of each block of lines, carried through the step of Gauss-Newton: a sandwich, so
-    that the errors may have any spectrum.
+    Errors of each block of lines are carried through the step of Gauss-Newton: a sandwich estimate,
+    so that the errors may have any spectrum.
     """
     solution = np.linalg.pinv(model.normal, rcond=1e-12, hermitian=True)
     slopes = _blocks(np.swapaxes(model.slopes * model.weight, 1, 2))
     slopes = slopes.reshape(BLOCKS, slopes.shape[1] * slopes.shape[2], slopes.shape[3])
     return [
-        np.sqrt(share) * (_blocks(errors).reshape(BLOCKS, 1, -1) @ slopes)[:, 0] @ solution
-        for errors, share in replicates(model.free)
+        np.sqrt(weight) * (_blocks(errors).reshape(BLOCKS, 1, -1) @ slopes)[:, 0] @ solution
+        for errors, weight in replicates(model.free)
     ]
 
 
 def _coefficient_steps(model: FittedModel, pole_steps):
-    """Changes of the coefficients (replicate, column, output) beside those of the poles."""
+    """Changes of the coefficients (replicate, column, output) with those of the poles."""
     inverse = np.swapaxes(_blocks(model.fit.inverse.T), 1, 2)
     found = []
-    for (errors, share), steps in zip(replicates(model.free), pole_steps, strict=True):
-        own = np.sqrt(share) * inverse @ _blocks(errors)
+    for (errors, weight), steps in zip(replicates(model.free), pole_steps, strict=True):
+        own = np.sqrt(weight) * inverse @ _blocks(errors)
         found.append(own - np.tensordot(steps, model.by_poles, axes=(1, 1)))
     return np.concatenate(found)
 
@@ -135,8 +135,8 @@ def modes_of_model(
 ) -> tuple[IdentifiedMode, ...]:
     """Modes of a fitted model with uncertainties; those of poles not refined have none.
 
-    Outputs are in units of `scale`, shapes in those of the log. Shares in the energy are those of
-    all lines.
+    Outputs are in units of `scale`, shapes in those of the log. Fractions of the energy are those
+    of all lines.
     """
     plain, lines, poles, fit = model.plain, model.lines, model.poles, model.fit
     covariances = pole_covariances(model)
@@ -148,8 +148,8 @@ def modes_of_model(
     transients, mirrored_transients = transients_of(plain, poles)
     modes = []
     for k, pole in enumerate(poles):
-        # Residues and transients are multiples of one shape. What they are together is known well,
-        # but hardly each, if one impact at the beginning is all that excites.
+        # Residues and transients are multiples of one shape. Their sum is determined well, but
+        # hardly each of them, if one impact at the beginning is the only excitation.
         terms = resonances[:, [k]] * plain.inputs, transients[:, [k]] * plain.unforced
         signals = np.concatenate(terms, axis=1)
         response = signals @ coefficients[k]
@@ -181,7 +181,7 @@ def modes_of_model(
 
 
 MAX_ADDED = 12  # poles, one at a time
-WEIGHT_DEGREE_SHARE = 0.5  # degree of the denominator that weights lines, over the highest
+WEIGHT_DEGREE = 0.5  # degree of the denominator that weights lines, over the highest
 MIN_WEIGHT = 1e-3  # size of the denominator, over its median, below which weights are equal
 CHANCE = 1e-3  # probability below which noise is no explanation
 SAME_POLE = 0.5  # distance of two poles over the smaller decay rate, below which they are one
@@ -190,7 +190,7 @@ MAX_SHAPE_ERRORS = 0.1
 
 
 class ForcedModes(NamedTuple):
-    """Candidate modes, stabilisation diagrams, and the share of the responses explained."""
+    """Candidate modes, stabilisation diagrams, and the fraction of the responses explained."""
 
     candidates: tuple[Candidate, ...]
     diagrams: tuple[Diagram, ...]
@@ -226,12 +226,12 @@ def forced_modes(
             raise ValueError("a measured force is zero throughout; leave it out")
         scale = np.where(scale > 0, scale, 1.0)
         lines = lines._replace(outputs=lines.outputs / scale, inputs=lines.inputs / force_scale)
-        candidates, diagram, shares = _modes_of_lines(
+        candidates, diagram, powers = _modes_of_lines(
             lines, scale, part, band, duration, order, _poles(found)
         )
         found += candidates
         diagrams.append(diagram)
-        rest, whole = rest + shares[0], whole + shares[1]
+        rest, whole = rest + powers[0], whole + powers[1]
     return ForcedModes(without_duplicates(found), tuple(diagrams), 1 - rest / max(whole, 1e-300))
 
 
@@ -243,7 +243,7 @@ def _poles(found):
 def _modes_of_lines(lines: Lines, scale, part, band, duration, order, known):
     """Candidates and diagram of a part of a band, and the powers of errors and responses.
 
-    Poles `known` from other parts of the band reach into this one by their flanks.
+    Poles `known` from other parts of the band have flanks in this one.
     """
     diagram = _diagram(lines, scale, part, order)
     model, dropped = refined_model(lines, _distinct(known, diagram), scale, part)
@@ -264,9 +264,9 @@ def _modes_of_lines(lines: Lines, scale, part, band, duration, order, known):
 
 
 def mode_reason(mode: IdentifiedMode, duration, band) -> str:
-    """Reason for rejecting a mode: a complex shape, only if errors are not what makes it complex.
+    """Reason for rejecting a mode, or ""; a shape must be complex beyond its errors to count.
 
-    Of a close pair that one force excites alike the log tells the sum of the shapes, hardly each.
+    Of a close pair that one force excites alike, the sum of the shapes is determined, hardly each.
     """
     errors = np.trace(mode.shape_covariance) / np.sum(np.abs(mode.shape) ** 2)
     least = MIN_COLLINEARITY if errors < MAX_SHAPE_ERRORS else 0.0
@@ -278,7 +278,7 @@ def _diagram(lines: Lines, scale, part, order) -> Diagram:
     highest = min(order or MAX_ORDER, len(lines.z) // (4 * lines.inputs.shape[1] + 4))
     degrees = range(2, max(highest, 3) + 1)
     first = fit_common_denominator(
-        products(lines, degrees[-1]), max(int(WEIGHT_DEGREE_SHARE * degrees[-1]), 2)
+        products(lines, degrees[-1]), max(int(WEIGHT_DEGREE * degrees[-1]), 2)
     )
     size = np.abs(np.polyval(first.denominator[::-1], lines.z))
     weights = 1 / np.maximum(size, MIN_WEIGHT * np.median(size))
@@ -291,12 +291,12 @@ def _diagram(lines: Lines, scale, part, order) -> Diagram:
         np.concatenate([fit.shapes for fit in fits]) * scale,
         np.zeros(sum(sizes)),
     )
-    # Modes beside the band leave their flanks in it.
+    # Modes outside the band have flanks in it.
     return stabilise(poles, (part[0] / 4, 0.5 / lines.step))
 
 
 def refined_model(lines, poles, scale, part):
-    """Model of those poles that are determined, and the modes of the others with reasons.
+    """Modal model of the poles that the lines determine, and the other modes with reasons.
 
     Two poles for one resonance, or one for none, make others uncertain, so that one goes at a time.
     """
@@ -332,7 +332,7 @@ def completed(lines, model, scale, part):
 
 
 def _distinct(known, diagram: Diagram) -> Complex[np.ndarray, " mode"]:
-    """Known poles, and those of the chains of a diagram, the longer first, that are others."""
+    """The `known` poles, and those of the chains of a diagram that differ, longer chains first."""
     kept = [complex(pole) for pole in known]
     for chain in sorted(diagram.chains, key=lambda chain: -chain.members.size):
         pole = complex(diagram.poles.poles[chain.best])

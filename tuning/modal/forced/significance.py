@@ -1,6 +1,6 @@
 """Tests of a modal model: poles that chance explains, and missing poles.
 
-A pole placed at a chance peak of the noise fits it well, so that its errors tell nothing against
+A pole placed at a chance peak of the noise fits it well, so that its errors say nothing against
 it; but what it explains, at one of many lines, is not more than the noise makes it. A pole that is
 missing leaves errors along 1 / (s - p). These are tests of F.
 """
@@ -29,7 +29,7 @@ MOST_PROMISING = 3  # of them, whose probabilities are computed
 
 
 def mode_chances(model: FittedModel) -> Float[np.ndarray, " mode"]:
-    """Probability that noise explains what each mode does, forced and free, at any of the lines.
+    """Probability that noise explains the response of each mode, forced and free.
 
     Both together, as the response to an impact at the start of a record is like a free one.
     """
@@ -37,7 +37,7 @@ def mode_chances(model: FittedModel) -> Float[np.ndarray, " mode"]:
     variance = _local_variance(model.fit.errors, model.free.free)
     for k in range(model.poles.size):
         # Without its coefficients x the sum of squared errors is more by x^T (F F^T)^-1 x. After a
-        # impact at the start forced and free ones are nearly one: F F^T would lose what is known.
+        # impact at the start forced and free ones are nearly one: F F^T would lose their sum.
         own = coefficient_places(model.lines, model.poles.size, k)
         directions, sizes, _ = np.linalg.svd(model.fit.inverse_factor[own], full_matrices=False)
         kept = sizes > MIN_SIZE * sizes[0]
@@ -78,7 +78,7 @@ def promising_poles(
 
 
 def _least_statistics(lines: Lines, errors, tried) -> Float[np.ndarray, " tried"]:
-    """What 1 / (s - p) explains of the errors, over their variance, if the model keeps its own."""
+    """Reduction of the errors by a pole 1 / (s - p), over their variance, the model unchanged."""
     angular = np.angle(lines.z) / lines.step
     variance = line_means(errors**2, NEIGHBOURS)
     errors = errors.reshape(2, len(lines.z), -1)
@@ -106,7 +106,7 @@ def _columns_of(lines: Lines, pole):
 
 
 def _chance(model: FittedModel, pole: complex) -> float:
-    """Probability by noise of what 1 / (s - p) explains of the errors."""
+    """Probability that a pole 1 / (s - p) reduces the errors as much by noise alone."""
     fit, columns = model.fit, _columns_of(model.lines, pole)
     basis = np.linalg.qr(columns - fit.basis @ (fit.basis.T @ columns))[0]
     along = basis.T @ fit.errors
@@ -139,5 +139,5 @@ def criterion(fit: LinearFit, modes: int) -> float:
 
 def _local_variance(errors, free):
     """Variance of a real or imaginary part at each line (line, output), by its neighbours."""
-    power, shares = (line_means(one, NEIGHBOURS) for one in (errors**2, free))
-    return power / np.maximum(shares, 1e-3)
+    power, freedom = (line_means(one, NEIGHBOURS) for one in (errors**2, free))
+    return power / np.maximum(freedom, 1e-3)

@@ -16,7 +16,7 @@ The expectation over N samples is, with the truncation at their ends (Sykulski e
     g = sum_l (1 - l / N) z^l = 1 / (1 - z) - z (1 - z^N) / (N (1 - z)^2),   z = exp((p - i w) h),
 
 with R(0) made symmetric. L is lower triangular and a polynomial in log w (in c_k its mean); E is
-positive definite whatever the noise. Shapes tell close modes apart that no single channel does.
+positive definite whatever the noise. Shapes separate close modes that no single channel does.
 
 The largest likelihood is found by damped Fisher scoring, in which each unknown has its own scale.
 """
@@ -43,7 +43,7 @@ def damped_scoring(
     tolerance: float,
     largest_steps: Callable[[Point, int], Float[np.ndarray, " unknown"] | float] | None = None,
 ) -> tuple[Point, float]:
-    """Point of the least cost near a start, and its cost; it is at the minimum to a `tolerance`.
+    """Minimum of a cost near a start to a `tolerance`, by damped Fisher scoring, and its cost.
 
     `information` returns the gradient of the cost and Fisher's information at a point, `moved` the
     point after a step of its unknowns with its cost, infinite where it may not be;
@@ -87,7 +87,7 @@ class Window(NamedTuple):
 
 
 class SpectralModel(NamedTuple):
-    """Poles p (1/s), shapes f, factor C of the forces, shared forces K, skewness b.
+    """Spectral model: poles p (1/s), shapes f, factor C of the forces, shared forces K, skewness b.
 
     The factor L of the background is a polynomial. `step` (s) is that of sampling; `cost` is the
     negative logarithm of the likelihood in a window.
@@ -204,7 +204,7 @@ def with_cost(model: SpectralModel, window: Window) -> SpectralModel:
 TOLERANCE = 5e-2  # of the logarithm of the likelihood, at which the search ends
 MAX_SKEWNESS = 3.0  # over the damping ratio
 PART_BINS = 256  # whose derivatives are formed at once
-UNKNOWN, MAX_OPEN = 1e100, 1e-6  # variance; share of a pole in such directions
+UNKNOWN, MAX_OPEN = 1e100, 1e-6  # variance; squared component of a pole in such directions
 MIN_DIRECTION = 1e-10  # of the scaled information; the scales of shapes have none
 
 
@@ -300,7 +300,7 @@ def _moved(model: SpectralModel, step) -> SpectralModel:
 
 
 def _largest_steps(model: SpectralModel, size: int):
-    """Largest steps of the unknowns: of forces their size, of others none.
+    """Largest steps of the unknowns: the size of forces, unlimited for the others.
 
     Where forces are fully correlated the diagonal of their factor is zero, and the cost flat in it.
     """
@@ -332,16 +332,16 @@ def maximise(model: SpectralModel, window: Window) -> SpectralModel:
 def covariance(model: SpectralModel, window: Window) -> Float[np.ndarray, "unknown unknown"]:
     """Covariance of all unknowns, in the order of `information`.
 
-    The variance of a pole that is left open is `UNKNOWN`; that scales of shapes are, and that
-    forces cannot be told from each other in few channels, does not matter.
+    The variance of a pole that is not determined is `UNKNOWN`. Scales of shapes, and in few
+    channels the division between forces, are not determined either, which does not matter.
     """
     fisher = information(model, window)[1]
     scale = 1 / np.sqrt(np.diag(fisher) + 1e-300)
     sizes, vectors = np.linalg.eigh(fisher * np.multiply.outer(scale, scale))
-    known = sizes > MIN_DIRECTION * sizes[-1]
-    found = (vectors[:, known] / sizes[known]) @ vectors[:, known].T
+    determined = sizes > MIN_DIRECTION * sizes[-1]
+    found = (vectors[:, determined] / sizes[determined]) @ vectors[:, determined].T
     found = found * np.multiply.outer(scale, scale)
     poles = 2 * model.poles.size
-    left_open = np.sum(vectors[:poles, ~known] ** 2, axis=1) > MAX_OPEN
+    left_open = np.sum(vectors[:poles, ~determined] ** 2, axis=1) > MAX_OPEN
     found[np.arange(poles)[left_open], np.arange(poles)[left_open]] = UNKNOWN
     return found

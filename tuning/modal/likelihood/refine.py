@@ -1,7 +1,7 @@
 """Modes that a subspace method leaves uncertain, decided by the likelihood of spectral matrices.
 
 Subspace methods of many channels are hard to beat, but with few channels or close modes damping
-ratios scatter several times as much as they must, and a mode may not be told from none. Modes apart
+ratios scatter several times as much as they must, and a mode may seem to be none. Modes apart
 from others are fitted in a window of their own (`model`). Of many channels those principal
 combinations count that hold most of the power in the window.
 """
@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from tuning.modal.likelihood.model import SpectralModel, Window, covariance, maximise
 
 WINDOW_WIDTHS = 8.0  # half width of the window around a pole over its half-power width
-WINDOW_SHARES = 0.1, 0.3  # of the frequency, at least and at most
+WINDOW_FRACTIONS = 0.1, 0.3  # of the frequency, at least and at most
 MIN_WINDOW_BINS = 16.0  # likewise in bins of the records
 MAX_GROUP = 6  # poles that are fitted together, the best determined ones
 MAX_ROWS = 4  # combinations of channels
@@ -27,7 +27,7 @@ FALSE_ALARM_PROBABILITY = 1e-4  # of a mode in a window that the likelihood gain
 BACKGROUND_ORDERS = 1, 2  # of its factor across a window
 SAME_POLE = 0.5  # distance of certain poles over the smaller decay rate, below which they are one
 CERTAIN_FIRST = 1e3  # weight of the distances of certain poles from those that the fit has moved
-START_SHARE = 0.02  # of the power of the window, of a mode to begin with, at least
+START_POWER = 0.02  # least power of a mode at the start, over that of the window
 
 
 class Start(NamedTuple):
@@ -60,7 +60,7 @@ class RefinedMode(NamedTuple):
 def refine_modes(
     records: Sequence[Float[np.ndarray, "time channel"]], rate: float, start: Start
 ) -> list[RefinedMode | None]:
-    """Each mode refined; None for those that the likelihood does not need, and for certain ones.
+    """Refined modes; None for modes that the likelihood does not need, and for certain ones.
 
     Certain modes apart from all uncertain ones are left alone.
     """
@@ -68,7 +68,7 @@ def refine_modes(
     resolution = rate / max(map(len, records))
     frequencies = start.poles.imag / (2 * np.pi)
     widths = -start.poles.real / (2 * np.pi)
-    half = np.clip(WINDOW_WIDTHS * widths, *np.multiply.outer(WINDOW_SHARES, frequencies))
+    half = np.clip(WINDOW_WIDTHS * widths, *np.multiply.outer(WINDOW_FRACTIONS, frequencies))
     half = np.maximum(half, MIN_WINDOW_BINS * resolution)
     transforms = [np.fft.rfft(record, axis=0) / np.sqrt(len(record)) for record in records]
     for group in _groups(frequencies, half):
@@ -128,7 +128,7 @@ def _select(window: Window, start: Start) -> list[RefinedMode | None]:
         trial = maximise(_with_pole(best, start, k, window), window)
         if best.cost - trial.cost > _least_gain(trial, window, start.poles.size):
             best, kept = trial, [*kept, k]
-    # One that filled the place of a later one is not needed any more.
+    # A mode that filled the place of a later one is not needed any more.
     for k in [k for k in kept if not start.certain[k]][:-1]:
         (trial, others), rest = _certain(window, start, order), [one for one in kept if one != k]
         for one in rest[len(others) :]:
@@ -146,10 +146,10 @@ def _select(window: Window, start: Start) -> list[RefinedMode | None]:
 
 
 def _order(window: Window, start: Start) -> int:
-    """Order of the background that Schwarz's criterion prefers beside the best determined modes.
+    """Order of the background that Schwarz's criterion prefers with the best determined modes.
 
-    Those are the certain ones and the first of the others, which a background of second degree may
-    fill the place of.
+    These are the certain ones and the first of the others, whose place a background of second
+    degree may fill.
     """
     first = np.arange(start.poles.size) == np.argmin(start.certain)
     some = start._replace(certain=start.certain | first)
@@ -160,7 +160,7 @@ def _order(window: Window, start: Start) -> int:
 
 
 def _certain(window: Window, start: Start, order: int) -> tuple[SpectralModel, list[int]]:
-    """The model of certain modes, all at once, and which they are; one of two at one place."""
+    """Model of the certain modes together, and their indices; of two at one place only one."""
     model, kept = _background(window, order), []
     for k in np.flatnonzero(start.certain).tolist():
         apart = np.abs(start.poles[kept] - start.poles[k])
@@ -170,7 +170,7 @@ def _certain(window: Window, start: Start, order: int) -> tuple[SpectralModel, l
 
 
 def _least_gain(model: SpectralModel, window: Window, trials: int) -> float:
-    """Logarithm of the likelihood that one more mode gains by chance, seldom.
+    """Gain in log-likelihood that one more mode exceeds by chance with a small probability.
 
     It may settle on any chance peak in the window, about two for each half-power width.
     """
@@ -186,7 +186,7 @@ def _least_gain(model: SpectralModel, window: Window, trials: int) -> float:
 def _places(starts, certain, poles) -> list[int]:
     """Places of the poles that belong to starts, as poles change places on the way.
 
-    Certain ones have the nearest: a start beside one of them may have become another mode.
+    Certain ones have the nearest: a start near one of them may have become another mode.
     """
     distance = np.abs(np.subtract.outer(starts, poles)) / -np.add.outer(starts.real, poles.real)
     return linear_sum_assignment(distance * np.where(certain, CERTAIN_FIRST, 1.0)[:, None])[
@@ -205,7 +205,7 @@ def _background(window: Window, order: int) -> SpectralModel:
 
 
 def _with_pole(model: SpectralModel, start: Start, k, window: Window) -> SpectralModel:
-    """The model with one more pole, of an amplitude by the share of its energy."""
+    """The model with one more pole, whose amplitude is that of its fraction of the energy."""
     count = model.poles.size
     shape = start.shapes[k] @ window.weights
     shape = shape / max(float(np.linalg.norm(shape)), 1e-300)
@@ -213,7 +213,7 @@ def _with_pole(model: SpectralModel, start: Start, k, window: Window) -> Spectra
     forces[:count, :count] = model.forces
     power = np.mean(window.spectra.trace(axis1=1, axis2=2).real / window.lengths)
     power = power * 2 * len(window.frequencies) * window.count
-    variance = max(float(start.variances[k]), START_SHARE * power)
+    variance = max(float(start.variances[k]), START_POWER * power)
     forces[count, count] = np.sqrt(-start.poles[k].real * variance)
     return SpectralModel(
         np.append(model.poles, start.poles[k]),

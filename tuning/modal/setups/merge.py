@@ -1,4 +1,4 @@
-"""Modes of several setups merged: sensors that move between records, beside references that stay.
+"""Modes merged from several setups: sensors that move between records, and references that stay.
 
     fit = merge_setups([identify_modes(read_log(path)) for path in ("north.csv", "south.csv")])
 
@@ -29,7 +29,7 @@ from tuning.modal.fit import Choice, ModalFit
 from tuning.modal.forced.forces import without_forces
 from tuning.modal.preprocessing import MAX_RATE_CHANGE, same_channels, with_channels
 from tuning.modal.result import (
-    MIN_ENERGY_SHARE,
+    MIN_ENERGY,
     Channels,
     IdentifiedMode,
     ModalEstimates,
@@ -44,8 +44,8 @@ def merged_channels(
 ) -> tuple[Channels, tuple[Int[np.ndarray, " channel"], ...]]:
     """Channels of all setups, each place once, and where those of each setup are among them.
 
-    Channels of one name and quantity are one place, unless the logs tell positions (or sensors of
-    the case) that differ. With `references`, the channels of these names are, and no others.
+    Channels of one name and quantity are one place, unless their positions (or sensors of the case)
+    in the logs differ. With `references`, the channels of these names are, and no others.
     `sources` are the names of the logs, for messages.
 
     Raises ValueError for a reference that a setup lacks, and for setups that no common channel
@@ -58,7 +58,7 @@ def merged_channels(
                 f"{source}: no channel {sorted(lacking)[0]!r}, which is to be a reference; "
                 f"the channels are {', '.join(setup.names)}"
             )
-    known = _known_places(setups)
+    given = _given_places(setups)
     places: dict[tuple, int] = {}
     rows, indices = [], []
     for number, setup in enumerate(setups):
@@ -68,7 +68,7 @@ def merged_channels(
             key: tuple = (name, quantity)
             if references is not None:
                 key = key if name in references else (*key, number)
-            elif len(known[name]) > 1:
+            elif len(given[name]) > 1:
                 unknown = position is None and sensor is None
                 key = (*key, number) if unknown else (*key, position, sensor)
             if key not in places:
@@ -85,19 +85,19 @@ def merged_channels(
     return Channels(named, quantities, positions, sensors), tuple(indices)
 
 
-def _known_places(setups: Sequence[Channels]) -> dict[str, set]:
-    """Positions and sensors that the logs tell for each name of a channel."""
-    known: dict[str, set] = {}
+def _given_places(setups: Sequence[Channels]) -> dict[str, set]:
+    """Positions and sensors in the logs, by the name of the channel."""
+    places: dict[str, set] = {}
     for setup in setups:
         for name, _, position, sensor in zip(*setup, strict=True):
-            told = known.setdefault(name, set())
+            of_name = places.setdefault(name, set())
             if position is not None or sensor is not None:
-                told.add((position, sensor))
-    return known
+                of_name.add((position, sensor))
+    return places
 
 
 def _full_name(row: tuple, source: str) -> str:
-    """Name of a channel that moves: with its position if it is known, else with its log."""
+    """Name of a channel that moves: with its position if that is given, else with its log."""
     name, _, position, _ = row
     return f"{name} at {position:g} m" if position is not None else f"{name} of {Path(source).stem}"
 
@@ -126,10 +126,10 @@ def logs_of_setups(
     """The logs of each setup: those with the same channels, positions and sampling rate.
 
     With `references`, channels of one name may be at different places in each log, and each is a
-    setup of its own. Measured forces tell no setup apart: a hammer may strike many places.
+    setup of its own. Measured forces do not count: a hammer may strike many places.
     `channels` are the names of those that are to be used, by default all.
 
-    Raises ValueError for references beside one log only, or that a log lacks, for setups without
+    Raises ValueError for references with one log only, or that a log lacks, for setups without
     a common channel, a log with forces only, and samples that are not even.
     """
     if references is not None and len(logs) == 1:
@@ -152,7 +152,7 @@ def logs_of_setups(
 
 
 def _with_known(log: Log, names: Sequence[str] | None) -> Log:
-    """The log with those of some channels that it has; all of its own, if none."""
+    """The log with those channels of `names` that it has; with all of its own if that is None."""
     return with_channels(log, [name for name in names or () if name in log.names] or None)
 
 
@@ -166,14 +166,14 @@ def _same_setup(a: Log, b: Log) -> bool:
 
 MAX_FREQUENCY_CHANGE = 0.03  # between setups: temperature, traffic, the mass of moved sensors
 MAX_SDS = 3.0  # standard deviations of the difference of two frequencies that may be more
-MIN_MAC = 0.6  # at common channels, where errors of the shapes take nothing from it
-OTHER_ERROR = 0.05  # of a component over the largest, by modes close by, beside its stated error
-MIN_SHARE_ALONE = 0.05  # of the energy; a mode that one setup alone shows may else be noise
-FAR = 1e6  # cost of a pair that is no pair
+MIN_MAC = 0.6  # at common channels, for shapes without errors
+OTHER_ERROR = 0.05  # of a component over the largest, by modes close by, added to its stated error
+MIN_ENERGY_ALONE = 0.05  # fraction of the energy below which a mode of one setup may be noise
+FAR = 1e6  # distance of modes that cannot be one
 
 
 def paired_modes(setups: Sequence[ModalFit], indices: Sequence[np.ndarray]) -> list[dict[int, int]]:
-    """For each mode of the structure, the mode (index) of each setup (index) that shows it.
+    """Groups of modes that are one mode of the structure: index of the mode by index of the setup.
 
     Modes of a setup are paired with those of the setups before by the least sum of distances, in
     frequency and in modal assurance criterion at the channels that both setups have, where these
@@ -204,7 +204,7 @@ def lone_modes(
     indices: Sequence[np.ndarray],
     groups: Sequence[tuple[dict[int, int], dict]],
 ) -> dict[int, str]:
-    """Groups (index) of a mode that one setup alone shows and that may be none, with the reason.
+    """Groups (index) with one setup alone whose mode may be none, with the reason.
 
     `groups` are the pairs of each mode, and what `uncertain_modes` found for it. Such a mode may be
     noise if it is weak, or another estimate of a mode that several setups show.
@@ -222,7 +222,7 @@ def lone_modes(
             for k, i in group.items()
             if distance(setups[k].modes[i], mode, indices[k], indices[own], 0.0) < FAR
         ]
-        if mode.energy_share < MIN_SHARE_ALONE:
+        if mode.energy_share < MIN_ENERGY_ALONE:
             found[number] = f"found in {setups[own].source} alone, and weak"
         elif same:
             found[number] = f"found in {setups[own].source} alone, where {same[0]:.4g} Hz may be it"
@@ -247,7 +247,7 @@ def uncertain_modes(
             ]
             width = max(mode.damping_ratio * mode.frequency, mode.frequency_sd)
             line = any(abs(one.frequency - mode.frequency) < width for one in setup.lines)
-            if mode.energy_share >= MIN_ENERGY_SHARE and not line and max(distances) < FAR:
+            if mode.energy_share >= MIN_ENERGY and not line and max(distances) < FAR:
                 near.append((max(distances), len(near), mode, reason))
         if near:
             found[number] = min(near)[2:]
@@ -257,8 +257,8 @@ def uncertain_modes(
 def distance(a: IdentifiedMode, b: IdentifiedMode, of_a, of_b, change=MAX_FREQUENCY_CHANGE):
     """Distance of two modes, of 2 at most; `FAR` if they are too unlike to be one.
 
-    `of_a` and `of_b` are the channels of their shapes; `change` is the share by which frequencies
-    may differ beside their errors.
+    `of_a` and `of_b` are the channels of their shapes; `change` is the fraction by which
+    frequencies may differ beyond their errors.
     """
     errors = MAX_SDS * np.hypot(a.frequency_sd, b.frequency_sd)
     limit = max(change * min(a.frequency, b.frequency), errors)
@@ -273,7 +273,7 @@ def distance(a: IdentifiedMode, b: IdentifiedMode, of_a, of_b, change=MAX_FREQUE
 
 
 def _left_by_errors(mode: IdentifiedMode, channels: np.ndarray) -> float:
-    """What errors of a shape leave of its modal assurance criterion with the true one, expected."""
+    """Expected modal assurance criterion of a shape with its errors and the true shape."""
     variances = Part(mode.shape, mode.shape_covariance, channels).variances[channels]
     error = np.sum(variances + OTHER_ERROR**2)
     size = np.sum(np.abs(mode.shape[channels]) ** 2)
@@ -288,8 +288,8 @@ class MultiSetupFit(ModalEstimates):
     reason, and shapes at its channels. For each of `modes`, `pairs` holds the index of the mode in
     each setup that shows it well. `channels` are those of all setups, each place once;
     `references` the names of those that two setups or more have. `choices` are the automatic
-    choices, with what overrides them; `notes` tell which modes some setup lacks, and where setups
-    disagree.
+    choices, with the options that override them; `notes` are sentences on modes that some setup
+    lacks, and on setups that disagree.
 
     >>> import numpy as np
     >>> import tuning
@@ -354,7 +354,7 @@ class MultiSetupFit(ModalEstimates):
         }
 
     def plot(self, path=None, length: float | None = None):
-        """Figure of what each setup says of frequencies and damping ratios, and of the shapes.
+        """Figure of frequencies and damping ratios of each setup, and of the merged shapes.
 
         `length` (m) is that of the beam; it is saved to `path` if given.
         """
@@ -374,7 +374,7 @@ def merge_setups(
 
     `references` are the names of the channels that stay at their places in all setups; all others
     are at other places then. By default channels of one name and quantity are one place, unless
-    the logs tell different positions of them.
+    their positions in the logs differ.
 
     A mode that one setup alone shows is among `rejected` if it has less than 5 % of the energy, or
     may be a mode that several setups show.
@@ -432,7 +432,7 @@ def merge_setups(
 
 
 def _merged(setups, indices, channels: Channels, pairs, uncertain):
-    """One mode from those of some setups, and of the shapes of uncertain ones; notes on it."""
+    """Merged mode of some setups, with the shapes of uncertain ones too, and notes on it."""
     modes = {k: setups[k].modes[pairs[k]] for k in sorted(pairs)}
     frequency, frequency_sd, moved = _mean([(m.frequency, m.frequency_sd) for m in modes.values()])
     damping, damping_sd, other = _mean([(m.damping_ratio, m.damping_sd) for m in modes.values()])
@@ -453,7 +453,7 @@ def _merged(setups, indices, channels: Channels, pairs, uncertain):
         if i not in shape.joined
     ]
     if lost := [channels.names[i] for i in np.flatnonzero(np.isnan(shape.shape))]:
-        notes.append(f"{frequency:.4g} Hz: the shape is not known at {', '.join(lost)}")
+        notes.append(f"{frequency:.4g} Hz: the shape is unknown at {', '.join(lost)}")
     for what, unlikely in (("frequencies", moved), ("damping ratios", other)):
         if unlikely:
             notes.append(
@@ -473,7 +473,7 @@ def _merged(setups, indices, channels: Channels, pairs, uncertain):
 
 
 def _mean(estimates: Sequence[tuple[float, float]]) -> tuple[float, float, bool]:
-    """Weighted mean of values with standard deviations, its own, and whether values disagree."""
+    """Weighted mean of values, its standard deviation, and whether the values disagree."""
     values, deviations = np.array(estimates).T
     weights = 1 / np.maximum(deviations, 1e-9 * np.abs(values)) ** 2
     mean = np.sum(weights * values) / weights.sum()
@@ -485,7 +485,7 @@ def _mean(estimates: Sequence[tuple[float, float]]) -> tuple[float, float, bool]
 
 
 def _why_lacking(setup: ModalFit, frequency: float, uncertain) -> str:
-    """Why a setup does not show a mode of some frequency (Hz), in words."""
+    """Reason in words why a setup lacks a mode of some frequency (Hz)."""
     low, high = setup.band
     if uncertain:
         return f"of {setup.source} the shape alone is used: {uncertain[1]}"

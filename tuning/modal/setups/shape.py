@@ -14,7 +14,7 @@ from jaxtyping import Complex, Float, Int
 
 STEPS = 12  # of Gauss and Newton, at most
 MIN_VARIANCE = 1e-8  # of a component over the largest, for weights
-OTHER_ERROR = 0.02  # of a component over the largest: calibration, beside its stated error
+OTHER_ERROR = 0.02  # of a component over the largest: calibration, added to its stated error
 MIN_SIGNAL = 3.0  # size of a shape at the references over its error
 
 
@@ -35,8 +35,8 @@ class Part(NamedTuple):
 class WholeShape(NamedTuple):
     """Shape with a largest component of one, NaN at channels without, and its covariance.
 
-    `joined` are the parts that it is made of; `misfit` is the rms of what the parts disagree in at
-    common channels, over what their errors let expect; the errors are widened by it beyond one.
+    `joined` are the parts that it is made of; `misfit` is the rms difference of the parts at common
+    channels over that expected from their errors, which are widened by it beyond one.
     """
 
     shape: Complex[np.ndarray, " channel"]
@@ -46,16 +46,16 @@ class WholeShape(NamedTuple):
 
 
 def whole_shape(parts: Sequence[Part], count: int) -> WholeShape:
-    """The shape at `count` channels whose parts these are.
+    """Whole shape at `count` channels, joined from its parts.
 
     A part whose common channels with the others are all near a node of the mode, or that has none,
     cannot be scaled and is left out.
     """
     start, scales = _joined(parts, count)
     used = tuple(sorted(scales))
-    known = np.flatnonzero(np.isfinite(start))
-    largest = int(known[np.argmax(np.abs(start[known]))])
-    free = np.array([i for i in known if i != largest], int)
+    present = np.flatnonzero(np.isfinite(start))
+    largest = int(present[np.argmax(np.abs(start[present]))])
+    free = np.array([i for i in present if i != largest], int)
     shape = start / start[largest]
     scale = np.array([scales[k] for k in used]) * start[largest]
     own = [parts[k] for k in used]
@@ -84,7 +84,7 @@ def whole_shape(parts: Sequence[Part], count: int) -> WholeShape:
     forward = _real(inverse[: free.size])
     errors = forward @ covariance @ forward.T * max(misfit, 1.0) ** 2
     all_errors = np.full((2 * count, 2 * count), np.nan)
-    both = np.concatenate([known, count + known])
+    both = np.concatenate([present, count + present])
     all_errors[np.ix_(both, both)] = 0.0
     both = np.concatenate([free, count + free])
     all_errors[np.ix_(both, both)] = errors
@@ -115,7 +115,7 @@ def _joined(parts: Sequence[Part], count: int):
 
 
 def _signal(part: Part, shape, variances) -> float:
-    """Size of a part, and of a shape, at their common channels over their errors; the lesser."""
+    """Signal-to-error ratio of a part and of a shape at their common channels, the smaller one."""
     common = np.isfinite(shape[part.channels])
     if not common.any():
         return 0.0
@@ -144,5 +144,5 @@ def _block_diagonal(covariances: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _real(matrix: np.ndarray) -> np.ndarray:
-    """The real matrix that does to real and imaginary parts what a complex one does."""
+    """Real matrix on real, then imaginary parts that is equivalent to a complex one."""
     return np.block([[matrix.real, -matrix.imag], [matrix.imag, matrix.real]])
