@@ -265,8 +265,7 @@ def intervals_of_waves(case: Case) -> int:
     if not all(map(is_concrete, jax.tree.leaves((case.loads, case.run, case.beam.length)))):
         raise ValueError(
             "the static peak under a force with waves needs concrete numbers of loads, run and"
-            " length:"
-            " leave them out of what jax.jit or jax.grad traces"
+            " length: leave them out of what jax.jit or jax.grad traces"
         )
     case = concrete_case(case)
     _, times = _intervals(case, load_set(case), np.zeros(0), 1)

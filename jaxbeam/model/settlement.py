@@ -163,8 +163,8 @@ def settled_beam(case: Case, layout: Layout | None = None, settlements=None) -> 
     right = force[free] - system.stiffness[np.ix_(free, held)] @ displacement[np.array(held, int)]
     displacement = set_at(displacement, free, solve(stiffness, right))
     padded = xp.concatenate([displacement, xp.zeros(1)])  # -1: no displacement
-    unknowns = padded[system.unknowns]
-    left, over = unknowns[:, :2, None], unknowns[:, 2:, None]
+    at_ends = padded[system.unknowns]
+    left, over = at_ends[:, :2, None], at_ends[:, 2:, None]
     across = system.transfer.across()
     forces = system.force_of_deflection @ (over - across[:, :2, :2] @ left)
     states = xp.concatenate([left, forces], axis=1)[..., 0]

@@ -86,7 +86,7 @@ def test_reactions_shear_forces_and_moving_axles():
     ("actions", "factors", "message"),
     [
         ({"a": {}}, {"c": {"a": 1.0}}, "actions.a has one of uniform, model, loads"),
-        ({"a": {"model": "LM1", "sped": 3.0}}, {"c": {"a": 1.0}}, "beside a model speed, lane or"),
+        ({"a": {"model": "LM1", "sped": 3.0}}, {"c": {"a": 1.0}}, "with a model speed, lane or"),
         ({"a": {"uniform": 1.0}}, {}, "nothing to combine"),
         (
             {"a": {"uniform": 1.0}},

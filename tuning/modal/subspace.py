@@ -100,9 +100,9 @@ def block_covariances(
     In each record the sums of all lags are over the same instants t.
     """
     usable = np.array([max(len(record) - lags, 0) for record in records], float)
-    counts = np.maximum(np.round(blocks * usable / usable.sum()), usable > 0).astype(int)
+    parts_of_records = np.maximum(np.round(blocks * usable / usable.sum()), usable > 0).astype(int)
     sums, counts = [], []
-    for record, parts, count in zip(records, counts, usable.astype(int), strict=True):
+    for record, parts, count in zip(records, parts_of_records, usable.astype(int), strict=True):
         if parts == 0:
             continue
         size = count // parts

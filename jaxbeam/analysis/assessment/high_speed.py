@@ -177,7 +177,7 @@ def _between(speeds, peaks, quantities, count: int) -> Float[np.ndarray, " added
     intervals = np.flatnonzero(next_to_peak)
     counts = np.diff(np.linspace(0, count, intervals.size + 1).astype(int))
     added = [
-        np.linspace(speeds[i], speeds[i + 1], added + 2)[1:-1]
-        for i, added in zip(intervals, counts, strict=True)
+        np.linspace(speeds[i], speeds[i + 1], number + 2)[1:-1]
+        for i, number in zip(intervals, counts, strict=True)
     ]
     return np.concatenate(added)

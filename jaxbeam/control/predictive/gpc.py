@@ -105,7 +105,7 @@ def predicted_outputs(
     columns = past * outputs + (before + moves) * actuators
     # Rows of past and future numbers themselves: readings back from k, moves from k - before.
     identity = xp.eye(columns)
-    readings = [identity[i * outputs : (i + 1) * outputs] for i in range(past)][::-1]
+    reading_rows = [identity[i * outputs : (i + 1) * outputs] for i in range(past)][::-1]
     steps = [
         identity[past * outputs + i * actuators : past * outputs + (i + 1) * actuators]
         for i in [*range(before)[::-1], *range(before, before + moves)]
@@ -114,12 +114,12 @@ def predicted_outputs(
     for j in range(1, horizon + 1):
         row = xp.zeros((outputs, columns))
         for i in range(1, past + 1):
-            row = row - one[i] * readings[-i]
+            row = row - one[i] * reading_rows[-i]
         for i in range(1, powers + 1):
             index = before + j - i  # of du(k + j - i)
             if 0 <= index < before + moves:
                 row = row + model.numerators[i - 1] @ steps[index]
-        readings.append(row)
+        reading_rows.append(row)
         predictions.append(row)
     stacked = xp.stack(predictions)
     shapes = (past, outputs), (before, actuators), (moves, actuators)

@@ -274,7 +274,7 @@ def test_columns_of_equal_names_are_renamed(tmp_path):
 
 def test_rows_that_are_written_twice_are_left_out(tmp_path):
     path = csv(tmp_path / "run.csv", np.repeat(TIMES, np.where(np.arange(400) % 150 == 7, 2, 1)))
-    log = read_warned(path, "3 rows are those before them once more and left out, .* in line 10")
+    log = read_warned(path, "3 rows repeat the one before and are left out, .* in line 10")
     np.testing.assert_allclose(log.times, TIMES, atol=1e-9)
 
 
