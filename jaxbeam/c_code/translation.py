@@ -25,7 +25,7 @@ from jaxbeam.runtime.c_writer import (
     kind_of,
     number_text,
 )
-from jaxbeam.runtime.interpreter import OPENED
+from jaxbeam.runtime.interpreter import called_program
 from jaxbeam.runtime.native_library import C_FOLDER
 
 WIDTH = 100  # of the lines of C
@@ -33,11 +33,17 @@ INDEX = "#"  # stands for the index in the form of an expression
 QUADRATIC_PROGRAMS = "numerics/qp"  # whose tolerances depend on the precision
 PACKAGE = str(Path(__file__).parents[1])
 MACHINERY = str(Path(__file__).parents[1] / "runtime")
-BY_POINTER = {"cholesky", "triangular_solve", "lu", "scan"}  # rules that take addresses of inputs
+BY_POINTER = {
+    "cholesky",
+    "triangular_solve",
+    "lu",
+    "scan",
+    "unstack",
+}  # rules that take addresses of inputs
 BY_PLACE = {"gather", "dynamic_slice"}  # that read their first input at places that are computed
 FREE = {  # that only move numbers, or are of truths and whole numbers
     *("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "slice", "rev"),
-    *("concatenate", "stack", "tile", "pad", "split", "iota", "gather", "dynamic_slice"),
+    *("concatenate", "stack", "tile", "pad", "split", "unstack", "iota", "gather", "dynamic_slice"),
     *("dynamic_update_slice", "scatter", "convert_element_type", "copy", "stop_gradient"),
     *("platform_index", "select_n", "and", "or", "not", "xor", "reduce_or", "reduce_and"),
 }
@@ -134,7 +140,7 @@ class ProgramWriter(Translation):
     def equation(self, equation, values: list[CArray]) -> list[CArray]:
         """Write an equation under the name of the function that it is of."""
         name = equation.primitive.name
-        if name in OPENED:
+        if called_program(equation) is not None:
             return super().equation(equation, values)
         place = _place(equation)
         if self.depth == 1 and place not in (None, self.told):
@@ -302,8 +308,9 @@ def operations(jaxpr) -> int:
 
 def _operations(equation) -> int:
     name, params = equation.primitive.name, equation.params
-    if name in OPENED:
-        return operations(_open(params[OPENED[name]]))
+    program = called_program(equation)
+    if program is not None:
+        return operations(_open(program))
     if name == "custom_linear_solve":
         return operations(_open(params["jaxprs"].solve))
     if name == "scan":
@@ -329,7 +336,7 @@ def _operations(equation) -> int:
         return 2 * made.size * int(np.prod([read.shape[axis] for axis in contracted], dtype=int))
     if name.startswith(("reduce", "arg", "cum")):
         return read.size
-    if name == "scatter-add":
+    if name in ("scatter-add", "scatter-sub", "scatter-mul"):
         return equation.invars[2].aval.size
     if name == "sort":
         size = read.shape[params["dimension"]]
@@ -338,6 +345,8 @@ def _operations(equation) -> int:
         return read.size // read.shape[-1] ** 2 * (read.shape[-1] ** 3 // 3 + read.shape[-1] ** 2)
     if name == "triangular_solve":
         return made.size * read.shape[-1]
+    if name == "polynomial":
+        return 2 * made.size * (len(equation.invars) - 2)
     if name == "integer_pow":
         return made.size * (2 * abs(params["y"]).bit_length() + 1)
     return made.size * {
@@ -348,6 +357,7 @@ def _operations(equation) -> int:
         "is_finite": 2,
         "lt_to": 3,
         "le_to": 2,
+        "one_minus_square": 3,
     }.get(name, 1)
 
 

@@ -26,6 +26,7 @@ from jaxbeam.runtime.c_writer import (
     select,
     strides_of,
 )
+from jaxbeam.runtime.interpreter import scan_counts
 
 
 def _convert(writer: Writer, params, values, outs):
@@ -124,6 +125,27 @@ def _split(writer: Writer, params, values, outs):
         found.append(writer.strided(value, shape, strides, first))
         first += shape[axis] * strides[axis]
     return found
+
+
+def _unstack(writer: Writer, params, values, outs):
+    value, axis, shape = values[0], params["axis"], outs[0][1]
+    strides = strides_of(value.shape)
+    step, own = strides[axis], [*strides[:axis], *strides[axis + 1 :]]
+    if axis == 0:  # parts of the array itself
+        return [
+            value._replace(shape=shape, name=f"({value.name} + {i * step})")
+            for i in range(len(outs))
+        ]
+    return [writer.strided(value, shape, own, i * step) for i in range(len(outs))]
+
+
+def _polynomial(writer: Writer, params, values, outs):
+    x, *coefficients = values
+    text = f"{{{len(coefficients)}}}"
+    for power in range(len(coefficients) - 1, 0, -1):
+        text = f"({text} * {{0}} + {{{power}}})"
+    (kind, shape), varying = outs[0], any(value.varying for value in values)
+    return writer.each(text, kind, shape, [x, *coefficients], varying)
 
 
 def _iota(writer: Writer, params, values, outs):
@@ -299,8 +321,8 @@ def _start(writer: Writer, places: CArray, batch, axes, value: CArray, sizes, la
     return first, " & ".join(inside)
 
 
-def _scatter(adds: bool):
-    """Entries of an array that are replaced, or added to; places outside of it are left out."""
+def _scatter(assign: str):
+    """Entries of an array that an assignment of C changes; places outside of it are left out."""
 
     def rule(writer: Writer, params, values, outs):
         value, places, parts = values
@@ -329,7 +351,7 @@ def _scatter(adds: bool):
                 flat_index(index, strides_of(parts.shape)), found.varying and not parted
             )
             entry = _lane(entry, parted and parts.varying, lane)
-            writer.line(f"if ({inside}) {to} {'+=' if adds else '='} {entry};")
+            writer.line(f"if ({inside}) {to} {assign} {entry};")
         return found
 
     return rule
@@ -459,6 +481,8 @@ ARRAY_RULES: dict[str, Callable] = {
     "tile": _tile,
     "pad": _pad,
     "split": _split,
+    "unstack": _unstack,
+    "polynomial": _polynomial,
     "iota": _iota,
     "reduce_sum": _reduce("add", "0"),
     "reduce_prod": _reduce("mul", "1"),
@@ -476,8 +500,10 @@ ARRAY_RULES: dict[str, Callable] = {
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update,
     "gather": _gather,
-    "scatter": _scatter(adds=False),
-    "scatter-add": _scatter(adds=True),
+    "scatter": _scatter("="),
+    "scatter-add": _scatter("+="),
+    "scatter-sub": _scatter("-="),
+    "scatter-mul": _scatter("*="),
     "sort": _sort,
     "cholesky": _cholesky,
     "triangular_solve": _triangular,
@@ -548,7 +574,7 @@ def _carried(writer: Writer, body, carry: list[CArray], before, after, least: bo
 
 
 def _scan(writer: Writer, params, values, outs):
-    constants, carried = params["num_consts"], params["num_carry"]
+    constants, carried = scan_counts(params)
     body, length = params["jaxpr"], params["length"]
     fixed, inputs = values[:constants], values[constants + carried :]
     rows = [v._replace(shape=v.shape[1:]) for v in inputs]

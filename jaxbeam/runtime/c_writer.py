@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from jaxbeam.runtime.interpreter import OPENED
+from jaxbeam.runtime.interpreter import called_program
 
 KINDS = {"f": "d", "i": "i", "u": "i", "b": "b"}  # by numpy's kinds: number, whole number, truth
 TYPES = {True: {"d": "Register", "i": "Mask", "b": "Mask"}, False: {"d": "double"}}
@@ -150,8 +150,9 @@ class Writer:
     def equation(self, equation, values: list[CArray]) -> list[CArray]:
         """Write an equation; its results. Raises UntranslatedError for one without a rule."""
         name, params = equation.primitive.name, equation.params
-        if name in OPENED:
-            return self.run(params[OPENED[name]], values)
+        program = called_program(equation)
+        if program is not None:
+            return self.run(program, values)
         if name in SAME:
             return values
         if name in self.rules:
@@ -344,6 +345,7 @@ ELEMENTWISE: dict[str, Callable[[str, bool], str]] = {
     "le_to": _both("({0} <= {1}) | ({1} != {1})"),
     "neg": _both("-{}"),
     "square": _both("{0} * {0}"),
+    "one_minus_square": _both("(1 + {0}) * (1 - {0})"),
     "max": _extreme("larger", ">"),
     "min": _extreme("smaller", "<"),
     "is_finite": _both("0 * {} == 0"),

@@ -6,6 +6,7 @@ they are, which compiles each of them alone.
 """
 
 import contextlib
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -92,6 +93,18 @@ class InterpretedProgram:
         return [values[place] for place in self.outputs]
 
 
+def called_program(equation):
+    """Jaxpr of the program that an equation calls, None for an operation."""
+    name, params = equation.primitive.name, equation.params
+    if name in OPENED:
+        return params[OPENED[name]]
+    if name == "call_hi_primitive":  # an operation of JAX 0.12 in terms of others
+        avals = [atom.aval for atom in equation.invars]
+        call = functools.partial(equation.primitive.to_lojax, **params)
+        return jax.make_jaxpr(call)(*avals)
+    return None
+
+
 def run_cost(jaxpr) -> float:
     """Estimated time (ns) that NumPy takes for a program."""
     return sum(map(_cost, jaxpr.eqns))
@@ -112,8 +125,9 @@ def _programs_of(equation) -> list:
 
 def _cost(equation) -> float:
     name, params = equation.primitive.name, equation.params
-    if name in OPENED:
-        return sum(map(run_cost, _programs_of(equation)))
+    program = called_program(equation)
+    if program is not None:
+        return run_cost(getattr(program, "jaxpr", program))
     if name == "scan":
         return params["length"] * run_cost(params["jaxpr"].jaxpr)
     if name in LOOPS:
@@ -134,8 +148,9 @@ def _rule(equation) -> Callable:
     avals = [atom.aval for atom in (*equation.invars, *equation.outvars)]
     if any(jnp.issubdtype(aval.dtype, jax.dtypes.extended) for aval in avals):
         return _as_it_is(equation)
-    if name in OPENED:
-        return InterpretedProgram(params[OPENED[name]])
+    program = called_program(equation)
+    if program is not None:
+        return InterpretedProgram(program)
     if name in ELEMENTWISE:
         return ELEMENTWISE[name]
     if name in WITH_PARAMETERS:
@@ -192,6 +207,7 @@ ELEMENTWISE: dict[str, Callable] = {
     "rsqrt": lambda x: 1 / np.sqrt(x),
     "cbrt": np.cbrt,
     "square": np.square,
+    "one_minus_square": lambda x: (1 + x) * (1 - x),
     "exp": np.exp,
     "exp2": np.exp2,
     "expm1": np.expm1,
@@ -271,6 +287,20 @@ def _slice(params, x, out):
 def _split(params, *_):
     ends = np.cumsum(params["sizes"])[:-1]
     return lambda value: np.split(value, ends, params["axis"])
+
+
+def _unstack(params, *_):
+    return lambda value: list(np.moveaxis(value, params["axis"], 0))
+
+
+def _polynomial(params, *avals):
+    def value(x, *coefficients):
+        found = coefficients[-1]
+        for coefficient in coefficients[-2::-1]:
+            found = found * x + coefficient
+        return np.broadcast_to(found, avals[-1].shape)
+
+    return value
 
 
 def _pad(params, x, padding, out):
@@ -426,9 +456,20 @@ def _eigh(params, *_):
     return decomposed
 
 
+def scan_counts(params) -> tuple[int, int]:
+    """Number of constants of a `scan`, and number of arrays that it carries, from its parameters.
+
+    JAX 0.12 replaced the numbers by a tree of all inputs.
+    """
+    if "ft_in" in params:
+        constants, carried, _ = params["ft_in"].unpack()
+        return len(list(constants)), len(list(carried))
+    return params["num_consts"], params["num_carry"]
+
+
 def _scan(params, *avals):
     body, length = InterpretedProgram(params["jaxpr"]), params["length"]
-    constants, carried = params["num_consts"], params["num_carry"]
+    constants, carried = scan_counts(params)
     order = range(length)[::-1] if params["reverse"] else range(length)
     stacked = params["jaxpr"].out_avals[carried:]
 
@@ -511,6 +552,8 @@ WITH_PARAMETERS: dict[str, Callable] = {
     "stack": lambda params, *_: lambda *parts: np.stack(parts, params["axis"]),
     "tile": lambda params, *_: lambda value: np.tile(value, params["reps"]),
     "split": _split,
+    "unstack": _unstack,
+    "polynomial": _polynomial,
     "pad": _pad,
     "iota": _iota,
     "dot_general": _dot,
@@ -532,6 +575,7 @@ WITH_PARAMETERS: dict[str, Callable] = {
     "gather": gather,
     "scatter": scatter(None),
     "scatter-add": scatter(np.add),
+    "scatter-sub": scatter(np.subtract),
     "scatter-mul": scatter(np.multiply),
     "scatter-max": scatter(np.maximum),
     "scatter-min": scatter(np.minimum),

@@ -91,6 +91,7 @@ def places(x):
     table = jnp.asarray(MATRIX)
     outside = table.at[index, 0].get(mode="fill")
     kept = x.at[index[0]].set(5.0, mode="drop"), x.at[np.array([0, 2, 2])].add(Y[:3])
+    kept += x.at[index[1] % 4].subtract(Y[0]), x.at[np.array([1, 3])].multiply(Y[:2])
     window = (
         lax.dynamic_slice(x, (index[0],), (2,)),
         lax.dynamic_update_slice(x, Y[:2], (index[1],)),
@@ -104,7 +105,8 @@ def shapes(x):
     padded = lax.pad(x, 0.5, [(1, 2, 1)])
     parts = jnp.split(jnp.concatenate([x, Y]), [3])
     tiled = jnp.tile(both, (2, 1)), both.T, jnp.pad(both, 1), jnp.flip(x), x[::2], x[1:3]
-    return both, padded, *parts, *tiled, jnp.outer(x, Y)[:, ::-1], jnp.arange(4) + x
+    rows = *both, *jnp.unstack(jnp.outer(x, Y), axis=1)
+    return both, padded, *parts, *tiled, *rows, jnp.outer(x, Y)[:, ::-1], jnp.arange(4) + x
 
 
 def reductions(x):
@@ -119,7 +121,8 @@ def elementary(x):
     more = jnp.sin(x), jnp.arctan2(x, Y), positive**1.5, x**3, x**-2, jnp.round(3 * x)
     rest = jnp.floor(x), jnp.sign(x), jnp.clip(x, -0.5, 0.5), jnp.isfinite(x / 0.0), x % 0.7
     kept = jnp.maximum(x, jnp.nan), jnp.minimum(jnp.nan, x), jnp.where(x > 0, x, Y)
-    return *of_all, *more, *rest, *kept, (x > 0) & ~(x > 1), (5 * x).astype(int) // 2
+    smooth = jnp.polyval(Y, x), jnp.polyval(x, 0.3), jax.vmap(jax.grad(jnp.tanh))(x)
+    return *of_all, *more, *rest, *kept, *smooth, (x > 0) & ~(x > 1), (5 * x).astype(int) // 2
 
 
 def systems(x):
