@@ -9,6 +9,7 @@ import abc
 import dataclasses
 from typing import ClassVar
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import polynomial
@@ -25,7 +26,8 @@ from jaxbeam.case.filters import filter_step
 from jaxbeam.control.feedback import pairing_error
 from jaxbeam.runtime.arrays import Array, Number, xp
 
-Polynomials = Float[Array, "power actuator"]  # in s (rad/s), the coefficients ascending
+# In s (rad/s), coefficients ascending; filters actuator by actuator, then those added to them.
+Polynomials = Float[Array, "power filter"]
 
 
 class AbstractCompensator(AbstractController):
@@ -45,7 +47,7 @@ class AbstractCompensator(AbstractController):
     def transfer_function(self) -> tuple[Polynomials, Polynomials]:
         """Numerators and denominators of H(s), all of one degree, 1 or 2."""
 
-    def bilinear_factor(self) -> Float[Array, " *actuator"]:
+    def bilinear_factor(self) -> Float[Array, " *filter"]:
         """The factor c (1/s) of the bilinear transform s = c (z - 1) / (z + 1)."""
         return 2 / self.period
 
@@ -73,16 +75,17 @@ class AbstractCompensator(AbstractController):
 
     def design_law(self, plant):
         numerator, denominator = self.transfer_function()
+        loops = self.gains.shape[0]
         if self.period is None:
-            loops = range(self.gains.shape[0])
+            pairs = enumerate(zip(numerator.T, denominator.T, strict=True))
             return ContinuousCompensator(
-                tuple(_reading_filter(i, numerator[:, i], denominator[:, i]) for i in loops)
+                tuple(_reading_filter(i % loops, *pair) for i, pair in pairs), loops
             )
         numerator, denominator = (
             _bilinear_transform(part, self.bilinear_factor()) for part in (numerator, denominator)
         )
         section = xp.concatenate([numerator, denominator]) / denominator[0]
-        return SampledCompensator(section[None])
+        return SampledCompensator(section[None], loops)
 
     def _per_loop(self, *coefficients) -> Polynomials:
         """Coefficients as rows with an entry for each loop; a single number holds for all loops."""
@@ -90,29 +93,39 @@ class AbstractCompensator(AbstractController):
 
 
 class SampledCompensator(AbstractSampledLaw):
-    """Second-order section of each loop; the state is that of the sections."""
+    """Second-order sections, those of each loop added up; the state is that of the sections."""
 
-    sections: Float[Array, "1 6 actuator"]
+    sections: Float[Array, "1 6 filter"]
+    loops: int = eqx.field(static=True)
 
     def initial_state(self):
         return xp.zeros((1, 2, self.sections.shape[-1]))
 
     def step(self, state, measurement, t):
-        readings = measurement.readings[: self.sections.shape[-1]]
-        return ControlStep(*filter_step(self.sections, state, readings))
+        readings = measurement.readings[: self.loops]
+        times = self.sections.shape[-1] // self.loops
+        readings = readings if times == 1 else xp.concatenate([readings] * times)
+        outputs, state = filter_step(self.sections, state, readings)
+        return ControlStep(_of_loops(outputs, self.loops), state)
 
 
 class ContinuousCompensator(AbstractContinuousLaw):
-    """Filter of the reading of each loop; the commands are the outputs of the filters."""
+    """Filters of the readings; the commands are their outputs, those of each loop added up."""
 
     reading_filters: tuple[ControllerFilter, ...]
+    loops: int = eqx.field(static=True)
 
     @property
     def filters(self):
         return self.reading_filters
 
     def command(self, state, measurement, t):
-        return measurement.readings[-len(self.reading_filters) :]
+        return _of_loops(measurement.readings[-len(self.reading_filters) :], self.loops)
+
+
+def _of_loops(outputs: Float[Array, " filter"], loops: int) -> Float[Array, " actuator"]:
+    """Sums of the outputs of the filters of each loop."""
+    return outputs if outputs.shape[0] == loops else xp.sum(outputs.reshape(-1, loops), axis=0)
 
 
 class PD(AbstractCompensator):
@@ -154,7 +167,9 @@ class PositivePositionFeedback(AbstractCompensator):
 
     (Goh and Caughey, International Journal of Control 41, 1985). Tuned to a mode it damps that
     mode and rolls off above it; at rest it lowers the stiffness. The bilinear transform is warped
-    to be exact at the frequency of the oscillator.
+    to be exact at the frequency of the oscillator. Several modes take several oscillators an
+    actuator, whose outputs are added up: row after row, the `further_` numbers are those of one
+    more oscillator at each actuator.
 
     >>> import jaxbeam as jb
     >>> case = jb.Case(
@@ -177,27 +192,63 @@ class PositivePositionFeedback(AbstractCompensator):
     damping_ratio: Float[Number, " *actuator"] = number(
         "1", "damping ratio of the oscillator", POSITIVE
     )
+    further_gains: Float[Number, "oscillator actuator"] | None = number(
+        "command per reading", "gains of further oscillators", default=None
+    )
+    further_frequencies: Float[Number, "oscillator actuator"] | None = number(
+        "Hz", "frequencies of further oscillators", POSITIVE, default=None
+    )
+    further_damping_ratios: Float[Number, "oscillator actuator"] | None = number(
+        "1", "damping ratios of further oscillators", POSITIVE, default=None
+    )
 
     def transfer_function(self):
-        angular_frequency = 2 * xp.pi * self.frequency
-        stiffness = angular_frequency**2
-        denominator = self._per_loop(stiffness, 2 * self.damping_ratio * angular_frequency, 1.0)
-        return self._per_loop(self.gains * stiffness, 0.0, 0.0), denominator
+        gains, frequencies, damping_ratios = self._oscillators()
+        angular_frequencies = 2 * xp.pi * frequencies
+        stiffness, zeros = angular_frequencies**2, xp.zeros_like(gains)
+        damping = 2 * damping_ratios * angular_frequencies
+        denominator = xp.stack([stiffness, damping, xp.ones_like(gains)])
+        return xp.stack([gains * stiffness, zeros, zeros]), denominator
+
+    def _oscillators(self) -> tuple[Float[Array, " filter"], ...]:
+        """Gains, frequencies (Hz) and damping ratios of all oscillators, row after row."""
+        firsts = self.gains, self.frequency, self.damping_ratio
+        rows = [xp.broadcast_to(first, self.gains.shape) for first in firsts]
+        further = self._further()
+        if further[0] is None:
+            return tuple(rows)
+        pairs = zip(rows, further, strict=True)
+        return tuple(xp.concatenate([row, others.reshape(-1)]) for row, others in pairs)
+
+    def _further(self):
+        return self.further_gains, self.further_frequencies, self.further_damping_ratios
 
     def bilinear_factor(self):
-        angular_frequency = 2 * xp.pi * self.frequency
-        return angular_frequency / xp.tan(angular_frequency * self.period / 2)
+        angular_frequencies = 2 * xp.pi * self._oscillators()[1]
+        return angular_frequencies / xp.tan(angular_frequencies * self.period / 2)
 
     def validate(self, case):
-        frequency, period = self.frequency, self.period
-        if period is not None and is_concrete(frequency) and is_concrete(period):
-            highest, nyquist = float(concrete(frequency).max()), 0.5 / float(concrete(period))
+        error = super().validate(case)
+        if error is not None:
+            return error
+        further, loops = [one for one in self._further() if one is not None], self.gains.shape[0]
+        words = "further_gains, further_frequencies and further_damping_ratios"
+        if len(further) % 3:
+            return f"{words} belong together: give all three, or none"
+        if any(one.shape != (further[0].shape[0], loops) for one in further):
+            return (
+                f"{words} must have as many rows, one for each further oscillator, of a number for"
+                f" each of {loops} actuators"
+            )
+        frequencies, period = self._oscillators()[1], self.period
+        if period is not None and is_concrete(frequencies) and is_concrete(period):
+            highest, nyquist = float(concrete(frequencies).max()), 0.5 / float(concrete(period))
             if highest >= nyquist:
                 return (
                     f"frequency must be below half the sampling frequency, {nyquist:g} Hz;"
                     f" it is {highest:g} Hz: lower it, or sample faster"
                 )
-        return super().validate(case)
+        return None
 
 
 def _reading_filter(
@@ -227,7 +278,7 @@ def _reading_filter(
     )
 
 
-def _bilinear_transform(coefficients: Polynomials, factor) -> Float[Array, "3 actuator"]:
+def _bilinear_transform(coefficients: Polynomials, factor) -> Float[Array, "3 filter"]:
     """Bilinear transform of polynomials in s: coefficients in 1/z, with s = c (z - 1) / (z + 1).
 
     The factor (1 + 1/z)^degree that clears the denominator is included.

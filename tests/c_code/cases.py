@@ -163,6 +163,17 @@ CASES = {
     "ppf": rig(
         jb.PositivePositionFeedback([1e3, 1e3], 8.0, damping_ratio=0.3, period=PERIOD, delay=1e-3)
     ),
+    "ppf-two-modes": rig(
+        jb.PositivePositionFeedback(
+            [1e3, 1e3],
+            8.0,
+            damping_ratio=0.3,
+            further_gains=[[-4e2, 2e2]],
+            further_frequencies=[[30.0, 20.0]],
+            further_damping_ratios=[[0.2, 0.5]],
+            period=PERIOD,
+        )
+    ),
     "prescribed": rig(
         Prescribed(
             [0.1, 0.2],

@@ -101,6 +101,41 @@ COMPENSATORS = {
 }
 
 
+TWO_MODES = jb.PositivePositionFeedback(
+    [300.0, 20.0],
+    frequency=[12.0, 45.0],
+    damping_ratio=0.3,
+    further_gains=[[-90.0, 60.0]],
+    further_frequencies=[[30.0, 20.0]],
+    further_damping_ratios=[[0.2, 0.5]],
+    period=PERIOD,
+)
+# Gain, frequency (rad/s) and damping ratio of the oscillators of each loop.
+OSCILLATORS = (
+    ((300.0, W[0], 0.3), (-90.0, 2 * np.pi * 30.0, 0.2)),
+    ((20.0, W[1], 0.3), (60.0, 2 * np.pi * 20.0, 0.5)),
+)
+
+
+def oscillator(gain: float, w: float, damping: float):
+    return control.tf([gain * w**2], [1.0, 2 * damping * w, w**2])
+
+
+def test_several_oscillators_of_an_actuator_against_python_control_and_scipy():
+    law = TWO_MODES.law(None)
+    state, commands = law.initial_state(), []
+    for readings in READINGS:
+        command, state, _ = law.step(state, measure(jnp.asarray(readings)), jnp.zeros(()))
+        commands.append(command)
+    for loop, oscillators in enumerate(OSCILLATORS):
+        truth = 0.0
+        for numbers in oscillators:
+            one = control.c2d(oscillator(*numbers), PERIOD, "tustin", prewarp_frequency=numbers[1])
+            truth += scipy.signal.lfilter(one.num[0][0], one.den[0][0], READINGS[:, loop])
+        found = np.array(commands)[:, loop]
+        assert_allclose(found, truth, rtol=0, atol=1e-12 * np.max(np.abs(truth)))
+
+
 def sampled(name: str, period: float = PERIOD) -> list[tuple[np.ndarray, np.ndarray]]:
     """Coefficients of the sampled filter of each loop, by python-control."""
     _, loops, matched = COMPENSATORS[name]
@@ -178,8 +213,7 @@ def test_positive_position_feedback_damps_the_mode_to_which_it_is_tuned():
     plant = control.ss(
         a, np.append(np.zeros(n), shape)[:, None], np.append(shape, np.zeros(n)), 0.0
     )
-    oscillator = control.tf([gain * first**2], [1.0, 2 * ratio * first, first**2])
-    truth = control.feedback(plant, oscillator, sign=1).poles()
+    truth = control.feedback(plant, oscillator(gain, first, ratio), sign=1).poles()
     found = linearised_loop(case, 0.0).poles()[: truth.size]
     near = np.abs(found[:, None] - truth).min(axis=1)
     assert np.all(near < 1e-3 * np.abs(found))
@@ -187,11 +221,12 @@ def test_positive_position_feedback_damps_the_mode_to_which_it_is_tuned():
 
 
 def without_period(name, **changes) -> jb.Case:
-    law = dataclasses.replace(COMPENSATORS[name][0], period=None)
+    law = TWO_MODES if name == "two modes" else COMPENSATORS[name][0]
+    law = dataclasses.replace(law, period=None)
     return dataclasses.replace(CASE, controller=law, **changes)
 
 
-@pytest.mark.parametrize("name", COMPENSATORS)
+@pytest.mark.parametrize("name", [*COMPENSATORS, "two modes"])
 def test_poles_in_continuous_time_against_python_control(name):
     """Point forces at the sensors; the states of the filters are among those of the loop."""
     forces, positions = [jb.PointForce(0.19), jb.PointForce(0.4)], (0.19, 0.4)
@@ -204,7 +239,11 @@ def test_poles_in_continuous_time_against_python_control(name):
     plant = control.ss(
         a, np.vstack([0 * rows.T, rows.T]), np.hstack([rows, 0 * rows]), np.zeros((2, 2))
     )
-    filters = control.append(*(control.ss(control.tf(*loop)) for loop in COMPENSATORS[name][1]))
+    if name == "two modes":
+        loops = [control.ss(sum(oscillator(*one) for one in loop)) for loop in OSCILLATORS]
+    else:
+        loops = [control.ss(control.tf(*loop)) for loop in COMPENSATORS[name][1]]
+    filters = control.append(*loops)
     truth = control.feedback(plant, filters, sign=1).poles()
     found = linearised_loop(case, 0.0).poles()
     assert found.size == truth.size
@@ -263,6 +302,18 @@ ERRORS = [
     ({"lag": jnp.ones(3)}, "controller.lag must be one number for all 2 loops or one for each"),
     ({"lag": jnp.asarray(0.0)}, "controller.lag must be positive"),
 ]
+OSCILLATOR_ERRORS = [
+    ({"further_gains": None}, "further_damping_ratios belong together: give all three, or none"),
+    ({"further_gains": jnp.ones((1, 1))}, "a number for each of 2 actuators"),
+    ({"further_frequencies": jnp.full((1, 2), 300.0)}, "250 Hz; it is 300 Hz"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), OSCILLATOR_ERRORS)
+def test_errors_of_further_oscillators(change, message):
+    law = dataclasses.replace(TWO_MODES, **change)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        check_case(dataclasses.replace(CASE, controller=law))
 
 
 @pytest.mark.parametrize(("change", "message"), ERRORS)

@@ -352,6 +352,7 @@ OF_CONTROLLERS = {
         "pd",
         "lead",
         "ppf",
+        "ppf-two-modes",
         "internal-model",
         "internal-model-scheduled",
         "feedback-stepped",

@@ -43,8 +43,8 @@ def _numbers(part: Any, address: str, *names: str) -> Iterator[tuple[str, float]
     for name in names:
         value = getattr(part, name, None)
         if value is not None:
-            for i, number in enumerate(np.ravel(value)):
-                yield f"{address}.{name}.{i}" if np.ndim(value) else f"{address}.{name}", number
+            for index, number in np.ndenumerate(value):
+                yield ".".join([address, name, *map(str, index)]), number
 
 
 def _parts(facts: Facts, key: str) -> list[tuple[str, Any]]:
@@ -574,7 +574,8 @@ def frequency_off_modes(facts):
         tuned = np.append(facts.frequencies / (1 + ratios), forced)
         found.append((address, own, unit, tuned, True))
     if getattr(facts.case.controller, "kind", "") == "ppf":
-        frequencies = _numbers(facts.case.controller, "controller", "frequency")
+        names = "frequency", "further_frequencies"
+        frequencies = _numbers(facts.case.controller, "controller", *names)
         found += [(name, float(f), "Hz", facts.frequencies, False) for name, f in frequencies]
     for address, own, unit, tuned, is_absorber in found:
         if not facts.frequencies.size or own < facts.frequencies[0]:
