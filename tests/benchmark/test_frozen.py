@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.optimize
+import scipy.signal
 from numpy.testing import assert_allclose
 
 import jaxbeam as jb
@@ -287,3 +288,85 @@ def test_an_ode_of_scipy_has_the_same_peaks():
         if law is None:
             stored = published("unknown_mass")["test"][0]
             assert_allclose(peak, stored.uncontrolled, rtol=1e-7)
+
+
+def _railway(load):
+    """Deflections (m) at the samples of the railway without commands, and those of each command.
+
+    Axles as forces on three sine modes, with the mass of the damper as a fourth coordinate: all of
+    it linear, with constant coefficients, and written down by hand.
+    """
+    length, stiffness, density, damping, period, steps = 25.0, 3e10, 15e3, 0.01, 0.02, 120
+    mass, own = 3750.0, 2 * np.pi * 3.48
+    (speed,) = load
+    n, modal_mass = np.arange(1, 4) * np.pi / length, density * length / 2
+    frequency, middle = n**2 * np.sqrt(stiffness / density), np.sin(n * length / 2)
+    stretch = np.append(-middle, 1.0)  # of the spring of the damper
+    inertia = np.diag([modal_mass] * 3 + [mass])
+    spring = np.diag([*(modal_mass * frequency**2), 0.0])
+    spring += mass * own**2 * np.outer(stretch, stretch)
+    dashpot = np.diag([*(2 * modal_mass * damping * frequency), 0.0])
+    dashpot += 2 * 0.086 * mass * own * np.outer(stretch, stretch)
+    upwards = np.append(middle, 0.0)
+
+    def accelerations(z, force):
+        return np.linalg.solve(inertia, force - spring @ z[:4] - dashpot @ z[4:])
+
+    axles = np.array([0.0, 3.0, 14.0, 17.0, 20.525, 22.525, 35.7625, 37.7625, 53.7625, 55.7625])
+    axles = np.append(axles, [71.7625, 73.7625, 89.7625, 91.7625])
+
+    def rates(t, z):
+        at = speed * t - axles
+        shapes = np.sin(np.outer(at[on_beam], n)).sum(axis=0)
+        return np.append(z[4:], accelerations(z, np.append(-170e3 * shapes, 0.0)))
+
+    passages = np.concatenate([axles, axles + length]) / speed
+    times, z, base = np.arange(2 * steps + 1) * period / 2, np.zeros(8), [0.0]
+    places = np.unique([*times, *passages[passages < times[-1]]])
+    for start, end in zip(places[:-1], places[1:], strict=True):
+        middle_of_axles = speed * (start + end) / 2 - axles
+        on_beam = (middle_of_axles > 0) & (middle_of_axles < length)
+        found = scipy.integrate.solve_ivp(rates, (start, end), z, "DOP853", rtol=1e-9, atol=1e-14)
+        z = found.y[:, -1]
+        if end in times:
+            base.append(middle @ z[:3])
+    state = np.zeros((8, 8))
+    state[:4, 4:] = np.eye(4)
+    state[4:] = np.linalg.solve(inertia, np.concatenate([-spring, -dashpot], axis=1))
+    held = np.append(np.zeros(4), np.linalg.solve(inertia, upwards))
+    transition, held, *_ = scipy.signal.cont2discrete(
+        (state, held[:, None], np.zeros((1, 8)), 0.0), period / 2
+    )
+    column, z = [0.0], np.zeros(8)  # of the first command, which acts for two samples
+    for k in range(2 * steps):
+        z = transition @ z + held[:, 0] * (k < 2)
+        column.append(middle @ z[:3])
+    column = np.array(column)
+    shifted = [np.append(np.zeros(2 * k), column[: len(column) - 2 * k]) for k in range(steps)]
+    return np.array(base), np.stack(shifted, axis=1)
+
+
+def test_the_railway_by_scipy_has_the_same_peaks_and_bound():
+    """Uncontrolled, under held commands, and least of all: by an ODE and a linear program."""
+    problem, stored = load("railway"), published("railway")["test"][0]
+    base, response = _railway(problem.test_load(TEST_SEEDS[0]))
+    assert_allclose(np.abs(base).max(), stored.uncontrolled, rtol=1e-6)
+    commands = held_commands(problem, np.random.default_rng(1).uniform)
+    law = jb.Prescribed(
+        offsets=[0.0],
+        period=problem.period,
+        times=np.arange(len(commands) + 1) * problem.period,
+        values=np.append(commands, commands[-1:], axis=0).T,
+    )
+    case = dataclasses.replace(problem.run_case(stored.load), controller=law)
+    found = scoring.sampled_peak(problem, case)
+    assert_allclose(found, np.abs(base + response @ commands[:, 0]).max(), rtol=1e-6)
+    scale = np.abs(base).max()
+    rows = np.concatenate([response, -response]) / scale
+    solution = scipy.optimize.linprog(
+        np.append(np.zeros(rows.shape[1]), 1.0),
+        np.append(rows, -np.ones((len(rows), 1)), axis=1),
+        -np.concatenate([base, -base]) / scale,
+        bounds=[(-5e4, 5e4)] * rows.shape[1] + [(0, None)],
+    )
+    assert_allclose(solution.x[-1] * scale, stored.bound, rtol=1e-5)
