@@ -263,7 +263,7 @@ def _draw(beam, stiff) -> Figure:
     )
     panels[1, 1].set_ylim(1, 10)
     panels[1, 1].legend(loc="lower left")
-    panels[0, 0].legend(["free beam", "0.5 kg at 0.3 m"], loc="lower left")
+    panels[0, 0].legend(["free beam", "0.5 kg at 0.3 m"], loc="upper right")
     for axes in panels[-1]:
         axes.set_xlabel("frequency (Hz)")
     set_title(figure, "Electrodynamic shaker on the beam of rig A")
