@@ -49,6 +49,7 @@ BENCHMARKS = {
     "quadratic_programs": Benchmark("programs of predictive control: OSQP"),
     "environments": Benchmark("environments to learn in: a plain one in NumPy", "--batch 16"),
     "controller_steps": Benchmark("steps of controllers", "--only feedback"),
+    "controller_code": Benchmark("C of controllers: operations, memory, agreement", "--only pd"),
     "profile": Benchmark("where the time of a sweep goes", "--modes 3"),
     "cluster": Benchmark("a sweep of a million runs on workers", "--runs 40000", "--runs 400000"),
 }
