@@ -43,7 +43,9 @@ class GainTable(Module):
         length = take(self.breakpoints, i + 1) - start
         interval_fraction = (fraction - start) / xp.where(length > 0, length, 1.0)
         fractions = powers(xp.clip(interval_fraction, 0.0, 1.0), self.coefficients.shape[1])
-        return xp.tensordot(fractions, take(self.coefficients, i), axes=1)
+        coefficients = take(self.coefficients, i)
+        rows = coefficients.reshape(coefficients.shape[0], -1)
+        return (fractions @ rows).reshape(coefficients.shape[1:])
 
 
 def breakpoints_between(

@@ -170,6 +170,8 @@ def array_namespace(*values: Any) -> Any:
 
 def take(array, index) -> Any:
     """Entries at an index along the first axis, one that may be traced in a known array."""
+    if isinstance(index, VectorisedArray) and not isinstance(array, VectorisedArray):
+        return vectorised.take(array, index)
     return jnp.asarray(array)[index] if is_jax(index) else array[index]
 
 

@@ -232,6 +232,17 @@ def _append(array, value):
     return np.concatenate([np.reshape(array, -1), np.reshape(value, -1)])
 
 
+def _searchsorted(array, values, side="left"):
+    if _level(array):
+        raise NotVectorisedError("numpy.searchsorted in an array that varies")
+    return VectorisedArray(np.searchsorted(array, values.values, side), values.level)
+
+
+def take(array, index):
+    """Entries of a known array at an index that varies, along the first axis."""
+    return VectorisedArray(array[index.values], index.level)
+
+
 def _reshape(array, shape):
     shape = shape if isinstance(shape, tuple) else (shape,)
     return VectorisedArray(array.values.reshape(array.values.shape[0], *shape), array.level)
@@ -306,6 +317,7 @@ _FUNCTIONS: dict[Callable, Callable] = {
     np.moveaxis: _moveaxis,
     np.transpose: _transpose,
     np.pad: _pad,
+    np.searchsorted: _searchsorted,
     np.tile: _tile,
     np.zeros_like: lambda array: np.zeros(array.shape, array.dtype),
     np.diff: lambda array: _along(np.diff, -1)(array),

@@ -3,6 +3,8 @@
 They are found by Newton's method together with the states at the nodes.
 """
 
+import contextlib
+
 import equinox as eqx
 import jax
 from jaxtyping import Float
@@ -13,7 +15,8 @@ from jaxbeam.integrator.propagators import GAUSS_NODES, NODE_COUNT
 from jaxbeam.model.modal_model import ModalModel
 from jaxbeam.model.sensing.sensor_signals import filtered_reading
 from jaxbeam.model.state_space import Plant
-from jaxbeam.runtime.arrays import Array, scan, vmap, xp
+from jaxbeam.runtime.arrays import Array, any_jax, scan, vmap, xp
+from jaxbeam.runtime.vectorised import NotVectorisedError, vectorised
 from jaxbeam.simulation.commands import limit_commands
 
 SHORTEST_STEP = 1e-12  # s, and of the time: far above the rounding of times
@@ -49,7 +52,8 @@ class ContinuousLoop(AbstractInputPolicy):
             return commands, commands[-1]
 
         def commands_for(commands):
-            return vmap(self._commands)(states(commands), times)
+            of_batch = vmap(self._commands, in_axes=(-1, None), out_axes=-1)
+            return vmap(of_batch)(states(commands), times)
 
         guess = xp.broadcast_to(memory, (NODE_COUNT, *memory.shape))
         commands = newton_fixed_point(commands_for, guess, NEWTON_ITERATIONS)
@@ -68,7 +72,10 @@ class ContinuousLoop(AbstractInputPolicy):
         """Commands of a single run at some times (s): those to the actuators, then the rates."""
         if not self.implicit:
             return self._open_loop_commands(times)
-        return vmap(lambda state, time: self._commands(state[:, None], time)[:, 0])(states, times)
+        if not any_jax(self, states, times):
+            with contextlib.suppress(NotVectorisedError):
+                return vectorised(self._commands)(states, times)
+        return vmap(self._commands)(states, times)
 
     def _open_loop_commands(self, times):
         """Commands of a law of time alone, (time, command): limits are applied to all at once."""
@@ -80,7 +87,7 @@ class ContinuousLoop(AbstractInputPolicy):
         return limit_commands(self.plant.case, commands.T).T
 
     def _commands(self, state, time):
-        """Commands and rates of the law's states, (command, batch), for states (state, batch)."""
+        """Commands and rates of the law's states, (command,), for the state of a run."""
         state = state[: self.model.state_count]  # without those of vehicles
         case, outputs = self.plant.case, self.output_rows @ state
         sensors = len(case.sensors)
@@ -88,17 +95,12 @@ class ContinuousLoop(AbstractInputPolicy):
         readings = [filtered_reading(sensor, None, None, value)[0] for sensor, value in pairs]
         if outputs.shape[0]:
             outputs = xp.stack([*readings, *outputs[sensors:]])  # filters of the law follow
-
-        def law(law_state, readings, plant_state):
-            no_command = xp.zeros(len(case.actuators))
-            measurement = Measurement(readings, plant_state, no_command)
-            command = limit_commands(case, self.law.command(law_state, measurement, time))
-            rates = self.law.rates(law_state, measurement, command, time)
-            return xp.concatenate([command, rates])
-
         law_state = state[state.shape[0] - self.controller_states :]
         plant_state = self.plant.from_modal(state[: self.plant.modal_model.state_count])
-        return vmap(law, in_axes=-1, out_axes=-1)(law_state, outputs, plant_state)
+        measurement = Measurement(outputs, plant_state, xp.zeros(len(case.actuators)))
+        command = limit_commands(case, self.law.command(law_state, measurement, time))
+        rates = self.law.rates(law_state, measurement, command, time)
+        return xp.concatenate([command, rates])
 
 
 def newton_fixed_point(
