@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxbeam.integrator.step_matrices import StepMatrices, advances_by_forces
+from jaxbeam.integrator.step_matrices import StepMatrices, advances_by_forces, share_matrices
 from jaxbeam.integrator.vehicles import StepInput, Vehicles, vehicle_maps
 from jaxbeam.model.contact import ModalCompliance, solve_contact_forces
 from jaxbeam.numerics.batched_linalg import matvec
@@ -131,8 +131,7 @@ def contact_maps(step: StepInput):
         return no_response, -weight
     parts = [response, *([] if commands is None else [commands.contact_response])]
     # Runs of the same wheels share the systems; weights are then right sides of one each.
-    batch = weight.shape[1]
-    shared = batch > 1 and not is_jax(inertia) and not np.ptp(inertia, axis=1).any()
+    shared = share_matrices(inertia)
     if shared:
         inertia, weight = inertia[:, :1], xp.moveaxis(weight, 1, -1)[:, :, 0][:, None]
     right = [inertia * part[:, None] for part in parts], [weight]

@@ -37,6 +37,7 @@ from jaxbeam.runtime.arrays import (
     Array,
     any_jax,
     cond,
+    is_jax,
     map_elements,
     set_at,
     take,
@@ -111,6 +112,11 @@ def advances_by_forces(states: int) -> bool:
     return states >= MANY_STATES
 
 
+def share_matrices(inertia: Float[Array, "*axis"]) -> bool:
+    """Whether the runs of a batch, along the second axis, are known to have the same wheels."""
+    return inertia.shape[1] > 1 and not is_jax(inertia) and not np.ptp(inertia, axis=1).any()
+
+
 def chunk_length(
     discrete: DiscreteModel, loads: LoadSet, max_loads: int, prepared: int | None = None
 ) -> int:
@@ -132,7 +138,10 @@ def chunk_length(
         transition = discrete.model.state_matrix.size
         if discrete.monitored_transition is not None:
             transition = max(transition, discrete.monitored_transition[0].size)
-    entries = loads.inertia.shape[1] * max(compliance, rows * states, transition)
+    batch = loads.inertia.shape[1]
+    shared = not loads.wheels.vehicles and share_matrices(loads.inertia)
+    of_matrices = (1 if shared else batch) * max(compliance, rows * states, transition)
+    entries = max(of_matrices, batch * (rows + states))
     if prepared:
         return prepared if prepared * entries <= PREPARED_ENTRIES else CHUNK_STEPS
     if any_jax(loads):
