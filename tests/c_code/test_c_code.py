@@ -80,6 +80,31 @@ def test_operations_at_worst_are_stated(kind, tmp_path):
         assert counted >= MIN_OPERATIONS_SHARE * program.operations
 
 
+CONVERSIONS = ["-Wconversion", "-Wsign-conversion", "-Wshadow"]
+FORBIDDEN = (
+    r"\b(goto|while|do|malloc|calloc|realloc|free|va_list|setjmp|longjmp)\b|\(\s*\*\s*\w+\s*\)\s*\("
+)
+FUNCTION = re.compile(r"^(?:static )?(?:void|real|int) (\w+)\([^;{]*\)\n\{\n(.*?)^\}", re.M | re.S)
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", KINDS)
+def test_programs_keep_the_rules_that_the_page_states(kind, tmp_path):
+    write_c(exported(kind), tmp_path)
+    build = [COMPILER, *STRICT, *CONVERSIONS, "-O0", "-c", "-o", "law.o", "law.c"]
+    subprocess.run(build, cwd=tmp_path, check=True)
+    code = re.sub(r"/\*.*?\*/", "", exported(kind).files["law.c"], flags=re.S)
+    assert not re.search(FORBIDDEN, code)
+    bodies = dict(FUNCTION.findall(code))
+    assert {"law_step", "law_reset"} <= set(bodies) and "return" not in bodies["law_step"]
+    # Outside functions nothing but constants, and a function calls those before it alone.
+    outside = FUNCTION.sub("", code)
+    assert not re.search(r"^(?!.*\bconst\b)(?:static )?(?:real|int) \w+(?:\[| =|;)", outside, re.M)
+    for i, body in enumerate(bodies.values()):
+        later = [name for name in list(bodies)[i:] if re.search(rf"\b{name}\(", body)]
+        assert not later
+
+
 # The example of docs/export.md: the program that it writes repeats the simulated commands.
 
 PAGE = (Path(__file__).parents[2] / "docs" / "export.md").read_text(encoding="utf-8")
