@@ -12,7 +12,7 @@ import jaxbeam as jb
 from jaxbeam.case.case import addresses, concrete_case, replace
 from jaxbeam.model.load_set import load_set
 from jaxbeam.runtime import interpreter
-from jaxbeam.runtime.arrays import add_at, is_jax, is_known, set_at, vmap, xp
+from jaxbeam.runtime.arrays import add_at, is_jax, is_known, set_at, take, vmap, xp
 from jaxbeam.runtime.interpreter import InterpretedProgram, compile_cost, run_cost
 from jaxbeam.runtime.lapack import _solve as solve
 from jaxbeam.runtime.vectorised import NotVectorisedError, VectorisedArray, vectorised
@@ -283,6 +283,7 @@ def test_costs_are_those_of_all_trips():
 # Functions of known arrays over a first axis: those of each element, all at once.
 
 CONSTANT = np.arange(6.0).reshape(2, 3)
+BORDERS = np.array([-1.0, 0.0, 1.0])
 
 # Functions of an array of two rows and three columns, and of a number.
 BATCHED_FUNCTIONS = {
@@ -301,6 +302,8 @@ BATCHED_FUNCTIONS = {
     "expand": lambda a, x: xp.expand_dims(a, -1) + xp.expand_dims(a, 0)[..., None],
     "broadcast to": lambda a, x: xp.broadcast_to(a[0] * x, (4, 3)),
     "moveaxis": lambda a, x: xp.moveaxis(a, 0, -1) + a.T * x,
+    "search": lambda a, x: take(CONSTANT, xp.searchsorted(BORDERS, x, side="right") // 2) * x,
+    "search of several": lambda a, x: take(CONSTANT, xp.searchsorted(BORDERS, a[0]) // 2),
     "pad": lambda a, x: xp.pad(a * x, [(0, 1), (2, 0)], constant_values=7.0),
     "tile": lambda a, x: xp.tile(a[1] * x, 2),
     "zeros": lambda a, x: xp.zeros_like(a) + x,
