@@ -16,16 +16,14 @@ from matplotlib.figure import Figure
 import jaxbeam as jb
 from experiments.studies import tune_feedforward
 from experiments.studies.hand_set import HAND_DRAWN, HAND_SET, drawn_table, trapezium
-from experiments.studies.held_out import HELD_OUT_ENTRY_TIME, RIGIDITY
+from experiments.studies.held_out import HELD_OUT_ENTRY_TIME, with_rigidity
 from experiments.studies.sensor_feedback import SENSORS_ONLY, bench_case, with_cutoff
 from experiments.studies.tuned_feedforward import BENCH, with_bench_delay
 from experiments.thesis.cases import with_duration
 from experiments.thesis.verdicts import Experiment, ExperimentResult
-from jaxbeam.model.modes import mesh_layout
 from jaxbeam.plot.style import colour, set_title, use_style
 from jaxbeam.simulation.integration_plan import integration_plan
 from jaxbeam.simulation.simulate import ContactLossWarning
-from tuning.control.objective import with_fixed_design
 
 RIG, MASS, SPEED = "B", 0.42, 0.55  # kg, m/s: a held-out load
 HEADWAY, DECELERATION = 0.4, 0.2  # s; m/s^2: the load leaves with less than half of its speed
@@ -114,13 +112,6 @@ def _with_second_mass(case: jb.Case) -> jb.Case:
     (first,) = case.loads
     second = dataclasses.replace(first, entry_time=first.entry_time + HEADWAY)
     return dataclasses.replace(case, loads=(first, second))
-
-
-def with_rigidity(case: jb.Case, factor: float) -> jb.Case:
-    """The case with another rigidity of the plant, of which the law does not know."""
-    design = {RIGIDITY: float(case.beam.flexural_rigidity)}
-    plant = jb.replace(case, {RIGIDITY: factor * design[RIGIDITY]})
-    return with_fixed_design(plant, design, mesh_layout(plant))
 
 
 def with_gate_error(case: jb.Case, error: float) -> jb.Case:

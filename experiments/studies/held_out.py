@@ -15,8 +15,10 @@ import jaxbeam as jb
 import tuning
 from experiments.thesis.chapter6.patch_rigs import ONE_SPAN_CUTOFF, TWO_SPAN_CUTOFF
 from experiments.thesis.figures import plot_commands, plot_deflections
+from jaxbeam.model.modes import mesh_layout
 from jaxbeam.plot.style import GREY, INK, colour, set_title, use_style
 from tuning.control.load_cases import AddressValues
+from tuning.control.objective import with_fixed_design
 
 PERIOD = 0.01  # s, of sampling
 MASSES, ENTRY_TIME = (0.261, 0.509), 0.05  # kg, s: training
@@ -108,6 +110,13 @@ class HeldOutStudy:
 def load_label(load: AddressValues, separator: str = ",") -> str:
     """Mass and speed of a load."""
     return f"{load['loads.0.mass']:g} kg{separator} {load['loads.0.speed']:g} m/s"
+
+
+def with_rigidity(case: jb.Case, factor: float) -> jb.Case:
+    """The case with a factor on the rigidity of the plant, of which the law does not know."""
+    design = {RIGIDITY: float(case.beam.flexural_rigidity)}
+    plant = jb.replace(case, {RIGIDITY: factor * design[RIGIDITY]})
+    return with_fixed_design(plant, design, mesh_layout(plant))
 
 
 def peaks(records: Sequence[jb.Record]) -> np.ndarray:
