@@ -29,7 +29,14 @@ LOST = 0.05  # of the readings
 COMPILER = "cc", "-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"
 OTHERS = {
     "internal-model-scheduled": jb.ScheduledInternalModel(period=PERIOD),
-    "h-infinity": jb.HInfinity(4e-4, 4.0, 4.0, 1e-3, corner=20.0, period=PERIOD),
+    "h-infinity": jb.HInfinity(
+        output_size=4e-4,
+        command_size=4.0,
+        force_size=4.0,
+        noise_size=1e-3,
+        corner=20.0,
+        period=PERIOD,
+    ),
     "mpc-scenario": jb.ScenarioMPC(
         horizon=6, moves=4, move_weight=1e-11, stiffness_factors=[0.8, 1.2], period=PERIOD
     ),
@@ -39,7 +46,9 @@ DAMPED = jb.Case(
     actuators=[jb.PointForce(0.3)],
     sensors=[jb.Sensor(0.3), jb.Sensor(0.3, "velocity")],
     loads=[jb.MovingMass(mass=0.509, speed=1.0, entry_time=0.2)],
-    controller=jb.SemiActive(0.5, 40.0, jb.Feedback([2e3]), period=PERIOD),
+    controller=jb.SemiActive(
+        min_damping=0.5, max_damping=40.0, desired=jb.Feedback([2e3]), period=PERIOD
+    ),
     run=jb.Run(1.0, sample_rate=1 / PERIOD),
 )
 CASES = {name: patch_case(law) for name, law in (CONTROLLERS | OTHERS).items()}

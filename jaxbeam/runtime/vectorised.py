@@ -7,7 +7,7 @@ the C integrator needs to know, without the 0.4 s of tracing and compiling the s
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -232,7 +232,7 @@ def _append(array, value):
     return np.concatenate([np.reshape(array, -1), np.reshape(value, -1)])
 
 
-def _searchsorted(array, values, side="left"):
+def _searchsorted(array, values, side: Literal["left", "right"] = "left"):
     if _level(array):
         raise NotVectorisedError("numpy.searchsorted in an array that varies")
     return VectorisedArray(np.searchsorted(array, values.values, side), values.level)
