@@ -38,7 +38,7 @@ from jaxbeam.cli.commands.stability import stability
 from jaxbeam.cli.commands.sweep import native, sweep
 from jaxbeam.cli.commands.thesis import demo, reproduce
 from jaxbeam.cli.commands.tune import tune
-from jaxbeam.cli.commands.weigh import calibrate, identify_responses, weigh
+from jaxbeam.cli.commands.weigh import calibrate, identify_responses, traffic, weigh
 from jaxbeam.cli.options import print_message
 from jaxbeam.runtime.interrupts import interruptible
 from jaxbeam.runtime.memory import RARELY
@@ -97,6 +97,7 @@ for _title, _commands in COMMANDS.items():
     for _command in _commands:
         app.command(_command, group=_group)
 app["weigh"].command(calibrate)
+app["weigh"].command(traffic)
 app.register_install_completion_command(
     help="Install completion of commands and options for bash, zsh, fish or PowerShell, also in"
     " the file that the shell reads when it starts."

@@ -7,14 +7,26 @@ from tuning.weighing.influence_lines import (
     InfluenceLines,
     model_influence_lines,
 )
+from tuning.weighing.traffic import (
+    TrafficSettings,
+    WeighedTraffic,
+    WeighedVehicle,
+    weigh_logs,
+    weigh_vehicles,
+)
 
 __all__ = [
     "Accuracy",
     "AxleWeighing",
     "InfluenceLines",
+    "WeighedTraffic",
+    "TrafficSettings",
+    "WeighedVehicle",
     "accuracy_class",
     "calibrate_influence_lines",
     "model_influence_lines",
     "relative_errors",
     "weigh_axles",
+    "weigh_logs",
+    "weigh_vehicles",
 ]

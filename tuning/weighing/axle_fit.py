@@ -29,6 +29,7 @@ The share d follows from the residuals r = (1 - H) e, H = J (J'J)^-1 J': their p
 noise, and d^2 |(1 - H) B|^2.
 """
 
+import copy
 import dataclasses
 import functools
 import itertools
@@ -42,8 +43,10 @@ from jaxtyping import Float
 from tuning.fit.uncertainty.covariance import t_quantile
 from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines
 
-BOUNCES, HOPS = (1.3, 1.8, 2.6), (9.0, 11.0, 13.5)  # Hz, of bodies and axles of lorries
-UNSPRUNG, DAMPING = 0.1, 0.16  # mass of the axle over that of the body on it; of body and axle
+# Hz, of bodies on air or leaf springs, which bounce and pitch, and of axles of lorries (OECD 1998).
+BODIES, HOPS = (1.3, 1.6, 2.0, 2.5, 3.0), (9.0, 11.0, 13.5)
+# Mass of the axle over that of the body on it; damping ratio of the body, loss factor of tyres.
+UNSPRUNG, DAMPING, LOSS = 0.12, 0.16, 0.1
 LOWEST, HIGHEST, SPACING = 0.6, 20.1, 0.3  # Hz, of the waves
 SHARES = 1e-4, 0.5  # of dynamic wheel forces in the static ones; worst roads have 0.3
 
@@ -57,15 +60,16 @@ def _power(f: Float[np.ndarray, " wave"]) -> Float[np.ndarray, " wave"]:
     """Spectrum of wheel forces at frequencies (Hz), but for a factor.
 
     It is that of quarter cars on a road of heights ~ 1 / frequency (ISO 8608), in the mean of usual
-    bodies and axles.
+    bodies and axles, each with forces of one variance.
     """
     power = np.zeros(f.size)
-    for bounce, hop in itertools.product(BOUNCES, HOPS):
-        link = bounce**2 + 2j * DAMPING * bounce * f  # stiffnesses over mass of the body
-        tyre = UNSPRUNG * hop**2 - bounce**2
+    for body, hop in itertools.product(BODIES, HOPS):
+        stiffness = UNSPRUNG * hop**2  # of tyres, over mass of the body
+        spring = body**2 * stiffness / (stiffness - body**2)
+        link, tyre = spring + 2j * DAMPING * np.sqrt(spring) * f, stiffness * (1 + 1j * LOSS)
         moving = (link - f**2) * (link + tyre - UNSPRUNG * f**2) - link**2
-        contact = tyre * (1 - tyre * (link - f**2) / moving)
-        power += np.abs(contact / f) ** 2
+        own = np.abs(tyre * (1 - tyre * (link - f**2) / moving) / f) ** 2
+        power += own / own.sum()
     return power
 
 
@@ -166,6 +170,8 @@ MARGIN_SHARE, MARGIN_TIME = 0.15, 0.25  # of the loaded time, and s, that are us
 CORRELATION = 0.05  # s, of dynamic wheel forces: their share follows from so many of these times
 SHARE_SPREAD = 0.3  # of the logarithm of the share of dynamic wheel forces
 SPEED_SPREAD = 0.03  # of the speed of the start, relative
+FREQUENCY_SPREADS = 0.01, 0.03  # of the first mode of the bridge, and of others, relative
+MOST_CHANGE = 0.1  # of logarithms of these
 MIN_GAP = 0.6  # m, between axles: less than any tandem's
 MIN_AXLE_SHARE = 0.04  # of the gross weight, in an axle: less stands for something else
 GROUP_GAP = 2.2  # m, of axles of one group (COST 323)
@@ -278,13 +284,25 @@ class Weights(NamedTuple):
         return 2 * float(np.sum(np.log(np.diag(self.factor))))
 
 
+class AxleTrain(NamedTuple):
+    """Axles of one speed and their forces (N), by lines, with dynamic wheel forces of a share."""
+
+    lines: InfluenceLines
+    geometry: AxleGeometry
+    forces: Float[np.ndarray, " axle"]
+    dynamic_share: float
+
+
 class CrossingLog:
     """Readings (SI units) of a crossing, in units of the white noise of each sensor.
 
-    `speed` (m/s) is what is known of it before the fit, within some per cent.
+    `speed` (m/s) is what is known of it before the fit, within some per cent; `seen` the geometry
+    that detectors of axles tell, with standard deviations of speed (m/s), entry time (s) and
+    offsets (m). `fixed` is the covariance of what is not modelled.
     """
 
     speed: float | None = None
+    seen: "tuple[AxleGeometry, Float[np.ndarray, ' number']] | None" = None
 
     def __init__(
         self,
@@ -313,6 +331,26 @@ class CrossingLog:
         self.freedom = max((last - first) / CORRELATION, 3.0)
         sensors = readings.shape[1]
         self.shifts = self.rows(np.broadcast_to(np.eye(sensors), (times.size, sensors, sensors)))
+        self.fixed = np.eye(self.target.size)
+
+    def without(self, train: "AxleTrain") -> "CrossingLog":
+        """The log less other axles on the bridge, of whose numbers hardly anything is known."""
+        lines, geometry, forces, share = train
+        model, explained = _Model(lines, self, geometry), lines.crossing(geometry, self.times)
+        columns, x = self.rows(explained), model.first(forces)
+        spreads, count, speed = np.zeros(x.size), model.count, abs(geometry.speed)
+        spreads[:count] = forces.max()
+        spreads[count : 2 * count + 1] = [0.05 * speed, 1 / speed, *np.ones(count - 1)]
+        spreads[x.size - model.modes :] = [FREQUENCY_SPREADS[min(i, 1)] for i in range(model.modes)]
+        waves = self.rows(dynamic_waves(lines, geometry, forces, self.times))
+        found = copy.copy(self)
+        found.fixed = self.fixed + _square(model.jacobian(x, columns) * spreads)
+        found.fixed += _square(share * waves)
+        if lines.deviations is not None:
+            found.fixed += _square(self.rows(_line_errors(lines, geometry, forces, self.times)))
+        found.target = self.target - columns @ forces
+        found.readings = self.readings - np.einsum("tas,a->ts", explained, forces)
+        return found
 
     def places(self, speed: float, length: float) -> tuple[float, float]:
         """How far axles may have come (m) at time 0, less the speed times it, least and most."""
@@ -349,41 +387,46 @@ def loaded_times(times, readings) -> tuple[float, float]:
 
 
 class _Model:
-    """Readings and slopes at numbers: forces, speed, entry time, offsets, shifts."""
+    """Readings and slopes at numbers.
+
+    These are forces, speed, entry time, offsets, shifts, and changes of the logarithms of the
+    frequencies in which the bridge vibrates.
+    """
 
     def __init__(self, lines: InfluenceLines, log: CrossingLog, start: AxleGeometry):
         self.lines, self.log, self.start = lines, log, start
-        self.count = start.offsets.size
+        self.count, self.modes = start.offsets.size, len(lines.modes)
 
-    def first(self, forces, shifts):
+    def first(self, forces):
         """Numbers of the start."""
         self.least = 0.01 * max(float(forces.sum()), 1e-12)
         at = self.start
         entry = [at.speed, at.entry_time, *at.offsets[1:]]
-        return np.concatenate([forces, entry, shifts])
+        return np.concatenate([forces, entry, np.zeros(self.log.shifts.shape[1] + self.modes)])
 
     def parts(self, x):
-        """Geometry, forces, shifts."""
+        """Geometry, forces, shifts, lines."""
         n = self.count
         geometry = AxleGeometry(
             x[n], x[n + 1], np.append(0.0, x[n + 2 : 2 * n + 1]), self.start.length
         )
-        return geometry, x[:n], x[2 * n + 1 :]
+        changes = x[x.size - self.modes :]
+        return geometry, x[:n], x[2 * n + 1 : x.size - self.modes], self.lines.tuned(changes)
 
     def residual(self, x):
         """What a model of numbers leaves of the readings, and its columns by forces."""
-        geometry, forces, shifts = self.parts(x)
-        columns = self.log.rows(self.lines.crossing(geometry, self.log.times))
+        geometry, forces, shifts, lines = self.parts(x)
+        columns = self.log.rows(lines.crossing(geometry, self.log.times))
         return self.log.target - columns @ forces - self.log.shifts @ shifts, columns
 
     def jacobian(self, x, columns):
         """Slopes of the readings by all numbers."""
-        geometry, forces, _ = self.parts(x)
+        geometry, forces, _, lines = self.parts(x)
         times = self.log.times
         step = STEPS * geometry.length / abs(geometry.speed)  # in time
 
-        def slopes(moved, size):
-            return (self.log.rows(self.lines.crossing(moved, times)) - columns) / size * forces
+        def slopes(moved, size, lines=lines):
+            return (self.log.rows(lines.crossing(moved, times)) - columns) / size * forces
 
         later = dataclasses.replace(geometry, entry_time=geometry.entry_time + step)
         speed = STEPS * geometry.speed
@@ -392,7 +435,9 @@ class _Model:
         parts = [columns, slopes(faster, speed).sum(axis=1, keepdims=True)]
         # An axle that is further behind enters later.
         parts += [by_entry.sum(axis=1, keepdims=True), by_entry[:, 1:] / abs(geometry.speed)]
-        return np.hstack([*parts, self.log.shifts])
+        others = [lines.tuned(STEPS * row) for row in np.eye(self.modes)]
+        tuned = [slopes(geometry, STEPS, one).sum(axis=1, keepdims=True) for one in others]
+        return np.hstack([*parts, self.log.shifts, *tuned])
 
     def known(self, x):
         """Residuals of what is known before, in standard deviations, and their slopes."""
@@ -417,6 +462,16 @@ class _Model:
             row[n] = np.sign(x[n]) / spread
             rows.append(row)
             left.append((self.log.speed - abs(x[n])) / spread)
+        if self.log.seen is not None:
+            seen, spreads = self.log.seen
+            numbers = np.array([seen.speed, seen.entry_time, *seen.offsets[1:]])
+            rows += list(np.eye(x.size)[n : 2 * n + 1] / spreads[:, None])
+            left += list((numbers - x[n : 2 * n + 1]) / spreads)
+        for i in range(self.modes):
+            row, spread = np.zeros(x.size), FREQUENCY_SPREADS[min(i, 1)]
+            row[i - self.modes] = 1 / spread
+            rows.append(row)
+            left.append(-x[i - self.modes] / spread)
         return np.array(left), np.array(rows).reshape(-1, x.size)
 
     def allowed(self, x):
@@ -434,6 +489,7 @@ class _Model:
         offsets = x[n + 2 : 2 * n + 1]
         if n > 1 and offsets[-1] > room:
             x[n + 2 : 2 * n + 1] = offsets * room / offsets[-1]
+        x[x.size - self.modes :] = np.clip(x[x.size - self.modes :], -MOST_CHANGE, MOST_CHANGE)
         return x
 
 
@@ -447,7 +503,7 @@ def fit_axles(
     """Axles fitted to the readings of a crossing, from a geometry and forces (N)."""
     model = _Model(lines, log, start)
     n = model.count
-    x = model.first(forces, np.zeros(log.shifts.shape[1]))
+    x = model.first(forces)
     if weights is None:
         weights = _weights(model, x, first_time=True)[0]
     for _ in range(2):
@@ -467,7 +523,7 @@ def fit_axles(
     covariance[unseen, unseen] = most[unseen] ** 2
     weighted = weights(left)
     deviance = weights.logarithm + weights.unlikely + weighted @ weighted + before @ before
-    geometry, forces, _ = model.parts(x)
+    geometry, forces, _, _ = model.parts(x)
     own = covariance[: 2 * n + 1, : 2 * n + 1]
     return AxleFit(
         geometry,
@@ -486,9 +542,7 @@ def fit_axles(
 def refined(fit: AxleFit, start: AxleGeometry, forces, log: CrossingLog):
     """Deviance, geometry and forces at the weights of a fit, of other axles from a start."""
     model = _Model(fit.lines, log, start)
-    x, squares = _gauss_newton(
-        model, model.first(forces, np.zeros(log.shifts.shape[1])), fit.weights
-    )
+    x, squares = _gauss_newton(model, model.first(forces), fit.weights)
     return fit.weights.logarithm + fit.weights.unlikely + squares, *model.parts(x)[:2]
 
 
@@ -526,11 +580,11 @@ def _gauss_newton(model: _Model, x, weights: Weights):
 
 def _weights(model: _Model, x, first_time=False) -> tuple[Weights, float, float]:
     """Weights for dynamic wheel forces at numbers, their share, and the excess of residuals."""
-    geometry, forces, _ = model.parts(x)
-    lines, log = model.lines, model.log
-    fixed = np.eye(log.target.size)
+    log = model.log
+    geometry, forces, _, lines = model.parts(x)
+    fixed = log.fixed
     if lines.deviations is not None:
-        fixed += _square(log.rows(_line_errors(lines, geometry, forces, log.times)))
+        fixed = fixed + _square(log.rows(_line_errors(lines, geometry, forces, log.times)))
     dynamic = _square(log.rows(dynamic_waves(lines, geometry, forces, log.times)))
     left, columns = model.residual(x)
     jacobian = model.jacobian(x, columns)

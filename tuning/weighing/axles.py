@@ -19,11 +19,10 @@ from jaxbeam.runtime.printer import text_table
 from tuning.logs.log import Log
 from tuning.logs.pairing import sensor_readings
 from tuning.weighing.axle_fit import AxleFit, CrossingLog
-from tuning.weighing.influence_lines import InfluenceLines, check_static, model_influence_lines
+from tuning.weighing.influence_lines import InfluenceLines, lines_for
 from tuning.weighing.matching_pursuit import MosesFit, moses
-from tuning.weighing.search import find_axles, free_frequency, most_likely
-
-MOST_EXCESS = 1.5  # of the variance of residuals, above which axles or lines are unlikely
+from tuning.weighing.search import find_axles, most_likely, with_free_frequency
+from tuning.weighing.vehicles import MOST_EXCESS
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -182,18 +181,9 @@ def weigh_axles(
         raise ValueError(f"speeds must be 0 < low < high in m/s; they are {low:g} and {high:g}")
     if axles is not None and axles < 1:
         raise ValueError(f"the number of axles must be 1 or more, not {axles}")
-    check_static(case)
     case = dataclasses.replace(case, loads=(), vehicle_sensors=(), profile=None)
-    lines = model_influence_lines(case) if influence_lines is None else influence_lines
-    if lines.values.shape[1] != len(case.sensors):
-        raise ValueError(
-            f"the influence lines are of {lines.values.shape[1]} sensors, the case has "
-            f"{len(case.sensors)}: calibrate with this case"
-        )
     readings, valid = sensor_readings(case, log)
-    if lines.deviations is not None and lines.frequency is not None:
-        # Slow runs, by which lines are calibrated, tell little of it, the log itself much.
-        lines = lines._replace(frequency=free_frequency(lines, log.times, readings))
+    lines = with_free_frequency(lines_for(case, influence_lines), log.times, readings)
     crossing = CrossingLog(log.times, readings, valid)
     fits, tried = find_axles(lines, crossing, speeds, both_ways, axles)
     if not fits:

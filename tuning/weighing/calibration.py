@@ -41,6 +41,7 @@ KNOTS = 41  # of the smooth part
 FREQUENCY_SHARES = np.geomspace(0.7, 1.8, 40)  # tried, of the model's first frequency
 NEAR, STEP = 0.08, 0.02  # of logarithms of the first frequency tried again
 NEAR_PEAK, FINE = 0.03, 0.01  # likewise, of others
+FARTHEST = 0.4  # of logarithms of frequencies, from the first ones
 FAR = np.exp(np.arange(-0.25, 0.2501, 0.005))  # shares of the model's, at which others may peak
 PEAK = 12.0  # times the median, of a clear peak of a periodogram
 SAME_SPEED = 0.1  # relative difference of speeds at which dynamic forces of a vehicle repeat
@@ -134,15 +135,15 @@ def _tuned(lines: InfluenceLines, mode: int, solved) -> InfluenceLines:
     near, step = (NEAR_PEAK, FINE) if mode else (NEAR, STEP)
 
     def at(log):
-        ratios = np.array(lines.ratios)
-        if mode:
-            ratios[mode] *= np.exp(log)
-            return lines._replace(ratios=ratios)
-        ratios[1:] /= np.exp(log)
-        return lines._replace(frequency=float(lines.frequency * np.exp(log)), ratios=ratios)
+        return lines.tuned(log * (np.arange(len(lines.modes)) == mode))
 
     logs = np.arange(-near, near + step / 2, step)
     misfits = [solved(at(log)).deviance for log in logs]
+    for end, sign in ((0, -1), (-1, 1)):  # on, as long as it falls towards an end
+        while np.argmin(misfits) == range(len(misfits))[end] and abs(logs[end]) < FARTHEST:
+            place = 0 if end == 0 else len(logs)
+            logs = np.insert(logs, place, logs[end] + sign * step)
+            misfits.insert(place, solved(at(logs[end])).deviance)
     i = int(np.clip(np.argmin(misfits), 1, len(logs) - 2))
     low, middle, high = misfits[i - 1 : i + 2]
     bend = max(low - 2 * middle + high, 1e-300)

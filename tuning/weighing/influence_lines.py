@@ -106,6 +106,13 @@ class InfluenceLines(NamedTuple):
             found += swing.reshape(*shape.shape, -1, 1) * (mode.parts @ self.values)
         return found
 
+    def tuned(self, logs: Float[np.ndarray, " mode"]) -> "InfluenceLines":
+        """Lines whose modes have other frequencies, by the logarithms of their ratios to these."""
+        if self.frequency is None or self.ratios is None:
+            return self
+        ratios = self.ratios * np.exp(logs - logs[0])
+        return self._replace(frequency=float(self.frequency * np.exp(logs[0])), ratios=ratios)
+
     @property
     def modes(self) -> "list[_Mode]":
         """Modes in which the bridge vibrates."""
@@ -243,6 +250,22 @@ def model_influence_lines(case: Case) -> InfluenceLines:
     positions = _stations(case)
     values = unit_force.readings(unit_force.length, positions / unit_force.length)
     return InfluenceLines(positions, values, None, *_first_modes(case, positions))
+
+
+def lines_for(case: Case, lines: InfluenceLines | None) -> InfluenceLines:
+    """Influence lines for the sensors of a case: those given, or else its own.
+
+    Raises ValueError for a sensor of velocity or acceleration, and lines of other sensors.
+    """
+    check_static(case)
+    if lines is None:
+        return model_influence_lines(case)
+    if lines.values.shape[1] != len(case.sensors):
+        raise ValueError(
+            f"the influence lines are of {lines.values.shape[1]} sensors, the case has "
+            f"{len(case.sensors)}: calibrate with this case"
+        )
+    return lines
 
 
 def _stations(case: Case) -> Float[np.ndarray, " point"]:

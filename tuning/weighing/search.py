@@ -19,6 +19,7 @@ from jaxtyping import Float
 from tuning.weighing.axle_fit import (
     GROUP_MEAN,
     AxleFit,
+    AxleTrain,
     CrossingLog,
     axle_groups,
     fit_axles,
@@ -42,6 +43,8 @@ MIN_CYCLES = 3.0  # of free vibration that tell its frequency
 MIN_EXPLAINED = 0.5  # share of its energy that one decaying mode explains
 AT_EXIT = 0.1  # of the largest mean over two cycles, below which nothing is on the bridge
 MAX_ROWS = 600  # samples of all sensors in a comb
+# Of two combs at once: speeds, relative; m; samples.
+PAIR_STEP, PAIR_SPACING, PAIR_ROWS = 0.06, 0.7, 300
 
 
 class _Comb(NamedTuple):
@@ -205,6 +208,44 @@ def _best_comb(lines: InfluenceLines, log: CrossingLog, speeds, both_ways: bool)
     return min((comb(best * near) for near in NEAR), key=lambda one: one.misfit)
 
 
+def two_trains(
+    lines: InfluenceLines, log: CrossingLog, speeds: tuple[float, float], both_ways: bool
+) -> list[AxleTrain]:
+    """Two trains of axles of two speeds that explain readings best, each by a comb of forces."""
+    stride = max(log.times.size * log.readings.shape[1] // PAIR_ROWS, 1)
+    times, readings = log.times[::stride], log.readings[::stride]
+    scale = np.maximum(readings.std(axis=0), 1e-300)
+    target = ((readings - readings.mean(axis=0)) / scale).T.ravel()
+    count = int(np.ceil(np.log(speeds[1] / speeds[0]) / PAIR_STEP)) + 1
+    directions = (1.0, -1.0) if both_ways else (1.0,)
+    tables = {}
+    for speed in np.outer(directions, np.geomspace(*speeds, count)).ravel().tolist():
+        low, high = log.places(speed, lines.length)
+        places = np.arange(low, high + PAIR_SPACING, PAIR_SPACING)
+        table = lines.crossing(AxleGeometry(speed, 0.0, places, lines.length), times) / scale
+        rows = (table - table.mean(axis=0)).transpose(2, 0, 1).reshape(target.size, -1)
+        tables[speed] = places, rows
+
+    def misfit(*pair):
+        return scipy.optimize.nnls(np.hstack([tables[speed][1] for speed in pair]), target)
+
+    first = min(tables, key=lambda speed: misfit(speed)[1])
+    second = min(tables, key=lambda speed: misfit(first, speed)[1])
+    first = min(tables, key=lambda speed: misfit(speed, second)[1])
+    forces, left = misfit(first, second)
+    found, begin = [], 0
+    for speed in (first, second):
+        places = tables[speed][0]
+        own, begin = forces[begin : begin + places.size], begin + places.size
+        used = own > 1e-6 * own.max(initial=0.0)
+        comb = _Comb(float(left), speed, places[used], own[used])
+        at, own = _axles_of(comb, PAIR_SPACING)
+        if at.size:
+            geometry = AxleGeometry(speed, at[0] / abs(speed), at - at[0], lines.length)
+            found.append(AxleTrain(lines, geometry, own, lines.dynamic_share))
+    return found
+
+
 def _weighted_comb(fit: AxleFit, log: CrossingLog) -> _Comb:
     """The comb of the best speed near that of a fit, with its weights."""
     shifts, target = fit.weights(log.shifts), fit.weights(log.target)
@@ -254,11 +295,26 @@ def _axles_of(comb: _Comb, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     return places[order], forces[order]
 
 
-def free_frequency(
+def with_free_frequency(
     lines: InfluenceLines,
     times: Float[np.ndarray, " time"],
     readings: Float[np.ndarray, "time sensor"],
-) -> float | None:
+) -> InfluenceLines:
+    """Calibrated lines with the first frequency that the free vibration after a crossing tells.
+
+    Slow runs, by which lines are calibrated, tell little of it.
+    """
+    if lines.deviations is None or lines.frequency is None:
+        return lines
+    change = np.log(_free_frequency(lines, times, readings) / lines.frequency)
+    return lines.tuned(change * (np.arange(len(lines.modes)) == 0))
+
+
+def _free_frequency(
+    lines: InfluenceLines,
+    times: Float[np.ndarray, " time"],
+    readings: Float[np.ndarray, "time sensor"],
+) -> float:
     """Frequency (Hz) of the free vibration after a crossing; that of the lines if none is clear."""
     first = lines.frequency
     assert first is not None

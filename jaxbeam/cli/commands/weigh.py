@@ -1,7 +1,13 @@
-"""Commands `weigh` (weigh-in-motion) and `identify-responses` (fit in the frequency domain)."""
+"""Commands `weigh` (weigh-in-motion) and `identify-responses` (fit in the frequency domain).
+
+`weigh calibrate` finds influence lines, `weigh traffic` a table of vehicles over a day.
+"""
 
 import json
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from jaxbeam.cli.arguments import (
     UsageError,
@@ -12,6 +18,7 @@ from jaxbeam.cli.arguments import (
     refuse_option,
 )
 from jaxbeam.cli.options import CaseOptions, Free, LogOptions, Output
+from jaxbeam.files.endings import TABLES, check_ending
 
 
 def weigh(
@@ -116,6 +123,89 @@ def calibrate(
         with whole_file(output, options.overwrite) as partial:
             partial.write_text(json.dumps(lines.to_dict()))
     options.report(lines.to_dict(), [str(lines)], output)
+
+
+def traffic(
+    case: Path,
+    /,
+    *logs: Path,
+    speeds: str,
+    calibration: tuple[Path, ...] = (),
+    detectors: str | None = None,
+    one_way: bool = False,
+    least_weight: float = 35.0,
+    store: Annotated[Path | None, Parameter(show_default=False)] = None,
+    output: Output = None,
+    reading: LogOptions = LogOptions(),
+    options: CaseOptions = CaseOptions(),
+) -> None:
+    """Weigh all vehicles in long logs, or a folder of logs: a table with a row for each.
+
+    Vehicles may come one by one, close behind each other, or meet on the bridge. Each is weighed
+    once, also after an interruption: the next call goes on where this one ended.
+
+    Parameters
+    ----------
+    case
+        Case file, TOML, with sensors on the beam; its loads are ignored.
+    logs
+        LOG...: logs of the sensors, or folders of logs.
+    speeds
+        LOW:HIGH: range of speeds (m/s) of the vehicles.
+    calibration
+        Logs of known vehicles, or a file of lines, as of weigh.
+    detectors
+        NAME=POSITION,NAME=POSITION: two channels with a pulse for each axle, and where they are
+        (m): they tell number, distances and speed of the axles.
+    one_way
+        Search vehicles from the left only.
+    least_weight
+        Lightest vehicle to weigh (kN).
+    store
+        FILE.jsonl: vehicles so far; CASE.vehicles.jsonl beside the call by default.
+    output
+        FILE.csv, .xlsx, .mat or .parquet: write a table with a row for each vehicle.
+    """
+    refuse_option(not logs, "weigh traffic needs a log: jaxbeam weigh traffic CASE LOG...")
+    if output is not None:
+        check_ending(output, "a table", TABLES)
+    options.check_outputs(output)
+    speed_range = parse_range("--speeds", speeds, "m/s, such as 8:35")
+    places = _places(detectors)
+    check_exists("log file", *calibration, *logs)
+    options.check_case(case)
+
+    import tuning  # sets XLA's threads, therefore before the case is read
+    from jaxbeam.files.tables import write_table
+    from tuning.monitoring.history import logs_in
+
+    place = store or Path(f"{case.stem}.vehicles.jsonl")
+    settings = tuning.weighing.TrafficSettings(speed_range, not one_way, 1e3 * least_weight, places)
+    parsed_case = options.read(case)
+    lines = _lines_of(parsed_case, calibration, reading) if calibration else None
+    files = [
+        file for path in logs for file in (logs_in(path, "*", place) if path.is_dir() else [path])
+    ]
+    found = tuning.weighing.weigh_logs(
+        parsed_case, files, place, settings, lines, read=reading.read, progress=not options.json_
+    )
+    if output is not None:
+        write_table(output, found.columns, options.overwrite)
+    options.report(found.to_dict(), [str(found)], output, place)
+
+
+def _places(text: str | None) -> dict[str, float]:
+    """Positions (m) of detectors by their channels. Raises UsageError for other words."""
+    found = {}
+    for part in text.split(",") if text else ():
+        name, _, place = part.partition("=")
+        try:
+            found[name.strip()] = float(place)
+        except ValueError:
+            raise UsageError(
+                f"--detectors takes NAME=POSITION,NAME=POSITION in m, not {part!r}"
+            ) from None
+    return found
 
 
 def _lines_of(case, calibration: tuple[Path, ...], reading: LogOptions):

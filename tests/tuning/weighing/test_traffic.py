@@ -1,0 +1,229 @@
+"""A table of vehicles over time: planted trucks of finite elements, alone and together."""
+
+import csv
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from jaxbeam.cli import main
+from jaxbeam.files.case_file import save_case
+from tests.oracles import planted_trucks
+from tests.tuning.weighing.test_weigh import case_of, log_of
+from tuning import Log
+from tuning.weighing import (
+    TrafficSettings,
+    calibrate_influence_lines,
+    weigh_logs,
+    weigh_vehicles,
+)
+from tuning.weighing.detectors import axles_of_pulses, pulse_times
+
+BRIDGE = planted_trucks.BRIDGES[0]
+STEP, SEED, DETECTORS = planted_trucks.STEP * planted_trucks.EVERY, 31, {"d0": 4.0, "d1": 16.0}
+SPEEDS = 8.0, 35.0
+# Axles, direction, time (s) at which the first axle enters: alone, meeting, one behind the other.
+ALONE = ((2, 1, 4.0), (5, -1, 10.0))
+TOGETHER = ((3, 1, 16.0), (4, -1, 16.7), (5, 1, 24.0), (2, 1, 26.2))
+
+
+def traffic(plan, duration: float, seed: int = SEED):
+    """Times, strains, pulses of detectors, and the trucks by their times of entry."""
+    rng = np.random.default_rng(seed)
+    surface = planted_trucks.road("A", rng)
+    times = STEP * np.arange(round(duration / STEP))
+    strain, pulses = np.zeros((times.size, 2)), 0.03 * rng.normal(size=(times.size, 2))
+    trucks = []
+    for axles, way, start in plan:
+        truck = planted_trucks.draw_truck(rng, axles)
+        truck = dataclasses.replace(truck, speed=way * truck.speed)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(planted_trucks, "NOISE", 0.0)  # that of the log is added below
+            passage = planted_trucks.cross(BRIDGE, truck, "A", surface, rng)
+        speed = abs(truck.speed)
+        first = round((start - planted_trucks.LEAD / speed) / STEP)
+        strain[first : first + len(passage.times)] += passage.strain
+        entry = times[first] + planted_trucks.LEAD / speed
+        trucks.append((entry, truck))
+        for own, place in zip(pulses.T, DETECTORS.values(), strict=True):
+            travelled = place if way > 0 else BRIDGE.length - place
+            for at in entry + (travelled + truck.offsets) / speed:
+                own += np.exp(-(((times - at) * speed / 0.3) ** 2))
+    strain += 0.04 * strain.std() * rng.normal(size=strain.shape)
+    return times, strain, pulses, trucks
+
+
+def logged(plan, duration: float) -> tuple[Log, list]:
+    times, strain, pulses, trucks = traffic(plan, duration)
+    names = ("s0", "s1", *DETECTORS)
+    columns = names, ("strain",) * 2 + ("voltage",) * 2, ("1", "1", "V", "V")
+    return Log(times, np.hstack([strain, pulses]), *columns, start="2026-03-29T23:59:55"), trucks
+
+
+def without_detectors(log: Log) -> Log:
+    columns = log.names[:2], log.quantities[:2], log.units[:2]
+    return Log(log.times, log.values[:, :2], *columns, source="tuesday")
+
+
+@pytest.fixture(scope="module")
+def lines():
+    known, _ = planted_trucks.site(0, "A", (), SEED)
+    return calibrate_influence_lines(case_of(BRIDGE), [log_of(one, known=True) for one in known])
+
+
+def check(vehicles, trucks, gross: float, axles: float):
+    assert len(vehicles) == len(trucks)
+    for one, (entry, truck) in zip(vehicles, trucks, strict=True):
+        assert one.time == pytest.approx(entry, abs=0.03)
+        assert one.speed == pytest.approx(truck.speed, rel=0.015)
+        assert one.gross_weight == pytest.approx(truck.loads.sum(), rel=gross)
+        np.testing.assert_allclose(one.forces, truck.loads, rtol=axles)
+        np.testing.assert_allclose(one.offsets, truck.offsets, atol=0.15)
+        assert one.groups == [len(group) for group in truck.groups]
+
+
+def test_vehicles_that_meet_and_follow_are_weighed_by_detectors(lines):
+    log, trucks = logged((*ALONE, *TOGETHER), 32.0)
+    settings = TrafficSettings(SPEEDS, detectors=DETECTORS)
+    found = weigh_vehicles(case_of(BRIDGE), log, settings, lines)
+    check(found.vehicles, trucks, 0.03, 0.15)
+    held = [
+        np.abs(np.array(one.forces) - truck.loads) < one.force_half_widths
+        for one, (_, truck) in zip(found.vehicles, trucks, strict=True)
+    ]
+    assert np.mean(np.concatenate(held)) >= 0.85
+    assert found.vehicles[0].stamp.startswith("2026-03-29T23:59:5")
+    assert found.vehicles[1].stamp.startswith("2026-03-30T00:00:0")
+    assert found.verdict.startswith("6 vehicles, 4 from the left and 2 from the right, of ")
+    table = found.columns
+    assert table["class"].tolist() == ["1-1", "1-1-3", "1-2", "1-1-2", "1-1-3", "1-1"]
+    assert np.isnan(table["axle 3 (kN)"][0]) and table["direction"][1] == "left"
+
+
+def test_vehicles_one_by_one_are_weighed_by_strain_alone(lines):
+    log, trucks = logged(ALONE, 14.0)
+    settings = TrafficSettings(SPEEDS)
+    found = weigh_vehicles(case_of(BRIDGE), without_detectors(log), settings, lines)
+    check(found.vehicles, trucks, 0.03, 0.15)
+
+
+def test_vehicles_that_meet_are_weighed_by_strain_alone(lines):
+    log, trucks = logged(TOGETHER[:2], 20.0)
+    settings = TrafficSettings(SPEEDS)
+    found = weigh_vehicles(case_of(BRIDGE), without_detectors(log), settings, lines)
+    check(found.vehicles, trucks, 0.03, 0.15)
+
+
+def test_pulses_of_vehicles_that_overtake_and_meet():
+    """Trains of pulses are told apart by their delays, whatever their order."""
+    truth = [(20.0, [0.0, 4.0, 5.3]), (-15.0, [0.0, 3.6]), (25.0, [0.0, 5.0])]
+    entries = 1.0, 1.1, 1.4
+    times = np.arange(0.0, 5.0, 1e-3)
+    signals = np.zeros((2, times.size))
+    for (speed, offsets), entry in zip(truth, entries, strict=True):
+        for signal, place in zip(signals, (4.0, 16.0), strict=True):
+            travelled = place if speed > 0 else 20.0 - place
+            for at in entry + (travelled + np.array(offsets)) / abs(speed):
+                signal += np.exp(-(((times - at) / 0.01) ** 2))
+    pulses = tuple(pulse_times(times, signal, 0.02) for signal in signals)
+    found = axles_of_pulses(pulses, (4.0, 16.0), (8.0, 35.0), 20.0)
+    assert [round(one.speed) for one in found] == [20, -15, 25]
+    for one, (_, offsets), entry in zip(found, truth, entries, strict=True):
+        np.testing.assert_allclose(one.offsets, offsets, atol=0.05)
+        assert one.entry_time == pytest.approx(entry, abs=0.01)
+    assert axles_of_pulses((np.zeros(0), np.ones(1)), (4.0, 16.0), (8.0, 35.0), 20.0) == []
+
+
+def write(path, log: Log, rows=slice(None)):
+    heads = [f"{name} [{'1' if name[0] == 's' else 'V'}]" for name in log.names]
+    table = np.column_stack([log.times, log.values])[rows]
+    lines = [",".join(["time [s]", *heads]), *(",".join(f"{x:.9g}" for x in row) for row in table)]
+    path.write_text("\n".join(lines))
+
+
+def test_a_stopped_weighing_goes_on(lines, tmp_path, monkeypatch):
+    """Passings in the store are not weighed again, also if its last line is broken off."""
+    log, trucks = logged(ALONE, 14.0)
+    write(tmp_path / "monday.csv", log)
+    settings, store = TrafficSettings(SPEEDS, detectors=DETECTORS), tmp_path / "store.jsonl"
+
+    def weighed():
+        return weigh_logs(case_of(BRIDGE), [tmp_path / "monday.csv"], store, settings, lines)
+
+    found = weighed()
+    check(found.vehicles, trucks, 0.03, 0.15)
+    whole = store.read_text()
+    head, first, *_ = whole.splitlines()
+    store.write_text("\n".join([head, first, first[:50]]) + "\n")
+    assert weighed().columns["time (s)"].tolist() == found.columns["time (s)"].tolist()
+    assert store.read_text().count('"vehicles"') == 2
+    monkeypatch.setattr("tuning.weighing.traffic.vehicles_in", None)
+    assert weighed().verdict == found.verdict
+    with pytest.raises(ValueError, match="was made with another case, other lines or settings"):
+        weigh_logs(case_of(BRIDGE), [], store, TrafficSettings((5.0, 30.0)), lines)
+    store.write_text("other\n")
+    with pytest.raises(ValueError, match="is no store of vehicles: give another name"):
+        weighed()
+
+
+def test_what_is_passed_over_is_said(lines):
+    """A vehicle on the bridge as the log begins, and samples that are missing."""
+    log, _ = logged(ALONE, 14.0)
+    late = (log.times > 4.5) & (log.times < 8.0)
+    cut = dataclasses.replace(
+        without_detectors(log), times=log.times[late], values=log.values[late, :2], valid=None
+    )
+    settings = TrafficSettings(SPEEDS)
+    found = weigh_vehicles(case_of(BRIDGE), cut, settings, lines)
+    assert found.problems[0].startswith(
+        "tuesday, 4.50 s: the log begins or ends while it is on the bridge"
+    )
+    gap = (log.times < 10.5) | (log.times > 10.6)
+    cut = dataclasses.replace(
+        without_detectors(log), times=log.times[gap], values=log.values[gap, :2], valid=None
+    )
+    only = dataclasses.replace(
+        cut, times=cut.times[cut.times > 7], values=cut.values[cut.times > 7], valid=None
+    )
+    found = weigh_vehicles(case_of(BRIDGE), only, settings, lines)
+    assert "samples are missing while it is on the bridge: not weighed" in found.problems[0]
+    assert found.verdict == "no vehicle is found"
+    with pytest.raises(ValueError, match="no channel 'd0' for a detector of axles"):
+        settings = TrafficSettings(SPEEDS, detectors=DETECTORS)
+        weigh_vehicles(case_of(BRIDGE), only, settings, lines)
+    with pytest.raises(ValueError, match="there must be two detectors of axles at two positions"):
+        TrafficSettings(SPEEDS, detectors={"d0": 4.0})
+    with pytest.raises(ValueError, match="speeds must be 0 < low < high"):
+        TrafficSettings((3.0, 2.0))
+
+
+def test_command_weighs_a_folder(lines, tmp_path, capsys):
+    log, trucks = logged(ALONE, 14.0)
+    folder = tmp_path / "day"
+    folder.mkdir()
+    write(folder / "1.csv", log, slice(0, round(8.0 / STEP)))
+    write(folder / "2.csv", log, slice(round(8.0 / STEP), None))
+    save_case(case_of(BRIDGE), tmp_path / "bridge.toml")
+    (tmp_path / "lines.json").write_text(json.dumps(lines.to_dict()))
+    table, store = tmp_path / "vehicles.csv", tmp_path / "store.jsonl"
+    words = [
+        "weigh", "traffic", str(tmp_path / "bridge.toml"), str(folder), "--speeds", "8:35",
+        "--calibration", str(tmp_path / "lines.json"), "--detectors", "d0=4,d1=16",
+        "--store", str(store), "-o", str(table), "--json",
+    ]  # fmt: skip
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    printed = capsys.readouterr()
+    assert ended.value.code == 0, printed.err
+    content = json.loads(printed.out)
+    assert [one["class"] for one in content["vehicles"]] == ["1-1", "1-1-3"]
+    with table.open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["log"] for row in rows] == ["1.csv", "2.csv"]
+    for row, (_, truck) in zip(rows, trucks, strict=True):
+        assert float(row["gross weight (kN)"]) == pytest.approx(truck.loads.sum() / 1e3, rel=0.03)
+    with pytest.raises(SystemExit) as ended:
+        main([*words[:8], "--detectors", "d0:4,d1=16"])
+    assert ended.value.code == 2
+    assert "--detectors takes NAME=POSITION,NAME=POSITION in m" in capsys.readouterr().err

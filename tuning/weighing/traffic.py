@@ -1,0 +1,523 @@
+"""Traffic over a bridge: a table of vehicles from long logs, each weighed once.
+
+Parts of a log with something on the bridge are those in which a reading, smoothed over two cycles
+of the first mode, is larger than that of a light vehicle, and than noise. The level of a sensor,
+which drifts with temperature, is the median of a minute or more.
+"""
+
+import dataclasses
+import datetime
+import hashlib
+import json
+import os
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxbeam.case.case import Case
+from jaxbeam.case.fields import refuses_traced
+from jaxbeam.runtime.input_file import read_text_input
+from jaxbeam.runtime.interrupts import keeping
+from jaxbeam.runtime.output_file import whole_file
+from jaxbeam.runtime.printer import TableViews, text_table
+from jaxbeam.runtime.progress import ProgressBar
+from tuning.logs.log import Log, LogWarning
+from tuning.logs.pairing import sensor_readings
+from tuning.logs.reading import read_log
+from tuning.modal.preprocessing import with_channels
+from tuning.weighing.axle_fit import AxleFit, CrossingLog
+from tuning.weighing.detectors import LEAST_GAP, axles_of_pulses, pulse_times
+from tuning.weighing.influence_lines import InfluenceLines, lines_for
+from tuning.weighing.search import with_free_frequency
+from tuning.weighing.vehicles import MOST_EXCESS, vehicles_in
+
+FORMAT = "jaxbeam vehicles 1"
+LEAST_WEIGHT = 35e3  # N, of vehicles that are weighed: lorries, by the usual limit of 3.5 t
+LEAST_READING = 0.25  # times the largest ordinate and this weight, of a vehicle of some axles
+NOISE = 6.0  # times the deviation of a smoothed reading, above which something is on the bridge
+LEVEL, PASSAGES = 60.0, 12.0  # s, and passages of the slowest vehicle, of a median
+LONGEST = 20.0  # m, of a vehicle
+AFTER = 2.0  # s of free vibration after a vehicle, which tell its frequency
+BEFORE = 0.6  # s
+MAX_LISTED = 20  # vehicles, in the text
+
+
+@dataclasses.dataclass(frozen=True)
+class TrafficSettings:
+    """How vehicles are found in logs.
+
+    `speeds` (m/s) are the lowest and highest ones, in both directions or, without `both_ways`, from
+    the left only; vehicles lighter than the `least_weight` (N) may be passed over. `detectors` are
+    the channels of two detectors of axles and their positions (m).
+
+    Raises ValueError unless speeds are 0 < low < high, and for another number of detectors.
+
+    >>> TrafficSettings((8.0, 35.0)).least_weight
+    35000.0
+    """
+
+    speeds: tuple[float, float]
+    both_ways: bool = True
+    least_weight: float = LEAST_WEIGHT
+    detectors: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        low, high = self.speeds
+        if not 0 < low < high:
+            raise ValueError(f"speeds must be 0 < low < high in m/s; they are {low:g} and {high:g}")
+        if len(self.detectors) not in (0, 2) or len(set(self.detectors.values())) == 1:
+            raise ValueError(
+                f"there must be two detectors of axles at two positions, or none, not"
+                f" {len(self.detectors)}: they tell speeds by the time between them"
+            )
+
+
+class WeighedVehicle(NamedTuple):
+    """A vehicle that was weighed: SI units, half widths of 95 % intervals.
+
+    `time` (s) is that at which the first axle enters the bridge, in the log of the name `file`;
+    `stamp` its date and time, "" if the log has none. At a negative speed it came from the right.
+    `doubt` is a sentence on why the weights may be wrong, "" if there is none.
+
+    >>> loads, errors = [6e4, 9e4], [1e3, 2e3]
+    >>> one = WeighedVehicle("log", 1.0, "", 20.0, [0, 4], loads, errors, 1.5e5, 2e3, [1, 1])
+    >>> one.silhouette
+    '1-1'
+    """
+
+    file: str
+    time: float
+    stamp: str
+    speed: float
+    offsets: list[float]
+    forces: list[float]
+    force_half_widths: list[float]
+    gross_weight: float
+    gross_half_width: float
+    groups: list[int]
+    doubt: str = ""
+
+    @property
+    def silhouette(self) -> str:
+        """Numbers of axles in the groups of the vehicle, from the front: its class, as "1-1-3"."""
+        return "-".join(map(str, self.groups))
+
+
+@dataclasses.dataclass(frozen=True)
+class WeighedTraffic(TableViews):
+    """Vehicles in the order of time, and what was passed over, by the names of logs.
+
+    >>> print(WeighedTraffic(()).verdict)
+    no vehicle is found
+    """
+
+    vehicles: tuple[WeighedVehicle, ...]
+    problems: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """How many vehicles there are, and their weights."""
+        count = len(self.vehicles)
+        if not count:
+            return "no vehicle is found"
+        weights = np.array([one.gross_weight for one in self.vehicles]) / 1e3
+        right = sum(one.speed > 0 for one in self.vehicles)
+        doubted = sum(bool(one.doubt) for one in self.vehicles)
+        return (
+            f"{count} vehicle{'s' * (count > 1)}, {right} from the left and {count - right} from"
+            f" the right, of {weights.min():.4g} to {weights.max():.4g} kN"
+            + f"; {doubted} with a doubt"
+            * bool(doubted)
+        )
+
+    @property
+    def columns(self) -> dict[str, np.ndarray]:
+        """Columns by head, a row for each vehicle; axles that it has not are NaN."""
+        rows = self.vehicles
+        most = max((len(one.forces) for one in rows), default=0)
+
+        def axles(name, scale):
+            table = np.full((len(rows), most), np.nan)
+            for row, one in zip(table, rows, strict=True):
+                row[: len(one.forces)] = np.array(getattr(one, name)) * scale
+            return table.T
+
+        low, high = (
+            np.array([1e-3 * (one.gross_weight + sign * one.gross_half_width) for one in rows])
+            for sign in (-1, 1)
+        )
+        found = {
+            "log": np.array([one.file for one in rows], str),
+            "time (s)": np.array([one.time for one in rows], float),
+            "date and time": np.array([one.stamp for one in rows], str),
+            "direction": np.array(["right" if one.speed > 0 else "left" for one in rows], str),
+            "speed (m/s)": np.array([abs(one.speed) for one in rows], float),
+            "axles": np.array([len(one.forces) for one in rows], int),
+            "class": np.array([one.silhouette for one in rows], str),
+            "gross weight (kN)": np.array([1e-3 * one.gross_weight for one in rows], float),
+            "gross weight, low (kN)": low,
+            "gross weight, high (kN)": high,
+        }
+        forces, halves = axles("forces", 1e-3), axles("force_half_widths", 1e-3)
+        for i, (force, half) in enumerate(zip(forces, halves, strict=True), 1):
+            found[f"axle {i} (kN)"] = force
+            found[f"axle {i}, low (kN)"], found[f"axle {i}, high (kN)"] = force - half, force + half
+        for i, place in enumerate(axles("offsets", 1.0)[1:], 2):
+            found[f"axle {i} at (m)"] = place
+        return found | {"doubt": np.array([one.doubt for one in rows], str)}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Vehicles and problems, plain numbers for JSON (SI units)."""
+        vehicles = [one._asdict() | {"class": one.silhouette} for one in self.vehicles]
+        return {"verdict": self.verdict, "vehicles": vehicles, "problems": list(self.problems)}
+
+    def __str__(self) -> str:
+        head = ("time", "to", "m/s", "class", "gross (kN)", "95 % interval", "axles (kN)")
+        rows = [
+            (
+                one.stamp or f"{one.time:.2f} s", "right" if one.speed > 0 else "left",
+                f"{abs(one.speed):.1f}", one.silhouette, f"{one.gross_weight / 1e3:.4g}",
+                f"{(one.gross_weight - one.gross_half_width) / 1e3:.4g} to"
+                f" {(one.gross_weight + one.gross_half_width) / 1e3:.4g}",
+                " ".join(f"{force / 1e3:.3g}" for force in one.forces) + " (?)" * bool(one.doubt),
+            )
+            for one in self.vehicles[:MAX_LISTED]
+        ]  # fmt: skip
+        lines = [self.verdict, *(text_table(head, rows, "<<><>><") if rows else [])]
+        more = len(self.vehicles) - MAX_LISTED
+        lines += [f"and {more} more: write the table with -o vehicles.csv"] * (more > 0)
+        return "\n".join([*lines, *self.problems])
+
+
+class Passing(NamedTuple):
+    """A part of a log with something on the bridge (s), and what speaks against weighing it."""
+
+    start: float
+    end: float
+    problem: str = ""
+
+
+def passings(
+    lines: InfluenceLines,
+    times: Float[np.ndarray, " time"],
+    readings: Float[np.ndarray, "time sensor"],
+    settings: TrafficSettings,
+) -> list[Passing]:
+    """Parts of readings with something on the bridge.
+
+    >>> import numpy as np
+    >>> lines = InfluenceLines(np.array([0.0, 5, 10]), np.array([[0.0], [-1e-8], [0]]))
+    >>> times = np.arange(2000) / 100
+    >>> readings = 5e4 * lines.at(20 * (times - 9.0))
+    >>> found = passings(lines, times, readings, TrafficSettings((10.0, 30.0)))
+    >>> print([(round(one.start, 1), round(one.end, 1)) for one in found])
+    [(8.5, 11.4)]
+    """
+    low, high = settings.speeds
+    step = float(np.median(np.diff(times)))
+    span = max(LEVEL, PASSAGES * (lines.length + LONGEST) / low)
+    blocks = np.array_split(np.arange(times.size), max(int((times[-1] - times[0]) / span), 1))
+    middles = [float(times[own].mean()) for own in blocks]
+    cycle = max(round(1 / (lines.frequency * step)), 1) if lines.frequency else 1
+    twice = np.convolve(np.ones(cycle), np.ones(cycle)) / cycle**2
+    on = np.zeros(times.size, bool)
+    for reading, line in zip(readings.T, lines.values.T, strict=True):
+        medians = [float(np.median(reading[own])) for own in blocks]
+        level = reading - np.interp(times, middles, medians)
+        smooth = np.convolve(level, twice, "same") if 2 * cycle < level.size else level
+        noise = 1.4826 * float(np.median(np.abs(smooth)))
+        least = LEAST_READING * settings.least_weight * float(np.abs(line).max())
+        on |= np.abs(smooth) > max(least, NOISE * noise)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]])))
+    spans = times[edges.reshape(-1, 2) - [0, 1]]
+    joined: list[list[float]] = []
+    for first, last in spans.tolist():
+        if joined and first - joined[-1][1] < lines.length / high:
+            joined[-1][1] = last
+        else:
+            joined.append([first, last])
+    gaps = times[:-1][np.diff(times) > 1.5 * step]
+    found = []
+    for i, (first, last) in enumerate(joined):
+        before = joined[i - 1][1] if i else float(times[0])
+        after = joined[i + 1][0] if i + 1 < len(joined) else float(times[-1])
+        begin, end = max(first - BEFORE, (first + before) / 2), min(last + AFTER, after)
+        if first - times[0] < 2 * step or times[-1] - last < 2 * step:
+            problem = "the log begins or ends while it is on the bridge"
+        elif np.any((gaps > begin) & (gaps < end)):
+            problem = "samples are missing while it is on the bridge"
+        else:
+            problem = ""
+        found.append(Passing(begin, end, problem))
+    return found
+
+
+@refuses_traced("a weighing")
+def weigh_vehicles(
+    case: Case,
+    log: Log,
+    settings: TrafficSettings,
+    influence_lines: InfluenceLines | None = None,
+) -> WeighedTraffic:
+    """All vehicles that crossed a known beam in a log, one by one or several at once.
+
+    The `influence_lines` are by default those of the case (see `calibrate_influence_lines`). Loads
+    and profile of case and log are not used.
+
+    Raises ValueError if a sensor measures velocity or acceleration, the influence lines are of
+    other sensors, and for a detector that the log does not have.
+
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> case = jb.Case(
+    ...     jb.Beam(20.0, 8e9, 12e3, damping_ratio=0.02, modes=1),
+    ...     sensors=[jb.Sensor(10.0, noise=2e-5)],
+    ...     loads=[jb.MovingForce(force=1e5, speed=20.0, entry_time=2.0)],
+    ...     run=jb.Run(6.0, sample_rate=50.0),
+    ... )
+    >>> record = jb.simulate(case)
+    >>> columns = ("w",), ("deflection",), ("m",), "log", (0,)
+    >>> log = tuning.Log(record.times, record.measured, *columns)
+    >>> settings = tuning.weighing.TrafficSettings((10.0, 30.0))
+    >>> (found,) = tuning.weighing.weigh_vehicles(case, log, settings).vehicles
+    >>> print(f"{found.gross_weight / 1e3:.0f} kN, class {found.silhouette}")
+    100 kN, class 1
+    """
+    record = _Record.of(case, lines_for(case, influence_lines), log, settings)
+    return _traffic([record.weighed(one) for one in record.passings])
+
+
+@refuses_traced("a weighing")
+def weigh_logs(
+    case: Case,
+    logs: Sequence[str | os.PathLike],
+    store: str | os.PathLike,
+    settings: TrafficSettings,
+    influence_lines: InfluenceLines | None = None,
+    *,
+    read: Callable[[Path], Log] = read_log,
+    progress: bool = False,
+) -> WeighedTraffic:
+    """All vehicles in some log files, of which those in the `store` are not weighed again.
+
+    See `weigh_vehicles`, also for `influence_lines`. A line is added to the store, a text file,
+    after each vehicle; logs that have changed are weighed again. `read` reads a log from its file;
+    a bar shows `progress`. Logs that cannot be read are among the problems.
+
+    Raises FileNotFoundError without the folder of the store, ValueError for a store of another
+    case, lines or settings, and as `weigh_vehicles` does.
+
+    >>> import dataclasses
+    >>> from pathlib import Path
+    >>> import jaxbeam as jb
+    >>> import tuning
+    >>> beam, load = jb.Beam(20.0, 8e9, 12e3, 0.02), jb.MovingForce(force=1e5, speed=20.0)
+    >>> load = dataclasses.replace(load, entry_time=2.0)
+    >>> case = jb.Case(beam, sensors=[jb.Sensor(10.0)], loads=[load], run=jb.Run(6.0, 50.0))
+    >>> record = jb.simulate(case)
+    >>> rows = zip(record.times, record.deflection[:, 0])
+    >>> text = "\\n".join(["t [s],w [m]", *(f"{t:.2f},{w:.4e}" for t, w in rows)])
+    >>> _ = Path("monday.csv").write_text(text)
+    >>> settings = tuning.weighing.TrafficSettings((10.0, 30.0))
+    >>> found = tuning.weighing.weigh_logs(case, ["monday.csv"], "vehicles.jsonl", settings)
+    >>> print(found.verdict)
+    1 vehicle, 1 from the left and 0 from the right, of 100 to 100 kN
+    """
+    store, lines = Path(store), lines_for(case, influence_lines)
+    if not store.parent.is_dir():
+        raise FileNotFoundError(f"there is no folder {store.parent} to write {store.name} to")
+    known = _Store.opened(store, _mark_of(case, lines, settings))
+    paths, problems = [Path(path) for path in logs], []
+    kept = keeping(lambda: f"{len(known.found)} passings are in {store}: go on by the same")
+    with kept, ProgressBar(len(paths), "log", shown=progress) as bar:
+        for path in paths:
+            name = f"{path.name} {path.stat().st_size}-{path.stat().st_mtime_ns}"
+            if name not in known.whole:
+                try:
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore", LogWarning)
+                        record = _Record.of(case, lines, read(path), settings)
+                except (ValueError, OSError, ImportError) as error:
+                    problems.append(" ".join(str(error).split()))
+                    bar.update()
+                    continue
+                for number, one in enumerate(record.passings):
+                    if f"{name} {number}" not in known.found:
+                        known.add(f"{name} {number}", *record.weighed(one))
+                known.add(name, [], [], whole=len(record.passings))
+            bar.update()
+    names = [f"{path.name} {path.stat().st_size}-{path.stat().st_mtime_ns}" for path in paths]
+    parts = [
+        known.found[f"{name} {number}"]
+        for name in names
+        for number in range(known.whole.get(name, 0))
+    ]
+    found = _traffic(parts)
+    return dataclasses.replace(found, problems=(*found.problems, *problems))
+
+
+class _Record(NamedTuple):
+    """A log with the readings of its sensors and detectors, and where something passes."""
+
+    name: str
+    start: str
+    times: Float[np.ndarray, " time"]
+    readings: Float[np.ndarray, "time sensor"]
+    valid: Bool[np.ndarray, "time sensor"]
+    signals: list[tuple[float, Float[np.ndarray, " time"]]]  # of detectors, with positions (m)
+    lines: InfluenceLines
+    settings: TrafficSettings
+    passings: list[Passing]
+
+    @classmethod
+    def of(cls, case: Case, lines: InfluenceLines, log: Log, settings: TrafficSettings):
+        """The record of a log. Raises ValueError for a detector that it has not."""
+        signals, others = [], list(range(len(log.names)))
+        for name, position in settings.detectors.items():
+            if name not in log.names:
+                raise ValueError(
+                    f"{log.source}: there is no channel {name!r} for a detector of axles; its"
+                    f" channels are {', '.join(log.names)}"
+                )
+            channel = log.names.index(name)
+            signals.append((position, log.values[:, channel]))
+            others.remove(channel)
+        names = [log.names[i] for i in others]
+        readings, valid = sensor_readings(case, with_channels(log, names) if signals else log)
+        found = passings(lines, log.times, readings, settings)
+        return cls(
+            Path(log.source).name, log.start, log.times, readings, valid, signals, lines, settings,
+            found,
+        )  # fmt: skip
+
+    def weighed(self, passing: Passing) -> tuple[list[WeighedVehicle], list[str]]:
+        """Vehicles of a part of the log, and sentences on what was not weighed."""
+        when = self._stamp(passing.start) or f"{passing.start:.2f} s"
+        about = f"{self.name}, {when}: "
+        if passing.problem:
+            return [], [f"{about}{passing.problem}: not weighed"]
+        own = (self.times >= passing.start) & (self.times <= passing.end)
+        times, readings, valid = self.times[own], self.readings[own], self.valid[own]
+        settings, seen = self.settings, None
+        if self.signals:
+            apart = LEAST_GAP / settings.speeds[1]
+            (first, one), (second, other) = self.signals
+            pulses = pulse_times(times, one[own], apart), pulse_times(times, other[own], apart)
+            seen = axles_of_pulses(pulses, (first, second), settings.speeds, self.lines.length)
+            if not settings.both_ways:
+                seen = [at for at in seen if at.speed > 0]
+        log = CrossingLog(times, readings, valid)
+        lines = with_free_frequency(self.lines, times, readings)
+        fits = vehicles_in(
+            lines, log, settings.speeds, settings.both_ways, seen, settings.least_weight
+        )
+        if not fits:
+            return [], [f"{about}no vehicle explains the readings at these speeds: not weighed"]
+        return [self._vehicle(fit) for fit in fits], []
+
+    def _stamp(self, time: float) -> str:
+        """Date and time of an instant (s) of the log, "" if it has none."""
+        if not self.start:
+            return ""
+        since = datetime.timedelta(seconds=time - float(self.times[0]))
+        return (datetime.datetime.fromisoformat(self.start) + since).isoformat(
+            timespec="milliseconds"
+        )
+
+    def _vehicle(self, fit: AxleFit) -> WeighedVehicle:
+        """The vehicle of a fit."""
+        count, at = fit.forces.size, fit.geometry
+        half, (gross, error) = fit.half_widths[:count], fit.gross_weight
+        doubt = ""
+        if fit.excess > MOST_EXCESS:
+            doubt = f"residuals have {fit.excess:.3g} times the variance expected"
+        elif not fit.is_plausible:
+            doubt = "an axle is too light"
+        elif gross < self.settings.least_weight:
+            doubt = "lighter than what is weighed"
+        share = float(fit.half_widths[0] / fit.errors[0])  # Student's quantile
+        return WeighedVehicle(
+            self.name, at.entry_time, self._stamp(at.entry_time), at.speed, at.offsets.tolist(),
+            fit.forces.tolist(), half.tolist(), gross, share * error,
+            [len(group) for group in fit.groups], doubt,
+        )  # fmt: skip
+
+
+def _traffic(parts: Iterable[tuple[list[WeighedVehicle], list[str]]]) -> WeighedTraffic:
+    """Table of what was found in parts of logs."""
+    vehicles: list[WeighedVehicle] = []
+    problems = []
+    for found, told in parts:
+        vehicles += found
+        problems += told
+    return WeighedTraffic(tuple(vehicles), tuple(problems))
+
+
+class _Store(NamedTuple):
+    """What was found so far: vehicles and problems of each passing, numbers of these in a log."""
+
+    path: Path
+    found: dict[str, tuple[list[WeighedVehicle], list[str]]]
+    whole: dict[str, int]
+
+    @classmethod
+    def opened(cls, path: Path, mark: str):
+        """The store in a file, which is begun if there is none; a broken last line is dropped.
+
+        Raises ValueError for a file that is no store, or of another case, lines or settings.
+        """
+        store = cls(path, {}, {})
+        if not path.exists():
+            with whole_file(path) as beside:
+                beside.write_text(json.dumps({"format": FORMAT, "mark": mark}) + "\n")
+            return store
+        head, *entries = read_text_input(path, "store of vehicles").split("\n")
+        content = _entry(head)
+        if content.get("format") != FORMAT:
+            raise ValueError(f"{path} is no store of vehicles: give another name")
+        if content.get("mark") != mark:
+            raise ValueError(
+                f"{path} was made with another case, other lines or settings: give the same, or"
+                " another store"
+            )
+        for entry in map(_entry, entries):
+            if "whole" in entry:
+                store.whole[entry["passing"]] = entry["whole"]
+            elif "passing" in entry:
+                vehicles = [WeighedVehicle(**one) for one in entry["vehicles"]]
+                store.found[entry["passing"]] = vehicles, entry["problems"]
+        return store
+
+    def add(
+        self, passing: str, vehicles: list[WeighedVehicle], problems: list[str], whole=None
+    ) -> None:
+        """Add a passing, or say that a log is done and has a number of them."""
+        entry: dict[str, Any] = {"passing": passing}
+        if whole is None:
+            self.found[passing] = vehicles, problems
+            entry |= {"vehicles": [one._asdict() for one in vehicles], "problems": problems}
+        else:
+            self.whole[passing] = entry["whole"] = whole
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry) + "\n")
+
+
+def _entry(line: str) -> dict[str, Any]:
+    """The table of a line; empty for one that is broken off."""
+    try:
+        found = json.loads(line)
+    except json.JSONDecodeError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _mark_of(case: Case, lines: InfluenceLines, settings: TrafficSettings) -> str:
+    """What tells weighings of other lines, sensors or settings apart."""
+    about = dataclasses.asdict(settings) | {"detectors": dict(settings.detectors)}
+    sensors = [sensor.quantity for sensor in case.sensors]
+    text = json.dumps([lines.to_dict(), sensors, about])
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -1,0 +1,140 @@
+"""Vehicles on a beam in a part of a log: one by one, one behind the other, or meeting each other.
+
+The axles of one speed are found first (`search`). A gap too long for one vehicle separates two.
+If residuals are larger than noise and dynamic wheel forces, or these are larger than the road gives
+them, two combs of forces of two speeds are tried instead. Each vehicle is then weighed in what the
+others leave, whose numbers are taken for hardly known, so that its covariance is the marginal one.
+Two vehicles are taken if they are more likely than one. Detectors tell number and places of axles.
+"""
+
+import copy
+
+import numpy as np
+import scipy.optimize
+
+from tuning.weighing.axle_fit import AxleFit, AxleTrain, CrossingLog, fit_axles, unlikeliness
+from tuning.weighing.detectors import MOST_GAP
+from tuning.weighing.influence_lines import AxleGeometry, InfluenceLines
+from tuning.weighing.search import find_axles, most_likely, two_trains
+
+MOST_EXCESS = 1.5  # of the variance of residuals, above which axles or lines are unlikely
+MOST_SHARE = 2.0  # times the usual dynamic wheel forces
+ROUNDS = 2  # of weighing each vehicle in what the others leave
+NEAR = 0.88, 1.12  # times the speed of a vehicle, sought again
+SEEN, SEEN_SPEED = 0.05, 0.02  # m, of axles by detectors; of their speed, relative
+
+
+def vehicles_in(
+    lines: InfluenceLines,
+    log: CrossingLog,
+    speeds: tuple[float, float],
+    both_ways: bool = True,
+    seen: list[AxleGeometry] | None = None,
+    least_weight: float = 0.0,
+) -> list[AxleFit]:
+    """Vehicles in a part of a log, in the order of their entries; empty if nothing crosses.
+
+    `speeds` (m/s) are the lowest and highest ones, from the left or, with `both_ways`, in both
+    directions; `seen` are the axles that detectors told, if there are any. Of several vehicles,
+    those below the `least_weight` (N) are left out.
+
+    >>> import numpy as np
+    >>> from tuning.weighing.axle_fit import CrossingLog
+    >>> from tuning.weighing.influence_lines import InfluenceLines
+    >>> lines = InfluenceLines(np.array([0.0, 5, 10]), np.array([[0.0], [-1e-8], [0]]))
+    >>> times = np.arange(200) / 100
+    >>> readings = 5e4 * lines.at(20 * (times - 0.5)) + 1e-6 * np.sin(1e3 * times[:, None])
+    >>> log = CrossingLog(times, readings, np.ones((200, 1), bool))
+    >>> (found,) = vehicles_in(lines, log, (10.0, 30.0), both_ways=False)
+    >>> print(f"{found.gross_weight[0] / 1e3:.0f} kN at {found.geometry.speed:.0f} m/s")
+    50 kN at 20 m/s
+    """
+    if seen is not None:
+        start = [AxleTrain(lines, at, np.ones(at.offsets.size), lines.dynamic_share) for at in seen]
+        return _weighed(log, _with_forces(log, start), _seen, least_weight)
+    fits, _ = find_axles(lines, log, speeds, both_ways)
+    if not fits:
+        return []
+    alone = most_likely(fits)
+    parts = _separated(alone)
+    found = [alone] if len(parts) == 1 else _weighed(log, parts, _found_again, least_weight)
+    usual = MOST_SHARE * lines.dynamic_share
+    if alone.is_plausible and max(alone.excess / MOST_EXCESS, alone.dynamic_share / usual) < 1:
+        return found
+    pair = _weighed(log, two_trains(lines, log, speeds, both_ways), _found_again, least_weight)
+    if len(pair) > 1 and _criterion(pair) < _criterion(found):
+        found = pair
+    return sorted(found, key=lambda fit: fit.geometry.entry_time)
+
+
+def _criterion(fits: list[AxleFit]) -> float:
+    """Criterion of all vehicles together: that of the last is given the others."""
+    *others, last = fits
+    more = [unlikeliness(fit.rows, fit.geometry.offsets, fit.forces) for fit in others]
+    return last.criterion + sum(more)
+
+
+def _weighed(
+    log: CrossingLog, trains: list[AxleTrain], weigh, least_weight: float
+) -> list[AxleFit]:
+    """Vehicles, each weighed in what the others leave."""
+    fits: list[AxleFit] = []
+    for _ in range(ROUNDS if len(trains) > 1 else 1):
+        fits = []
+        for train in trains[:]:
+            own = copy.copy(log)
+            for other in trains:
+                own = own if other is train else own.without(other)
+            fit = weigh(own, train)
+            at = [one is train for one in trains].index(True)
+            if fit is None or len(trains) > 1 and fit.gross_weight[0] < least_weight:
+                del trains[at]
+                continue
+            fits.append(fit)
+            trains[at] = AxleTrain(fit.lines, fit.geometry, fit.forces, fit.dynamic_share)
+    return fits
+
+
+def _found_again(log: CrossingLog, train: AxleTrain) -> AxleFit | None:
+    """The axles of a vehicle, sought again near its speed."""
+    speed = train.geometry.speed
+    fits, _ = find_axles(train.lines, log, (NEAR[0] * speed, NEAR[1] * speed))
+    return most_likely(fits) if fits else None
+
+
+def _seen(log: CrossingLog, train: AxleTrain) -> AxleFit:
+    """The vehicle whose axles detectors told."""
+    at = train.geometry
+    speed, more = abs(at.speed), at.offsets.size - 1
+    log.seen = at, np.array([SEEN_SPEED * speed, SEEN / speed, *(SEEN * np.ones(more))])
+    return fit_axles(train.lines, at, train.forces, log)
+
+
+def _with_forces(log: CrossingLog, trains: list[AxleTrain]) -> list[AxleTrain]:
+    """Trains with the forces of least squares of all of them together."""
+    if not trains:
+        return []
+    tables = [log.rows(one.lines.crossing(one.geometry, log.times)) for one in trains]
+    columns = np.hstack([*tables, log.shifts])
+    least = np.append(
+        np.zeros(columns.shape[1] - log.shifts.shape[1]), [-np.inf] * len(log.shifts.T)
+    )
+    sizes = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    x = scipy.optimize.lsq_linear(columns / sizes, log.target, (least, np.inf)).x / sizes
+    parts = np.cumsum([one.forces.size for one in trains])
+    return [
+        one._replace(forces=np.maximum(own, 1e-3 * x[: parts[-1]].max()))
+        for one, own in zip(trains, np.split(x, parts)[:-1], strict=True)
+    ]
+
+
+def _separated(fit: AxleFit) -> list[AxleTrain]:
+    """The vehicles of a fit, which gaps separate."""
+    at = fit.geometry
+    cuts = np.flatnonzero(np.diff(at.offsets) > MOST_GAP) + 1
+    found = []
+    for own in np.split(np.arange(fit.forces.size), cuts):
+        entry = at.entry_time + at.offsets[own[0]] / abs(at.speed)
+        geometry = AxleGeometry(at.speed, entry, at.offsets[own] - at.offsets[own[0]], at.length)
+        found.append(AxleTrain(fit.lines, geometry, fit.forces[own], fit.dynamic_share))
+    return found
