@@ -182,8 +182,9 @@ def weigh_axles(
     if axles is not None and axles < 1:
         raise ValueError(f"the number of axles must be 1 or more, not {axles}")
     case = dataclasses.replace(case, loads=(), vehicle_sensors=(), profile=None)
+    lines = lines_for(case, influence_lines)
     readings, valid = sensor_readings(case, log)
-    lines = with_free_frequency(lines_for(case, influence_lines), log.times, readings)
+    lines = with_free_frequency(lines, log.times, readings)
     crossing = CrossingLog(log.times, readings, valid)
     fits, tried = find_axles(lines, crossing, speeds, both_ways, axles)
     if not fits:

@@ -45,6 +45,40 @@ def mdf(path, groups=None):
     file.save(path, overwrite=True)
 
 
+def test_traces_of_a_seismic_recorder(tmp_path):
+    """Two parts of a trace with samples missing between them; a file that is cut off."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of modules that obspy imports
+        obspy = pytest.importorskip("obspy")
+        start = obspy.UTCDateTime(2026, 3, 29, 23, 59, 59, 500000)
+
+        def trace(channel, samples, late):
+            about = {"network": "XX", "station": "B1", "channel": channel, "sampling_rate": 200.0}
+            return obspy.Trace(samples, about | {"starttime": start + late / 200})
+
+        counts = np.round(1e5 * np.sin(np.arange(2000) / 10)).astype(np.int32)
+        parts = trace("HNZ", counts[:900], 0), trace("HNZ", counts[1000:], 1000)
+        stream = obspy.Stream([*parts, trace("HNE", 2 * counts, 0)])
+        stream.write(tmp_path / "run.mseed", format="MSEED", reclen=512)
+        stream[2:].write(tmp_path / "cut.mseed", format="MSEED", reclen=512)
+    units = {"XX.B1.HNZ": "mm", "XX.B1.HNE": "mm"}
+    with pytest.raises(ValueError, match=r"run.mseed, sample 900, column 'XX.B1.HNZ'"):
+        read_log(tmp_path / "run.mseed", units=units)
+    log = read_log(tmp_path / "run.mseed", units=units, missing="mask")
+    assert log.start == "2026-03-29T23:59:59.500000" and log.sample_rate == pytest.approx(200.0)
+    np.testing.assert_array_equal(np.flatnonzero(~log.valid[:, 0]), np.arange(900, 1000))
+    kept = log.valid[:, 0]
+    np.testing.assert_allclose(log.values[kept, 0], 1e-3 * counts[kept], rtol=1e-12)
+    np.testing.assert_allclose(log.values[:, 1], 2e-3 * counts, rtol=1e-12)
+    whole = (tmp_path / "cut.mseed").read_bytes()
+    (tmp_path / "cut.mseed").write_bytes(whole[: len(whole) - 700])
+    with pytest.warns(LogWarning, match="the file is cut off within a record"):
+        read_log(tmp_path / "cut.mseed", units={"XX.B1.HNE": "mm"})
+    (tmp_path / "no.mseed").write_bytes(b"hello" * 100)
+    with pytest.raises(ValueError, match=r"no.mseed: the file is damaged or cut off"):
+        read_log(tmp_path / "no.mseed")
+
+
 def test_groups_of_a_measurement_file_are_joined_by_their_times(tmp_path):
     """Two groups, the slower 1 ms later; its sine is interpolated."""
     slow = 1e-3 + np.arange(40) / 100

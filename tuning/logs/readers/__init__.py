@@ -56,7 +56,7 @@ def _format_of(path: Path, start: bytes) -> LogFormat:
     for log_format in FORMATS:
         if suffix not in log_format.suffixes:
             continue
-        if log_format.is_text:
+        if log_format.is_text or not log_format.magics:
             return log_format
         raise ValueError(
             f"{path}: this is no {log_format.name} file, whatever it is called: it is"

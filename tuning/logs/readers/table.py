@@ -55,8 +55,8 @@ class LogFormat(NamedTuple):
     """A format of log files.
 
     `read` returns the tables of the runs in a file, by name (a single run is called ""). A file
-    that begins with one of `magics` is of the format; so is a text file (`is_text`) with one of the
-    `suffixes`.
+    that begins with one of `magics` is of the format; so is a text file (`is_text`), or one of a
+    format without `magics`, with one of the `suffixes`.
     """
 
     name: str
