@@ -119,21 +119,25 @@ def is_unit(text: str) -> bool:
 
 _SENSITIVITY = re.compile(
     r"\s*(?P<size>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*"
-    r"\(?(?P<out>mV/V|V/V|[^\s/()]+)\)?\s*/(?P<of>.+)"
+    r"(?:\((?P<inside>[^()]+)\)|(?P<out>mV/V|V/V|[^\s/()]+))\s*/(?P<of>.+)"
 )
 
 
 def transducer_unit(text: str, output_unit: Unit) -> Unit:
     """Unit of the quantity that a transducer measures, from its sensitivity, such as `100 mV/g`.
 
-    `output_unit` is that of its output, the unit of the column (volts, say).
+    `output_unit` is that of its output, the unit of the column (volts, say). What a sensitivity is
+    divided by may also be the output: `0.01 g/mV`.
 
     Raises ValueError for a text that is no sensitivity, for zero, and for another output quantity.
     """
     found = _SENSITIVITY.fullmatch(text)
     if found is None or float(found["size"]) == 0.0:
         raise ValueError(f"the sensitivity {text!r} should be like '100 mV/g': number, unit/unit")
-    out, measured = unit(found["out"]), unit(found["of"].strip().strip("()"))
+    out, measured = unit(found["out"] or found["inside"]), unit(found["of"].strip().strip("()"))
+    if measured.quantity == output_unit.quantity != out.quantity:
+        factor = float(found["size"]) * out.factor / measured.factor
+        return Unit(out.si, output_unit.factor * factor, out.quantity)
     if out.quantity != output_unit.quantity:
         raise ValueError(
             f"the sensitivity {text!r} is for {out.quantity}, but the column is "

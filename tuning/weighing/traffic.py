@@ -420,13 +420,13 @@ class _Record(NamedTuple):
         return [self._vehicle(fit) for fit in fits], []
 
     def _stamp(self, time: float) -> str:
-        """Date and time of an instant (s) of the log, "" if it has none."""
+        """Date and time, or time of day, of an instant (s) of the log; "" if it has none."""
         if not self.start:
             return ""
-        since = datetime.timedelta(seconds=time - float(self.times[0]))
-        return (datetime.datetime.fromisoformat(self.start) + since).isoformat(
-            timespec="milliseconds"
-        )
+        dated = "T" in self.start
+        begin = datetime.datetime.fromisoformat(self.start if dated else f"0002-01-01T{self.start}")
+        at = begin + datetime.timedelta(seconds=time - float(self.times[0]))
+        return (at if dated else at.time()).isoformat(timespec="milliseconds")
 
     def _vehicle(self, fit: AxleFit) -> WeighedVehicle:
         """The vehicle of a fit."""

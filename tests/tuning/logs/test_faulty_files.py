@@ -575,7 +575,7 @@ def test_days_of_a_workbook_saved_as_numbers(tmp_path):
     assert log.start.startswith(("2024-05-04T00:00:10", "2024-05-04T00:00:09.999"))
 
 
-@pytest.mark.parametrize("word", ["OVR", "-OL-", "Overload", "#N/A"])
+@pytest.mark.parametrize("word", ["OVR", "-OL-", "Overload", "#N/A", "-OVR-", "***"])
 def test_samples_beyond_the_range_are_missing(tmp_path, word):
     cells = [
         word if i in (0, 57, 58) else f"{signal(t):.6E}".replace("E", "D")
@@ -608,6 +608,8 @@ def test_units_of_amplifiers_and_converters(tmp_path):
     assert log.quantities == ("force", "acceleration")
     np.testing.assert_allclose(1e-3 * log.values[:, 0], signal(TIMES), atol=1e-7)
     np.testing.assert_allclose(log.values[:, 1], signal(TIMES), atol=6e-6)
+    path.with_suffix(".toml").write_text('[columns]\na = {sensitivity = "1e-5 (m/s^2)/count"}\n')
+    np.testing.assert_allclose(read_log(path).values[:, -1], signal(TIMES), atol=6e-6)
 
 
 def test_a_column_without_a_unit_is_no_channel_beside_others(tmp_path):

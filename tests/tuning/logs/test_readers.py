@@ -433,8 +433,8 @@ def test_formats_are_found_in_the_modules_of_the_readers():
     assert len(set(suffixes)) == len(suffixes)
     binary = {suffix for f in readers.FORMATS if not f.is_text for suffix in f.suffixes}
     assert binary == {
-        ".tdms", ".mf4", ".mdf", ".mat", ".h5", ".hdf5", ".nc", ".parquet", ".xlsx", ".uff",
-        ".unv", ".npy", ".npz", ".wav", ".gz", ".zip",
+        ".tdms", ".mf4", ".mdf", ".mseed", ".miniseed", ".mat", ".h5", ".hdf5", ".nc", ".parquet",
+        ".xlsx", ".uff", ".unv", ".npy", ".npz", ".wav", ".gz", ".zip",
     }  # fmt: skip
     assert set(suffixes) - binary == {".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm"}
 

@@ -104,8 +104,10 @@ def test_vehicles_that_meet_and_follow_are_weighed_by_detectors(lines):
 def test_vehicles_one_by_one_are_weighed_by_strain_alone(lines):
     log, trucks = logged(ALONE, 14.0)
     settings = TrafficSettings(SPEEDS)
-    found = weigh_vehicles(case_of(BRIDGE), without_detectors(log), settings, lines)
+    clock = dataclasses.replace(without_detectors(log), start="23:59:55.000")
+    found = weigh_vehicles(case_of(BRIDGE), clock, settings, lines)
     check(found.vehicles, trucks, 0.03, 0.15)
+    assert [one.stamp[:5] for one in found.vehicles] == ["23:59", "00:00"]
 
 
 def test_vehicles_that_meet_are_weighed_by_strain_alone(lines):

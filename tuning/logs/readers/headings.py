@@ -100,7 +100,9 @@ def seconds_of(path: Path, column: str, cells: Sequence[str], lines: Sequence[in
             start = moments[0].isoformat()
             seconds = np.array([(one - moments[0]).total_seconds() for one in moments])
         else:
-            start, own = cells[0].strip(), np.array([_of_day(one) for one in found])
+            own = np.array([_of_day(one) for one in found])
+            day = datetime.min + timedelta(seconds=float(own[0]))
+            start = day.time().isoformat(timespec="milliseconds")
             seconds = own - own[0] + DAY * np.cumsum(np.diff(own, prepend=own[0]) < -DAY / 2)
     except (ValueError, TypeError, OverflowError) as error:  # TypeError: with and without zone
         raise ValueError(f"{place(lines[0])}: dates and times: {error}") from None

@@ -17,11 +17,13 @@ from tuning.logs.units import is_unit
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 _QUOTIENT = re.compile(r"^(?P<name>[^/]*?\S)(\s*/\s*|\s+in\s+)(?P<unit>\S+)$")
 _FORTRAN = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+))[dD]([-+]?\d+)")
-# Words of loggers, in small letters, for samples beyond the range and for none.
+# Words of loggers, in small letters, for samples beyond the range and for none; signs around them
+# are left out.
+_SIGNS = "+-*#<>!. "
 _NO_SAMPLE = frozenset(
-    ["ovr", "ovrng", "ovf", "ovfl", "ol", "o.l.", "-ol-", "+ol", "-ol", "+ovr", "-ovr", "over"]
-    + ["overload", "overflow", "overrange", "over range", "over-range", "clip", "clipped"]
-    + ["#n/a", "n/a", "na", "null", "none", "#num!", "#value!", "missing", "---", "--", "*****"]
+    ["ovr", "ovrng", "ovf", "ovfl", "ol", "o.l", "over", "overload", "overflow", "overrange"]
+    + ["over range", "over-range", "clip", "clipped", "n/a", "na", "null", "none", "num", "value"]
+    + ["missing"]
 )
 MAX_SHOWN = 40  # characters of a cell in a message
 MIN_CHANNEL_LENGTH = 0.1  # of the samples: shorter arrays are no channels, and may be left out
@@ -255,7 +257,9 @@ def number_of(cell: str) -> float | None:
         found = _FORTRAN.fullmatch(text)
         if found:
             return float(f"{found[1]}e{found[2]}")
-        return np.nan if text.lower() in _NO_SAMPLE else None
+        word = text.lower().strip(_SIGNS)
+        # A sign alone is the unit of a number without one.
+        return np.nan if word in _NO_SAMPLE or (not word and len(text) > 1) else None
 
 
 def check_widths(
