@@ -11,7 +11,7 @@ import functools
 import itertools
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -78,16 +78,48 @@ class TranslatedLoop(NamedTuple):
     failures: int
 
 
-def translated_loop(loop: SampledLoop) -> TranslatedLoop:
-    """Events of a loop in C.
+class _Program(NamedTuple):
+    """C code of the events of loops of one structure: what is given to it, and what they share.
+
+    `given` tells which of the `constants` and numbers of a loop are arguments; `rest` is what is
+    no number in a loop, `kinds` are shapes and types of its numbers.
+    """
+
+    text: str
+    constants: list[np.ndarray]
+    given: list[bool]
+    rest: SampledLoop
+    kinds: list[tuple]
+
+
+def translated_loops(loops: Sequence[SampledLoop]) -> list[TranslatedLoop]:
+    """Events of loops in C; those that differ in numbers alone share a program.
 
     Raises UntranslatedError for a loop with a part that is not translated: accelerations, which
     follow from the contact forces, and a law with other functions than `c_translation` has.
     """
+    found: list[TranslatedLoop] = []
+    program = None
+    for loop in loops:
+        numbers, rest = eqx.partition(loop, _is_number)
+        numbers, memory = (jax.tree.map(np.asarray, tree) for tree in (numbers, loop.start(1)))
+        leaves, kept = jax.tree.leaves(numbers), jax.tree.leaves(memory)
+        kinds = [(leaf.shape, leaf.dtype) for leaf in leaves]
+        same = program is not None and kinds == program.kinds
+        if not (same and eqx.tree_equal(rest, program.rest) is True):
+            program = _program(loop, numbers, rest, memory, kinds)
+        arrays = [*program.constants, *leaves]
+        given = itertools.compress(arrays, program.given)
+        start = np.concatenate([np.ravel(leaf).astype(float) for leaf in kept])
+        place = sum(np.size(leaf) for leaf in kept[:-1])  # failures are the last
+        found.append(TranslatedLoop(program.text, tuple(map(_as_argument, given)), start, place))
+    return found
+
+
+def _program(loop: SampledLoop, numbers, rest, memory: LoopMemory, kinds) -> _Program:
+    """The program of a loop, from its numbers, what is no number, and its memory at the start."""
     if loop.measured_rows is not None:
         raise UntranslatedError("readings of accelerations")
-    numbers, rest = eqx.partition(loop, _is_number)
-    numbers, memory = (jax.tree.map(np.asarray, tree) for tree in (numbers, loop.start(1)))
 
     def process(numbers, event, time, memory, state):
         own = eqx.combine(numbers, rest)
@@ -97,17 +129,12 @@ def translated_loop(loop: SampledLoop) -> TranslatedLoop:
     state = np.zeros((loop.model.state_count, 1))
     closed = jax.make_jaxpr(process)(numbers, np.int64(0), np.float64(0), memory, state)
     jaxpr = without_unused(closed.jaxpr)
-    variables = [*jaxpr.constvars, *jaxpr.invars]
-    used = used_variables(jaxpr)
-    arrays = [*map(np.asarray, closed.consts), *jax.tree.leaves(numbers)]
-    arrays = [a if v in used else None for a, v in zip(arrays, variables, strict=False)]
-    leaves = jax.tree.leaves(memory)
-    text = _text(jaxpr, arrays, leaves, state)
-    place = sum(np.size(leaf) for leaf in leaves[:-1])  # failures are the last
-    assert isinstance(memory, LoopMemory)
-    start = np.concatenate([np.ravel(leaf).astype(float) for leaf in leaves])
-    given = tuple(_as_argument(array) for array in arrays if array is not None)
-    return TranslatedLoop(text, given, start, place)
+    used, constants = used_variables(jaxpr), list(map(np.asarray, closed.consts))
+    arrays = [*constants, *jax.tree.leaves(numbers)]
+    given = [v in used for v, _ in zip([*jaxpr.constvars, *jaxpr.invars], arrays, strict=False)]
+    shown = [array if own else None for array, own in zip(arrays, given, strict=True)]
+    text = _text(jaxpr, shown, jax.tree.leaves(memory), state)
+    return _Program(text, constants, given, rest, kinds)
 
 
 def _is_number(leaf: Any) -> bool:
@@ -171,7 +198,7 @@ class NativeLoops:
             raise NotVectorisedError("a law for each of many runs")
         designs = range(1 if self.shared else len(batches.shared_values))
         try:
-            self.translations = [translated_loop(self._policy(batch)) for batch in designs]
+            self.translations = translated_loops([self._policy(batch) for batch in designs])
             first = self.translations[0]
             if any(one.text != first.text for one in self.translations):
                 raise NotVectorisedError("laws of several structures")

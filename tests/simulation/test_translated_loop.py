@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from jaxbeam.integrator.inputs import StepInfo
 from jaxbeam.model.load_set import load_set
@@ -16,7 +16,7 @@ from jaxbeam.runtime.c_writer import UntranslatedError
 from jaxbeam.runtime.native_library import C_FOLDER, find_compiler
 from jaxbeam.simulation.closed_loop import closed_loop, loop_schedule
 from jaxbeam.simulation.integration_plan import sample_times
-from jaxbeam.sweeps.native_integration import translated_loop
+from jaxbeam.sweeps.native_integration import translated_loops
 from tests.c_code.cases import CASES
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler here")
@@ -67,7 +67,7 @@ def test_events_give_the_commands_of_the_loop(kind, tmp_path):
         memory = loop._process_event(memory, both, info)
         expected.append(np.asarray(loop.path.acting(memory.commands)))
     actuators = len(CASES[kind].actuators)
-    found = commands_in_c(translated_loop(loop), times, states, actuators, tmp_path)
+    found = commands_in_c(translated_loops([loop])[0], times, states, actuators, tmp_path)
     largest = np.max(np.abs(expected))
     assert_allclose(found, expected, rtol=0, atol=1e-12 * largest)
 
@@ -75,13 +75,20 @@ def test_events_give_the_commands_of_the_loop(kind, tmp_path):
 @pytest.mark.parametrize("kind", REFUSED)
 def test_what_is_not_translated_is_named(kind):
     with pytest.raises(UntranslatedError, match=REFUSED[kind]):
-        translated_loop(loop_of(CASES[kind]))
+        translated_loops([loop_of(CASES[kind])])
 
 
 def test_loops_of_one_structure_share_their_code():
     """Numbers of the design, of the plant and of the schedule are arguments."""
-    case, texts = CASES["pd"], set()
+    case, loops = CASES["pd"], [loop_of(CASES["mpc"])]
     for gain in (1.0, 2.0):
         controller = dataclasses.replace(case.controller, gains=gain * case.controller.gains)
-        texts.add(translated_loop(loop_of(dataclasses.replace(case, controller=controller))).text)
-    assert len(texts) == 1
+        loops.append(loop_of(dataclasses.replace(case, controller=controller)))
+    together, alone = translated_loops(loops), [translated_loops([loop])[0] for loop in loops]
+    assert len({one.text for one in together}) == 2
+    for one, other in zip(together, alone, strict=True):
+        assert one.text == other.text
+        assert_array_equal(one.memory, other.memory)
+        for number, expected in zip(one.inputs, other.inputs, strict=True):
+            assert_array_equal(number, expected)
+    assert any(np.any(a != b) for a, b in zip(together[1].inputs, together[2].inputs, strict=True))
