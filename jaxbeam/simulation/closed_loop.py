@@ -36,7 +36,7 @@ from jaxbeam.model.sensing.sensor_signals import (
     sent_readings,
     with_sensor_filters,
 )
-from jaxbeam.model.state_space import state_space
+from jaxbeam.model.state_space import Plant, state_space
 from jaxbeam.runtime.arrays import Array, any_jax, block_diag, not_differentiated, xp
 from jaxbeam.runtime.compiling import compiled_if_traced
 from jaxbeam.simulation.commands import command_path
@@ -185,14 +185,21 @@ def command_lag(case: Case) -> int:
 
 
 def closed_loop(
-    case: Case, layout: Layout, loads: LoadSet, schedule: EventSchedule, noisy: bool = True
+    case: Case,
+    layout: Layout,
+    loads: LoadSet,
+    schedule: EventSchedule,
+    noisy: bool = True,
+    known: tuple[Plant, tuple[ModalModel, Array]] | None = None,
 ) -> SampledLoop | ContinuousLoop:
     """Input policy for a case that has a controller; its `model` is the one to be integrated.
 
-    Without `noisy` the sensors have no noise. Raises TypeError if the law of the controller has not
-    the interface for samples, or for continuous time if it has no period.
+    Without `noisy` the sensors have no noise. Of a loop with samples its plant, and the model and
+    rows with the filters of the sensors may be `known`. Raises TypeError if the law of the
+    controller has not the interface for samples, or for continuous time if it has no period.
     """
-    plant, controller = state_space(case, layout=layout), case.controller
+    plant = state_space(case, layout=layout) if known is None else known[0]
+    controller = case.controller
     for part in (controller, *case.sensors):  # the schedule has them as they are
         refuse_derivatives(part)
     law = controller.law(plant)  # once: the design may solve Riccati equations
@@ -215,7 +222,7 @@ def closed_loop(
         )
     if not any_jax(plant, law, schedule):
         law = law.tabulated(schedule.times[schedule.control_sample >= 0])
-    model, output_rows = with_sensor_filters(plant)
+    model, output_rows = with_sensor_filters(plant) if known is None else known[1]
     sections = tuple(sensor_sections(sensor, controller.period) for sensor in case.sensors)
     noise = None
     if noisy and any(sensor.noise is not None for sensor in case.sensors):

@@ -11,7 +11,7 @@ import functools
 import itertools
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -36,6 +36,8 @@ from jaxbeam.model.load_set import LoadSet, WheelSet, load_set
 from jaxbeam.model.modal_model import ModalModel, has_coupling, modal_model
 from jaxbeam.model.modes import mesh_layout
 from jaxbeam.model.sensing.output_rows import corrected_places
+from jaxbeam.model.sensing.sensor_signals import with_sensor_filters
+from jaxbeam.model.state_space import build_plant
 from jaxbeam.runtime.c_translation import Translation
 from jaxbeam.runtime.c_writer import (
     HEADERS,
@@ -61,7 +63,7 @@ void process_event(const void *const *inputs, int64_t event, double time, Regist
                    const Register *state, Register *commands) {
 """
 
-MAX_DESIGNS = 64  # laws of more batches are sooner designed by one program
+MAX_DESIGNS = 1024  # laws of more batches would take much memory
 LOOP_HEADERS = "registers.h", "translated.h", "algebra.h", "decompose.h"
 GROUP_RUNS = 4096  # whose inputs are made at once; those of 512 take as long
 
@@ -92,7 +94,7 @@ class _Program(NamedTuple):
     kinds: list[tuple]
 
 
-def translated_loops(loops: Sequence[SampledLoop]) -> list[TranslatedLoop]:
+def translated_loops(loops: Iterable[SampledLoop]) -> list[TranslatedLoop]:
     """Events of loops in C; those that differ in numbers alone share a program.
 
     Raises UntranslatedError for a loop with a part that is not translated: accelerations, which
@@ -139,9 +141,9 @@ def _program(loop: SampledLoop, numbers, rest, memory: LoopMemory, kinds) -> _Pr
 
 def _is_number(leaf: Any) -> bool:
     """Whether a leaf is a number that another loop of the same structure may have otherwise."""
-    return isinstance(leaf, np.ndarray | np.generic | float | jax.Array) and jnp.issubdtype(
-        jnp.result_type(leaf), jnp.floating
-    )
+    if isinstance(leaf, np.ndarray | np.generic | jax.Array):
+        return np.issubdtype(leaf.dtype, np.floating)
+    return isinstance(leaf, float)
 
 
 def _as_argument(array) -> np.ndarray:
@@ -187,18 +189,19 @@ def _loaded(writer: Writer, stored: CArray, kind: str) -> CArray:
 class NativeLoops:
     """Sampled loops of the batches of a sweep in C, whose law is designed once where it is one.
 
-    Raises NotVectorisedError where a loop cannot be translated or compiled.
+    All share the `model` of the beam. Raises NotVectorisedError where a loop cannot be translated
+    or compiled.
     """
 
-    def __init__(self, program: Program, batches: Batches):
-        self.program, self.batches = program, batches
-        self._policy = functools.cache(self._policy_of)
+    def __init__(self, program: Program, batches: Batches, model: ModalModel):
+        self.program, self.batches, self.model = program, batches, model
+        self._filtered = None
         self.shared = self._is_shared()
         if not self.shared and len(batches.shared_values) > MAX_DESIGNS:
             raise NotVectorisedError("a law for each of many runs")
         designs = range(1 if self.shared else len(batches.shared_values))
         try:
-            self.translations = translated_loops([self._policy(batch) for batch in designs])
+            self.translations = translated_loops(map(self._policy, designs))
             first = self.translations[0]
             if any(one.text != first.text for one in self.translations):
                 raise NotVectorisedError("laws of several structures")
@@ -217,7 +220,8 @@ class NativeLoops:
 
     def model_inputs(self, histories: bool) -> dict[str, Any]:
         """Those of the `NativeInputs` that the model of the loop determines, which all share."""
-        case, model = self.program.case, self._policy(0).model
+        assert self._filtered is not None
+        case, model = self.program.case, self._filtered[0]
         rows = history_rows(case, model) if histories else None
         return native_peaks.loop_model_inputs(model, *outputs_of(case, model), rows)
 
@@ -253,13 +257,16 @@ class NativeLoops:
             return np.full(self.batches.run_index.shape[1], np.inf)
         shared = self.batches.shared_values[batch]
         loads = self.program.loads(shared, self.batches.batched_values[batch])
-        model = self._policy(0).plant.modal_model
-        return np.asarray(load_amplitude(self.program.case_with(shared), model, loads))
+        return np.asarray(load_amplitude(self.program.case_with(shared), self.model, loads))
 
-    def _policy_of(self, batch: int) -> SampledLoop:
+    def _policy(self, batch: int) -> SampledLoop:
         case = self.program.case_with(self.batches.shared_values[batch])
         layout = self.program.shapes.layout
-        loop = closed_loop(case, layout, load_set(case, layout), self.program.schedule)
+        plant = build_plant(case, self.model)
+        if self._filtered is None:
+            self._filtered = with_sensor_filters(plant)
+        known = plant, self._filtered
+        loop = closed_loop(case, layout, plant.loads, self.program.schedule, known=known)
         assert isinstance(loop, SampledLoop)
         return loop
 
@@ -333,7 +340,7 @@ class NativeBatches:
                 if schedule is not None:
                     of_model["history_rows"] = history_rows(program.case, known.model)
             else:
-                self.loops = NativeLoops(program, batches)
+                self.loops = NativeLoops(program, batches, known.model)
                 of_model = self.loops.model_inputs(schedule is not None)
         self.of_model = {
             name: None if part is None else part[None] for name, part in of_model.items()
