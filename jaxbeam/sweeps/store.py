@@ -90,10 +90,14 @@ def blocks_mark(fingerprint: str) -> str:
 
 
 def checksummed() -> list[Any]:
-    """Compressor of arrays, with a checksum by which damage is detected."""
+    """Compressor of arrays, with a checksum by which damage is detected.
+
+    Of numbers with random last digits little more is left out at higher levels, in four times as
+    long: 3 % of 4096 histories.
+    """
     from zarr.codecs import ZstdCodec
 
-    return [ZstdCodec(checksum=True)]
+    return [ZstdCodec(level=1, checksum=True)]
 
 
 def array_options() -> dict[str, Any]:
