@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbeam as jb
-from experiments.benchmarks.common import parser
+from experiments.benchmarks import trains
+from experiments.benchmarks.common import one_span_case, parser
 from jaxbeam.integrator import native_peaks
 from jaxbeam.runtime import native_library
 
@@ -75,11 +76,39 @@ def _sweep(over: dict, case: jb.Case = CASE):
     return jb.sweep(case, over, progress=False).peak_deflection.values
 
 
-def _on_rough_road(over: dict):
-    """Sweep of the truck of five axles over its rough road, in C where there is a compiler."""
+def _crossings(histories: bool):
+    """Peaks of 64 masses at 64 speeds at three sensors, or histories of 251 samples."""
+    _build_c()
+    over = {MASS: np.linspace(0.1, 1.0, 64), SPEED: np.linspace(0.3, 10.0, 64)}
+    case = jb.replace(one_span_case(3), {"run.sample_rate": 100.0})
+    runs = jb.sweep(case, over, histories=histories, progress=False)
+    return (runs.deflection if histories else runs.peak_deflection).values
+
+
+def _trains(count: int):
+    """Peaks of deflection under the ten trains of `trains` at so many sensors."""
+    case = trains.bridge()
+    places = np.linspace(0.0, trains.LENGTH, count + 2)[1:-1]
+    sensors = tuple(jb.Sensor(float(place)) for place in places)
+    case = jb.Case(case.beam, sensors=sensors, loads=case.loads, run=case.run)
+    return _sweep({"loads.0.train": trains.TRAINS, SPEED: np.linspace(40.0, 90.0, 101)}, case)
+
+
+def _build_c() -> None:
+    """Compile the C integrator, where there is a compiler."""
     if native_library.find_compiler() and not native_peaks.available():
         native_peaks.LIBRARY.build()
-    return _sweep(over, jb.load_case(ROOT / "examples/road_bridge/case.toml"))
+
+
+def _in_c(over: dict, case: jb.Case):
+    """Peaks of a sweep, in C where there is a compiler."""
+    _build_c()
+    return _sweep(over, case)
+
+
+def _on_rough_road(over: dict):
+    """Sweep of the truck of five axles over its rough road."""
+    return _in_c(over, jb.load_case(ROOT / "examples/road_bridge/case.toml"))
 
 
 ROWS: dict[str, Callable] = {
@@ -100,6 +129,13 @@ ROWS: dict[str, Callable] = {
     "sweep over 6 gains": lambda: _sweep(
         {"controller.gains.0": np.linspace(100.0, 300.0, 6)}, FED_BACK
     ),
+    "sweep over 512 gains": lambda: _in_c(
+        {"controller.gains.0": np.linspace(100.0, 300.0, 512)}, FED_BACK
+    ),
+    "4096 crossings": lambda: _crossings(False),
+    "4096 histories": lambda: _crossings(True),
+    "ten trains, 101 speeds, 1 sensor": lambda: _trains(1),
+    "ten trains, 101 speeds, 41 sensors": lambda: _trains(41),
     "truck on a road, 16 speeds": lambda: _on_rough_road({SPEED: np.linspace(20.0, 30.0, 16)}),
     "truck on a road, 5 seeds, 5 speeds": lambda: _on_rough_road(
         {"profile.seed": range(5), SPEED: np.linspace(20.0, 30.0, 5)}
